@@ -1,0 +1,3 @@
+from bodyscan.cli import main
+
+main()

@@ -1,0 +1,77 @@
+"""What went wrong, where, and what to do about it.
+
+`BadInput` is something a user can mend (the command line exits with 2); `FailedWork` is good input
+on which the work did not succeed (exit 1).
+"""
+
+from __future__ import annotations
+
+
+class BodyscanError(Exception):
+    """Root of the tree. `what` went wrong, `where` (file, line, pair, shot), `remedy`: what to do."""
+
+    exit_code = 1
+
+    def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
+        super().__init__(what, where, remedy)
+        self.what, self.where, self.remedy = what, where, remedy
+
+    def __str__(self) -> str:
+        text = f"{self.where}: {self.what}" if self.where else self.what
+        return f"{text}\n  {self.remedy}" if self.remedy else text
+
+
+class BadInput(BodyscanError):
+    """The input cannot be used as it is."""
+
+    exit_code = 2
+
+
+class RigFileError(BadInput):
+    """The rig file is wrong; `where` is file:line:column."""
+
+
+class CaptureError(BadInput):
+    """A capture folder lacks something or holds something unusable."""
+
+
+class ImageError(CaptureError):
+    """One image is missing, unreadable, of the wrong size, or shows nothing."""
+
+
+class CalibrationFileError(BadInput):
+    """A stored calibration cannot be read or does not belong to this rig."""
+
+
+class ResultError(BadInput):
+    """A stored scan result cannot be read."""
+
+
+class FailedWork(BodyscanError):
+    """The input was good but the work on it did not succeed."""
+
+    exit_code = 1
+
+
+class BoardNotFound(FailedWork):
+    """No board was found in an image that should show one."""
+
+
+class DecodingFailed(FailedWork):
+    """The images of a stripe sequence do not add up to a stripe code."""
+
+
+class DegeneratePoses(FailedWork):
+    """The board poses cannot determine the camera (too few, or a pure translation)."""
+
+
+class PairFailed(FailedWork):
+    """One pair could not be calibrated; the others go on."""
+
+
+class RigDisconnected(FailedWork):
+    """No shared board view ties two groups of pairs together."""
+
+
+class ScanFailed(FailedWork):
+    """A scan gives no body."""

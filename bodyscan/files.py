@@ -1,0 +1,111 @@
+"""Files that are wholly there or not at all, and the same bytes for the same content."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+_ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip file can hold; any fixed one would do
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; when the block ends well it takes `path`'s place.
+
+    The temporary path keeps the suffix, because writers such as Open3D's choose the format by it.
+    When the block raises, the temporary file goes and `path` is as it was before. The folder is
+    made if need be. A block that writes nothing raises FileNotFoundError.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(6)}.tmp{path.suffix}")
+    try:
+        yield temporary
+        _flush(temporary, os.O_RDWR)
+        os.replace(temporary, path)
+    except BaseException:
+        with suppress(FileNotFoundError):
+            temporary.unlink()
+        raise
+    if os.name == "posix":  # the rename itself must survive a power cut too
+        _flush(path.parent, os.O_RDONLY)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write `data` to `path`, all or nothing."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write `text` to `path` as UTF-8 with plain line feeds, all or nothing."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write `json_text(content)` to `path`, all or nothing."""
+    write_text(path, json_text(content))
+
+
+def json_text(content: Any) -> str:
+    """JSON that is exact on reading back (every float64 to the last bit) and good to diff.
+
+    Keys are sorted, two spaces an indent, a list of numbers on one line (so a matrix takes a line a
+    row). numpy arrays and scalars are taken as lists and numbers. Raises ValueError for NaN and
+    infinity, which JSON does not have, and TypeError for what is no JSON value.
+    """
+    return _json(content, "") + "\n"
+
+
+def write_npz(path: Path, /, **arrays: Any) -> None:
+    """Write arrays as a compressed .npz whose bytes depend on the arrays alone (no time stamps).
+
+    Read back with `numpy.load(path, allow_pickle=False)`. Raises ValueError for object arrays.
+    """
+    import numpy as np
+
+    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name in sorted(arrays):
+            entry = zipfile.ZipInfo(f"{name}.npy", _ZIP_EPOCH)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = 0o644 << 16
+            entry.create_system = 3
+            with archive.open(entry, "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, np.asanyarray(arrays[name]), allow_pickle=False)
+
+
+def _flush(path: Path, flags: int) -> None:
+    handle = os.open(path, flags)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _json(value: Any, indent: str) -> str:
+    value = value.tolist() if hasattr(value, "tolist") else value
+    deeper = indent + "  "
+    if isinstance(value, Mapping) and value:
+        if not all(isinstance(key, str) for key in value):
+            raise TypeError(f"JSON keys must be text, got {list(value)[:5]}")
+        items = [f"{json.dumps(key)}: {_json(value[key], deeper)}" for key in sorted(value)]
+        brackets = "{}"
+    elif isinstance(value, list | tuple) and any(_is_container(item) for item in value):
+        items = [_json(item, deeper) for item in value]
+        brackets = "[]"
+    elif isinstance(value, list | tuple):
+        return "[" + ", ".join(_json(item, deeper) for item in value) + "]"
+    else:
+        return json.dumps({} if isinstance(value, Mapping) else value, allow_nan=False)
+    inside = f",\n{deeper}".join(items)
+    return f"{brackets[0]}\n{deeper}{inside}\n{indent}{brackets[1]}"
+
+
+def _is_container(value: Any) -> bool:
+    return isinstance(value, Mapping | list | tuple) or getattr(value, "ndim", 0) > 0

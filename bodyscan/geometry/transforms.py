@@ -1,0 +1,109 @@
+"""Rigid transforms that read aloud: `rig_from_camera @ camera_from_board`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RigidTransform:
+    """`a_from_b`: takes coordinates in frame b to coordinates in frame a.
+
+    rotation: (3, 3) orthonormal, determinant +1.  translation: (3,) mm, b's origin seen in a.
+    """
+
+    rotation: Array
+    translation: Array
+
+    @staticmethod
+    def identity() -> RigidTransform:
+        return RigidTransform(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_rotation_vector(rotation_vector: ArrayLike, translation: ArrayLike) -> RigidTransform:
+        """Axis times angle, (3,) radians, and a (3,) translation in mm."""
+        rotation = Rotation.from_rotvec(np.asarray(rotation_vector, float)).as_matrix()
+        return RigidTransform(rotation, np.asarray(translation, float))
+
+    @staticmethod
+    def from_matrix(matrix: ArrayLike) -> RigidTransform:
+        """(4, 4) or (3, 4); the rotation part is brought to the nearest rotation."""
+        matrix = np.asarray(matrix, float)
+        u, _, vt = np.linalg.svd(matrix[:3, :3])
+        rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        return RigidTransform(rotation, matrix[:3, 3].copy())
+
+    @property
+    def matrix(self) -> Array:
+        """(4, 4) homogeneous matrix."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
+        return matrix
+
+    @property
+    def rotation_vector(self) -> Array:
+        """(3,) axis times angle, radians."""
+        return Rotation.from_matrix(self.rotation).as_rotvec()
+
+    @property
+    def angle(self) -> float:
+        """Size of the rotation, radians."""
+        return float(np.linalg.norm(self.rotation_vector))
+
+    def __matmul__(self, other: RigidTransform) -> RigidTransform:
+        return RigidTransform(
+            self.rotation @ other.rotation, self.rotation @ other.translation + self.translation
+        )
+
+    def inverse(self) -> RigidTransform:
+        return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def apply(self, points: Array) -> Array:
+        """Points (..., 3) in b -> (..., 3) in a."""
+        return points @ self.rotation.T + self.translation
+
+    def rotate(self, directions: Array) -> Array:
+        """Directions (..., 3) in b -> (..., 3) in a."""
+        return directions @ self.rotation.T
+
+    def moved(self, twist: ArrayLike) -> RigidTransform:
+        """A small motion in frame a put before it: exp(twist) @ self, to first order in coupling.
+
+        twist: (6,) rotation vector (radians), then translation (mm).
+        """
+        twist = np.asarray(twist, float)
+        return RigidTransform.from_rotation_vector(twist[:3], twist[3:]) @ self
+
+
+def skew(vectors: Array) -> Array:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3): skew(a) @ b = a x b."""
+    zero = np.zeros(vectors.shape[:-1])
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return np.stack(rows, axis=-1).reshape(*vectors.shape[:-1], 3, 3)
+
+
+def adjoint(a_from_b: RigidTransform) -> Array:
+    """(6, 6): carries a twist (rotation, translation) expressed in b to the same motion in a."""
+    rotation = a_from_b.rotation
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3] = matrix[3:, 3:] = rotation
+    matrix[3:, :3] = skew(a_from_b.translation) @ rotation
+    return matrix
+
+
+def rigid_fit(source: Array, target: Array) -> RigidTransform:
+    """`target_from_source` that best carries points (N, 3) onto (N, 3), least squares.
+
+    Source: Arun, Huang, Blostein 1987, with Umeyama's correction against reflections.
+    """
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    u, _, vt = np.linalg.svd((target - target_mean).T @ (source - source_mean))
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return RigidTransform(rotation, target_mean - rotation @ source_mean)

@@ -1,0 +1,34 @@
+"""How a stage tells how far it is: stages call a plain function, the command line draws the bar."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+Progress = Callable[[str, int, int], None]
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """The progress of whoever does not want to know."""
+
+
+def threaded(
+    work: Callable[[Item], Result],
+    items: Iterable[Item],
+    *,
+    stage: str,
+    progress: Progress = silent,
+    workers: int = 2,
+) -> list[Result]:
+    """`work` on every item in threads, results in the items' order."""
+    todo: Sequence[Item] = list(items)
+    progress(stage, 0, len(todo))
+    results = []
+    with ThreadPoolExecutor(workers) as pool:
+        for done, result in enumerate(pool.map(work, todo), start=1):
+            results.append(result)
+            progress(stage, done, len(todo))
+    return results

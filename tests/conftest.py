@@ -1,0 +1,19 @@
+"""What every test may use."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def captures() -> Path:
+    """The folder of real captures; tests that need it say so when it is not there."""
+    folder = Path(os.environ.get("BODYSCAN_CAPTURES", PROJECT.parent / "shared" / "captures"))
+    if not folder.is_dir():
+        pytest.skip(f"real captures not found at {folder} (set BODYSCAN_CAPTURES)")
+    return folder

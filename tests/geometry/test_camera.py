@@ -1,0 +1,55 @@
+import cv2
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bodyscan.geometry.camera import Camera
+
+cameras = st.builds(
+    Camera,
+    alpha=st.floats(500.0, 3000.0),
+    beta=st.floats(500.0, 3000.0),
+    gamma=st.floats(-3.0, 3.0),
+    u0=st.floats(300.0, 340.0),
+    v0=st.floats(220.0, 260.0),
+    k1=st.floats(-0.2, 0.2),
+    k2=st.floats(-0.1, 0.1),
+    width=st.just(640),
+    height=st.just(480),
+)
+
+
+def pixels_of(camera: Camera) -> np.ndarray:
+    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 7))
+    return np.stack([u, v], axis=-1)
+
+
+@given(cameras)
+def test_projecting_a_ray_gives_its_pixel_back(camera):
+    pixels = pixels_of(camera)
+    again = camera.project(camera.rays(pixels) * 1234.5)
+    # Newton's method has converged to rounding: 1e-8 px is far below any corner's noise.
+    assert np.max(np.abs(again - pixels)) < 1e-8
+
+
+@given(cameras)
+def test_distortion_is_that_of_equations_3_to_5(camera):
+    points = camera.rays(pixels_of(camera)).reshape(-1, 3) * 700.0
+    ideal = points @ camera.matrix.T
+    u, v = (ideal[:, :2] / ideal[:, 2:]).T
+    normalized = np.linalg.solve(camera.matrix, np.stack([u, v, np.ones_like(u)]))
+    r2 = normalized[0] ** 2 + normalized[1] ** 2
+    factor = camera.k1 * r2 + camera.k2 * r2**2
+    # Eq. 3 scales u - u0, which holds x and, through the skew, y; so does ours.
+    real = np.stack([u + (u - camera.u0) * factor, v + (v - camera.v0) * factor], axis=1)
+    assert np.allclose(camera.project(points), real, atol=1e-8)
+
+
+@given(cameras)
+def test_shearing_makes_it_opencvs_camera(camera):
+    points = camera.rays(pixels_of(camera)).reshape(-1, 3) * 700.0
+    matrix = camera.matrix
+    matrix[0, 1] = 0.0
+    lens = np.array([camera.k1, camera.k2, 0.0, 0.0])
+    opencv = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, lens)[0].reshape(-1, 2)
+    assert np.allclose(camera.without_skew(camera.project(points)), opencv, atol=1e-8)

@@ -1,0 +1,55 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from bodyscan.geometry.transforms import RigidTransform, adjoint, rigid_fit, skew
+
+vectors = arrays(float, 3, elements=st.floats(-3.0, 3.0))
+lengths = arrays(float, 3, elements=st.floats(-2000.0, 2000.0))
+transforms = st.builds(RigidTransform.from_rotation_vector, vectors, lengths)
+
+
+@given(transforms, arrays(float, (5, 3), elements=st.floats(-2000.0, 2000.0)))
+def test_inverse_undoes(a_from_b, points):
+    # 1e-9 mm: a thousand times the rounding of coordinates of a few metres.
+    assert np.allclose(a_from_b.inverse().apply(a_from_b.apply(points)), points, atol=1e-9)
+
+
+@given(transforms, transforms, lengths)
+def test_composition_applies_right_to_left(a_from_b, b_from_c, point):
+    composed = (a_from_b @ b_from_c).apply(point)
+    assert np.allclose(composed, a_from_b.apply(b_from_c.apply(point)), atol=1e-9)
+
+
+@given(transforms)
+def test_rotations_stay_rotations(a_from_b):
+    assert np.allclose(a_from_b.rotation @ a_from_b.rotation.T, np.eye(3), atol=1e-12)
+    assert np.isclose(np.linalg.det(a_from_b.rotation), 1.0)
+
+
+@given(transforms)
+def test_matrix_round_trip(a_from_b):
+    again = RigidTransform.from_matrix(a_from_b.matrix)
+    assert np.allclose(again.matrix, a_from_b.matrix, atol=1e-12)
+
+
+@given(transforms, vectors, vectors)
+def test_adjoint_carries_small_motions(a_from_b, turn, shift):
+    twist = 1e-6 * np.concatenate([turn, shift])
+    in_b = a_from_b @ RigidTransform.identity().moved(twist)
+    in_a = RigidTransform.identity().moved(adjoint(a_from_b) @ twist) @ a_from_b
+    # The two agree to first order; the second-order term is (1e-6)^2 times metres.
+    assert np.allclose(in_b.matrix, in_a.matrix, atol=1e-7)
+
+
+@given(vectors, vectors)
+def test_skew_is_the_cross_product(a, b):
+    assert np.allclose(skew(a) @ b, np.cross(a, b))
+
+
+@given(transforms, st.integers(0, 2**32 - 1))
+def test_rigid_fit_recovers_the_transform(a_from_b, seed):
+    points = np.random.default_rng(seed).uniform(-500.0, 500.0, (12, 3))
+    found = rigid_fit(points, a_from_b.apply(points))
+    assert np.allclose(found.matrix, a_from_b.matrix, atol=1e-9)
