@@ -1,0 +1,179 @@
+"""Board corners to a small fraction of a pixel: the image of a corner is fitted around each.
+
+Four squares meet in a corner; blurred, that is an offset plus the product of two edges:
+
+    I(p) = a + g . p + b E(n1 . (p - c)) E(n2 . (p - c)),    E(d) = erf(d / (sqrt(2) sigma)),
+
+with c the corner, n1 and n2 the normals of the two edge lines. All corners of a board are fitted
+at once by Gauss-Newton steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MAX_MOVE_PX = 1.5
+MAX_RADIUS_PX = 9.0
+WINDOW_SQUARES = 0.42
+BLUR_PX = 0.9
+CLEAR_OF_MARKER_PX = 1.4
+MIN_ARM_PX = 1.5
+BLUR_RANGE_PX = (0.3, 3.0)
+MIN_PIXELS = 16
+MIN_CONTRAST = 4.0
+MAX_RESIDUAL = 0.25
+STEPS = 12
+CONVERGED_PX = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class SightedCorners:
+    """Corners of one board face found in an image.
+
+    ids: (N,) int64.  pixels: (N, 2) px.  printed_count: how many corners the face has.
+    """
+
+    ids: NDArray[np.int64]
+    pixels: Array
+    printed_count: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Patches:
+    """Pixels around N corners, P each: place (N, P, 2) px, grey (N, P), weight (N, P): 0 or 1."""
+
+    place: Array
+    grey: Array
+    weight: Array
+
+
+def refine_corners(
+    image: NDArray[np.uint8], start: Array, along: Array, *, marker_gap: float | None = None
+) -> tuple[Array, Mask]:
+    """Corners (N, 2) px from starts a few pixels off, and which of them can be trusted (N,).
+
+    along: (N, 2, 2) px, columns: one square along the print's x, one along its y, so that no
+    neighbouring edge enters.  marker_gap: on a ChArUco board the white rim around a marker, in
+    squares; the window then is a cross that stays clear of the markers.
+    """
+    if not len(start):
+        return start, np.zeros(0, bool)
+    patches = _patches(image, start, along, marker_gap)
+    fitted, residual = _fit(patches, start, along)
+    pixels, contrast = fitted[:, :2], np.abs(fitted[:, 5])
+    good = patches.weight.sum(axis=1) >= MIN_PIXELS
+    good &= np.linalg.norm(pixels - start, axis=1) < MAX_MOVE_PX
+    good &= (contrast > MIN_CONTRAST) & (residual < MAX_RESIDUAL * contrast)
+    return pixels, good
+
+
+def _patches(
+    image: NDArray[np.uint8], start: Array, along: Array, marker_gap: float | None
+) -> _Patches:
+    """The pixels of a square window that belong to the four squares around each corner."""
+    radius = int(np.ceil(MAX_RADIUS_PX))
+    across = np.arange(-radius, radius + 1)
+    offset = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
+    place = np.rint(start)[:, None] + offset.astype(np.float64)
+    height, width = image.shape
+    inside = np.all((place >= 0) & (place <= [width - 1, height - 1]), axis=-1)
+    column, row = np.clip(place, 0, [width - 1, height - 1]).astype(np.intp).transpose(2, 0, 1)
+    from_corner = place - start[:, None]
+    squares = np.einsum("nij,npj->npi", np.linalg.pinv(along), from_corner)
+    weight = inside & np.all(np.abs(squares) < WINDOW_SQUARES, axis=-1)
+    weight &= np.sum(from_corner**2, axis=-1) <= MAX_RADIUS_PX**2
+    if marker_gap is not None:
+        # Distance in px from the nearer of the two edges through the corner, and where markers begin.
+        lengths = np.abs(np.linalg.det(along))[:, None] / np.linalg.norm(along, axis=1)[:, ::-1]
+        from_edge = np.abs(squares) * lengths[:, None]
+        clear = np.maximum(marker_gap * lengths - CLEAR_OF_MARKER_PX, MIN_ARM_PX)
+        weight &= np.any(from_edge < clear[:, None], axis=-1)
+    return _Patches(place, image[row, column].astype(float), weight.astype(float))
+
+
+def _fit(patches: _Patches, start: Array, along: Array) -> tuple[Array, Array]:
+    """Parameters (N, 9) and RMS residuals (N,), grey levels.
+
+    Parameters: corner (2), the angles of both edges' normals (2), blur, b, a, g (2).
+    """
+    angles = np.arctan2(along[:, 1], along[:, 0]) + np.pi / 2.0
+    state = np.column_stack(
+        [start, angles, np.full(len(start), BLUR_PX), np.zeros((len(start), 4))]
+    )
+    state[:, 5:] = _linear(patches, state)
+    total = np.maximum(patches.weight.sum(axis=1), 1.0)
+    damping = np.full(len(start), 1e-2)
+    residual, jacobian = _linearized(patches, state)
+    cost = np.sum(patches.weight * residual**2, axis=1)
+    for _ in range(STEPS):
+        weighted = np.swapaxes(jacobian * patches.weight[..., None], 1, 2)
+        normal = weighted @ jacobian
+        gradient = (weighted @ residual[..., None])[..., 0]
+        diagonal = np.einsum("nii->ni", normal)
+        damped = normal + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(9)
+        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+        trial = state + step
+        trial[:, 4] = np.clip(trial[:, 4], *BLUR_RANGE_PX)
+        new_residual, new_jacobian = _linearized(patches, trial)
+        new_cost = np.sum(patches.weight * new_residual**2, axis=1)
+        better = new_cost < cost
+        state = np.where(better[:, None], trial, state)
+        residual = np.where(better[:, None], new_residual, residual)
+        jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
+        cost = np.where(better, new_cost, cost)
+        damping = np.where(better, damping / 10.0, damping * 10.0)
+        if np.max(np.linalg.norm(step[:, :2], axis=1)) < CONVERGED_PX:
+            break
+    return state, np.sqrt(cost / total)
+
+
+def _linear(patches: _Patches, state: Array) -> Array:
+    """b, a and g (N, 4) by least squares for given edges."""
+    edges, *_ = _edges(patches, state)
+    relative = patches.place - state[:, None, :2]
+    design = np.concatenate(
+        [edges.prod(axis=-1)[..., None], np.ones_like(relative[..., :1]), relative], axis=-1
+    )
+    weighted = design * patches.weight[..., None]
+    normal = np.einsum("npi,npj->nij", weighted, design) + 1e-9 * np.eye(4)
+    return np.linalg.solve(normal, np.einsum("npi,np->ni", weighted, patches.grey)[..., None])[
+        ..., 0
+    ]
+
+
+def _edges(patches: _Patches, state: Array) -> tuple[Array, Array, Array, Array]:
+    """E (N, P, 2) of both edges, its slope, distances to the edges, and distances along them."""
+    relative = patches.place - state[:, None, :2]
+    cos, sin = np.cos(state[:, None, 2:4]), np.sin(state[:, None, 2:4])
+    across = relative[..., :1] * cos + relative[..., 1:] * sin
+    lengthwise = relative[..., 1:] * cos - relative[..., :1] * sin
+    blur = state[:, None, 4:5]
+    slope = np.sqrt(2.0 / np.pi) / blur * np.exp(-0.5 * (across / blur) ** 2)
+    return erf(across / (np.sqrt(2.0) * blur)), slope, across, lengthwise
+
+
+def _linearized(patches: _Patches, state: Array) -> tuple[Array, Array]:
+    """Residuals (N, P), grey levels, and their derivatives (N, P, 9)."""
+    edges, slope, across, lengthwise = _edges(patches, state)
+    relative = patches.place - state[:, None, :2]
+    b, a, g = state[:, 5, None], state[:, 6, None], state[:, 7:]
+    product = edges.prod(axis=-1)
+    residual = a + np.einsum("npi,ni->np", relative, g) + b * product - patches.grey
+    # b times the other edge's value: what a change of one edge's value is worth.
+    worth = b[..., None] * edges[..., ::-1] * slope
+    cos, sin = np.cos(state[:, None, 2:4]), np.sin(state[:, None, 2:4])
+    jacobian = np.empty((*product.shape, 9))
+    jacobian[..., 0] = -(worth * cos).sum(axis=-1) - g[:, None, 0]
+    jacobian[..., 1] = -(worth * sin).sum(axis=-1) - g[:, None, 1]
+    jacobian[..., 2:4] = worth * lengthwise
+    jacobian[..., 4] = -(worth * across).sum(axis=-1) / state[:, 4, None]
+    jacobian[..., 5], jacobian[..., 6] = product, 1.0
+    jacobian[..., 7:] = relative
+    return residual, jacobian

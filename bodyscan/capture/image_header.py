@@ -1,0 +1,114 @@
+"""What a PNG or JPEG file says of itself in its first bytes, and whether it is all there.
+
+So that a wrong image is refused before it is decoded: an image of 60000 x 60000 pixels fits into a
+few kilobytes of file and fills the memory.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+_JPEG = b"\xff\xd8\xff"
+_JPEG_END = b"\xff\xd9"
+_TAIL = 65536  # some writers add a few bytes behind the end
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """Width and height in pixels, bits a sample, and whether the end of the image is there."""
+
+    width: int
+    height: int
+    bits: int
+    complete: bool
+
+
+class NoImage(Exception):
+    """Not the start of a PNG or JPEG file; says why."""
+
+
+def read_header(path: Path) -> ImageHeader:
+    """Raises NoImage when `path` is no PNG or JPEG file, OSError when it cannot be read."""
+    with path.open("rb") as stream:
+        start = stream.read(33)
+        if not start:
+            raise NoImage("is an empty file")
+        if start.startswith(_PNG):
+            width, height, bits = _png_header(start)
+            return ImageHeader(width, height, bits, _ends_with(stream, 33, _PNG_END))
+        if start.startswith(_JPEG):
+            width, height, bits, end = _jpeg_header(stream)
+            return ImageHeader(width, height, bits, _ends_with(stream, end, _JPEG_END))
+    raise NoImage("is neither a PNG nor a JPEG image")
+
+
+def png_damage(data: bytes) -> str | None:
+    """What is wrong with the chunks of a whole PNG file (ends early, checksum wrong), or None.
+
+    libpng decodes such a file as far as it gets and leaves the rest of the image as it is.
+    """
+    place = len(_PNG)
+    while True:
+        if place + 12 > len(data):
+            return "is cut short"
+        (length,) = struct.unpack_from(">I", data, place)
+        end = place + 8 + length
+        if end + 4 > len(data):
+            return "is cut short"
+        (checksum,) = struct.unpack_from(">I", data, end)
+        if zlib.crc32(memoryview(data)[place + 4 : end]) != checksum:
+            return "is damaged (a checksum is wrong)"
+        if data[place + 4 : place + 8] == b"IEND":
+            return None
+        place = end + 4
+
+
+def _png_header(start: bytes) -> tuple[int, int, int]:
+    if len(start) < 33:
+        raise NoImage("is cut short")
+    length, kind, width, height, bits = struct.unpack_from(">I4sIIB", start, 8)
+    (checksum,) = struct.unpack_from(">I", start, 29)
+    if (length, kind) != (13, b"IHDR") or zlib.crc32(start[12:29]) != checksum:
+        raise NoImage("is damaged (its PNG header is wrong)")
+    return width, height, bits
+
+
+def _jpeg_header(stream: BinaryIO) -> tuple[int, int, int, int]:
+    """Width, height, bits, and where the frame header ends. Source: ITU-T T.81, Annex B."""
+    stream.seek(2)
+    while True:
+        marker = stream.read(2)
+        while marker == b"\xff\xff":  # fill bytes
+            marker = b"\xff" + stream.read(1)
+        if len(marker) < 2:
+            raise NoImage("is cut short")
+        if marker[0] != 0xFF or marker[1] in (0x00, 0xD9, 0xDA):
+            raise NoImage("is damaged (its JPEG header is wrong)")
+        if marker[1] == 0x01 or 0xD0 <= marker[1] <= 0xD8:
+            continue  # markers without content
+        content = stream.read(2)
+        if len(content) < 2:
+            raise NoImage("is cut short")
+        (length,) = struct.unpack(">H", content)
+        if length < 2:
+            raise NoImage("is damaged (its JPEG header is wrong)")
+        if 0xC0 <= marker[1] <= 0xCF and marker[1] not in (0xC4, 0xC8, 0xCC):
+            frame = stream.read(5)
+            if len(frame) < 5:
+                raise NoImage("is cut short")
+            bits, height, width = struct.unpack(">BHH", frame)
+            return width, height, bits, stream.tell()
+        stream.seek(length - 2, 1)
+
+
+def _ends_with(stream: BinaryIO, start: int, mark: bytes) -> bool:
+    """Whether `mark` stands near the end of the file, behind `start`."""
+    size = stream.seek(0, 2)
+    stream.seek(max(start, size - _TAIL))
+    return mark in stream.read()

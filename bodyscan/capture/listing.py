@@ -1,0 +1,64 @@
+"""What lies in a capture folder, looked up without ever leaving it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from bodyscan.errors import CaptureError
+
+
+class Listing:
+    """Reads each folder once; refuses symbolic links that lead out of the capture folder."""
+
+    def __init__(self, root: Path) -> None:
+        """Raises CaptureError when `root` is no folder."""
+        if not root.is_dir():
+            what = "is not a folder" if root.exists() else "does not exist"
+            remedy = "Check the folder's name, and that the disk it lies on is there."
+            raise CaptureError(f"the capture folder {what}", where=str(root), remedy=remedy)
+        self.root = root
+        self._real_root = os.path.realpath(root)
+        self._entries: dict[str, dict[str, bool]] = {}
+
+    def has(self, relative: str) -> bool:
+        """Whether a file or folder of that relative path (parts joined by /) is there."""
+        parent, _, name = relative.rpartition("/")
+        is_link = self._read(parent).get(name)
+        if is_link is None:
+            return False
+        if not is_link:
+            return True
+        path = self.root / relative
+        self._refuse_if_outside(path)
+        return path.exists()
+
+    def names(self, relative: str) -> tuple[str, ...]:
+        """Names of what a folder holds, () if there is no such folder. "" is the root."""
+        return tuple(self._read(relative))
+
+    def _read(self, relative: str) -> dict[str, bool]:
+        """Name -> whether it is a symbolic link, for what a folder holds."""
+        if relative not in self._entries:
+            there = relative == "" or self.has(relative)
+            self._entries[relative] = self._scan(self.root / relative) if there else {}
+        return self._entries[relative]
+
+    def _scan(self, folder: Path) -> dict[str, bool]:
+        try:
+            with os.scandir(folder) as entries:
+                return {entry.name: entry.is_symlink() for entry in entries}
+        except NotADirectoryError:
+            return {}
+        except OSError as error:
+            what = f"cannot be read: {error.strerror}"
+            raise CaptureError(what, where=str(folder), remedy="Check its permissions.") from None
+
+    def _refuse_if_outside(self, path: Path) -> None:
+        real = os.path.realpath(path)
+        if not Path(real).is_relative_to(self._real_root):
+            raise CaptureError(
+                f"is a symbolic link that leads out of the capture folder, to {real}",
+                where=str(path),
+                remedy="Copy what it points to into the capture folder, or name that folder.",
+            )

@@ -1,0 +1,115 @@
+"""The frames of a stripe sequence, laid out so that every image row crosses the stripes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.capture.views import StripeMap
+
+if TYPE_CHECKING:
+    from bodyscan.capture.boundaries import Boundaries
+
+Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+SATURATED = 254
+MIN_CONTRAST = 4.0
+MIN_CONTRAST_TO_NOISE = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class StripeImages:
+    """Frames as scan lines: L lines, each of P positions across the stripes.
+
+    lit, dark: (L, P) uint8.  patterns, inverses: (bits, L, P) uint8.
+    turned: the lines are the camera image's columns (its stripes are horizontal).
+    """
+
+    lit: Bytes
+    dark: Bytes
+    patterns: Bytes
+    inverses: Bytes
+    turned: bool
+
+    @staticmethod
+    def along_lines(
+        lit: Bytes, dark: Bytes | None, patterns: Bytes, inverses: Bytes, direction: str
+    ) -> StripeImages:
+        """From images (H, W) and stacks (bits, H, W)."""
+        if dark is None:
+            dark = np.minimum(patterns, inverses).min(axis=0)
+        turned = direction == "horizontal"
+        if turned:
+            lit, dark = cv2.transpose(lit), cv2.transpose(dark)
+            patterns = np.stack([cv2.transpose(image) for image in patterns])
+            inverses = np.stack([cv2.transpose(image) for image in inverses])
+        return StripeImages(lit, dark, patterns, inverses, turned)
+
+    @property
+    def contrast(self) -> NDArray[np.float32]:
+        """Lit minus dark, (L, P), grey levels."""
+        return cv2.subtract(self.lit, self.dark, dtype=cv2.CV_32F)
+
+    def decode(self, noise: float, stripes: int) -> tuple[NDArray[np.int32], Mask]:
+        """The stripe (L, P) that each pixel lies in, and which pixels can be relied on.
+
+        Not to be relied on: low contrast, saturation, codes that were not projected, and pixels
+        beside a jump of the code by more than one (a mixed pixel at a depth jump is one).
+        """
+        codes = self.binary()
+        contrast = self.contrast
+        usable = contrast >= max(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * noise)
+        usable &= (self.lit < SATURATED) & (codes < stripes)
+        return codes, usable & ~beside_jumps(codes, usable)
+
+    def binary(self) -> NDArray[np.int32]:
+        """(L, P): the Gray code's sign bits turned into stripe numbers."""
+        gray = np.zeros(self.lit.shape, np.uint16)
+        for pattern, inverse in zip(self.patterns, self.inverses, strict=True):
+            gray = (gray << 1) | (pattern > inverse)
+        for shift in (1, 2, 4, 8):
+            gray ^= gray >> shift
+        return gray.astype(np.int32)
+
+    def stripe_map(
+        self,
+        lit: Bytes,
+        s: NDArray[np.float32],
+        sigma: NDArray[np.float32],
+        boundaries: Boundaries,
+        stripes: int,
+    ) -> StripeMap:
+        """Back to the camera's own layout."""
+        contrast = self.contrast
+        line, position = boundaries.line.astype(float), boundaries.position
+        pixels = np.stack([position, line], axis=-1)
+        if self.turned:
+            s, sigma, contrast = (cv2.transpose(image) for image in (s, sigma, contrast))
+            pixels = pixels[:, ::-1]
+        return StripeMap(
+            s=s,
+            sigma=sigma,
+            lit=lit,
+            contrast=contrast,
+            boundary_index=boundaries.index,
+            boundary_pixels=np.ascontiguousarray(pixels, float),
+            boundary_sigma_px=boundaries.sigma_px,
+            stripes=stripes,
+        )
+
+
+def beside_jumps(codes: NDArray[np.int32], usable: Mask) -> Mask:
+    """(L, P): pixels whose code differs from a usable neighbour's by more than one."""
+    jumps = np.zeros(codes.shape, bool)
+    across = (np.abs(np.diff(codes, axis=1)) > 1) & usable[:, 1:] & usable[:, :-1]
+    jumps[:, 1:] |= across
+    jumps[:, :-1] |= across
+    along = (np.abs(np.diff(codes, axis=0)) > 1) & usable[1:] & usable[:-1]
+    jumps[1:] |= along
+    jumps[:-1] |= along
+    return jumps

@@ -1,0 +1,92 @@
+"""File-name templates such as `{shot}/{pair}/{frame}.png`: checked, filled in, read backwards."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from functools import lru_cache
+from string import Formatter
+
+SHOT = r"\w[\w.-]*"
+_FIELDS = ("shot", "pair", "frame")
+_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+def fill(template: str, *, shot: str, pair: str, frame: str) -> str:
+    """The relative path that `template` gives; the template is one without `template_faults`."""
+    return template.format(shot=shot, pair=pair, frame=frame)
+
+
+def has_field(template: str, field: str) -> bool:
+    return field in _fields(template)
+
+
+@lru_cache(maxsize=4096)
+def shot_pattern(template: str, pair: str, frame: str) -> tuple[re.Pattern[str], ...]:
+    """One pattern a path part, that together tell the shot (group `shot`) from a file's path."""
+    marked = re.escape(fill(template, shot="\0", pair=pair, frame=frame)).split("/")
+    return tuple(_shot_group(part) for part in marked)
+
+
+def template_faults(template: str, *, many_pairs: bool, needs_frame: bool) -> Iterator[str]:
+    """What is wrong with a file-name template, in words that follow its key."""
+    try:
+        fields = _fields(template)
+    except ValueError as error:
+        yield f"is no file-name template: {error}"
+        return
+    if many_pairs and "pair" not in fields:
+        yield "needs {pair}, since the rig has several pairs"
+    if needs_frame and "frame" not in fields:
+        yield "needs {frame}, since a stripe sequence has many images"
+    if not template.lower().endswith(_SUFFIXES):
+        yield f"must end in {', '.join(_SUFFIXES)}: only PNG and JPEG images are read"
+    fault = path_fault(template)
+    if fault:
+        yield fault
+
+
+def frame_name_faults(name: str) -> Iterator[str]:
+    """What is wrong with a name of `frames.pattern` that holds `{bit}`."""
+    try:
+        parts = list(Formatter().parse(name))
+    except ValueError as error:
+        yield f"is no frame name: {error}"
+        return
+    fields = [(field, spec, how) for _, field, spec, how in parts if field is not None]
+    if not fields:
+        yield "needs {bit}, or must be a list of one name a bit"
+    for field, spec, how in fields:
+        if field != "bit" or how or not re.fullmatch(r"0?[1-9]?d?", spec or ""):
+            yield f"may only hold {{bit}} or such as {{bit:02d}}, not {{{field}}}"
+
+
+def path_fault(path: str) -> str | None:
+    """Why a relative path might lead out of the folder it starts in, or None."""
+    if "\\" in path or "\0" in path or re.match(r"[A-Za-z]:", path):
+        return "must use / between folders, and neither \\ nor a drive letter"
+    if path.startswith("/"):
+        return "must be relative to the capture folder"
+    parts = path.split("/")
+    if ".." in parts:
+        return "must not climb out of the capture folder with .."
+    return "has an empty part between two /" if "" in parts else None
+
+
+def _fields(template: str) -> set[str]:
+    fields = set()
+    for _, field, spec, conversion in Formatter().parse(template):
+        if field is None:
+            continue
+        if field not in _FIELDS or spec or conversion:
+            allowed = ", ".join(f"{{{name}}}" for name in _FIELDS)
+            raise ValueError(f"it may hold {allowed}, not {{{field}}}")
+        fields.add(field)
+    return fields
+
+
+def _shot_group(part: str) -> re.Pattern[str]:
+    first, *others = part.split(re.escape("\0"))
+    if not others:
+        return re.compile(first)
+    return re.compile(first + f"(?P<shot>{SHOT})" + "(?P=shot)".join(others))
