@@ -1,0 +1,182 @@
+"""A board as it was made: its print, square by square, and the sheet it is glued to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from bodyscan.capture.rig import Board
+from bodyscan.errors import BadInput
+from bodyscan.simulation.scene import Floats, Surface, grid_surface, grid_triangles
+from bodyscan.simulation.settings import BoardMaking
+
+Array = NDArray[np.float64]
+
+_STEPS = 4
+"""Mesh cells a square, when the board is not flat."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoardPrint:
+    """Squares (and markers in them) evaluated where a ray hits, so that edges are exact.
+
+    cells: (rows + 2, columns + 2, k, k) albedo; a rim of blank squares all round. A square's
+    middle `inner_mm` is cut into (k - 2)^2 modules; entries 0 and k - 1 are what surrounds them.
+    """
+
+    square_mm: float
+    inner_mm: float
+    cells: Floats
+
+    def albedo(self, places: Floats) -> Floats:
+        """(N, 2) mm on the print, from the first square's outer corner -> (N,)."""
+        rows, columns, modules, _ = self.cells.shape
+        column, i = self._cell(places[:, 0], columns, modules)
+        row, j = self._cell(places[:, 1], rows, modules)
+        return self.cells[row, column, j, i]
+
+    def _cell(
+        self, place: Floats, squares: int, modules: int
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """The square's number along one side, and the module's inside it."""
+        number = np.floor(place / np.float32(self.square_mm))
+        inside = place - number * np.float32(self.square_mm)
+        start = (self.square_mm - self.inner_mm) / 2.0
+        module = np.floor((inside - np.float32(start)) * np.float32((modules - 2) / self.inner_mm))
+        return (
+            np.clip(number + 1, 0, squares - 1).astype(np.intp),
+            np.clip(module + 1, 0, modules - 1).astype(np.intp),
+        )
+
+
+def board_print(board: Board, face: int, making: BoardMaking) -> BoardPrint:
+    """The print of face 0 (front) or 1 (back); the back's markers follow the front's."""
+    dark = _dark_squares(board)
+    markers = _markers(board, face, int((~dark).sum())) if board.kind == "charuco" else None
+    modules = 3 if markers is None else markers.shape[1] + 2
+    cells = np.zeros((board.rows + 2, board.columns + 2, modules, modules), bool)
+    cells[1:-1, 1:-1] = dark[:, :, None, None]
+    if markers is not None:
+        row, column = np.nonzero(~dark)
+        cells[row + 1, column + 1, 1:-1, 1:-1] = markers
+    albedo = np.where(cells, making.black, making.white).astype(np.float32)
+    return BoardPrint(board.square_mm, board.marker_mm or 0.5 * board.square_mm, albedo)
+
+
+def _dark_squares(board: Board) -> NDArray[np.bool_]:
+    row, column = np.indices((board.rows, board.columns))
+    turned = board.kind == "charuco" and board.legacy_layout and board.rows % 2 == 0
+    return (row + column) % 2 == (1 if turned else 0)
+
+
+def _markers(board: Board, face: int, count: int) -> NDArray[np.bool_]:
+    """(count, m, m): dark modules of the markers of one face, their border included."""
+    if not hasattr(cv2.aruco, board.dictionary):
+        raise BadInput(f"OpenCV has no marker dictionary {board.dictionary}", where=board.name)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    first = board.first_marker + face * count
+    if first + count > len(dictionary.bytesList):
+        raise BadInput(
+            f"{board.dictionary} has {len(dictionary.bytesList)} markers, "
+            f"face {face} needs up to {first + count}",
+            where=board.name,
+        )
+    size = dictionary.markerSize + 2
+    ids = range(first, first + count)
+    return np.stack([dictionary.generateImageMarker(i, size) < 128 for i in ids])
+
+
+@dataclass(frozen=True, eq=False)
+class MadeBoard:
+    """surfaces: in the board frame.  corners: (faces * N, 3) where the printed inner corners
+    really are, board frame, numbered as the rig file's boards are (front, then back)."""
+
+    surfaces: tuple[Surface, ...]
+    corners: Array
+
+
+def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> MadeBoard:
+    """The board of the rig file, with what went wrong in making it."""
+    width, height = board.columns * board.square_mm, board.rows * board.square_mm
+    surfaces, corners = [], []
+    for face in range(board.faces):
+        error = _print_error(board, making, rng)
+        places = _places(board, flat=making.bow_mm == 0 and making.print_error_mm == 0)
+        vertices = _on_sheet(places.reshape(-1, 2), board, face, error, making.bow_mm)
+        triangles = grid_triangles(places.shape[1] - 1, places.shape[0] - 1)
+        printed = board_print(board, face, making)
+        surfaces.append(
+            Surface(
+                vertices,
+                triangles,
+                printed=printed,
+                places=places.reshape(-1, 2),
+                open_to_light=True,
+            )
+        )
+        c, r = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
+        inner = np.stack([c.ravel(), r.ravel()], axis=1).astype(float) * board.square_mm
+        corners.append(_on_sheet(inner, board, face, error, making.bow_mm))
+    surfaces += _sides(board, width, height, making)
+    return MadeBoard(tuple(surfaces), np.concatenate(corners))
+
+
+def _places(board: Board, flat: bool) -> Array:
+    """Mesh vertices on the print, (rows, columns, 2) mm, with the margin round it."""
+
+    def line(squares: int) -> Array:
+        size = squares * board.square_mm
+        inner = np.linspace(0.0, size, squares * _STEPS + 1)[1:-1]
+        edges = [-board.margin_mm, 0.0] if board.margin_mm > 0 else [0.0]
+        ends = [size, size + board.margin_mm] if board.margin_mm > 0 else [size]
+        whole = np.concatenate([edges, inner, ends])
+        return whole[[0, -1]] if flat else whole
+
+    return np.stack(np.meshgrid(line(board.columns), line(board.rows)), axis=-1)
+
+
+def _on_sheet(places: Array, board: Board, face: int, error: Array, bow_mm: float) -> Array:
+    """Places on the print (N, 2) -> board frame (N, 3): printing error, turning over, bow."""
+    square = board.square_mm
+    grid = np.clip(places / square, 0.0, [board.columns, board.rows])[:, ::-1].T
+    moved = places + np.stack([map_coordinates(e, grid, order=1) for e in error], axis=1)
+    x, y = moved[:, 0], moved[:, 1]
+    if face == 1:
+        x = board.columns * square - x
+    across, down = x / (board.columns * square) - 0.5, y / (board.rows * square) - 0.5
+    bow = bow_mm * (1.0 - 2.0 * (across**2 + down**2))
+    return np.stack([x, y, face * board.thickness_mm - bow], axis=1)
+
+
+def _print_error(board: Board, making: BoardMaking, rng: np.random.Generator) -> Array:
+    """(2, rows + 1, columns + 1): how far each corner of a square is printed off, mm."""
+    shape = (2, board.rows + 1, board.columns + 1)
+    if making.print_error_mm == 0:
+        return np.zeros(shape)
+    if making.print_error == "corner":
+        return making.print_error_mm * rng.standard_normal(shape)
+    row, column = np.indices(shape[1:]) / max(shape[1:])
+    waves = np.zeros(shape)
+    for _ in range(6):
+        turn = rng.uniform(0.0, 2.0 * np.pi, 2)
+        fx, fy = rng.normal(0.0, 3.0, 2)
+        waves += np.cos(fx * column + fy * row + turn[:, None, None])
+    return waves * making.print_error_mm / np.sqrt(3.0)
+
+
+def _sides(board: Board, width: float, height: float, making: BoardMaking) -> list[Surface]:
+    """The sheet's edges, and its blank back if only one face is printed."""
+    m, depth = board.margin_mm, np.array([0.0, 0.0, board.thickness_mm])
+    x, y = np.array([width + 2 * m, 0.0, 0.0]), np.array([0.0, height + 2 * m, 0.0])
+    start = np.array([-m, -m, 0.0])
+    patches = []
+    if board.thickness_mm > 0:
+        patches = [(start, x, depth), (start, y, depth)]
+        patches += [(start + y, x, depth), (start + x, y, depth)]
+    if board.faces == 1:
+        patches.append((start + depth + np.array([0.0, 0.0, 0.05]), x, y))
+    return [grid_surface(*patch, albedo=making.side) for patch in patches]

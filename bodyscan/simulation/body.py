@@ -1,0 +1,80 @@
+"""The person: a subject's mesh brought to the rig frame, with skin, and the sway between pairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from bodyscan.errors import BadInput
+from bodyscan.files import replacing
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.simulation.scene import Surface
+from bodyscan.simulation.settings import Person
+
+Array = NDArray[np.float64]
+
+
+def load_subject(path: Path, person: Person, rng: np.random.Generator) -> Surface:
+    """A subject's PLY (metres, z up, facing -y) as a smooth surface in the rig frame, mm.
+
+    The mesh is subdivided by Loop's rule, turned to face +x and put with its middle over the
+    rig's centre. The surface returned is itself the truth.
+    """
+    mesh = o3d.io.read_triangle_mesh(str(path)) if path.is_file() else o3d.geometry.TriangleMesh()
+    if not mesh.has_triangles():
+        raise BadInput(
+            "no triangle mesh can be read here",
+            where=str(path),
+            remedy="Give a PLY in metres, z up, facing -y: see data/subjects/README.md.",
+        )
+    mesh = mesh.subdivide_loop(person.subdivisions)
+    mesh.compute_vertex_normals()
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    vertices = np.asarray(mesh.vertices) @ turn.T * 1000.0
+    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    vertices -= [middle[0], middle[1], vertices[:, 2].min()]
+    return Surface(
+        vertices,
+        np.asarray(mesh.triangles).astype(np.int64),
+        albedo=skin(vertices, person, rng),
+        normals=np.asarray(mesh.vertex_normals) @ turn.T,
+    )
+
+
+def skin(vertices: Array, person: Person, rng: np.random.Generator) -> Array:
+    """(N,) albedo at vertices (N, 3): a sum of waves 60 to 400 mm long."""
+    waves = np.zeros(len(vertices))
+    for length in np.geomspace(60.0, 400.0, 8):
+        way = rng.standard_normal(3)
+        phase = vertices @ (way / np.linalg.norm(way)) * (2.0 * np.pi / length)
+        waves += np.cos(phase + rng.uniform(0.0, 2.0 * np.pi))
+    return person.skin * (1.0 + person.skin_variation * waves / 4.0)
+
+
+def draw_sway(person: Person, height_mm: float, rng: np.random.Generator) -> RigidTransform:
+    """`swayed_from_still`: a lean about the feet and a shift, together at most sway_mm at the head.
+
+    Seven tenths of it come from leaning, as a standing person sways like a pole on its ankles.
+    """
+    if person.sway_mm == 0:
+        return RigidTransform.identity()
+    size, way = rng.uniform(0.3, 1.0), rng.uniform(0.0, 2.0 * np.pi)
+    lean, turn = 0.7 * size * person.sway_mm / height_mm, rng.normal(0.0, 0.2)
+    axis = np.array([-np.sin(way), np.cos(way), turn]) * lean
+    shift = 0.3 * size * person.sway_mm * np.array([np.cos(way), np.sin(way), 0.0])
+    return RigidTransform.from_rotation_vector(axis, shift)
+
+
+def save_truth(surface: Surface, path: Path) -> None:
+    """Binary PLY, mm, rig frame, with vertex normals."""
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(surface.vertices),
+        o3d.utility.Vector3iVector(surface.triangles.astype(np.int32)),
+    )
+    if surface.normals is not None:
+        mesh.vertex_normals = o3d.utility.Vector3dVector(surface.normals)
+    with replacing(path) as temporary:
+        o3d.io.write_triangle_mesh(str(temporary), mesh, write_ascii=False)

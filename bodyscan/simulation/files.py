@@ -1,0 +1,76 @@
+"""What the simulator writes: the rig file, captures.yaml, images and the truth."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.capture.captures_file import CapturesFile, ShotEntry, write_captures_file
+from bodyscan.capture.rig import CaptureFolder, Pair, Rig
+
+WHEN = datetime(2026, 11, 21, 10, 0, 0)
+"""The date written into captures.yaml: always the same, so that the bytes are too."""
+
+# Noise leaves nothing to find twice: Huffman coding of differences alone is quickest and smallest.
+_PNG = [
+    cv2.IMWRITE_PNG_COMPRESSION,
+    1,
+    cv2.IMWRITE_PNG_STRATEGY,
+    cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
+]
+_PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
+
+
+def scaled_rig(rig: Rig, scale: float, calibration: str) -> Rig:
+    """The rig with image size and number of stripes scaled, its captures in one folder."""
+
+    def scaled(value: int) -> int:
+        return max(2, round(value * scale))
+
+    def resized(pair: Pair) -> Pair:
+        camera, projector = pair.camera, pair.projector
+        size = {"width": scaled(camera.width), "height": scaled(camera.height)}
+        fewer = projector and projector.model_copy(update={"stripes": scaled(projector.stripes)})
+        change = {"camera": camera.model_copy(update=size), "projector": fewer}
+        return pair.model_copy(update=change)
+
+    return rig.model_copy(
+        update={
+            "pairs": tuple(resized(pair) for pair in rig.pairs),
+            "calibration": (CaptureFolder(folder=calibration),),
+        }
+    )
+
+
+def write_captures(
+    folder: Path,
+    kind: Literal["calibration", "scan"],
+    shots: Sequence[tuple[str, Sequence[str], Sequence[str]]],
+    subject: str | None = None,
+) -> None:
+    """captures.yaml: each shot's name, the pairs that took stripes, the pairs that took lit."""
+    entries = tuple(
+        ShotEntry(name=name, stripes=tuple(stripes) or None, lit=tuple(lit) or None)
+        for name, stripes, lit in shots
+    )
+    write_captures_file(folder, CapturesFile(kind=kind, when=WHEN, subject=subject, shots=entries))
+
+
+def write_image(path: Path, image: NDArray[np.uint8]) -> None:
+    """An image, PNG packed quickly; whole or not at all.
+
+    It is not flushed to the disk one by one: there are thousands, and they can be made again.
+    """
+    options = _PNG if path.suffix.lower() == ".png" else []
+    _, packed = cv2.imencode(path.suffix, image, options)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
+    temporary.write_bytes(packed.tobytes())
+    os.replace(temporary, path)

@@ -1,0 +1,82 @@
+"""What the projector throws: reflected binary code, most significant bit first, and its light.
+
+Written for the simulator alone; it shares nothing with `bodyscan.capture.codes`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+PAD = 4
+"""Stripes by which a table of light reaches beyond the sweep."""
+
+FINE = 128
+"""Entries of a table of light for each stripe."""
+
+
+def bit_count(stripes: int) -> int:
+    """Patterns needed to tell the stripes apart."""
+    return int(np.ceil(np.log2(stripes)))
+
+
+def code_bits(stripes: int) -> NDArray[np.bool_]:
+    """(bits, stripes): whether stripe i is lit in pattern k, 0 the most significant."""
+    index = np.arange(stripes)
+    code = index ^ (index >> 1)
+    places = np.arange(bit_count(stripes))[::-1]
+    return (code >> places[:, None] & 1).astype(bool)
+
+
+@dataclass(frozen=True, eq=False)
+class LightTable:
+    """Light against the stripe coordinate, one row for each of several blurs.
+
+    values: (blurs, entries) float32 in 0..1.
+    """
+
+    values: NDArray[np.float32]
+
+    def at(self, index: NDArray[np.int32]) -> NDArray[np.float32]:
+        """Light at entries from `table_index`."""
+        return self.values.ravel().take(index)
+
+
+def table_index(
+    s: NDArray[np.floating], stripes: int, blur: NDArray[np.integer] | None = None
+) -> NDArray[np.int32]:
+    """Entry of a stripe coordinate (NaN: beyond the sweep), and of its row of blur if several."""
+    entries = (stripes + 2 * PAD) * FINE
+    place = np.nan_to_num((s + PAD) * FINE, nan=0.0, posinf=0.0, neginf=0.0)
+    index = np.clip(place, 0, entries - 1).astype(np.int32)
+    return index if blur is None else (index + blur * entries).astype(np.int32)
+
+
+def light_table(
+    lit: NDArray[np.bool_], blurs: NDArray[np.float64], jitter: NDArray[np.float64] | None = None
+) -> LightTable:
+    """Light of one frame: the stripes that are lit, smeared by Gaussians.
+
+    lit: (S,).  blurs: (B,) standard deviations in stripes.
+    jitter: (S + 1,) how far each boundary strays, in stripes.
+    """
+    stripes = len(lit)
+    boundaries = np.arange(stripes + 1, dtype=float)
+    if jitter is not None:
+        boundaries = np.maximum.accumulate(boundaries + jitter)
+    energy = np.concatenate([[0.0], np.cumsum(lit * np.diff(boundaries))])
+    edges = np.arange((stripes + 2 * PAD) * FINE + 1) / FINE - PAD
+    sharp = np.diff(np.interp(edges, boundaries, energy)) * FINE
+    return LightTable(np.stack([_smeared(sharp, blur) for blur in blurs]).astype(np.float32))
+
+
+def _smeared(values: NDArray[np.float64], blur: float) -> NDArray[np.float64]:
+    if blur <= 0:
+        return values
+    reach = int(np.ceil(min(4.0 * blur, PAD) * FINE))
+    place = np.arange(-reach, reach + 1) / FINE / blur
+    kernel = np.exp(-0.5 * place**2)
+    padded = np.pad(values, reach, mode="edge")
+    return np.convolve(padded, kernel / kernel.sum(), mode="valid")

@@ -1,0 +1,233 @@
+"""The rig as it was really built: nominal placings, off by what hands and tape measures are off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.capture.rig import Pair, Placing, Rig
+from bodyscan.errors import BadInput
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.simulation.lens import TrueCamera
+from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
+from bodyscan.simulation.settings import Optics, Projection, SimulationSettings
+
+Array = NDArray[np.float64]
+AnyProjector = MirrorProjector | PinholeProjector
+
+_UP = np.array([0.0, 0.0, 1.0])
+_LAMP_STRIPES = 2
+
+
+@dataclass(frozen=True, eq=False)
+class TruePair:
+    """name; its camera, where it stands; its projector in the camera's frame.
+
+    reach_mm: the working distance, from the nominal placing. has_stripes: False for a camera
+    alone, which a plain lamp lights.
+    """
+
+    name: str
+    camera: TrueCamera
+    rig_from_camera: RigidTransform
+    projector: AnyProjector
+    reach_mm: float
+    has_stripes: bool
+
+
+def build_pairs(
+    rig: Rig, settings: SimulationSettings, stream: Callable[[int], np.random.Generator]
+) -> dict[str, TruePair]:
+    """Every pair's true parameters, each drawn from its own `stream(number)`.
+
+    The pair that fixes the rig frame, if the rig file has one do so, stands where it should.
+    Raises BadInput for a pair without nominal placing.
+    """
+    fixed = None if rig.rig_frame.shot else (rig.rig_frame.pair or rig.pairs[0].name)
+    return {
+        pair.name: _build(pair, pair.name == fixed, settings, stream(number))
+        for number, pair in enumerate(rig.pairs)
+    }
+
+
+def _build(
+    pair: Pair, fixed: bool, settings: SimulationSettings, rng: np.random.Generator
+) -> TruePair:
+    if pair.nominal is None:
+        raise BadInput(
+            "a rig can be simulated only if every pair has a nominal placing",
+            where=f"pair {pair.name}",
+            remedy="Add nominal: {position_mm: [x, y, z], look_at_mm: [x, y, z]} to the rig file.",
+        )
+    optics = settings.optics
+    reach = float(np.linalg.norm(np.subtract(*_ends(pair.nominal))))
+    camera = draw_camera(pair.camera.width, pair.camera.height, optics, rng)
+    nominal = rig_from_view(pair.nominal)
+    placed = _perturbed(nominal, optics, reach, rng)
+    rig_from_camera = nominal if fixed else placed
+    horizontal = pair.projector is None or pair.projector.direction == "horizontal"
+    placing = pair.projector_nominal or _beside(nominal, reach, horizontal)
+    rig_from_projector = _perturbed(rig_from_view(placing), optics, reach, rng)
+    stripes = pair.projector.stripes if pair.projector else _LAMP_STRIPES
+    builder = build_mirror if settings.projection.kind == "mirror" else build_pinhole
+    projector = builder(
+        rig_from_camera.inverse() @ rig_from_projector,
+        stripes,
+        horizontal,
+        _seen_points(camera, settings.projection, reach),
+        settings.projection,
+        rng,
+    )
+    has_stripes = pair.projector is not None
+    return TruePair(pair.name, camera, rig_from_camera, projector, reach, has_stripes)
+
+
+def draw_camera(width: int, height: int, optics: Optics, rng: np.random.Generator) -> TrueCamera:
+    """A lens drawn around the nominal one; pixel values scale with the image's width."""
+    pixel = width / 1280.0
+    alpha = optics.focal_widths * width * (1.0 + optics.focal_spread * rng.standard_normal())
+    beta = alpha * (1.0 + optics.aspect_spread * (1.0 + 0.5 * rng.standard_normal()))
+    u0, v0 = optics.centre_px * pixel * rng.standard_normal(2)
+    gamma = optics.skew_px * pixel * (1.0 + 0.2 * rng.standard_normal())
+    k1 = optics.k1 + optics.k1_spread * float(np.clip(rng.standard_normal(), -2, 2))
+    k2 = optics.k2 + optics.k2_spread * float(np.clip(rng.standard_normal(), -2, 2))
+    middle = ((width - 1) / 2.0, (height - 1) / 2.0)
+    return TrueCamera(
+        float(alpha),
+        float(beta),
+        float(gamma),
+        float(middle[0] + u0),
+        float(middle[1] + v0),
+        k1,
+        k2,
+        width,
+        height,
+    )
+
+
+def rig_from_view(placing: Placing) -> RigidTransform:
+    """From a device that looks along its z, y down, upright in the rig."""
+    position, target = _ends(placing)
+    forward = target - position
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, _UP)
+    if np.linalg.norm(right) < 1e-6:  # straight up or down: the image's top is towards x
+        right = np.cross([-1.0, 0.0, 0.0], forward)
+    right = right / np.linalg.norm(right)
+    return RigidTransform(np.stack([right, np.cross(forward, right), forward], axis=1), position)
+
+
+def _ends(placing: Placing) -> tuple[Array, Array]:
+    return np.array(placing.position_mm, float), np.array(placing.look_at_mm, float)
+
+
+def _beside(nominal: RigidTransform, reach: float, horizontal: bool) -> Placing:
+    """Where a projector without a placing stands: above the camera, or to its right."""
+    axis = -nominal.rotation[:, 1] if horizontal else nominal.rotation[:, 0]
+    position = nominal.translation + 0.22 * reach * axis
+    target = nominal.translation + reach * nominal.rotation[:, 2]
+    return Placing(position_mm=tuple(position.tolist()), look_at_mm=tuple(target.tolist()))
+
+
+def _perturbed(
+    rig_from_device: RigidTransform, optics: Optics, reach: float, rng: np.random.Generator
+) -> RigidTransform:
+    """A placing off by hand; less so where all is nearer than in a body scanner."""
+    turn = np.radians(optics.angle_deg) * rng.standard_normal(3)
+    shift = optics.position_mm * min(1.0, reach / 1300.0) * rng.standard_normal(3)
+    turned = RigidTransform.from_rotation_vector(turn, np.zeros(3)).rotation
+    return RigidTransform(rig_from_device.rotation @ turned, rig_from_device.translation + shift)
+
+
+def _seen_points(camera: TrueCamera, projection: Projection, reach: float) -> Array:
+    """Points (N, 3) on the border of what the camera sees, near and far."""
+    u, v = np.linspace(-0.5, camera.width - 0.5, 9), np.linspace(-0.5, camera.height - 0.5, 9)
+    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    depths = reach * np.linspace(projection.near, projection.far, 5)
+    return (camera.directions(grid)[:, None, :] * depths[:, None]).reshape(-1, 3)
+
+
+def build_mirror(
+    camera_from_projector: RigidTransform,
+    stripes: int,
+    horizontal: bool,
+    seen: Array,
+    projection: Projection,
+    rng: np.random.Generator,
+) -> MirrorProjector:
+    """A laser and mirror at the projector's place, sweeping over all points seen.
+
+    The laser's apex lies at a right angle to the way out; stripes run along the mirror's axis.
+    """
+    axes = camera_from_projector.rotation.T
+    axis = axes[0] if horizontal else -axes[1]
+    out = axes[2]
+    back = np.cross(axis, out)
+    centre = camera_from_projector.translation
+    laser = centre + projection.laser_mm * back
+    offset = float(rng.uniform(*projection.mirror_offset_mm))
+    tilt = np.radians(projection.sheet_tilt_deg) * (1.0 + 0.3 * rng.standard_normal())
+    target = centre + projection.aim_mm * rng.standard_normal() * out
+    aim = (target - laser) / np.linalg.norm(target - laser)
+    upright = np.cross(axis, aim)
+    sheet = np.cos(tilt) * upright / np.linalg.norm(upright) + np.sin(tilt) * axis
+    sheet = sheet - (sheet @ aim) * aim
+    zero = (out + back) / np.sqrt(2.0)
+    wide = MirrorProjector(
+        stripes, axis, centre, zero, offset, laser, sheet / np.linalg.norm(sheet), aim, 0.0, 1.0
+    )
+    theta = wide.angle(seen)
+    fan = float(1.05 * np.abs(wide.across(seen, theta)).max())
+    first, last = _sweep(theta, projection.margin, _downwards(seen, theta, horizontal))
+    return MirrorProjector(
+        stripes,
+        axis,
+        centre,
+        zero,
+        offset,
+        laser,
+        wide.sheet,
+        aim,
+        first,
+        last - first,
+        fan,
+        projection.smile_stripes,
+    )
+
+
+def build_pinhole(
+    camera_from_projector: RigidTransform,
+    stripes: int,
+    horizontal: bool,
+    seen: Array,
+    projection: Projection,
+    rng: np.random.Generator,
+) -> PinholeProjector:
+    """A projector with a lens at the projector's place; its sheets bend with k1 and k2."""
+    x, y, z = camera_from_projector.rotation.T
+    rows = np.stack([x, y, z] if horizontal else [-y, x, z])
+    k1 = projection.k1 * (1.0 + 0.2 * rng.standard_normal())
+    k2 = projection.k2 * (1.0 + 0.2 * rng.standard_normal())
+    centre = camera_from_projector.translation
+    wide = PinholeProjector(stripes, rows, centre, 0.0, 1.0, 1e9, k1, k2)
+    along, across = wide.slide(seen)
+    first, last = _sweep(across, projection.margin, _downwards(seen, across, horizontal))
+    half = float(1.05 * np.abs(along).max())
+    return PinholeProjector(
+        stripes, rows, centre, first, last, half, k1, k2, projection.smile_stripes
+    )
+
+
+def _downwards(seen: Array, sweep: Array, horizontal: bool) -> bool:
+    """Whether the sweep's coordinate grows down (or to the right of) the image."""
+    image = seen[:, 1 if horizontal else 0] / seen[:, 2]
+    return float(np.corrcoef(image, sweep)[0, 1]) > 0
+
+
+def _sweep(values: Array, margin: float, forward: bool) -> tuple[float, float]:
+    low, high = float(values.min()), float(values.max())
+    low, high = low - margin * (high - low), high + margin * (high - low)
+    return (low, high) if forward else (high, low)

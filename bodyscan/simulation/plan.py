@@ -1,0 +1,265 @@
+"""Where the board is held, shot by shot, and which pairs take what of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.capture.rig import Board, Rig
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.simulation.layout import TruePair
+
+Array = NDArray[np.float64]
+
+STRIPES_WITHIN_DEG, LIT_WITHIN_DEG = 50.0, 70.0
+STRIPES_INSIDE, LIT_INSIDE = 0.5, 0.25
+GRAZING_DEG = 12.0
+"""A pair takes the board that lies on the floor from this angle above it."""
+
+_CELLS = (6, 8)
+_NEAR, _FAR = 0.73, 1.12
+_ASIDE = 0.22
+_CANDIDATES = 3000
+_FADE = 0.35
+"""How quickly a merit loses its worth once it is had often enough."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoardShot:
+    """One board pose, and the pairs that take the whole stripe sequence, or the lit image alone."""
+
+    name: str
+    board: str
+    rig_from_board: RigidTransform
+    stripes: tuple[str, ...]
+    lit: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What one pair sees of boards, N poses at once.
+
+    angle_deg: (N,) between the face it sees and the way to the camera.  back: (N,) bool.
+    inside: (N,) share of the board in the image.  cells: (N, cells) bool, image cells it covers,
+    near and far apart.  lean: (N,) which way the board is turned, 0..7.
+    """
+
+    angle_deg: Array
+    back: NDArray[np.bool_]
+    inside: Array
+    cells: NDArray[np.bool_]
+    lean: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Merits:
+    """What poses are good for. offered: (poses, merits) bool.  worth: (merits,) of each time it is
+    had, up to `needed` (merits,) times; it fades quickly from there."""
+
+    offered: NDArray[np.bool_]
+    worth: Array
+    needed: Array
+
+
+def default_shots(pairs: int) -> int:
+    """40 for twelve pairs; 8 for one."""
+    return max(8, round(40 * pairs / 12))
+
+
+def plan_boards(
+    rig: Rig, pairs: Mapping[str, TruePair], shots: int, rng: np.random.Generator
+) -> list[BoardShot]:
+    """The floor shot if the rig file names one, then `shots` poses.
+
+    Poses are drawn in front of pairs chosen in turn; of many, those are taken that add most:
+    image area not yet covered near and far, new tilts, pairs tied that share no board yet.
+    """
+    board = rig.boards[0]
+    plan = [_floor_shot(rig, pairs)] if rig.rig_frame.shot else []
+    taken = {rig.rig_frame.shot}
+    names = (name for i in range(10_000) if (name := f"b{i + 1:02d}") not in taken)
+    poses = _candidates(board, list(pairs.values()), rng)
+    sights = {name: look(pair, poses, board) for name, pair in pairs.items()}
+    for pose in _chosen(_merits(sights, pairs, board), shots):
+        stripes, lit = _takes(board, sights, pairs, pose)
+        plan.append(BoardShot(next(names), board.name, poses[pose], stripes, lit))
+    return plan
+
+
+def look(pair: TruePair, poses: Sequence[RigidTransform], board: Board) -> Sight:
+    """What a pair sees of the board in each pose (rig_from_board)."""
+    points = _grid(board)
+    turns = np.stack([pose.rotation for pose in poses])
+    shifts = np.stack([pose.translation for pose in poses])
+    camera_from_rig = pair.rig_from_camera.inverse()
+    seen = camera_from_rig.apply(points @ turns.transpose(0, 2, 1) + shifts[:, None])
+    middle = seen.mean(axis=1)
+    normal = camera_from_rig.rotate(turns[:, :, 2])
+    cosine = np.einsum("ij,ij->i", normal, middle) / np.linalg.norm(middle, axis=1)
+    depth = np.maximum(seen[..., 2], 1.0)
+    camera = pair.camera
+    pixel = camera.image(np.concatenate([seen[..., :2], depth[..., None]], axis=-1))
+    within = (seen[..., 2] > 0.2 * pair.reach_mm) & np.all(
+        (pixel > 4.0) & (pixel < np.array([camera.width, camera.height]) - 5.0), axis=-1
+    )
+    facing = normal * np.sign(cosine)[:, None]
+    lean = np.arctan2(facing[:, 1], facing[:, 0])
+    return Sight(
+        np.degrees(np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))),
+        cosine < 0,
+        within.mean(axis=1),
+        _covered(pixel, within, middle[:, 2] > 0.93 * pair.reach_mm, camera.width, camera.height),
+        np.floor((lean + np.pi) / (2.0 * np.pi) * 8.0).astype(np.int64) % 8,
+    )
+
+
+def _covered(
+    pixel: Array, within: NDArray[np.bool_], far: NDArray[np.bool_], width: int, height: int
+) -> NDArray[np.bool_]:
+    rows, columns = _CELLS
+    row = np.clip(pixel[..., 1] * rows / height, 0, rows - 1).astype(int)
+    column = np.clip(pixel[..., 0] * columns / width, 0, columns - 1).astype(int)
+    cell = (far[:, None] * rows + row) * columns + column
+    covered = np.zeros((len(pixel), 2 * rows * columns), bool)
+    pose, point = np.nonzero(within)
+    covered[pose, cell[pose, point]] = True
+    return covered
+
+
+def _grid(board: Board) -> Array:
+    x = np.linspace(0.0, board.columns * board.square_mm, 15)
+    y = np.linspace(0.0, board.rows * board.square_mm, 13)
+    x, y = np.meshgrid(x, y)
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+
+
+def _can(board: Board, sight: Sight, stripes: bool) -> NDArray[np.bool_]:
+    """(N,) poses in which a pair takes stripes (or at least the lit image).
+
+    A plain board is found only if it is seen whole; a board's back only if it is printed.
+    """
+    whole = board.kind == "checkerboard"
+    share = 1.0 if whole else (STRIPES_INSIDE if stripes else LIT_INSIDE)
+    within = STRIPES_WITHIN_DEG if stripes else LIT_WITHIN_DEG
+    printed = ~sight.back if board.faces == 1 else np.ones_like(sight.back)
+    return (sight.inside >= share) & (sight.angle_deg <= within) & printed
+
+
+def _takes(
+    board: Board, sights: Mapping[str, Sight], pairs: Mapping[str, TruePair], pose: int
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    stripes = tuple(
+        name
+        for name, sight in sights.items()
+        if _can(board, sight, True)[pose] and pairs[name].has_stripes
+    )
+    lit = tuple(
+        name
+        for name, sight in sights.items()
+        if _can(board, sight, False)[pose] and name not in stripes
+    )
+    return stripes, lit
+
+
+def _floor_shot(rig: Rig, pairs: Mapping[str, TruePair]) -> BoardShot:
+    frame = rig.rig_frame
+    board = rig.board(frame.board) if frame.board else rig.boards[0]
+    x, y = np.array(frame.x_axis, float), np.array(frame.y_axis, float)
+    x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
+    pose = RigidTransform(np.stack([x, y, np.cross(x, y)], axis=1), np.array(frame.origin_mm))
+    lit = []
+    for name, pair in pairs.items():
+        sight = look(pair, [pose], board)
+        seen = sight.inside[0] >= LIT_INSIDE and (board.faces == 2 or not sight.back[0])
+        if seen and sight.angle_deg[0] <= 90.0 - GRAZING_DEG:
+            lit.append(name)
+    return BoardShot(str(frame.shot), board.name, pose, (), tuple(lit))
+
+
+def _candidates(
+    board: Board, pairs: Sequence[TruePair], rng: np.random.Generator
+) -> list[RigidTransform]:
+    """Poses near the middle of what pairs look at, faced by them or turned between two poles."""
+    poses: list[RigidTransform] = []
+    while len(poses) < _CANDIDATES:
+        pair = pairs[len(poses) % len(pairs)]
+        pose = _draw_pose(board, pair, len(pairs) > 1, rng)
+        if (pose.apply(_grid(board))[:, 2] > 5.0).all():
+            poses.append(pose)
+    return poses
+
+
+def _draw_pose(
+    board: Board, pair: TruePair, turned: bool, rng: np.random.Generator
+) -> RigidTransform:
+    """A pose in front of one pair: its middle, which way it faces, how it is turned in itself."""
+    reach = pair.reach_mm
+    camera = pair.camera
+    pixel = rng.uniform(0.05, 0.95, 2) * [camera.width, camera.height]
+    ray = camera.directions(pixel)
+    middle = ray * reach * rng.uniform(_NEAR, _FAR)
+    middle[0] = np.clip(middle[0], -_ASIDE * reach, _ASIDE * reach)
+    tilt, way = np.radians(rng.uniform(0.0, 35.0)), rng.uniform(0.0, 2.0 * np.pi)
+    yaw = np.radians(rng.choice([-60.0, -30.0, 30.0, 60.0])) if turned and rng.random() < 0.4 else 0
+    roll = rng.choice([0.0, 0.5 * np.pi]) + rng.normal(0.0, 0.15)
+    over = np.pi if board.faces == 2 and rng.random() < 0.35 else 0.0
+    lean = RigidTransform.from_rotation_vector(
+        tilt * np.array([np.cos(way), np.sin(way), 0.0]), np.zeros(3)
+    )
+    if yaw:
+        lean = RigidTransform.from_rotation_vector(0.4 * lean.rotation_vector, np.zeros(3))
+    turn = (
+        _rotation([0, yaw, 0]) @ lean.rotation @ _rotation([0, 0, roll]) @ _rotation([0, over, 0])
+    )
+    centre = np.array([board.columns, board.rows, 0.0]) * board.square_mm / 2.0
+    camera_from_board = RigidTransform(turn, middle - turn @ centre)
+    return pair.rig_from_camera @ camera_from_board
+
+
+def _rotation(vector: Sequence[float]) -> Array:
+    return RigidTransform.from_rotation_vector(vector, np.zeros(3)).rotation
+
+
+def _chosen(merits: Merits, shots: int) -> list[int]:
+    """Greedily, the poses that add most to what is not yet covered and tied."""
+    free = np.ones(len(merits.offered), bool)
+    had = np.zeros(len(merits.worth))
+    chosen: list[int] = []
+    for _ in range(min(shots, len(free))):
+        spare = np.maximum(had - merits.needed + 1.0, 0.0)
+        gain = merits.offered @ (merits.worth * _FADE**spare)
+        best = int(np.argmax(np.where(free, gain, -1.0)))
+        free[best] = False
+        had += merits.offered[best]
+        chosen.append(best)
+    return chosen
+
+
+def _merits(sights: Mapping[str, Sight], pairs: Mapping[str, TruePair], board: Board) -> Merits:
+    """Every cell of every image three times, once near and once far; tilts to all sides; six
+    boards a pair; two pairs on one face of a board, or on both, three times."""
+    parts: list[tuple[NDArray[np.bool_], float, float]] = []
+    striped = {n: _can(board, s, True) & pairs[n].has_stripes for n, s in sights.items()}
+    seen = {name: _can(board, sight, False) for name, sight in sights.items()}
+    for name, sight in sights.items():
+        split = sight.cells & striped[name][:, None]
+        near, far = np.split(split, 2, axis=1)
+        leans = (sight.lean[:, None] == np.arange(8)) & (seen[name] & (sight.angle_deg > 15))[
+            :, None
+        ]
+        parts += [(near | far, 3.0, 3.0), (split, 0.7, 1.0), (leans, 3.0, 1.0)]
+        parts += [(striped[name][:, None], 5.0, 6.0)]
+    for first, second in combinations(sights, 2):
+        both = seen[first] & seen[second]
+        same = sights[first].back == sights[second].back
+        parts += [((both & same)[:, None], 3.0, 3.0), ((both & ~same)[:, None], 2.0, 3.0)]
+    sizes = [part.shape[1] for part, _, _ in parts]
+    return Merits(
+        np.concatenate([part for part, _, _ in parts], axis=1),
+        np.repeat([worth for _, worth, _ in parts], sizes),
+        np.repeat([needed for _, _, needed in parts], sizes),
+    )

@@ -1,0 +1,179 @@
+"""Projectors as they are built: a laser sheet on a rotating mirror, or a lens.
+
+Written for the simulator alone: calibration never sees these models, only the light they throw.
+All vectors are in the frame of the pair's camera, mm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Floats = NDArray[Any]
+
+
+class Projector(Protocol):
+    """What the renderer asks of a projector. Points (..., 3) keep their float type."""
+
+    @property
+    def stripes(self) -> int: ...
+
+    def stripe(self, points: Floats) -> Floats:
+        """Stripe coordinate s (...) of the light that reaches points; NaN where none does."""
+
+    def source(self, s: Floats) -> Floats:
+        """(..., 3): the point from which the light of stripe coordinate s seems to come."""
+
+
+@dataclass(frozen=True, eq=False)
+class MirrorProjector:
+    """A laser's fan of light, reflected by a mirror whose surface lies off its rotation axis.
+
+    The fan's plane contains `laser` (its apex), is normal to `sheet` and its middle ray runs along
+    `aim`. The mirror's normal at angle theta is cos(theta) zero + sin(theta) (axis x zero); its
+    surface lies `offset_mm` from `centre` along that normal. Stripe coordinate s is swept at
+    mirror angle first_angle + s / stripes * sweep_angle. Each stripe is a plane; with an offset, or
+    a sheet tilted against the axis, the planes have no line in common.
+    fan: tangent of half the fan's opening.  smile_stripes: s strays by this much at a fan's ends.
+    """
+
+    stripes: int
+    axis: Array
+    centre: Array
+    zero: Array
+    offset_mm: float
+    laser: Array
+    sheet: Array
+    aim: Array
+    first_angle: float
+    sweep_angle: float
+    fan: float = 1.0
+    smile_stripes: float = 0.0
+
+    def angle(self, points: Floats) -> Floats:
+        """Mirror angle at which the sheet passes through points (...,), radians.
+
+        Mirrored point P' = P - 2 (n.q - e) n, q = P - centre, lies on the laser's own sheet:
+        m.(P' - laser) = 0. With n.q and n.m in cos and sin of theta this reads
+        A cos 2theta + B sin 2theta = K + 2 e n.m, solved for theta with the small last term held
+        back one step (it shrinks by offset / distance each time).
+        """
+        zero, side = self._normals
+        m1, m2, m3 = (float(self.sheet @ v) for v in (zero, side, self.axis))
+        q1, q2, q3 = (_along(points, v, self.centre) for v in (zero, side, self.axis))
+        constant = q3 * m3 + float(self.sheet @ (self.centre - self.laser))
+        a, b = q1 * m1 - q2 * m2, q1 * m2 + q2 * m1
+        radius, phase = np.hypot(a, b), np.arctan2(b, a)
+        branch = -1.0 if m2 < 0 else 1.0
+        theta = np.zeros_like(radius)
+        for _ in range(4 if points.dtype == np.float32 else 12):
+            lever = 2.0 * self.offset_mm * (m1 * np.cos(theta) + m2 * np.sin(theta))
+            ratio = np.clip((constant + lever) / radius, -1.0, 1.0)
+            theta = 0.5 * _wrapped(phase - branch * np.arccos(ratio))
+        return theta
+
+    def stripe(self, points: Floats) -> Floats:
+        theta = self.angle(points)
+        s = (theta - self.first_angle) * (self.stripes / self.sweep_angle)
+        across = self.across(points, theta) / self.fan
+        if self.smile_stripes:
+            s = s + self.smile_stripes * across**2
+        return np.where(np.abs(across) <= 1.0, s, np.nan).astype(points.dtype)
+
+    def across(self, points: Floats, theta: Floats) -> Floats:
+        """Tangent of the angle, inside the fan, between a point's ray and the middle ray.
+
+        It is taken after the point is mirrored back to the laser's side: (P' - laser) against
+        `aim` and the sheet's other direction. Infinite behind the projector.
+        """
+        cos, sin = np.cos(theta), np.sin(theta)
+        zero, side = self._normals
+        edge = np.cross(self.sheet, self.aim)
+        height = cos * _along(points, zero, self.centre) + sin * _along(points, side, self.centre)
+        height = height - self.offset_mm
+
+        def mirrored(way: Array) -> Floats:
+            tilt = cos * float(zero @ way) + sin * float(side @ way)
+            return _along(points, way, self.laser) - 2.0 * height * tilt
+
+        forward = mirrored(self.aim)
+        lit = (forward > 0) & (height > 0)
+        return np.divide(mirrored(edge), forward, out=np.full_like(forward, np.inf), where=lit)
+
+    def source(self, s: Floats) -> Floats:
+        theta = self.first_angle + s * (self.sweep_angle / self.stripes)
+        cos, sin = np.cos(theta), np.sin(theta)
+        zero, side = self._normals
+        arm = self.laser - self.centre
+        twice = 2.0 * (cos * float(zero @ arm) + sin * float(side @ arm) - self.offset_mm)
+        c, d = twice * cos, twice * sin
+        parts = [float(self.laser[i]) - c * float(zero[i]) - d * float(side[i]) for i in range(3)]
+        return np.stack(parts, axis=-1)
+
+    def plane(self, s: Floats) -> Floats:
+        """(..., 4): a, b, c (unit normal), d of Eq. 6 for stripe coordinates s, without smile."""
+        theta = self.first_angle + np.asarray(s, float) * (self.sweep_angle / self.stripes)
+        zero, side = self._normals
+        normal = np.cos(theta)[..., None] * zero + np.sin(theta)[..., None] * side
+        mirrored = self.sheet - 2.0 * (normal @ self.sheet)[..., None] * normal
+        d = -np.einsum("...i,...i->...", mirrored, self.source(np.asarray(s, float)))
+        return np.concatenate([mirrored, d[..., None]], axis=-1)
+
+    @property
+    def _normals(self) -> tuple[Array, Array]:
+        """The mirror's normal at angle 0, and a quarter turn on."""
+        return self.zero, np.cross(self.axis, self.zero)
+
+
+@dataclass(frozen=True, eq=False)
+class PinholeProjector:
+    """A projector with a lens: all light from one point, its stripes straight on the slide only.
+
+    rotation: (3, 3), projector axes as rows; `across` the stripes is its row 1, along them row 0.
+    The slide's coordinates are normalized, moved by the lens as in Eq. 3-4; stripe coordinate 0
+    lies at `first` and S at `last` across, and the slide ends at +-`half` along.
+    """
+
+    stripes: int
+    rotation: Array
+    centre: Array
+    first: float
+    last: float
+    half: float = 1.0
+    k1: float = 0.0
+    k2: float = 0.0
+    smile_stripes: float = 0.0
+
+    def slide(self, points: Floats) -> tuple[Floats, Floats]:
+        """Slide coordinates (along, across) of points; NaN behind the projector."""
+        x, y, z = (_along(points, row, self.centre) for row in self.rotation)
+        front = np.where(z > 0, z, np.nan).astype(points.dtype)
+        x, y = x / front, y / front
+        square = x**2 + y**2
+        grow = 1.0 + self.k1 * square + self.k2 * square**2
+        return x * grow, y * grow
+
+    def stripe(self, points: Floats) -> Floats:
+        along, across = self.slide(points)
+        s = (across - self.first) * (self.stripes / (self.last - self.first))
+        s = s + self.smile_stripes * (along / self.half) ** 2
+        return np.where(np.abs(along) <= self.half, s, np.nan).astype(points.dtype)
+
+    def source(self, s: Floats) -> Floats:
+        return np.broadcast_to(self.centre.astype(s.dtype), (*s.shape, 3))
+
+
+def _along(points: Floats, vector: Array, origin: Array) -> Floats:
+    """How far points (..., 3) lie from the origin along a vector."""
+    x, y, z = (points[..., i] * float(vector[i]) for i in range(3))
+    return x + y + z - float(vector @ origin)
+
+
+def _wrapped(angle: Floats) -> Floats:
+    """To (-pi, pi]."""
+    turn = angle.dtype.type(2.0 * np.pi)
+    return angle - turn * np.round(angle / turn)

@@ -1,0 +1,151 @@
+"""Everything about a simulated scanner that can be chosen; each number with its unit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Optics:
+    """The cameras. Each pair's true lens is drawn around these values; pixels are those of an
+    image 1280 px wide and shrink with the image.
+
+    focal_widths: focal length in image widths; 1.18 sees 1.1 m at 1.3 m.
+    focal_spread, aspect_spread: relative standard deviations of alpha, and of beta / alpha.
+    skew_px: gamma.  centre_px: standard deviation of the principal point about the middle.
+    k1, k2 and their standard deviations: Eq. 3-4, in normalized coordinates.
+    blur_px: standard deviation of the lens's point spread, px of the image as it is (not scaled).
+    vignetting: 0 none, 1 the full cos^4 law.
+    samples: the image is sampled at samples x samples points a pixel.
+    position_mm, angle_deg: standard deviation, for each axis, of the true placing about the
+    nominal one (projectors too).
+    """
+
+    focal_widths: float = 1.18
+    focal_spread: float = 0.01
+    aspect_spread: float = 0.002
+    skew_px: float = -0.5
+    centre_px: float = 10.0
+    k1: float = -0.10
+    k1_spread: float = 0.03
+    k2: float = 0.05
+    k2_spread: float = 0.02
+    blur_px: float = 0.6
+    vignetting: float = 0.0
+    samples: int = 3
+    position_mm: float = 10.0
+    angle_deg: float = 1.0
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The projectors.
+
+    kind: `mirror`, a laser sheet swept by a rotating mirror whose surface lies off its axis, or
+    `pinhole`, a projector with a lens (k1, k2 bend its sheets).
+    mirror_offset_mm: the mirror's surface lies this far off its axis (lowest, highest).
+    laser_mm: from the axis to the laser's apex.  sheet_tilt_deg: standard deviation of the angle
+    of the sheet against the axis.  aim_mm: standard deviation of how far the sheet misses the axis.
+    near, far: the sweep covers the image between these distances, in working distances.
+    margin: share of the sweep added at each end.
+    blur_stripes: standard deviation of the light's spread across the stripes, in stripes.
+    defocus_stripes: what is added to it (in quadrature) at a distance of twice or half the working
+    distance; grows with |1/d - 1/working distance|.
+    jitter_stripes: standard deviation of each stripe boundary's place, drawn anew for each frame.
+    smile_stripes: how far a stripe's ends are bowed from its middle.
+    speckle: standard deviation of the laser's brightness, relative, drawn anew for each frame.
+    k1, k2: lens of the pinhole kind.
+    """
+
+    kind: Literal["mirror", "pinhole"] = "mirror"
+    mirror_offset_mm: tuple[float, float] = (5.0, 10.0)
+    laser_mm: float = 45.0
+    sheet_tilt_deg: float = 1.0
+    aim_mm: float = 1.0
+    near: float = 0.62
+    far: float = 1.4
+    margin: float = 0.02
+    blur_stripes: float = 0.25
+    defocus_stripes: float = 0.0
+    jitter_stripes: float = 0.0
+    smile_stripes: float = 0.0
+    speckle: float = 0.0
+    k1: float = -0.12
+    k2: float = 0.05
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Brightness. board_grey, person_grey: grey level of a perfectly white surface that faces the
+    projector at 0.85 working distances, in board and in person shots (the exposure is set for
+    each). ambient_grey: what the room's own light adds to a perfectly white surface."""
+
+    board_grey: float = 235.0
+    person_grey: float = 295.0
+    ambient_grey: float = 13.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The sensor. electrons_per_grey: photo-electrons that make a grey level (shot noise at grey
+    200 is then sqrt(200 / 140) = 1.2).  photons: scales the number of photons, not the brightness.
+    read_grey: read noise, grey levels. Grey levels are rounded to 0..255."""
+
+    electrons_per_grey: float = 140.0
+    photons: float = 1.0
+    read_grey: float = 0.7
+
+
+@dataclass(frozen=True)
+class BoardMaking:
+    """How well the board is made.
+
+    white, black, side: albedo.  bow_mm: its middle stands out by this much, towards the front.
+    print_error_mm: standard deviation, for each axis, of where a corner of a square was printed.
+    print_error: `smooth` (a slow wave over the board) or `corner` (each corner on its own).
+    """
+
+    white: float = 0.8
+    black: float = 0.06
+    side: float = 0.3
+    bow_mm: float = 0.0
+    print_error_mm: float = 0.0
+    print_error: Literal["smooth", "corner"] = "smooth"
+
+
+@dataclass(frozen=True)
+class Person:
+    """skin: mean albedo.  skin_variation: how much it varies over the body, relative.
+    sway_mm: between pairs the person moves as a whole, by at most this much at head height.
+    subdivisions: Loop subdivisions of the subject's mesh."""
+
+    skin: float = 0.62
+    skin_variation: float = 0.10
+    sway_mm: float = 0.0
+    subdivisions: int = 2
+
+
+@dataclass(frozen=True)
+class Room:
+    """Floor at z = 0 and four walls, so that stripes fall behind the board too.
+
+    wall_mm: from the rig's centre to the walls, but at least twice as far as the cameras."""
+
+    floor: float = 0.22
+    wall: float = 0.25
+    wall_mm: float = 2600.0
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """All of them, and how many threads work at the same time."""
+
+    optics: Optics = field(default_factory=Optics)
+    projection: Projection = field(default_factory=Projection)
+    lighting: Lighting = field(default_factory=Lighting)
+    noise: Noise = field(default_factory=Noise)
+    board: BoardMaking = field(default_factory=BoardMaking)
+    person: Person = field(default_factory=Person)
+    room: Room = field(default_factory=Room)
+    workers: int = 2

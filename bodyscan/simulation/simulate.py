@@ -1,0 +1,203 @@
+"""A whole captured data set of a rig: boards, a person, and the truth about them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+
+from bodyscan.capture.rig import Rig
+from bodyscan.capture.rig_file import load_rig, write_rig
+from bodyscan.capture.templates import fill
+from bodyscan.files import write_json
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import Progress, silent
+from bodyscan.simulation import body, files
+from bodyscan.simulation.board import make_board
+from bodyscan.simulation.layout import TruePair, build_pairs
+from bodyscan.simulation.plan import default_shots, plan_boards
+from bodyscan.simulation.render import Lamps, View, expose, render_pair
+from bodyscan.simulation.room import build_room
+from bodyscan.simulation.scene import Scene, Surface
+from bodyscan.simulation.settings import SimulationSettings
+from bodyscan.simulation.truth import Truth, describe
+
+CALIBRATION, PERSON = "captures/calibration", "captures/person"
+PERSON_SHOT = "s01"
+
+_PAIRS, _BOARDS, _PLAN, _SKIN, _SWAY, _RAYS, _NOISE = range(1, 8)
+"""What a random number is drawn for: each has a stream of its own, whatever the others draw."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """One pair's images of one shot: what stands there besides the room, and where."""
+
+    number: int
+    shot: str
+    folder: str
+    surfaces: tuple[Surface, ...]
+    rig_from_surfaces: RigidTransform
+    white_grey: float
+    sequence: bool
+
+
+def simulate(
+    rig_file: Path,
+    out: Path,
+    *,
+    subject: Path | None = None,
+    scale: float = 1.0,
+    seed: int = 0,
+    settings: SimulationSettings | None = None,
+    board_shots: int | None = None,
+    progress: Progress = silent,
+) -> None:
+    """Write captures of the rig in `rig_file`, with known truth, into the folder `out`.
+
+    subject: a body mesh (see `body.load_subject`); without one only boards are captured.
+    scale: of image size and number of stripes.  board_shots: besides the one that fixes the rig
+    frame; 40 for twelve pairs if not given.
+    The same arguments give the same bytes. Raises RigFileError, and BadInput for a rig without
+    nominal placings or a subject that cannot be read.
+    """
+    settings = settings or SimulationSettings()
+    rig = files.scaled_rig(load_rig(rig_file), scale, CALIBRATION)
+    truth = _decide(rig, subject, settings, seed, board_shots)
+    _render_all(rig, truth, Path(out), progress)
+    write_rig(out / "rig.yaml", rig)
+    listed = [(shot.name, shot.stripes, shot.lit) for shot in truth.plan]
+    files.write_captures(out / CALIBRATION, "calibration", listed)
+    if truth.person is not None:
+        striped = [name for name, pair in truth.pairs.items() if pair.has_stripes]
+        alone = [name for name in truth.pairs if name not in striped]
+        shots = [(PERSON_SHOT, striped, alone)]
+        files.write_captures(out / PERSON, "scan", shots, truth.subject)
+        body.save_truth(truth.person, out / "truth" / "subject.ply")
+    write_json(out / "truth" / "truth.json", describe(truth))
+
+
+def _decide(
+    rig: Rig, subject: Path | None, settings: SimulationSettings, seed: int, shots: int | None
+) -> Truth:
+    """Everything that is true of the data set, drawn before any image is made."""
+
+    def stream(*purpose: int) -> np.random.Generator:
+        return np.random.default_rng([seed, *purpose])
+
+    pairs = build_pairs(rig, settings, lambda number: stream(_PAIRS, number))
+    boards = {
+        board.name: make_board(board, settings.board, stream(_BOARDS, number))
+        for number, board in enumerate(rig.boards)
+    }
+    plan = plan_boards(rig, pairs, shots or default_shots(len(pairs)), stream(_PLAN))
+    if subject is None:
+        return Truth(rig.name, seed, settings, pairs, boards, tuple(plan), None, None, {})
+    person = body.load_subject(subject, settings.person, stream(_SKIN))
+    height = float(person.vertices[:, 2].max())
+    sways = {
+        name: body.draw_sway(settings.person, height, stream(_SWAY, number))
+        for number, name in enumerate(pairs)
+    }
+    pseudonym = f"sim-{subject.stem.replace('_', '-')}"
+    return Truth(rig.name, seed, settings, pairs, boards, tuple(plan), pseudonym, person, sways)
+
+
+def _tasks(truth: Truth, pair: str) -> list[_Task]:
+    """What one pair captures: its board shots, then the person."""
+    light = truth.settings.lighting
+    tasks = [
+        _Task(
+            number=number,
+            shot=shot.name,
+            folder=CALIBRATION,
+            surfaces=truth.boards[shot.board].surfaces,
+            rig_from_surfaces=shot.rig_from_board,
+            white_grey=light.board_grey,
+            sequence=pair in shot.stripes,
+        )
+        for number, shot in enumerate(truth.plan)
+        if pair in (*shot.stripes, *shot.lit)
+    ]
+    if truth.person is not None:
+        still, has_stripes = truth.sways[pair], truth.pairs[pair].has_stripes
+        number, shown = len(truth.plan), (truth.person,)
+        tasks.append(
+            _Task(number, PERSON_SHOT, PERSON, shown, still, light.person_grey, has_stripes)
+        )
+    return tasks
+
+
+def _render_all(rig: Rig, truth: Truth, out: Path, progress: Progress) -> None:
+    """Every image of every pair; each thread has a pair at a time."""
+    tasks = {name: _tasks(truth, name) for name in truth.pairs}
+    tell = _counter("simulate", sum(map(len, tasks.values())), progress)
+    room = build_room(truth.pairs.values(), truth.settings.room)
+
+    def work(number: int, pair: TruePair) -> None:
+        rays = np.random.default_rng([truth.seed, _RAYS, number])
+        view = View.of(pair.camera, truth.settings.optics, rays)
+        for task in tasks[pair.name]:
+            noise = np.random.default_rng([truth.seed, _NOISE, number, task.number])
+            _render(rig, pair, view, room, task, truth.settings, out, noise)
+            tell()
+
+    with ThreadPoolExecutor(truth.settings.workers) as pool:
+        futures = [pool.submit(work, i, pair) for i, pair in enumerate(truth.pairs.values())]
+        try:
+            for future in futures:
+                future.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _counter(stage: str, total: int, progress: Progress) -> Callable[[], None]:
+    """A function that counts its calls, from any thread, and tells how far things are."""
+    lock, done = Lock(), 0
+    progress(stage, 0, total)
+
+    def tell() -> None:
+        nonlocal done
+        with lock:
+            done += 1
+            progress(stage, done, total)
+
+    return tell
+
+
+def _render(
+    rig: Rig,
+    pair: TruePair,
+    view: View,
+    room: Sequence[Surface],
+    task: _Task,
+    settings: SimulationSettings,
+    out: Path,
+    rng: np.random.Generator,
+) -> None:
+    """One pair, one shot: cast, expose, write."""
+    camera_from_rig = pair.rig_from_camera.inverse()
+    camera_from_surfaces = camera_from_rig @ task.rig_from_surfaces
+    scene = Scene(
+        [surface.moved(camera_from_surfaces) for surface in task.surfaces]
+        + [surface.moved(camera_from_rig) for surface in room]
+    )
+    lamps = Lamps(task.white_grey, settings.lighting.ambient_grey, 0.85 * pair.reach_mm)
+    images: Mapping[str, np.ndarray] = render_pair(
+        scene,
+        view,
+        pair.projector,
+        lamps,
+        settings.projection,
+        rng,
+        frames=rig.frames,
+        sequence=task.sequence,
+    )
+    for frame, image in images.items():
+        name = fill(rig.files, shot=task.shot, pair=pair.name, frame=frame)
+        files.write_image(out / task.folder / name, expose(image, settings.noise, rng))

@@ -1,0 +1,94 @@
+"""What was true: a JSON document that explains its own keys."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.simulation.board import MadeBoard
+from bodyscan.simulation.layout import AnyProjector, TruePair
+from bodyscan.simulation.plan import BoardShot
+from bodyscan.simulation.projector import MirrorProjector
+from bodyscan.simulation.scene import Surface
+from bodyscan.simulation.settings import SimulationSettings
+
+KEYS = {
+    "pairs.*.camera": "alpha, beta, gamma, u0, v0 (px), k1, k2 (Eq. 1-5), width, height (px)",
+    "pairs.*.rig_from_camera": "4x4, camera coordinates to rig coordinates, mm",
+    "pairs.*.projector": "see bodyscan/simulation/projector.py; vectors in the camera frame, mm",
+    "pairs.*.projector.kind": "mirror or pinhole",
+    "pairs.*.boundary_planes": "mirror only: a, b, c (unit normal), d (mm) of Eq. 6 in the camera "
+    "frame, of the boundaries s = 0..S, before any smile",
+    "pairs.*.swayed_from_still": "4x4, where the person of truth/subject.ply stood when this pair "
+    "captured it, rig frame, mm",
+    "shots.*.rig_from_board": "4x4, board coordinates to rig coordinates, mm",
+    "boards.*.corners_mm": "where the printed inner corners really are, board frame (front, then "
+    "back), if the board is not perfect",
+    "settings": "see bodyscan/simulation/settings.py for the meaning and unit of each",
+    "subject": "pseudonym; its surface is subject.ply, mm, rig frame",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """All that is decided before an image is made.
+
+    person: the subject's surface in the rig frame, standing still.
+    sways: by pair, `swayed_from_still` of the person when that pair captures.
+    """
+
+    rig: str
+    seed: int
+    settings: SimulationSettings
+    pairs: Mapping[str, TruePair]
+    boards: Mapping[str, MadeBoard]
+    plan: tuple[BoardShot, ...]
+    subject: str | None
+    person: Surface | None
+    sways: Mapping[str, RigidTransform]
+
+
+def describe(truth: Truth) -> dict[str, Any]:
+    """The truth as JSON values, but for the subject's surface."""
+    making = truth.settings.board
+    perfect = making.bow_mm == 0 and making.print_error_mm == 0
+    return {
+        "version": 1,
+        "keys": KEYS,
+        "rig": truth.rig,
+        "seed": truth.seed,
+        "subject": truth.subject,
+        "pairs": {name: _pair(pair, truth.sways.get(name)) for name, pair in truth.pairs.items()},
+        "shots": {
+            shot.name: {"board": shot.board, "rig_from_board": shot.rig_from_board.matrix}
+            for shot in truth.plan
+        },
+        "boards": {}
+        if perfect
+        else {name: {"corners_mm": board.corners} for name, board in truth.boards.items()},
+        "settings": asdict(truth.settings),
+    }
+
+
+def _pair(pair: TruePair, sway: RigidTransform | None) -> dict[str, Any]:
+    document: dict[str, Any] = {
+        "camera": asdict(pair.camera),
+        "rig_from_camera": pair.rig_from_camera.matrix,
+        "projector": _projector(pair.projector),
+    }
+    if isinstance(pair.projector, MirrorProjector):
+        planes = pair.projector.plane(np.arange(pair.projector.stripes + 1.0))
+        document["boundary_planes"] = planes
+    if sway is not None:
+        document["swayed_from_still"] = sway.matrix
+    return document
+
+
+def _projector(projector: AnyProjector) -> dict[str, Any]:
+    kind = "mirror" if isinstance(projector, MirrorProjector) else "pinhole"
+    values = {f.name: getattr(projector, f.name) for f in fields(projector)}
+    return {"kind": kind} | values
