@@ -1,0 +1,153 @@
+"""Stripe boundaries seen on boards of known pose: what light sheets are fitted to (Eq. 18)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.light_planes import Axis
+from bodyscan.geometry.transforms import RigidTransform
+
+Array = NDArray[np.float64]
+
+BIN_PX = 16
+
+
+@dataclass(frozen=True, eq=False)
+class BoundaryPoints:
+    """Stripe boundaries of one pair carried onto its boards, camera frame.
+
+    index: (N,) boundary i, where s = i.  board: (N,) number of the shot.
+    points: (N, 3) mm.  per_pixel: (N, 3) mm, how a point moves on its board for one pixel across
+    the stripe.  sigma_px: (N,).
+    """
+
+    index: NDArray[np.int64]
+    board: NDArray[np.int64]
+    points: Array
+    per_pixel: Array
+    sigma_px: Array
+
+
+def points_on_board(camera: Camera, camera_from_board: RigidTransform, pixels: Array) -> Array:
+    """Eq. 18: pixels (N, 2) carried onto the board's plane z = 0, camera frame (N, 3) mm."""
+    normal = camera_from_board.rotation[:, 2]
+    rays = camera.rays(pixels)
+    return rays * (normal @ camera_from_board.translation / (rays @ normal))[:, None]
+
+
+def boundary_points(
+    camera: Camera,
+    camera_from_board: RigidTransform,
+    index: NDArray[np.int64],
+    pixels: Array,
+    sigma_px: Array,
+    *,
+    board: int,
+    direction: Axis,
+) -> BoundaryPoints:
+    """Carry boundary pixels (N, 2) of one shot onto its board."""
+    across = np.array([0.0, 0.5]) if direction == "horizontal" else np.array([0.5, 0.0])
+    return BoundaryPoints(
+        index,
+        np.full(len(index), board),
+        points_on_board(camera, camera_from_board, pixels),
+        points_on_board(camera, camera_from_board, pixels + across)
+        - points_on_board(camera, camera_from_board, pixels - across),
+        sigma_px,
+    )
+
+
+def join(parts: Sequence[BoundaryPoints]) -> BoundaryPoints:
+    """The boundary points of several shots as one."""
+    return BoundaryPoints(
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("index", "board", "points", "per_pixel", "sigma_px")
+        )
+    )
+
+
+def part(data: BoundaryPoints, kept: NDArray[np.bool_]) -> BoundaryPoints:
+    """The points where `kept` (N,) is true."""
+    return BoundaryPoints(*(getattr(data, field.name)[kept] for field in fields(data)))
+
+
+def binned(data: BoundaryPoints, camera: Camera, direction: Axis) -> BoundaryPoints:
+    """Weighted means over BIN_PX pixels along each boundary: ten times fewer points.
+
+    Over so short a piece a boundary is straight: its sagitta is below a thousandth of a pixel.
+    """
+    if not len(data.index):
+        return data
+    x, y, z = data.points.T
+    pixel = camera.alpha * x / z if direction == "horizontal" else camera.beta * y / z
+    place = np.floor(pixel / BIN_PX).astype(np.int64)
+    place -= place.min()
+    cell = np.ravel_multi_index(
+        (data.board, data.index, place),
+        tuple(int(v.max()) + 1 for v in (data.board, data.index, place)),
+    )
+    occupied = np.bincount(cell)
+    filled = np.flatnonzero(occupied)
+    number = np.zeros(len(occupied), np.int64)
+    number[filled] = np.arange(len(filled))
+    group = number[cell]
+    weight = 1.0 / data.sigma_px**2
+    total = np.bincount(group, weight)
+
+    def mean(values: Array) -> Array:
+        columns = [np.bincount(group, weight * column) / total for column in values.T]
+        return np.stack(columns, axis=1)
+
+    first = np.empty(len(filled), np.int64)
+    first[group] = np.arange(len(group))
+    return BoundaryPoints(
+        data.index[first],
+        data.board[first],
+        mean(data.points),
+        mean(data.per_pixel),
+        1.0 / np.sqrt(total),
+    )
+
+
+def thinned(data: BoundaryPoints, most: int) -> BoundaryPoints:
+    """Every n-th boundary only, so that no more than about `most` points are left."""
+    every = -(-len(data.index) // most)
+    if every <= 1:
+        return data
+    _, rank = np.unique(data.index, return_inverse=True)
+    return part(data, rank % every == min(every // 2, int(rank.max())))
+
+
+@dataclass(frozen=True, eq=False)
+class BoardErrors:
+    """How a board that is not quite where it is thought to be moves its points.
+
+    effects: (N, 3): 1 for the board's shift, and a point's place on it (of unit variance) for its
+    two tilts.  along_ray: (N, 3) mm that the point moves along its ray for each mm of an effect
+    along the board's normal.  facing: (N,) |normal . ray|: mm from the board for each mm of depth.
+    """
+
+    effects: Array
+    along_ray: Array
+    facing: Array
+
+
+def board_errors(data: BoundaryPoints) -> BoardErrors:
+    """From the points themselves, which lie on their boards."""
+    effects, normals = np.ones_like(data.points), np.empty_like(data.points)
+    for board in np.unique(data.board):
+        own = data.board == board
+        centred = data.points[own] - data.points[own].mean(axis=0)
+        _, axes = np.linalg.eigh(centred.T @ centred)
+        place = centred @ axes[:, 1:]
+        effects[own, 1:] = place / np.maximum(place.std(axis=0), 1e-9)
+        normals[own] = axes[:, 0]
+    outward = np.sum(normals * data.points, axis=1)
+    along_ray = data.points / outward[:, None]
+    return BoardErrors(effects, along_ray, np.abs(outward / data.points[:, 2]))

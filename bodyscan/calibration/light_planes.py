@@ -1,0 +1,153 @@
+"""Light planes from stripe boundaries on boards of known pose (3.2, Eq. 15-18)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.calibration.boundary_points import (
+    BoundaryPoints,
+    board_errors,
+    boundary_points,
+    join,
+    points_on_board,
+)
+from bodyscan.geometry.light_planes import Axis, LightPlanes
+
+__all__ = [
+    "BoundaryPoints",
+    "PlaneFit",
+    "boundary_points",
+    "fit_light_planes",
+    "join",
+    "points_on_board",
+]
+
+Array = NDArray[np.float64]
+
+FEWEST_POINTS = 12
+LEAST_OPENING = 1e-4
+REWEIGHTINGS = 4
+CAUCHY_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneFit:
+    """planes, and the distance of every boundary point to its plane (N,) mm, NaN without one.
+
+    rms_mm: robustly weighted root mean square of the distances.
+    """
+
+    planes: LightPlanes
+    distances_mm: Array
+    rms_mm: float
+
+
+def fit_light_planes(
+    data: BoundaryPoints,
+    stripes: int,
+    direction: Axis,
+    *,
+    board_error_mm: float = 0.0,
+    fewest_points: int = FEWEST_POINTS,
+) -> PlaneFit:
+    """One plane for each boundary seen on at least two boards, weighted least squares.
+
+    A point's weight is what one pixel of error moves it off the plane; outliers lose theirs
+    (Cauchy).  A boundary seen on one board only, or whose points lie on a line, gets no plane; a
+    board counts with `fewest_points`.  board_error_mm: how well the boards' places are known, for
+    the covariance (see `board_errors`).
+    """
+    count = stripes + 1
+    enough = _boards_seen(data, count, fewest_points) >= 2
+    spread_mm = np.linalg.norm(data.per_pixel, axis=1) * data.sigma_px
+    robust = np.ones(len(data.index))
+    for _ in range(REWEIGHTINGS):
+        planes, opening, scatter = _weighted_planes(data, robust / spread_mm**2, count)
+        distances = np.sum(data.points * planes[data.index, :3], axis=1) + planes[data.index, 3]
+        leverage = np.abs(np.sum(data.per_pixel * planes[data.index, :3], axis=1))
+        spread_mm = np.maximum(leverage, 1e-6) * data.sigma_px
+        normalized = distances / spread_mm
+        scale = max(1.4826 * float(np.nanmedian(np.abs(normalized))), 1e-9)
+        robust = 1.0 / (1.0 + (normalized / (CAUCHY_SIGMAS * scale)) ** 2)
+        robust = np.nan_to_num(robust)
+    bad = ~enough | (opening < LEAST_OPENING)
+    planes = np.where(bad[:, None], np.nan, planes)
+    distances = np.where(bad[data.index], np.nan, distances)
+    used = np.isfinite(distances)
+    total = float(np.sum(robust[used]))
+    rms = float(np.sqrt(np.sum((robust * distances**2)[used]) / total)) if total else np.nan
+    weights = robust / (spread_mm * scale) ** 2
+    covariance = _covariance(planes, scatter / scale**2, data, weights, board_error_mm)
+    return PlaneFit(LightPlanes(planes, covariance, direction), distances, rms)
+
+
+def _boards_seen(data: BoundaryPoints, count: int, fewest: int) -> NDArray[np.int64]:
+    boards = int(data.board.max()) + 1 if len(data.board) else 1
+    points = np.bincount(data.index * boards + data.board, minlength=count * boards)
+    return np.sum(points.reshape(count, boards) >= fewest, axis=1)
+
+
+def _weighted_planes(
+    data: BoundaryPoints, weights: Array, count: int
+) -> tuple[Array, Array, Array]:
+    """Planes (count, 4), how far their points open into a plane, and their moments (count, 4, 4)."""
+    homogeneous = np.column_stack([data.points, np.ones(len(data.points))])
+    moments = np.empty((count, 4, 4))
+    for i in range(4):
+        for j in range(i, 4):
+            products = weights * homogeneous[:, i] * homogeneous[:, j]
+            moments[:, i, j] = moments[:, j, i] = np.bincount(data.index, products, count)
+    total = np.maximum(moments[:, 3, 3], 1e-300)
+    mean = moments[:, :3, 3] / total[:, None]
+    scatter = moments[:, :3, :3] / total[:, None, None] - mean[:, :, None] * mean[:, None, :]
+    values, vectors = np.linalg.eigh(scatter)
+    normals = vectors[:, :, 0]
+    offsets = -np.sum(normals * mean, axis=1)
+    sign = np.where(offsets < 0.0, -1.0, 1.0)
+    planes = np.column_stack([normals, offsets]) * sign[:, None]
+    opening = values[:, 1] / np.maximum(values[:, 2], 1e-300)
+    return planes, opening, moments
+
+
+def _covariance(
+    planes: Array, moments: Array, data: BoundaryPoints, weights: Array, board_error_mm: float
+) -> Array:
+    """(S + 1, 4, 4): inverse of the weighted normal equations on the planes' three freedoms, and
+    what boards out of place by board_error_mm add to it."""
+    known = np.isfinite(planes[:, 0])
+    covariance = np.full((len(planes), 4, 4), np.nan)
+    normals = planes[known, :3]
+    # Two directions square to the normal, and the offset: the freedoms of a plane.
+    helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(normals, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    basis = np.zeros((len(normals), 4, 3))
+    basis[:, :3, 0], basis[:, :3, 1] = first, np.cross(normals, first)
+    basis[:, 3, 2] = 1.0
+    transposed = basis.transpose(0, 2, 1)
+    inverse = basis @ np.linalg.pinv(transposed @ moments[known] @ basis, hermitian=True)
+    inverse = inverse @ transposed
+    covariance[known] = inverse
+    if board_error_mm > 0.0:
+        pulled = inverse[:, None] @ _board_pull(planes, data, weights)[known]
+        spread = np.einsum("nbik,nbjk->nij", pulled, pulled)
+        covariance[known] += board_error_mm**2 * spread
+    return covariance
+
+
+def _board_pull(planes: Array, data: BoundaryPoints, weights: Array) -> Array:
+    """(S + 1, boards, 4, 3): how much 1 mm of each board error pulls at each plane's coefficients."""
+    errors = board_errors(data)
+    off = np.sum(planes[data.index, :3] * errors.along_ray, axis=1)
+    effects = np.nan_to_num(off * weights)[:, None] * errors.effects
+    homogeneous = np.column_stack([data.points, np.ones(len(data.points))])
+    boards = int(data.board.max()) + 1
+    cell, cells = data.index * boards + data.board, len(planes) * boards
+    pull = np.empty((cells, 4, 3))
+    for i in range(4):
+        for j in range(3):
+            pull[:, i, j] = np.bincount(cell, homogeneous[:, i] * effects[:, j], cells)
+    return pull.reshape(len(planes), boards, 4, 3)

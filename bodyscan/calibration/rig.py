@@ -1,0 +1,239 @@
+"""The rig's calibration, stage by stage: boards, cameras, one joint solve, light planes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
+from bodyscan.calibration.pair import (
+    BoardBoundaries,
+    PairCalibration,
+    PairQuality,
+    boundaries_near,
+    calibrate_light,
+    planar_view,
+    usable,
+)
+from bodyscan.calibration.rig_calibration import RigCalibration
+from bodyscan.capture.boards import corner_points
+from bodyscan.capture.codes import read_stripes
+from bodyscan.capture.detection import find_boards
+from bodyscan.capture.folder import Captures
+from bodyscan.capture.folder import Sequence as ImageSequence
+from bodyscan.capture.images import read_lit, read_sequence
+from bodyscan.capture.rig import Board, Rig
+from bodyscan.capture.views import BoardView
+from bodyscan.errors import BodyscanError, FailedWork
+from bodyscan.progress import Progress, silent, threaded
+from bodyscan.registration.located_view import LocatedView, board_symmetries
+from bodyscan.registration.rig_solve import PlacedRig, place_rig
+
+FEWEST_VIEWS = 3
+
+
+def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> RigCalibration:
+    """Board images in, calibrated rig out.
+
+    A bad image or pair costs that image or pair and is named in `failed` or `notes`.  Raises
+    FailedWork if no pair is left, RigDisconnected if the pairs do not hang together, BadInput if
+    nothing fixes the rig frame.
+    """
+    boards = {board.name: board for board in rig.boards}
+    notes: list[str] = []
+    views = find_all_boards(rig, captures, notes, progress)
+    cameras, failed = calibrate_cameras(rig, views, boards, progress)
+    if not cameras:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
+        raise FailedWork(f"no pair could be calibrated ({reasons})", where=f"rig {rig.name}")
+    progress("joining the pairs", 0, 1)
+    located = locate_views(views, cameras, boards, notes)
+    placed = place_rig(rig, located, {name: c.camera for name, c in cameras.items()})
+    progress("joining the pairs", 1, 1)
+    boundaries = decode_on_boards(rig, captures, placed, views, notes, progress)
+    pairs = calibrate_pairs(rig, cameras, placed, boundaries, failed, progress)
+    return RigCalibration(
+        rig,
+        pairs,
+        {name: placed.rig_from_camera[name] for name in pairs},
+        placed.covariance,
+        placed.rig_from_board,
+        failed,
+        (*notes, *placed.notes),
+    )
+
+
+def find_all_boards(
+    rig: Rig, captures: Captures, notes: list[str], progress: Progress = silent
+) -> list[BoardView]:
+    """Boards in all lit images; images that cannot be read, or show no board, go into `notes`."""
+
+    def find(sequence: ImageSequence) -> tuple[list[BoardView], str | None]:
+        where = f"{sequence.lit} (pair {sequence.pair}, shot {sequence.shot})"
+        try:
+            image = read_lit(sequence, rig.pair(sequence.pair).camera)
+            found = find_boards(image, rig.boards, pair=sequence.pair, shot=sequence.shot)
+        except BodyscanError as error:
+            return [], str(error)
+        return found, None if found else f"{where}: no board found"
+
+    results = threaded(find, captures.sequences, stage="finding boards", progress=progress)
+    notes += [note for _, note in results if note]
+    return [view for found, _ in results for view in found]
+
+
+def calibrate_cameras(
+    rig: Rig,
+    views: Sequence[BoardView],
+    boards: Mapping[str, Board],
+    progress: Progress = silent,
+) -> tuple[dict[str, CameraCalibration], dict[str, str]]:
+    """Every pair's camera by itself; pairs that fail, with the reason."""
+
+    def calibrate(name: str) -> CameraCalibration | str:
+        spec = rig.pair(name).camera
+        own = [v for v in views if v.pair == name and usable(v, boards[v.board])]
+        try:
+            return calibrate_camera(
+                [planar_view(view, boards[view.board]) for view in own], spec.width, spec.height
+            )
+        except BodyscanError as error:
+            return str(error)
+
+    names = [pair.name for pair in rig.pairs]
+    results = threaded(calibrate, names, stage="calibrating cameras", progress=progress)
+    done = {n: r for n, r in zip(names, results, strict=True) if isinstance(r, CameraCalibration)}
+    failed = {n: r for n, r in zip(names, results, strict=True) if isinstance(r, str)}
+    return done, failed
+
+
+def locate_views(
+    views: Sequence[BoardView],
+    cameras: Mapping[str, CameraCalibration],
+    boards: Mapping[str, Board],
+    notes: list[str],
+) -> list[LocatedView]:
+    """The pose of each board in the camera that saw it; views that fit no pose are dropped."""
+    located = []
+    for view in views:
+        board = boards[view.board]
+        if view.pair not in cameras or not usable(view, board):
+            continue
+        pose, residuals = locate_board(cameras[view.pair].camera, planar_view(view, board))
+        rms = float((residuals**2).sum(axis=1).mean() ** 0.5)
+        if rms > max(1.0, 6.0 * cameras[view.pair].rms_px):
+            notes.append(
+                f"{view.pair}: board {board.name} in shot {view.shot} fits no pose ({rms:.2f} px); "
+                "not used"
+            )
+            continue
+        symmetries = board_symmetries(board) if view.turnable else board_symmetries(board)[:1]
+        located.append(
+            LocatedView(
+                view.pair,
+                view.shot,
+                view.board,
+                corner_points(board)[view.corner_ids],
+                view.pixels,
+                pose,
+                symmetries,
+            )
+        )
+    return located
+
+
+def decode_on_boards(
+    rig: Rig,
+    captures: Captures,
+    placed: PlacedRig,
+    views: Sequence[BoardView],
+    notes: list[str],
+    progress: Progress = silent,
+) -> dict[tuple[str, str, str], BoardBoundaries]:
+    """Stripe boundaries near each board, by (pair, shot, board); bad sequences go into `notes`."""
+    kept = {(view.pair, view.shot, view.board) for view in placed.views}
+    wanted: dict[tuple[str, str], list[BoardView]] = {}
+    for view in views:
+        if (view.pair, view.shot, view.board) in kept:
+            wanted.setdefault((view.pair, view.shot), []).append(view)
+    sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
+
+    def decode(sequence: ImageSequence) -> dict[tuple[str, str, str], BoardBoundaries] | str:
+        spec = rig.pair(sequence.pair)
+        assert spec.projector is not None
+        try:
+            images = read_sequence(sequence, spec.camera, workers=1)
+            stripes = read_stripes(
+                images.lit,
+                images.dark,
+                images.patterns,
+                images.inverses,
+                stripes=spec.projector.stripes,
+                direction=spec.projector.direction,
+            )
+        except BodyscanError as error:
+            return f"pair {sequence.pair}, shot {sequence.shot}: {error}"
+        return {
+            (view.pair, view.shot, view.board): boundaries_near(stripes, view)
+            for view in wanted[sequence.pair, sequence.shot]
+        }
+
+    results = threaded(decode, sequences, stage="decoding stripes", progress=progress)
+    notes += [result for result in results if isinstance(result, str)]
+    return {
+        key: found
+        for result in results
+        if not isinstance(result, str)
+        for key, found in result.items()
+    }
+
+
+def calibrate_pairs(
+    rig: Rig,
+    cameras: Mapping[str, CameraCalibration],
+    placed: PlacedRig,
+    boundaries: Mapping[tuple[str, str, str], BoardBoundaries],
+    failed: dict[str, str],
+    progress: Progress = silent,
+) -> dict[str, PairCalibration]:
+    """Light planes of every pair; a pair whose projector fails is added to `failed`."""
+
+    def calibrate(name: str) -> PairCalibration | str:
+        camera = placed.cameras[name]
+        views = [view for view in placed.views if view.pair == name]
+        quality = PairQuality(placed.rms_px[name], len(views))
+        pair = PairCalibration(name, camera, cameras[name].covariance, None, quality)
+        projector = rig.pair(name).projector
+        if projector is None:
+            return pair
+        camera_from_rig = placed.rig_from_camera[name].inverse()
+        shots = [
+            (
+                rig.board(view.board),
+                camera_from_rig @ placed.rig_from_board[view.target],
+                float(view.points[0, 2]),
+                boundaries[name, view.shot, view.board],
+            )
+            for view in views
+            if (name, view.shot, view.board) in boundaries
+        ]
+        try:
+            fit = calibrate_light(name, camera, projector, shots)
+        except BodyscanError as error:
+            return str(error)
+        return replace(
+            pair,
+            light=fit.planes,
+            quality=replace(
+                quality,
+                planes_rms_mm=fit.rms_mm,
+                stripe_shots=len(shots),
+                stripes_calibrated=int(fit.planes.calibrated[1:-1].sum()),
+                stripes_projected=projector.stripes - 1,
+            ),
+        )
+
+    names = sorted(cameras)
+    results = threaded(calibrate, names, stage="fitting light planes", progress=progress)
+    failed |= {n: r for n, r in zip(names, results, strict=True) if isinstance(r, str)}
+    return {n: r for n, r in zip(names, results, strict=True) if isinstance(r, PairCalibration)}

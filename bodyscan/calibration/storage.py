@@ -1,0 +1,161 @@
+"""Calibrations on disk: `calibration.json`, diffable and exact, dense arrays beside it as .npz."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from bodyscan import __version__
+from bodyscan.calibration.pair import PairCalibration, PairQuality
+from bodyscan.calibration.rig_calibration import RigCalibration
+from bodyscan.capture.rig import Rig
+from bodyscan.errors import CalibrationFileError
+from bodyscan.files import write_json, write_npz
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.light_planes import LightPlanes
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.uncertainty import PlacingCovariance
+
+SCHEMA = "bodyscan-calibration"
+VERSION = 1
+FILE_NAME = "calibration.json"
+ARRAYS_NAME = "calibration.npz"
+
+
+def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
+    """Write `calibration.json` and `calibration.npz` into `folder`; returns the JSON's path."""
+    arrays: dict[str, Any] = {"placing_covariance": calibration.covariance.matrix}
+    for name, pair in calibration.pairs.items():
+        arrays[f"{name}/camera_covariance"] = pair.camera_covariance
+        if pair.light is not None:
+            arrays[f"{name}/planes"] = pair.light.coefficients
+            arrays[f"{name}/planes_covariance"] = pair.light.covariance
+    write_npz(folder / ARRAYS_NAME, **arrays)
+    content = {
+        "schema": SCHEMA,
+        "version": VERSION,
+        "software": f"bodyscan {__version__}",
+        "arrays_sha256": _sha256(folder / ARRAYS_NAME),
+        "rig": calibration.rig.model_dump(mode="json"),
+        "pairs": {name: _pair_content(calibration, name) for name in calibration.pairs},
+        "boards": [
+            {"shot": shot, "board": board, "rig_from_board": transform.matrix}
+            for (shot, board), transform in sorted(calibration.rig_from_board.items())
+        ],
+        "placing_covariance_order": calibration.covariance.names,
+        "failed": calibration.failed,
+        "notes": calibration.notes,
+    }
+    write_json(folder / FILE_NAME, content)
+    return folder / FILE_NAME
+
+
+def load_calibration(path: Path) -> RigCalibration:
+    """Read a calibration from its folder or its JSON file.
+
+    Raises CalibrationFileError if files are missing, damaged, or of another schema version.
+    """
+    file = path / FILE_NAME if path.is_dir() else path
+    try:
+        content = json.loads(file.read_text("utf-8"))
+        if content.get("schema") != SCHEMA or content.get("version") != VERSION:
+            raise CalibrationFileError(
+                f"schema {content.get('schema')} version {content.get('version')}, "
+                f"expected {SCHEMA} version {VERSION}",
+                where=str(file),
+                remedy="calibrate again with this version of bodyscan",
+            )
+        arrays_file = file.with_name(ARRAYS_NAME)
+        if _sha256(arrays_file) != content["arrays_sha256"]:
+            raise CalibrationFileError(
+                f"does not belong to {file.name}",
+                where=str(arrays_file),
+                remedy="restore both files from one calibration, or calibrate again",
+            )
+        with np.load(arrays_file, allow_pickle=False) as arrays:
+            return _calibration(content, arrays)
+    except FileNotFoundError as error:
+        raise CalibrationFileError(
+            "there is no such file",
+            where=str(error.filename or file),
+            remedy="give the folder that `bodyscan calibrate-rig` wrote",
+        ) from error
+    except (
+        OSError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        ValueError,
+        zipfile.BadZipFile,
+        ValidationError,
+    ) as error:
+        raise CalibrationFileError(
+            f"is not a readable calibration ({type(error).__name__}: {error})",
+            where=str(file),
+            remedy="restore the file from a copy, or calibrate again",
+        ) from error
+
+
+def calibration_id(path: Path) -> str:
+    """SHA-256 of the calibration's JSON, which itself holds the hash of its arrays."""
+    return _sha256(path / FILE_NAME if path.is_dir() else path)
+
+
+def _pair_content(calibration: RigCalibration, name: str) -> dict[str, Any]:
+    pair = calibration.pairs[name]
+    return {
+        "camera": asdict(pair.camera),
+        "rig_from_camera": calibration.rig_from_camera[name].matrix,
+        "light": None
+        if pair.light is None
+        else {"model": "planes", "direction": pair.light.direction},
+        "quality": asdict(pair.quality),
+    }
+
+
+def _calibration(content: dict[str, Any], arrays: Any) -> RigCalibration:
+    pairs = {
+        name: PairCalibration(
+            name,
+            Camera(**part["camera"]),
+            arrays[f"{name}/camera_covariance"],
+            None
+            if part["light"] is None
+            else LightPlanes(
+                arrays[f"{name}/planes"],
+                arrays[f"{name}/planes_covariance"],
+                part["light"]["direction"],
+            ),
+            PairQuality(**part["quality"]),
+        )
+        for name, part in content["pairs"].items()
+    }
+    return RigCalibration(
+        Rig.model_validate(content["rig"]),
+        pairs,
+        {name: _transform(part["rig_from_camera"]) for name, part in content["pairs"].items()},
+        PlacingCovariance(tuple(content["placing_covariance_order"]), arrays["placing_covariance"]),
+        {
+            (part["shot"], part["board"]): _transform(part["rig_from_board"])
+            for part in content["boards"]
+        },
+        content["failed"],
+        tuple(content["notes"]),
+    )
+
+
+def _transform(matrix: Any) -> RigidTransform:
+    """As written, to the last bit: no orthonormalisation on reading."""
+    array = np.array(matrix, float)
+    return RigidTransform(array[:3, :3].copy(), array[:3, 3].copy())
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

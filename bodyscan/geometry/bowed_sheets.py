@@ -1,0 +1,134 @@
+"""Sheets that may bow across their width, smooth over s; without the bow, smooth planes.
+
+In a frame roughly at the projector let y' = Y/Z across the stripes, x' = (X + x0)/Z along them and
+w = D/Z - 1. The sheet at s is
+
+    y' = p(s) + q(s) x' + r(s) w + b2(s) x'^2 + b3(s) x'^3 + ...
+
+Without b this is a plane, any plane; p, q, r, b are Chebyshev polynomials over [0, S]. Where the
+projector's centre lies is not assumed: r(s) moves each sheet on its own. Only the bow, which is
+small, is carried straight on from the frame's origin, moved along the stripes by x0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from bodyscan.geometry.lens_sheets import LensSheets
+from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
+
+Array = NDArray[np.float64]
+
+PLANE_DEGREE, BOW_DEGREE = 7, 3
+FALL = 0.3
+PLANE_SPREAD = (1.0, 0.03, 0.03)
+BOW_SPREAD = (0.1, 0.03, 0.03)
+"""Standard deviations before any data, of p, q, r and of b2, b3, ...: coefficient m of a
+polynomial is expected FALL times as large as m - 1."""
+ASIDE = 0.3
+"""Standard deviation of where the boards' middle lies along the stripes, in distances."""
+
+
+@dataclass(frozen=True, eq=False)
+class SheetsAtStripe:
+    """Coefficients (..., K) at s and their derivatives by s; Chebyshev polynomials (..., M)."""
+
+    value: Array
+    slope: Array
+    basis: Array
+
+
+@dataclass(frozen=True, eq=False)
+class BowedSheets(SmoothSheets):
+    """parameters: the polynomials p, q, r (PLANE_DEGREE), then b2, b3, ... (BOW_DEGREE), lowest
+    degree first; with a bow, x0 (mm) is the last.
+
+    bow_terms: how many of b2, b3, ... there are; 0 for planes.
+    """
+
+    bow_terms: int
+
+    @staticmethod
+    def of_pinhole(pinhole: LensSheets, bow_terms: int) -> BowedSheets:
+        """The planes of a projector without lens, y' = (s - c) / f: where a fit starts."""
+        size = 3 * (PLANE_DEGREE + 1) + bow_terms * (BOW_DEGREE + 1) + (bow_terms > 0)
+        parameters, half = np.zeros(size), pinhole.stripes / 2.0
+        focal, centre = pinhole.parameters[:2]
+        parameters[:2] = (half - centre) / focal, half / focal
+        return BowedSheets(
+            pinhole.projector_from_camera,
+            pinhole.middle,
+            pinhole.stripes,
+            pinhole.direction,
+            parameters,
+            np.full((size, size), np.nan),
+            bow_terms,
+        )
+
+    @property
+    def kind(self) -> str:
+        return "bowed" if self.bow_terms else "smooth-planes"
+
+    def prior(self) -> tuple[Array, Array]:
+        fall = FALL ** np.arange(PLANE_DEGREE + 1)
+        # A lens bows the sheets above and below its axis opposite ways: b2 is as large in s as at 0.
+        late = FALL ** np.maximum(np.arange(BOW_DEGREE + 1) - 1, 0)
+        spread = [size * fall for size in PLANE_SPREAD]
+        spread += [size * late for size in BOW_SPREAD[: self.bow_terms]]
+        deviation = self.parameters
+        if self.bow_terms:
+            spread.append(np.array([ASIDE * self.distance_mm]))
+            middle = self.projector_from_camera.apply(self.middle)[0]
+            deviation = np.append(deviation[:-1], middle + deviation[-1])
+        size = np.concatenate(spread)
+        return deviation / size, np.diag(1.0 / size)
+
+    def retract(self, step: Array) -> BowedSheets:
+        return replace(self, parameters=self.parameters + step)
+
+    def at(self, s: Array) -> SheetsAtStripe:
+        u = 2.0 * np.asarray(s, float) / self.stripes - 1.0
+        basis = chebyshev.chebvander(u, PLANE_DEGREE)
+        polynomials = self._polynomials()
+        slopes = chebyshev.chebder(polynomials, axis=1) * (2.0 / self.stripes)
+        return SheetsAtStripe(basis @ polynomials.T, basis[..., :-1] @ slopes.T, basis)
+
+    def offset(self, points: Array, sheet: SheetsAtStripe, *, parameters: bool = False) -> Offset:
+        seen = self.projector_from_camera.apply(points)
+        reach = seen[..., 2]
+        shift = self.parameters[-1] if self.bow_terms else 0.0
+        x, y, w = (seen[..., 0] + shift) / reach, seen[..., 1] / reach, self.distance_mm / reach
+        bow = range(2, 2 + self.bow_terms)
+        terms = np.stack([np.ones_like(x), x, w - 1.0, *(x**n for n in bow)], axis=-1)
+        by_x = -sheet.value[..., 1]
+        for n in bow:
+            by_x = by_x - n * sheet.value[..., 1 + n] * x ** (n - 1)
+        by_z = -by_x * x - y + sheet.value[..., 2] * w
+        by_point = np.stack([by_x, np.ones_like(x), by_z], axis=-1) / reach[..., None]
+        return Offset(
+            y - np.sum(sheet.value * terms, axis=-1),
+            by_point @ self.projector_from_camera.rotation,
+            -np.sum(sheet.slope * terms, axis=-1),
+            reach,
+            self._by_parameter(sheet.basis, terms, by_point) if parameters else None,
+        )
+
+    def _by_parameter(self, basis: Array, terms: Array, by_point: Array) -> Array:
+        columns = [-terms[..., k, None] * basis for k in range(3)]
+        low = basis[..., : BOW_DEGREE + 1]
+        columns += [-terms[..., 3 + k, None] * low for k in range(self.bow_terms)]
+        columns += [by_point[..., :1]] if self.bow_terms else []
+        return np.concatenate(columns, axis=-1)
+
+    def _polynomials(self) -> Array:
+        """(3 + bow_terms, PLANE_DEGREE + 1): a row for each polynomial."""
+        planes = 3 * (PLANE_DEGREE + 1)
+        rows = np.zeros((3 + self.bow_terms, PLANE_DEGREE + 1))
+        rows[:3] = self.parameters[:planes].reshape(3, -1)
+        if self.bow_terms:
+            rows[3:, : BOW_DEGREE + 1] = self.parameters[planes:-1].reshape(self.bow_terms, -1)
+        return rows

@@ -1,0 +1,129 @@
+"""Sheets of light as triangulation sees them, and the chapter's: one free plane a stripe (Eq. 6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Axis = Literal["horizontal", "vertical"]
+
+
+class LightSheets(Protocol):
+    """What triangulation needs of a projector, whatever its model.
+
+    rays (..., 3) have z = 1, camera frame; s (...) is real. `depth` of the two latter is z (...)
+    where it is known already. All are NaN where a ray meets no sheet.
+    direction: the way the stripes run in the image.
+    """
+
+    @property
+    def direction(self) -> Axis: ...
+
+    @property
+    def stripes(self) -> int: ...
+
+    @property
+    def kind(self) -> str:
+        """`planes`, `smooth-planes`, `bowed` or `lens`: see `sheet_arrays.from_arrays`."""
+        ...
+
+    def depth(self, rays: Array, s: Array) -> Array:
+        """z (...) mm where rays meet the sheets at s."""
+        ...
+
+    def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
+        """dz/ds (...), mm a stripe."""
+        ...
+
+    def variance_mm2(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
+        """Variance of z (...) that comes from how well the sheets themselves are known, mm^2."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class LightPlanes:
+    """coefficients: (S + 1, 4), row i is (a, b, c, d) of the plane at s = i: ax + by + cz + d = 0.
+
+    Camera frame, mm, (a, b, c) a unit vector, d >= 0.  A row of NaN: stripe not calibrated.
+    covariance: (S + 1, 4, 4) of the coefficients.
+    direction: the way the stripes run in the image.
+    """
+
+    coefficients: Array
+    covariance: Array
+    direction: Axis
+
+    @property
+    def kind(self) -> str:
+        return "planes"
+
+    @property
+    def stripes(self) -> int:
+        return len(self.coefficients) - 1
+
+    @property
+    def calibrated(self) -> NDArray[np.bool_]:
+        """(S + 1,): which boundaries have a plane."""
+        return np.isfinite(self.coefficients[:, 0])
+
+    def at(self, s: Array) -> Array:
+        """Planes (..., 4) at real s (...,), linear between neighbours; NaN beside a missing one."""
+        below, share = self._between(s)
+        share = share[..., None]
+        # A whole s needs only its own plane, not the neighbour's.
+        lower = np.where(share < 1.0, self.coefficients[below], 0.0)
+        upper = np.where(share > 0.0, self.coefficients[below + 1], 0.0)
+        return (1.0 - share) * lower + share * upper
+
+    def depth(self, rays: Array, s: Array) -> Array:
+        """Eq. 13: z = -d / (a x/z + b y/z + c)."""
+        planes = self.at(s)
+        facing = np.sum(planes[..., :3] * rays, axis=-1)
+        depth = -planes[..., 3] / np.where(facing == 0.0, np.nan, facing)
+        return np.where(depth > 0.0, depth, np.nan)
+
+    def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
+        """dz/ds (...) between the two planes around s; at a whole s, beyond it where there is one."""
+        depth = self.depth(rays, s) if depth is None else depth
+        below, share = self._between(s)
+        step = self.coefficients[below + 1] - self.coefficients[below]
+        before = self.coefficients[below] - self.coefficients[np.maximum(below - 1, 0)]
+        alone = np.isnan(step[..., :1]) & (share[..., None] == 0.0) & (below[..., None] > 0)
+        step = np.where(alone, before, step)
+        facing = np.sum(self.at(s)[..., :3] * rays, axis=-1)
+        return -(depth * np.sum(step[..., :3] * rays, axis=-1) + step[..., 3]) / facing
+
+    def variance_mm2(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
+        """Neighbouring planes come from the same boards: their errors are taken as one."""
+        depth = self.depth(rays, s) if depth is None else depth
+        below, share = self._between(s)
+        facing = np.sum(self.at(s)[..., :3] * rays, axis=-1)
+        point = np.concatenate([rays * depth[..., None], np.ones_like(depth)[..., None]], axis=-1)
+        lower, upper = (
+            np.sqrt(np.einsum("...i,...ij,...j->...", point, self.covariance[row], point))
+            for row in (below, below + 1)
+        )
+        lower, upper = np.where(share < 1.0, lower, 0.0), np.where(share > 0.0, upper, 0.0)
+        return (((1.0 - share) * lower + share * upper) / facing) ** 2
+
+    def _between(self, s: Array) -> tuple[NDArray[np.int64], Array]:
+        """The plane below s, and how far s is on its way to the next."""
+        last = len(self.coefficients) - 2
+        below = np.clip(np.nan_to_num(np.floor(s), nan=0.0).astype(np.int64), 0, last)
+        return below, np.where(np.isfinite(s), s - below, np.nan)
+
+
+def baseline_angle_tilt(planes: Array, direction: Axis) -> tuple[Array, Array, Array]:
+    """Eq. 7-9: baseline (mm), projection angle and tilt angle (radians) of planes (N, 4).
+
+    They divide by a, which is 0 for horizontal stripes; those are reported about the other axis,
+    x and y exchanged.
+    """
+    a, b, c, d = np.moveaxis(planes, -1, 0)
+    if direction == "horizontal":
+        a, b = b, a
+    return d / a, np.arctan(-c / a), np.arctan(-b / a)

@@ -1,0 +1,54 @@
+"""Sheets of light of any kind as plain arrays and back, to the last bit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.geometry.bowed_sheets import BOW_DEGREE, PLANE_DEGREE, BowedSheets
+from bodyscan.geometry.lens_sheets import LensSheets
+from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
+from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.transforms import RigidTransform
+
+Array = NDArray[np.float64]
+
+KINDS = ("planes", "smooth-planes", "bowed", "lens")
+
+
+def to_arrays(sheets: LightSheets) -> dict[str, Array]:
+    """Arrays that, with `sheets.kind` and `sheets.direction`, hold all of the sheets."""
+    if isinstance(sheets, LightPlanes):
+        return {"planes": sheets.coefficients, "covariance": sheets.covariance}
+    if isinstance(sheets, SmoothSheets):
+        return {
+            "projector_from_camera": sheets.projector_from_camera.matrix,
+            "middle": sheets.middle,
+            "stripes": np.array(float(sheets.stripes)),
+            "parameters": sheets.parameters,
+            "covariance": sheets.covariance,
+        }
+    raise TypeError(f"no sheets of light: {type(sheets).__name__}")
+
+
+def from_arrays(kind: str, arrays: Mapping[str, Any], direction: Axis) -> LightSheets:
+    """The sheets that `to_arrays` took apart. Raises ValueError for an unknown kind or arrays of
+    the wrong size, KeyError for a missing one."""
+    if kind not in KINDS:
+        raise ValueError(f"sheets of light of an unknown kind, {kind!r}")
+    if kind == "planes":
+        return LightPlanes(arrays["planes"], arrays["covariance"], direction)
+    matrix, parameters = arrays["projector_from_camera"], arrays["parameters"]
+    frame = RigidTransform(matrix[:3, :3].copy(), matrix[:3, 3].copy())
+    shared = (
+        frame, arrays["middle"], int(arrays["stripes"]), direction, parameters, arrays["covariance"],
+    )  # fmt: skip
+    if kind == "lens":
+        return LensSheets(*shared)
+    bow, over = divmod(len(parameters) - 3 * (PLANE_DEGREE + 1), BOW_DEGREE + 1)
+    if bow < 0 or over != (kind == "bowed") or (bow > 0) != (kind == "bowed"):
+        raise ValueError(f"{len(parameters)} parameters do not make {kind} sheets of light")
+    return BowedSheets(*shared, bow)

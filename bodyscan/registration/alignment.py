@@ -1,0 +1,225 @@
+"""Range images brought together where they overlap, the boards' solution and covariance as prior.
+
+A multiway ICP: matches between all pairs, then one solve for the small motions of all of them
+together with the prior, so the ring closes and only what the boards leave open is improved.  Pairs
+without overlap stay where the boards put them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.geometry.transforms import RigidTransform, adjoint
+from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.registration.matching import (
+    Matches,
+    Patch,
+    match_nearest,
+    match_projected,
+    patch,
+)
+from bodyscan.registration.uncertainty import PlacingCovariance
+
+Array = NDArray[np.float64]
+
+BODY_CENTRE_MM = np.array([0.0, 0.0, 900.0])
+
+
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """matching: `projected` (into the other camera's pixel grid) or `nearest` (Open3D's ICP).
+
+    spacing_mm: of the points that take part.  reach_mm: farthest match, halved each round down to
+    `least_reach_mm`.  fewest: matches below which two pairs do not count as overlapping.
+    sway_mm, sway_deg: how far a subject may move between pairs (standard deviations; a rotation
+    about the body's centre); 0 for a rigid object.  limit_sigmas: a pair that wants to move
+    farther than this many standard deviations of its prior stays where it was.
+    correlated: neighbouring points share their errors, so many count as one.
+    """
+
+    matching: Literal["projected", "nearest"] = "projected"
+    spacing_mm: float = 5.0
+    reach_mm: float = 12.0
+    least_reach_mm: float = 3.0
+    rounds: int = 5
+    fewest: int = 100
+    sway_mm: float = 1.0
+    sway_deg: float = 0.05
+    limit_sigmas: float = 5.0
+    correlated: float = 10.0
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """source and target pairs, how many points they share, their distance before and after, mm."""
+
+    source: str
+    target: str
+    points: int
+    rms_before_mm: float
+    rms_after_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """rig_from_camera after alignment; motion_mm of each pair at the body's centre; pairs refused
+    because they wanted to move farther than the prior allows, in sigmas; overlaps.
+    """
+
+    rig_from_camera: dict[str, RigidTransform]
+    motion_mm: dict[str, float]
+    refused: dict[str, float]
+    overlaps: tuple[Overlap, ...]
+
+    @property
+    def rms_before_mm(self) -> float:
+        return _pooled([(o.points, o.rms_before_mm) for o in self.overlaps])
+
+    @property
+    def rms_after_mm(self) -> float:
+        return _pooled([(o.points, o.rms_after_mm) for o in self.overlaps])
+
+
+def align(
+    images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    prior: PlacingCovariance,
+    settings: AlignmentSettings = AlignmentSettings(),
+) -> Alignment:
+    """Small motions of all range images that bring their overlaps together."""
+    names = [image.pair for image in images]
+    start = [rig_from_camera[name] for name in names]
+    patches = [patch(image, settings.spacing_mm) for image in images]
+    covariance = _prior(names, prior, settings)
+    motion = np.zeros((len(names), 6))
+    reach = settings.reach_mm
+    for _ in range(settings.rounds):
+        moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
+        motion = _solve(_all_matches(patches, moved, reach, settings), motion, covariance, settings)
+        reach = max(reach / 2.0, settings.least_reach_mm)
+    motion, refused = _bounded(names, motion, covariance, settings.limit_sigmas)
+    moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
+    shift = np.linalg.norm(motion[:, 3:] + np.cross(motion[:, :3], BODY_CENTRE_MM), axis=1)
+    return Alignment(
+        dict(zip(names, moved, strict=True)),
+        dict(zip(names, shift.tolist(), strict=True)),
+        refused,
+        _overlaps(names, patches, start, moved, settings),
+    )
+
+
+def _all_matches(
+    patches: Sequence[Patch],
+    placings: Sequence[RigidTransform],
+    reach_mm: float,
+    settings: AlignmentSettings,
+) -> dict[tuple[int, int], Matches]:
+    """Both ways for every two pairs, so that what one way gets wrong on curves cancels."""
+    match = match_projected if settings.matching == "projected" else match_nearest
+    boxes = [
+        (points.min(axis=0) - reach_mm, points.max(axis=0) + reach_mm)
+        for points in (t.apply(p.points) for p, t in zip(patches, placings, strict=True))
+    ]
+    found = {}
+    for i, j in permutations(range(len(patches)), 2):
+        if np.any(boxes[i][0] > boxes[j][1]) or np.any(boxes[j][0] > boxes[i][1]):
+            continue
+        matches = match(patches[i], patches[j], placings[i], placings[j], reach_mm)
+        if len(matches.distances) >= settings.fewest:
+            found[i, j] = matches
+    return found
+
+
+def _solve(
+    matches: Mapping[tuple[int, int], Matches],
+    motion: Array,
+    covariance: Array,
+    settings: AlignmentSettings,
+) -> Array:
+    """Motions (P, 6), one Gauss-Newton step: matches pull together, the prior holds near zero."""
+    normal = np.linalg.inv(covariance)
+    right = np.zeros(motion.size)
+    for (a, b), found in matches.items():
+        i, j = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
+        jacobian = np.concatenate([np.cross(found.points, found.normals), found.normals], axis=1)
+        sigma = np.hypot(found.sigma_mm, _spread(found.distances))
+        robust = 1.0 / (1.0 + (found.distances / (2.0 * sigma)) ** 2)
+        weights = robust / (sigma**2 * settings.correlated)
+        information = jacobian.T @ (jacobian * weights[:, None])
+        # The distance left after the step: d + J (x_i - m_i) - J (x_j - m_j).
+        wanted = information @ (motion[a] - motion[b]) - jacobian.T @ (weights * found.distances)
+        normal[i, i] += information
+        normal[j, j] += information
+        normal[i, j] -= information
+        normal[j, i] -= information
+        right[i] += wanted
+        right[j] -= wanted
+    return np.linalg.solve(normal, right).reshape(-1, 6)
+
+
+def _prior(names: Sequence[str], prior: PlacingCovariance, settings: AlignmentSettings) -> Array:
+    """(6P, 6P): the calibration's covariance, plus sway about the body's centre for each pair."""
+    order = np.concatenate([6 * prior.names.index(name) + np.arange(6) for name in names])
+    rotation, translation = np.radians(settings.sway_deg), settings.sway_mm
+    sway = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
+    carry = adjoint(RigidTransform(np.eye(3), BODY_CENTRE_MM))
+    each = np.kron(np.eye(len(names)), carry @ sway @ carry.T)
+    return prior.matrix[np.ix_(order, order)] + each
+
+
+def _bounded(
+    names: Sequence[str], motion: Array, covariance: Array, limit: float
+) -> tuple[Array, dict[str, float]]:
+    """Put pairs back that moved more than `limit` sigmas of their own prior (six freedoms)."""
+    kept, refused = motion.copy(), {}
+    for k, name in enumerate(names):
+        block = covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
+        sigmas = float(np.sqrt(motion[k] @ np.linalg.solve(block, motion[k]) / 6.0))
+        if sigmas > limit:
+            refused[name] = sigmas
+            kept[k] = 0.0
+    return kept, refused
+
+
+def _overlaps(
+    names: Sequence[str],
+    patches: Sequence[Patch],
+    before: Sequence[RigidTransform],
+    after: Sequence[RigidTransform],
+    settings: AlignmentSettings,
+) -> tuple[Overlap, ...]:
+    """Distances in each overlap; both with the same reach, so that they can be compared."""
+    was = _all_matches(patches, before, settings.least_reach_mm, settings)
+    now = _all_matches(patches, after, settings.least_reach_mm, settings)
+    return tuple(
+        Overlap(
+            names[i],
+            names[j],
+            len(now[i, j].distances),
+            _rms(was[i, j].distances) if (i, j) in was else float("nan"),
+            _rms(now[i, j].distances),
+        )
+        for i, j in now
+    )
+
+
+def _rms(distances: Array) -> float:
+    return float(np.sqrt(np.mean(distances**2)))
+
+
+def _spread(distances: Array) -> float:
+    return max(1.4826 * float(np.median(np.abs(distances))), 0.01)
+
+
+def _pooled(parts: Sequence[tuple[int, float]]) -> float:
+    known = [(points, rms) for points, rms in parts if np.isfinite(rms)]
+    total = sum(points for points, _ in known)
+    if not total:
+        return float("nan")
+    return float(np.sqrt(sum(points * rms**2 for points, rms in known) / total))

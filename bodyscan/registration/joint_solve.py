@@ -1,0 +1,203 @@
+"""The rig in one solve (pycolmap): cameras are sensors of one rig, shots are frames, corners known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from bodyscan.errors import FailedWork
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.located_view import LocatedView
+from bodyscan.registration.view_graph import Target
+
+Array = NDArray[np.float64]
+
+COLMAP_PIXEL_CENTRE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class JointSolution:
+    """All placings in the root camera's frame, mm, and the cameras the solve ended with."""
+
+    root_from_camera: dict[str, RigidTransform]
+    root_from_board: dict[Target, RigidTransform]
+    cameras: dict[str, Camera]
+
+
+def solve_jointly(
+    views: Sequence[LocatedView],
+    cameras: dict[str, Camera],
+    root_from_camera: dict[str, RigidTransform],
+    root_from_board: dict[Target, RigidTransform],
+    *,
+    root: str,
+    refine_cameras: bool,
+    loss_px: float,
+) -> JointSolution:
+    """Bundle adjustment with the boards' corners as constant points and a Cauchy loss.
+
+    A world of COLMAP is one board; each (shot, board) is a frame, so `rig_from_world` is
+    `root_from_board`.  Raises FailedWork if the solver does not converge.
+    """
+    names = [root, *sorted(set(cameras) - {root})]
+    ids = {name: number for number, name in enumerate(names, start=1)}
+    targets = sorted({view.target for view in views})
+    model = pycolmap.Reconstruction()
+    for name in names:
+        model.add_camera(colmap_camera(cameras[name], ids[name]))
+    model.add_rig(_colmap_rig(names, root_from_camera))
+    points = _add_points(model, views)
+    for number, target in enumerate(targets, start=1):
+        group = [view for view in views if view.target == target]
+        _add_frame(model, number, group, ids, cameras, points, root_from_board[target])
+    _adjust(model, refine_cameras, loss_px)
+    rig = model.rig(1)
+    placed = {root: RigidTransform.identity()}
+    for name in names[1:]:
+        sensor_from_rig = rig.sensor_from_rig(_sensor(ids[name]))
+        placed[name] = RigidTransform.from_matrix(sensor_from_rig.matrix()).inverse()
+    boards = {
+        target: RigidTransform.from_matrix(model.frame(number).rig_from_world.matrix())
+        for number, target in enumerate(targets, start=1)
+    }
+    solved = {name: _refined(cameras[name], model.camera(ids[name])) for name in names}
+    return JointSolution(placed, boards, solved)
+
+
+def colmap_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
+    """COLMAP's RADIAL model: no skew and square pixels, see `colmap_pixels`.
+
+    Its OPENCV model would also refine p1 and p2, which the chapter's lens does not have.
+    """
+    return pycolmap.Camera(
+        model="RADIAL",
+        width=camera.width,
+        height=camera.height,
+        params=[
+            camera.alpha,
+            camera.u0 + COLMAP_PIXEL_CENTRE,
+            camera.v0 + COLMAP_PIXEL_CENTRE,
+            camera.k1,
+            camera.k2,
+        ],
+        camera_id=camera_id,
+    )
+
+
+def colmap_pixels(camera: Camera, pixels: Array) -> Array:
+    """OpenCV px (N, 2) -> COLMAP px (N, 2) of the same camera without skew, beta brought to alpha."""
+    square = camera.without_skew(pixels)
+    square[..., 1] = camera.v0 + (square[..., 1] - camera.v0) * camera.alpha / camera.beta
+    return square + COLMAP_PIXEL_CENTRE
+
+
+def _refined(camera: Camera, solved: pycolmap.Camera) -> Camera:
+    focal, u0, v0, k1, k2 = (float(value) for value in solved.params)
+    aspect, shear = camera.beta / camera.alpha, camera.gamma / camera.beta
+    v0_moved = (v0 - COLMAP_PIXEL_CENTRE - camera.v0) * aspect
+    return replace(
+        camera,
+        alpha=focal,
+        beta=focal * aspect,
+        gamma=shear * focal * aspect,
+        # The shear was undone about the old principal point.
+        u0=u0 - COLMAP_PIXEL_CENTRE + shear * v0_moved,
+        v0=camera.v0 + v0_moved,
+        k1=k1,
+        k2=k2,
+    )
+
+
+def _sensor(camera_id: int) -> pycolmap.sensor_t:
+    return pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
+
+
+def _rigid3d(transform: RigidTransform) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(transform.matrix[:3])
+
+
+def _colmap_rig(names: Sequence[str], root_from_camera: dict[str, RigidTransform]) -> pycolmap.Rig:
+    rig = pycolmap.Rig(rig_id=1)
+    rig.add_ref_sensor(_sensor(1))
+    for number, name in enumerate(names[1:], start=2):
+        rig.add_sensor(_sensor(number), _rigid3d(root_from_camera[name].inverse()))
+    return rig
+
+
+def _add_points(
+    model: pycolmap.Reconstruction, views: Sequence[LocatedView]
+) -> dict[tuple[str, tuple[float, ...]], int]:
+    """One constant point for each corner of each board; keyed by board and rounded place."""
+    keys = sorted({key for view in views for key in _point_keys(view)})
+    numbers = {key: number for number, key in enumerate(keys, start=1)}
+    for (_, place), number in numbers.items():
+        point = pycolmap.Point3D()
+        point.xyz = np.array(place)
+        model.add_point3D_with_id(number, point)
+    return numbers
+
+
+def _point_keys(view: LocatedView) -> list[tuple[str, tuple[float, ...]]]:
+    rounded = np.round(view.points, 6) + 0.0
+    return [(view.board, tuple(point)) for point in rounded.tolist()]
+
+
+def _add_frame(
+    model: pycolmap.Reconstruction,
+    number: int,
+    group: Sequence[LocatedView],
+    ids: dict[str, int],
+    cameras: dict[str, Camera],
+    points: dict[tuple[str, tuple[float, ...]], int],
+    root_from_board: RigidTransform,
+) -> None:
+    frame = pycolmap.Frame(frame_id=number, rig_id=1)
+    first_image = model.num_images() + 1
+    for image_id, view in enumerate(group, start=first_image):
+        data = pycolmap.data_t(_sensor(ids[view.pair]), image_id)
+        frame.add_data_id(data)
+    frame.rig_from_world = _rigid3d(root_from_board)
+    model.add_frame(frame)
+    for image_id, view in enumerate(group, start=first_image):
+        image = pycolmap.Image(
+            name=f"{view.shot}/{view.board}/{view.pair}",
+            keypoints=colmap_pixels(cameras[view.pair], view.pixels),
+            camera_id=ids[view.pair],
+            image_id=image_id,
+        )
+        image.frame_id = number
+        model.add_image(image)
+        for k, key in enumerate(_point_keys(view)):
+            model.add_observation(points[key], pycolmap.TrackElement(image_id, k))
+    model.register_frame(number)
+
+
+def _adjust(model: pycolmap.Reconstruction, refine_cameras: bool, loss_px: float) -> None:
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_points3D = False
+    options.refine_focal_length = refine_cameras
+    options.refine_principal_point = refine_cameras
+    options.refine_extra_params = refine_cameras
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = loss_px
+    options.ceres.solver_options.gradient_tolerance = 1e-10
+    options.ceres.solver_options.function_tolerance = 1e-12
+    options.ceres.solver_options.num_threads = 2
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.images:
+        config.add_image(image_id)
+    for point_id in model.points3D:
+        config.add_constant_point(point_id)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    summary = adjuster.solve()
+    if not summary.is_solution_usable():
+        raise FailedWork(
+            f"the joint solve of the rig did not converge: {summary.brief_report()}",
+            remedy="look at the views listed above; a mislabelled shot can cause this",
+        )

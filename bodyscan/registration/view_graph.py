@@ -1,0 +1,228 @@
+"""Who shares which board with whom (networkx), and the starting placing that follows from it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.errors import RigDisconnected
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.located_view import LocatedView, apart
+
+AGREEMENT_MM = 40.0
+REACH_MM = 1000.0
+MOST_CANDIDATES = 12
+
+Array = NDArray[np.float64]
+Target = tuple[str, str]
+Group = dict[str, RigidTransform]
+
+
+@dataclass(frozen=True, eq=False)
+class Tie:
+    """What the boards shared by two groups of pairs say of their relative placing.
+
+    votes: how many shared targets agree with it.  rivals: votes of the best contradicting placing,
+    which only boards with an ambiguous numbering (or wrong views) can have.
+    """
+
+    first_from_second: RigidTransform
+    targets: tuple[Target, ...]
+    votes: int
+    rivals: int
+    corners: int
+
+    @property
+    def decided(self) -> bool:
+        return self.votes > self.rivals
+
+    @property
+    def strength(self) -> tuple[int, int]:
+        """Decided ties first, then those with most corners."""
+        return min(self.votes - self.rivals, 2), self.corners
+
+
+def view_graph(views: Iterable[LocatedView], pairs: Sequence[str]) -> nx.Graph:
+    """Nodes: pairs.  Edges: pairs that saw a board at the same moment; attribute `targets`."""
+    graph = nx.Graph()
+    graph.add_nodes_from(pairs)
+    for target, group in _by_target(views).items():
+        for a, b in combinations(sorted({view.pair for view in group}), 2):
+            if not graph.has_edge(a, b):
+                graph.add_edge(a, b, targets=[])
+            graph.edges[a, b]["targets"].append(target)
+    return graph
+
+
+def placings(
+    views: Sequence[LocatedView], pairs: Sequence[str], root: str
+) -> dict[str, RigidTransform]:
+    """`root_from_camera` of every pair.
+
+    Groups of placed pairs grow together, the best decided tie first; a tie between two groups is
+    voted on by all boards that any pair of the one and any of the other saw at the same moment.
+    Raises RigDisconnected, naming the groups and what would tie them, or the shots whose board's
+    numbering leaves a tie open.
+    """
+    _refuse_disconnected(view_graph(views, pairs))
+    targets = _by_target(views)
+    groups: list[Group] = [{name: RigidTransform.identity()} for name in pairs]
+    ties: dict[tuple[int, int], Tie | None] = {}
+    while len(groups) > 1:
+        for i, j in combinations(range(len(groups)), 2):
+            if (i, j) not in ties:
+                ties[i, j] = _tie(groups[i], groups[j], targets)
+        found = {key: tie for key, tie in ties.items() if tie is not None}
+        (i, j), best = max(found.items(), key=lambda item: item[1].strength)
+        if not best.decided:
+            raise _open_tie(groups[i], groups[j], best)
+        merged = groups[i] | {
+            name: best.first_from_second @ placing for name, placing in groups[j].items()
+        }
+        kept = [k for k in range(len(groups)) if k not in (i, j)]
+        ties = {
+            (kept.index(p), kept.index(q)): tie
+            for (p, q), tie in ties.items()
+            if p in kept and q in kept
+        }
+        groups = [*(groups[k] for k in kept), merged]
+    to_root = groups[0][root].inverse()
+    return {name: to_root @ placing for name, placing in groups[0].items()}
+
+
+def place_boards(
+    views: Iterable[LocatedView], root_from_camera: dict[str, RigidTransform]
+) -> tuple[list[LocatedView], dict[Target, RigidTransform], list[str]]:
+    """Resolve every view's alternative, place every board, and name the views that fit nowhere.
+
+    Returns the kept views, `root_from_board` of each target, and a line for each dropped view.
+    """
+    kept: list[LocatedView] = []
+    boards: dict[Target, RigidTransform] = {}
+    dropped: list[str] = []
+    for target, group in _by_target(views).items():
+        placing = _agreed_placing(group, root_from_camera)
+        boards[target] = placing
+        for view in group:
+            resolved = min(
+                (view.resolved(choice) for choice in view.alternatives),
+                key=lambda r: apart(root_from_camera[r.pair] @ r.camera_from_board, placing, 300.0),
+            )
+            gap = apart(root_from_camera[view.pair] @ resolved.camera_from_board, placing, 300.0)
+            if gap <= 2.0 * AGREEMENT_MM:
+                kept.append(resolved)
+            else:
+                dropped.append(
+                    f"{view.pair}: board {view.board} in shot {view.shot} lies {gap:.0f} mm from "
+                    "where the other pairs see it; not used"
+                )
+    return kept, boards, dropped
+
+
+def _agreed_placing(
+    group: Sequence[LocatedView], root_from_camera: dict[str, RigidTransform]
+) -> RigidTransform:
+    """The placing of a board that most corners of its views support."""
+    candidates = [root_from_camera[view.pair] @ view.camera_from_board for view in group]
+
+    def support(placing: RigidTransform) -> float:
+        return sum(
+            len(view.pixels)
+            for view in group
+            if any(
+                apart(
+                    root_from_camera[view.pair] @ view.resolved(choice).camera_from_board,
+                    placing,
+                    300.0,
+                )
+                < AGREEMENT_MM
+                for choice in view.alternatives
+            )
+        ) + 1e-3 * max(len(view.pixels) for view in group)
+
+    return max(candidates, key=support)
+
+
+def _by_target(views: Iterable[LocatedView]) -> dict[Target, list[LocatedView]]:
+    groups: dict[Target, list[LocatedView]] = defaultdict(list)
+    for view in views:
+        groups[view.target].append(view)
+    return dict(sorted(groups.items()))
+
+
+def _tie(first: Group, second: Group, targets: dict[Target, list[LocatedView]]) -> Tie | None:
+    """Let every target that both groups saw propose `first_from_second`; take the most agreed."""
+    proposals: dict[Target, list[RigidTransform]] = {}
+    corners: dict[Target, int] = {}
+    for target, seen in targets.items():
+        a = max((v for v in seen if v.pair in first), key=_size, default=None)
+        b = max((v for v in seen if v.pair in second), key=_size, default=None)
+        if a is None or b is None:
+            continue
+        to_board = first[a.pair] @ a.camera_from_board
+        from_board = (second[b.pair] @ b.camera_from_board).inverse()
+        turns = a.alternatives if a.ambiguous else b.alternatives
+        proposals[target] = [to_board @ turn @ from_board for turn in turns]
+        corners[target] = min(_size(a), _size(b))
+    if not proposals:
+        return None
+    everything = [p for proposal in proposals.values() for p in proposal]
+    owner = np.repeat(np.arange(len(proposals)), [len(p) for p in proposals.values()])
+    clearest = sorted(proposals, key=lambda target: -corners[target])[:MOST_CANDIDATES]
+    candidates = [p for target in clearest for p in proposals[target]]
+    gaps = np.array([_gaps(candidate, everything) for candidate in candidates])
+    votes = [len(set(owner[gap < 2.0 * AGREEMENT_MM])) for gap in gaps]
+    best = int(np.argmax(votes))
+    rivals = [
+        count
+        for count, candidate in zip(votes, candidates, strict=True)
+        if apart(candidate, candidates[best], REACH_MM) > 4.0 * AGREEMENT_MM
+    ]
+    return Tie(
+        candidates[best],
+        tuple(proposals),
+        votes[best],
+        max(rivals, default=0),
+        sum(corners.values()),
+    )
+
+
+def _size(view: LocatedView) -> int:
+    return len(view.pixels)
+
+
+def _gaps(candidate: RigidTransform, others: Sequence[RigidTransform]) -> Array:
+    """`apart` of one transform and many, (N,) mm."""
+    rotations = np.array([other.rotation for other in others])
+    shifts = np.array([other.translation for other in others]) - candidate.translation
+    cosines = (np.einsum("ij,nij->n", candidate.rotation, rotations) - 1.0) / 2.0
+    angles = np.arccos(np.clip(cosines, -1.0, 1.0))
+    return np.linalg.norm(shifts, axis=1) + angles * REACH_MM
+
+
+def _refuse_disconnected(graph: nx.Graph) -> None:
+    groups = sorted((sorted(group) for group in nx.connected_components(graph)), key=len)
+    if len(groups) > 1:
+        smallest, rest = groups[0], groups[-1]
+        raise RigDisconnected(
+            f"no shared board view ties {', '.join(smallest)} to {', '.join(rest)}",
+            remedy=f"capture shots in which {smallest[0]} and {rest[0]} (or others of these two "
+            "groups) see the board at the same moment",
+        )
+
+
+def _open_tie(first: Group, second: Group, tie: Tie) -> RigDisconnected:
+    shots = ", ".join(sorted({shot for shot, _ in tie.targets})[:6])
+    return RigDisconnected(
+        f"the placing of {', '.join(sorted(first))} and {', '.join(sorted(second))} stays open: "
+        "their shared board may be numbered from either end, and their views do not settle which "
+        f"(shots {shots})",
+        remedy="capture one or two more shots that both see, the board tilted differently; or use "
+        "a ChArUco board, or one whose columns and rows differ in parity",
+    )

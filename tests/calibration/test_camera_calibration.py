@@ -1,0 +1,111 @@
+import numpy as np
+import pytest
+
+from bodyscan.calibration.camera import (
+    INTRINSICS,
+    PlanarView,
+    calibrate_camera,
+    locate_board,
+    projection_jacobians,
+)
+from bodyscan.calibration.zhang import homography, matrix_from_homographies
+from bodyscan.errors import DegeneratePoses
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+
+# Table 1 of the chapter, and its 48 calibration points at 20 mm.
+CAMERA = Camera(1061.71, 1064.09, -0.562002, 350.08, 286.547, -0.140279, -0.0916363, 640, 480)
+POINTS = np.array([[20.0 * c, 20.0 * r, 0.0] for r in range(1, 7) for c in range(1, 9)])
+TURNS = ([0.4, 0.2, 0.05], [-0.35, 0.3, 0.0], [0.1, -0.45, 0.1])
+
+
+def views(turns, noise_px=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    found = []
+    for k, turn in enumerate(turns):
+        pose = RigidTransform.from_rotation_vector(turn, [-90.0, -70.0, 400.0 + 20.0 * k])
+        pixels = CAMERA.project(pose.apply(POINTS)) + rng.normal(0.0, noise_px, (48, 2))
+        found.append(PlanarView(f"s{k}", POINTS, pixels))
+    return found
+
+
+def test_three_noiseless_poses_give_table_1_back():
+    found = calibrate_camera(views(TURNS), 640, 480).camera
+    # Without noise only rounding is left: 1e-5 px, 1e-7 in k.
+    for name in INTRINSICS:
+        assert getattr(found, name) == pytest.approx(getattr(CAMERA, name), rel=1e-6, abs=1e-5)
+
+
+def test_sigmas_are_honest():
+    # 40 draws of 0.03 px noise: errors over sigmas have a spread of 1 +- 0.11 (1 / sqrt(2 * 40)),
+    # and the estimate of the noise itself adds a few percent: 0.7 to 1.3 is three sigmas.
+    errors = []
+    for seed in range(40):
+        result = calibrate_camera(views(TURNS, 0.03, seed), 640, 480)
+        sigmas = np.sqrt(np.diag(result.covariance))
+        errors.append(
+            [
+                (getattr(result.camera, name) - getattr(CAMERA, name)) / sigma
+                for name, sigma in zip(INTRINSICS, sigmas, strict=True)
+            ]
+        )
+    spread = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert np.all((spread > 0.7) & (spread < 1.3)), spread
+
+
+def test_an_outlier_corner_does_no_harm():
+    disturbed = views(TURNS, 0.03)
+    disturbed[1].pixels[10] += [5.0, -4.0]
+    found = calibrate_camera(disturbed, 640, 480).camera
+    clean = calibrate_camera(views(TURNS, 0.03), 640, 480).camera
+    # The clean solution's own sigma of alpha is about 0.5 px.
+    assert abs(found.alpha - clean.alpha) < 0.5
+
+
+def test_two_poses_are_refused():
+    with pytest.raises(DegeneratePoses, match="2 usable board poses"):
+        calibrate_camera(views(TURNS[:2]), 640, 480)
+
+
+def test_pure_translation_is_refused():
+    with pytest.raises(DegeneratePoses, match="translation only"):
+        calibrate_camera(views([TURNS[0]] * 4, 0.03), 640, 480)
+
+
+def test_zhangs_closed_form_has_the_skew():
+    straight = Camera(1000.0, 990.0, 12.0, 330.0, 250.0, 0.0, 0.0, 640, 480)
+    homographies = []
+    for turn in TURNS:
+        pose = RigidTransform.from_rotation_vector(turn, [-90.0, -70.0, 400.0])
+        homographies.append(homography(POINTS[:, :2], straight.project(pose.apply(POINTS))))
+    found = matrix_from_homographies(homographies, 640, 480)
+    assert np.allclose(found, straight.matrix, atol=1e-4)
+
+
+def test_projection_jacobians_are_derivatives():
+    points = np.random.default_rng(1).uniform([-80, -80, 350], [80, 80, 500], (20, 3))
+    intrinsics, by_point = projection_jacobians(CAMERA, points)
+    step = 1e-4
+    for k in range(3):
+        shift = np.zeros(3)
+        shift[k] = step
+        numeric = (CAMERA.project(points + shift) - CAMERA.project(points - shift)) / (2 * step)
+        # Central differences: rounding of 1e-13 * 1000 px / 1e-4 mm.
+        assert np.allclose(by_point[:, :, k], numeric, atol=1e-6)
+    from dataclasses import replace
+
+    for k, name in enumerate(INTRINSICS):
+        more = replace(CAMERA, **{name: getattr(CAMERA, name) + step})
+        less = replace(CAMERA, **{name: getattr(CAMERA, name) - step})
+        numeric = (more.project(points) - less.project(points)) / (2 * step)
+        assert np.allclose(intrinsics[:, :, k], numeric, atol=1e-5)
+
+
+@pytest.mark.parametrize("plane_z", [0.0, 6.0])
+def test_a_board_is_located_from_either_face(plane_z):
+    points = POINTS + np.array([0.0, 0.0, plane_z])
+    pose = RigidTransform.from_rotation_vector([0.3, np.pi * (plane_z > 0), 0.1], [60, -70, 420.0])
+    view = PlanarView("s", points, CAMERA.project(pose.apply(points)))
+    found, residuals = locate_board(CAMERA, view)
+    assert np.allclose(found.matrix, pose.matrix, atol=1e-6)
+    assert np.max(np.abs(residuals)) < 1e-6

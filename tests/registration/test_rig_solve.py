@@ -1,0 +1,127 @@
+import numpy as np
+import pytest
+from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
+
+from bodyscan.capture.rig import Board
+from bodyscan.errors import RigDisconnected
+from bodyscan.registration.rig_solve import place_rig
+from bodyscan.registration.uncertainty import position_sigma
+
+
+def centre_errors(placed, placings):
+    return {
+        name: placed.rig_from_camera[name].translation - placings[name].translation
+        for name in placings
+    }
+
+
+def rms(errors):
+    return float(np.sqrt(np.mean([np.sum(e**2) for e in errors.values()])))
+
+
+def test_twelve_cameras_are_placed():
+    placings, cameras = ring_of_cameras()
+    views, _ = ring_views(placings, cameras)
+    placed = place_rig(ring_rig(placings), views, cameras)
+    # Sigmas of the centres that the solve reports are 0.05 to 0.1 mm here.
+    assert rms(centre_errors(placed, placings)) < 0.25
+    assert not placed.notes
+
+
+def test_sigmas_of_positions_are_honest():
+    placings, cameras = ring_of_cameras(heights=(700, 1200))
+    normalized = []
+    for seed in range(12):
+        views, _ = ring_views(placings, cameras, shots=20, seed=seed)
+        placed = place_rig(ring_rig(placings), views, cameras)
+        for name, error in centre_errors(placed, placings).items():
+            if name != "p1-1":
+                sigma = position_sigma(placed.covariance, name, placings[name].translation)
+                normalized.append(error / sigma)
+    # 12 x 5 x 3 draws, correlated within a seed (12 x 6 independent ones at worst): 1 +- 0.1.
+    assert 0.75 < np.sqrt(np.mean(np.square(normalized))) < 1.3
+
+
+def test_wrong_views_are_found_and_named():
+    placings, cameras = ring_of_cameras()
+    views, _ = ring_views(placings, cameras)
+    clean = rms(centre_errors(place_rig(ring_rig(placings), views, cameras), placings))
+    number = next(i for i, v in enumerate(views) if v.pair == "p2-2" and len(v.pixels) > 30)
+    shuffled = views[number].pixels.copy()
+    shuffled[[3, 20]] = shuffled[[20, 3]]
+    shuffled += 4.0
+    views[number] = type(views[number])(
+        "p2-2",
+        views[number].shot,
+        "board",
+        views[number].points,
+        shuffled,
+        views[number].camera_from_board,
+    )
+    placed = place_rig(ring_rig(placings), views, cameras)
+    assert any("p2-2" in note and views[number].shot in note for note in placed.notes)
+    assert rms(centre_errors(placed, placings)) < 1.2 * clean + 0.02
+
+
+def test_two_groups_without_a_shared_view_are_named():
+    placings, cameras = ring_of_cameras(heights=(700, 1200))
+    views, _ = ring_views(placings, cameras, shots=20)
+    apart = [v for v in views if (v.pair[:2] == "p3") == (int(v.shot[1:]) % 2 == 0)]
+    with pytest.raises(RigDisconnected, match="p3-1") as caught:
+        place_rig(ring_rig(placings), apart, cameras)
+    assert "capture shots in which" in str(caught.value)
+
+
+@pytest.mark.parametrize(("columns", "faces"), [(9, 1), (9, 2), (10, 2)])
+def test_plain_boards_numbered_from_either_end_are_resolved(columns, faces):
+    board = Board(
+        name="plain",
+        columns=columns,
+        rows=7,
+        square_mm=70,
+        faces=faces,
+        thickness_mm=6 * (faces - 1),
+    )
+    placings, cameras = ring_of_cameras(heights=(700, 1200))
+    # A one-faced board is seen by two poles at once in few of so many shots.
+    views, _ = ring_views(placings, cameras, shots=160 // faces, board=board)
+    rig = ring_rig(placings).model_copy(update={"boards": (board,)})
+    placed = place_rig(rig, views, cameras)
+    # One wrong turn among the tree's edges would show as metres.
+    assert rms(centre_errors(placed, placings)) < 0.5
+
+
+def test_an_ambiguous_board_seen_once_is_not_guessed():
+    board = Board(name="plain", columns=9, rows=7, square_mm=70)
+    placings, cameras = ring_of_cameras(poles=1, heights=(900, 1100))
+    views, _ = ring_views(placings, cameras, shots=60, board=board)
+    shots = {v.shot for v in views if v.pair == "p1-1"} & {
+        v.shot for v in views if v.pair == "p1-2"
+    }
+    views = [v for v in views if v.shot == min(shots)]
+    rig = ring_rig(placings).model_copy(update={"boards": (board,)})
+    with pytest.raises(RigDisconnected, match=min(shots)):
+        place_rig(rig, views, cameras)
+
+
+def test_the_board_can_fix_the_frame():
+    placings, cameras = ring_of_cameras()
+    views, truth = ring_views(placings, cameras)
+    fixed = truth["s00", "board"]
+    rig = ring_rig(placings).model_copy(
+        update={
+            "rig_frame": ring_rig(placings).rig_frame.model_copy(
+                update={
+                    "pair": None,
+                    "shot": "s00",
+                    "board": CHARUCO.name,
+                    "origin_mm": tuple(fixed.translation),
+                    "x_axis": tuple(fixed.rotation[:, 0]),
+                    "y_axis": tuple(fixed.rotation[:, 1]),
+                }
+            )
+        }
+    )
+    placed = place_rig(rig, views, cameras)
+    # One board of 48 corners in a few views holds the frame: its own pose is good to 1e-4 rad.
+    assert rms(centre_errors(placed, placings)) < 0.5
