@@ -1,0 +1,100 @@
+"""Cameras judged by boards they were not joined on: triangulated corners against the true board."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.calibration.rig import calibrate_cameras, find_all_boards, locate_views
+from bodyscan.capture.folder import Captures
+from bodyscan.capture.rig import Rig
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform, rigid_fit
+from bodyscan.geometry.triangulation import triangulate
+from bodyscan.registration.located_view import LocatedView
+from bodyscan.registration.rig_solve import place_rig
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FreeTriangulation:
+    """One shot: corners seen by two or more cameras, RMS reprojection of the triangulated corners
+    (px), RMS distance of the triangulated corners to the rigidly fitted board (mm).
+    """
+
+    shot: str
+    corners: int
+    observations: int
+    rms_px: float
+    rms_mm: float
+
+
+def triangulate_board(
+    views: Sequence[LocatedView],
+    cameras: dict[str, Camera],
+    rig_from_camera: dict[str, RigidTransform],
+) -> FreeTriangulation:
+    """The views of one board in one shot, each corner triangulated by itself."""
+    corners, number = np.unique(
+        np.concatenate([np.round(view.points, 6) for view in views]), axis=0, return_inverse=True
+    )
+    pixels = np.full((len(views), len(corners), 2), np.nan)
+    for k, (view, numbers) in enumerate(
+        zip(views, np.split(number, np.cumsum([len(v.pixels) for v in views])[:-1]), strict=True)
+    ):
+        pixels[k, numbers] = view.pixels
+    own = [cameras[view.pair] for view in views]
+    camera_from_rig = [rig_from_camera[view.pair].inverse() for view in views]
+    points = triangulate(own, camera_from_rig, pixels)
+    known = np.isfinite(points[:, 0])
+    residuals = np.stack(
+        [
+            camera.project(transform.apply(points[known])) - seen[known]
+            for camera, transform, seen in zip(own, camera_from_rig, pixels, strict=True)
+        ]
+    )
+    squared = np.sum(residuals**2, axis=-1)
+    observed = np.isfinite(squared)
+    off = np.full(1, np.nan)
+    if known.sum() >= 4:
+        rig_from_board = rigid_fit(corners[known], points[known])
+        off = np.sum((rig_from_board.apply(corners[known]) - points[known]) ** 2, axis=1)
+    return FreeTriangulation(
+        views[0].shot,
+        int(known.sum()),
+        int(observed.sum()),
+        float(np.sqrt(np.mean(squared[observed]))) if observed.any() else float("nan"),
+        float(np.sqrt(np.mean(off))),
+    )
+
+
+def leave_shots_out(rig: Rig, captures: Captures) -> list[FreeTriangulation]:
+    """Each shot in turn left out of the joint solve, then its board triangulated by that rig."""
+    boards = {board.name: board for board in rig.boards}
+    found = find_all_boards(rig, captures, [])
+    results = []
+    for shot in captures.shots:
+        others = [view for view in found if view.shot != shot]
+        calibrated, _ = calibrate_cameras(rig, others, boards)
+        views = locate_views(found, calibrated, boards, [])
+        placed = place_rig(
+            rig,
+            [view for view in views if view.shot != shot],
+            {name: c.camera for name, c in calibrated.items()},
+        )
+        left_out = [view for view in views if view.shot == shot]
+        if len(left_out) >= 2:
+            results.append(triangulate_board(left_out, placed.cameras, placed.rig_from_camera))
+    return results
+
+
+def pooled(results: Sequence[FreeTriangulation]) -> tuple[float, float]:
+    """RMS over all shots: reprojection (px) and distance to the board (mm)."""
+    px = sum(r.observations * r.rms_px**2 for r in results) / sum(r.observations for r in results)
+    known = [r for r in results if np.isfinite(r.rms_mm)]
+    mm = sum(r.corners * r.rms_mm**2 for r in known) / sum(r.corners for r in known)
+    return float(np.sqrt(px)), float(np.sqrt(mm))

@@ -1,0 +1,129 @@
+"""A simulated workspace held against the truth beside it: calibration, cloud and mesh."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from bodyscan.calibration.rig_calibration import RigCalibration
+from bodyscan.calibration.storage import load_calibration
+from bodyscan.errors import BadInput
+from bodyscan.evaluation.surface import Deviation, deviation, signed_distances
+from bodyscan.fusion.storage import load_scan
+from bodyscan.fusion.topology import topology
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.report.pictures import draw_deviation
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RigDeviation:
+    """Errors of each pair against truth in the rig frame as defined, nothing else aligned.
+
+    centres_mm: (P, 3).  rotations_deg: (P,).  sigmas: (P, 3) of the centres, as reported.
+    """
+
+    names: tuple[str, ...]
+    centres_mm: Array
+    rotations_deg: Array
+    sigmas_mm: Array
+
+    @property
+    def centres_rms_mm(self) -> float:
+        return float(np.sqrt(np.mean(np.sum(self.centres_mm**2, axis=1))))
+
+    @property
+    def rotations_rms_deg(self) -> float:
+        return float(np.sqrt(np.mean(self.rotations_deg**2)))
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The simulator's truth: facts is truth.json; the subject's surface in mm, rig frame."""
+
+    facts: dict[str, Any]
+    vertices: Array | None
+    faces: NDArray[np.int64] | None
+
+
+def load_truth(folder: Path) -> Truth:
+    """Read `truth/`. Raises BadInput if there is none: real captures have no truth."""
+    try:
+        facts = json.loads((folder / "truth.json").read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise BadInput(
+            f"has no readable truth ({error})",
+            where=str(folder),
+            remedy="only workspaces made by `bodyscan simulate` can be held against the truth",
+        ) from error
+    surface = folder / "subject.ply"
+    if not surface.exists():
+        return Truth(facts, None, None)
+    mesh = o3d.io.read_triangle_mesh(str(surface))
+    return Truth(facts, np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int64))
+
+
+def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
+    """Camera centres and rotations against the truth."""
+    from bodyscan.registration.uncertainty import position_sigma
+
+    names = tuple(sorted(calibration.rig_from_camera))
+    centres, rotations, sigmas = [], [], []
+    for name in names:
+        found = calibration.rig_from_camera[name]
+        true = RigidTransform.from_matrix(truth.facts["pairs"][name]["rig_from_camera"])
+        centres.append(found.translation - true.translation)
+        rotations.append(np.degrees((found.inverse() @ true).angle))
+        sigmas.append(position_sigma(calibration.covariance, name, found.translation))
+    return RigDeviation(names, np.array(centres), np.array(rotations), np.array(sigmas))
+
+
+def evaluate_workspace(workspace: Path) -> str:
+    """A text with every figure, and deviation pictures beside the scan."""
+    truth = load_truth(workspace / "truth")
+    calibration = load_calibration(workspace / "calibration")
+    rig = compare_rig(calibration, truth)
+    lines = [
+        "against the truth (synthetic):",
+        f"  camera centres          {rig.centres_rms_mm:.3f} mm RMS, rotations "
+        f"{rig.rotations_rms_deg:.4f} degrees RMS, {len(rig.names)} pairs",
+    ]
+    folder = workspace / "scan"
+    if not (folder / "scan.json").exists() or truth.vertices is None or truth.faces is None:
+        return "\n".join([*lines, "  no scan to compare yet"])
+    stored = load_scan(folder)
+    cloud = signed_distances(stored.cloud.points, truth.vertices, truth.faces)
+    measured = np.unique(stored.mesh.faces[~stored.mesh.filled])
+    mesh = signed_distances(stored.mesh.vertices[measured], truth.vertices, truth.faces)
+    shape = topology(stored.mesh.vertices, stored.mesh.faces)
+    pictures = [folder / "cloud-deviation.png", folder / "mesh-deviation.png"]
+    draw_deviation(stored.cloud.points, cloud, pictures[0], normals=stored.cloud.normals)
+    draw_deviation(
+        stored.mesh.vertices[measured], mesh, pictures[1], normals=stored.mesh.normals[measured]
+    )
+    lines += [
+        f"  cloud, {len(stored.cloud.points):,} points   {_figures(deviation(cloud))}",
+        f"  mesh, measured vertices {_figures(deviation(mesh))}",
+        f"  mesh: {shape}",
+        "results:",
+        f"  calibration {workspace / 'calibration' / 'calibration.json'}",
+        f"  cloud       {folder / 'cloud.ply'}",
+        f"  mesh        {folder / 'mesh.ply'}",
+        f"  exports     {workspace / 'export'}",
+        f"  pictures    {', '.join(str(path) for path in sorted(folder.glob('*.png')))}",
+    ]
+    return "\n".join(lines)
+
+
+def _figures(d: Deviation) -> str:
+    return (
+        f"bias {d.bias_mm:+.3f}, median {d.median_mm:.3f}, RMS {d.rms_mm:.3f}, "
+        f"95 % {d.p95_mm:.3f}, worst {d.worst_mm:.2f} mm"
+    )

@@ -1,0 +1,111 @@
+"""glTF 2.0 in one binary file (GLB): metres, y up, front towards +z, as its standard says."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.files import replacing
+from bodyscan.fusion.body import BodyCloud, BodyMesh
+
+FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+POINTS, TRIANGLES = 0, 4
+
+
+def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
+    """Write a mesh or a cloud; a mesh's vertices carry `_FILLED`, 1 where nothing was measured."""
+    points = body.points if isinstance(body, BodyCloud) else body.vertices
+    attributes = {
+        "POSITION": _y_up(points) / 1000.0,
+        "NORMAL": _y_up(body.normals),
+        "COLOR_0": _linear(body.colours),
+    }
+    indices = None
+    if isinstance(body, BodyMesh):
+        attributes["_FILLED"] = np.isnan(body.sigma_mm)
+        indices = body.faces
+    document, chunks = _document(attributes, indices)
+    text = json.dumps(document, separators=(",", ":")).encode("ascii")
+    text += b" " * (-len(text) % 4)
+    size = sum(len(chunk) for chunk in chunks)
+    with replacing(Path(path)) as temporary, temporary.open("wb") as stream:
+        stream.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + size))
+        stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        stream.write(struct.pack("<I4s", size, b"BIN\0"))
+        for chunk in chunks:
+            stream.write(chunk)
+
+
+def _y_up(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Rig frame (x front, y left, z up) to glTF's (x left, y up, z front)."""
+    return vectors[:, [1, 2, 0]]
+
+
+def _linear(colours: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """(N, 3) sRGB bytes to (N, 4) linear shorts: glTF's vertex colours are linear, with alpha."""
+    encoded = np.arange(256) / 255.0
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    table = np.rint(65535.0 * linear).astype(np.uint16)
+    return np.concatenate([table[colours], np.full((len(colours), 1), 65535, np.uint16)], axis=1)
+
+
+def _document(
+    attributes: dict[str, NDArray[Any]], indices: NDArray[np.int64] | None
+) -> tuple[dict[str, Any], list[bytes]]:
+    """The JSON part and the chunks of the binary part (each a multiple of four bytes)."""
+    accessors: list[dict[str, Any]] = []
+    views: list[dict[str, Any]] = []
+    chunks: list[bytes] = []
+
+    def add(values: NDArray[Any], component: int, kind: str, target: int, **extra: Any) -> int:
+        data = values.tobytes()
+        offset = sum(len(chunk) for chunk in chunks)
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(data), "target": target})
+        accessors.append(
+            {
+                "bufferView": len(views) - 1,
+                "componentType": component,
+                "count": len(values) if kind != "SCALAR" else values.size,
+                "type": kind,
+                **extra,
+            }
+        )
+        chunks.append(data)
+        return len(accessors) - 1
+
+    numbers = {}
+    for name, values in attributes.items():
+        if name == "COLOR_0":
+            shorts = values.astype("<u2")
+            numbers[name] = add(shorts, UNSIGNED_SHORT, "VEC4", ARRAY_BUFFER, normalized=True)
+            continue
+        floats = values.astype("<f4")
+        kind = "SCALAR" if floats.ndim == 1 else "VEC3"
+        ends = {}
+        if name == "POSITION":
+            ends = {"min": floats.min(axis=0).tolist(), "max": floats.max(axis=0).tolist()}
+        numbers[name] = add(floats, FLOAT, kind, ARRAY_BUFFER, **ends)
+    primitive: dict[str, Any] = {"attributes": numbers, "material": 0, "mode": POINTS}
+    if indices is not None:
+        corners = indices.astype("<u4").ravel()
+        primitive["mode"] = TRIANGLES
+        primitive["indices"] = add(corners, UNSIGNED_INT, "SCALAR", ELEMENT_ARRAY_BUFFER)
+    surface = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
+    document = {
+        "asset": {"version": "2.0", "generator": "bodyscan"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "body"}],
+        "meshes": [{"primitives": [primitive], "name": "body"}],
+        "materials": [{"name": "body", "pbrMetallicRoughness": surface}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": sum(len(chunk) for chunk in chunks)}],
+    }
+    return document, chunks

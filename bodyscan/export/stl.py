@@ -1,0 +1,27 @@
+"""Binary STL."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bodyscan.files import replacing
+from bodyscan.fusion.body import BodyMesh
+
+TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+HEADER = b"bodyscan: mm, x the way the subject faces, z up, floor at z = 0"
+
+
+def write_stl(path: Path, mesh: BodyMesh) -> None:
+    """Write a mesh in mm, rig frame. STL knows no colours, normals of vertices or filled faces."""
+    corners = mesh.vertices[mesh.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(cross, axis=1, keepdims=True)
+    triangles = np.zeros(len(mesh.faces), TRIANGLE)
+    triangles["normal"] = cross / np.where(length > 0, length, 1.0)
+    triangles["corners"] = corners
+    with replacing(Path(path)) as temporary, temporary.open("wb") as stream:
+        stream.write(HEADER.ljust(80, b"\0"))
+        stream.write(np.uint32(len(triangles)).astype("<u4").tobytes())
+        stream.write(triangles.data)

@@ -1,0 +1,107 @@
+"""A closed mesh from a body cloud: screened Poisson, then what it made up is marked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bodyscan.errors import ScanFailed
+from bodyscan.fusion.body import BodyCloud, BodyMesh
+from bodyscan.fusion.carving import hints
+from bodyscan.fusion.repair import closed
+from bodyscan.fusion.topology import (
+    face_components,
+    signed_volume,
+    topology,
+    vertex_normals,
+    without_unused,
+)
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.reconstruction.range_image import RangeImage
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+FEWEST_POINTS = 1000
+ROUGH_POINTS = 100_000
+
+
+def mesh(
+    cloud: BodyCloud,
+    range_images: Sequence[RangeImage] = (),
+    rig_from_camera: dict[str, RigidTransform] | None = None,
+    *,
+    depth: int = 9,
+    reach_mm: float = 4.0,
+    workers: int = 2,
+) -> BodyMesh:
+    """One closed manifold surface around a cloud, faces outward.
+
+    range_images: as measured, background and all (not cleaned); with them, gaps that cameras saw
+    through are not webbed over. depth: of the octree; each step halves the cells (about 3.5 mm at
+    9 for a standing person). reach_mm: a vertex farther than this from every point was measured
+    by nobody. Raises ScanFailed if no closed surface comes out.
+    """
+    if len(cloud.points) < FEWEST_POINTS:
+        raise ScanFailed(
+            f"a cloud of {len(cloud.points)} points is too small for a mesh",
+            remedy="Look at the range images; is the subject inside the scan volume?",
+        )
+    tree = cKDTree(cloud.points)
+    points, normals = cloud.points, cloud.normals.astype(np.float64)
+    some = slice(None, None, max(1, len(points) // ROUGH_POINTS))
+    rough = largest_piece(*poisson(points[some], normals[some], depth - 1))
+    made_up = _made_up(*rough, tree, 2.0 * reach_mm)
+    extra = hints(*rough, made_up, tree, range_images, rig_from_camera or {}, workers=workers)
+    points, normals = np.concatenate([points, extra[0]]), np.concatenate([normals, extra[1]])
+    vertices, faces = largest_piece(*poisson(points, normals, depth))
+    found = topology(vertices, faces)
+    if not found.manifold:
+        raise ScanFailed(f"no closed surface came out of the cloud ({found})")
+    return dressed(vertices, faces, cloud, tree, reach_mm)
+
+
+def poisson(points: Array, normals: Array, depth: int) -> tuple[Array, Indices]:
+    """Vertices and faces of Open3D's screened Poisson surface (Kazhdan and Hoppe 2013)."""
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.normals = o3d.utility.Vector3dVector(normals)
+    # More threads would add up in another order each time: other bytes for the same input.
+    surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+        cloud, depth=depth, n_threads=1
+    )
+    return np.asarray(surface.vertices), np.asarray(surface.triangles).astype(np.int64)
+
+
+def largest_piece(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
+    """The connected piece with the most faces, closed and turned to look outwards."""
+    vertices, faces = closed(vertices, faces)
+    labels = face_components(faces, len(vertices))
+    vertices, faces, _ = without_unused(vertices, faces[labels == np.argmax(np.bincount(labels))])
+    return vertices, faces if signed_volume(vertices, faces) > 0 else faces[:, ::-1].copy()
+
+
+def dressed(
+    vertices: Array, faces: Indices, cloud: BodyCloud, tree: cKDTree, reach_mm: float
+) -> BodyMesh:
+    """With normals, the nearest points' colours and sigmas, and which faces were made up."""
+    distance, nearest = (np.asarray(found) for found in tree.query(vertices, workers=2))
+    sigma_mm = cloud.sigma_mm[nearest]
+    sigma_mm[distance > reach_mm] = np.nan
+    return BodyMesh(
+        vertices,
+        faces,
+        vertex_normals(vertices, faces),
+        cloud.colours[nearest],
+        sigma_mm,
+        np.any(np.isnan(sigma_mm)[faces], axis=1),
+    )
+
+
+def _made_up(vertices: Array, faces: Indices, tree: cKDTree, reach_mm: float) -> NDArray[np.bool_]:
+    """(F,) faces with a corner that no point lies near."""
+    distance = np.asarray(tree.query(vertices, distance_upper_bound=reach_mm, workers=2)[0])
+    return np.any(np.isinf(distance)[faces], axis=1)

@@ -1,0 +1,123 @@
+"""A scan's result on disk: `cloud.ply`, `mesh.ply`, and `scan.json`, written last, that vouches."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodyscan import __version__
+from bodyscan.errors import ResultError
+from bodyscan.export.ply import read_ply_cloud, read_ply_mesh, write_ply
+from bodyscan.files import write_json
+from bodyscan.fusion.body import BodyCloud, BodyMesh
+from bodyscan.fusion.scan import Scan
+
+SCHEMA = "bodyscan-scan"
+VERSION = 1
+FILE_NAME = "scan.json"
+CLOUD_NAME, MESH_NAME = "cloud.ply", "mesh.ply"
+
+
+@dataclass(frozen=True, eq=False)
+class StoredScan:
+    """facts: the content of scan.json."""
+
+    cloud: BodyCloud
+    mesh: BodyMesh
+    facts: dict[str, Any]
+
+
+def save_scan(
+    scan: Scan,
+    folder: Path,
+    *,
+    calibration_id: str,
+    subject: str | None,
+    when: datetime | None,
+) -> Path:
+    """Write the body model and what it is into `folder`; returns the path of scan.json."""
+    (folder / FILE_NAME).unlink(missing_ok=True)
+    write_ply(folder / CLOUD_NAME, scan.cloud)
+    write_ply(folder / MESH_NAME, scan.mesh)
+    write_json(
+        folder / FILE_NAME,
+        {
+            "schema": SCHEMA,
+            "version": VERSION,
+            "software": f"bodyscan {__version__}",
+            "units": "mm",
+            "axes": "origin on the floor at the rig's centre, x forward, y to the left, z up",
+            "subject": subject,
+            "when": when.isoformat() if when else None,
+            "calibration_id": calibration_id,
+            "sha256": {name: _sha256(folder / name) for name in (CLOUD_NAME, MESH_NAME)},
+            "counts": {
+                "points": len(scan.cloud.points),
+                "vertices": len(scan.mesh.vertices),
+                "faces": len(scan.mesh.faces),
+                "filled_faces": int(np.count_nonzero(scan.mesh.filled)),
+            },
+            "median_sigma_mm": float(np.nanmedian(scan.cloud.sigma_mm)),
+            "measured": scan.measured,
+            "failed": scan.failed,
+            "alignment": _alignment(scan),
+        },
+    )
+    return folder / FILE_NAME
+
+
+def load_scan(folder: Path) -> StoredScan:
+    """Read what `save_scan` wrote. Raises ResultError if it is missing, incomplete or damaged."""
+    file = folder / FILE_NAME
+    remedy = "scan again, or give the folder that `bodyscan scan` wrote"
+    try:
+        facts = json.loads(file.read_text("utf-8"))
+        for name, digest in facts["sha256"].items():
+            if _sha256(folder / name) != digest:
+                raise ResultError(
+                    "was changed or cut short", where=str(folder / name), remedy=remedy
+                )
+        cloud, mesh = read_ply_cloud(folder / CLOUD_NAME), read_ply_mesh(folder / MESH_NAME)
+    except FileNotFoundError as error:
+        raise ResultError(
+            "there is no such file", where=str(error.filename or file), remedy=remedy
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ResultError(
+            f"is no readable scan result ({type(error).__name__}: {error})",
+            where=str(file),
+            remedy=remedy,
+        ) from error
+    return StoredScan(cloud, mesh, facts)
+
+
+def _alignment(scan: Scan) -> dict[str, Any] | None:
+    if scan.alignment is None:
+        return None
+    alignment = scan.alignment
+    return {
+        "rms_before_mm": _number(alignment.rms_before_mm),
+        "rms_after_mm": _number(alignment.rms_after_mm),
+        "motion_mm": alignment.motion_mm,
+        "refused": alignment.refused,
+        "rig_from_camera": {name: t.matrix for name, t in alignment.rig_from_camera.items()},
+        "overlaps": [
+            {key: _number(value) for key, value in asdict(overlap).items()}
+            for overlap in alignment.overlaps
+        ],
+    }
+
+
+def _number(value: Any) -> Any:
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,0 +1,33 @@
+"""Stripe map to range image: a point, a normal and a sigma for every lit pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.geometry.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class RangeImage:
+    """What one pair saw of a subject, on the camera's pixel grid, camera frame.
+
+    points: (height, width, 3) float32, mm; NaN where nothing was measured.
+    normals: (height, width, 3) float32, unit, towards the camera; NaN likewise.
+    sigma_mm: (height, width) float32, standard deviation of the point along its viewing ray.
+    colours: (height, width) uint8, grey level of the lit image.
+    """
+
+    pair: str
+    camera: Camera
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    sigma_mm: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(height, width): where a point was measured."""
+        return np.isfinite(self.sigma_mm)

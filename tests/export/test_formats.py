@@ -1,0 +1,205 @@
+"""OBJ, STL and GLB as other programs read them, and the JSON beside each file."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from small_bodies import ball, points
+
+from bodyscan import __version__
+from bodyscan.errors import BadInput
+from bodyscan.export.exporting import CLOUD_FORMATS, MESH_FORMATS, Origin, export
+from bodyscan.export.glb import write_glb
+from bodyscan.export.obj import write_obj
+from bodyscan.export.scan import export_scan
+from bodyscan.export.stl import write_stl
+from bodyscan.export.text import fixed, lines, whole
+from bodyscan.fusion.storage import StoredScan
+
+ORIGIN = Origin("S-0042", "3f2a")
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20), st.integers(0, 6))
+def test_fixed_writes_what_python_writes(values: list[float], decimals: int):
+    text = lines([fixed(np.array(values), decimals), "\n"]).decode().split()
+    assert len(text) == len(values)
+    for mine, value in zip(text, values, strict=True):
+        # Ties may round either way, since ours are scaled first: half a unit in the last place.
+        assert float(mine) == pytest.approx(value, abs=0.5000001 * 10.0**-decimals)
+        assert len(mine.partition(".")[2]) == decimals
+        assert mine != "-0"
+        assert not (
+            mine.lstrip("-").startswith("0") and len(mine.partition(".")[0].lstrip("-")) > 1
+        )
+
+
+@given(st.lists(st.integers(0, 10**7), min_size=1, max_size=20))
+def test_whole_writes_what_python_writes(values: list[int]):
+    assert lines(["f ", whole(np.array(values)), "\n"]).decode() == "".join(
+        f"f {value}\n" for value in values
+    )
+
+
+def test_obj(tmp_path: Path):
+    mesh = ball()
+    write_obj(tmp_path / "body.obj", mesh)
+    rows = [line.split() for line in (tmp_path / "body.obj").read_text().splitlines()]
+    vertices = np.array([row[1:] for row in rows if row[0] == "v"], float)
+    normals = np.array([row[1:] for row in rows if row[0] == "vn"], float)
+    faces = [row[1:] for row in rows if row[0] == "f"]
+    # Four places: half a unit in the fourth.
+    np.testing.assert_allclose(vertices[:, :3], mesh.vertices, atol=0.51e-4)
+    np.testing.assert_allclose(vertices[:, 3:] * 255.0, mesh.colours, atol=0.02)
+    np.testing.assert_allclose(normals, mesh.normals, atol=0.51e-4)
+    corners = np.array([[int(corner.split("//")[0]) for corner in face] for face in faces])
+    np.testing.assert_array_equal(corners - 1, mesh.faces)
+    assert all(corner.split("//")[0] == corner.split("//")[1] for face in faces for corner in face)
+    seen = o3d.io.read_triangle_mesh(str(tmp_path / "body.obj"))
+    assert len(seen.vertices) == len(mesh.vertices)  # welded
+    # Open3D's reader numbers vertices as faces name them.
+    order = np.unique(mesh.faces.ravel(), return_index=True)[1].argsort()
+    np.testing.assert_allclose(np.asarray(seen.vertices), mesh.vertices[order], atol=1e-4)
+    colours = np.asarray(seen.vertex_colors) * 255.0
+    np.testing.assert_allclose(colours, mesh.colours[order], atol=0.02)
+
+
+def test_stl(tmp_path: Path):
+    mesh = ball()
+    write_stl(tmp_path / "body.stl", mesh)
+    size = (tmp_path / "body.stl").stat().st_size
+    assert size == 84 + 50 * len(mesh.faces)
+    seen = o3d.io.read_triangle_mesh(str(tmp_path / "body.stl"))
+    corners = np.asarray(seen.vertices)[np.asarray(seen.triangles)]
+    np.testing.assert_allclose(corners, mesh.vertices[mesh.faces], atol=2e-5)  # float32
+    seen.compute_triangle_normals()
+    outward = corners.mean(axis=1) - mesh.vertices.mean(axis=0)
+    assert (np.sum(np.asarray(seen.triangle_normals) * outward, axis=1) > 0).all()
+
+
+def glb_parts(path: Path) -> tuple[dict, bytes]:
+    """The JSON and the binary part, by the standard's own words (glTF 2.0, 4.4)."""
+    data = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    assert size % 4 == 0
+    document = json.loads(data[20 : 20 + size])
+    binary_size, kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert kind == b"BIN\0"
+    assert binary_size % 4 == 0
+    binary = data[28 + size :]
+    assert len(binary) == binary_size == document["buffers"][0]["byteLength"]
+    return document, binary
+
+
+def accessor(document: dict, binary: bytes, number: int) -> np.ndarray:
+    told = document["accessors"][number]
+    view = document["bufferViews"][told["bufferView"]]
+    assert view["byteOffset"] % 4 == 0
+    kind = {5126: "<f4", 5123: "<u2", 5125: "<u4"}[told["componentType"]]
+    width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[told["type"]]
+    values = np.frombuffer(binary, kind, told["count"] * width, view["byteOffset"])
+    assert view["byteLength"] == values.nbytes
+    return values.reshape(-1, width)
+
+
+def test_glb_mesh(tmp_path: Path):
+    mesh = ball()
+    write_glb(tmp_path / "body.glb", mesh)
+    document, binary = glb_parts(tmp_path / "body.glb")
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert primitive["mode"] == 4
+    read = {k: accessor(document, binary, n) for k, n in primitive["attributes"].items()}
+    x, y, z = mesh.vertices.T / 1000.0
+    np.testing.assert_allclose(read["POSITION"], np.stack([y, z, x], axis=1), atol=1e-7)
+    told = document["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_array_equal(told["min"], read["POSITION"].min(axis=0))
+    np.testing.assert_array_equal(told["max"], read["POSITION"].max(axis=0))
+    np.testing.assert_allclose(np.linalg.norm(read["NORMAL"], axis=1), 1.0, atol=1e-6)
+    # Vertex colours are linear light; sRGB's middle grey 188 is half of white.
+    order = np.argsort(mesh.colours[:, 0])
+    half = np.searchsorted(read["COLOR_0"][order, 0], 32768)
+    assert abs(int(mesh.colours[order[half], 0]) - 188) <= 2
+    assert (read["COLOR_0"][:, 3] == 65535).all()
+    np.testing.assert_array_equal(read["_FILLED"][:, 0] == 1.0, np.isnan(mesh.sigma_mm))
+    indices = accessor(document, binary, primitive["indices"])
+    np.testing.assert_array_equal(indices.reshape(-1, 3), mesh.faces)
+    seen = o3d.io.read_triangle_mesh(str(tmp_path / "body.glb"))
+    assert len(seen.triangles) == len(mesh.faces)
+    # The same hand: outward faces stay outward.
+    assert seen.get_volume() > 0
+
+
+def test_glb_cloud(tmp_path: Path):
+    cloud = points()
+    write_glb(tmp_path / "cloud.glb", cloud)
+    document, binary = glb_parts(tmp_path / "cloud.glb")
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0
+    assert "indices" not in primitive
+    position = accessor(document, binary, primitive["attributes"]["POSITION"])
+    np.testing.assert_allclose(position[:, 1] * 1000.0, cloud.points[:, 2], atol=2e-4)
+
+
+@pytest.mark.parametrize("suffix", MESH_FORMATS)
+def test_beside_each_mesh_stands_what_it_is(tmp_path: Path, suffix: str):
+    mesh = ball()
+    export(tmp_path / f"body{suffix}", mesh, ORIGIN)
+    told = json.loads((tmp_path / f"body{suffix}.json").read_text())
+    assert told["units"] == ("m" if suffix == ".glb" else "mm")
+    assert told["axes"]["y"] == ("up" if suffix == ".glb" else "left")
+    assert told["kind"] == "mesh"
+    assert told["vertices"] == len(mesh.vertices)
+    assert told["faces"] == len(mesh.faces)
+    assert told["filled_faces"] == np.count_nonzero(mesh.filled)
+    assert told["subject"] == "S-0042"
+    assert told["calibration_id"] == "3f2a"
+    assert told["software"] == f"bodyscan {__version__}"
+    assert sorted(p.name for p in tmp_path.iterdir()) == [f"body{suffix}", f"body{suffix}.json"]
+
+
+@pytest.mark.parametrize("suffix", CLOUD_FORMATS)
+def test_beside_each_cloud_too(tmp_path: Path, suffix: str):
+    export(tmp_path / f"cloud{suffix}", points(), ORIGIN)
+    told = json.loads((tmp_path / f"cloud{suffix}.json").read_text())
+    assert told["kind"] == "cloud"
+    assert told["points"] == 500
+
+
+@pytest.mark.parametrize(
+    ("name", "body"), [("body.fbx", ball()), ("c.stl", points()), ("c", ball())]
+)
+def test_an_unknown_format_is_refused(tmp_path: Path, name: str, body):
+    with pytest.raises(BadInput, match="cannot be written"):
+        export(tmp_path / name, body, ORIGIN)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_same_body_gives_the_same_bytes(tmp_path: Path):
+    for folder in ("one", "other"):
+        for suffix in MESH_FORMATS:
+            export(tmp_path / folder / f"body{suffix}", ball(), ORIGIN)
+    for path in (tmp_path / "one").iterdir():
+        assert path.read_bytes() == (tmp_path / "other" / path.name).read_bytes()
+
+
+def test_a_scan_in_several_versions(tmp_path: Path):
+    scan = StoredScan(points(), ball(), {"subject": None, "calibration_id": "3f2a"})
+    written = export_scan(scan, tmp_path, ["ply", "STL"], ["full", "open"])
+    names = ["body.ply", "body.stl", "body-open.ply", "body-open.stl"]
+    assert [path.name for path in written] == names
+    assert all(path.is_file() for path in written)
+    told = json.loads((tmp_path / "body-open.ply.json").read_text())
+    assert told["filled_faces"] == 0
+    assert told["subject"] is None
+    for formats, versions in ((["fbx"], ["full"]), (["ply"], ["heavy"])):
+        with pytest.raises(BadInput, match="to export"):
+            export_scan(scan, tmp_path, formats, versions)

@@ -1,0 +1,82 @@
+"""Range images of a body on a floor, with flying pixels: what stays is the body."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ray_cast_scan import Scan, load_rig
+
+from bodyscan.evaluation.surface import signed_distances
+from bodyscan.fusion.cleaning import clean
+from bodyscan.reconstruction.range_image import RangeImage
+
+NOISE_MM = 0.3
+
+
+def distances(scan: Scan, images: list[RangeImage]) -> np.ndarray:
+    points = [
+        scan.rig_from_camera[i.pair].apply(i.points[i.valid][::5].astype(float)) for i in images
+    ]
+    return np.abs(signed_distances(np.concatenate(points), scan.truth.vertices, scan.truth.faces))
+
+
+def test_floor_and_flying_pixels_go_and_the_body_stays(scan: Scan, cleaned: list[RangeImage]):
+    before, after = distances(scan, scan.range_images), distances(scan, cleaned)
+    body, kept = before < 6 * NOISE_MM, after < 6 * NOISE_MM
+    # The scene holds a floor and about 1 % flying pixels.
+    assert np.mean(~body) > 0.2
+    # A flying pixel within a few millimetres of the surface cannot be told from it: 0.1 %.
+    assert np.mean(~kept) < 1e-3
+    assert after.max() < 15.0
+    # Lost for good: rims of surfaces, and what is below the volume's 5 mm.
+    assert kept.sum() > 0.95 * body.sum()
+
+
+def test_only_the_scan_volume_is_kept(scan: Scan, cleaned: list[RangeImage]):
+    volume = load_rig().volume
+    for image in cleaned:
+        x, y, z = scan.rig_from_camera[image.pair].apply(image.points[image.valid].astype(float)).T
+        assert np.hypot(x, y).max() <= volume.radius_mm + 1e-2  # float32 at a metre
+        assert z.min() >= volume.bottom_mm - 1e-2
+
+
+def test_a_speckle_in_the_air_goes(scan: Scan, cleaned: list[RangeImage]):
+    image = cleaned[6]
+    rows, columns = slice(100, 106), slice(40, 46)
+    assert not image.valid[rows, columns].any()
+    points, sigma_mm, normals = image.points.copy(), image.sigma_mm.copy(), image.normals.copy()
+    points[rows, columns] = 1300.0 * image.camera.pixel_rays()[rows, columns]
+    sigma_mm[rows, columns], normals[rows, columns] = NOISE_MM, [0.0, 0.0, -1.0]
+    image = replace(image, points=points, sigma_mm=sigma_mm, normals=normals)
+    volume = load_rig().volume
+    (strict,) = clean([image], scan.rig_from_camera, volume)
+    # 36 pixels of 2.3 mm^2 are less than 150 mm^2, but more than 20 even without their rim.
+    assert not strict.valid[rows, columns].any()
+    (lenient,) = clean([image], scan.rig_from_camera, volume, smallest_patch_mm2=20.0)
+    assert lenient.valid[rows, columns].sum() >= 12
+
+
+def test_the_images_given_are_not_changed(scan: Scan, cleaned: list[RangeImage]):
+    for before, after in zip(scan.range_images, cleaned, strict=True):
+        assert before.pair == after.pair
+        assert before.valid.sum() > after.valid.sum()
+        kept = after.valid
+        np.testing.assert_array_equal(after.points[kept], before.points[kept])
+        assert np.isnan(after.points[~kept]).all()
+
+
+def test_an_image_of_nothing_stays_one(scan: Scan):
+    image = scan.range_images[0]
+    nothing = np.full_like(image.sigma_mm, np.nan)
+    empty = replace(image, sigma_mm=nothing, points=np.full_like(image.points, np.nan))
+    (cleaned,) = clean([empty], scan.rig_from_camera, load_rig().volume)
+    assert not cleaned.valid.any()
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_threads_change_nothing(scan: Scan, cleaned: list[RangeImage], workers: int):
+    again = clean(scan.range_images[:4], scan.rig_from_camera, load_rig().volume, workers=workers)
+    for one, other in zip(again, cleaned, strict=False):
+        np.testing.assert_array_equal(one.points, other.points)

@@ -1,0 +1,162 @@
+"""Quadratic fits on the pixel grid, on planes, spheres and steps whose truth is known exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bodyscan.fusion.smoothing import Surface, smooth
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.reconstruction.range_image import RangeImage
+
+CAMERA = Camera(430.0, 428.0, 0.7, 161.0, 118.0, -0.12, 0.08, 320, 240)
+DISTANCE = 320.0  # a pixel is 0.75 mm wide there, as in the real rigs
+RAYS = CAMERA.pixel_rays()
+POSE = RigidTransform.from_rotation_vector([0.3, -2.0, 0.4], [700.0, -200.0, 900.0])
+
+
+def image_of(depth: np.ndarray, noise_mm: float = 0.0, seed: int = 0) -> RangeImage:
+    """Of depths (h, w), NaN where nothing is; noise along the ray, which sigma_mm tells."""
+    length = np.linalg.norm(RAYS, axis=-1)
+    noise = noise_mm * np.random.default_rng(seed).normal(size=depth.shape)
+    points = RAYS * (depth + noise / length)[..., None]
+    sigma = np.where(np.isfinite(depth), max(noise_mm, 0.05), np.nan)
+    grey = np.full(depth.shape, 128, np.uint8)
+    return RangeImage(
+        "pair",
+        CAMERA,
+        points.astype(np.float32),
+        np.full_like(points, np.nan, np.float32),
+        sigma.astype(np.float32),
+        grey,
+    )
+
+
+def plane_depth(normal: np.ndarray, distance: float = DISTANCE) -> np.ndarray:
+    """Of the plane through (0, 0, distance)."""
+    return distance * normal[2] / (RAYS @ normal)
+
+
+def sphere_depth(radius: float) -> np.ndarray:
+    """Of a sphere whose nearest point is at DISTANCE on the axis; NaN beside it."""
+    centre = np.array([0.0, 0.0, DISTANCE + radius])
+    a, b = np.sum(RAYS**2, axis=-1), RAYS @ centre
+    inside = b * b - a * (centre @ centre - radius**2)
+    return np.where(inside > 0, (b - np.sqrt(np.maximum(inside, 0))) / a, np.nan)
+
+
+def smoothed(image: RangeImage) -> tuple[Surface, np.ndarray, np.ndarray]:
+    """With points and normals in the camera frame, (N, 3), where there are any."""
+    surface = smooth(image, POSE)
+    assert surface is not None
+    there = surface.weight > 0
+    camera_from_rig = POSE.inverse()
+    points = camera_from_rig.apply(surface.points[there].astype(float))
+    return surface, points, camera_from_rig.rotate(surface.normals[there].astype(float))
+
+
+@settings(max_examples=10, deadline=None)
+@given(tilt_x=st.floats(-1.0, 1.0), tilt_y=st.floats(-1.0, 1.0))
+def test_a_plane_stays_exactly_itself(tilt_x: float, tilt_y: float):
+    """Through lens distortion and skew: the inverse depth of a plane is what the fit is made for.
+
+    Not quite affine in pixels, since the lens bends them; the quadratic takes up most of that.
+    """
+    normal = np.array([tilt_x, tilt_y, 1.0]) / np.linalg.norm([tilt_x, tilt_y, 1.0])
+    _, points, normals = smoothed(image_of(plane_depth(normal)))
+    distance = (points - [0.0, 0.0, DISTANCE]) @ normal
+    assert np.abs(distance).max() < 1e-3  # float32 at a metre, and the lens over 9 pixels
+    assert np.abs(normals + normal).max() < 1e-3
+
+
+@pytest.mark.parametrize(("radius", "bias_mm"), [(150.0, 0.003), (50.0, 0.006), (15.0, 0.05)])
+def test_curved_surfaces_are_not_flattened(radius: float, bias_mm: float):
+    """A plane fit over 7 mm would be 4 mm^2 / radius off: 0.03, 0.08 and 0.3 mm."""
+    _, points, normals = smoothed(image_of(sphere_depth(radius)))
+    outward = points - [0.0, 0.0, DISTANCE + radius]
+    off = np.linalg.norm(outward, axis=1) - radius
+    facing = outward[:, 2] < -0.7 * radius  # not the rim, where the sphere turns away
+    assert np.count_nonzero(facing) > 300
+    assert np.abs(off[facing]).max() < bias_mm
+    cosine = np.sum(normals * outward, axis=1) / np.linalg.norm(outward, axis=1)
+    # A slope is off by what the quadratic leaves out, which goes with (window / radius)^2, more so
+    # where the surface runs askew; 0.1 degrees for float32.
+    angle = np.degrees(np.arccos(cosine[facing].clip(-1.0, 1.0)))
+    assert angle.max() < 150.0 * (3.5 / radius) ** 2 + 0.1
+
+
+def test_noise_goes_down_as_sigma_says():
+    noise_mm, normal = 0.3, np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
+    surface, points, _ = smoothed(image_of(plane_depth(normal), noise_mm))
+    distance = (points - [0.0, 0.0, DISTANCE]) @ normal
+    sigma = surface.sigma_mm[surface.weight > 0]
+    # A quadratic over 9 x 9 pixels leaves 1/4 of the noise, and the tilt takes its share.
+    assert np.std(distance) < 0.3 * noise_mm
+    assert abs(np.mean(distance)) < 0.01
+    # About 800 independent windows: their standard deviation is known to 3 %.
+    assert 0.9 < np.std(distance / sigma) < 1.15
+
+
+def test_sigmas_that_promise_too_much_are_corrected():
+    depth = plane_depth(np.array([0.0, 0.0, 1.0]))
+    honest, boastful = image_of(depth, 0.3), image_of(depth, 0.3)
+    boastful.sigma_mm[:] /= 4.0
+    one, other = smooth(honest, POSE), smooth(boastful, POSE)
+    assert one is not None
+    assert other is not None
+    np.testing.assert_allclose(np.nanmedian(other.sigma_mm), np.nanmedian(one.sigma_mm), rtol=0.03)
+
+
+def test_a_step_stays_sharp():
+    """Two planes 12 mm apart meet along a column: neither bends towards the other."""
+    depth = np.full(CAMERA.pixel_rays().shape[:2], DISTANCE)
+    depth[:, 160:] += 12.0
+    surface = smooth(image_of(depth, 0.1), POSE)
+    assert surface is not None
+    points = POSE.inverse().apply(surface.points.astype(float))
+    off = np.abs(points[..., 2] - depth)
+    # One-sided windows keep 0.1 mm noise below 0.1; a bend would show as millimetres.
+    assert np.nanmax(off) < 0.3
+    assert np.isfinite(off[:, 155:165]).mean() > 0.95
+    # Points at the jump count less than those well inside.
+    weight = np.median(surface.weight, axis=0)
+    assert weight[159] < 0.4 * weight[100]
+    assert weight[160] < 0.4 * weight[220]
+
+
+def test_wild_points_are_left_out():
+    depth = plane_depth(np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0]))
+    rng = np.random.default_rng(3)
+    wild = rng.random(depth.shape) < 0.02
+    image = image_of(np.where(wild, depth + rng.uniform(2.0, 10.0, depth.shape), depth), 0.1)
+    surface = smooth(image, POSE)
+    assert surface is not None
+    points = POSE.inverse().apply(surface.points.astype(float))
+    off = np.abs(points[..., 2] - depth)
+    # 0.4 mm are four of the pixels' own sigmas, sixteen of the fits'.
+    assert np.mean(off[~wild & np.isfinite(off)] > 0.4) < 1e-4
+    assert np.isnan(off[wild]).mean() > 0.9
+
+
+def test_small_holes_do_no_harm():
+    depth = sphere_depth(60.0)
+    holes = np.random.default_rng(4).random(depth.shape) < 0.03
+    surface, points, _ = smoothed(image_of(np.where(holes, np.nan, depth)))
+    outward = points - [0.0, 0.0, DISTANCE + 60.0]
+    off = np.linalg.norm(outward, axis=1) - 60.0
+    facing = outward[:, 2] < -0.7 * 60.0
+    # Values put into the holes are off by their curvature, 0.02 mm, and weigh a few per cent.
+    assert np.abs(off[facing]).max() < 0.01
+    assert not (surface.weight[holes[tuple(_box(surface))]] > 0).any()
+
+
+def _box(surface: Surface) -> list[slice]:
+    (column, row), (height, width) = surface.corner, surface.weight.shape
+    return [slice(row, row + height), slice(column, column + width)]
+
+
+def test_an_image_of_nothing_gives_nothing():
+    assert smooth(image_of(np.full((240, 320), np.nan)), POSE) is None

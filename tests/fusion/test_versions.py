@@ -1,0 +1,45 @@
+"""The light and the open version of a body mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.evaluation.surface import deviation, signed_distances
+from bodyscan.fusion.body import BodyMesh
+from bodyscan.fusion.topology import topology
+from bodyscan.fusion.versions import light, measured_only
+
+
+def test_the_light_version_is_close_and_closed(body: BodyMesh):
+    lean = light(body, faces=20_000)
+    assert abs(len(lean.faces) - 20_000) <= 20
+    found = topology(lean.vertices, lean.faces)
+    assert found.manifold
+    assert found.components == 1
+    assert found.volume_mm3 == pytest.approx(
+        topology(body.vertices, body.faces).volume_mm3, rel=2e-3
+    )
+    off = deviation(signed_distances(lean.vertices, body.vertices, body.faces))
+    # Faces of 12 mm: on a radius of 40 mm a flat one is off by up to 0.3 mm.
+    assert off.p95_mm < 0.3
+    assert lean.filled.mean() == pytest.approx(body.filled.mean(), abs=0.05)
+    np.testing.assert_array_equal(lean.filled, np.isnan(lean.sigma_mm)[lean.faces].any(axis=1))
+
+
+def test_a_small_mesh_stays_as_it_is(body: BodyMesh):
+    assert light(body, faces=len(body.faces)) is body
+
+
+def test_the_open_version_is_what_was_measured(body: BodyMesh):
+    measured = measured_only(body)
+    assert len(measured.faces) == np.count_nonzero(~body.filled)
+    assert not measured.filled.any()
+    assert np.isfinite(measured.sigma_mm).all()
+    assert not topology(measured.vertices, measured.faces).closed
+    np.testing.assert_array_equal(
+        measured.vertices[measured.faces], body.vertices[body.faces[~body.filled]]
+    )
+    np.testing.assert_array_equal(
+        measured.colours[measured.faces], body.colours[body.faces[~body.filled]]
+    )
