@@ -14,14 +14,16 @@ from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.sheet_fit import SheetFit, fit_sheets
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 Array = NDArray[np.float64]
 
-CHOICE_BINS = 4000
-FIT_BINS = 25000
-START_BINS = 1500
+CHOICE_BINS, FIT_BINS = 4000, 25000
+START_BINS, START_STEPS, FOLD_STEPS = 1000, 15, 8
+AXIS_STARTS = (-0.5, 0.0, 0.5, 1.0, 1.5)
+"""Where a projector's axis may be, in heights of its image."""
 BINS_A_BOARD = 2
 """So many bins of a boundary make a board count for a free plane."""
 
@@ -73,26 +75,45 @@ def fit_light(data: BoundaryPoints, stripes: int, direction: Axis, camera: Camer
     else:
         fit = fit_planes(bins, stripes, direction, error)
         sheets = fit.planes
-    pairs = np.unique(np.stack([data.index, data.board]), axis=1)
-    seen = np.bincount(pairs[0], minlength=stripes + 1)
-    return LightFit(sheets, figures[chosen].model, figures, fit.rms_mm, error, seen)
+    return LightFit(
+        sheets, figures[chosen].model, figures, fit.rms_mm, error, boards_seen(bins, stripes)
+    )
 
 
 def smooth_models(
     data: BoundaryPoints, stripes: int, direction: Axis
 ) -> list[tuple[str, SmoothSheets]]:
     """The models whose sheets change smoothly with s, simplest first, fitted to binned points."""
-    start = thinned(data, START_BINS)
-    pinhole = fit_pinhole(start.points, start.index.astype(float))
+    few = thinned(data, START_BINS)
+    pinhole = fit_pinhole(few.points, few.index.astype(float))
     plain = pinhole.sheets(data.points, stripes, direction)
-    models: list[tuple[str, SmoothSheets]] = [("pinhole", plain)]
-    lens = plain
-    for terms, name in ((1, "lens k1"), (2, "lens k1 k2"), (4, "lens k1 k2 p1 p2")):
-        lens = fit_sheets(lens.with_lens(terms), data).sheets
-        models.append((name, lens))
-    for terms, name in ((0, "smooth planes"), (1, "bowed sheets"), (3, "bowed sheets, 3 terms")):
-        models.append((name, BowedSheets.of_pinhole(plain, terms)))
+    lens = _lens_start(plain, few)
+    models: list[tuple[str, SmoothSheets]] = [
+        ("pinhole", plain),
+        ("lens k1", lens.with_lens(1)),
+        ("lens k1 k2", lens),
+        ("lens k1 k2 p1 p2", lens.with_lens(4)),
+        ("smooth planes", BowedSheets.of_pinhole(plain, 0)),
+        ("bowed sheets", BowedSheets.of_pinhole(plain, 1)),
+        ("bowed sheets, 3 terms", BowedSheets.of_pinhole(plain, 3)),
+    ]
     return [(name, fit_sheets(model, data).sheets) for name, model in models]
+
+
+def _lens_start(plain: LensSheets, data: BoundaryPoints) -> LensSheets:
+    """A lens fitted from several places of its axis: planes hardly say where it is, and many
+    projectors shine upwards, with their axis at the image's edge or outside."""
+    centres = [plain.parameters[1], *(share * plain.stripes for share in AXIS_STARTS)]
+    starts = [plain.turned(float(centre)).with_lens(2) for centre in centres]
+    fits = [fit_sheets(start, data, most_steps=START_STEPS) for start in starts]
+    return min(fits, key=lambda fit: fit.noise).sheets
+
+
+def boards_seen(data: BoundaryPoints, stripes: int) -> NDArray[np.int64]:
+    """(S + 1,) on how many boards each boundary was seen."""
+    boards = int(data.board.max(initial=0)) + 1
+    points = np.bincount(data.index * boards + data.board, minlength=(stripes + 1) * boards)
+    return np.count_nonzero(points.reshape(stripes + 1, boards), axis=1).astype(np.int64)
 
 
 def fit_planes(
@@ -105,7 +126,10 @@ def fit_planes(
 
 
 def _smooth_candidate(name: str, start: SmoothSheets) -> Candidate:
-    return Candidate(name, lambda data: fit_sheets(start, data, board_error_mm=1.0).sheets)
+    def fit(data: BoundaryPoints) -> LightSheets:
+        return fit_sheets(start, data, board_error_mm=1.0, most_steps=FOLD_STEPS).sheets
+
+    return Candidate(name, fit)
 
 
 def _planes_candidate(stripes: int, direction: Axis) -> Candidate:

@@ -13,7 +13,6 @@ from scipy.optimize import least_squares
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import Axis, LightPlanes
-from bodyscan.geometry.transforms import RigidTransform
 
 Array = NDArray[np.float64]
 
@@ -33,17 +32,8 @@ class PinholeProjector:
         return above / below
 
     def sheets(self, points: Array, stripes: int, direction: Axis) -> LensSheets:
-        """The same model as a projector without lens that shines at points (N, 3) on boards.
-
-        Where its centre lies along the stripes is not known: opposite the points' middle.
-        """
-        matrix, rotation, translation = _as_camera(self)
-        middle = points.mean(axis=0)
-        translation[0] = -float(rotation[0] @ middle)
-        projector_from_camera = RigidTransform(rotation, translation.ravel())
-        return LensSheets.pinhole(
-            projector_from_camera, middle, stripes, direction, matrix[1, 1], matrix[1, 2]
-        )
+        """The same model as a projector without lens that shines at points (N, 3) on boards."""
+        return LensSheets.pinhole(self.matrix, points.mean(axis=0), stripes, direction)
 
     def planes(self, stripes: int, direction: Axis) -> LightPlanes:
         """The same model as light planes: all share one line, the projector's centre lies on it."""

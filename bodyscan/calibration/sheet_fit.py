@@ -27,11 +27,16 @@ a mean was taken over."""
 
 @dataclass(frozen=True, eq=False)
 class SheetFit(Generic[Sheets]):
-    """sheets with their covariance; distances (N,) mm of the points to them; robust weights (N,)."""
+    """sheets with their covariance.
+
+    distances_mm: (N,) of the points to them.  weights: (N,), robust.  noise: robust spread of the
+    distances, in the points' own standard deviations.
+    """
 
     sheets: Sheets
     distances_mm: Array
     weights: Array
+    noise: float
 
     @property
     def rms_mm(self) -> float:
@@ -54,7 +59,11 @@ class _Equations:
 
 
 def fit_sheets(
-    start: Sheets, data: BoundaryPoints, *, board_error_mm: float = 0.0
+    start: Sheets,
+    data: BoundaryPoints,
+    *,
+    board_error_mm: float = 0.0,
+    most_steps: int = MOST_STEPS,
 ) -> SheetFit[Sheets]:
     """Levenberg-Marquardt on the points' offsets from their sheets, Cauchy loss, prior of the model.
 
@@ -63,7 +72,7 @@ def fit_sheets(
     """
     sheets, damping = start, 1e-6
     equations = _equations(sheets, data)
-    for _ in range(MOST_STEPS):
+    for _ in range(most_steps):
         cost = _cost(sheets, data, equations)
         for _ in range(8):
             step = -_solve(equations.normal, equations.gradient, damping)
@@ -81,7 +90,9 @@ def fit_sheets(
     by_point = equations.offset.by_point
     distances = equations.offset.value / np.linalg.norm(by_point, axis=1)
     covariance = _covariance(equations, data, board_error_mm)
-    return SheetFit(sheets.with_covariance(covariance), distances, equations.weights)
+    return SheetFit(
+        sheets.with_covariance(covariance), distances, equations.weights, equations.noise
+    )
 
 
 def _equations(sheets: SmoothSheets, data: BoundaryPoints) -> _Equations:

@@ -15,7 +15,10 @@ from bodyscan.capture.rig import Board
 
 Array = NDArray[np.float64]
 
+MIN_CORNERS = 4
+MIN_CORNERS_FOR_LENS = 12
 RANSAC_SHARE_OF_SQUARE = 0.15
+ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,30 +66,62 @@ def _locate_face(
         return None
     board_map, inliers = fit
     nearby = _corners_beside(board, printed[of_face[inliers]].mean(axis=1))
-    if not len(nearby):
+    if len(nearby) < MIN_CORNERS:
         return None
-    points = boards.corner_points(board.model_copy(update={"faces": 1}))[nearby, :2]
-    gap = (1.0 - (board.marker_mm or 0.0) / board.square_mm) / 2.0
-    along = board.square_mm * board_map.jacobian(points)
-    pixels, good = refine_corners(image, board_map.apply(points), along, marker_gap=gap)
+    pixels, good = _refine(image, board, board_map, nearby, printed)
     ids = nearby[good] + face * boards.corners_per_face(board)
     return SightedCorners(ids, pixels[good], boards.corners_per_face(board))
+
+
+def _refine(
+    image: NDArray[np.uint8],
+    board: Board,
+    board_map: BoardMap,
+    corner_ids: NDArray[np.int64],
+    markers: Array,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Corners fitted where the markers say they are; then, as corners say it better than
+    markers, once more where the corners found say that those not found must be."""
+    points = boards.corner_points(board.model_copy(update={"faces": 1}))[corner_ids, :2]
+    gap = (1.0 - (board.marker_mm or 0.0) / board.square_mm) / 2.0
+    marked = np.floor(markers[0].mean(axis=0) / board.square_mm).astype(int).sum()
+    row, column = np.divmod(corner_ids, board.columns - 1)
+    bright_diagonal = (row + column + marked) % 2 == 0
+
+    def refine(at: BoardMap) -> tuple[Array, NDArray[np.bool_]]:
+        along = board.square_mm * at.jacobian(points)
+        return refine_corners(image, at.apply(points), along, bright_diagonal, marker_gap=gap)
+
+    pixels, good = refine(board_map)
+    if good.sum() >= MIN_CORNERS_FOR_LENS:
+        again, good_again = refine(fit_board_map(points[good], pixels[good]))
+        pixels = np.where(good[:, None], pixels, again)
+        good = good | good_again
+    return pixels, good
 
 
 def _fit_markers(
     printed: Array, corners: Array, board: Board
 ) -> tuple[BoardMap, NDArray[np.bool_]] | None:
-    """Where the print appears, and which markers (M,) agree on it; None if no two do."""
+    """Where the print appears, and which markers (M,) agree on it; None if no two do.
+
+    A homography picks those that agree; a lens that bends the board's far parts away from it is
+    followed in a few rounds.
+    """
     size = np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
     tolerance = max(2.0, RANSAC_SHARE_OF_SQUARE * size * board.square_mm / (board.marker_mm or 1))
     points, pixels = printed.reshape(-1, 2), corners.reshape(-1, 2)
     _, mask = cv2.findHomography(points, pixels, cv2.RANSAC, tolerance)
     if mask is None:
         return None
-    inliers = mask.reshape(-1, 4).all(axis=1)
-    if inliers.sum() < 2:
-        return None
-    return fit_board_map(printed[inliers].reshape(-1, 2), corners[inliers].reshape(-1, 2)), inliers
+    agree = mask.reshape(-1, 4).all(axis=1)
+    for _ in range(ROUNDS):
+        if agree.sum() < 2:
+            return None
+        board_map = fit_board_map(printed[agree].reshape(-1, 2), corners[agree].reshape(-1, 2))
+        error = np.linalg.norm(board_map.apply(printed) - corners, axis=-1)
+        agree = (error < tolerance).all(axis=1)
+    return (board_map, agree) if agree.sum() >= 2 else None
 
 
 def _corners_beside(board: Board, centres: Array) -> NDArray[np.int64]:

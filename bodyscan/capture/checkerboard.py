@@ -29,14 +29,16 @@ def find_checkerboard(image: Image, board: Board) -> SightedCorners | None:
     """All inner corners of a checkerboard seen whole, numbered by the convention above."""
     _refuse_square(board)
     printed = boards.corner_points(board.model_copy(update={"faces": 1}))[:, :2]
+    row, column = np.divmod(np.arange(len(printed)), board.columns - 1)
+    even = (row + column) % 2 == 0
     for candidate in _candidates(image, board):
-        pixels = _numbered_as_printed(image, board, candidate, printed)
+        pixels, first_is_black = _numbered_as_printed(image, board, candidate, printed)
         board_map = fit_board_map(printed, pixels)
         error = board_map.apply(printed) - pixels
         if not np.sqrt(np.mean(np.sum(error**2, axis=-1))) < CONSISTENT_PX:
             continue
         along = board.square_mm * board_map.jacobian(printed)
-        refined, good = refine_corners(image, pixels, along)
+        refined, good = refine_corners(image, pixels, along, even != first_is_black)
         if good.mean() >= MIN_SHARE_OF_CORNERS:
             ids = np.flatnonzero(good).astype(np.int64)
             return SightedCorners(ids, refined[good], len(printed))
@@ -73,17 +75,23 @@ def _sector_based(image: Image, size: tuple[int, int]) -> Array | None:
     return np.asarray(corners, float).reshape(-1, 2) if found else None
 
 
-def _numbered_as_printed(image: Image, board: Board, corners: Array, printed: Array) -> Array:
-    """Corners (N, 2) in the print's order: never mirrored, first square black where that tells."""
+def _numbered_as_printed(
+    image: Image, board: Board, corners: Array, printed: Array
+) -> tuple[Array, bool]:
+    """Corners (N, 2) in the print's order, and whether its first square is black.
+
+    Never mirrored; from the end where the first square is black if the other end has it white.
+    """
     grid = corners.reshape(board.rows - 1, board.columns - 1, 2)
     across = (grid[:, -1] - grid[:, 0]).mean(axis=0)
     down = (grid[-1] - grid[0]).mean(axis=0)
     if across[0] * down[1] - across[1] * down[0] < 0:
         grid = grid[:, ::-1]
     pixels = grid.reshape(-1, 2)
-    if (board.columns + board.rows) % 2 and not _first_is_black(image, board, pixels, printed):
-        pixels = pixels[::-1]
-    return np.ascontiguousarray(pixels)
+    first_is_black = _first_is_black(image, board, pixels, printed)
+    if (board.columns + board.rows) % 2 and not first_is_black:
+        pixels, first_is_black = pixels[::-1], True
+    return np.ascontiguousarray(pixels), first_is_black
 
 
 def _first_is_black(image: Image, board: Board, pixels: Array, printed: Array) -> bool:

@@ -55,19 +55,26 @@ class _Patches:
 
 
 def refine_corners(
-    image: NDArray[np.uint8], start: Array, along: Array, *, marker_gap: float | None = None
+    image: NDArray[np.uint8],
+    start: Array,
+    along: Array,
+    bright_diagonal: Mask,
+    *,
+    marker_gap: float | None = None,
 ) -> tuple[Array, Mask]:
-    """Corners (N, 2) px from starts a few pixels off, and which of them can be trusted (N,).
+    """Corners (N, 2) px from starts about a pixel off, and which of them can be trusted (N,).
 
     along: (N, 2, 2) px, columns: one square along the print's x, one along its y, so that no
-    neighbouring edge enters.  marker_gap: on a ChArUco board the white rim around a marker, in
-    squares; the window then is a cross that stays clear of the markers.
+    neighbouring edge enters.  bright_diagonal: (N,) whether the white squares at a corner are the
+    one before it in x and y and the one behind it in both, or the other two.  marker_gap: on a
+    ChArUco board the white rim around a marker, in squares; markers stay out of the windows.
     """
     if not len(start):
         return start, np.zeros(0, bool)
-    patches = _patches(image, start, along, marker_gap)
+    patches = _patches(image, start, along, bright_diagonal, marker_gap)
     fitted, residual = _fit(patches, start, along)
-    pixels, contrast = fitted[:, :2], np.abs(fitted[:, 5])
+    # b is the brightness of the squares where one edge distance is negative: not the diagonal.
+    pixels, contrast = fitted[:, :2], np.where(bright_diagonal, -fitted[:, 5], fitted[:, 5])
     good = patches.weight.sum(axis=1) >= MIN_PIXELS
     good &= np.linalg.norm(pixels - start, axis=1) < MAX_MOVE_PX
     good &= (contrast > MIN_CONTRAST) & (residual < MAX_RESIDUAL * contrast)
@@ -75,7 +82,11 @@ def refine_corners(
 
 
 def _patches(
-    image: NDArray[np.uint8], start: Array, along: Array, marker_gap: float | None
+    image: NDArray[np.uint8],
+    start: Array,
+    along: Array,
+    bright_diagonal: Mask,
+    marker_gap: float | None,
 ) -> _Patches:
     """The pixels of a square window that belong to the four squares around each corner."""
     radius = int(np.ceil(MAX_RADIUS_PX))
@@ -90,11 +101,12 @@ def _patches(
     weight = inside & np.all(np.abs(squares) < WINDOW_SQUARES, axis=-1)
     weight &= np.sum(from_corner**2, axis=-1) <= MAX_RADIUS_PX**2
     if marker_gap is not None:
-        # Distance in px from the nearer of the two edges through the corner, and where markers begin.
+        # Distances in px from the two edges through the corner, and where markers begin.
         lengths = np.abs(np.linalg.det(along))[:, None] / np.linalg.norm(along, axis=1)[:, ::-1]
         from_edge = np.abs(squares) * lengths[:, None]
         clear = np.maximum(marker_gap * lengths - CLEAR_OF_MARKER_PX, MIN_ARM_PX)
-        weight &= np.any(from_edge < clear[:, None], axis=-1)
+        white = (squares.prod(axis=-1) > 0) == bright_diagonal[:, None]
+        weight &= np.any(from_edge < clear[:, None], axis=-1) | ~white
     return _Patches(place, image[row, column].astype(float), weight.astype(float))
 
 

@@ -14,16 +14,13 @@ Indices = NDArray[np.int64]
 
 
 def closed(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
-    """Faces at edges that are no edges of a surface go, surfaces that only touch are parted, holes
-    are closed with fans of triangles.
+    """Vertices (V, 3) and faces (F, 3) of a closed manifold surface made from nearly one.
 
-    A surface extracted from an octree has a few such places; a closed manifold stays as it is.
+    Faces at edges that more than two share go, surfaces that touch in a vertex are parted, holes
+    are closed with fans of triangles. An octree's surface has a few such places; a closed
+    manifold stays as it is, but for the numbers of its vertices.
     """
-    for _ in range(len(faces)):
-        bad = _unsound(faces, len(vertices))
-        if not bad.any():
-            break
-        faces = faces[~bad]
+    faces = faces[~_unsound(faces, len(vertices))]
     labels, count = corner_fans(faces)
     parted = np.empty((count, 3))
     parted[labels] = vertices[faces.ravel()]

@@ -71,18 +71,18 @@ def scan(
             "nobody stands in the scan volume",
             remedy="look at the lit images; check `volume` in the rig file",
         )
-    placing = calibration.rig_from_camera
+    placing = dict(calibration.rig_from_camera)
     alignment = None
     if settings.alignment is not None and len(seen) > 1:
         progress("aligning", 0, 1)
         alignment = align(seen, placing, calibration.covariance, settings.alignment)
-        placing = alignment.rig_from_camera
+        placing |= alignment.rig_from_camera
         progress("aligning", 1, 1)
     progress("merging", 0, 1)
     cloud = merge(seen, placing, points=settings.points)
     progress("merging", 1, 1)
     progress("meshing", 0, 1)
-    surface = mesh(cloud)
+    surface = mesh(cloud, images, placing)
     progress("meshing", 1, 1)
     measured = {image.pair: int(image.valid.sum()) for image in cleaned}
     return Scan(cloud, surface, alignment, measured, failed)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
-from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.transforms import RigidTransform, skew
 
 Array = NDArray[np.float64]
 
@@ -32,25 +32,19 @@ ASIDE = 0.3
 class LensSheets(SmoothSheets):
     """parameters: f, c (stripes), then as many of k1, k2, p1, p2 as the lens has.
 
-    The freedoms of a fit: a small motion of the projector's frame (`RigidTransform.moved`), then
-    the parameters.
+    The freedoms of a fit: a small motion of the projector's frame (rotation vector, translation in
+    mm, put before it), then the parameters.
     """
 
     @staticmethod
-    def pinhole(
-        projector_from_camera: RigidTransform,
-        middle: Array,
-        stripes: int,
-        direction: Axis,
-        focal: float,
-        centre: float,
-    ) -> LensSheets:
-        """A projector without a lens."""
-        size = FRAME + SCALE
-        return LensSheets(
-            projector_from_camera, middle, stripes, direction,
-            np.array([focal, centre]), np.full((size, size), np.nan),
-        )  # fmt: skip
+    def pinhole(matrix: Array, middle: Array, stripes: int, direction: Axis) -> LensSheets:
+        """Without a lens, s = (row 0 . X) / (row 1 . X) with matrix (2, 4), X homogeneous, camera
+        frame. Where the centre lies along the stripes it does not say: opposite the middle."""
+        frame, scale = _frame_and_scale(matrix[0], matrix[1], 0.0)
+        opposite = frame.translation - [frame.apply(middle)[0], 0.0, 0.0]
+        frame, size = RigidTransform(frame.rotation, opposite), FRAME + SCALE
+        unknown = np.full((size, size), np.nan)
+        return LensSheets(frame, middle, stripes, direction, scale, unknown)
 
     @property
     def kind(self) -> str:
@@ -64,6 +58,14 @@ class LensSheets(SmoothSheets):
         size = FRAME + len(parameters)
         return replace(self, parameters=parameters, covariance=np.full((size, size), np.nan))
 
+    def turned(self, centre: float) -> LensSheets:
+        """Turned about the line along its stripes, so that its axis passes through s = centre."""
+        focal, now = self.parameters[:SCALE]
+        turn = np.array([np.arctan((centre - now) / focal), 0.0, 0.0])
+        frame = RigidTransform.from_rotation_vector(turn, np.zeros(3)) @ self.projector_from_camera
+        parameters = np.append([focal, centre], self.parameters[SCALE:])
+        return replace(self, projector_from_camera=frame, parameters=parameters)
+
     def prior(self) -> tuple[Array, Array]:
         lens = self.parameters[SCALE:]
         x, y, z = self.projector_from_camera.apply(self.middle)
@@ -74,11 +76,17 @@ class LensSheets(SmoothSheets):
         return np.append(x / (ASIDE * z), lens / spread), jacobian
 
     def retract(self, step: Array) -> LensSheets:
-        return replace(
-            self,
-            projector_from_camera=self.projector_from_camera.moved(step[:FRAME]),
-            parameters=self.parameters + step[FRAME:],
-        )
+        """The step is taken in the 2 x 4 matrix of the projector without its lens: there the
+        valley in which frame, f and c make up for one another is straight."""
+        rows = self.projector_from_camera.matrix[:3]
+        turn = skew(step[:3]) @ rows
+        turn[:, 3] += step[3:FRAME]
+        (focal, centre), (more_focal, more_centre) = self.parameters[:SCALE], step[FRAME:][:SCALE]
+        above = (focal + more_focal) * rows[1] + (centre + more_centre) * rows[2]
+        above += focal * turn[1] + centre * turn[2]
+        frame, scale = _frame_and_scale(above, rows[2] + turn[2], rows[0, 3] + turn[0, 3])
+        lens = self.parameters[SCALE:] + step[FRAME + SCALE :]
+        return replace(self, projector_from_camera=frame, parameters=np.append(scale, lens))
 
     def at(self, s: Array) -> Array:
         return s
@@ -112,3 +120,15 @@ class LensSheets(SmoothSheets):
             reach,
             jacobian,
         )
+
+
+def _frame_and_scale(above: Array, below: Array, x: float) -> tuple[RigidTransform, Array]:
+    """projector_from_camera and (f, c) of s = (above . X) / (below . X); x: of its translation."""
+    above, below = above / np.linalg.norm(below[:3]), below / np.linalg.norm(below[:3])
+    axis, centre = below[:3], float(above[:3] @ below[:3])
+    down = above[:3] - centre * axis
+    focal = float(np.linalg.norm(down))
+    down = down / focal
+    rotation = np.stack([np.cross(down, axis), down, axis])
+    translation = np.array([x, (above[3] - centre * below[3]) / focal, below[3]])
+    return RigidTransform(rotation, translation), np.array([focal, centre])

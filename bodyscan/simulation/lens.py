@@ -82,7 +82,7 @@ def sampled_directions(
     camera: TrueCamera, count: int, rng: np.random.Generator, rows: slice
 ) -> NDArray[np.float32]:
     """Rays of some rows, (rows * width * count^2, 3) float32; each pixel shifts its samples."""
-    shift = rng.random((camera.height, camera.width, 1, 2))[rows]
+    shift = rng.random((*camera.grid(rows).shape[:2], 1, 2))
     inside = np.mod(sample_offsets(count) + shift, 1.0) - 0.5
     pixels = camera.grid(rows)[:, :, None, :] + inside
     return camera.directions(pixels.reshape(-1, 2)).astype(np.float32)

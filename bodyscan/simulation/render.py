@@ -1,24 +1,30 @@
-"""From a scene, a camera and a projector to images: light by rays, then lens and sensor."""
+"""From a scene, a camera and a projector to images: rays, light, and what the lens makes of it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.capture.rig import FrameNames
-from bodyscan.simulation.gray import PAD, LightTable, bit_count, code_bits, light_table, table_index
+from bodyscan.simulation.gray import (
+    PAD,
+    LightTable,
+    bit_count,
+    code_bits,
+    light_table,
+    table_index,
+)
 from bodyscan.simulation.lens import TrueCamera, sampled_directions
 from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene, dot
-from bodyscan.simulation.settings import Noise, Optics, Projection
+from bodyscan.simulation.sensor import blurred, off_focus, shade, speckled
+from bodyscan.simulation.settings import Optics, Projection
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
-Image = NDArray[np.uint8]
 
 _BAND = 250_000
 _DEFOCUS_STEPS = 12
@@ -37,29 +43,31 @@ class View:
 
     @staticmethod
     def of(camera: TrueCamera, optics: Optics, rng: np.random.Generator) -> View:
+        """Rays through places inside each pixel that `rng` shifts."""
         rows = max(1, _BAND // (camera.width * optics.samples**2))
-        seed = int(rng.integers(1 << 62))
-        bands = [slice(r, min(r + rows, camera.height)) for r in range(0, camera.height, rows)]
-        shifted = [
-            (band, sampled_directions(camera, optics.samples, np.random.default_rng(seed), band))
-            for band in bands
-        ]
-        return View(camera, optics, tuple(shifted))
+        cuts = [slice(r, min(r + rows, camera.height)) for r in range(0, camera.height, rows)]
+        bands = [(cut, sampled_directions(camera, optics.samples, rng, cut)) for cut in cuts]
+        return View(camera, optics, tuple(bands))
 
 
 @dataclass(frozen=True)
 class Lamps:
-    """How bright: grey level of a white surface facing the projector at reach_mm, and what the
-    room's light makes of a white surface."""
+    """How bright, and where it is sharp.
+
+    laser_grey: grey level of a white surface that faces the projector at reach_mm.
+    ambient_grey: what the room's own light makes of a white surface.
+    focus_mm: distance at which the projector and the camera are focused.
+    """
 
     laser_grey: float
     ambient_grey: float
     reach_mm: float
+    focus_mm: float
 
 
 @dataclass(frozen=True, eq=False)
 class PixelTruth:
-    """What lies at each pixel's centre. depth: (height, width) mm, NaN where nothing is.
+    """What lies at each pixel's centre. depth: (height, width) mm along z, NaN where nothing is.
 
     s: stripe coordinate, NaN where no light of the projector arrives.
     """
@@ -70,15 +78,13 @@ class PixelTruth:
 
 def frame_names(frames: FrameNames, bits: int) -> tuple[list[str], list[str]]:
     """Names of the patterns and of their inverses, as the rig file has them."""
-    return _names(frames.pattern, bits), _names(frames.inverse, bits)
 
+    def names(template: str | tuple[str, ...]) -> list[str]:
+        if isinstance(template, str):
+            return [template.format(bit=bit) for bit in range(bits)]
+        return list(template[:bits])
 
-def _names(template: str | tuple[str, ...], bits: int) -> list[str]:
-    if isinstance(template, str):
-        return [template.format(bit=bit) for bit in range(bits)]
-    if len(template) != bits:
-        raise ValueError(f"{len(template)} frame names are given for {bits} patterns")
-    return list(template)
+    return names(frames.pattern), names(frames.inverse)
 
 
 def render_pair(
@@ -92,24 +98,36 @@ def render_pair(
     frames: FrameNames | None = None,
     sequence: bool = True,
 ) -> dict[str, Floats]:
-    """Noiseless images, (height, width) float32 grey levels, by frame name.
+    """Images without sensor noise, (height, width) float32 grey levels, by frame name.
 
+    scene: in the camera's frame.  rng: for the laser's jitter and speckle.
     With `sequence` the whole stripe sequence (lit, dark, patterns, inverses), else lit alone.
+    `sensor.expose` makes 8-bit images of them.
     """
     frames = frames or FrameNames()
     tables = _tables(projector.stripes, projection, rng, frames, sequence)
-    height, width = view.camera.height, view.camera.width
-    images = {name: np.zeros((height, width), np.float32) for name in (*tables, "")}
+    shape = (view.camera.height, view.camera.width)
+    laser = {name: np.zeros(shape, np.float32) for name in tables}
+    ambient, depth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     samples = view.optics.samples**2
     for rows, directions in view.bands:
         hits = scene.cast(directions)
         weight, s = laser_light(scene, hits, projector, lamps)
         index = table_index(s, projector.stripes, _blur_rows(hits, projection, lamps))
         for name, table in tables.items():
-            images[name][rows] = _pixels(weight, table.at(index), samples).reshape(-1, width)
-        ambient = _pixels(hits.albedo, np.full_like(s, lamps.ambient_grey), samples)
-        images[""][rows] = ambient.reshape(-1, width)
-    return _finished(images, view, projection, frames, rng, sequence)
+            laser[name][rows] = _pixels(weight, table.at(index), samples).reshape(-1, shape[1])
+        white = np.full_like(s, lamps.ambient_grey)
+        ambient[rows] = _pixels(hits.albedo, white, samples).reshape(-1, shape[1])
+        depth[rows] = hits.depth.reshape(-1, samples).min(axis=1).reshape(-1, shape[1])
+    if sequence and frames.dark is not None:
+        laser[frames.dark] = np.zeros(shape, np.float32)
+    shading, focus = shade(view.camera, view.optics), off_focus(depth, lamps.focus_mm)
+    return {
+        name: blurred(
+            (speckled(light, projection.speckle, rng) + ambient) * shading, view.optics, focus
+        )
+        for name, light in laser.items()
+    }
 
 
 def _pixels(weight: Floats, light: Floats, samples: int) -> Floats:
@@ -142,19 +160,11 @@ def pixel_truth(scene: Scene, camera: TrueCamera, projector: Projector) -> Pixel
     directions = camera.directions(camera.grid()).reshape(-1, 3)
     hits = scene.cast(directions.astype(np.float32))
     depth = np.where(np.isfinite(hits.depth), hits.depth, np.nan).astype(float)
-    weight, _ = laser_light(scene, hits, projector, Lamps(1.0, 0.0, 1000.0))
+    weight, _ = laser_light(scene, hits, projector, Lamps(1.0, 0.0, 1.0, 1.0))
     s = projector.stripe(directions * depth[:, None])
     lit = (weight > 0) & (s >= 0) & (s <= projector.stripes)
     shape = (camera.height, camera.width)
     return PixelTruth(depth.reshape(shape), np.where(lit, s, np.nan).reshape(shape))
-
-
-def expose(image: Floats, noise: Noise, rng: np.random.Generator) -> Image:
-    """What the sensor makes of a noiseless image: shot and read noise, 8 bits."""
-    electrons = noise.electrons_per_grey * noise.photons
-    spread = np.sqrt(np.maximum(image, 0.0) / electrons + noise.read_grey**2)
-    noisy = image + spread * rng.standard_normal(image.shape, dtype=np.float32)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
 def _tables(
@@ -191,56 +201,15 @@ def _lit_stripes(stripes: int) -> NDArray[np.bool_]:
 
 def _blurs(projection: Projection) -> Array:
     """Standard deviations in stripes, from the best focus to the worst."""
-    steps = _DEFOCUS_STEPS if projection.defocus_stripes > 0 else 1
-    worst = projection.defocus_stripes * np.arange(steps) / max(steps - 1, 1) * 2.0
-    return np.hypot(projection.blur_stripes, worst)
+    if projection.defocus_stripes <= 0:
+        return np.array([projection.blur_stripes])
+    steps = np.linspace(0.0, projection.defocus_stripes, _DEFOCUS_STEPS)
+    return np.hypot(projection.blur_stripes, steps)
 
 
 def _blur_rows(hits: Hits, projection: Projection, lamps: Lamps) -> NDArray[np.int32] | None:
-    """Which of `_blurs` holds at each hit."""
+    """Which of `_blurs` holds at each hit; its distance to the projector is about its depth."""
     if projection.defocus_stripes <= 0:
         return None
-    depth = np.where(np.isfinite(hits.depth), hits.depth, lamps.reach_mm)
-    off = np.abs(lamps.reach_mm / depth - 1.0) * 2.0
-    step = np.rint(off * (_DEFOCUS_STEPS - 1) / 2.0)
-    return np.minimum(step, _DEFOCUS_STEPS - 1).astype(np.int32)
-
-
-def _finished(
-    images: dict[str, Floats],
-    view: View,
-    projection: Projection,
-    frames: FrameNames,
-    rng: np.random.Generator,
-    sequence: bool,
-) -> dict[str, Floats]:
-    """Speckle, ambient light, vignetting and the lens's blur put on."""
-    ambient = images.pop("")
-    shade = _vignette(view)
-    done = {}
-    for name, image in images.items():
-        if projection.speckle > 0:
-            image = image * _speckle(image.shape, projection.speckle, rng)
-        done[name] = _blurred((image + ambient) * shade, view.optics.blur_px)
-    if sequence and frames.dark is not None:
-        done[frames.dark] = _blurred(ambient * shade, view.optics.blur_px)
-    return done
-
-
-def _speckle(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Floats:
-    """Brightness factors of mean 1: a gamma distribution, as speckle averaged over a pixel has."""
-    return rng.standard_gamma(1.0 / size**2, shape, dtype=np.float32) * np.float32(size**2)
-
-
-def _vignette(view: View) -> Floats | float:
-    if view.optics.vignetting <= 0:
-        return 1.0
-    directions = view.camera.directions(view.camera.grid())
-    cosine = 1.0 / np.linalg.norm(directions, axis=-1)
-    return (1.0 - view.optics.vignetting * (1.0 - cosine**4)).astype(np.float32)
-
-
-def _blurred(image: Floats, sigma: float) -> Floats:
-    if sigma <= 0:
-        return image
-    return cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101)
+    off = off_focus(hits.depth, lamps.focus_mm)
+    return np.rint(off * (_DEFOCUS_STEPS - 1)).astype(np.int32)

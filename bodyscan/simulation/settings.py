@@ -16,6 +16,8 @@ class Optics:
     skew_px: gamma.  centre_px: standard deviation of the principal point about the middle.
     k1, k2 and their standard deviations: Eq. 3-4, in normalized coordinates.
     blur_px: standard deviation of the lens's point spread, px of the image as it is (not scaled).
+    defocus_px: what is added to it (in quadrature) at half the working distance; it
+    grows as |working distance / distance - 1|.
     vignetting: 0 none, 1 the full cos^4 law.
     samples: the image is sampled at samples x samples points a pixel.
     position_mm, angle_deg: standard deviation, for each axis, of the true placing about the
@@ -32,6 +34,7 @@ class Optics:
     k2: float = 0.05
     k2_spread: float = 0.02
     blur_px: float = 0.6
+    defocus_px: float = 0.0
     vignetting: float = 0.0
     samples: int = 3
     position_mm: float = 10.0
@@ -45,13 +48,13 @@ class Projection:
     kind: `mirror`, a laser sheet swept by a rotating mirror whose surface lies off its axis, or
     `pinhole`, a projector with a lens (k1, k2 bend its sheets).
     mirror_offset_mm: the mirror's surface lies this far off its axis (lowest, highest).
-    laser_mm: from the axis to the laser's apex.  sheet_tilt_deg: standard deviation of the angle
-    of the sheet against the axis.  aim_mm: standard deviation of how far the sheet misses the axis.
+    laser_mm: from the axis to the laser's apex.  sheet_tilt_deg: the laser sheet's angle
+    against the axis, give or take 30 %.  aim_mm: standard deviation of how far it misses the axis.
     near, far: the sweep covers the image between these distances, in working distances.
     margin: share of the sweep added at each end.
     blur_stripes: standard deviation of the light's spread across the stripes, in stripes.
-    defocus_stripes: what is added to it (in quadrature) at a distance of twice or half the working
-    distance; grows with |1/d - 1/working distance|.
+    defocus_stripes: what is added to it (in quadrature) at half the working distance; it
+    grows as |working distance / distance - 1|.
     jitter_stripes: standard deviation of each stripe boundary's place, drawn anew for each frame.
     smile_stripes: how far a stripe's ends are bowed from its middle.
     speckle: standard deviation of the laser's brightness, relative, drawn anew for each frame.

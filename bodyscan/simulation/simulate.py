@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,14 +20,18 @@ from bodyscan.simulation import body, files
 from bodyscan.simulation.board import make_board
 from bodyscan.simulation.layout import TruePair, build_pairs
 from bodyscan.simulation.plan import default_shots, plan_boards
-from bodyscan.simulation.render import Lamps, View, expose, render_pair
+from bodyscan.simulation.render import Lamps, View, render_pair
 from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Scene, Surface
+from bodyscan.simulation.sensor import expose
 from bodyscan.simulation.settings import SimulationSettings
 from bodyscan.simulation.truth import Truth, describe
 
 CALIBRATION, PERSON = "captures/calibration", "captures/person"
 PERSON_SHOT = "s01"
+
+_BRIGHT_AT = 0.85
+"""The exposure is set for a surface this near, in working distances."""
 
 _PAIRS, _BOARDS, _PLAN, _SKIN, _SWAY, _RAYS, _NOISE = range(1, 8)
 """What a random number is drawn for: each has a stream of its own, whatever the others draw."""
@@ -187,8 +191,9 @@ def _render(
         [surface.moved(camera_from_surfaces) for surface in task.surfaces]
         + [surface.moved(camera_from_rig) for surface in room]
     )
-    lamps = Lamps(task.white_grey, settings.lighting.ambient_grey, 0.85 * pair.reach_mm)
-    images: Mapping[str, np.ndarray] = render_pair(
+    reach, ambient = pair.reach_mm, settings.lighting.ambient_grey
+    lamps = Lamps(task.white_grey, ambient, _BRIGHT_AT * reach, reach)
+    images = render_pair(
         scene,
         view,
         pair.projector,

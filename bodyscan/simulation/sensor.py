@@ -1,0 +1,66 @@
+"""From light to grey levels: the laser's speckle, the lens's blur and shade, the sensor's noise."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.simulation.lens import TrueCamera
+from bodyscan.simulation.settings import Noise, Optics
+
+Floats = NDArray[np.float32]
+Image = NDArray[np.uint8]
+
+_FOCUS_STEPS = 5
+
+
+def expose(image: Floats, noise: Noise, rng: np.random.Generator) -> Image:
+    """What the sensor makes of a noiseless image: shot and read noise, 8 bits."""
+    electrons = noise.electrons_per_grey * noise.photons
+    spread = np.sqrt(np.maximum(image, 0.0) / electrons + noise.read_grey**2)
+    noisy = image + spread * rng.standard_normal(image.shape, dtype=np.float32)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def speckled(image: Floats, size: float, rng: np.random.Generator) -> Floats:
+    """Laser light with speckle of relative standard deviation `size` and mean 1: a gamma
+    distribution, as that of speckle averaged over a pixel (Goodman, Speckle Phenomena, 2007)."""
+    if size <= 0:
+        return image
+    return image * (
+        rng.standard_gamma(size**-2, image.shape, dtype=np.float32) * np.float32(size**2)
+    )
+
+
+def shade(camera: TrueCamera, optics: Optics) -> Floats | float:
+    """Vignetting: the share of light that arrives, (height, width)."""
+    if optics.vignetting <= 0:
+        return 1.0
+    cosine = 1.0 / np.linalg.norm(camera.directions(camera.grid()), axis=-1)
+    return (1.0 - optics.vignetting * (1.0 - cosine**4)).astype(np.float32)
+
+
+def off_focus(depth: Floats, focus_mm: float) -> Floats:
+    """How far out of focus depths (mm, > 0) are: |focus / depth - 1|, as the circle of confusion
+    grows; 0 at focus_mm, 1 at half of it and at most."""
+    return np.minimum(np.abs(np.float32(focus_mm) / depth - 1.0), 1.0)
+
+
+def blurred(image: Floats, optics: Optics, out_of_focus: Floats | None) -> Floats:
+    """The lens's Gaussian blur; wider where the scene is out of focus (0..1), if that is given."""
+    if optics.defocus_px <= 0 or out_of_focus is None:
+        return _gaussian(image, optics.blur_px)
+    place = out_of_focus * (_FOCUS_STEPS - 1)
+    result = np.zeros_like(image)
+    for step in range(_FOCUS_STEPS):
+        share = np.maximum(1.0 - np.abs(place - step), 0.0).astype(np.float32)
+        wide = np.hypot(optics.blur_px, optics.defocus_px * step / (_FOCUS_STEPS - 1))
+        result += share * _gaussian(image, float(wide))
+    return result
+
+
+def _gaussian(image: Floats, sigma: float) -> Floats:
+    if sigma <= 0:
+        return image
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101))

@@ -1,0 +1,61 @@
+"""The projected code and its light."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.simulation.gray import FINE, PAD, bit_count, code_bits, light_table, table_index
+
+NO_BLUR = np.array([0.0])
+
+
+@pytest.mark.parametrize(("stripes", "bits"), [(2, 1), (254, 8), (256, 8), (320, 9), (640, 10)])
+def test_every_stripe_has_its_code_and_neighbours_differ_in_one_bit(
+    stripes: int, bits: int
+) -> None:
+    code = code_bits(stripes)
+    assert code.shape == (bits, stripes)
+    assert bits == bit_count(stripes)
+    assert len({tuple(column) for column in code.T}) == stripes
+    assert (np.diff(code.astype(int), axis=1) != 0).sum(axis=0).tolist() == [1] * (stripes - 1)
+
+
+def test_most_significant_bit_first() -> None:
+    """Of 8 stripes: 0 1 3 2 6 7 5 4."""
+    values = code_bits(8).T @ [4, 2, 1]
+    assert values.tolist() == [0, 1, 3, 2, 6, 7, 5, 4]
+
+
+def test_light_is_on_in_lit_stripes_and_nowhere_beyond_the_sweep() -> None:
+    lit = np.array([True, False, True])
+    table = light_table(lit, NO_BLUR)
+    s = np.array([-1.0, 0.5, 1.5, 2.5, 3.5, np.nan, np.inf, -np.inf])
+    assert table.at(table_index(s, 3)).tolist() == [0, 1, 0, 1, 0, 0, 0, 0]
+
+
+def test_blur_spreads_light_and_keeps_its_sum() -> None:
+    lit = np.array([True, False, True, True])
+    sharp, soft = (light_table(lit, np.array([b])).values[0] for b in (0.0, 0.25))
+    assert soft.sum() == pytest.approx(sharp.sum(), rel=1e-6)
+    edge = soft[(PAD + 1) * FINE - 1 : (PAD + 1) * FINE + 1].mean()
+    assert edge == pytest.approx(0.5, abs=1e-3)  # half the light at a boundary, 4 sigma off others
+    off = round(0.25 * FINE)  # a standard deviation outside of the first edge: 15.87 % (normal)
+    assert soft[PAD * FINE - off : PAD * FINE - off + 2].mean() == pytest.approx(0.1587, abs=0.01)
+
+
+def test_jitter_moves_boundaries() -> None:
+    lit = np.array([False, True, True, False])
+    stray = np.array([0.0, 0.1, 0.0, -0.2, 0.0])
+    table = light_table(lit, NO_BLUR, stray).values[0]
+    on = np.flatnonzero(table > 0.5) / FINE - PAD
+    assert on[0] == pytest.approx(1.1, abs=1 / FINE)
+    assert on[-1] == pytest.approx(2.8, abs=2 / FINE)
+
+
+def test_each_blur_has_its_row() -> None:
+    table = light_table(np.ones(2, bool), np.array([0.1, 0.5]))
+    s = np.array([-0.3, -0.3])
+    near, far = table.at(table_index(s, 2, np.array([0, 1])))
+    assert near < 0.01  # three standard deviations out
+    assert far == pytest.approx(0.274, abs=0.01)  # 0.6 standard deviations out
