@@ -81,7 +81,8 @@ def calibration_table(calibration: RigCalibration) -> Table:
         "pair",
         "corners RMS px",
         "poses",
-        "planes RMS mm",
+        "light",
+        "sheets RMS mm",
         "stripes",
         "position mm (x, y, z)",
         "sigma mm",
@@ -95,6 +96,7 @@ def calibration_table(calibration: RigCalibration) -> Table:
             name,
             f"{quality.corners_rms_px:.3f}",
             str(quality.poses),
+            quality.light_model or "-",
             "-" if quality.planes_rms_mm is None else f"{quality.planes_rms_mm:.3f}",
             f"{quality.stripes_calibrated} of {quality.stripes_projected}"
             if pair.light is not None
@@ -103,7 +105,7 @@ def calibration_table(calibration: RigCalibration) -> Table:
             " ".join(f"{value:.3f}" for value in sigma),
         )
     for name in calibration.failed:
-        table.add_row(name, "failed", *["-"] * 5, style="red")
+        table.add_row(name, "failed", *["-"] * 6, style="red")
     return table
 
 

@@ -12,6 +12,7 @@ from bodyscan.calibration.light_choice import Candidate, HeldOutModel, choose, f
 from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
 from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.sheet_fit import SheetFit, fit_sheets
+from bodyscan.errors import PairFailed
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lens_sheets import LensSheets
@@ -24,6 +25,7 @@ CHOICE_BINS, FIT_BINS = 4000, 25000
 START_BINS, START_STEPS, FOLD_STEPS = 1000, 15, 8
 AXIS_STARTS = (-0.5, 0.0, 0.5, 1.0, 1.5)
 """Where a projector's axis may be, in heights of its image."""
+FEWEST_BOARDS, FEWEST_POINTS = 2, 500
 BINS_A_BOARD = 2
 """So many bins of a boundary make a board count for a free plane."""
 
@@ -56,8 +58,16 @@ class LightFit:
 def fit_light(data: BoundaryPoints, stripes: int, direction: Axis, camera: Camera) -> LightFit:
     """Sheets of light from boundaries on two or more boards, camera frame.
 
-    With two boards halves of them are held out, with three or more whole boards.
+    With two boards halves of them are held out, with three or more whole boards.  Raises
+    PairFailed with fewer than two boards, or hardly any boundaries on them.
     """
+    boards = len(np.unique(data.board))
+    if boards < FEWEST_BOARDS or len(data.index) < FEWEST_POINTS:
+        raise PairFailed(
+            f"{len(data.index)} points of stripe boundaries on {boards} boards are too few for "
+            "sheets of light",
+            remedy="capture the stripe sequence on the board in three or more poses",
+        )
     bins = binned(data, camera, direction)
     few = thinned(bins, CHOICE_BINS)
     starts = smooth_models(few, stripes, direction)

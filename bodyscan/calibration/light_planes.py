@@ -93,7 +93,7 @@ def _boards_seen(data: BoundaryPoints, count: int, fewest: int) -> NDArray[np.in
 def _weighted_planes(
     data: BoundaryPoints, weights: Array, count: int
 ) -> tuple[Array, Array, Array]:
-    """Planes (count, 4), how far their points open into a plane, and their moments (count, 4, 4)."""
+    """Planes (count, 4), how far their points open, and their moments (count, 4, 4)."""
     homogeneous = np.column_stack([data.points, np.ones(len(data.points))])
     moments = np.empty((count, 4, 4))
     for i in range(4):
@@ -139,7 +139,7 @@ def _covariance(
 
 
 def _board_pull(planes: Array, data: BoundaryPoints, weights: Array) -> Array:
-    """(S + 1, boards, 4, 3): how much 1 mm of each board error pulls at each plane's coefficients."""
+    """(S + 1, boards, 4, 3): the pull of 1 mm of each board error at each plane."""
     errors = board_errors(data)
     off = np.sum(planes[data.index, :3] * errors.along_ray, axis=1)
     effects = np.nan_to_num(off * weights)[:, None] * errors.effects

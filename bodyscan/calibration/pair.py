@@ -8,20 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.calibration.boundary_points import BoundaryPoints
 from bodyscan.calibration.camera import PlanarView
-from bodyscan.calibration.light_planes import (
-    BoundaryPoints,
-    PlaneFit,
-    boundary_points,
-    fit_light_planes,
-    join,
-)
+from bodyscan.calibration.light import LightFit, fit_light
+from bodyscan.calibration.light_choice import HeldOutModel
+from bodyscan.calibration.light_planes import boundary_points, join
 from bodyscan.capture.boards import corner_points, corners_per_face
 from bodyscan.capture.rig import Board, ProjectorSpec
 from bodyscan.capture.views import BoardView, StripeMap
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.light_planes import LightPlanes
+from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.transforms import RigidTransform
 
 Array = NDArray[np.float64]
@@ -34,7 +31,9 @@ RIM_SQUARES = 0.1
 @dataclass(frozen=True)
 class PairQuality:
     """Figures of one pair: corners' RMS (px) over `poses` board poses; distances of boundary points
-    to their planes, RMS (mm), over `stripe_shots` boards; boundaries with a plane, of those thrown.
+    to their sheets, RMS (mm), over `stripe_shots` boards; boundaries with a sheet, of those thrown.
+
+    held_out: every model of the light tried on boards it was not fitted to, simplest first.
     """
 
     corners_rms_px: float
@@ -43,6 +42,12 @@ class PairQuality:
     stripe_shots: int = 0
     stripes_calibrated: int = 0
     stripes_projected: int = 0
+    held_out: tuple[HeldOutModel, ...] = ()
+
+    @property
+    def light_model(self) -> str | None:
+        """The model of the light that held-out boards chose."""
+        return next((tried.model for tried in self.held_out if tried.chosen), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +61,7 @@ class PairCalibration:
     name: str
     camera: Camera
     camera_covariance: Array
-    light: LightPlanes | None
+    light: LightSheets | None
     quality: PairQuality
 
 
@@ -99,8 +104,8 @@ def calibrate_light(
     camera: Camera,
     projector: ProjectorSpec,
     shots: Iterable[tuple[Board, RigidTransform, float, BoardBoundaries]],
-) -> PlaneFit:
-    """Light planes from the boundaries on boards: (board, camera_from_board, face's z, boundaries).
+) -> LightFit:
+    """Light sheets from the boundaries on boards: (board, camera_from_board, face's z, boundaries).
 
     Raises PairFailed if fewer than two boards carry stripes.
     """
@@ -115,7 +120,7 @@ def calibrate_light(
             where=f"pair {name}",
             remedy="capture the stripe sequence on the board in three or more poses",
         )
-    return fit_light_planes(join(parts), projector.stripes, projector.direction)
+    return fit_light(join(parts), projector.stripes, projector.direction, camera)
 
 
 def on_board(

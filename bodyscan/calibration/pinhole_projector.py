@@ -1,4 +1,4 @@
-"""The rival: a projector as a pinhole, 2 x 4 matrix (Bolles 1981), by least squares and by OpenCV."""
+"""The rival: a projector as a 2 x 4 matrix (Bolles 1981), by least squares and by OpenCV."""
 
 from __future__ import annotations
 

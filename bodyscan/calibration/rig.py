@@ -1,4 +1,4 @@
-"""The rig's calibration, stage by stage: boards, cameras, one joint solve, light planes."""
+"""The rig's calibration, stage by stage: boards, cameras, one joint solve, light sheets."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def calibrate_pairs(
     failed: dict[str, str],
     progress: Progress = silent,
 ) -> dict[str, PairCalibration]:
-    """Light planes of every pair; a pair whose projector fails is added to `failed`."""
+    """Light sheets of every pair; a pair whose projector fails is added to `failed`."""
 
     def calibrate(name: str) -> PairCalibration | str:
         camera = placed.cameras[name]
@@ -223,17 +223,18 @@ def calibrate_pairs(
             return str(error)
         return replace(
             pair,
-            light=fit.planes,
+            light=fit.sheets,
             quality=replace(
                 quality,
                 planes_rms_mm=fit.rms_mm,
                 stripe_shots=len(shots),
-                stripes_calibrated=int(fit.planes.calibrated[1:-1].sum()),
+                stripes_calibrated=fit.stripes_calibrated,
                 stripes_projected=projector.stripes - 1,
+                held_out=fit.held_out,
             ),
         )
 
     names = sorted(cameras)
-    results = threaded(calibrate, names, stage="fitting light planes", progress=progress)
+    results = threaded(calibrate, names, stage="fitting light sheets", progress=progress)
     failed |= {n: r for n, r in zip(names, results, strict=True) if isinstance(r, str)}
     return {n: r for n, r in zip(names, results, strict=True) if isinstance(r, PairCalibration)}

@@ -65,7 +65,7 @@ def fit_sheets(
     board_error_mm: float = 0.0,
     most_steps: int = MOST_STEPS,
 ) -> SheetFit[Sheets]:
-    """Levenberg-Marquardt on the points' offsets from their sheets, Cauchy loss, prior of the model.
+    """Levenberg-Marquardt on the points' offsets from their sheets: Cauchy loss, the model's prior.
 
     board_error_mm: how well the boards' places are known (see `BoardErrors`). It does not change
     the sheets but their covariance: a board's points err together, however many they are.

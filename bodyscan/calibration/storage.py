@@ -13,13 +13,15 @@ import numpy as np
 from pydantic import ValidationError
 
 from bodyscan import __version__
+from bodyscan.calibration.light_choice import HeldOutModel
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.capture.rig import Rig
 from bodyscan.errors import CalibrationFileError
 from bodyscan.files import write_json, write_npz
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.light_planes import LightPlanes
+from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.uncertainty import PlacingCovariance
 
@@ -35,8 +37,8 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
     for name, pair in calibration.pairs.items():
         arrays[f"{name}/camera_covariance"] = pair.camera_covariance
         if pair.light is not None:
-            arrays[f"{name}/planes"] = pair.light.coefficients
-            arrays[f"{name}/planes_covariance"] = pair.light.covariance
+            for key, array in to_arrays(pair.light).items():
+                arrays[f"{name}/light/{key}"] = array
     write_npz(folder / ARRAYS_NAME, **arrays)
     content = {
         "schema": SCHEMA,
@@ -115,7 +117,7 @@ def _pair_content(calibration: RigCalibration, name: str) -> dict[str, Any]:
         "rig_from_camera": calibration.rig_from_camera[name].matrix,
         "light": None
         if pair.light is None
-        else {"model": "planes", "direction": pair.light.direction},
+        else {"kind": pair.light.kind, "direction": pair.light.direction},
         "quality": asdict(pair.quality),
     }
 
@@ -126,14 +128,8 @@ def _calibration(content: dict[str, Any], arrays: Any) -> RigCalibration:
             name,
             Camera(**part["camera"]),
             arrays[f"{name}/camera_covariance"],
-            None
-            if part["light"] is None
-            else LightPlanes(
-                arrays[f"{name}/planes"],
-                arrays[f"{name}/planes_covariance"],
-                part["light"]["direction"],
-            ),
-            PairQuality(**part["quality"]),
+            None if part["light"] is None else _light(part["light"], name, arrays),
+            _quality(part["quality"]),
         )
         for name, part in content["pairs"].items()
     }
@@ -149,6 +145,17 @@ def _calibration(content: dict[str, Any], arrays: Any) -> RigCalibration:
         content["failed"],
         tuple(content["notes"]),
     )
+
+
+def _light(content: dict[str, Any], name: str, arrays: Any) -> LightSheets:
+    prefix = f"{name}/light/"
+    own = {key.removeprefix(prefix): arrays[key] for key in arrays.files if key.startswith(prefix)}
+    return from_arrays(content["kind"], own, content["direction"])
+
+
+def _quality(content: dict[str, Any]) -> PairQuality:
+    tried = tuple(HeldOutModel(**figures) for figures in content["held_out"])
+    return PairQuality(**content | {"held_out": tried})
 
 
 def _transform(matrix: Any) -> RigidTransform:

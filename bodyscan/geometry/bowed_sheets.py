@@ -75,7 +75,7 @@ class BowedSheets(SmoothSheets):
 
     def prior(self) -> tuple[Array, Array]:
         fall = FALL ** np.arange(PLANE_DEGREE + 1)
-        # A lens bows the sheets above and below its axis opposite ways: b2 is as large in s as at 0.
+        # A lens bows the sheets above and below its axis opposite ways: b2 grows with s.
         late = FALL ** np.maximum(np.arange(BOW_DEGREE + 1) - 1, 0)
         spread = [size * fall for size in PLANE_SPREAD]
         spread += [size * late for size in BOW_SPREAD[: self.bow_terms]]
@@ -92,7 +92,7 @@ class BowedSheets(SmoothSheets):
 
     def at(self, s: Array) -> SheetsAtStripe:
         u = 2.0 * np.asarray(s, float) / self.stripes - 1.0
-        basis = chebyshev.chebvander(u, PLANE_DEGREE)
+        basis: Array = chebyshev.chebvander(u, PLANE_DEGREE).astype(np.float64)
         polynomials = self._polynomials()
         slopes = chebyshev.chebder(polynomials, axis=1) * (2.0 / self.stripes)
         return SheetsAtStripe(basis @ polynomials.T, basis[..., :-1] @ slopes.T, basis)
@@ -102,11 +102,13 @@ class BowedSheets(SmoothSheets):
         reach = seen[..., 2]
         shift = self.parameters[-1] if self.bow_terms else 0.0
         x, y, w = (seen[..., 0] + shift) / reach, seen[..., 1] / reach, self.distance_mm / reach
-        bow = range(2, 2 + self.bow_terms)
-        terms = np.stack([np.ones_like(x), x, w - 1.0, *(x**n for n in bow)], axis=-1)
+        powers = [np.ones_like(x), x]
+        for _ in range(self.bow_terms):
+            powers.append(powers[-1] * x)
+        terms = np.stack([powers[0], x, w - 1.0, *powers[2:]], axis=-1)
         by_x = -sheet.value[..., 1]
-        for n in bow:
-            by_x = by_x - n * sheet.value[..., 1 + n] * x ** (n - 1)
+        for n in range(2, 2 + self.bow_terms):
+            by_x = by_x - n * sheet.value[..., 1 + n] * powers[n - 1]
         by_z = -by_x * x - y + sheet.value[..., 2] * w
         by_point = np.stack([by_x, np.ones_like(x), by_z], axis=-1) / reach[..., None]
         return Offset(

@@ -1,4 +1,4 @@
-"""Sheets of light as triangulation sees them, and the chapter's: one free plane a stripe (Eq. 6)."""
+"""Sheets of light as triangulation sees them; the chapter's: one free plane a stripe (Eq. 6)."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class LightPlanes:
         return np.where(depth > 0.0, depth, np.nan)
 
     def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        """dz/ds (...) between the two planes around s; at a whole s, beyond it where there is one."""
+        """dz/ds (...) between the two planes around s; at the last plane, those before it."""
         depth = self.depth(rays, s) if depth is None else depth
         below, share = self._between(s)
         step = self.coefficients[below + 1] - self.coefficients[below]

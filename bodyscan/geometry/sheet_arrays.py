@@ -43,12 +43,10 @@ def from_arrays(kind: str, arrays: Mapping[str, Any], direction: Axis) -> LightS
         return LightPlanes(arrays["planes"], arrays["covariance"], direction)
     matrix, parameters = arrays["projector_from_camera"], arrays["parameters"]
     frame = RigidTransform(matrix[:3, :3].copy(), matrix[:3, 3].copy())
-    shared = (
-        frame, arrays["middle"], int(arrays["stripes"]), direction, parameters, arrays["covariance"],
-    )  # fmt: skip
+    stripes, middle, covariance = int(arrays["stripes"]), arrays["middle"], arrays["covariance"]
     if kind == "lens":
-        return LensSheets(*shared)
+        return LensSheets(frame, middle, stripes, direction, parameters, covariance)
     bow, over = divmod(len(parameters) - 3 * (PLANE_DEGREE + 1), BOW_DEGREE + 1)
     if bow < 0 or over != (kind == "bowed") or (bow > 0) != (kind == "bowed"):
         raise ValueError(f"{len(parameters)} parameters do not make {kind} sheets of light")
-    return BowedSheets(*shared, bow)
+    return BowedSheets(frame, middle, stripes, direction, parameters, covariance, bow)

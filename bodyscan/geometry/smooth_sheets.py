@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Sheets = TypeVar("Sheets", bound="SmoothSheets")
 
 NEWTON_STEPS = 5
-CONVERGED = 1e-6
+EXACT, CONVERGED = 1e-11, 1e-6
 CHUNK = 1 << 17
 
 
@@ -149,5 +149,7 @@ class SmoothSheets(ABC):
                 slope = np.sum(offset.by_point * rays, axis=-1) * offset.reach
                 step = offset.value * offset.reach / (slope + offset.value * forward)
                 depth = depth - step
+                if not np.any(np.abs(step) > EXACT * np.abs(depth)):
+                    break
             good = (np.abs(step) < CONVERGED * depth) & (offset.reach > 0.0)
             return np.where(good & (s >= 0.0) & (s <= self.stripes), depth, np.nan)

@@ -11,7 +11,6 @@ from bodyscan.capture.views import StripeMap
 from bodyscan.errors import BadInput
 from bodyscan.reconstruction.range_image import RangeImage
 
-STEP_STRIPES = 0.25
 NORMAL_WINDOW_PX = 5
 
 
@@ -35,8 +34,9 @@ def range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
     rays = camera.rays(np.column_stack([columns, rows]).astype(np.float64))
     s = stripes.s[rows, columns].astype(np.float64)
     depth = pair.light.depth(rays, s)
-    per_stripe = _depth_per_stripe(pair, rays, s)
-    sigma = np.abs(per_stripe) * stripes.sigma[rows, columns] * np.linalg.norm(rays, axis=1)
+    decoding = (pair.light.depth_per_stripe(rays, s, depth) * stripes.sigma[rows, columns]) ** 2
+    sheets = pair.light.variance_mm2(rays, s, depth)
+    sigma = np.sqrt(decoding + sheets) * np.linalg.norm(rays, axis=1)
     points = np.full((camera.height, camera.width, 3), np.nan, np.float32)
     sigmas = np.full((camera.height, camera.width), np.nan, np.float32)
     known = np.isfinite(depth) & np.isfinite(sigma)
@@ -77,14 +77,3 @@ def grid_normals(points: NDArray[np.float32]) -> NDArray[np.float32]:
     normal = -np.stack([slope_x, slope_y, mi - slope_x * mx - slope_y * my], axis=-1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
     return np.where(enough[..., None], normal, np.nan).astype(np.float32)
-
-
-def _depth_per_stripe(
-    pair: PairCalibration, rays: NDArray[np.float64], s: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """dz/ds (N,) mm a stripe, by a difference within the same two planes where it can."""
-    assert pair.light is not None
-    whole = np.floor(s)
-    lower = np.maximum(s - STEP_STRIPES, whole)
-    upper = np.minimum(s + STEP_STRIPES, whole + 1.0)
-    return (pair.light.depth(rays, upper) - pair.light.depth(rays, lower)) / (upper - lower)

@@ -7,12 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.simulation.lens import TrueCamera
-from bodyscan.simulation.settings import Noise, Optics
+from bodyscan.simulation.settings import Lighting, Noise, Optics
 
 Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 
 _FOCUS_STEPS = 5
+
+
+def exposure(lit: Floats, grey: float, lighting: Lighting) -> float:
+    """The exposure at which the brightest hundredth of a lit image begins at `grey`."""
+    bright = max(float(np.percentile(lit, 99.0)), 1e-3)
+    return float(np.clip(grey / bright, lighting.shortest, lighting.longest))
 
 
 def expose(image: Floats, noise: Noise, rng: np.random.Generator) -> Image:

@@ -80,13 +80,21 @@ class Projection:
 
 @dataclass(frozen=True)
 class Lighting:
-    """Brightness. board_grey, person_grey: grey level of a perfectly white surface that faces the
-    projector at 0.85 working distances, in board and in person shots (the exposure is set for
-    each). ambient_grey: what the room's own light adds to a perfectly white surface."""
+    """Brightness. Grey levels are those at exposure 1 unless said otherwise.
 
-    board_grey: float = 235.0
-    person_grey: float = 295.0
-    ambient_grey: float = 13.0
+    laser_grey: of a perfectly white surface that faces the projector at 0.85 working distances.
+    ambient_grey: what the room's own light adds to a perfectly white surface.
+    board_grey, person_grey: each pair sets its exposure for each shot, so that the brightest
+    hundredth of the lit image begins at this grey level.
+    shortest, longest: exposures it can set.
+    """
+
+    laser_grey: float = 240.0
+    ambient_grey: float = 10.0
+    board_grey: float = 205.0
+    person_grey: float = 205.0
+    shortest: float = 0.4
+    longest: float = 2.5
 
 
 @dataclass(frozen=True)
@@ -142,7 +150,7 @@ class Room:
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """All of them, and how many threads work at the same time."""
+    """All of them."""
 
     optics: Optics = field(default_factory=Optics)
     projection: Projection = field(default_factory=Projection)
@@ -151,4 +159,3 @@ class SimulationSettings:
     board: BoardMaking = field(default_factory=BoardMaking)
     person: Person = field(default_factory=Person)
     room: Room = field(default_factory=Room)
-    workers: int = 2

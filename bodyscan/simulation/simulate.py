@@ -23,7 +23,7 @@ from bodyscan.simulation.plan import default_shots, plan_boards
 from bodyscan.simulation.render import Lamps, View, render_pair
 from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Scene, Surface
-from bodyscan.simulation.sensor import expose
+from bodyscan.simulation.sensor import expose, exposure
 from bodyscan.simulation.settings import SimulationSettings
 from bodyscan.simulation.truth import Truth, describe
 
@@ -31,7 +31,7 @@ CALIBRATION, PERSON = "captures/calibration", "captures/person"
 PERSON_SHOT = "s01"
 
 _BRIGHT_AT = 0.85
-"""The exposure is set for a surface this near, in working distances."""
+"""Where a surface is as bright as `Lighting.laser_grey` says, in working distances."""
 
 _PAIRS, _BOARDS, _PLAN, _SKIN, _SWAY, _RAYS, _NOISE = range(1, 8)
 """What a random number is drawn for: each has a stream of its own, whatever the others draw."""
@@ -46,7 +46,7 @@ class _Task:
     folder: str
     surfaces: tuple[Surface, ...]
     rig_from_surfaces: RigidTransform
-    white_grey: float
+    bright_grey: float
     sequence: bool
 
 
@@ -59,20 +59,21 @@ def simulate(
     seed: int = 0,
     settings: SimulationSettings | None = None,
     board_shots: int | None = None,
+    workers: int = 2,
     progress: Progress = silent,
 ) -> None:
     """Write captures of the rig in `rig_file`, with known truth, into the folder `out`.
 
     subject: a body mesh (see `body.load_subject`); without one only boards are captured.
     scale: of image size and number of stripes.  board_shots: besides the one that fixes the rig
-    frame; 40 for twelve pairs if not given.
+    frame; 40 for twelve pairs if not given.  workers: pairs at the same time.
     The same arguments give the same bytes. Raises RigFileError, and BadInput for a rig without
     nominal placings or a subject that cannot be read.
     """
     settings = settings or SimulationSettings()
     rig = files.scaled_rig(load_rig(rig_file), scale, CALIBRATION)
     truth = _decide(rig, subject, settings, seed, board_shots)
-    _render_all(rig, truth, Path(out), progress)
+    _render_all(rig, truth, Path(out), workers, progress)
     write_rig(out / "rig.yaml", rig)
     listed = [(shot.name, shot.stripes, shot.lit) for shot in truth.plan]
     files.write_captures(out / CALIBRATION, "calibration", listed)
@@ -121,7 +122,7 @@ def _tasks(truth: Truth, pair: str) -> list[_Task]:
             folder=CALIBRATION,
             surfaces=truth.boards[shot.board].surfaces,
             rig_from_surfaces=shot.rig_from_board,
-            white_grey=light.board_grey,
+            bright_grey=light.board_grey,
             sequence=pair in shot.stripes,
         )
         for number, shot in enumerate(truth.plan)
@@ -136,7 +137,7 @@ def _tasks(truth: Truth, pair: str) -> list[_Task]:
     return tasks
 
 
-def _render_all(rig: Rig, truth: Truth, out: Path, progress: Progress) -> None:
+def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progress) -> None:
     """Every image of every pair; each thread has a pair at a time."""
     tasks = {name: _tasks(truth, name) for name in truth.pairs}
     tell = _counter("simulate", sum(map(len, tasks.values())), progress)
@@ -150,7 +151,7 @@ def _render_all(rig: Rig, truth: Truth, out: Path, progress: Progress) -> None:
             _render(rig, pair, view, room, task, truth.settings, out, noise)
             tell()
 
-    with ThreadPoolExecutor(truth.settings.workers) as pool:
+    with ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(work, i, pair) for i, pair in enumerate(truth.pairs.values())]
         try:
             for future in futures:
@@ -191,8 +192,8 @@ def _render(
         [surface.moved(camera_from_surfaces) for surface in task.surfaces]
         + [surface.moved(camera_from_rig) for surface in room]
     )
-    reach, ambient = pair.reach_mm, settings.lighting.ambient_grey
-    lamps = Lamps(task.white_grey, ambient, _BRIGHT_AT * reach, reach)
+    light, reach = settings.lighting, pair.reach_mm
+    lamps = Lamps(light.laser_grey, light.ambient_grey, _BRIGHT_AT * reach, reach)
     images = render_pair(
         scene,
         view,
@@ -203,6 +204,7 @@ def _render(
         frames=rig.frames,
         sequence=task.sequence,
     )
+    length = exposure(images[rig.frames.lit], task.bright_grey, light)
     for frame, image in images.items():
         name = fill(rig.files, shot=task.shot, pair=pair.name, frame=frame)
-        files.write_image(out / task.folder / name, expose(image, settings.noise, rng))
+        files.write_image(out / task.folder / name, expose(image * length, settings.noise, rng))

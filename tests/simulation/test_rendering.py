@@ -96,8 +96,10 @@ def test_depth_is_that_of_the_surfaces() -> None:
     sphere = (b - np.sqrt(np.maximum(root, 0))) / np.sum(rays**2, axis=-1)
     deep, off = root > 4e3, root < -4e3  # well inside, well outside of the outline (4e4 its middle)
     assert deep.any()
-    # a ball of 60 x 120 facets is up to 200 (1 - cos 1.5 deg) = 0.07 mm inside the sphere
-    assert truth.depth[deep] == pytest.approx(sphere[deep], abs=0.1)
+    # facets of 3 degrees both ways lie up to 2 x 200 (1 - cos 1.5 deg) = 0.14 mm inside the sphere,
+    # along a ray that slants by 71 degrees (root = 4e3) three times that
+    assert truth.depth[deep] == pytest.approx(sphere[deep], abs=0.45)
+    assert (truth.depth[deep] >= sphere[deep] - 1e-3).all()
     assert truth.depth[off] == pytest.approx(1500.0, abs=1e-3)
 
 
