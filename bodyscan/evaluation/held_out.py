@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.camera import CameraCalibration
+from bodyscan.calibration.light import fit_light
 from bodyscan.calibration.light_planes import BoundaryPoints, fit_light_planes, join
 from bodyscan.calibration.pair import BoardBoundaries, on_board
 from bodyscan.calibration.pinhole_projector import fit_pinhole, fit_pinhole_opencv
@@ -81,6 +82,7 @@ def _models(
     stripes, direction = projector.stripes, projector.direction
     return {
         "free planes": fit_light_planes(points, stripes, direction).planes,
+        "chosen by held-out boards": fit_light(points, stripes, direction, camera.camera).sheets,
         "pinhole (2 x 4, stripes)": pinhole.planes(stripes, direction),
         "pinhole (OpenCV, corners)": opencv.planes(stripes, direction),
     }

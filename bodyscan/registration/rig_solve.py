@@ -6,9 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bodyscan.capture.rig import Rig
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.least_squares import cauchy_weights, spread
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.joint_solve import solve_jointly
 from bodyscan.registration.located_view import LocatedView
@@ -24,6 +26,9 @@ from bodyscan.registration.view_graph import (
 BAD_VIEW_SIGMAS = 6.0
 LEAST_BAD_PX = 0.5
 LOSS_PX = 0.3
+ROBUST_SIGMAS = 4.0
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +75,11 @@ def place_rig(
             loss_px=LOSS_PX,
         )
         errors = [
-            _rms(view, solution.cameras, solution.root_from_camera, solution.root_from_board)
+            _rms(
+                _residuals(
+                    view, solution.cameras, solution.root_from_camera, solution.root_from_board
+                )
+            )
             for view in kept
         ]
         limit = max(BAD_VIEW_SIGMAS * float(np.median(errors)), LEAST_BAD_PX)
@@ -98,9 +107,9 @@ def place_rig(
         cameras_free=refine,
     )
     rms = {
-        name: _pooled(
+        name: _robust_rms(
             [
-                (len(v.pixels), _rms(v, solution.cameras, rig_from_camera, rig_from_board))
+                _residuals(v, solution.cameras, rig_from_camera, rig_from_board)
                 for v in kept
                 if v.pair == name
             ]
@@ -118,19 +127,24 @@ def place_rig(
     )
 
 
-def _rms(
+def _residuals(
     view: LocatedView,
     cameras: Mapping[str, Camera],
     rig_from_camera: Mapping[str, RigidTransform],
     rig_from_board: Mapping[Target, RigidTransform],
-) -> float:
+) -> Array:
     camera_from_board = rig_from_camera[view.pair].inverse() @ rig_from_board[view.target]
-    seen = cameras[view.pair].project(camera_from_board.apply(view.points))
-    return float(np.sqrt(np.mean(np.sum((seen - view.pixels) ** 2, axis=1))))
+    return cameras[view.pair].project(camera_from_board.apply(view.points)) - view.pixels
 
 
-def _pooled(parts: Sequence[tuple[int, float]]) -> float:
-    total = sum(count for count, _ in parts)
-    if not total:
+def _rms(residuals: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
+
+
+def _robust_rms(parts: Sequence[Array]) -> float:
+    """RMS distance of corners, px, with the weights of the solve's loss: outliers do not count."""
+    if not parts:
         return float("nan")
-    return float(np.sqrt(sum(count * rms**2 for count, rms in parts) / total))
+    residuals = np.concatenate(parts).ravel()
+    weights = cauchy_weights(residuals, 2, ROBUST_SIGMAS * spread(residuals))
+    return float(np.sqrt(2.0 * np.sum(weights * residuals**2) / np.sum(weights)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bodyscan.capture.rig import Board, Rig
 from bodyscan.geometry.transforms import RigidTransform
@@ -23,6 +23,8 @@ GRAZING_DEG = 12.0
 _CELLS = (6, 8)
 _NEAR, _FAR = 0.73, 1.12
 _ASIDE = 0.22
+_TILT_DEG = 35.0
+_OFF_FLOOR_MM = 5.0
 _CANDIDATES = 3000
 _FADE = 0.35
 """How quickly a merit loses its worth once it is had often enough."""
@@ -131,9 +133,8 @@ def _covered(
 
 
 def _grid(board: Board) -> Array:
-    x = np.linspace(0.0, board.columns * board.square_mm, 15)
-    y = np.linspace(0.0, board.rows * board.square_mm, 13)
-    x, y = np.meshgrid(x, y)
+    width, height, _ = _extent(board)
+    x, y = np.meshgrid(np.linspace(0.0, width, 15), np.linspace(0.0, height, 13))
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
 
@@ -185,42 +186,54 @@ def _candidates(
 ) -> list[RigidTransform]:
     """Poses near the middle of what pairs look at, faced by them or turned between two poles."""
     poses: list[RigidTransform] = []
-    while len(poses) < _CANDIDATES:
-        pair = pairs[len(poses) % len(pairs)]
-        pose = _draw_pose(board, pair, len(pairs) > 1, rng)
-        if (pose.apply(_grid(board))[:, 2] > 5.0).all():
-            poses.append(pose)
-    return poses
+    count = -(-_CANDIDATES // len(pairs))
+    for pair in pairs:
+        camera, reach = pair.camera, pair.reach_mm
+        pixels = rng.uniform(0.05, 0.95, (count, 2)) * [camera.width, camera.height]
+        middles = camera.directions(pixels) * reach * rng.uniform(_NEAR, _FAR, (count, 1))
+        middles[:, 0] = np.clip(middles[:, 0], -_ASIDE * reach, _ASIDE * reach)
+        poses += [
+            pair.rig_from_camera @ _draw_pose(board, middle, len(pairs) > 1, rng)
+            for middle in middles
+        ]
+    return [_off_floor(pose, board) for pose in poses]
+
+
+def _off_floor(rig_from_board: RigidTransform, board: Board) -> RigidTransform:
+    """The pose, lifted if need be until the board only just does not touch the floor."""
+    margin = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]) * board.margin_mm
+    low, high = margin + [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]] * _extent(board)
+    x, y = np.meshgrid([low[0], high[0]], [low[1], high[1]])
+    corners = np.stack([x.ravel(), y.ravel(), np.zeros(4)], axis=1)
+    short = _OFF_FLOOR_MM + board.thickness_mm - rig_from_board.apply(corners)[:, 2].min()
+    lift = np.array([0.0, 0.0, max(short, 0.0)])
+    return RigidTransform(rig_from_board.rotation, rig_from_board.translation + lift)
+
+
+def _extent(board: Board) -> Array:
+    """(3,) width and height of the checkered area, mm."""
+    return np.array([board.columns, board.rows, 0.0]) * board.square_mm
 
 
 def _draw_pose(
-    board: Board, pair: TruePair, turned: bool, rng: np.random.Generator
+    board: Board, middle: Array, turned: bool, rng: np.random.Generator
 ) -> RigidTransform:
-    """A pose in front of one pair: its middle, which way it faces, how it is turned in itself."""
-    reach = pair.reach_mm
-    camera = pair.camera
-    pixel = rng.uniform(0.05, 0.95, 2) * [camera.width, camera.height]
-    ray = camera.directions(pixel)
-    middle = ray * reach * rng.uniform(_NEAR, _FAR)
-    middle[0] = np.clip(middle[0], -_ASIDE * reach, _ASIDE * reach)
-    tilt, way = np.radians(rng.uniform(0.0, 35.0)), rng.uniform(0.0, 2.0 * np.pi)
-    yaw = np.radians(rng.choice([-60.0, -30.0, 30.0, 60.0])) if turned and rng.random() < 0.4 else 0
+    """A pose with its middle there: which way it faces, how it is turned in itself.
+
+    turned: two poses in five look past the camera, to where other poles stand.
+    """
+    tilt, way = np.radians(rng.uniform(0.0, _TILT_DEG)), rng.uniform(0.0, 2.0 * np.pi)
+    yaw = 0.0
+    if turned and rng.random() < 0.4:
+        yaw, tilt = np.radians(rng.choice([-60.0, -30.0, 30.0, 60.0])), 0.4 * tilt
     roll = rng.choice([0.0, 0.5 * np.pi]) + rng.normal(0.0, 0.15)
     over = np.pi if board.faces == 2 and rng.random() < 0.35 else 0.0
-    lean = RigidTransform.from_rotation_vector(
-        tilt * np.array([np.cos(way), np.sin(way), 0.0]), np.zeros(3)
-    )
-    if yaw:
-        lean = RigidTransform.from_rotation_vector(0.4 * lean.rotation_vector, np.zeros(3))
-    turn = (
-        _rotation([0, yaw, 0]) @ lean.rotation @ _rotation([0, 0, roll]) @ _rotation([0, over, 0])
-    )
-    centre = np.array([board.columns, board.rows, 0.0]) * board.square_mm / 2.0
-    camera_from_board = RigidTransform(turn, middle - turn @ centre)
-    return pair.rig_from_camera @ camera_from_board
+    lean = _rotation(tilt * np.array([np.cos(way), np.sin(way), 0.0]))
+    turn = _rotation([0, yaw, 0]) @ lean @ _rotation([0, 0, roll]) @ _rotation([0, over, 0])
+    return RigidTransform(turn, middle - turn @ _extent(board) / 2.0)
 
 
-def _rotation(vector: Sequence[float]) -> Array:
+def _rotation(vector: ArrayLike) -> Array:
     return RigidTransform.from_rotation_vector(vector, np.zeros(3)).rotation
 
 
@@ -228,13 +241,14 @@ def _chosen(merits: Merits, shots: int) -> list[int]:
     """Greedily, the poses that add most to what is not yet covered and tied."""
     free = np.ones(len(merits.offered), bool)
     had = np.zeros(len(merits.worth))
+    offered = merits.offered.astype(np.float32)
     chosen: list[int] = []
     for _ in range(min(shots, len(free))):
         spare = np.maximum(had - merits.needed + 1.0, 0.0)
-        gain = merits.offered @ (merits.worth * _FADE**spare)
+        gain = offered @ (merits.worth * _FADE**spare).astype(np.float32)
         best = int(np.argmax(np.where(free, gain, -1.0)))
         free[best] = False
-        had += merits.offered[best]
+        had += offered[best]
         chosen.append(best)
     return chosen
 

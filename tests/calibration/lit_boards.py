@@ -57,7 +57,7 @@ class Mirror:
             return np.sum(thrown * (points - apex), axis=1), apex
 
         angle = np.zeros(len(points))
-        for _ in range(7):
+        for _ in range(5):
             off = beside(angle)[0]
             angle -= off * 1e-5 / (beside(angle + 1e-5)[0] - off)
         away = points - beside(angle)[1]
@@ -84,7 +84,8 @@ class Lens:
 
 @dataclass(frozen=True)
 class Uneven:
-    """The same light with its boundaries out of place, each by its own share of a stripe."""
+    """The same light with its boundaries out of place, each by its own share of a stripe, at most
+    `size`."""
 
     light: Mirror
     size: float
@@ -114,9 +115,7 @@ class Scene:
     def size(self) -> Array:
         return self.square * np.array([self.columns, self.rows])
 
-    def looking_at(
-        self, middle: Sequence[float], turn: Sequence[float]
-    ) -> RigidTransform:
+    def looking_at(self, middle: Sequence[float], turn: Sequence[float]) -> RigidTransform:
         """camera_from_board of a board whose middle is there, turned from facing the camera."""
         rotation = RigidTransform.from_rotation_vector(turn, np.zeros(3)).rotation
         return RigidTransform(rotation, middle - rotation @ np.append(self.size / 2.0, 0.0))
@@ -127,7 +126,7 @@ class Scene:
         return rays * (normal @ camera_from_board.translation / (rays @ normal))[:, None]
 
     def crossings(
-        self, camera_from_board: RigidTransform, every_px: int = 4
+        self, camera_from_board: RigidTransform, every_px: int = 8
     ) -> tuple[NDArray[np.int64], Array]:
         """Boundaries and the pixels where they cross every n-th line of the image, on the board."""
         tall = self.direction == "horizontal"
@@ -141,7 +140,7 @@ class Scene:
             pixels = np.column_stack([line, place] if tall else [place, line])
             return self.projector.stripe(self.on_plane(pixels, camera_from_board)), pixels
 
-        for _ in range(8):
+        for _ in range(6):
             s = stripe(place)[0]
             slope = (stripe(place + 0.5)[0] - s) / 0.5
             place = np.clip(place - (s - wanted) / slope, -400.0, 2000.0)
@@ -170,9 +169,14 @@ class Scene:
             sigma = np.full(len(index), max(noise_px, 0.01))
             parts.append(
                 boundary_points(
-                    self.camera, placed, index, pixels, sigma, board=number,
+                    self.camera,
+                    placed,
+                    index,
+                    pixels,
+                    sigma,
+                    board=number,
                     direction=self.direction,
-                )  # fmt: skip
+                )
             )
         return join(parts)
 
@@ -219,7 +223,7 @@ def body_scene(k1: float, k2: float = 0.0, axis: float = 330.0) -> Scene:
     camera = Camera(1510.0, 1513.0, -0.5, 645.0, 508.0, -0.1, 0.05, 1280, 1024)
     focal = 730.0
     # The middle of the image is to be lit by stripe 320, wherever the lens looks.
-    tilt = np.arctan(280.0 / 1300.0) + (320.0 - axis) / focal
+    tilt = np.arctan(280.0 / 1300.0) - np.arctan((320.0 - axis) / focal)
     rotation = RigidTransform.from_rotation_vector([tilt, 0.0, 0.0], np.zeros(3))
     turned = RigidTransform.from_rotation_vector([0.0, 0.02, 0.01], np.zeros(3))
     place = RigidTransform(np.eye(3), np.array([-15.0, 280.0, 5.0]))

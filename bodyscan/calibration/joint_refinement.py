@@ -1,0 +1,279 @@
+"""Camera, board poses and light sheets of one pair in one solve, on corners and stripes together.
+
+Stripes are straight-edged light on a flat board: they say how boards lie to each other far more
+finely than 48 corners do, and corners keep the scale.  Only for sheets that are smooth in s, whose few
+parameters are unknowns like any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.calibration.boundary_points import BoundaryPoints, points_on_board
+from bodyscan.calibration.camera import (
+    INTRINSICS,
+    PlanarView,
+    projection_jacobians,
+    twist_jacobian,
+)
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.least_squares import cauchy_weights, spread
+from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.transforms import RigidTransform
+
+Array = NDArray[np.float64]
+Sheets = TypeVar("Sheets", bound=SmoothSheets)
+
+STEPS = 20
+CAUCHY_SIGMAS = 4.0
+FLOOR_PX = 0.02
+DIFFERENCES = (1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-5, 1e-5, *[1e-6] * 3, *[1e-3] * 3)
+"""Steps for derivatives of a boundary point by the intrinsics and by its board's motion."""
+
+
+@dataclass(frozen=True, eq=False)
+class StripedBoard:
+    """One shot: its corners, and the stripe boundaries on it: pixels (N, 2), index (N,) with s = i,
+    sigma_px (N,) and across (2,), the unit vector across the stripes in the image.
+    """
+
+    view: PlanarView
+    pixels: Array
+    index: Array
+    sigma_px: Array
+    across: Array
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit(Generic[Sheets]):
+    """What fits corners and stripes together; covariance (7, 7) of the camera.
+
+    corners_rms_px and stripes_rms_px are robustly weighted.
+    """
+
+    camera: Camera
+    camera_from_board: dict[str, RigidTransform]
+    sheets: Sheets
+    camera_covariance: Array
+    corners_rms_px: float
+    stripes_rms_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class _State(Generic[Sheets]):
+    camera: Camera
+    poses: tuple[RigidTransform, ...]
+    sheets: Sheets
+
+    def moved(self, step: Array) -> _State[Sheets]:
+        last = 7 + 6 * len(self.poses)
+        changed = {
+            name: getattr(self.camera, name) + float(change)
+            for name, change in zip(INTRINSICS, step[:7], strict=True)
+        }
+        twists = step[7:last].reshape(-1, 6)
+        poses = tuple(p.moved(twist) for p, twist in zip(self.poses, twists, strict=True))
+        return _State(replace(self.camera, **changed), poses, self.sheets.retract(step[last:]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Noise:
+    corner_px: float
+    stripe: float
+
+
+def striped_board(
+    view: PlanarView, camera: Camera, data: BoundaryPoints, number: int
+) -> StripedBoard:
+    """The (binned) boundary points of one board as image measurements again."""
+    own = data.board == number
+    across = np.median(
+        camera.project(data.points[own] + data.per_pixel[own]) - camera.project(data.points[own]),
+        axis=0,
+    )
+    return StripedBoard(
+        view,
+        camera.project(data.points[own]),
+        data.index[own].astype(float),
+        np.hypot(data.sigma_px[own], FLOOR_PX),
+        across / np.linalg.norm(across),
+    )
+
+
+def refine_jointly(
+    camera: Camera,
+    camera_from_board: Mapping[str, RigidTransform],
+    sheets: Sheets,
+    boards: Sequence[StripedBoard],
+) -> JointFit[Sheets]:
+    """Levenberg-Marquardt from a camera, poses and sheets found one after the other.
+
+    Boards of which only corners are known take part with empty pixels.
+    """
+    state = _State(camera, tuple(camera_from_board[b.view.shot] for b in boards), sheets)
+    noise = _noise(state, boards)
+    damping, cost = 1e-6, _cost(state, boards, noise)
+    for _ in range(STEPS):
+        normal, gradient = _equations(state, boards, noise)
+        for _ in range(8):
+            candidate = state.moved(-_solve(normal, gradient, damping))
+            new_cost = _cost(candidate, boards, noise)
+            if new_cost < cost:
+                break
+            damping = max(10.0 * damping, 1e-6)
+        else:
+            break
+        gained, state, damping = cost - new_cost, candidate, max(damping / 10.0, 1e-10)
+        noise = _noise(state, boards)
+        cost = _cost(state, boards, noise)
+        if gained < 1e-2:
+            break
+    normal, _ = _equations(state, boards, noise)
+    covariance = _solve(normal, np.eye(len(normal)))
+    last = 7 + 6 * len(boards)
+    corners = np.concatenate([_corner_residuals(state, k, b) for k, b in enumerate(boards)])
+    return JointFit(
+        state.camera,
+        {b.view.shot: pose for b, pose in zip(boards, state.poses, strict=True)},
+        state.sheets.with_covariance(covariance[last:, last:]),
+        covariance[:7, :7],
+        _weighted_rms(corners, 2) * np.sqrt(2.0),
+        _weighted_rms(np.concatenate(_stripe_residuals(state, boards, pixels=True)), 1),
+    )
+
+
+def _corner_residuals(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
+    seen = state.camera.project(state.poses[k].apply(board.view.points))
+    return (seen - board.view.pixels).ravel()
+
+
+def _points(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
+    height = RigidTransform(np.eye(3), np.array([0.0, 0.0, board.view.points[0, 2]]))
+    return points_on_board(state.camera, state.poses[k] @ height, board.pixels)
+
+
+def _stripe_residuals(
+    state: _State[Sheets], boards: Sequence[StripedBoard], *, pixels: bool = False
+) -> list[Array]:
+    """Offsets from the sheets over their sigma (or in px), board by board."""
+    found = []
+    for k, board in enumerate(boards):
+        points = _points(state, k, board)
+        offset = state.sheets.offset(points, state.sheets.at(board.index))
+        sigma = _sigma(state, k, board, points, offset.by_point)
+        found.append(offset.value / sigma * (board.sigma_px if pixels else 1.0))
+    return found
+
+
+def _sigma(
+    state: _State[Sheets], k: int, board: StripedBoard, points: Array, by_point: Array
+) -> Array:
+    """What one sigma_px across the stripe is worth in the offset's unit, (N,)."""
+    shifted = _points(state, k, replace(board, pixels=board.pixels + 0.5 * board.across))
+    leverage = np.abs(np.sum(by_point * (shifted - points), axis=1)) / 0.5
+    return np.maximum(leverage, 1e-12) * board.sigma_px
+
+
+def _noise(state: _State[Sheets], boards: Sequence[StripedBoard]) -> _Noise:
+    corners = np.concatenate([_corner_residuals(state, k, b) for k, b in enumerate(boards)])
+    stripes = np.concatenate(_stripe_residuals(state, boards))
+    return _Noise(max(spread(corners), 1e-3), max(spread(stripes), 1e-2))
+
+
+def _cost(state: _State[Sheets], boards: Sequence[StripedBoard], noise: _Noise) -> float:
+    with np.errstate(all="ignore"):
+        corners = np.concatenate([_corner_residuals(state, k, b) for k, b in enumerate(boards)])
+        stripes = np.concatenate(_stripe_residuals(state, boards))
+        total = 0.0
+        for residuals, group, size in ((corners, 2, noise.corner_px), (stripes, 1, noise.stripe)):
+            squared = np.sum((residuals.reshape(-1, group) / (size * CAUCHY_SIGMAS)) ** 2, axis=1)
+            total += CAUCHY_SIGMAS**2 * float(np.sum(np.log1p(squared)))
+    known, _ = state.sheets.prior()
+    total += float(known @ known)
+    return total if np.isfinite(total) else np.inf
+
+
+def _equations(
+    state: _State[Sheets], boards: Sequence[StripedBoard], noise: _Noise
+) -> tuple[Array, Array]:
+    """Normal matrix and gradient of half the cost: camera, poses, then the sheets' parameters."""
+    known, prior = state.sheets.prior()
+    last = 7 + 6 * len(boards)
+    size = last + prior.shape[1]
+    normal, gradient = np.zeros((size, size)), np.zeros(size)
+    normal[last:, last:] = prior.T @ prior
+    gradient[last:] = prior.T @ known
+    for k, board in enumerate(boards):
+        pose = np.arange(7 + 6 * k, 13 + 6 * k)
+        points = state.poses[k].apply(board.view.points)
+        intrinsics, by_point = projection_jacobians(state.camera, points)
+        jacobian = np.concatenate([intrinsics, by_point @ twist_jacobian(points)], axis=2)
+        residuals = _corner_residuals(state, k, board) / noise.corner_px
+        columns = np.concatenate([np.arange(7), pose])
+        rows = jacobian.reshape(-1, 13) / noise.corner_px
+        _add(normal, gradient, columns, rows, residuals, 2)
+        if len(board.index):
+            columns = np.concatenate([np.arange(7), pose, np.arange(last, size)])
+            residuals, rows = _stripe_equations(state, k, board, noise)
+            _add(normal, gradient, columns, rows, residuals, 1)
+    return normal, gradient
+
+
+def _stripe_equations(
+    state: _State[Sheets], k: int, board: StripedBoard, noise: _Noise
+) -> tuple[Array, Array]:
+    """Residuals (N,) and their derivatives (N, 13 + P) by camera, this board's pose, and sheets."""
+    points = _points(state, k, board)
+    offset = state.sheets.offset(points, state.sheets.at(board.index), parameters=True)
+    assert offset.by_parameter is not None
+    sigma = _sigma(state, k, board, points, offset.by_point) * noise.stripe
+    by_place = np.empty((len(points), 13))
+    for column, size in enumerate(DIFFERENCES):
+        ends = []
+        for sign in (1.0, -1.0):
+            step = np.zeros(7 + 6 * len(state.poses))
+            step[column if column < 7 else 6 * k + column] = sign * size
+            moved = _State(state.camera, state.poses, _Still()).moved(step)
+            ends.append(_points(moved, k, board))
+        by_place[:, column] = np.sum(offset.by_point * (ends[0] - ends[1]), axis=1) / (2.0 * size)
+    jacobian = np.concatenate([by_place, offset.by_parameter], axis=1) / sigma[:, None]
+    return offset.value / sigma, jacobian
+
+
+class _Still:
+    """Sheets that do not move: only camera and poses are differentiated."""
+
+    def retract(self, step: Array) -> _Still:
+        return self
+
+
+def _add(
+    normal: Array,
+    gradient: Array,
+    columns: NDArray[np.int64],
+    rows: Array,
+    residuals: Array,
+    group: int,
+) -> None:
+    weights = cauchy_weights(residuals, group, CAUCHY_SIGMAS)
+    normal[np.ix_(columns, columns)] += rows.T @ (rows * weights[:, None])
+    gradient[columns] += rows.T @ (weights * residuals)
+
+
+def _solve(normal: Array, right: Array, damping: float = 0.0) -> Array:
+    """normal x = right, scaled to a unit diagonal: freedoms mix radians, mm and px."""
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scaled = normal / np.outer(size, size) + damping * np.eye(len(normal))
+    columns = right.reshape(len(right), -1) / size[:, None]
+    solved = np.linalg.lstsq(scaled, columns, rcond=1e-14)[0] / size[:, None]
+    return np.asarray(solved.reshape(right.shape), np.float64)
+
+
+def _weighted_rms(residuals: Array, group: int) -> float:
+    weights = cauchy_weights(residuals, group, CAUCHY_SIGMAS * spread(residuals))
+    return float(np.sqrt(np.sum(weights * residuals**2) / np.sum(weights)))

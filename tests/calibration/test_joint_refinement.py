@@ -1,0 +1,77 @@
+"""Corners and stripes in one solve: what it must better, on the chapter's own camera."""
+
+import numpy as np
+from lit_boards import Mirror, Scene
+
+from bodyscan.calibration.boundary_points import binned, boundary_points, join
+from bodyscan.calibration.camera import PlanarView, calibrate_camera
+from bodyscan.calibration.joint_refinement import refine_jointly, striped_board
+from bodyscan.calibration.light import fit_light
+from bodyscan.geometry.camera import Camera
+
+CAMERA = Camera(1061.71, 1064.09, -0.562002, 350.08, 286.547, -0.140279, -0.0916363, 640, 480)
+MIRROR = Mirror(
+    254, np.array([-150.0, 0, 0]), np.array([150.0, 0, 420.0]), np.array([0, 1.0, 0])
+)  # fmt: skip
+SCENE = Scene(CAMERA, MIRROR, "vertical", 20.0, 9, 7)
+POSES = [
+    SCENE.looking_at(middle, turn)
+    for middle, turn in (
+        ((0, 0, 400), (0.3, 0.25, 0)),
+        ((-10, 5, 420), (-0.35, 0.2, 0.1)),
+        ((10, -5, 390), (0.1, -0.4, 0)),
+    )
+]
+
+
+def calibrated(seed):
+    """Camera, sheets and striped boards found one after the other, from noisy measurements."""
+    rng = np.random.default_rng(seed)
+    column, row = np.meshgrid(np.arange(1, 9), np.arange(1, 7))
+    corners = np.column_stack([20.0 * column.ravel(), 20.0 * row.ravel(), np.zeros(48)])
+    views = [
+        PlanarView(
+            f"s{k}", corners, CAMERA.project(p.apply(corners)) + rng.normal(0, 0.015, (48, 2))
+        )
+        for k, p in enumerate(POSES)
+    ]
+    camera = calibrate_camera(views, 640, 480)
+    parts = []
+    for k, pose in enumerate(POSES):
+        index, pixels = SCENE.crossings(pose, 2)
+        pixels[:, 0] += rng.normal(0.0, 0.06, len(pixels))
+        placed = camera.camera_from_board[f"s{k}"]
+        sigma = np.full(len(index), 0.06)
+        parts.append(
+            boundary_points(
+                camera.camera, placed, index, pixels, sigma, board=k, direction="vertical"
+            )
+        )
+    bins = binned(join(parts), camera.camera, "vertical")
+    sheets = fit_light(bins, 254, "vertical", camera.camera).sheets
+    return camera, sheets, [striped_board(v, camera.camera, bins, k) for k, v in enumerate(views)]
+
+
+def flatness_rms_mm(camera, sheets):
+    """Of a flat plane 405 mm away, measured without noise: what is left is systematic."""
+    u, v = np.meshgrid(np.arange(180.0, 520.0, 10.0), np.arange(150.0, 430.0, 10.0))
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    s = MIRROR.stripe(SCENE.on_plane(pixels, SCENE.looking_at((0, 0, 405), (0, 0, 0))))
+    rays = camera.rays(pixels)
+    points = rays * sheets.depth(rays, s)[:, None]
+    centred = points - points.mean(axis=0)
+    return float(np.sqrt(np.linalg.eigvalsh(centred.T @ centred / len(centred))[0]))
+
+
+def test_a_plane_becomes_flatter():
+    before, after = [], []
+    for seed in range(3):
+        camera, sheets, boards = calibrated(seed)
+        joint = refine_jointly(camera.camera, camera.camera_from_board, sheets, boards)
+        before.append(flatness_rms_mm(camera.camera, sheets))
+        after.append(flatness_rms_mm(joint.camera, joint.sheets))
+        # Corners stay explained to their noise of 0.015 px in each coordinate, 0.021 in both.
+        assert joint.corners_rms_px < 0.03
+    # The issue's bound is 0.002 mm; three poses reached 0.0003 to 0.0006 here.
+    assert max(after) < 0.002
+    assert np.mean(after) < 0.5 * np.mean(before)

@@ -1,0 +1,221 @@
+"""Every model of the light against its own derivatives, and against the chapter's planes."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bodyscan.geometry.bowed_sheets import BowedSheets
+from bodyscan.geometry.lens_sheets import LensSheets
+from bodyscan.geometry.light_planes import LightPlanes
+from bodyscan.geometry.measuring import measure
+from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
+from bodyscan.geometry.smooth_sheets import SmoothSheets
+
+STRIPES = 200
+MIDDLE = np.array([20.0, -30.0, 1300.0])
+# f = 300 stripes, axis at stripe 80, 250 mm above the camera, looking down on the middle.
+DOWN, AXIS = np.array([0.02, 0.98, -0.2]), np.array([-0.01, 0.2, 0.98])
+MATRIX = np.stack(
+    [300 * np.append(DOWN, 250.0) + 80 * np.append(AXIS, -20.0), np.append(AXIS, -20.0)]
+)
+PINHOLE = LensSheets.pinhole(MATRIX, MIDDLE, STRIPES, "horizontal")
+
+
+def models(seed: int) -> list[SmoothSheets]:
+    """Each kind, moved a little away from a pinhole at random, with some covariance."""
+    rng = np.random.default_rng(seed)
+    made: list[SmoothSheets] = [PINHOLE.with_lens(terms) for terms in (0, 1, 2, 4)]
+    made += [BowedSheets.of_pinhole(PINHOLE, terms) for terms in (0, 1, 3)]
+    return [moved(model, rng) for model in made]
+
+
+def moved(model: SmoothSheets, rng: np.random.Generator) -> SmoothSheets:
+    size = np.full(len(model.covariance), 0.01)
+    if isinstance(model, BowedSheets):
+        size[2:24] *= 0.1
+        size[24:] *= 0.5
+    else:
+        size[3:6], size[6:8] = 5.0, 1.0
+    step = size * rng.standard_normal(len(size))
+    spread = 1e-4 * size[:, None] * rng.standard_normal((len(size), len(size)))
+    return model.retract(step).with_covariance(spread @ spread.T)
+
+
+def some_points(rng: np.random.Generator, count: int = 50) -> tuple[np.ndarray, np.ndarray]:
+    points = MIDDLE + rng.uniform(-250.0, 250.0, (count, 3))
+    return points, rng.uniform(10.0, 190.0, count)
+
+
+def sliced(model: SmoothSheets, rays: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """s at which rays are measured at a depth, by bisection: depth falls or grows with s."""
+    low, high = np.zeros(len(rays)), np.full(len(rays), float(STRIPES))
+    grows = model.offset(rays * depth[:, None], model.at(low)).by_stripe < 0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        off = model.offset(rays * depth[:, None], model.at(middle)).value
+        above = (off > 0) == grows
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    return 0.5 * (low + high)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 10_000))
+def test_derivatives_are_those_of_the_offset(seed):
+    rng = np.random.default_rng(seed)
+    points, s = some_points(rng)
+    for model in models(seed):
+        offset = model.offset(points, model.at(s), parameters=True)
+
+        def by(change, step, model=model):
+            return (change(step) - change(-step)) / (2.0 * step)
+
+        for k, axis in enumerate(np.eye(3)):
+            slope = by(lambda h, a=axis, m=model: m.offset(points + h * a, m.at(s)).value, 0.01)
+            # Central differences over 0.01 mm in 1300: rounding and curvature below 1e-6.
+            assert np.allclose(offset.by_point[:, k], slope, rtol=1e-5, atol=1e-8)
+        slope = by(lambda h, m=model: m.offset(points, m.at(s + h)).value, 0.001)
+        assert np.allclose(offset.by_stripe, slope, rtol=1e-5, atol=1e-9)
+        for k, axis in enumerate(np.eye(len(model.covariance))):
+            size = np.abs(offset.by_parameter[:, k]).max() + 1e-12
+            slope = by(
+                lambda h, a=axis, m=model: (
+                    m.retract(h * a).offset(points, m.retract(h * a).at(s)).value
+                ),
+                1e-5 / size,
+            )
+            assert np.allclose(offset.by_parameter[:, k], slope, rtol=1e-4, atol=1e-4 * size)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 10_000))
+def test_depth_and_its_slope(seed):
+    rng = np.random.default_rng(seed)
+    points, _ = some_points(rng)
+    rays, depth = points / points[:, 2:], points[:, 2]
+    for model in models(seed):
+        s = sliced(model, rays, depth)
+        inside = (s > 1.0) & (s < STRIPES - 1.0)
+        # Bisection leaves 1e-14 stripes, a stripe is worth some 10 mm.
+        assert np.allclose(model.depth(rays, s)[inside], depth[inside], atol=1e-6)
+        slope = (model.depth(rays, s + 1e-3) - model.depth(rays, s - 1e-3)) / 2e-3
+        assert np.allclose(model.depth_per_stripe(rays, s)[inside], slope[inside], rtol=1e-5)
+
+
+@settings(max_examples=2, deadline=None)
+@given(st.integers(0, 10_000))
+def test_variance_is_that_of_sheets_drawn_from_the_covariance(seed):
+    rng = np.random.default_rng(seed)
+    points, _ = some_points(rng, 8)
+    rays, depth = points / points[:, 2:], points[:, 2]
+    for model in models(seed):
+        s = sliced(model, rays, depth)
+        factor = np.linalg.cholesky(model.covariance + 1e-30 * np.eye(len(model.covariance)))
+        draws = [
+            model.retract(factor @ rng.standard_normal(len(factor))).depth(rays, s)
+            for _ in range(200)
+        ]
+        # 200 draws give a standard deviation to 5 percent; five times that.
+        ratio = np.std(draws, axis=0) / np.sqrt(model.variance_mm2(rays, s))
+        inside = (s > 5.0) & (s < STRIPES - 5.0)
+        assert np.all(np.abs(ratio[inside] - 1.0) < 0.25)
+
+
+def test_smooth_planes_are_planes():
+    model = next(m for m in models(4) if m.kind == "smooth-planes")
+    index = np.arange(STRIPES + 1)
+    planes = model.tangent_planes(index)
+    chapter = LightPlanes(planes, np.zeros((STRIPES + 1, 4, 4)), "horizontal")
+    rng = np.random.default_rng(1)
+    rays = np.column_stack([rng.uniform(-0.3, 0.3, (300, 2)), np.ones(300)])
+    s = rng.integers(1, STRIPES, 300).astype(float)
+    # Far away rays and planes are nearly parallel: compare where a scanner measures.
+    near = chapter.depth(rays, s)
+    near = np.isfinite(near) & (near > 500.0) & (near < 3000.0)
+    assert near.sum() > 50
+    assert np.allclose(model.depth(rays, s)[near], chapter.depth(rays, s)[near], rtol=1e-9)
+
+
+def test_a_lens_without_distortion_is_the_two_by_four_matrix():
+    points, _ = some_points(np.random.default_rng(2))
+    homogeneous = np.column_stack([points, np.ones(len(points))])
+    above, below = MATRIX @ homogeneous.T
+    assert np.allclose(PINHOLE.stripe(points), above / below, rtol=1e-12)
+    assert abs(PINHOLE.projector_from_camera.apply(MIDDLE)[0]) < 1e-9
+
+
+def test_turning_a_projector_moves_its_axis_and_little_else():
+    turned = PINHOLE.turned(140.0)
+    assert turned.parameters[1] == 140.0
+    assert np.allclose(turned.projector_from_camera.inverse().translation,
+                       PINHOLE.projector_from_camera.inverse().translation)  # fmt: skip
+    # What the axis meets is lit by the stripe it was lit by before, to second order in the turn.
+    along = turned.projector_from_camera.inverse().apply(np.array([0.0, 0.0, 1300.0]))
+    assert abs(PINHOLE.stripe(along) - 140.0) < 1e-6
+
+
+def test_no_depth_outside_the_stripes_or_behind():
+    rays = np.tile([0.0, 0.0, 1.0], (3, 1))
+    for model in models(3):
+        assert np.isnan(model.depth(rays, np.array([-0.5, STRIPES + 0.5, np.nan]))).all()
+    # Below the projector, a ray that falls steeply never meets the light that falls least.
+    steep = np.array([[0.0, 3.0, 1.0]])
+    assert np.isnan(PINHOLE.depth(steep, np.array([10.0]))).all()
+
+
+def test_arrays_hold_everything():
+    rng = np.random.default_rng(5)
+    points, s = some_points(rng)
+    rays = points / points[:, 2:]
+    planes = LightPlanes(rng.normal(size=(5, 4)), rng.normal(size=(5, 4, 4)), "vertical")
+    for sheets in (*models(7), planes):
+        again = from_arrays(sheets.kind, to_arrays(sheets), sheets.direction)
+        assert type(again) is type(sheets)
+        assert (again.kind, again.direction) == (sheets.kind, sheets.direction)
+        assert again.stripes == sheets.stripes
+        for left, right in zip(to_arrays(sheets).values(), to_arrays(again).values(), strict=True):
+            assert np.array_equal(left, right)
+        assert np.array_equal(again.depth(rays, s), sheets.depth(rays, s), equal_nan=True)
+
+
+def test_arrays_of_another_kind_are_refused():
+    bowed = models(0)[-1]
+    with pytest.raises(ValueError, match="smooth-planes"):
+        from_arrays("smooth-planes", to_arrays(bowed), "horizontal")
+    with pytest.raises(ValueError, match="cones"):
+        from_arrays("cones", to_arrays(bowed), "horizontal")
+
+
+def test_planes_have_slope_and_variance_between_two_and_at_the_last():
+    planes = models(4)[4].tangent_planes(np.arange(STRIPES + 1))
+    spread = np.zeros((STRIPES + 1, 4, 4))
+    spread[:, 3, 3] = 0.01
+    planes[150] = np.nan
+    chapter = LightPlanes(planes, spread, "horizontal")
+    ray = np.array([[0.02, 0.01, 1.0]])
+    for s in (100.5, 149.0, 151.0, 99.0):
+        s = np.array([s])
+        depth = chapter.depth(ray, s)
+        side = -1.0 if s[0] == 149.0 else 1.0
+        nearby = chapter.depth(ray, s + side * 1e-6)
+        slope = (nearby - depth) / (side * 1e-6)
+        assert np.allclose(chapter.depth_per_stripe(ray, s), slope, rtol=1e-4)
+        facing = chapter.at(s)[0, :3] @ ray[0]
+        # A plane's offset, 0.1 mm uncertain, moves the depth by that over n . ray.
+        assert np.allclose(chapter.variance_mm2(ray, s), 0.01 / facing**2)
+    assert np.isnan(chapter.variance_mm2(ray, np.array([149.5]))).all()
+
+
+def test_what_is_too_uncertain_is_not_measured():
+    model = models(2)[0]
+    points, _ = some_points(np.random.default_rng(6))
+    rays = points / points[:, 2:]
+    s = model.stripe(points)
+    inside = (s > 0) & (s < STRIPES)
+    good = measure(model, rays, s)
+    assert np.array_equal(np.isfinite(good.depth), inside)
+    sigma = float(np.sqrt(np.nanmedian(good.variance_mm2)))
+    worse = model.with_covariance(model.covariance * (1e-3 * 1300.0 / sigma) ** 2)
+    kept = np.isfinite(measure(worse, rays, s).depth)
+    # Sigma is now about one thousandth of the distance: some are below, some above.
+    assert 0 < kept.sum() < inside.sum()
