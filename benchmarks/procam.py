@@ -23,10 +23,10 @@ def report() -> str:
     return f"""## A real pair, each board held out (procam-board)
 
 Camera and boards from the corners of all poses; the projector from the stripes of all poses but
-one; that one's board measured. Board units (75 a square): median absolute distance to the board's plane,
-then RMS about the points' own plane. Stripes of one direction only: for OpenCV's stereo calibration the
-missing projector coordinate is imputed. "Chosen" is the model that the remaining boards choose by
-holding out each of them in turn; the board measured takes no part in the choice.
+one; that one's board measured. Board units (75 a square): median absolute distance to the board's
+plane, then RMS about the points' own plane. Stripes of one direction only: for OpenCV's stereo
+calibration the missing projector coordinate is imputed. "Chosen" is the model that the remaining
+boards choose by holding out each of them in turn; the board measured takes no part in the choice.
 
 | model | {" | ".join(shots)} | mean of medians |
 |---|{"---|" * (len(shots) + 1)}

@@ -153,8 +153,12 @@ def _corner_residuals(state: _State[Sheets], k: int, board: StripedBoard) -> Arr
 
 
 def _points(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
+    return _on_board(state.camera, state.poses[k], board)
+
+
+def _on_board(camera: Camera, camera_from_board: RigidTransform, board: StripedBoard) -> Array:
     height = RigidTransform(np.eye(3), np.array([0.0, 0.0, board.view.points[0, 2]]))
-    return points_on_board(state.camera, state.poses[k] @ height, board.pixels)
+    return points_on_board(camera, camera_from_board @ height, board.pixels)
 
 
 def _stripe_residuals(
@@ -234,22 +238,21 @@ def _stripe_equations(
     sigma = _sigma(state, k, board, points, offset.by_point) * noise.stripe
     by_place = np.empty((len(points), 13))
     for column, size in enumerate(DIFFERENCES):
-        ends = []
-        for sign in (1.0, -1.0):
-            step = np.zeros(7 + 6 * len(state.poses))
-            step[column if column < 7 else 6 * k + column] = sign * size
-            moved = _State(state.camera, state.poses, _Still()).moved(step)
-            ends.append(_points(moved, k, board))
-        by_place[:, column] = np.sum(offset.by_point * (ends[0] - ends[1]), axis=1) / (2.0 * size)
+        ahead, behind = (_nudged(state, k, board, column, step) for step in (size, -size))
+        by_place[:, column] = np.sum(offset.by_point * (ahead - behind), axis=1) / (2.0 * size)
     jacobian = np.concatenate([by_place, offset.by_parameter], axis=1) / sigma[:, None]
     return offset.value / sigma, jacobian
 
 
-class _Still:
-    """Sheets that do not move: only camera and poses are differentiated."""
-
-    def retract(self, step: Array) -> _Still:
-        return self
+def _nudged(state: _State[Sheets], k: int, board: StripedBoard, column: int, step: float) -> Array:
+    """Boundary points after a small change of one intrinsic (0-6) or of the board's pose (7-12)."""
+    if column < len(INTRINSICS):
+        name = INTRINSICS[column]
+        camera = replace(state.camera, **{name: getattr(state.camera, name) + step})
+        return _on_board(camera, state.poses[k], board)
+    twist = np.zeros(6)
+    twist[column - len(INTRINSICS)] = step
+    return _on_board(state.camera, state.poses[k].moved(twist), board)
 
 
 def _add(

@@ -76,7 +76,7 @@ def fit_light(data: BoundaryPoints, stripes: int, direction: Axis, camera: Camer
     fold = folds(few)
     tried = [hold_out(candidate, few, fold) for candidate in candidates]
     chosen, figures = choose(candidates, tried, few.board)
-    error = tried[chosen].board_error_mm()
+    error = tried[chosen].board_error_mm(few)
     fit: SheetFit[SmoothSheets] | PlaneFit
     sheets: LightSheets
     if chosen < len(starts):

@@ -18,7 +18,10 @@ AS_GOOD = 1.1
 """A simpler model is taken if its error is at most this many times the best one's."""
 CAP = 30.0
 """No point counts for more than this many times the best model's median."""
-OUTLIER = 4.0
+OUTLIER, MAD = 4.0, 1.4826
+LEAST_SHARE = 0.01
+"""Boards are never taken for known so well that less than this share of the squared held-out
+distances is theirs."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +64,24 @@ class HeldOutErrors:
     distances: Array
     unit_variance: Array
 
-    def board_error_mm(self) -> float:
-        """How far out of place boards must be, for distances as large as these are."""
+    def board_error_mm(self, data: BoundaryPoints) -> float:
+        """How far out of place boards must be, for distances as large as these are.
+
+        data: the points that were held out. Their own noise, seen in how neighbours on a boundary
+        differ, is taken off.
+        """
         known = np.isfinite(self.distances) & np.isfinite(self.unit_variance)
         squared = self.distances[known] ** 2
         if not squared.size:
             return 0.0
-        limit = (OUTLIER * 1.4826) ** 2 * np.median(squared)
-        return float(np.sqrt(np.minimum(squared, limit).mean() / self.unit_variance[known].mean()))
+        limit = (OUTLIER * MAD) ** 2 * np.median(squared)
+        total = np.minimum(squared, limit).mean()
+        together = (np.diff(data.index) == 0) & (np.diff(data.board) == 0)
+        steps = np.diff(self.distances)[together]
+        steps = steps[np.isfinite(steps)]
+        noise = 0.5 * (MAD * np.median(np.abs(steps))) ** 2 if steps.size else 0.0
+        left = max(total - noise, LEAST_SHARE * total)
+        return float(np.sqrt(left / self.unit_variance[known].mean()))
 
 
 def folds(data: BoundaryPoints) -> NDArray[np.int64]:
@@ -145,6 +158,6 @@ def _median(distances: Array) -> float:
 
 
 def _rms(distances: Array) -> float:
-    limit = OUTLIER * 1.4826 * _median(distances)
+    limit = OUTLIER * MAD * _median(distances)
     kept = distances[distances <= limit]
     return float(np.sqrt(np.mean(kept**2))) if kept.size else np.inf

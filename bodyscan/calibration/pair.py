@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from bodyscan.calibration.boundary_points import BoundaryPoints
 from bodyscan.calibration.camera import PlanarView
-from bodyscan.calibration.light import LightFit, fit_light
 from bodyscan.calibration.light_choice import HeldOutModel
 from bodyscan.calibration.light_planes import boundary_points, join
 from bodyscan.capture.boards import corner_points, corners_per_face
@@ -34,6 +33,8 @@ class PairQuality:
     to their sheets, RMS (mm), over `stripe_shots` boards; boundaries with a sheet, of those thrown.
 
     held_out: every model of the light tried on boards it was not fitted to, simplest first.
+    refinement: of a pair by itself, whether camera, boards and light were refined together and why;
+    flatness_mm: RMS of held-out boards about their own planes, before and after.
     """
 
     corners_rms_px: float
@@ -43,6 +44,8 @@ class PairQuality:
     stripes_calibrated: int = 0
     stripes_projected: int = 0
     held_out: tuple[HeldOutModel, ...] = ()
+    refinement: str = ""
+    flatness_mm: tuple[float, float] | None = None
 
     @property
     def light_model(self) -> str | None:
@@ -99,13 +102,13 @@ def boundaries_near(stripes: StripeMap, view: BoardView) -> BoardBoundaries:
     )
 
 
-def calibrate_light(
+def boundaries_on_boards(
     name: str,
     camera: Camera,
     projector: ProjectorSpec,
     shots: Iterable[tuple[Board, RigidTransform, float, BoardBoundaries]],
-) -> LightFit:
-    """Light sheets from the boundaries on boards: (board, camera_from_board, face's z, boundaries).
+) -> BoundaryPoints:
+    """Boundaries carried onto boards: (board, camera_from_board, face's z, boundaries) of each shot.
 
     Raises PairFailed if fewer than two boards carry stripes.
     """
@@ -113,14 +116,14 @@ def calibrate_light(
         on_board(camera, projector, board, pose, face_z, boundaries, number)
         for number, (board, pose, face_z, boundaries) in enumerate(shots)
     ]
-    parts = [part for part in parts if len(part.index)]
-    if len(parts) < FEWEST_STRIPE_SHOTS:
+    striped = sum(len(part.index) > 0 for part in parts)
+    if striped < FEWEST_STRIPE_SHOTS:
         raise PairFailed(
-            f"stripes were decoded on {len(parts)} board poses, a light plane needs at least two",
+            f"stripes were decoded on {striped} board poses, a light plane needs at least two",
             where=f"pair {name}",
             remedy="capture the stripe sequence on the board in three or more poses",
         )
-    return fit_light(join(parts), projector.stripes, projector.direction, camera)
+    return join(parts)
 
 
 def on_board(

@@ -5,16 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
+from bodyscan.calibration.boundary_points import BoundaryPoints, binned
+from bodyscan.calibration.camera import (
+    CameraCalibration,
+    PlanarView,
+    calibrate_camera,
+    locate_board,
+)
+from bodyscan.calibration.joint_refinement import striped_board
+from bodyscan.calibration.light import fit_light
 from bodyscan.calibration.pair import (
     BoardBoundaries,
     PairCalibration,
     PairQuality,
     boundaries_near,
-    calibrate_light,
+    boundaries_on_boards,
     planar_view,
     usable,
 )
+from bodyscan.calibration.refinement_choice import refine_where_better
 from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.capture.boards import corner_points
 from bodyscan.capture.codes import read_stripes
@@ -199,42 +208,83 @@ def calibrate_pairs(
     """Light sheets of every pair; a pair whose projector fails is added to `failed`."""
 
     def calibrate(name: str) -> PairCalibration | str:
-        camera = placed.cameras[name]
-        views = [view for view in placed.views if view.pair == name]
-        quality = PairQuality(placed.rms_px[name], len(views))
-        pair = PairCalibration(name, camera, cameras[name].covariance, None, quality)
-        projector = rig.pair(name).projector
-        if projector is None:
-            return pair
-        camera_from_rig = placed.rig_from_camera[name].inverse()
-        shots = [
-            (
-                rig.board(view.board),
-                camera_from_rig @ placed.rig_from_board[view.target],
-                float(view.points[0, 2]),
-                boundaries[name, view.shot, view.board],
-            )
-            for view in views
-            if (name, view.shot, view.board) in boundaries
-        ]
         try:
-            fit = calibrate_light(name, camera, projector, shots)
+            return _calibrate_pair(rig, name, cameras[name], placed, boundaries)
         except BodyscanError as error:
             return str(error)
-        return replace(
-            pair,
-            light=fit.sheets,
-            quality=replace(
-                quality,
-                planes_rms_mm=fit.rms_mm,
-                stripe_shots=len(shots),
-                stripes_calibrated=fit.stripes_calibrated,
-                stripes_projected=projector.stripes - 1,
-                held_out=fit.held_out,
-            ),
-        )
 
     names = sorted(cameras)
     results = threaded(calibrate, names, stage="fitting light sheets", progress=progress)
     failed |= {n: r for n, r in zip(names, results, strict=True) if isinstance(r, str)}
     return {n: r for n, r in zip(names, results, strict=True) if isinstance(r, PairCalibration)}
+
+
+def _calibrate_pair(
+    rig: Rig,
+    name: str,
+    own: CameraCalibration,
+    placed: PlacedRig,
+    boundaries: Mapping[tuple[str, str, str], BoardBoundaries],
+) -> PairCalibration:
+    camera = placed.cameras[name]
+    views = [view for view in placed.views if view.pair == name]
+    quality = PairQuality(placed.rms_px[name], len(views))
+    projector = rig.pair(name).projector
+    if projector is None:
+        return PairCalibration(name, camera, own.covariance, None, quality)
+    camera_from_rig = placed.rig_from_camera[name].inverse()
+    lit = [view for view in views if (name, view.shot, view.board) in boundaries]
+    poses = [camera_from_rig @ placed.rig_from_board[view.target] for view in lit]
+    points = boundaries_on_boards(
+        name,
+        camera,
+        projector,
+        [
+            (
+                rig.board(view.board),
+                pose,
+                float(view.points[0, 2]),
+                boundaries[name, view.shot, view.board],
+            )
+            for view, pose in zip(lit, poses, strict=True)
+        ],
+    )
+    fit = fit_light(points, projector.stripes, projector.direction, camera)
+    quality = replace(
+        quality,
+        planes_rms_mm=fit.rms_mm,
+        stripe_shots=len(lit),
+        stripes_calibrated=fit.stripes_calibrated,
+        stripes_projected=projector.stripes - 1,
+        held_out=fit.held_out,
+    )
+    pair = PairCalibration(name, camera, own.covariance, fit.sheets, quality)
+    # In a rig of several pairs the boards are held by all cameras together, far better than
+    # one pair's stripes could.
+    return pair if len(placed.cameras) > 1 else _refined(pair, own, lit, points)
+
+
+def _refined(
+    pair: PairCalibration,
+    own: CameraCalibration,
+    views: Sequence[LocatedView],
+    points: BoundaryPoints,
+) -> PairCalibration:
+    """Camera, boards and light of a pair by itself in one solve, where held-out boards gain."""
+    assert pair.light is not None
+    data = binned(points, pair.camera, pair.light.direction)
+    boards = [
+        striped_board(PlanarView(view.shot, view.points, view.pixels), pair.camera, data, number)
+        for number, view in enumerate(views)
+    ]
+    choice = refine_where_better(own, pair.light, boards, data)
+    quality = replace(pair.quality, refinement=choice.reason, flatness_mm=choice.flatness_mm)
+    if choice.joint is None:
+        return replace(pair, quality=quality)
+    return replace(
+        pair,
+        camera=choice.joint.camera,
+        camera_covariance=choice.joint.camera_covariance,
+        light=choice.joint.sheets,
+        quality=replace(quality, corners_rms_px=choice.joint.corners_rms_px),
+    )

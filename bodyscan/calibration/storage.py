@@ -155,7 +155,10 @@ def _light(content: dict[str, Any], name: str, arrays: Any) -> LightSheets:
 
 def _quality(content: dict[str, Any]) -> PairQuality:
     tried = tuple(HeldOutModel(**figures) for figures in content["held_out"])
-    return PairQuality(**content | {"held_out": tried})
+    flatness = content["flatness_mm"]
+    return PairQuality(
+        **content | {"held_out": tried, "flatness_mm": tuple(flatness) if flatness else None}
+    )
 
 
 def _transform(matrix: Any) -> RigidTransform:

@@ -16,8 +16,8 @@ _FOCUS_STEPS = 5
 
 
 def exposure(lit: Floats, grey: float, lighting: Lighting) -> float:
-    """The exposure at which the brightest hundredth of a lit image begins at `grey`."""
-    bright = max(float(np.percentile(lit, 99.0)), 1e-3)
+    """The exposure at which the brightest thousandth of a lit image begins at `grey`."""
+    bright = max(float(np.percentile(lit, 99.9)), 1e-3)
     return float(np.clip(grey / bright, lighting.shortest, lighting.longest))
 
 

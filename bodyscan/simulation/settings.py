@@ -85,14 +85,14 @@ class Lighting:
     laser_grey: of a perfectly white surface that faces the projector at 0.85 working distances.
     ambient_grey: what the room's own light adds to a perfectly white surface.
     board_grey, person_grey: each pair sets its exposure for each shot, so that the brightest
-    hundredth of the lit image begins at this grey level.
+    thousandth of the lit image begins at this grey level.
     shortest, longest: exposures it can set.
     """
 
     laser_grey: float = 240.0
     ambient_grey: float = 10.0
-    board_grey: float = 205.0
-    person_grey: float = 205.0
+    board_grey: float = 235.0
+    person_grey: float = 230.0
     shortest: float = 0.4
     longest: float = 2.5
 

@@ -132,24 +132,29 @@ class Scene:
         tall = self.direction == "horizontal"
         width, height = self.camera.width, self.camera.height
         lines = np.arange(0.0, width if tall else height, every_px)
-        index = np.arange(1, self.projector.stripes)
-        line, wanted = (grid.ravel() for grid in np.meshgrid(lines, index))
-        place = np.full(len(line), (height if tall else width) / 2.0)
+        wanted = np.arange(1.0, self.projector.stripes)
 
-        def stripe(place: Array) -> tuple[Array, Array]:
+        def stripe(line: Array, place: Array) -> tuple[Array, Array]:
             pixels = np.column_stack([line, place] if tall else [place, line])
             return self.projector.stripe(self.on_plane(pixels, camera_from_board)), pixels
 
-        for _ in range(6):
-            s = stripe(place)[0]
-            slope = (stripe(place + 0.5)[0] - s) / 0.5
-            place = np.clip(place - (s - wanted) / slope, -400.0, 2000.0)
-        s, pixels = stripe(place)
+        coarse = np.linspace(0.0, height if tall else width, 40)
+        first = stripe(np.repeat(lines, 40), np.tile(coarse, len(lines)))[0].reshape(-1, 40)
+        rises = 1 if first[0, -1] > first[0, 0] else -1
+        place = np.stack(
+            [np.interp(wanted, row[::rises], coarse[::rises]) for row in first]
+        ).ravel()
+        line, wanted = np.repeat(lines, len(wanted)), np.tile(wanted, len(lines))
+        for _ in range(3):
+            s = stripe(line, place)[0]
+            slope = (stripe(line, place + 0.5)[0] - s) / 0.5
+            place = place - (s - wanted) / slope
+        s, pixels = stripe(line, place)
         on_board = camera_from_board.inverse().apply(self.on_plane(pixels, camera_from_board))
         seen = (np.abs(s - wanted) < 1e-6) & np.all(pixels > 0, axis=1)
         seen &= np.all(pixels < [width - 1, height - 1], axis=1)
         seen &= np.all((on_board[:, :2] > 0) & (on_board[:, :2] < self.size), axis=1)
-        return wanted[seen], pixels[seen]
+        return wanted[seen].astype(np.int64), pixels[seen]
 
     def boundaries(
         self,

@@ -93,7 +93,7 @@ def test_bowed_sheets_of_a_mirror():
 @cache
 def lens(k1: float = -0.035, k2: float = 0.0, axis: float = 330.0) -> tuple[Scene, LightFit]:
     scene = body_scene(k1, k2, axis)
-    return scene, fitted(scene, boards(scene, BODY_POSES))
+    return scene, fitted(scene, boards(scene, BODY_POSES, corner_px=0.02))
 
 
 def body(scene: Scene, noise_px: float) -> tuple[np.ndarray, ...]:
@@ -112,7 +112,8 @@ def body(scene: Scene, noise_px: float) -> tuple[np.ndarray, ...]:
     normals = (points - [0.0, 0.0, 1300.0]) * [1.0, 0.0, 1.0] / 170.0
     s = scene.projector.stripe(points)
     lit = (normals[:, 2] < -0.5) & (s > 1) & (s < scene.projector.stripes - 1)
-    slope = (scene.projector.stripe(hit(pixels + [0.0, 0.5])[1]) - s) / 0.5
+    below = pixels + np.array([0.0, 0.5])
+    slope = (scene.projector.stripe(hit(below)[1]) - s) / 0.5
     noise = slope * np.random.default_rng(3).normal(0.0, noise_px, len(s))
     return rays[lit], points[lit], (s + noise)[lit], normals[lit]
 
@@ -149,15 +150,19 @@ def test_the_lens_axis_is_found_outside_the_image():
     assert abs(fit.sheets.parameters[1] - scene.projector.centre) < 20.0
 
 
-def test_bowed_sheets_are_nearly_as_good_where_boards_were():
-    scene, fit = lens()
-    bowed = min(figure(fit, "bowed sheets"), figure(fit, "bowed sheets, 3 terms"))
-    assert bowed < 0.6 * min(figure(fit, "smooth planes"), figure(fit, "free planes"))
+def test_bowed_sheets_come_near_where_boards_were():
+    _, fit = lens()
+    bowed = next(held for held in fit.held_out if held.model == "bowed sheets")
+    best = next(held for held in fit.held_out if held.chosen)
+    assert bowed.median_mm < 1.5 * best.median_mm
+    for planes in ("smooth planes", "free planes", "pinhole"):
+        held = next(held for held in fit.held_out if held.model == planes)
+        assert held.median_mm > 1.5 * best.median_mm
 
 
 def test_sigma_tells_how_far_off_the_sheets_are():
     pulls = []
-    for seed in range(2, 8):
+    for seed in range(2, 6):
         scene = chapter_scene()
         fit = fitted(scene, boards(scene, CHAPTER_POSES, seed=seed))
         pose = scene.looking_at([0.0, 0.0, 400.0], [0.05, -0.1, 0.0])
@@ -166,7 +171,7 @@ def test_sigma_tells_how_far_off_the_sheets_are():
         measured = measure(fit.sheets, rays, index.astype(float))
         off = measured.depth - scene.on_plane(pixels, pose)[:, 2]
         pulls.append(np.sqrt(np.nanmean(off**2 / measured.variance_mm2)))
-    # Three boards tell their own error badly: within a factor of two, over six calibrations.
+    # Three boards tell their own error badly: within a factor of two, over four calibrations.
     assert 0.5 < np.sqrt(np.mean(np.square(pulls))) < 2.0
 
 

@@ -1,0 +1,1 @@
+"""The models the chapter is compared with (1, 4.2), all as `Camera` and `LightSheets`."""

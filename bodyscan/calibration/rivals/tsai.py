@@ -1,0 +1,129 @@
+"""Tsai's camera calibration (1987) from points that do not lie in one plane.
+
+Radial alignment: whatever the focal length, the depth and the radial distortion, a point's image
+lies on the ray from the image centre towards its place across the axis. That gives rotation and
+shift across linearly, then focal length and depth; all are refined together at last. The model has
+one coefficient, from real to ideal: ideal = real (1 + kappa r^2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TsaiCamera:
+    """focal (px of a row), aspect (px of a column each), centre (2,) px, kappa for places in units
+    of the focal length.  camera_from_points: where the camera stands.  rms_px: of the residuals.
+    """
+
+    focal: float
+    aspect: float
+    centre: Array
+    kappa: float
+    camera_from_points: RigidTransform
+    rms_px: float
+
+    def camera(self, width: int, height: int) -> Camera:
+        """As the chapter's camera: k1 and k2 that undo kappa best over the image."""
+        corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
+        scale = np.array([self.focal * self.aspect, self.focal])
+        real = np.linspace(0.0, 1.0, 201)[1:] * np.linalg.norm(
+            (corners - self.centre) / scale, axis=1
+        ).max(initial=0.0)
+        ideal = real * (1.0 + self.kappa * real**2)
+        # Weighted by the radius: there is more image there.
+        rows = np.stack([ideal**3, ideal**5], axis=1) * np.sqrt(real)[:, None]
+        k1, k2 = np.linalg.lstsq(rows, (real - ideal) * np.sqrt(real), rcond=None)[0]
+        return Camera(
+            alpha=self.focal * self.aspect,
+            beta=self.focal,
+            gamma=0.0,
+            u0=float(self.centre[0]),
+            v0=float(self.centre[1]),
+            k1=float(k1),
+            k2=float(k2),
+            width=width,
+            height=height,
+        )
+
+
+def calibrate_tsai(points: Array, pixels: Array, centre: Array) -> TsaiCamera:
+    """From points (N, 3) mm, not in one plane, their pixels (N, 2) and a rough image centre (2,).
+
+    The centre is taken where radial alignment is best (Lenz and Tsai 1988), then all is refined.
+    """
+    found = least_squares(lambda place: _alignment(points, pixels - place)[1], centre).x
+    rotation, across, aspect = _aligned(points, pixels - found)
+    focal, depth = _focal_and_depth(points, pixels - found, rotation, across)
+    start = np.concatenate(
+        [
+            RigidTransform(rotation, np.zeros(3)).rotation_vector,
+            [*across, depth, focal, aspect, *found, 0.0],
+        ]
+    )
+    solved = least_squares(
+        lambda values: _residuals(values, points, pixels), start, x_scale="jac", loss="linear"
+    )
+    values = solved.x
+    rms = float(np.sqrt(2.0 * np.mean(solved.fun**2)))
+    place = RigidTransform.from_rotation_vector(values[:3], values[3:6])
+    return TsaiCamera(
+        float(values[6]), float(values[7]), values[8:10], float(values[10]), place, rms
+    )
+
+
+def _alignment(points: Array, image: Array) -> tuple[Array, Array]:
+    """Unknowns (8,) s r1, s tx, r2, ty with |r2| = 1, s the aspect, and residuals (N,), px mm."""
+    u, v = image[:, :1], image[:, 1:]
+    whole = np.column_stack([points, np.ones(len(points))])
+    rows = np.concatenate([v * whole, -u * whole], axis=1)
+    size = np.linalg.norm(rows, axis=0)
+    _, vectors = np.linalg.eigh((rows / size).T @ (rows / size))
+    solved = vectors[:, 0] / size
+    solved /= np.linalg.norm(solved[4:7])
+    return solved, rows @ solved
+
+
+def _aligned(points: Array, image: Array) -> tuple[Array, Array, float]:
+    """Rotation (3, 3), shift across (2,), aspect."""
+    solved, _ = _alignment(points, image)
+    aspect = float(np.linalg.norm(solved[:3]))
+    first, second = solved[:4] / aspect, solved[4:]
+    whole = np.column_stack([points, np.ones(len(points))])
+    # The sign: points are seen on the side of the axis on which they lie.
+    sign = np.sign(np.sum((whole @ np.stack([first, second]).T) * image))
+    first, second = sign * first, sign * second
+    rows = np.stack([first[:3], second[:3], np.cross(first[:3], second[:3])])
+    rotation = RigidTransform.from_matrix(np.column_stack([rows, np.zeros(3)])).rotation
+    return rotation, np.array([first[3], second[3]]), aspect
+
+
+def _focal_and_depth(
+    points: Array, image: Array, rotation: Array, across: Array
+) -> tuple[float, float]:
+    """Focal length (px) and depth (mm) without distortion, linear."""
+    height = points @ rotation[1] + across[1]
+    forward = points @ rotation[2]
+    rows = np.stack([height, -image[:, 1]], axis=1)
+    focal, depth = np.linalg.lstsq(rows, forward * image[:, 1], rcond=None)[0]
+    return float(focal), float(depth)
+
+
+def _residuals(values: Array, points: Array, pixels: Array) -> Array:
+    """Px in the ideal image, (2 N,)."""
+    focal, aspect, centre, kappa = values[6], values[7], values[8:10], values[10]
+    seen = RigidTransform.from_rotation_vector(values[:3], values[3:6]).apply(points)
+    scale = np.array([focal * aspect, focal])
+    real = (pixels - centre) / scale
+    ideal = real * (1.0 + kappa * np.sum(real**2, axis=1, keepdims=True))
+    return ((seen[:, :2] / seen[:, 2:] - ideal) * scale).ravel()

@@ -1,0 +1,65 @@
+"""A flat plane in a range image: how far it is from flat, and how much of that is no noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+DEGREE = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Flatness:
+    """points: how many.  normal (3,) and offset_mm of the best plane, normal . p = offset.
+
+    rms_mm: of the points' distances from it.  systematic_rms_mm: of what is smooth in them.
+    """
+
+    points: int
+    normal: Array
+    offset_mm: float
+    rms_mm: float
+    systematic_rms_mm: float
+
+
+def best_plane(points: Array) -> tuple[Array, float]:
+    """Unit normal (3,) and offset of the plane through points (N, 3), least squares."""
+    middle = points.mean(axis=0)
+    centred = points - middle
+    _, vectors = np.linalg.eigh(centred.T @ centred)
+    normal = vectors[:, 0] * (np.sign(vectors[:, 0] @ middle) or 1.0)
+    return normal, float(normal @ middle)
+
+
+def flatness(points: Array, degree: int = DEGREE) -> Flatness:
+    """Of points (N, 3) measured on a flat plane.
+
+    The smooth part of the distances is a polynomial of so high a degree over the plane (products
+    of Legendre polynomials); noise of N points puts only sqrt(terms / N) of itself there.
+    """
+    normal, offset = best_plane(points)
+    distances = points @ normal - offset
+    smooth = smooth_part(points, distances, degree)
+    return Flatness(len(points), normal, offset, _rms(distances), _rms(smooth))
+
+
+def smooth_part(points: Array, values: Array, degree: int = DEGREE) -> Array:
+    """(N,): the polynomial over a plane nearest to values (N,) at points (N, 3)."""
+    middle = points.mean(axis=0)
+    centred = points - middle
+    _, vectors = np.linalg.eigh(centred.T @ centred)
+    place = centred @ vectors[:, 1:]
+    place /= np.abs(place).max(axis=0)
+    rows = legendre.legvander2d(place[:, 0], place[:, 1], [degree, degree])
+    total = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)).ravel()
+    rows = rows[:, total <= degree]
+    return np.asarray(rows @ np.linalg.lstsq(rows, values, rcond=None)[0], np.float64)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
