@@ -156,7 +156,8 @@ def scan(
         subject=captures.subject,
         when=captures.when,
     )
-    pictures = draw_scan(result, out)
+    with console.errors.status("drawing"):
+        pictures = draw_scan(result, out)
     for name, reason in result.failed.items():
         console.console.print(f"left out: {name}: {reason}", style="red", highlight=False)
     console.console.print(console.scan_table(result))
@@ -175,7 +176,8 @@ def export(
     from bodyscan.export.scan import export_scan
     from bodyscan.fusion.storage import load_scan
 
-    written = export_scan(load_scan(result), out or result / "export", formats.split(","))
+    with console.errors.status("exporting"):
+        written = export_scan(load_scan(result), out or result / "export", formats.split(","))
     console.console.print("\n".join(map(str, written)))
 
 
@@ -185,4 +187,6 @@ def evaluate(workspace: Folder) -> None:
     from bodyscan import console
     from bodyscan.evaluation.workspace import evaluate_workspace
 
-    console.console.print(evaluate_workspace(workspace), highlight=False)
+    with console.errors.status("comparing"):
+        text = evaluate_workspace(workspace)
+    console.console.print(text, highlight=False)
