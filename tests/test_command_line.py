@@ -41,11 +41,11 @@ def test_a_missing_calibration_is_bad_input(tmp_path):
 def test_check_and_help_import_nothing_heavy():
     for arguments in (["--help"], ["check", str(RIGS / "three-pole-12.yaml")]):
         program = (
-            "import sys; sys.argv = ['bodyscan', *%r]\n"
+            f"import sys; sys.argv = ['bodyscan', *{arguments!r}]\n"
             "from bodyscan.cli import main\n"
             "try:\n    main()\nexcept SystemExit:\n    pass\n"
-            "print('heavy:', [m for m in %r if m in sys.modules])"
-        ) % (arguments, HEAVY)
+            f"print('heavy:', [m for m in {HEAVY!r} if m in sys.modules])"
+        )
         done = subprocess.run(
             [sys.executable, "-c", program], capture_output=True, text=True, check=True
         )
