@@ -26,11 +26,11 @@ from bodyscan.calibration.pair import (
 from bodyscan.calibration.refinement_choice import refine_where_better
 from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.capture.boards import corner_points
-from bodyscan.capture.codes import read_stripes
+from bodyscan.capture.decoding import decode_sequence
 from bodyscan.capture.detection import find_boards
 from bodyscan.capture.folder import Captures
 from bodyscan.capture.folder import Sequence as ImageSequence
-from bodyscan.capture.images import read_lit, read_sequence
+from bodyscan.capture.images import read_lit
 from bodyscan.capture.rig import Board, Rig
 from bodyscan.capture.views import BoardView
 from bodyscan.errors import BodyscanError, FailedWork
@@ -168,20 +168,10 @@ def decode_on_boards(
     sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
 
     def decode(sequence: ImageSequence) -> dict[tuple[str, str, str], BoardBoundaries] | str:
-        spec = rig.pair(sequence.pair)
-        assert spec.projector is not None
         try:
-            images = read_sequence(sequence, spec.camera, workers=1)
-            stripes = read_stripes(
-                images.lit,
-                images.dark,
-                images.patterns,
-                images.inverses,
-                stripes=spec.projector.stripes,
-                direction=spec.projector.direction,
-            )
+            stripes = decode_sequence(sequence, rig.pair(sequence.pair))
         except BodyscanError as error:
-            return f"pair {sequence.pair}, shot {sequence.shot}: {error}"
+            return str(error)
         return {
             (view.pair, view.shot, view.board): boundaries_near(stripes, view)
             for view in wanted[sequence.pair, sequence.shot]

@@ -16,9 +16,8 @@ from bodyscan.calibration.pair import BoardBoundaries, on_board
 from bodyscan.calibration.pinhole_projector import fit_pinhole, fit_pinhole_opencv
 from bodyscan.calibration.rig import calibrate_cameras, find_all_boards
 from bodyscan.capture.boards import corner_points
-from bodyscan.capture.codes import read_stripes
+from bodyscan.capture.decoding import decode_sequence
 from bodyscan.capture.folder import Captures
-from bodyscan.capture.images import read_sequence
 from bodyscan.capture.rig import Rig
 from bodyscan.capture.views import BoardView, StripeMap
 from bodyscan.errors import PairFailed
@@ -103,15 +102,7 @@ def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, 
         sequence = captures.sequence(pair, view.shot)
         if sequence is None or not sequence.has_stripes:
             continue
-        images = read_sequence(sequence, spec.camera)
-        stripes = read_stripes(
-            images.lit,
-            images.dark,
-            images.patterns,
-            images.inverses,
-            stripes=spec.projector.stripes,
-            direction=spec.projector.direction,
-        )
+        stripes = decode_sequence(sequence, spec, workers=2)
         pose = camera.camera_from_board[view.shot]
         boundaries = BoardBoundaries(
             stripes.boundary_index,

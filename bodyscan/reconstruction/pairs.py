@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from bodyscan.calibration.rig_calibration import RigCalibration
-from bodyscan.capture.codes import read_stripes
+from bodyscan.capture.decoding import decode_sequence
 from bodyscan.capture.folder import Captures, Sequence
-from bodyscan.capture.images import read_sequence
 from bodyscan.errors import BodyscanError, ScanFailed
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.reconstruction.range_image import RangeImage
@@ -35,7 +34,8 @@ def range_images(
 
     def reconstruct(sequence: Sequence) -> RangeImage | tuple[str, str]:
         try:
-            return _range_image(calibration, sequence)
+            stripes = decode_sequence(sequence, calibration.rig.pair(sequence.pair))
+            return range_image(calibration.pairs[sequence.pair], stripes)
         except BodyscanError as error:
             return sequence.pair, str(error)
 
@@ -46,18 +46,3 @@ def range_images(
         reasons = "\n".join(f"  {name}: {reason}" for name, reason in failed.items())
         raise ScanFailed(f"no pair gave a range image:\n{reasons}")
     return images, failed
-
-
-def _range_image(calibration: RigCalibration, sequence: Sequence) -> RangeImage:
-    spec = calibration.rig.pair(sequence.pair)
-    assert spec.projector is not None
-    images = read_sequence(sequence, spec.camera, workers=1)
-    stripes = read_stripes(
-        images.lit,
-        images.dark,
-        images.patterns,
-        images.inverses,
-        stripes=spec.projector.stripes,
-        direction=spec.projector.direction,
-    )
-    return range_image(calibration.pairs[sequence.pair], stripes)
