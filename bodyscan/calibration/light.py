@@ -86,7 +86,7 @@ def fit_light(data: BoundaryPoints, stripes: int, direction: Axis, camera: Camer
         fit = fit_planes(bins, stripes, direction, error)
         sheets = fit.planes
     return LightFit(
-        sheets, figures[chosen].model, figures, fit.rms_mm, error, boards_seen(bins, stripes)
+        sheets, candidates[chosen].name, figures, fit.rms_mm, error, boards_seen(bins, stripes)
     )
 
 
@@ -139,10 +139,11 @@ def _smooth_candidate(name: str, start: SmoothSheets) -> Candidate:
     def fit(data: BoundaryPoints) -> LightSheets:
         return fit_sheets(start, data, board_error_mm=1.0, most_steps=FOLD_STEPS).sheets
 
-    return Candidate(name, fit)
+    return Candidate(name, start.kind, fit)
 
 
 def _planes_candidate(stripes: int, direction: Axis) -> Candidate:
-    return Candidate(
-        "free planes", lambda data: fit_planes(data, stripes, direction, 1.0).planes, False
-    )
+    def fit(data: BoundaryPoints) -> LightSheets:
+        return fit_planes(data, stripes, direction, 1.0).planes
+
+    return Candidate("free planes", "planes", fit, everywhere=False)

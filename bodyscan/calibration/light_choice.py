@@ -14,8 +14,9 @@ from bodyscan.geometry.light_planes import LightSheets
 Array = NDArray[np.float64]
 
 MOST_FOLDS = 6
-AS_GOOD = 1.1
-"""A simpler model is taken if its error is at most this many times the best one's."""
+AS_GOOD = 1.15
+"""A simpler kind of model is taken if its error is at most this many times the best one's: boards
+held out differ by as much among themselves."""
 CAP = 30.0
 """No point counts for more than this many times the best model's median."""
 OUTLIER, MAD = 4.0, 1.4826
@@ -26,13 +27,14 @@ distances is theirs."""
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model to try; candidates are listed simplest first.
+    """A model to try; candidates are listed simplest first, those of a kind together.
 
     fit: sheets from points, with the covariance of boards 1 mm out of place.
     everywhere: gives sheets for every s, so that a ray it cannot measure counts against it.
     """
 
     name: str
+    kind: str
     fit: Callable[[BoundaryPoints], LightSheets]
     everywhere: bool = True
 
@@ -114,11 +116,11 @@ def hold_out(candidate: Candidate, data: BoundaryPoints, fold: NDArray[np.int64]
 def choose(
     candidates: Sequence[Candidate], tried: Sequence[HeldOutErrors], board: NDArray[np.int64]
 ) -> tuple[int, tuple[HeldOutModel, ...]]:
-    """The number of the model to use, and the figures of all.
+    """The number of the model to use, and the figures of all that measured anything.
 
-    Of the models that measure everywhere the simplest that is as good as the best. The others,
-    which give no depth where a stripe was seen too seldom, are compared with it only where they
-    do, and must be clearly better.
+    Of the models that measure everywhere the best of the simplest kind that is as good as the best
+    of all. The others, which give no depth where a stripe was seen too seldom, are compared with it
+    only where they do, and must be clearly better.
     """
     distances = [np.abs(errors.distances) for errors in tried]
     medians = [_median(d) for d in distances]
@@ -127,7 +129,8 @@ def choose(
     capped = [np.minimum(np.nan_to_num(d, nan=cap), cap) for d in distances]
     means = [_mean_of_boards(c, board, np.ones(len(c), bool)) for c in capped]
     best = min(means[i] for i in everywhere)
-    chosen = next(i for i in everywhere if means[i] <= AS_GOOD * best)
+    kind = next(candidates[i].kind for i in everywhere if means[i] <= AS_GOOD * best)
+    chosen = min((i for i in everywhere if candidates[i].kind == kind), key=means.__getitem__)
     for i in sorted(set(range(len(candidates))) - set(everywhere)):
         known = np.isfinite(distances[i])
         means[i] = _mean_of_boards(capped[i], board, known)
@@ -143,6 +146,7 @@ def choose(
             i == chosen,
         )
         for i, candidate in enumerate(candidates)
+        if np.isfinite(medians[i])
     )
     return chosen, figures
 

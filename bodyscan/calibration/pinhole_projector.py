@@ -16,6 +16,8 @@ from bodyscan.geometry.light_planes import Axis, LightPlanes
 
 Array = NDArray[np.float64]
 
+MOST_POINTS = 20000
+
 
 @dataclass(frozen=True, eq=False)
 class PinholeProjector:
@@ -47,8 +49,10 @@ class PinholeProjector:
 def fit_pinhole(points: Array, s: Array) -> PinholeProjector:
     """From points (N, 3) on boards, camera frame, and their stripe coordinates (N,); robust.
 
-    Linear start, then least squares on s with a Cauchy loss.
+    Linear start, then least squares on s with a Cauchy loss, on at most MOST_POINTS of them.
     """
+    every = -(-len(points) // MOST_POINTS)
+    points, s = points[::every], s[::every]
     centre, size = points.mean(axis=0), points.std()
     scaled = np.column_stack([(points - centre) / size, np.ones(len(points))])
     middle, half = float(np.mean(s)), float(np.std(s))

@@ -20,6 +20,7 @@ SETTLED = 0.01
 """A step that lowers the cost by less than this (in units of its own standard deviation squared)
 is the last."""
 CAUCHY_SIGMAS = 3.0
+BLOCK = 128
 FLOOR_PX = 0.02
 """Added to every sigma: lens, board and camera are not known better than this, however many pixels
 a mean was taken over."""
@@ -111,9 +112,18 @@ def _equations(sheets: SmoothSheets, data: BoundaryPoints) -> _Equations:
         sigma,
         noise,
         weights,
-        weighted.T @ offset.by_parameter + jacobian.T @ jacobian,
+        _gram(weighted, offset.by_parameter) + jacobian.T @ jacobian,
         weighted.T @ offset.value + jacobian.T @ known,
     )
+
+
+def _gram(left: Array, right: Array) -> Array:
+    """left.T @ right for tall matrices, in blocks too small for BLAS to start threads for: pairs
+    are fitted side by side, and threads that wait for a core cost several times what they save."""
+    blocks = len(left) // BLOCK
+    cut = blocks * BLOCK
+    head, tail = (matrix[:cut].reshape(blocks, BLOCK, -1) for matrix in (left, right))
+    return np.sum(head.transpose(0, 2, 1) @ tail, axis=0) + left[cut:].T @ right[cut:]
 
 
 def _cost(sheets: SmoothSheets, data: BoundaryPoints, equations: _Equations) -> float:

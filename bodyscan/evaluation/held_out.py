@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.calibration.boundary_points import BoundaryPoints, binned
 from bodyscan.calibration.camera import CameraCalibration
-from bodyscan.calibration.light import fit_light
-from bodyscan.calibration.light_planes import BoundaryPoints, fit_light_planes, join
+from bodyscan.calibration.light import fit_light, smooth_models
+from bodyscan.calibration.light_planes import fit_light_planes, join
 from bodyscan.calibration.pair import BoardBoundaries, on_board
 from bodyscan.calibration.pinhole_projector import fit_pinhole, fit_pinhole_opencv
 from bodyscan.calibration.rig import calibrate_cameras, find_all_boards
@@ -69,6 +70,7 @@ def _models(
     projector = rig.pair(pair).projector
     assert projector is not None
     points = join([shot.points for shot in shots])
+    stripes, direction = projector.stripes, projector.direction
     pinhole = fit_pinhole(points.points, points.index.astype(float))
     corners = [_corners_with_stripe(rig, shot) for shot in shots]
     opencv = fit_pinhole_opencv(
@@ -78,8 +80,9 @@ def _models(
         [c[2] for c in corners],
         pinhole,
     )
-    stripes, direction = projector.stripes, projector.direction
+    smooth = dict(smooth_models(binned(points, camera.camera, direction), stripes, direction))
     return {
+        "smooth planes": smooth["smooth planes"],
         "free planes": fit_light_planes(points, stripes, direction).planes,
         "chosen by held-out boards": fit_light(points, stripes, direction, camera.camera).sheets,
         "pinhole (2 x 4, stripes)": pinhole.planes(stripes, direction),
@@ -103,6 +106,7 @@ def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, 
         if sequence is None or not sequence.has_stripes:
             continue
         stripes = decode_sequence(sequence, spec, workers=2)
+        face_z = float(corner_points(boards[view.board])[view.corner_ids[0], 2])
         pose = camera.camera_from_board[view.shot]
         boundaries = BoardBoundaries(
             stripes.boundary_index,
@@ -110,7 +114,7 @@ def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, 
             stripes.boundary_sigma_px.astype(np.float64),
         )
         points = on_board(
-            camera.camera, spec.projector, boards[view.board], pose, 0.0, boundaries, number
+            camera.camera, spec.projector, boards[view.board], pose, face_z, boundaries, number
         )
         shots.append(_Shot(view, pose, points, stripes))
     if len(shots) < 3:
@@ -137,8 +141,8 @@ def _measure(model: str, sheets: LightSheets, held: _Shot) -> HeldOut:
     depth = sheets.depth(rays, held.points.index.astype(float))
     known = np.isfinite(depth)
     measured = rays[known] * depth[known, None]
-    normal = held.camera_from_board.rotation[:, 2]
-    distance = (measured - held.camera_from_board.translation) @ normal
+    centre = held.points.points.mean(axis=0)
+    distance = (measured - centre) @ held.camera_from_board.rotation[:, 2]
     typical = float(np.median(np.abs(distance)))
     near = np.abs(distance - np.median(distance)) < 10.0 * max(typical, 1e-6)
     centred = measured[near] - measured[near].mean(axis=0)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.capture.views import StripeMap
 from bodyscan.errors import BadInput
+from bodyscan.geometry.measuring import measure
 from bodyscan.reconstruction.range_image import RangeImage
 
 NORMAL_WINDOW_PX = 5
@@ -33,10 +34,10 @@ def range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
     rows, columns = np.nonzero(np.isfinite(stripes.s))
     rays = camera.rays(np.column_stack([columns, rows]).astype(np.float64))
     s = stripes.s[rows, columns].astype(np.float64)
-    depth = pair.light.depth(rays, s)
-    decoding = (pair.light.depth_per_stripe(rays, s, depth) * stripes.sigma[rows, columns]) ** 2
-    sheets = pair.light.variance_mm2(rays, s, depth)
-    sigma = np.sqrt(decoding + sheets) * np.linalg.norm(rays, axis=1)
+    measured = measure(pair.light, rays, s)
+    depth = measured.depth
+    decoding = (measured.per_stripe * stripes.sigma[rows, columns]) ** 2
+    sigma = np.sqrt(decoding + measured.variance_mm2) * np.linalg.norm(rays, axis=1)
     points = np.full((camera.height, camera.width, 3), np.nan, np.float32)
     sigmas = np.full((camera.height, camera.width), np.nan, np.float32)
     known = np.isfinite(depth) & np.isfinite(sigma)

@@ -145,12 +145,13 @@ class Scene:
             [np.interp(wanted, row[::rises], coarse[::rises]) for row in first]
         ).ravel()
         line, wanted = np.repeat(lines, len(wanted)), np.tile(wanted, len(lines))
-        for _ in range(3):
-            s = stripe(line, place)[0]
-            slope = (stripe(line, place + 0.5)[0] - s) / 0.5
-            place = place - (s - wanted) / slope
-        s, pixels = stripe(line, place)
-        on_board = camera_from_board.inverse().apply(self.on_plane(pixels, camera_from_board))
+        with np.errstate(all="ignore"):
+            for _ in range(3):
+                s = stripe(line, place)[0]
+                slope = (stripe(line, place + 0.5)[0] - s) / 0.5
+                place = place - (s - wanted) / slope
+            s, pixels = stripe(line, place)
+            on_board = camera_from_board.inverse().apply(self.on_plane(pixels, camera_from_board))
         seen = (np.abs(s - wanted) < 1e-6) & np.all(pixels > 0, axis=1)
         seen &= np.all(pixels < [width - 1, height - 1], axis=1)
         seen &= np.all((on_board[:, :2] > 0) & (on_board[:, :2] < self.size), axis=1)
