@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
-import pytest
+# As the command line does: stages share the cores out, BLAS threads inside them only get in the way.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from pathlib import Path  # noqa: E402
+
+import pytest  # noqa: E402
 
 PROJECT = Path(__file__).parents[1]
 
