@@ -7,9 +7,9 @@ import os
 # As the command line does: stages share the cores out, BLAS threads inside them only get in the way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from pathlib import Path  # noqa: E402
+from pathlib import Path
 
-import pytest  # noqa: E402
+import pytest
 
 PROJECT = Path(__file__).parents[1]
 
