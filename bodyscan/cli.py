@@ -190,3 +190,38 @@ def evaluate(workspace: Folder) -> None:
     with console.errors.status("comparing"):
         text = evaluate_workspace(workspace)
     console.console.print(text, highlight=False)
+
+
+@app.command("export-rig")
+def export_rig(
+    calibration: Annotated[Path, typer.Argument(help="What calibrate-rig wrote.")],
+    out: Annotated[Path, typer.Option(help="Folder to write into.")],
+    formats: Annotated[str, typer.Option("--format", help="Comma-separated.")] = "colmap,opencv",
+) -> None:
+    """Write a calibrated rig for other programs: a COLMAP model with rig, OpenCV's YAML."""
+    from bodyscan import console
+    from bodyscan.calibration.storage import load_calibration
+    from bodyscan.export.rig import export_rig as write
+
+    written = write(load_calibration(calibration), out, formats.split(","))
+    console.console.print("\n".join(map(str, written)))
+
+
+@app.command("sigma-map")
+def sigma_map(
+    calibration: Annotated[Path, typer.Argument(help="What calibrate-rig wrote.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Default: `sigma-map.png` beside the calibration.")
+    ] = None,
+) -> None:
+    """Draw how well the rig's placing knows each place of the scan volume, front and side."""
+    from bodyscan import console
+    from bodyscan.calibration.storage import load_calibration
+    from bodyscan.report.sigma_map import draw_sigma_map
+
+    rig = load_calibration(calibration)
+    folder = calibration if calibration.is_dir() else calibration.parent
+    cameras = {name: pair.camera for name, pair in rig.pairs.items()}
+    path = out or folder / "sigma-map.png"
+    draw_sigma_map(rig.rig.volume, rig.rig_from_camera, cameras, rig.covariance, path)
+    console.console.print(f"picture: {path}")

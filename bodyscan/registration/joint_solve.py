@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -132,8 +133,12 @@ def _colmap_rig(names: Sequence[str], root_from_camera: dict[str, RigidTransform
 def _add_points(
     model: pycolmap.Reconstruction, views: Sequence[LocatedView]
 ) -> dict[tuple[str, tuple[float, ...]], int]:
-    """One constant point for each corner of each board; keyed by board and rounded place."""
-    keys = sorted({key for view in views for key in _point_keys(view)})
+    """One constant point for each corner of each board; keyed by board and rounded place.
+
+    COLMAP refuses a point that a single view observes: such a corner is left out.
+    """
+    seen = Counter(key for view in views for key in _point_keys(view))
+    keys = sorted(key for key, count in seen.items() if count > 1)
     numbers = {key: number for number, key in enumerate(keys, start=1)}
     for (_, place), number in numbers.items():
         point = pycolmap.Point3D()
@@ -173,7 +178,8 @@ def _add_frame(
         image.frame_id = number
         model.add_image(image)
         for k, key in enumerate(_point_keys(view)):
-            model.add_observation(points[key], pycolmap.TrackElement(image_id, k))
+            if key in points:
+                model.add_observation(points[key], pycolmap.TrackElement(image_id, k))
     model.register_frame(number)
 
 

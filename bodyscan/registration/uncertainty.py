@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +56,64 @@ def position_sigma(covariance: PlacingCovariance, name: str, position: Array) ->
     return np.sqrt(np.diag(point_covariance(covariance.of(name), position)))
 
 
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """What all corners say of all unknowns: J^T W J, px-2 times units.
+
+    Unknowns: motions of the pairs `names` (6 each), motions of the boards `targets` (6 each), then
+    lenses (focal length, u0, v0, k1, k2 of each pair) if `cameras_free`.  held: unknowns that the
+    rig frame's definition fixes.  variance_px2: of a corner's coordinate.
+    """
+
+    names: tuple[str, ...]
+    targets: tuple[Target, ...]
+    cameras_free: bool
+    matrix: Array
+    held: NDArray[np.int64]
+    variance_px2: float
+
+    @property
+    def first_board(self) -> int:
+        return 6 * len(self.names)
+
+    @property
+    def first_lens(self) -> int:
+        return self.first_board + 6 * len(self.targets)
+
+    def covariance(self) -> PlacingCovariance:
+        """Of the pairs' motions, all other unknowns left free."""
+        size = len(self.matrix)
+        free = np.setdiff1d(np.arange(size), self.held)
+        full = np.zeros((size, size))
+        full[np.ix_(free, free)] = self.variance_px2 * scaled_inverse(
+            self.matrix[np.ix_(free, free)]
+        )
+        pairs = slice(0, self.first_board)
+        return PlacingCovariance(self.names, full[pairs, pairs])
+
+    def without_boards(self) -> Array:
+        """(11P, 11P), or (6P, 6P): information on pairs and lenses, the boards eliminated.
+
+        A board that holds the rig frame is known instead. Source: Schur complement, Triggs et al.,
+        Bundle Adjustment - A Modern Synthesis, 2000, 6.1.
+        """
+        size = len(self.matrix)
+        boards = np.arange(self.first_board, self.first_lens)
+        rest = np.setdiff1d(np.arange(size), boards)
+        boards = np.setdiff1d(boards, self.held)
+        cross = self.matrix[np.ix_(rest, boards)]
+        inverse = scaled_inverse(self.matrix[np.ix_(boards, boards)])
+        return self.matrix[np.ix_(rest, rest)] - cross @ inverse @ cross.T
+
+
+def scaled_inverse(matrix: Array) -> Array:
+    """Pseudo-inverse of a symmetric matrix whose unknowns have units of very different size."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    reduced = matrix * np.outer(scale, scale)
+    inverse = np.linalg.pinv(reduced, rcond=1e-14, hermitian=True)
+    return np.asarray(inverse * np.outer(scale, scale))
+
+
 def placing_covariance(
     views: Sequence[LocatedView],
     cameras: dict[str, Camera],
@@ -68,9 +126,37 @@ def placing_covariance(
 ) -> PlacingCovariance:
     """Covariance of every `rig_from_camera`, the rig frame held by one pair or one board.
 
+    With `cameras_free` the focal length, centre, k1 and k2 of each camera are unknowns too (as in
+    the joint solve).
+    """
+    equations = normal_equations(
+        views,
+        cameras,
+        rig_from_camera,
+        rig_from_board,
+        fixed_pair=fixed_pair,
+        fixed_target=fixed_target,
+        cameras_free=cameras_free,
+    )
+    return equations.covariance()
+
+
+def normal_equations(
+    views: Sequence[LocatedView],
+    cameras: Mapping[str, Camera],
+    rig_from_camera: Mapping[str, RigidTransform],
+    rig_from_board: Mapping[Target, RigidTransform],
+    *,
+    fixed_pair: str | None,
+    fixed_target: Target | None,
+    cameras_free: bool,
+    lens_prior: bool = True,
+) -> NormalEquations:
+    """The joint solve's normal equations at its solution.
+
     A corner q of the rig frame is seen at R^T (q - t); a motion of the board and the opposite
-    motion of the camera change that alike, so both share one Jacobian.  With `cameras_free` the
-    focal length, centre, k1 and k2 of each camera are unknowns too (as in the joint solve).
+    motion of the camera change that alike, so both share one Jacobian.  `lens_prior` adds what is
+    known of lenses beforehand; leave it out where views are to be added to other views.
     """
     names = tuple(sorted(rig_from_camera))
     targets = sorted(rig_from_board)
@@ -94,19 +180,13 @@ def placing_covariance(
         normal[np.ix_(columns, columns)] += block.T @ (block * weights[:, None])
         squared.append(weights * residuals**2)
         count += len(residuals)
-    if cameras_free:
+    if cameras_free and lens_prior:
         prior = [PRIOR_SIGMA["focal"], *[PRIOR_SIGMA["centre"]] * 2, *[PRIOR_SIGMA["k"]] * 2]
         lens = np.arange(first_lens, size)
         normal[lens, lens] += np.tile(1.0 / np.array(prior) ** 2, len(names))
     held = _held(names, targets, first_board, fixed_pair, fixed_target)
-    free = np.setdiff1d(np.arange(size), held)
-    variance = float(np.sum(np.concatenate(squared))) / max(count - len(free), 1)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal)[free], 1e-300))
-    reduced = normal[np.ix_(free, free)] * np.outer(scale, scale)
-    inverse = np.linalg.pinv(reduced, rcond=1e-14, hermitian=True) * np.outer(scale, scale)
-    full = np.zeros((size, size))
-    full[np.ix_(free, free)] = variance * inverse
-    return PlacingCovariance(names, full[:first_board, :first_board])
+    variance = float(np.sum(np.concatenate(squared))) / max(count - (size - len(held)), 1)
+    return NormalEquations(names, tuple(targets), cameras_free, normal, held, variance)
 
 
 def _held(
@@ -125,9 +205,9 @@ def _held(
 
 def _view_jacobian(
     view: LocatedView,
-    cameras: dict[str, Camera],
-    rig_from_camera: dict[str, RigidTransform],
-    rig_from_board: dict[Target, RigidTransform],
+    cameras: Mapping[str, Camera],
+    rig_from_camera: Mapping[str, RigidTransform],
+    rig_from_board: Mapping[Target, RigidTransform],
 ) -> tuple[Array, Array]:
     """d(pixels) (2N, 17) by camera motion, board motion, lens (focal, u0, v0, k1, k2); residuals."""
     camera = cameras[view.pair]

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
@@ -124,4 +126,16 @@ def test_the_board_can_fix_the_frame():
     )
     placed = place_rig(rig, views, cameras)
     # One board of 48 corners in a few views holds the frame: its own pose is good to 1e-4 rad.
+    assert rms(centre_errors(placed, placings)) < 0.5
+
+
+def test_a_corner_seen_only_once_does_no_harm():
+    placings, cameras = ring_of_cameras(heights=(700, 1200))
+    views, _ = ring_views(placings, cameras, shots=20)
+    rare = views[0].points[0]
+    thinned = [views[0]]
+    for view in views[1:]:
+        kept = np.any(view.points != rare, axis=1)
+        thinned.append(replace(view, points=view.points[kept], pixels=view.pixels[kept]))
+    placed = place_rig(ring_rig(placings), thinned, cameras)
     assert rms(centre_errors(placed, placings)) < 0.5

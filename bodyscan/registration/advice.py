@@ -1,0 +1,238 @@
+"""What holds a rig together, what is weak in it, and which shots would help most."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import networkx as nx
+import numpy as np
+
+from bodyscan.capture.rig import Board, Rig
+from bodyscan.registration.more_shots import (
+    MOST_SHOTS,
+    BoardPlace,
+    Knowledge,
+    Sharpening,
+    board_places,
+)
+from bodyscan.registration.rig_frame import frame_target
+from bodyscan.registration.rig_solve import PlacedRig
+from bodyscan.registration.uncertainty import (
+    normal_equations,
+    point_covariance,
+    position_sigma,
+)
+from bodyscan.registration.view_graph import Target, view_graph
+
+WEAK_TIMES = 2.0
+"""A link is weak if its sigma is so many times that of the usual link of the best chain."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """Two pairs that saw boards at the same moments; sigma_mm of second's place seen from first,
+    by all boards of the rig together."""
+
+    first: str
+    second: str
+    shots: int
+    sigma_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class MoreShots:
+    """`shots` more of the board at `place` bring the sigma of `pair` from before to after.
+
+    between: the two pairs whose common view of it matters most.  halves: whether after is half.
+    """
+
+    pair: str
+    shots: int
+    between: tuple[str, str]
+    place: BoardPlace
+    before_mm: float
+    after_mm: float
+    halves: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Advice:
+    """links: all, least known first.  chain: those by which all pairs are tied together best.
+
+    bridges: links without which the rig falls apart; crucial: shots (with board) likewise.  weak:
+    links of the chain far less known than its usual ones; no other link does better there.
+    worst: the pair least known in the rig frame, and its sigma (mm, all axes together).
+    """
+
+    links: tuple[Link, ...]
+    chain: tuple[Link, ...]
+    bridges: tuple[Link, ...]
+    weak: tuple[Link, ...]
+    crucial: tuple[Target, ...]
+    worst: str
+    worst_sigma_mm: float
+    more: MoreShots | None
+
+    @property
+    def lines(self) -> list[str]:
+        """For the builder of the rig."""
+        said = [
+            f"nothing but {_shots(link.shots)} in common ties {link.first} and {link.second}, and "
+            "nothing else the parts of the rig on either side of them"
+            for link in self.bridges
+        ]
+        if self.crucial:
+            names = ", ".join(f"{shot} ({board})" for shot, board in self.crucial)
+            said.append(f"without any one of these shots the rig would fall apart: {names}")
+        said += [
+            f"weak link: {link.second} is known to {link.sigma_mm:.3f} mm from {link.first} "
+            f"({_shots(link.shots)} in common), and no other link ties their sides better"
+            for link in self.weak
+        ]
+        said.append(
+            f"{self.worst} is known least in the rig frame: sigma {self.worst_sigma_mm:.3f} mm"
+        )
+        return said + ([_sentence(self.more)] if self.more else [])
+
+
+def advise(rig: Rig, placed: PlacedRig, *, cameras_free: bool = True) -> Advice:
+    """Links, weak spots and the most useful further shots of a placed rig.
+
+    cameras_free: whether the joint solve refined the cameras (as `place_rig` does by default).
+    """
+    links = links_of(placed)
+    graph = view_graph(placed.views, sorted(placed.rig_from_camera))
+    bridging = {frozenset(edge) for edge in nx.bridges(graph)}
+    chain = best_chain(links)
+    usual = float(np.median([link.sigma_mm for link in chain])) if chain else 0.0
+    sigmas = {
+        name: float(np.linalg.norm(position_sigma(placed.covariance, name, t.translation)))
+        for name, t in placed.rig_from_camera.items()
+    }
+    worst = max(sorted(sigmas), key=lambda name: sigmas[name])
+    return Advice(
+        links,
+        chain,
+        tuple(link for link in links if {link.first, link.second} in bridging),
+        tuple(link for link in chain if link.sigma_mm > WEAK_TIMES * usual),
+        crucial_shots(placed),
+        worst,
+        sigmas[worst],
+        more_shots(rig, placed, worst, cameras_free=cameras_free),
+    )
+
+
+def links_of(placed: PlacedRig) -> tuple[Link, ...]:
+    """Every two pairs that share a shot, the least known first."""
+    found = []
+    graph = view_graph(placed.views, sorted(placed.rig_from_camera))
+    for first, second, targets in graph.edges(data="targets"):
+        motion = placed.covariance.between(first, second)
+        spread = point_covariance(motion, placed.rig_from_camera[second].translation)
+        found.append(Link(first, second, len(targets), float(np.sqrt(np.trace(spread)))))
+    return tuple(sorted(found, key=lambda link: (-link.sigma_mm, link.first, link.second)))
+
+
+def best_chain(links: Sequence[Link]) -> tuple[Link, ...]:
+    """The links (a minimum spanning tree by sigma) that tie all pairs together best, the least
+    known first."""
+    graph = nx.Graph()
+    graph.add_edges_from(
+        (link.first, link.second, {"link": link, "sigma": link.sigma_mm}) for link in links
+    )
+    tree = nx.minimum_spanning_edges(graph, weight="sigma", data=True)
+    return tuple(sorted((data["link"] for _, _, data in tree), key=lambda link: -link.sigma_mm))
+
+
+def crucial_shots(placed: PlacedRig) -> tuple[Target, ...]:
+    """Shots whose loss would leave pairs that no shared view ties to the others."""
+    graph = nx.Graph()
+    graph.add_nodes_from(("pair", name) for name in placed.rig_from_camera)
+    graph.add_edges_from((("pair", view.pair), ("shot", view.target)) for view in placed.views)
+    return tuple(sorted(what for kind, what in nx.articulation_points(graph) if kind == "shot"))
+
+
+def more_shots(
+    rig: Rig, placed: PlacedRig, pair: str, *, cameras_free: bool = True
+) -> MoreShots | None:
+    """The place for a board where fewest more shots halve the sigma of `pair`'s position.
+
+    None where no place in the scan volume is seen by two pairs, or no shot would tell anything new.
+    """
+    places = board_places(
+        _usual_board(rig, placed), rig.volume, placed.cameras, placed.rig_from_camera
+    )
+    if not places:
+        return None
+    fixed = frame_target(rig)
+    equations = normal_equations(
+        placed.views,
+        placed.cameras,
+        placed.rig_from_camera,
+        placed.rig_from_board,
+        fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
+        fixed_target=fixed,
+        cameras_free=cameras_free and len(placed.rig_from_camera) > 1,
+    )
+    knowledge = Knowledge(equations, placed.cameras, placed.rig_from_camera)
+    tried = [(place, knowledge.after(knowledge.information(place), pair)) for place in places]
+    place, best = min(tried, key=lambda item: _preference(item[1]))
+    if best.after_mm2[-1] > 0.98 * best.before_mm2:
+        return None
+    shots = best.shots_to_halve or MOST_SHOTS
+    return MoreShots(
+        pair,
+        shots,
+        _between(knowledge, place, pair, shots),
+        place,
+        float(np.sqrt(best.before_mm2)),
+        float(np.sqrt(best.after_mm2[shots - 1])),
+        best.shots_to_halve is not None,
+    )
+
+
+def _usual_board(rig: Rig, placed: PlacedRig) -> Board:
+    return rig.board(Counter(view.board for view in placed.views).most_common(1)[0][0])
+
+
+def _preference(sharpening: Sharpening) -> tuple[int, float]:
+    """Fewest shots to halve; where that is equal or out of reach, most gained."""
+    shots = sharpening.shots_to_halve
+    return shots or MOST_SHOTS + 1, float(sharpening.after_mm2[(shots or MOST_SHOTS) - 1])
+
+
+def _between(knowledge: Knowledge, place: BoardPlace, pair: str, shots: int) -> tuple[str, str]:
+    """The two pairs whose views of that board alone would tell most."""
+
+    def left(two: tuple[str, str]) -> float:
+        information = knowledge.information(place.seen_only_by(two))
+        return float(knowledge.after(information, pair, shots).after_mm2[-1])
+
+    return min(combinations(place.seen_by, 2), key=left)
+
+
+def _shots(count: int) -> str:
+    return "1 shot" if count == 1 else f"{count} shots"
+
+
+def _sentence(more: MoreShots) -> str:
+    a, b = more.between
+    place = more.place
+    x, y, z = place.centre_mm
+    others = [name for name in place.seen_by if name not in more.between]
+    also = f" (also by {', '.join(others)})" if others else ""
+    effect = (
+        f"would halve the sigma of {more.pair}"
+        if more.halves
+        else f"would sharpen {more.pair}, though not by half"
+    )
+    return (
+        f"{more.shots} more {'shot' if more.shots == 1 else 'shots'} seen by both {a} and {b}{also}, "
+        f"board at {place.height} height "
+        f"(middle at {x:.0f}, {y:.0f}, {z:.0f} mm, facing {place.facing_deg:.0f} degrees from the "
+        f"rig's x axis to its y axis, tilted this way and that), {effect}: {more.before_mm:.3f} to "
+        f"{more.after_mm:.3f} mm"
+    )

@@ -1,0 +1,203 @@
+"""Which further shots of a board would tell most about a pair's place: information added, not
+guessed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.calibration.camera import twist_jacobian
+from bodyscan.capture.boards import corner_points, corners_per_face
+from bodyscan.capture.rig import Board, Volume
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.visibility import in_image
+from bodyscan.registration.located_view import LocatedView
+from bodyscan.registration.uncertainty import NormalEquations, normal_equations, scaled_inverse
+
+Array = NDArray[np.float64]
+
+HEIGHTS_MM = {"knee": 500.0, "waist": 1000.0, "chest": 1350.0}
+# Shots at one place differ a little, as held boards do: about x, about y, in the board's plane.
+TILTS_DEG = ((20.0, 0.0, 0.0), (-20.0, 0.0, 15.0), (0.0, 20.0, -15.0))
+LEAST_FACING = 0.4  # cosine between the board's normal and the line of sight
+FEWEST_CORNERS = 12
+EDGE_PX = 5.0
+MOST_SHOTS = 60
+APART = 0.35  # of the volume's radius: boards are tried so far off the middle, too
+STEP_DEG = 15.0
+
+
+@dataclass(frozen=True, eq=False)
+class BoardPlace:
+    """Where a board might be held: a few tilts of it about one place.
+
+    facing_deg: azimuth of the front's normal in the rig frame.  views: of each tilt, by the pairs
+    that would see it.
+    """
+
+    height: str
+    centre_mm: Array
+    facing_deg: float
+    rig_from_board: tuple[RigidTransform, ...]
+    views: tuple[tuple[LocatedView, ...], ...]
+
+    @property
+    def seen_by(self) -> tuple[str, ...]:
+        """Pairs that see every tilt."""
+        seen = [{view.pair for view in tilt} for tilt in self.views]
+        return tuple(sorted(set.intersection(*seen)))
+
+    def seen_only_by(self, pairs: Sequence[str]) -> BoardPlace:
+        views = tuple(tuple(v for v in tilt if v.pair in pairs) for tilt in self.views)
+        return BoardPlace(self.height, self.centre_mm, self.facing_deg, self.rig_from_board, views)
+
+
+def board_places(
+    board: Board,
+    volume: Volume,
+    cameras: Mapping[str, Camera],
+    rig_from_camera: Mapping[str, RigidTransform],
+) -> list[BoardPlace]:
+    """Upright boards at knee, waist and chest, facing between any two cameras; those that at least
+    two pairs would see."""
+    found = []
+    for height, z in HEIGHTS_MM.items():
+        if not volume.bottom_mm < z < volume.top_mm:
+            continue
+        for azimuth in facings(rig_from_camera.values(), board.faces == 2):
+            ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+            for share in (-APART, 0.0, APART):
+                centre = np.array([0.0, 0.0, z]) + share * volume.radius_mm * ahead
+                poses = tuple(_tilted(board, centre, ahead))
+                views = tuple(
+                    tuple(_views(board, pose, cameras, rig_from_camera)) for pose in poses
+                )
+                place = BoardPlace(height, centre, float(np.degrees(azimuth)), poses, views)
+                if len(place.seen_by) >= 2:
+                    found.append(place)
+    return found
+
+
+def facings(placings: Iterable[RigidTransform], two_faced: bool) -> list[float]:
+    """Azimuths (radians) halfway between any two cameras, as seen from the rig's axis."""
+    places = np.array([placing.translation[:2] for placing in placings])
+    towards = places / np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-9)
+    between = np.array([a + b for a, b in combinations(towards, 2)]).reshape(-1, 2)
+    between = between[np.linalg.norm(between, axis=1) > 0.2]  # opposite cameras: no way between
+    degrees = np.degrees(np.arctan2(between[:, 1], between[:, 0]))
+    steps = np.rint(degrees / STEP_DEG) * STEP_DEG % (180.0 if two_faced else 360.0)
+    return [float(np.radians(step)) for step in np.unique(steps)]
+
+
+@dataclass(frozen=True, eq=False)
+class Sharpening:
+    """Variance (mm2, all three axes together) of one pair's place after 1, 2, ... more shots."""
+
+    before_mm2: float
+    after_mm2: Array
+
+    @property
+    def shots_to_halve(self) -> int | None:
+        """Fewest shots that halve the sigma; None if so many as were tried do not."""
+        enough = np.flatnonzero(self.after_mm2 <= self.before_mm2 / 4.0)
+        return int(enough[0]) + 1 if enough.size else None
+
+
+class Knowledge:
+    """The information that the rig's shots hold, ready to have that of other shots added."""
+
+    def __init__(
+        self,
+        equations: NormalEquations,
+        cameras: Mapping[str, Camera],
+        rig_from_camera: Mapping[str, RigidTransform],
+    ) -> None:
+        self._equations = equations
+        self._cameras, self._placings = cameras, rig_from_camera
+        information = equations.without_boards()
+        # A board that holds the frame is gone from it already; a pair that does goes here.
+        held_pair = equations.held[equations.held < equations.first_board]
+        self._unknowns = len(information)
+        self._free = np.setdiff1d(np.arange(self._unknowns), held_pair)
+        information = information[np.ix_(self._free, self._free)]
+        self._scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        scaled = information * np.outer(self._scale, self._scale)
+        self._inverse = scaled_inverse(scaled)
+
+    def information(self, place: BoardPlace) -> Array:
+        """What one shot there says, the mean of its tilts; scaled, free unknowns only."""
+        total = np.zeros((len(self._free), len(self._free)))
+        for pose, views in zip(place.rig_from_board, place.views, strict=True):
+            if len(views) < 2:  # its own pose is unknown: one camera alone learns no placing
+                continue
+            shot = normal_equations(
+                views,
+                self._cameras,
+                self._placings,
+                {views[0].target: pose},
+                fixed_pair=None,
+                fixed_target=None,
+                cameras_free=self._equations.cameras_free,
+                lens_prior=False,
+            )
+            total += shot.without_boards()[np.ix_(self._free, self._free)]
+        return total * np.outer(self._scale, self._scale) / len(place.views)
+
+    def after(self, information: Array, pair: str, most: int = MOST_SHOTS) -> Sharpening:
+        """How a pair's place sharpens with 1 to `most` shots of that information each.
+
+        The matrix inversion lemma in the basis in which the added information is diagonal, so that
+        all numbers of shots come at once.
+        """
+        start = 6 * self._equations.names.index(pair)
+        jacobian = np.zeros((3, self._unknowns))
+        motion = twist_jacobian(self._placings[pair].translation[None])[0]
+        jacobian[:, start : start + 6] = motion
+        jacobian = jacobian[:, self._free] * self._scale
+        values, vectors = np.linalg.eigh(information)
+        kept = values > 1e-12 * values[-1]
+        root = vectors[:, kept] * np.sqrt(values[kept])
+        gain, basis = np.linalg.eigh(root.T @ self._inverse @ root)
+        reach = np.sum((basis.T @ root.T @ self._inverse @ jacobian.T) ** 2, axis=1)
+        shots = np.arange(1, most + 1)[:, None]
+        drop = np.sum(reach / (1.0 / shots + np.maximum(gain, 0.0)), axis=1)
+        before = float(np.trace(jacobian @ self._inverse @ jacobian.T))
+        variance = self._equations.variance_px2
+        return Sharpening(variance * before, variance * (before - drop))
+
+
+def _tilted(board: Board, centre: Array, ahead: Array) -> Iterator[RigidTransform]:
+    """`rig_from_board` of an upright board whose front looks along `ahead`, slightly tilted."""
+    down = np.array([0.0, 0.0, -1.0])
+    upright = np.column_stack([np.cross(down, -ahead), down, -ahead])
+    middle = board.square_mm / 2.0 * np.array([board.columns, board.rows, 0.0])
+    for tilt in TILTS_DEG:
+        turn = RigidTransform.from_rotation_vector(np.radians(tilt), np.zeros(3)).rotation
+        yield RigidTransform(upright @ turn, centre - upright @ turn @ middle)
+
+
+def _views(
+    board: Board,
+    rig_from_board: RigidTransform,
+    cameras: Mapping[str, Camera],
+    rig_from_camera: Mapping[str, RigidTransform],
+) -> Iterator[LocatedView]:
+    """What each camera would see of the board, without noise."""
+    corners, count = corner_points(board), corners_per_face(board)
+    for name, placing in rig_from_camera.items():
+        camera_from_board = placing.inverse() @ rig_from_board
+        sight = camera_from_board.apply(corners[:count].mean(axis=0))
+        facing = camera_from_board.rotation[:, 2] @ sight / np.linalg.norm(sight)
+        if abs(facing) < LEAST_FACING or (facing < 0 and board.faces == 1):
+            continue
+        face = corners[:count] if facing > 0 else corners[-count:]
+        points = camera_from_board.apply(face)
+        seen = in_image(cameras[name], points, EDGE_PX)
+        if seen.sum() >= FEWEST_CORNERS:
+            pixels = cameras[name].project(points[seen])
+            yield LocatedView(name, "more", board.name, face[seen], pixels, camera_from_board)

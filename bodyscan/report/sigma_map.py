@@ -1,0 +1,121 @@
+"""How well the placing of the pairs knows each place of the scan volume, as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.calibration.camera import twist_jacobian
+from bodyscan.capture.rig import Volume
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.visibility import in_image
+from bodyscan.registration.uncertainty import PlacingCovariance
+from bodyscan.report.pictures import BACKGROUND, INK, Image, Scale, _bar, _save, _turbo
+
+Array = NDArray[np.float64]
+
+STEP_MM = 20.0
+MARGIN_PX = 60
+UNSEEN = (200, 200, 200)
+PLANES = {
+    "front: y to the right, z up": (0.0, 1.0, 0.0),
+    "side: x to the left, z up": (-1.0, 0.0, 0.0),
+}
+"""Planes through the rig's axis, by what runs to the picture's right."""
+
+
+def sigma_at(
+    points: Array,
+    rig_from_camera: Mapping[str, RigidTransform],
+    cameras: Mapping[str, Camera],
+    covariance: PlacingCovariance,
+) -> tuple[Array, NDArray[np.int64]]:
+    """Rig points (N, 3) -> sigma (N,) mm, all axes together, and how many pairs see each, (N,).
+
+    A point is the mean of what the pairs that see it say, so only what they err alike, and their
+    share of what they err apart, is left. Placing alone: no noise of stripes, no swaying subject.
+    NaN where no pair sees anything.
+    """
+    seen = np.stack(
+        [
+            in_image(cameras[name], rig_from_camera[name].inverse().apply(points))
+            if name in cameras
+            else np.zeros(len(points), bool)
+            for name in covariance.names
+        ],
+        axis=1,
+    )
+    count = seen.sum(axis=1)
+    masks, which = np.unique(seen, axis=0, return_inverse=True)
+    shares = masks / np.maximum(masks.sum(axis=1, keepdims=True), 1)
+    pairs = len(covariance.names)
+    blocks = covariance.matrix.reshape(pairs, 6, pairs, 6)
+    motions = np.einsum("mp,piqj,mq->mij", shares, blocks, shares, optimize=True)
+    jacobian = twist_jacobian(points)
+    variance = np.einsum("nki,nij,nkj->n", jacobian, motions[which.reshape(-1)], jacobian)
+    return np.where(count > 0, np.sqrt(np.maximum(variance, 0.0)), np.nan), count
+
+
+def draw_sigma_map(
+    volume: Volume,
+    rig_from_camera: Mapping[str, RigidTransform],
+    cameras: Mapping[str, Camera],
+    covariance: PlacingCovariance,
+    path: Path,
+    *,
+    step_mm: float = STEP_MM,
+    height_px: int = 900,
+) -> None:
+    """Maps of `sigma_at` in the planes x = 0 (front) and y = 0 (side), one colour scale, as PNG.
+
+    Light grey where no pair sees anything.
+    """
+    maps = {}
+    for caption, right in PLANES.items():
+        points = plane_points(volume, np.array(right), step_mm)
+        sigma, _ = sigma_at(points.reshape(-1, 3), rig_from_camera, cameras, covariance)
+        maps[caption] = sigma.reshape(points.shape[:2])
+    known = np.concatenate([values[np.isfinite(values)] for values in maps.values()])
+    top = float(np.percentile(known, 98)) if known.size else 1.0
+    scale = Scale(0.0, max(top, 1e-6), "sigma, mm", _turbo())
+    panels = [_panel(values, scale, caption, volume, height_px) for caption, values in maps.items()]
+    _save(path, [*panels, _bar(scale, height_px)])
+
+
+def plane_points(volume: Volume, right: Array, step_mm: float) -> Array:
+    """(rows, columns, 3) mm: middles of cells about `step_mm` wide in the upright plane through the
+    rig's axis along `right` (3,).  Row 0 is the highest."""
+    columns = max(round(2.0 * volume.radius_mm / step_mm), 1)
+    rows = max(round((volume.top_mm - volume.bottom_mm) / step_mm), 1)
+    along = volume.radius_mm * ((2.0 * np.arange(columns) + 1.0) / columns - 1.0)
+    share = (np.arange(rows) + 0.5) / rows
+    height = volume.top_mm + share * (volume.bottom_mm - volume.top_mm)
+    return along[None, :, None] * right + height[:, None, None] * np.array([0.0, 0.0, 1.0])
+
+
+def _panel(values: Array, scale: Scale, caption: str, volume: Volume, height_px: int) -> Image:
+    """One map with its caption and a height every half metre."""
+    tall = height_px - 2 * MARGIN_PX
+    px_per_mm = tall / (volume.top_mm - volume.bottom_mm)
+    wide = max(round(2.0 * volume.radius_mm * px_per_mm), 1)
+    colours = scale.colours(values.ravel().astype(np.float32)).reshape(*values.shape, 3)
+    colours[~np.isfinite(values)] = UNSEEN
+    map_ = cv2.resize(colours, (wide, tall), interpolation=cv2.INTER_NEAREST)
+    panel = np.full((height_px, wide + 2 * MARGIN_PX, 3), BACKGROUND, np.uint8)
+    panel[MARGIN_PX : MARGIN_PX + tall, MARGIN_PX : MARGIN_PX + wide] = map_
+    for height in np.arange(0.0, volume.top_mm, 500.0):
+        row = round(MARGIN_PX + (volume.top_mm - height) * px_per_mm)
+        if row <= MARGIN_PX + tall + 5:
+            _text(panel, f"{height:.0f}", (8, row))
+            cv2.line(panel, (MARGIN_PX - 8, row), (MARGIN_PX - 2, row), INK, 1)
+    _text(panel, f"{caption}, mm", (MARGIN_PX, MARGIN_PX - 20))
+    return panel
+
+
+def _text(panel: Image, text: str, corner: tuple[int, int]) -> None:
+    cv2.putText(panel, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)

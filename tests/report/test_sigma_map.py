@@ -1,0 +1,91 @@
+import cv2
+import numpy as np
+import pytest
+from ring import ring_of_cameras
+
+from bodyscan.capture.rig import Volume
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.visibility import in_image
+from bodyscan.registration.uncertainty import PlacingCovariance
+from bodyscan.report.sigma_map import draw_sigma_map, sigma_at
+
+MIDDLE = np.array([[0.0, 0.0, 1000.0]])
+
+
+def shifts(names, mm):
+    """Every pair shifted by itself, `mm` along each axis, not turned."""
+    own = np.diag([0.0, 0.0, 0.0, *[mm**2] * 3])
+    return PlacingCovariance(tuple(names), np.kron(np.eye(len(names)), own))
+
+
+def test_independent_shifts_average_out():
+    placings, cameras = ring_of_cameras(heights=(1000,))
+    sigma, seen = sigma_at(MIDDLE, placings, cameras, shifts(placings, 0.3))
+    assert seen[0] == 3
+    assert sigma[0] == pytest.approx(0.3 * np.sqrt(3) / np.sqrt(3))  # three axes, three pairs
+
+
+def test_shifts_in_common_do_not():
+    placings, cameras = ring_of_cameras(heights=(1000,))
+    own = np.diag([0.0, 0.0, 0.0, *[0.3**2] * 3])
+    together = PlacingCovariance(tuple(placings), np.kron(np.ones((3, 3)), own))
+    sigma, _ = sigma_at(MIDDLE, placings, cameras, together)
+    assert sigma[0] == pytest.approx(0.3 * np.sqrt(3))
+
+
+def test_sigma_is_that_of_drawn_placings():
+    placings, cameras = ring_of_cameras(heights=(900, 1300))
+    names = tuple(placings)
+    rng = np.random.default_rng(1)
+    # Turns of 1e-4 radians about the rig's origin and shifts of 0.1 mm, all correlated.
+    mixing = rng.normal(size=(36, 36)) / 6.0 * np.tile([1e-4] * 3 + [0.1] * 3, 6)[:, None]
+    points = rng.uniform([-300, -300, 700], [300, 300, 1500], (20, 3))
+    covariance = PlacingCovariance(names, mixing @ mixing.T)
+    sigma, seen = sigma_at(points, placings, cameras, covariance)
+    sights = np.array([in_image(cameras[n], placings[n].inverse().apply(points)) for n in names])
+    assert np.array_equal(sights.sum(axis=0), seen)
+    squared = np.zeros(len(points))
+    for draw in rng.normal(size=(800, 36)):
+        motions = (mixing @ draw).reshape(6, 6)
+        moved = np.array(
+            [placings[n].moved(m).apply(placings[n].inverse().apply(points)) - points
+             for n, m in zip(names, motions, strict=True)]
+        )  # fmt: skip
+        mean = np.sum(moved * sights[..., None], axis=0) / np.maximum(seen, 1)[:, None]
+        squared += np.sum(mean**2, axis=1)
+    drawn = np.sqrt(squared / 800)
+    # 800 draws of 3 axes tell a sigma to 2 or 3 % if one axis leads; three such.
+    assert np.all(seen > 0)
+    np.testing.assert_allclose(sigma, drawn, rtol=0.1)
+
+
+def test_what_no_pair_sees_has_no_sigma(tmp_path):
+    placings, cameras = ring_of_cameras(heights=(400,))
+    sigma, seen = sigma_at(np.array([[0.0, 0.0, 2100.0]]), placings, cameras, shifts(placings, 0.3))
+    assert seen[0] == 0
+    assert np.isnan(sigma[0])
+    path = tmp_path / "map.png"
+    draw_sigma_map(Volume(), placings, cameras, shifts(placings, 0.3), path)
+    picture = cv2.imread(str(path))
+    height, width = picture.shape[:2]
+    assert height == 900
+    # Two maps of 700 mm about the axis: unseen grey above, a colour where three cameras look.
+    for column in (width // 4 - 50, 3 * width // 4 - 100):
+        assert np.ptp(picture[100, column].astype(int)) == 0
+        assert np.ptp(picture[700, column].astype(int)) > 50
+    again = tmp_path / "again.png"
+    draw_sigma_map(Volume(), placings, cameras, shifts(placings, 0.3), again)
+    assert again.read_bytes() == path.read_bytes()
+
+
+def test_points_that_the_lens_folds_back_are_not_seen():
+    """With k1 = -0.4 a point at 70 degrees projects into the image, which ends at 23 degrees."""
+    camera = Camera(1500.0, 1500.0, 0.0, 640.0, 512.0, -0.4, 0.0, 1280, 1024)
+    angles = np.linspace(0.0, 1.4, 200)
+    points = 1000.0 * np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
+    pixels = camera.project(points)
+    folded = (pixels[:, 0] > 0) & (pixels[:, 0] < 1279) & (angles > 0.8)
+    assert folded.any()
+    assert not in_image(camera, points)[folded].any()
+    assert in_image(camera, points)[angles < 0.38].all()
+    assert not in_image(camera, -points).any()
