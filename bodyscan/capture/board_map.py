@@ -59,8 +59,8 @@ def fit_board_map(printed: Array, pixels: Array, *, lens: bool = True) -> BoardM
     design = _monomials((printed - middle) / size, degree)
     residual = pixels - _project(homography, printed)
     ridge = 1e-3 * len(printed) * np.eye(design.shape[1])
-    coefficients = np.linalg.solve(design.T @ design + ridge, design.T @ residual)
-    return BoardMap(homography, coefficients, middle, size, degree)
+    solved = np.linalg.solve(design.T @ design + ridge, design.T @ residual)
+    return BoardMap(homography, np.asarray(solved, np.float64), middle, size, degree)
 
 
 def _project(homography: Array, points: Array) -> Array:

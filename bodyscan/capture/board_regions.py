@@ -32,6 +32,11 @@ class Region:
     right: int
     bottom: int
 
+    @property
+    def area(self) -> int:
+        """px^2."""
+        return (self.right - self.left) * (self.bottom - self.top)
+
     def cut(self, image: Image) -> Image:
         """That part of the image."""
         return np.ascontiguousarray(image[self.top : self.bottom, self.left : self.right])

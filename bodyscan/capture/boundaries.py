@@ -1,4 +1,4 @@
-"""Where one stripe ends and the next begins, to a fraction of a pixel, and s in between."""
+"""Where one stripe ends and the next begins, to a fraction of a pixel."""
 
 from __future__ import annotations
 
@@ -8,59 +8,89 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfinv
 
+from bodyscan.capture.albedo_edges import Brightness
 from bodyscan.capture.stripe_images import StripeImages
 
-Floats = NDArray[np.float32]
+Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
-TABLE_SIZE = 4096
 MAX_RATIO = 0.98
+TABLE_SIZE = 4096
+LEAST_SIGMA_PX = 0.015
+"""What blur that is not Gaussian and a sensor that is not quite linear leave, seen in tests."""
+
+MIN_STRIPE_PX = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Boundaries:
-    """Crossings in the order of lines and positions.
+    """Boundaries in the order of scan lines and of places on them.
 
-    line: (N,) scan line.  before: (N,) the pixel before the crossing.  position: (N,) float64, px
-    along the line.  index: (N,) boundary i lies between stripes i - 1 and i.  rises: (N,) whether
-    s increases with position.  sigma_px: (N,) float32.
+    line: (N,) scan line.  before: (N,) the pixel before the crossing.  position: (N,) px along the
+    line.  line_position: (N,) px, beside the line by a fraction where an edge of brightness pulls
+    it.  sigma_px: (N,) standard deviation across the stripes.  index: (N,) boundary i lies between
+    stripes i - 1 and i.  joined: (N - 1,) whether the next boundary ends the stripe that this one
+    begins.  blur2: px^2, of lens and pixel, see `albedo_edges`.
     """
 
     line: Ints
     before: Ints
-    position: NDArray[np.float64]
-    index: Ints
-    rises: NDArray[np.bool_]
+    position: Floats
+    line_position: Floats
     sigma_px: Floats
+    index: Ints
+    joined: Mask
+    blur2: float
 
 
 def find_boundaries(
     images: StripeImages,
+    brightness: Brightness,
     codes: NDArray[np.int32],
-    usable: NDArray[np.bool_],
-    noise: float,
+    usable: Mask,
+    variance: NDArray[np.float32],
 ) -> Boundaries:
     """All places where the code changes by one between two usable pixels of a line.
 
-    Only one bit flips there. Its pattern minus its inverse, divided by their sum above the dark
-    (which takes out the surface's own black and white), is an error function of the distance
-    from the boundary whatever the blur; the inverse error function makes it a straight line,
-    whose zero is the boundary.
+    Only one bit flips there. Its pattern minus its inverse, divided by lit minus dark (which takes
+    out most of the surface's own black and white), is an error function of the distance from the
+    boundary whatever the blur; the inverse error function makes it a straight line, whose zero is
+    the boundary. `variance` (256,) is that of each grey level.
     """
     change = np.diff(codes, axis=1)
     crossing = (np.abs(change) == 1) & usable[:, 1:] & usable[:, :-1]
-    line, before = np.nonzero(crossing)
-    rises = change[line, before] > 0
-    index = codes[line, before].astype(np.int64) + rises
+    flat = np.flatnonzero(crossing)
+    line, before = np.divmod(flat, crossing.shape[1])
+    at = line * codes.shape[1] + before
+    index = np.maximum(codes.ravel()[at], codes.ravel()[at + 1]).astype(np.int64)
     bit = len(images.patterns) - 1 - _trailing_zeros(index)
-    left, left_sum = _ratio(images, bit, line, before)
-    right, right_sum = _ratio(images, bit, line, before + 1)
-    a, b = _straighten(left), _straighten(right)
-    fraction = np.clip(a / (a - b), 0.0, 1.0)
-    slope = np.abs(right - left)
-    grey = np.minimum(left_sum, right_sum)
-    sigma = np.sqrt(2.0) * noise / np.maximum(grey, 1.0) / np.maximum(slope, 0.05)
-    return Boundaries(line, before, before + fraction, index, rises, sigma.astype(np.float32))
+    edges = brightness.at(at)
+    left, left_sigma = _straightened(images, variance, bit, at, edges.before)
+    right, right_sigma = _straightened(images, variance, bit, at + 1, edges.behind)
+    fraction = np.clip(left / (left - right), 0.0, 1.0)
+    sigma = np.hypot((1.0 - fraction) * left_sigma, fraction * right_sigma)
+    sigma = np.hypot(sigma / np.abs(left - right), LEAST_SIGMA_PX)
+    position = before + fraction
+    joined = _joined(line, index, position)
+    blur2 = edges.blur2(position, joined)
+    return Boundaries(
+        line=line,
+        before=before,
+        position=position + blur2 * edges.along,
+        line_position=line + blur2 * edges.across,
+        sigma_px=np.hypot(sigma, edges.doubt(blur2)),
+        index=index,
+        joined=joined,
+        blur2=blur2,
+    )
+
+
+def _joined(line: Ints, index: Ints, position: Floats) -> Mask:
+    """(N - 1,) whether the next boundary ends the stripe that this one begins."""
+    return (
+        (np.diff(line) == 0) & (np.abs(np.diff(index)) == 1) & (np.diff(position) > MIN_STRIPE_PX)
+    )
 
 
 def _trailing_zeros(index: Ints) -> Ints:
@@ -68,45 +98,21 @@ def _trailing_zeros(index: Ints) -> Ints:
     return np.frexp((index & -index).astype(float))[1].astype(np.int64) - 1
 
 
-def _ratio(images: StripeImages, bit: Ints, line: Ints, position: Ints) -> tuple[Floats, Floats]:
-    """(pattern - inverse) / (pattern + inverse - 2 dark), and that sum."""
-    pattern = images.patterns[bit, line, position].astype(np.float32)
-    inverse = images.inverses[bit, line, position].astype(np.float32)
-    total = np.maximum(pattern + inverse - 2.0 * images.dark[line, position], 1.0)
-    return (pattern - inverse) / total, total
-
-
-_TABLE = erfinv(np.linspace(-MAX_RATIO, MAX_RATIO, TABLE_SIZE + 1)).astype(np.float32)
-
-
-def _straighten(ratio: Floats) -> Floats:
-    """Inverse error function, from a table."""
-    scaled = (np.clip(ratio, -MAX_RATIO, MAX_RATIO) / MAX_RATIO + 1.0) * (TABLE_SIZE / 2)
-    return _TABLE[np.rint(scaled).astype(np.int32)]
-
-
-def interpolate_stripes(
-    boundaries: Boundaries, codes: NDArray[np.int32], usable: NDArray[np.bool_]
+def _straightened(
+    images: StripeImages, variance: NDArray[np.float32], bit: Ints, at: Ints, contrast: Floats
 ) -> tuple[Floats, Floats]:
-    """s and its standard deviation (L, P), NaN where there is none."""
-    shape = codes.shape
-    crossing = np.zeros(shape, bool)
-    crossing[boundaries.line, boundaries.before] = True
-    last = np.cumsum(crossing.ravel(), dtype=np.int32).reshape(shape) - crossing - 1
-    step = np.diff(boundaries.index)
-    width = np.diff(boundaries.position)
-    joined = (np.abs(step) == 1) & (np.diff(boundaries.line) == 0) & (width > 0.2)
-    slope = np.where(joined, step / np.where(joined, width, 1.0), np.nan)
-    offset = boundaries.index[:-1] - slope * boundaries.position[:-1]
-    variance = boundaries.sigma_px.astype(float) ** 2
-    spread = np.abs(slope) * np.sqrt((variance[:-1] + variance[1:]) / 2)
-    slope, offset, spread = (
-        np.append(value, np.nan).astype(np.float64) for value in (slope, offset, spread)
-    )
-    pixel = np.arange(shape[1], dtype=np.float32)
-    s = (offset[last] + slope[last] * pixel).astype(np.float32)
-    wrong = ~usable | (np.abs(s - codes - 0.5) > 0.6)
-    s[wrong] = np.nan
-    sigma = spread[last].astype(np.float32)
-    sigma[np.isnan(s)] = np.nan
-    return s, sigma
+    """Distance from the boundary in units of sqrt(2) blurs (with a sign), and its sigma."""
+    place = bit * images.lit.size + at
+    pattern = images.patterns.ravel()[place]
+    inverse = images.inverses.ravel()[place]
+    difference = np.subtract(pattern, inverse, dtype=np.float32)
+    ratio = difference / contrast
+    scaled = (np.clip(ratio, -MAX_RATIO, MAX_RATIO) / MAX_RATIO + 1.0) * (TABLE_SIZE / 2)
+    entry = np.rint(scaled).astype(np.int32)
+    noise = np.sqrt(variance[pattern] + variance[inverse]) / contrast
+    return _STRAIGHT[entry], noise * _STRETCH[entry]
+
+
+_RATIOS = np.linspace(-MAX_RATIO, MAX_RATIO, TABLE_SIZE + 1)
+_STRAIGHT = erfinv(_RATIOS)
+_STRETCH = np.sqrt(np.pi) / 2.0 * np.exp(_STRAIGHT**2)

@@ -68,9 +68,11 @@ def _candidates(image: Image, board: Board) -> Iterator[Array]:
     whole = Region(0, 0, image.shape[1], image.shape[0])
     yield from _found(_classic, image, size, whole, 1.0)
     regions = board_regions(image, size[0] * size[1])
-    for scale in (2.0, 1.0):
-        for region in regions:
-            yield from _found(_classic, image, size, region, scale)
+    small = [region for region in regions if 2 * region.area < image.size]
+    for region, scale in [(region, 2.0) for region in small] + [
+        (region, 1.0) for region in regions
+    ]:
+        yield from _found(_classic, image, size, region, scale)
     for region in regions[:1]:
         yield from _found(_sector_based, image, size, region, 1.0)
 
@@ -126,7 +128,9 @@ def _first_is_black(image: Image, board: Board, pixels: Array, printed: Array) -
     """
     board_map = fit_board_map(printed, pixels)
     column, row = np.meshgrid(np.arange(1, board.columns - 1), np.arange(1, board.rows - 1))
-    middle = board.square_mm * (np.stack([column.ravel(), row.ravel()], axis=-1) + 0.5)
+    middle = board.square_mm * (np.stack([column.ravel(), row.ravel()], axis=-1) + 0.5).astype(
+        float
+    )
     where = board_map.apply(middle).astype(np.float32)
     grey = cv2.remap(image, where[:, None], None, cv2.INTER_LINEAR).ravel().astype(float)
     even = (column.ravel() + row.ravel()) % 2 == 0

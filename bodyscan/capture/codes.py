@@ -10,9 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.boundaries import find_boundaries, interpolate_stripes
+from bodyscan.capture.albedo_edges import Brightness, without_edges_across
+from bodyscan.capture.boundaries import find_boundaries
+from bodyscan.capture.grey_noise import noise_variance
 from bodyscan.capture.rig import ProjectorSpec
-from bodyscan.capture.sequence import check_codes, check_frames, grey_noise
+from bodyscan.capture.sequence import check_codes, check_frames
+from bodyscan.capture.stripe_coordinates import interpolate_stripes
 from bodyscan.capture.stripe_images import StripeImages
 from bodyscan.capture.views import StripeMap
 from bodyscan.errors import BadInput
@@ -64,9 +67,11 @@ def read_stripes(
     """
     check_frames(lit, dark, patterns, inverses, bits_needed(stripes))
     images = StripeImages.along_lines(lit, dark, patterns, inverses, direction)
-    noise = grey_noise(images)
-    codes, usable = images.decode(noise, stripes)
+    variance = noise_variance(images)
+    codes, usable = images.decode(variance, stripes)
     check_codes(images, codes, usable, stripes)
-    boundaries = find_boundaries(images, codes, usable, noise)
+    brightness = Brightness.of(images, variance)
+    boundaries = find_boundaries(images, brightness, codes, usable, variance)
     s, sigma = interpolate_stripes(boundaries, codes, usable)
+    s, sigma = without_edges_across(s, sigma, brightness, boundaries.blur2)
     return images.stripe_map(lit, s, sigma, boundaries, stripes)

@@ -24,6 +24,7 @@ MAX_RADIUS_PX = 9.0
 WINDOW_SQUARES = 0.42
 BLUR_PX = 0.9
 CLEAR_OF_MARKER_PX = 1.4
+MIN_BORDER_PX = 5.0
 MIN_ARM_PX = 1.5
 BLUR_RANGE_PX = (0.3, 3.0)
 MIN_PIXELS = 16
@@ -78,6 +79,9 @@ def refine_corners(
     good = patches.weight.sum(axis=1) >= MIN_PIXELS
     good &= np.linalg.norm(pixels - start, axis=1) < MAX_MOVE_PX
     good &= (contrast > MIN_CONTRAST) & (residual < MAX_RESIDUAL * contrast)
+    # At the picture's rim a corner seen on one side only is fitted well, but in the wrong place.
+    size = np.array(image.shape[::-1])
+    good &= np.all((pixels >= MIN_BORDER_PX) & (pixels <= size - 1 - MIN_BORDER_PX), axis=1)
     return pixels, good
 
 

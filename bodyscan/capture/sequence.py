@@ -29,15 +29,6 @@ def check_frames(
         raise DecodingFailed(f"dark frame of {dark.shape} px, lit frame of {lit.shape} px")
 
 
-def grey_noise(images: StripeImages) -> float:
-    """Standard deviation of one frame's grey levels, from how the brighter frame of the first
-    bit (whose edges are few) differs from the lit frame."""
-    brighter = np.maximum(images.patterns[0], images.inverses[0])
-    difference = brighter.astype(np.int16) - images.lit
-    spread = difference[np.abs(difference) <= 20]
-    return float(max(np.std(spread) / np.sqrt(2.0), 0.5)) if spread.size else 0.5
-
-
 def check_codes(
     images: StripeImages, codes: NDArray[np.int32], usable: NDArray[np.bool_], stripes: int
 ) -> None:

@@ -20,6 +20,7 @@ Mask = NDArray[np.bool_]
 SATURATED = 254
 MIN_CONTRAST = 4.0
 MIN_CONTRAST_TO_NOISE = 5.0
+WHOLLY_COVERED = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +56,19 @@ class StripeImages:
         """Lit minus dark, (L, P), grey levels."""
         return cv2.subtract(self.lit, self.dark, dtype=cv2.CV_32F)
 
-    def decode(self, noise: float, stripes: int) -> tuple[NDArray[np.int32], Mask]:
+    def decode(self, variance: NDArray[np.float32], stripes: int) -> tuple[NDArray[np.int32], Mask]:
         """The stripe (L, P) that each pixel lies in, and which pixels can be relied on.
 
-        Not to be relied on: low contrast, saturation, codes that were not projected, and pixels
-        beside a jump of the code by more than one (a mixed pixel at a depth jump is one).
+        Not to be relied on: low contrast, saturation, codes that were not projected, pixels that
+        the surface's rim covers only in part, and pixels beside a jump of the code by more than
+        one (a mixed pixel at a depth jump is one).
+        variance: (256,) of each grey level.
         """
         codes = self.binary()
+        noise = np.sqrt(variance)[cv2.max(self.lit, self.dark)]
         contrast = self.contrast
-        usable = contrast >= max(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * noise)
+        usable = contrast >= np.maximum(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * noise)
+        usable &= ~half_covered(contrast, usable)
         usable &= (self.lit < SATURATED) & (codes < stripes)
         return codes, usable & ~beside_jumps(codes, usable)
 
@@ -86,8 +91,7 @@ class StripeImages:
     ) -> StripeMap:
         """Back to the camera's own layout."""
         contrast = self.contrast
-        line, position = boundaries.line.astype(float), boundaries.position
-        pixels = np.stack([position, line], axis=-1)
+        pixels = np.stack([boundaries.position, boundaries.line_position], axis=-1)
         if self.turned:
             s, sigma, contrast = (cv2.transpose(image) for image in (s, sigma, contrast))
             pixels = pixels[:, ::-1]
@@ -98,9 +102,19 @@ class StripeImages:
             contrast=contrast,
             boundary_index=boundaries.index,
             boundary_pixels=np.ascontiguousarray(pixels, float),
-            boundary_sigma_px=boundaries.sigma_px,
+            boundary_sigma_px=boundaries.sigma_px.astype(np.float32),
             stripes=stripes,
         )
+
+
+def half_covered(contrast: NDArray[np.float32], lit: Mask) -> Mask:
+    """(L, P): pixels beside one that is not lit and much darker than their brightest neighbour.
+
+    They straddle the rim of the surface, and tell s of its part of them, not of their middle.
+    """
+    around = np.ones((3, 3), np.uint8)
+    at_rim = cv2.erode(lit.astype(np.uint8), around, borderValue=1) == 0
+    return at_rim & (contrast < WHOLLY_COVERED * cv2.dilate(contrast, around))
 
 
 def beside_jumps(codes: NDArray[np.int32], usable: Mask) -> Mask:

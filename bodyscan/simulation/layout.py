@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,18 +94,9 @@ def draw_camera(width: int, height: int, optics: Optics, rng: np.random.Generato
     gamma = optics.skew_px * pixel * (1.0 + 0.2 * rng.standard_normal())
     k1 = optics.k1 + optics.k1_spread * float(np.clip(rng.standard_normal(), -2, 2))
     k2 = optics.k2 + optics.k2_spread * float(np.clip(rng.standard_normal(), -2, 2))
-    middle = ((width - 1) / 2.0, (height - 1) / 2.0)
-    return TrueCamera(
-        float(alpha),
-        float(beta),
-        float(gamma),
-        float(middle[0] + u0),
-        float(middle[1] + v0),
-        k1,
-        k2,
-        width,
-        height,
-    )
+    u0, v0 = u0 + (width - 1) / 2.0, v0 + (height - 1) / 2.0
+    alpha, beta, gamma, u0, v0 = (float(value) for value in (alpha, beta, gamma, u0, v0))
+    return TrueCamera(alpha, beta, gamma, u0, v0, k1, k2, width, height)
 
 
 def rig_from_view(placing: Placing) -> RigidTransform:
@@ -143,7 +134,7 @@ def _perturbed(
 
 
 def _seen_points(camera: TrueCamera, projection: Projection, reach: float) -> Array:
-    """Points (N, 3) on the border of what the camera sees, near and far."""
+    """Points (N, 3) all over what the camera sees, its corners among them, near to far."""
     u, v = np.linspace(-0.5, camera.width - 0.5, 9), np.linspace(-0.5, camera.height - 0.5, 9)
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     depths = reach * np.linspace(projection.near, projection.far, 5)
@@ -182,19 +173,12 @@ def build_mirror(
     theta = wide.angle(seen)
     fan = float(1.05 * np.abs(wide.across(seen, theta)).max())
     first, last = _sweep(theta, projection.margin, _downwards(seen, theta, horizontal))
-    return MirrorProjector(
-        stripes,
-        axis,
-        centre,
-        zero,
-        offset,
-        laser,
-        wide.sheet,
-        aim,
-        first,
-        last - first,
-        fan,
-        projection.smile_stripes,
+    return replace(
+        wide,
+        first_angle=first,
+        sweep_angle=last - first,
+        fan=fan,
+        smile_stripes=projection.smile_stripes,
     )
 
 
@@ -216,9 +200,8 @@ def build_pinhole(
     along, across = wide.slide(seen)
     first, last = _sweep(across, projection.margin, _downwards(seen, across, horizontal))
     half = float(1.05 * np.abs(along).max())
-    return PinholeProjector(
-        stripes, rows, centre, first, last, half, k1, k2, projection.smile_stripes
-    )
+    bow = projection.smile_stripes
+    return replace(wide, first=first, last=last, half=half, smile_stripes=bow)
 
 
 def _downwards(seen: Array, sweep: Array, horizontal: bool) -> bool:

@@ -174,3 +174,16 @@ def test_settings_for_a_kind_of_projector() -> None:
     assert settings_for("pinhole").projection.kind == "pinhole"
     with pytest.raises(BadInput, match="laser"):
         settings_for("laser")
+
+
+def test_a_camera_without_projector_takes_lit_images_by_a_lamp(tmp_path: Path) -> None:
+    text = (PROJECT / "rigs" / "one-pair.yaml").read_text()
+    lines = [line for line in text.splitlines() if "projector" not in line]
+    (tmp_path / "rig.yaml").write_text("\n".join(lines) + "\n")
+    simulate(tmp_path / "rig.yaml", tmp_path / "out", scale=0.25, board_shots=2)
+    folder = tmp_path / "out" / "captures" / "calibration"
+    shots = yaml.safe_load((folder / "captures.yaml").read_text())["shots"]
+    assert [shot["lit"] for shot in shots] == [["pair"], ["pair"]]
+    assert {path.name for path in folder.rglob("*.png")} == {"lit.png"}
+    image = cv2.imread(str(folder / "b01" / "pair" / "lit.png"), cv2.IMREAD_GRAYSCALE)
+    assert np.mean(image > 100) > 0.1  # the board's white, brightly lit

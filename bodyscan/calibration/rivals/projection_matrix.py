@@ -55,7 +55,9 @@ def split_projection_matrix(
         width=width,
         height=height,
     )
-    return camera, RigidTransform(rotation, translation)
+    return camera, RigidTransform(
+        np.asarray(rotation, np.float64), np.asarray(translation, np.float64)
+    )
 
 
 def _scaling(places: Array) -> Array:

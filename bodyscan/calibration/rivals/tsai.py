@@ -62,7 +62,11 @@ def calibrate_tsai(points: Array, pixels: Array, centre: Array) -> TsaiCamera:
 
     The centre is taken where radial alignment is best (Lenz and Tsai 1988), then all is refined.
     """
-    found = least_squares(lambda place: _alignment(points, pixels - place)[1], centre).x
+
+    def misaligned(place: Array) -> Array:
+        return _alignment(points, pixels - place)[1]
+
+    found = least_squares(misaligned, centre).x
     rotation, across, aspect = _aligned(points, pixels - found)
     focal, depth = _focal_and_depth(points, pixels - found, rotation, across)
     start = np.concatenate(
@@ -71,9 +75,7 @@ def calibrate_tsai(points: Array, pixels: Array, centre: Array) -> TsaiCamera:
             [*across, depth, focal, aspect, *found, 0.0],
         ]
     )
-    solved = least_squares(
-        lambda values: _residuals(values, points, pixels), start, x_scale="jac", loss="linear"
-    )
+    solved = least_squares(_residuals, start, x_scale="jac", args=(points, pixels))
     values = solved.x
     rms = float(np.sqrt(2.0 * np.mean(solved.fun**2)))
     place = RigidTransform.from_rotation_vector(values[:3], values[3:6])

@@ -1,0 +1,55 @@
+"""The 2 x 4 matrix with its index re-mapped: stripes at equal angles made stripes at equal tangents.
+
+A rotating mirror throws its stripes at nearly equal angles, a pinhole's slide needs equal tangents.
+A smooth function of the index makes up for that; what is left is that the stripes share no line.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from bodyscan.calibration.pinhole_projector import fit_pinhole
+from bodyscan.geometry.light_planes import Axis, LightPlanes
+
+Array = NDArray[np.float64]
+
+POWERS = (3, 4, 5)
+"""The matrix has a scale, a shift and a perspective of the index itself: powers 0 to 2."""
+
+
+def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis) -> LightPlanes:
+    """Planes of the best 2 x 4 matrix and re-mapping of s (N,) at points (N, 3), camera frame.
+
+    Robust (Cauchy), started from the matrix alone.
+    """
+    start = fit_pinhole(points, s).matrix
+    middle, size = points.mean(axis=0), float(points.std())
+    # In units of the cloud of points and of half the stripes all unknowns are about 1.
+    scale = np.diag([size, size, size, 1.0])
+    scale[:3, 3] = middle
+    matrix = start @ scale
+    half = stripes / 2.0
+    matrix[0] = (matrix[0] - half * matrix[1]) / half
+    matrix /= np.linalg.norm(matrix[1])
+    whole = np.column_stack([(points - middle) / size, np.ones(len(points))])
+
+    def residuals(values: Array) -> Array:
+        above, below = whole @ values[:4], whole @ values[4:8]
+        return above / below - _remapped(s / half - 1.0, values[8:])
+
+    flat = np.concatenate([matrix.ravel(), np.zeros(len(POWERS))])
+    spread = 1.4826 * float(np.median(np.abs(residuals(flat)))) + 1e-12
+    solved = least_squares(residuals, flat, loss="cauchy", f_scale=spread, x_scale="jac").x
+    u = np.arange(stripes + 1.0) / half - 1.0
+    rows = solved[:4] - _remapped(u, solved[8:])[:, None] * solved[4:8]
+    planes = rows @ np.linalg.inv(scale)
+    planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+    planes *= np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
+    return LightPlanes(planes, np.full((stripes + 1, 4, 4), np.nan), direction)
+
+
+def _remapped(u: Array, factors: Array) -> Array:
+    """u in [-1, 1] over all stripes -> where a pinhole's slide would have it."""
+    return np.asarray(u + np.stack([u**power for power in POWERS], axis=-1) @ factors, np.float64)
