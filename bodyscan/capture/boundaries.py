@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import erfinv
 
 from bodyscan.capture.albedo_edges import Brightness
+from bodyscan.capture.gray_code import bit_that_flips
 from bodyscan.capture.stripe_images import StripeImages
 
 Floats = NDArray[np.float64]
@@ -64,7 +65,7 @@ def find_boundaries(
     line, before = np.divmod(flat, crossing.shape[1])
     at = line * codes.shape[1] + before
     index = np.maximum(codes.ravel()[at], codes.ravel()[at + 1]).astype(np.int64)
-    bit = len(images.patterns) - 1 - _trailing_zeros(index)
+    bit = bit_that_flips(index, len(images.patterns))
     edges = brightness.at(at)
     left, left_sigma = _straightened(images, variance, bit, at, edges.before)
     right, right_sigma = _straightened(images, variance, bit, at + 1, edges.behind)
@@ -91,11 +92,6 @@ def _joined(line: Ints, index: Ints, position: Floats) -> Mask:
     return (
         (np.diff(line) == 0) & (np.abs(np.diff(index)) == 1) & (np.diff(position) > MIN_STRIPE_PX)
     )
-
-
-def _trailing_zeros(index: Ints) -> Ints:
-    """Position of the lowest bit set; index > 0. Boundary i flips that bit of the Gray code."""
-    return np.frexp((index & -index).astype(float))[1].astype(np.int64) - 1
 
 
 def _straightened(

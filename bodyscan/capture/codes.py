@@ -1,9 +1,4 @@
-"""Gray-coded stripes: the images for a projector, and reading camera images of them.
-
-Reflected binary code, i ^ (i >> 1), most significant bit first, ceil(log2(stripes)) bits. From
-one stripe to the next exactly one bit flips, so a pixel at a boundary is never off by more than
-the stripe next to it.
-"""
+"""Gray-coded stripes: the images for a projector, and reading camera images of them."""
 
 from __future__ import annotations
 
@@ -12,20 +7,16 @@ from numpy.typing import NDArray
 
 from bodyscan.capture.albedo_edges import Brightness, without_edges_across
 from bodyscan.capture.boundaries import find_boundaries
+from bodyscan.capture.gray_code import bits_needed, gray_from_stripe, stripe_from_gray
 from bodyscan.capture.grey_noise import noise_variance
 from bodyscan.capture.rig import ProjectorSpec
-from bodyscan.capture.sequence import check_codes, check_frames
+from bodyscan.capture.sequence import check_codes, check_exposure, check_frames
 from bodyscan.capture.stripe_coordinates import interpolate_stripes
 from bodyscan.capture.stripe_images import StripeImages
 from bodyscan.capture.views import StripeMap
 from bodyscan.errors import BadInput
 
 Images = NDArray[np.uint8]
-
-
-def bits_needed(stripes: int) -> int:
-    """Number of bits, and so of pattern frames, for this many stripes (>= 2)."""
-    return (stripes - 1).bit_length()
 
 
 def pattern_frames(spec: ProjectorSpec, width: int, height: int) -> Images:
@@ -41,7 +32,7 @@ def pattern_frames(spec: ProjectorSpec, width: int, height: int) -> Images:
             remedy="project fewer stripes",
         )
     stripe = np.arange(across) * spec.stripes // across
-    gray = stripe ^ (stripe >> 1)
+    gray = gray_from_stripe(stripe)
     shift = np.arange(bits_needed(spec.stripes))[::-1]
     lines = ((gray >> shift[:, None] & 1) * 255).astype(np.uint8)
     lines = lines[:, :, None] if spec.direction == "horizontal" else lines[:, None, :]
@@ -67,9 +58,12 @@ def read_stripes(
     """
     check_frames(lit, dark, patterns, inverses, bits_needed(stripes))
     images = StripeImages.along_lines(lit, dark, patterns, inverses, direction)
+    check_exposure(images)
+    gray = images.gray()
+    check_codes(images, gray, stripes)
+    codes = stripe_from_gray(gray)
     variance = noise_variance(images)
-    codes, usable = images.decode(variance, stripes)
-    check_codes(images, codes, usable, stripes)
+    usable = images.usable(codes, variance, stripes)
     brightness = Brightness.of(images, variance)
     boundaries = find_boundaries(images, brightness, codes, usable, variance)
     s, sigma = interpolate_stripes(boundaries, codes, usable)

@@ -56,30 +56,26 @@ class StripeImages:
         """Lit minus dark, (L, P), grey levels."""
         return cv2.subtract(self.lit, self.dark, dtype=cv2.CV_32F)
 
-    def decode(self, variance: NDArray[np.float32], stripes: int) -> tuple[NDArray[np.int32], Mask]:
-        """The stripe (L, P) that each pixel lies in, and which pixels can be relied on.
+    def gray(self) -> NDArray[np.uint16]:
+        """(L, P) code words: a bit is 1 where the pattern is brighter than its inverse."""
+        words = np.zeros(self.lit.shape, np.uint16)
+        for pattern, inverse in zip(self.patterns, self.inverses, strict=True):
+            words = (words << 1) | (pattern > inverse)
+        return words
 
-        Not to be relied on: low contrast, saturation, codes that were not projected, pixels that
-        the surface's rim covers only in part, and pixels beside a jump of the code by more than
-        one (a mixed pixel at a depth jump is one).
-        variance: (256,) of each grey level.
+    def usable(self, codes: NDArray[np.int32], variance: NDArray[np.float32], stripes: int) -> Mask:
+        """(L, P): pixels whose stripes `codes` can be relied on.
+
+        Not low contrast, saturation, codes that were not projected, pixels that the surface's rim
+        covers only in part, and pixels beside a jump of the code by more than one (a mixed pixel
+        at a depth jump is one). variance: (256,) of each grey level.
         """
-        codes = self.binary()
         noise = np.sqrt(variance)[cv2.max(self.lit, self.dark)]
         contrast = self.contrast
         usable = contrast >= np.maximum(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * noise)
         usable &= ~half_covered(contrast, usable)
         usable &= (self.lit < SATURATED) & (codes < stripes)
-        return codes, usable & ~beside_jumps(codes, usable)
-
-    def binary(self) -> NDArray[np.int32]:
-        """(L, P): the Gray code's sign bits turned into stripe numbers."""
-        gray = np.zeros(self.lit.shape, np.uint16)
-        for pattern, inverse in zip(self.patterns, self.inverses, strict=True):
-            gray = (gray << 1) | (pattern > inverse)
-        for shift in (1, 2, 4, 8):
-            gray ^= gray >> shift
-        return gray.astype(np.int32)
+        return usable & ~beside_jumps(codes, usable)
 
     def stripe_map(
         self,

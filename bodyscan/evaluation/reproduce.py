@@ -69,7 +69,7 @@ def reproduce(
     calibrated = calibrate_all(captures)
     found = _measure_all(captures, calibrated, seed, quick, real_light, progress)
     text = report(found)
-    _draw(captures, calibrated, Path(out))
+    draw(captures, calibrated, Path(out))
     write_text(Path(out) / TEXT, text)
     return text
 
@@ -109,7 +109,8 @@ def _measure_all(
     )
 
 
-def _draw(captures: ChapterCaptures, calibrated: Calibrated, out: Path) -> None:
+def draw(captures: ChapterCaptures, calibrated: Calibrated, out: Path) -> None:
+    """Fig. 6 and Fig. 7 into the folder `out`."""
     # Matplotlib takes a second to import: only whoever draws waits for it.
     from bodyscan.report.figures import PlaneCurve, draw_projector, draw_range_data
 

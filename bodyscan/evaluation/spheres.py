@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.errors import FailedWork
+from bodyscan.evaluation.planes import best_plane
 from bodyscan.geometry.least_squares import spread
 
 Array = NDArray[np.float64]
@@ -29,6 +30,8 @@ REACH = 1.15
 """Points within so many radii of a centre may be the sphere's own when it is found."""
 OFF_SURFACE = 0.15
 """How far off its surface they may lie, in radii."""
+ROUNDER = 0.5
+"""By how much a sphere must explain its points better than a plane does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +175,14 @@ def _most_voted(points: Array, votes: Array, radius: float) -> Sphere | None:
         if near.sum() < FEWEST_POINTS:
             return None
         centre = np.median(votes[near], axis=0)
-    own = np.abs(np.linalg.norm(points - centre, axis=1) - radius) < OFF_SURFACE * radius
-    return fit_sphere(points[own], radius) if own.sum() >= FEWEST_POINTS else None
+    own = points[np.abs(np.linalg.norm(points - centre, axis=1) - radius) < OFF_SURFACE * radius]
+    if len(own) < FEWEST_POINTS:
+        return None
+    sphere = fit_sphere(own, radius)
+    normal, offset = best_plane(own)
+    flat = spread(own @ normal - offset)
+    # Ground between the spheres gathers votes too, but a plane explains it better.
+    return sphere if spread(sphere.distances(own)) < ROUNDER * flat else None
 
 
 def _in_reading_order(spheres: list[Sphere]) -> list[Sphere]:

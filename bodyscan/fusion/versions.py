@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.body import BodyMesh
+from bodyscan.fusion.meshing import largest_piece
 from bodyscan.fusion.topology import topology, vertex_normals, without_unused
 
 
@@ -27,6 +28,10 @@ def light(mesh: BodyMesh, *, faces: int = 50_000) -> BodyMesh:
     vertices = reduced.vertex.positions.numpy().astype(np.float64)
     corners = reduced.triangle.indices.numpy().astype(np.int64)
     found = topology(vertices, corners)
+    if not found.manifold or found.components > 1:
+        # Where surfaces nearly touch (between fingers) a collapse may fold one onto the other.
+        vertices, corners = largest_piece(vertices, corners)
+        found = topology(vertices, corners)
     if not found.manifold:
         raise ScanFailed(
             f"the mesh did not stay closed when reduced to {faces} faces ({found})",

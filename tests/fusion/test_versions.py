@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import open3d as o3d
 import pytest
 
 from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.fusion.body import BodyMesh
-from bodyscan.fusion.topology import topology
+from bodyscan.fusion.topology import topology, vertex_normals
 from bodyscan.fusion.versions import light, measured_only
 
 
@@ -43,3 +44,24 @@ def test_the_open_version_is_what_was_measured(body: BodyMesh):
     np.testing.assert_array_equal(
         measured.colours[measured.faces], body.colours[body.faces[~body.filled]]
     )
+
+
+def test_a_reduction_that_folds_is_mended():
+    # A thin wavy sheet: its two sides collapse onto each other, and Open3D leaves an open fold.
+    sphere = o3d.geometry.TriangleMesh.create_sphere(1.0, resolution=60)
+    vertices = np.asarray(sphere.vertices) * [100.0, 60.0, 0.05]
+    vertices[:, 2] += 3.0 * np.sin(vertices[:, 0] / 8.0) * np.cos(vertices[:, 1] / 5.0)
+    faces = np.asarray(sphere.triangles).astype(np.int64)
+    count = len(vertices)
+    sheet = BodyMesh(
+        vertices,
+        faces,
+        vertex_normals(vertices, faces),
+        np.zeros((count, 3), np.uint8),
+        np.zeros(count, np.float32),
+        np.zeros(len(faces), bool),
+    )
+    reduced = light(sheet, faces=1000)
+    found = topology(reduced.vertices, reduced.faces)
+    assert found.manifold
+    assert found.components == 1

@@ -34,22 +34,24 @@ def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis)
     matrix[0] = (matrix[0] - half * matrix[1]) / half
     matrix /= np.linalg.norm(matrix[1])
     whole = np.column_stack([(points - middle) / size, np.ones(len(points))])
+    index, powers = s / half - 1.0, _powers(s / half - 1.0)
 
     def residuals(values: Array) -> Array:
         above, below = whole @ values[:4], whole @ values[4:8]
-        return above / below - _remapped(s / half - 1.0, values[8:])
+        return np.asarray(above / below - index - powers @ values[8:], np.float64)
 
     flat = np.concatenate([matrix.ravel(), np.zeros(len(POWERS))])
     spread = 1.4826 * float(np.median(np.abs(residuals(flat)))) + 1e-12
     solved = least_squares(residuals, flat, loss="cauchy", f_scale=spread, x_scale="jac").x
     u = np.arange(stripes + 1.0) / half - 1.0
-    rows = solved[:4] - _remapped(u, solved[8:])[:, None] * solved[4:8]
+    remapped = u + _powers(u) @ solved[8:]
+    rows = solved[:4] - remapped[:, None] * solved[4:8]
     planes = rows @ np.linalg.inv(scale)
     planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
     planes *= np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
     return LightPlanes(planes, np.full((stripes + 1, 4, 4), np.nan), direction)
 
 
-def _remapped(u: Array, factors: Array) -> Array:
-    """u in [-1, 1] over all stripes -> where a pinhole's slide would have it."""
-    return np.asarray(u + np.stack([u**power for power in POWERS], axis=-1) @ factors, np.float64)
+def _powers(u: Array) -> Array:
+    """(N, 3) of the index u in [-1, 1]."""
+    return np.stack([u**power for power in POWERS], axis=-1)

@@ -1,0 +1,133 @@
+"""Spheres whose truth is known: fits, Eq. 19, and finding them in a range image."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bodyscan.errors import FailedWork
+from bodyscan.evaluation.spheres import (
+    Sphere,
+    centre_distances,
+    find_spheres,
+    fit_sphere,
+    mean_square,
+    measure_sphere,
+    nearest_sphere,
+)
+from bodyscan.reconstruction.triangulation import grid_normals
+
+CENTRES = np.array(
+    [[-73, -50, 405], [-11, -50, 405], [51, -50, 405], [-42, 8, 385], [20, 8, 385.0]]
+)
+
+
+def cap(centre, radius: float, count: int = 2000, noise: float = 0.0, seed: int = 0) -> np.ndarray:
+    """Points on the side that faces the camera, within 60 degrees of the way to it."""
+    rng = np.random.default_rng(seed)
+    height, turn = rng.uniform(0.5, 1.0, count), rng.uniform(0.0, 2.0 * np.pi, count)
+    wide = np.sqrt(1.0 - height**2)
+    arms = np.stack([wide * np.cos(turn), wide * np.sin(turn), -height], axis=1)
+    return centre + arms * (radius + noise * rng.standard_normal(count))[:, None]
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    x=st.floats(-100.0, 100.0),
+    z=st.floats(200.0, 2000.0),
+    radius=st.floats(5.0, 200.0),
+    seed=st.integers(0, 1000),
+)
+def test_an_exact_cap_gives_its_sphere(x, z, radius, seed):
+    centre = np.array([x, -30.0, z])
+    points = cap(centre, radius, seed=seed)
+    free, held = fit_sphere(points), fit_sphere(points, radius)
+    # Rounding of coordinates of 2000 mm, squared in the start and refined from there.
+    assert np.allclose(free.centre, centre, atol=1e-5)
+    assert free.radius == pytest.approx(radius, abs=1e-5)
+    assert np.allclose(held.centre, centre, atol=1e-6)
+    assert held.radius == radius
+    assert mean_square(points, free) < 1e-9
+
+
+def test_eq_19_is_the_noise_squared():
+    noise = 0.02
+    found = measure_sphere(cap(CENTRES[0], 25.0, 20000, noise), 25.0)
+    # Variance of 20000 draws: 1 percent; the fits take up 4 of 20000 freedoms.
+    assert found.e_given == pytest.approx(noise**2, rel=0.04)
+    assert found.e_fitted == pytest.approx(noise**2, rel=0.04)
+    # A cap of 60 degrees determines its radius about 10 sigma / sqrt(N).
+    assert found.fitted.radius == pytest.approx(25.0, abs=0.005)
+
+
+def test_a_given_radius_shows_what_a_fitted_one_hides():
+    found = measure_sphere(cap(CENTRES[0], 25.5), 25.0)
+    assert found.fitted.radius == pytest.approx(25.5, abs=1e-5)
+    assert found.e_fitted < 1e-9
+    # The centre takes up part of 0.5 mm: what is left varies over the cap.
+    assert 1e-3 < found.e_given < 0.25
+
+
+def test_outliers_do_not_pull_the_fit_but_count_in_e():
+    points = cap(CENTRES[0], 25.0, 5000, 0.01)
+    points[::100, 2] += 5.0
+    found = measure_sphere(points, 25.0)
+    assert np.linalg.norm(found.given.centre - CENTRES[0]) < 0.01
+    # A hundredth of the points, some 4 mm off the sphere.
+    assert 0.05 < found.e_given < 0.3
+
+
+def test_too_few_points_are_refused():
+    with pytest.raises(FailedWork, match="too few"):
+        fit_sphere(cap(CENTRES[0], 25.0, 20))
+
+
+def range_image(noise: float = 0.0) -> np.ndarray:
+    """(H, W, 3): five balls on a slanting ground, seen from the origin, every second pixel."""
+    u, v = np.meshgrid(np.arange(0.0, 640.0, 2.0), np.arange(0.0, 480.0, 2.0))
+    rays = np.stack([(u - 350.0) / 1062.0, (v - 287.0) / 1064.0, np.ones_like(u)], axis=-1)
+    depth = 25.0 * 17.6 / (1.0 + 0.33 * rays[..., 1])
+    square = np.sum(rays**2, axis=-1)
+    for centre in CENTRES:
+        along = rays @ centre
+        root = along**2 - square * (centre @ centre - 25.0**2)
+        ball = (along - np.sqrt(np.maximum(root, 0.0))) / square
+        depth = np.where((root > 0) & (ball < depth), ball, depth)
+    depth = depth + noise * np.random.default_rng(0).standard_normal(depth.shape)
+    return rays * depth[..., None]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_spheres_are_found_in_reading_order(noise):
+    points = range_image(noise)
+    normals = grid_normals(points.astype(np.float32)).astype(float)
+    found = find_spheres(points, normals, 25.0, 5)
+    # 3000 points each: what is not noise / sqrt(3000) comes from a few ground points near by.
+    assert np.allclose(np.stack([s.centre for s in found]), CENTRES, atol=0.05)
+    owner = nearest_sphere(points.reshape(-1, 3), found)
+    counts = np.bincount(owner[owner >= 0], minlength=5)
+    assert (counts > 2500).all()
+    on = np.linalg.norm(points.reshape(-1, 3)[owner == 3] - CENTRES[3], axis=1)
+    assert np.abs(on - 25.0).max() < 4.0
+
+
+def test_missing_spheres_are_missed():
+    points = range_image()
+    normals = grid_normals(points.astype(np.float32)).astype(float)
+    with pytest.raises(FailedWork, match="2 spheres"):
+        find_spheres(points[:, :100], normals[:, :100], 25.0, 5)
+
+
+def test_scale_and_distances():
+    turned = CENTRES[:, [2, 0, 1]] * (1.0 + 200e-6) + 7.0
+    found = centre_distances(turned, CENTRES)
+    assert found.scale_ppm == pytest.approx(200.0, abs=1e-6)
+    # Distances of 60 to 124 mm, 200 ppm of them.
+    assert 0.012 < found.rms_mm < 0.025
+
+
+def test_distances_have_a_sign():
+    sphere = Sphere(np.array([0.0, 0.0, 400.0]), 25.0)
+    assert sphere.distances(np.array([[0.0, 0.0, 374.0], [0.0, 0.0, 376.0]])) == pytest.approx(
+        [1.0, -1.0]
+    )
