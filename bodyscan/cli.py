@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from bodyscan import __version__
-from bodyscan.errors import BodyscanError
+from bodyscan.errors import BadInput, BodyscanError
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, help=__doc__
@@ -49,6 +49,14 @@ def _options(
         raise typer.Exit
 
 
+def _refuse_file(folder: Path | None) -> None:
+    """A folder to write into must not be a file: said before the work, not after it."""
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise BadInput(
+            "is a file; results go into a folder", where=str(folder), remedy="give another --out"
+        )
+
+
 @app.command()
 def check(rig_file: RigFile) -> None:
     """Validate a rig file and its capture folders, and list what is missing."""
@@ -67,14 +75,29 @@ def simulate(
     subject: Annotated[
         Path | None, typer.Option(help="A body surface (PLY, metres, z up, facing -y).")
     ] = None,
-    scale: Annotated[float, typer.Option(help="Image size, 1 for what the rig file says.")] = 1.0,
+    scale: Annotated[
+        float,
+        typer.Option(min=0.1, max=4.0, help="Of image size and number of stripes."),
+    ] = 1.0,
     seed: Annotated[int, typer.Option(help="Of every random draw.")] = 0,
     projector: Annotated[
         str, typer.Option(help="mirror (laser and rotating mirror) or pinhole (with a lens).")
     ] = "mirror",
-    board_shots: Annotated[int | None, typer.Option(help="Number of board poses.")] = None,
+    board_shots: Annotated[
+        int | None, typer.Option(min=3, help="Number of board poses; 40 for twelve pairs.")
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Write over captures that are there already.")
+    ] = False,
 ) -> None:
-    """Simulate captures of a rig, a board and a person, with known truth beside them."""
+    """Simulate captures of a rig, a board and (with --subject) a person, with known truth."""
+    _refuse_file(out)
+    if not overwrite and ((out / "captures").exists() or (out / "rig.yaml").exists()):
+        raise BadInput(
+            "this folder holds captures already, which would be written over",
+            where=str(out),
+            remedy="give another --out, or say --overwrite",
+        )
     from bodyscan import console
     from bodyscan.simulation import settings_for
     from bodyscan.simulation import simulate as run
@@ -107,6 +130,7 @@ def calibrate_rig(
     from bodyscan.capture.folder import open_captures
     from bodyscan.capture.rig_file import load_rig
 
+    _refuse_file(out)
     rig = load_rig(rig_file)
     captures = open_captures(rig, rig_file)
     with console.stage_clock() as clock:
@@ -138,11 +162,12 @@ def scan(
     from bodyscan import console
     from bodyscan.calibration.storage import calibration_id, load_calibration
     from bodyscan.capture.folder import open_scan
-    from bodyscan.fusion.scan import ScanSettings, alignment_settings
+    from bodyscan.fusion.scan import ScanSettings, alignment_settings, warnings
     from bodyscan.fusion.scan import scan as fuse
     from bodyscan.fusion.storage import save_scan
     from bodyscan.report.scan_pictures import draw_scan
 
+    _refuse_file(out)
     rig_calibration = load_calibration(calibration)
     captures = open_scan(rig_calibration.rig, folder)
     settings = ScanSettings(points, alignment_settings(align))
@@ -160,6 +185,8 @@ def scan(
         pictures = draw_scan(result, out)
     for name, reason in result.failed.items():
         console.console.print(f"left out: {name}: {reason}", style="red", highlight=False)
+    for warning in warnings(result):
+        console.console.print(f"warning: {warning}", style="yellow", highlight=False)
     console.console.print(console.scan_table(result))
     console.console.print(console.times_table(clock.seconds))
     console.console.print(f"result: {saved}\npictures: {', '.join(map(str, pictures))}")
@@ -176,6 +203,7 @@ def export(
     from bodyscan.export.scan import export_scan
     from bodyscan.fusion.storage import load_scan
 
+    _refuse_file(out)
     with console.errors.status("exporting"):
         written = export_scan(load_scan(result), out or result / "export", formats.split(","))
     console.console.print("\n".join(map(str, written)))
@@ -225,3 +253,28 @@ def sigma_map(
     path = out or folder / "sigma-map.png"
     draw_sigma_map(rig.rig.volume, rig.rig_from_camera, cameras, rig.covariance, path)
     console.console.print(f"picture: {path}")
+
+
+@app.command()
+def reproduce(
+    out: Annotated[Path, typer.Option(help="Folder for the text and the figures.")],
+    seed: Annotated[int, typer.Option(help="Of all noise.")] = 0,
+    real_light: Annotated[
+        bool, typer.Option("--real-light", help="A bowed board, speckle, jitter, a smile, defocus.")
+    ] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Coarser rendering and fewer shots.")
+    ] = False,
+) -> None:
+    """Simulate the chapter's own set-up: its Tables 1 and 2, its Fig. 6 and 7, and all rivals."""
+    from bodyscan import console
+    from bodyscan.evaluation.reproduce import FIGURES, TEXT
+    from bodyscan.evaluation.reproduce import reproduce as run
+
+    with console.stage_clock() as clock:
+        text = run(out, seed=seed, quick=quick, real_light=real_light, progress=clock)
+    # Tables are wider than most terminals: a line cut in two would be hard to read.
+    typer.echo(text)
+    console.console.print(console.times_table(clock.seconds))
+    files = ", ".join(str(out / name) for name in (TEXT, *FIGURES))
+    console.console.print(f"written: {files}", soft_wrap=True)

@@ -72,6 +72,8 @@ def load_model(
         document = read_yaml(path)
     except YamlError as unreadable:
         raise report(path, [unreadable.problem], error, remedy) from None
+    except FileNotFoundError:
+        raise error("there is no such file", where=str(path), remedy="check the path") from None
     except OSError as fault:
         what = f"cannot be read: {fault.strerror or fault}"
         raise error(what, where=str(path), remedy=remedy) from None

@@ -22,6 +22,7 @@ MIN_CONTRAST = 4
 MIN_SHARE_LIT = 1e-3
 MAX_SHARE_SATURATED = 0.5
 MIN_DIFFERENCE = 0.06
+NOISE_GREY = 4
 MAX_SUM_ERROR = 0.15
 MAX_SHARE_BEYOND = 0.05
 MIN_FLIPS = 50
@@ -86,7 +87,8 @@ def check_exposure(images: StripeImages) -> None:
                 f"pattern and inverse of bit {bit} look alike",
                 remedy="see whether one of the two frames is missing or was taken twice",
             )
-        error = np.mean(np.minimum(np.abs(pattern + inverse - both) / contrast, 1.0))
+        excess = np.maximum(np.abs(pattern + inverse - both) - NOISE_GREY, 0)
+        error = np.mean(np.minimum(excess / contrast, 1.0))
         if error > MAX_SUM_ERROR:
             raise DecodingFailed(
                 f"pattern and inverse of bit {bit} do not add up to the lit frame "

@@ -111,7 +111,10 @@ def evaluate_workspace(workspace: Path) -> str:
     lines += [
         f"  cloud, {len(stored.cloud.points):,} points   {_figures(deviation(cloud))}",
         f"  mesh, measured vertices {_figures(deviation(mesh))}",
-        f"  mesh: {shape}",
+        f"  mesh: {'closed' if shape.closed else 'open'}, "
+        f"{'manifold' if shape.manifold else 'not manifold'}, {shape.components} piece(s), "
+        f"{'outward' if shape.volume_mm3 > 0 else 'inward'} faces, "
+        f"{shape.volume_mm3 / 1e6:.2f} litres",
         "results:",
         f"  calibration {workspace / 'calibration' / 'calibration.json'}",
         f"  cloud       {folder / 'cloud.ply'}",

@@ -15,6 +15,9 @@ from bodyscan.progress import Progress, silent
 from bodyscan.reconstruction.pairs import range_images
 from bodyscan.registration.alignment import Alignment, AlignmentSettings, align
 
+MOST_FILLED = 0.25
+MOST_DISAGREEMENT_MM = 0.8
+
 
 @dataclass(frozen=True)
 class ScanSettings:
@@ -86,3 +89,21 @@ def scan(
     progress("meshing", 1, 1)
     measured = {image.pair: int(image.valid.sum()) for image in cleaned}
     return Scan(cloud, surface, alignment, measured, failed)
+
+
+def warnings(result: Scan) -> list[str]:
+    """What an operator should know before trusting the model."""
+    found = []
+    filled = float(result.mesh.filled.mean())
+    if filled > MOST_FILLED:
+        found.append(
+            f"{100.0 * filled:.0f} % of the mesh is made up: the pairs that measured do not see "
+            "the body from all sides"
+        )
+    alignment = result.alignment
+    if alignment is not None and alignment.rms_after_mm > MOST_DISAGREEMENT_MM:
+        found.append(
+            f"the pairs disagree by {alignment.rms_after_mm:.2f} mm where they overlap: is this the "
+            "calibration of this rig, has nothing moved since, did the person stand still?"
+        )
+    return found
