@@ -34,7 +34,10 @@ def checkered(size_px: float, black: float = 0.1, turned_deg: float = 20.0) -> F
     cos, sin = np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))
 
     def albedo(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        column, row = np.floor((cos * u - sin * v) / size_px), np.floor((sin * u + cos * v) / size_px)
+        column, row = (
+            np.floor((cos * u - sin * v) / size_px),
+            np.floor((sin * u + cos * v) / size_px),
+        )
         return np.where((column + row) % 2 == 0, black, 1.0)
 
     return albedo
@@ -56,7 +59,9 @@ def render_sequence(
     """Frames of the surface on which s is `s_at(u, v)`; NaN, or beyond the stripes: dark."""
     n = SUPERSAMPLING
     height, width = shape
-    u, v = np.meshgrid((np.arange(width * n) + 0.5) / n - 0.5, (np.arange(height * n) + 0.5) / n - 0.5)
+    u, v = np.meshgrid(
+        (np.arange(width * n) + 0.5) / n - 0.5, (np.arange(height * n) + 0.5) / n - 0.5
+    )
     s, brightness = s_at(u, v), albedo(u, v)
     on = np.isfinite(s) & (s >= 0) & (s < stripes)
     rng = np.random.default_rng(seed)

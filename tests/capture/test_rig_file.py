@@ -217,7 +217,7 @@ def test_alias_bombs_are_refused_before_they_go_off(tmp_path: Path) -> None:
 
 
 def test_a_missing_rig_file(tmp_path: Path) -> None:
-    with pytest.raises(RigFileError, match=r"nowhere\.yaml: cannot be read: No such file"):
+    with pytest.raises(RigFileError, match=r"nowhere\.yaml: there is no such file"):
         load_rig(tmp_path / "nowhere.yaml")
     with pytest.raises(RigFileError, match="cannot be read: Is a directory"):
         load_rig(tmp_path)
