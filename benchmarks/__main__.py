@@ -36,7 +36,7 @@ def main() -> None:
     head = (
         "# Results\n\nWritten by `make bench` (`python -m benchmarks`); each section says how it was "
         f"got.\nMachine: {os.cpu_count()} cores, {platform.machine()}, "
-        f"Python {platform.python_version()}.\n"
+        f"Python {platform.python_version()}; load average {os.getloadavg()[1]:.1f}.\n"
     )
     body = [f"<!-- {name} -->\n{sections[name]}\n" for name in BENCHMARKS if name in sections]
     write_text(RESULTS, "\n".join([head, *body]))
