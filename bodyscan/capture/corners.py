@@ -30,6 +30,7 @@ BLUR_RANGE_PX = (0.3, 3.0)
 MIN_PIXELS = 16
 MIN_CONTRAST = 4.0
 MAX_RESIDUAL = 0.25
+MAX_SIGMA_PX = 0.06
 STEPS = 12
 CONVERGED_PX = 1e-3
 
@@ -73,12 +74,13 @@ def refine_corners(
     if not len(start):
         return start, np.zeros(0, bool)
     patches = _patches(image, start, along, bright_diagonal, marker_gap)
-    fitted, residual = _fit(patches, start, along)
+    fitted, residual, sigma = _fit(patches, start, along)
     # b is the brightness of the squares where one edge distance is negative: not the diagonal.
     pixels, contrast = fitted[:, :2], np.where(bright_diagonal, -fitted[:, 5], fitted[:, 5])
     good = patches.weight.sum(axis=1) >= MIN_PIXELS
     good &= np.linalg.norm(pixels - start, axis=1) < MAX_MOVE_PX
     good &= (contrast > MIN_CONTRAST) & (residual < MAX_RESIDUAL * contrast)
+    good &= sigma < MAX_SIGMA_PX
     # At the picture's rim a corner seen on one side only is fitted well, but in the wrong place.
     size = np.array(image.shape[::-1])
     good &= np.all((pixels >= MIN_BORDER_PX) & (pixels <= size - 1 - MIN_BORDER_PX), axis=1)
@@ -114,8 +116,8 @@ def _patches(
     return _Patches(place, image[row, column].astype(float), weight.astype(float))
 
 
-def _fit(patches: _Patches, start: Array, along: Array) -> tuple[Array, Array]:
-    """Parameters (N, 9) and RMS residuals (N,), grey levels.
+def _fit(patches: _Patches, start: Array, along: Array) -> tuple[Array, Array, Array]:
+    """Parameters (N, 9), RMS residuals (N,) in grey levels, and the corners' sigmas (N,), px.
 
     Parameters: corner (2), the angles of both edges' normals (2), blur, b, a, g (2).
     """
@@ -147,7 +149,15 @@ def _fit(patches: _Patches, start: Array, along: Array) -> tuple[Array, Array]:
         damping = np.where(better, damping / 10.0, damping * 10.0)
         if np.max(np.linalg.norm(step[:, :2], axis=1)) < CONVERGED_PX:
             break
-    return state, np.sqrt(cost / total)
+    return state, np.sqrt(cost / total), _sigma(patches, jacobian, cost)
+
+
+def _sigma(patches: _Patches, jacobian: Array, cost: Array) -> Array:
+    """Standard deviation (N,) px of the corner's worse coordinate, from what the fit leaves over."""
+    normal = np.swapaxes(jacobian * patches.weight[..., None], 1, 2) @ jacobian
+    left_over = cost / np.maximum(patches.weight.sum(axis=1) - 9.0, 1.0)
+    covariance = np.linalg.pinv(normal, hermitian=True)[:, :2, :2] * left_over[:, None, None]
+    return np.sqrt(np.maximum(np.einsum("nii->ni", covariance).max(axis=1), 0.0))
 
 
 def _linear(patches: _Patches, state: Array) -> Array:

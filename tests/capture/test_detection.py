@@ -121,7 +121,7 @@ def test_no_board_is_an_empty_list_within_a_second():
     rng = np.random.default_rng(3)
     clouds = cv2.GaussianBlur(rng.normal(size=(1024, 1280)).astype(np.float32), (0, 0), 8)
     clouds = cv2.normalize(clouds, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-    marked = render([(MARKED, view_of(MARKED, 30, 60, 20, width=1280, height=1024))])
+    marked = cv2.resize(render([(MARKED, view_of(MARKED, 30, 60, 20))]), (1280, 1024))
     for image in (clouds, marked, np.zeros_like(clouds)):
         began = time.process_time()
         assert found(image, PLAIN) == []

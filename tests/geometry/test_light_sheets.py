@@ -82,7 +82,7 @@ def test_derivatives_are_those_of_the_offset(seed):
                 lambda h, a=axis, m=model: (
                     m.retract(h * a).offset(points, m.retract(h * a).at(s)).value
                 ),
-                1e-5 / size,
+                1e-6 / size,
             )
             assert np.allclose(offset.by_parameter[:, k], slope, rtol=1e-4, atol=1e-4 * size)
 
