@@ -239,20 +239,31 @@ def _stripe_equations(
     by_place = np.empty((len(points), 13))
     for column, size in enumerate(DIFFERENCES):
         ahead, behind = (_nudged(state, k, board, column, step) for step in (size, -size))
-        by_place[:, column] = np.sum(offset.by_point * (ahead - behind), axis=1) / (2.0 * size)
-    jacobian = np.concatenate([by_place, offset.by_parameter], axis=1) / sigma[:, None]
-    return offset.value / sigma, jacobian
+        by_place[:, column] = (ahead - behind) / (2.0 * size * noise.stripe)
+    by_parameter = offset.by_parameter / sigma[:, None]
+    return offset.value / sigma, np.concatenate([by_place, by_parameter], axis=1)
 
 
 def _nudged(state: _State[Sheets], k: int, board: StripedBoard, column: int, step: float) -> Array:
-    """Boundary points after a small change of one intrinsic (0-6) or of the board's pose (7-12)."""
+    """Offsets over their sigma after a small change of an intrinsic (0-6) or the board's pose (7-12).
+
+    The sigma changes too: left out of the derivative, noise would pull the focal lengths up.
+    """
     if column < len(INTRINSICS):
         name = INTRINSICS[column]
         camera = replace(state.camera, **{name: getattr(state.camera, name) + step})
-        return _on_board(camera, state.poses[k], board)
+        return _offsets(replace(state, camera=camera), k, board)
     twist = np.zeros(6)
     twist[column - len(INTRINSICS)] = step
-    return _on_board(state.camera, state.poses[k].moved(twist), board)
+    poses = (*state.poses[:k], state.poses[k].moved(twist), *state.poses[k + 1 :])
+    return _offsets(replace(state, poses=poses), k, board)
+
+
+def _offsets(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
+    """Offsets of one board's boundaries from their sheets, over their sigma, (N,)."""
+    points = _points(state, k, board)
+    offset = state.sheets.offset(points, state.sheets.at(board.index))
+    return np.asarray(offset.value / _sigma(state, k, board, points, offset.by_point), np.float64)
 
 
 def _add(
