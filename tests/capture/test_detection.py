@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from board_rendering import render, true_corners, view_of
 
+from bodyscan.capture import checkerboard
 from bodyscan.capture.board_map import fit_board_map
 from bodyscan.capture.boards import corner_points
 from bodyscan.capture.detection import find_boards
@@ -51,6 +52,26 @@ def test_a_board_that_looks_the_same_from_both_ends_is_said_to_be_turnable(spin_
     true = true_corners(board, place)
     off = min(np.abs(errors(view, order)).max() for order in (true, true[::-1]))
     assert off < 0.1, "one of the two numberings, and not a mirrored one"
+
+
+@pytest.mark.parametrize("order", [np.s_[:, ::-1], np.s_[::-1], np.s_[::-1, ::-1], np.s_[:]])
+def test_whatever_way_a_detector_counts_the_numbering_is_the_same(monkeypatch, order):
+    place = view_of(PLAIN, 35, 60, 20, fill=0.55)
+    true = true_corners(PLAIN, place)
+    counted = true.reshape(6, 9, 2)[order].reshape(-1, 2).astype(np.float32)
+    monkeypatch.setattr(checkerboard, "_classic", lambda image, size: (True, counted))
+    (view,) = found(render([(PLAIN, place)]), PLAIN)
+    assert np.abs(errors(view, true)).max() < 0.1
+
+
+def test_corners_that_make_no_board_are_not_believed(monkeypatch):
+    place = view_of(PLAIN, 35, 60, 20, fill=0.55)
+    # Every one of them is a corner of the right colours, but two rows are exchanged.
+    rows = true_corners(PLAIN, place).astype(np.float32).reshape(6, 9, 2)
+    wrong = rows[[2, 1, 0, 3, 4, 5]].reshape(-1, 2)
+    monkeypatch.setattr(checkerboard, "_classic", lambda image, size: (True, wrong))
+    monkeypatch.setattr(checkerboard, "_sector_based", lambda image, size: (False, None))
+    assert found(render([(PLAIN, place)]), PLAIN) == []
 
 
 def test_a_plain_board_with_two_faces_is_turnable():
