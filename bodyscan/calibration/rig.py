@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
-from bodyscan.calibration.boundary_points import BoundaryPoints, binned
 from bodyscan.calibration.camera import (
     CameraCalibration,
     PlanarView,
     calibrate_camera,
     locate_board,
 )
-from bodyscan.calibration.joint_refinement import striped_board
-from bodyscan.calibration.light import fit_light
+from bodyscan.calibration.coverage import coverage_notes
 from bodyscan.calibration.pair import (
     BoardBoundaries,
     PairCalibration,
-    PairQuality,
     boundaries_near,
-    boundaries_on_boards,
     planar_view,
     usable,
 )
-from bodyscan.calibration.refinement_choice import refine_where_better
+from bodyscan.calibration.pairs import calibrate_pairs
 from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.capture.boards import corner_points
 from bodyscan.capture.decoding import decode_sequence
@@ -34,11 +29,11 @@ from bodyscan.capture.images import read_lit
 from bodyscan.capture.rig import Board, Rig
 from bodyscan.capture.views import BoardView
 from bodyscan.errors import BodyscanError, FailedWork
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.registration.located_view import LocatedView, board_symmetries
+from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import PlacedRig, place_rig
-
-FEWEST_VIEWS = 3
 
 
 def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> RigCalibration:
@@ -51,6 +46,7 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
     boards = {board.name: board for board in rig.boards}
     notes: list[str] = []
     views = find_all_boards(rig, captures, notes, progress)
+    notes += coverage_notes(rig, views)
     cameras, failed = calibrate_cameras(rig, views, boards, progress)
     if not cameras:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
@@ -58,18 +54,32 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
     progress("joining the pairs", 0, 1)
     located = locate_views(views, cameras, boards, notes)
     placed = place_rig(rig, located, {name: c.camera for name, c in cameras.items()})
+
+    cameras = {name: own for name, own in cameras.items() if name in placed.rig_from_camera}
     progress("joining the pairs", 1, 1)
     boundaries = decode_on_boards(rig, captures, placed, views, notes, progress)
-    pairs = calibrate_pairs(rig, cameras, placed, boundaries, failed, progress)
+    pairs = calibrate_pairs(rig, cameras, placed, boundaries, failed, notes, progress)
     return RigCalibration(
         rig,
         pairs,
-        {name: placed.rig_from_camera[name] for name in pairs},
+        {name: placing_of(rig, placed, pair) for name, pair in pairs.items()},
         placed.covariance,
         placed.rig_from_board,
         failed,
         (*notes, *placed.notes),
     )
+
+
+def placing_of(rig: Rig, placed: PlacedRig, pair: PairCalibration) -> RigidTransform:
+    """`rig_from_camera`; where the pair's stripes changed its camera, so that the board which fixes
+    the rig frame is still seen where it lies."""
+    target, camera = frame_target(rig), pair.camera
+    view = next((v for v in placed.views if v.pair == pair.name and v.target == target), None)
+    if view is None or camera == placed.cameras[pair.name]:
+        return placed.rig_from_camera[pair.name]
+    seen = PlanarView(view.shot, view.points, view.pixels)
+    camera_from_board, _ = locate_board(camera, seen)
+    return placed.rig_from_board[view.target] @ camera_from_board.inverse()
 
 
 def find_all_boards(
@@ -185,96 +195,3 @@ def decode_on_boards(
         if not isinstance(result, str)
         for key, found in result.items()
     }
-
-
-def calibrate_pairs(
-    rig: Rig,
-    cameras: Mapping[str, CameraCalibration],
-    placed: PlacedRig,
-    boundaries: Mapping[tuple[str, str, str], BoardBoundaries],
-    failed: dict[str, str],
-    progress: Progress = silent,
-) -> dict[str, PairCalibration]:
-    """Light sheets of every pair; a pair whose projector fails is added to `failed`."""
-
-    def calibrate(name: str) -> PairCalibration | str:
-        try:
-            return _calibrate_pair(rig, name, cameras[name], placed, boundaries)
-        except BodyscanError as error:
-            return str(error)
-
-    names = sorted(cameras)
-    results = threaded(calibrate, names, stage="fitting light sheets", progress=progress)
-    failed |= {n: r for n, r in zip(names, results, strict=True) if isinstance(r, str)}
-    return {n: r for n, r in zip(names, results, strict=True) if isinstance(r, PairCalibration)}
-
-
-def _calibrate_pair(
-    rig: Rig,
-    name: str,
-    own: CameraCalibration,
-    placed: PlacedRig,
-    boundaries: Mapping[tuple[str, str, str], BoardBoundaries],
-) -> PairCalibration:
-    camera = placed.cameras[name]
-    views = [view for view in placed.views if view.pair == name]
-    quality = PairQuality(placed.rms_px[name], len(views))
-    projector = rig.pair(name).projector
-    if projector is None:
-        return PairCalibration(name, camera, own.covariance, None, quality)
-    camera_from_rig = placed.rig_from_camera[name].inverse()
-    lit = [view for view in views if (name, view.shot, view.board) in boundaries]
-    poses = [camera_from_rig @ placed.rig_from_board[view.target] for view in lit]
-    points = boundaries_on_boards(
-        name,
-        camera,
-        projector,
-        [
-            (
-                rig.board(view.board),
-                pose,
-                float(view.points[0, 2]),
-                boundaries[name, view.shot, view.board],
-            )
-            for view, pose in zip(lit, poses, strict=True)
-        ],
-    )
-    fit = fit_light(points, projector.stripes, projector.direction, camera)
-    quality = replace(
-        quality,
-        planes_rms_mm=fit.rms_mm,
-        stripe_shots=len(lit),
-        stripes_calibrated=fit.stripes_calibrated,
-        stripes_projected=projector.stripes - 1,
-        held_out=fit.held_out,
-    )
-    pair = PairCalibration(name, camera, own.covariance, fit.sheets, quality)
-    # In a rig of several pairs the boards are held by all cameras together, far better than
-    # one pair's stripes could.
-    return pair if len(placed.cameras) > 1 else _refined(pair, own, lit, points)
-
-
-def _refined(
-    pair: PairCalibration,
-    own: CameraCalibration,
-    views: Sequence[LocatedView],
-    points: BoundaryPoints,
-) -> PairCalibration:
-    """Camera, boards and light of a pair by itself in one solve, where held-out boards gain."""
-    assert pair.light is not None
-    data = binned(points, pair.camera, pair.light.direction)
-    boards = [
-        striped_board(PlanarView(view.shot, view.points, view.pixels), pair.camera, data, number)
-        for number, view in enumerate(views)
-    ]
-    choice = refine_where_better(own, pair.light, boards, data)
-    quality = replace(pair.quality, refinement=choice.reason, flatness_mm=choice.flatness_mm)
-    if choice.joint is None:
-        return replace(pair, quality=quality)
-    return replace(
-        pair,
-        camera=choice.joint.camera,
-        camera_covariance=choice.joint.camera_covariance,
-        light=choice.joint.sheets,
-        quality=replace(quality, corners_rms_px=choice.joint.corners_rms_px),
-    )

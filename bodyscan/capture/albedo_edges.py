@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +28,10 @@ ENOUGH = 100
 UNEXPLAINED = 0.3
 SIGNIFICANCE = 2.5
 MAX_SLOPE = 1.0
+GENTLE_PX = 3
+"""Half the window over which shading is taken to change evenly."""
+LEAST_PIXELS = 12
+LEAST_SPREAD = 0.5
 MAX_SHIFT_PX = 0.6
 
 
@@ -35,36 +40,39 @@ class Brightness:
     """How bright the surface is, as scan lines of pixels.
 
     logarithm: (L, P) of lit minus dark.  noise2: (L, P) its variance.  across: (L, P) its gradient
-    from line to line, 1/px, brought near zero where noise may explain it.
+    from line to line, 1/px, brought near `shading_across` where noise may explain the difference.
+    shading: (L, P) the gradient along the line of the gentle part, of many pixels around.
     """
 
     logarithm: NDArray[np.float32]
     noise2: NDArray[np.float32]
     across: NDArray[np.float32]
+    shading: NDArray[np.float32]
 
     @staticmethod
-    def of(images: StripeImages, variance: NDArray[np.float32]) -> Brightness:
-        """variance: (256,) of each grey level."""
+    def of(images: StripeImages, variance: NDArray[np.float32], usable: Mask) -> Brightness:
+        """variance: (256,) of each grey level.  usable: (L, P) pixels on a lit surface."""
         contrast = np.maximum(images.contrast, 1.0)
         logarithm = np.log(contrast)
         noise2 = (variance[images.lit] + variance[images.dark]) / contrast**2
-        across = np.zeros_like(logarithm)
-        difference = (logarithm[2:] - logarithm[:-2]) / 2
-        across[1:-1] = _significant(difference, (noise2[2:] + noise2[:-2]) / 4)
-        return Brightness(logarithm, noise2, across)
+        along, across = gentle_gradient(logarithm, usable)
+        difference = (logarithm[2:] - logarithm[:-2]) / 2 - across[1:-1]
+        across[1:-1] += _significant(difference, (noise2[2:] + noise2[:-2]) / 4)
+        return Brightness(logarithm, noise2, across, along)
 
     def at(self, place: NDArray[np.int64]) -> BrightnessEdges:
         """Between the pixels at flat places `place` (N,) and those behind them."""
-        before, behind, across, noise2 = (
+        before, behind, across, shading, noise2 = (
             image.ravel()[where].astype(np.float64)
             for image, where in (
                 (self.logarithm, place),
                 (self.logarithm, place + 1),
                 (self.across, place),
+                (self.shading, place),
                 (self.noise2, place),
             )
         )
-        along = _significant(behind - before, 2.0 * noise2)
+        along = shading + _significant(behind - before - shading, 2.0 * noise2)
         middle = (before + behind) / 2
         return BrightnessEdges(
             before=np.exp(middle - along / 2),
@@ -129,6 +137,34 @@ def without_edges_across(
     shift = np.clip(blur2 * brightness.across, -MAX_SHIFT_PX, MAX_SHIFT_PX)
     pull = slope * shift
     return s - pull, np.hypot(sigma, 2.0 * UNEXPLAINED * pull)
+
+
+def gentle_gradient(
+    image: NDArray[np.float32], usable: Mask
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Gradient along and across the lines (L, P), 1/px: least squares over the usable pixels of a
+    small window; 0 where there are too few."""
+    offset = np.arange(-GENTLE_PX, GENTLE_PX + 1, dtype=np.float32)
+    flat = np.ones_like(offset)
+    inside = usable.astype(np.float32)
+    weighted = np.where(usable, image, np.float32(0.0))
+
+    def moment(of: NDArray[np.float32], along: int, across: int) -> NDArray[Any]:
+        kernels = (offset**power if power else flat for power in (along, across))
+        return cv2.sepFilter2D(of, cv2.CV_32F, *kernels, borderType=cv2.BORDER_CONSTANT)
+
+    count = moment(inside, 0, 0)
+    enough = count > LEAST_PIXELS - 0.5
+    count = np.where(enough, count, np.float32(1.0))
+    x, y = moment(inside, 1, 0) / count, moment(inside, 0, 1) / count
+    mean = moment(weighted, 0, 0) / count
+    xx = moment(inside, 2, 0) / count - x * x
+    yy = moment(inside, 0, 2) / count - y * y
+    xy = moment(inside, 1, 1) / count - x * y
+    xv, yv = moment(weighted, 1, 0) / count - x * mean, moment(weighted, 0, 1) / count - y * mean
+    enough &= xx * yy - xy * xy > LEAST_SPREAD
+    area = np.where(enough, xx * yy - xy * xy, np.float32(np.inf))
+    return (yy * xv - xy * yv) / area, (xx * yv - xy * xv) / area
 
 
 def _significant(gradient: NDArray[Any], variance: NDArray[Any]) -> NDArray[Any]:

@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 MAX_RATIO = 0.98
 TABLE_SIZE = 4096
-LEAST_SIGMA_PX = 0.015
+LEAST_SIGMA_PX = 0.008
 """What blur that is not Gaussian and a sensor that is not quite linear leave, seen in tests."""
 
 MIN_STRIPE_PX = 0.2
@@ -73,7 +73,7 @@ def find_boundaries(
     sigma = np.hypot((1.0 - fraction) * left_sigma, fraction * right_sigma)
     sigma = np.hypot(sigma / np.abs(left - right), LEAST_SIGMA_PX)
     position = before + fraction
-    joined = _joined(line, index, position)
+    joined = _joined(line, index, position) & _whole(before, usable, line)
     blur2 = edges.blur2(position, joined)
     return Boundaries(
         line=line,
@@ -92,6 +92,14 @@ def _joined(line: Ints, index: Ints, position: Floats) -> Mask:
     return (
         (np.diff(line) == 0) & (np.abs(np.diff(index)) == 1) & (np.diff(position) > MIN_STRIPE_PX)
     )
+
+
+def _whole(before: Ints, usable: Mask, line: Ints) -> Mask:
+    """(N - 1,) whether all pixels from one boundary to the next can be used: where one cannot, the
+    surface may end, and another that happens to show the next stripe begin."""
+    bad = np.cumsum(~usable.ravel())
+    at = line * usable.shape[1] + before
+    return bad[at[1:]] == bad[at[:-1]]
 
 
 def _straightened(

@@ -64,7 +64,7 @@ def read_stripes(
     codes = stripe_from_gray(gray)
     variance = noise_variance(images)
     usable = images.usable(codes, variance, stripes)
-    brightness = Brightness.of(images, variance)
+    brightness = Brightness.of(images, variance, usable)
     boundaries = find_boundaries(images, brightness, codes, usable, variance)
     s, sigma = interpolate_stripes(boundaries, codes, usable)
     s, sigma = without_edges_across(s, sigma, brightness, boundaries.blur2)

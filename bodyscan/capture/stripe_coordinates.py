@@ -21,8 +21,12 @@ SMOOTHERS = (
 REACH_PX = 6.0
 MAX_STRAY = 4.0
 SLACK = 0.15
-BEYOND = 3.0
-"""How much less is known of s beyond the ends of a run."""
+BEYOND = 0.4
+"""How far s is continued past the last boundary of a run, stripes."""
+BEYOND_DOUBT = 3.0
+"""How much less is known of s there."""
+MAX_PULL = 0.05
+"""More than blur does to s on any smooth surface."""
 
 
 def interpolate_stripes(
@@ -30,8 +34,8 @@ def interpolate_stripes(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """s and its standard deviation, (L, P) each, NaN where there is none.
 
-    Between two boundaries s is linear. In the half stripes at both ends of a run it goes on as in
-    the whole stripe beside them.
+    Between two boundaries s is a cubic with the slopes that the boundaries around them tell
+    (Hermite's). Past the last boundary of a run it goes on with the slope there, a little way.
     """
     s = np.full(codes.shape, np.nan, np.float32)
     sigma = s.copy()
@@ -41,14 +45,14 @@ def interpolate_stripes(
     stripes = _Segments.of(boundaries, joined)
     last = _last_boundary(boundaries, codes.shape)
     wanted = np.flatnonzero(usable & (last >= 0))
-    stripes.fill(s, sigma, wanted, last.ravel()[wanted], codes, 1.0)
+    stripes.fill(s, sigma, wanted, last.ravel()[wanted], codes)
     for neighbour in (-1, 1):
         wanted = np.flatnonzero(usable & np.isnan(s))
         segment = last.ravel()[wanted] + neighbour
         within = (segment >= 0) & (segment < len(joined))
         wanted, segment = wanted[within], segment[within]
         here = boundaries.line[segment + (neighbour < 0)] == wanted // codes.shape[1]
-        stripes.fill(s, sigma, wanted[here], segment[here], codes, BEYOND)
+        stripes.fill(s, sigma, wanted[here], segment[here], codes)
     return s, sigma
 
 
@@ -61,13 +65,20 @@ def _last_boundary(boundaries: Boundaries, shape: tuple[int, ...]) -> NDArray[np
 
 @dataclass(frozen=True, eq=False)
 class _Segments:
-    """s = offset + slope * place on a scan line between boundaries j and j + 1; NaN if not joined.
+    """s on a scan line between boundaries j and j + 1: NaN if they are not joined.
 
-    float64: an offset may be large where the slope is.
+    start: place of boundary j, px.  width: to the next, px.  index: s at boundary j.  rise: what s
+    gains to the next.  slope_in, slope_out: ds per px at both ends.  pull: what blur adds to s
+    where s bends, blur^2 / 2 times its second derivative.  sigma: of s.
     """
 
-    slope: Floats
-    offset: Floats
+    start: Floats
+    width: Floats
+    index: Floats
+    rise: Floats
+    slope_in: Floats
+    slope_out: Floats
+    pull: Floats
     sigma: Floats
 
     @staticmethod
@@ -75,9 +86,31 @@ class _Segments:
         position, sigma_px = smoothed(boundaries, joined)
         width = np.where(joined, np.diff(position), np.nan)
         width[width < MIN_STRIPE_PX] = np.nan
-        slope = np.diff(boundaries.index) / width
-        sigma = np.abs(slope) * np.sqrt((sigma_px[1:] ** 2 + sigma_px[:-1] ** 2) / 2)
-        return _Segments(slope, boundaries.index[:-1] - slope * position[:-1], sigma)
+        rise = np.diff(boundaries.index).astype(float)
+        slope_in, slope_out = end_slopes(rise / width, width)
+        pull = 0.5 * boundaries.blur2 * (slope_out - slope_in) / width
+        pull = np.clip(pull, -MAX_PULL, MAX_PULL)
+        sigma = np.abs(rise / width) * np.sqrt((sigma_px[1:] ** 2 + sigma_px[:-1] ** 2) / 2)
+        start, index = position[:-1], boundaries.index[:-1].astype(float)
+        return _Segments(start, width, index, rise, slope_in, slope_out, pull, sigma)
+
+    def at(self, segment: NDArray[np.integer], place: NDArray[np.integer]) -> tuple[Floats, Floats]:
+        """s and its standard deviation at places (px) on segments, and somewhat outside of them.
+
+        Outside, the bend of the segment's end goes on, and s is doubted by as much as that adds.
+        """
+        width, rise = self.width[segment], self.rise[segment]
+        share = (place - self.start[segment]) / width
+        inside = np.clip(share, 0.0, 1.0)
+        first, last = self.slope_in[segment] * width, self.slope_out[segment] * width
+        bend = inside * (1.0 - inside)
+        within = inside * rise + bend * ((1.0 - inside) * (first - rise) - inside * (last - rise))
+        beyond = share - inside
+        bending = 0.5 * beyond**2 * (last - first)
+        outside = beyond * np.where(beyond < 0.0, first, last) + bending
+        doubt = np.where(beyond == 0.0, 1.0, BEYOND_DOUBT) * self.sigma[segment]
+        value = self.index[segment] + within + outside - self.pull[segment]
+        return value, np.hypot(doubt, bending)
 
     def fill(
         self,
@@ -86,15 +119,38 @@ class _Segments:
         pixels: NDArray[np.intp],
         segment: NDArray[np.integer],
         codes: NDArray[np.int32],
-        doubt: float,
     ) -> None:
-        """Writes s and sigma at flat `pixels` from their segments, where the code agrees."""
-        place = pixels % s.shape[1]
-        segment = np.minimum(segment, len(self.slope) - 1)
-        value = self.offset[segment] + self.slope[segment] * place
-        agrees = np.abs(value - codes.ravel()[pixels] - 0.5) < 0.5 + SLACK
-        s.ravel()[pixels[agrees]] = value[agrees]
-        sigma.ravel()[pixels[agrees]] = doubt * self.sigma[segment[agrees]]
+        """Writes s and sigma at flat `pixels` from their segments, where the code agrees and the
+        segment is left by no more than a part of a stripe."""
+        segment = np.minimum(segment, len(self.start) - 1)
+        value, spread = self.at(segment, pixels % s.shape[1])
+        off_code = np.abs(value - codes.ravel()[pixels] - 0.5)
+        off_segment = np.abs(value - self.index[segment] - 0.5 * self.rise[segment])
+        takes = (off_code < 0.5 + SLACK) & (off_segment < 0.5 + BEYOND)
+        s.ravel()[pixels[takes]] = value[takes]
+        sigma.ravel()[pixels[takes]] = spread[takes]
+
+
+def end_slopes(secant: Floats, width: Floats) -> tuple[Floats, Floats]:
+    """Slopes of s at both ends of every segment from the segments beside it; their own secant where
+    there are none.
+
+    Within a run the slope at a boundary is that of the parabola through it and its neighbours; at
+    a run's end the parabola of the one segment goes on. Segments in which s runs the other way
+    tell nothing of this one.
+    """
+    nothing = np.array([np.nan])
+    secant_before, width_before = np.r_[nothing, secant[:-1]], np.r_[nothing, width[:-1]]
+    slope = (width_before * secant + width * secant_before) / (width_before + width)
+    slope = np.where(secant_before * secant > 0.0, slope, np.nan)
+    slope_out = np.r_[slope[1:], nothing]
+    return _completed(slope, slope_out, secant), _completed(slope_out, slope, secant)
+
+
+def _completed(slope: Floats, other: Floats, secant: Floats) -> Floats:
+    """Slopes at one end; where unknown, of the parabola with slope `other` at the other end."""
+    slope = np.where(np.isnan(slope), 2.0 * secant - other, slope)
+    return np.where(np.isnan(slope), secant, slope)
 
 
 def smoothed(boundaries: Boundaries, joined: Mask) -> tuple[Floats, Floats]:

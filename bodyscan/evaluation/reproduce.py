@@ -19,6 +19,7 @@ from bodyscan.evaluation.chapter.measuring import (
     points_of,
     true_approach,
 )
+from bodyscan.evaluation.chapter.point_sigma import point_sigma
 from bodyscan.evaluation.chapter.setup import (
     CAMERA,
     PROJECTOR,
@@ -106,7 +107,13 @@ def _measure_all(
         by_stage=results[2],
         by_reference=results[3],
         noise=noise_bound(captures),
+        sigmas=tuple(point_sigma(approach, captures) for approach in _with_sigmas(shown)),
     )
+
+
+def _with_sigmas(approaches: Sequence[Approach]) -> list[Approach]:
+    """Those whose sheets know their covariance."""
+    return [approach for approach in approaches if approach.name in ("(iii)", "ours")]
 
 
 def draw(captures: ChapterCaptures, calibrated: Calibrated, out: Path) -> None:

@@ -72,7 +72,7 @@ def test_projected_frames_seen_as_they_are_give_their_stripes(direction, with_da
     stripe_px = len(pixel) / 40
     true = (pixel + 0.5) / stripe_px
     true = np.broadcast_to(true[:, None] if direction == "horizontal" else true, lit.shape)
-    assert np.isfinite(seen.s).mean() > 0.97
+    assert np.isfinite(seen.s).mean() > 0.96
     # Unblurred boundaries between two pixels are known to half a pixel, and here exactly there.
     np.testing.assert_allclose(seen.s[np.isfinite(seen.s)], true[np.isfinite(seen.s)], atol=0.02)
     axis = 1 if direction == "horizontal" else 0

@@ -49,7 +49,8 @@ def test_boundaries_and_s_on_a_plain_surface(stripe_px, stripes, boundary_px, s_
     sequence = render_sequence(s_at, stripes=stripes)
     seen = read(sequence, stripes)
     lit = np.isfinite(sequence.s) & (seen.contrast > 20)
-    assert np.isfinite(seen.s[lit]).mean() > 0.995
+    # Past the last boundary of a line s goes on for 0.4 stripes, of up to one.
+    assert np.isfinite(seen.s[lit]).mean() > 0.995 - 2 * 0.35 * stripe_px / seen.s.shape[1]
     error = (seen.s - sequence.s)[lit & np.isfinite(seen.s)]
     assert np.sqrt(np.mean(error**2)) < s_rms
     assert robust(boundary_errors(seen, s_at)) < boundary_px
@@ -65,7 +66,7 @@ def test_black_and_white_does_not_move_boundaries():
     assert np.sqrt(np.mean(error**2)) < 0.1
     lit = np.isfinite(sequence.s) & np.isfinite(seen.s)
     assert np.sqrt(np.mean((seen.s - sequence.s)[lit] ** 2)) < 0.03
-    assert lit.mean() > 0.98
+    assert lit.mean() > 0.97
 
 
 @pytest.mark.parametrize("light", [12.0, 40.0])
@@ -75,7 +76,7 @@ def test_sigmas_say_how_far_off_values_are_in_dim_light(stripe_px, light):
     sequence = render_sequence(s_at, stripes=stripes, light=light)
     seen = read(sequence, stripes)
     lit = np.isfinite(sequence.s) & np.isfinite(seen.s)
-    assert lit.sum() > 0.99 * np.isfinite(sequence.s).sum()
+    assert lit.sum() > 0.985 * np.isfinite(sequence.s).sum()
     # Noise rules here: ratios of 1 would be perfect; a floor of 0.015 px lowers those of the brighter.
     ratio = robust((seen.s - sequence.s)[lit] / seen.sigma[lit])
     assert 0.5 < ratio < 1.2
@@ -211,3 +212,44 @@ def test_real_stripes_on_a_real_board_are_smooth(captures, pose):
     # sigmas say, in images whose finest stripes have only a fifth to a third of the full contrast.
     assert robust(stray_px) < 0.13
     assert 0.7 < robust(stray_px / sigma) < 1.4
+
+
+def test_stripes_that_end_and_begin_again_are_not_joined():
+    """Behind a narrow dark gap another surface happens to show the very next stripe."""
+
+    def s_at(u, v):
+        behind = 17.4 + (v - 113) / 9.0
+        return np.where(v < 108, 3 + v / 7.5, np.where(v < 113, np.nan, behind))
+
+    sequence = render_sequence(s_at, stripes=40)
+    seen = read(sequence, 40)
+    both = np.isfinite(seen.s) & np.isfinite(sequence.s)
+    # 0.2 stripes when the two were joined.
+    assert np.abs(seen.s - sequence.s)[both].max() < 0.08
+
+
+def test_between_boundaries_s_bends_as_it_does_around_them():
+    sequence = render_sequence(lambda u, v: 3 + v / 9.0 + (v / 60.0) ** 2, stripes=60, noise=0.3)
+    seen = read(sequence, 60)
+    both = np.isfinite(seen.s) & np.isfinite(sequence.s)
+    error = (seen.s - sequence.s)[both]
+    # Straight lines between boundaries would be off by up to s'' w^2 / 8 = 0.005, all to one side.
+    assert np.sqrt(np.mean(error**2)) < 0.0045
+    assert abs(error.mean()) < 0.0004
+
+
+def test_shading_that_fades_gently_does_not_move_stripes():
+    def mean_error(fade):
+        scene = render_sequence(
+            lambda u, v: 3 + v / 4.0,
+            stripes=90,
+            albedo=lambda u, v: np.exp(fade * (v - 100)),
+            light=80.0,
+            noise=0.3,
+        )
+        seen = read(scene, 90)
+        both = np.isfinite(seen.s) & np.isfinite(scene.s) & (seen.contrast > 40)
+        return (seen.s - scene.s)[both].mean()
+
+    # A pixel's light comes from the bright side by blur^2 / 80 = 0.0055 px, 0.0014 stripes.
+    assert abs(mean_error(1 / 80) - mean_error(-1 / 80)) < 0.0007

@@ -14,6 +14,7 @@ from bodyscan.evaluation.chapter.measuring import (
     true_approach,
     whole_stripes,
 )
+from bodyscan.evaluation.chapter.point_sigma import point_sigma
 from bodyscan.evaluation.chapter.setup import (
     BOARD,
     CAMERA,
@@ -157,6 +158,14 @@ def test_noise_is_less_than_everything(captures, measured):
         assert 0 < alone < sphere.e_given
 
 
+def test_points_are_as_far_off_as_they_say(captures, calibrated):
+    found = point_sigma(calibrated.ours, captures)
+    # 0.9 to 1.0 in docs/reproduction.md; so coarsely rendered, boards seem worse placed than they are.
+    assert 0.25 < found.spheres < 1.7
+    assert 0.25 < found.plate < 1.7
+    assert found.beyond_three < 0.02
+
+
 def test_whole_stripes_are_middles():
     assert whole_stripes(np.array([0.0, 3.2, 3.99])) == pytest.approx([0.5, 3.5, 3.5])
     assert np.isnan(whole_stripes(np.array([np.nan]))[0])
@@ -174,6 +183,7 @@ def test_the_report_says_all_of_it(tmp_path, captures, calibrated, measured):
         by_stage=fine[:1],
         by_reference=fine[-1:],
         noise=noise_bound(captures),
+        sigmas=(point_sigma(calibrated.ours, captures),),
     )
     text = report(found)
     for wanted in ("Table 1", "Table 2", "mean square", "contradicts", "scale ppm", "noise alone"):

@@ -1,0 +1,43 @@
+"""How much of each camera's picture the boards have covered: beyond, its lens is a guess."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.capture.rig import Rig
+from bodyscan.capture.views import BoardView
+
+Array = NDArray[np.float64]
+
+CELLS = 64
+"""The picture is divided so finely, across and down."""
+TOO_LITTLE = 0.2
+
+
+def covered(pixels: Sequence[Array], width: int, height: int) -> float:
+    """Share of a picture that the hulls of the views' corners cover together; pixels (N, 2) each."""
+    mask = np.zeros((CELLS, CELLS), np.uint8)
+    scale = np.array([CELLS / width, CELLS / height])
+    for corners in pixels:
+        hull = cv2.convexHull(((corners + 0.5) * scale - 0.5).astype(np.float32))
+        cv2.fillConvexPoly(mask, np.rint(hull).astype(np.int32), 1)
+    return float(mask.mean())
+
+
+def coverage_notes(rig: Rig, views: Sequence[BoardView]) -> list[str]:
+    """A line for each camera of which the boards fill too little to know its lens."""
+    notes = []
+    for pair in rig.pairs:
+        own = [view.pixels for view in views if view.pair == pair.name]
+        share = covered(own, pair.camera.width, pair.camera.height)
+        if own and share < TOO_LITTLE:
+            notes.append(
+                f"{pair.name}: in all {len(own)} views together the board covers only "
+                f"{100 * share:.0f} % of the picture, so its lens and focal length are poorly "
+                "known: bring the board closer, and into the corners"
+            )
+    return notes

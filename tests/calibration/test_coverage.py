@@ -1,0 +1,49 @@
+"""A camera whose boards fill too little of its picture is named."""
+
+import numpy as np
+import pytest
+
+from bodyscan.calibration.coverage import coverage_notes, covered
+from bodyscan.capture.rig_file import load_rig
+from bodyscan.capture.views import BoardView
+
+
+def corners(left: float, top: float, width: float, height: float) -> np.ndarray:
+    u, v = np.meshgrid(np.linspace(left, left + width, 8), np.linspace(top, top + height, 6))
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+@pytest.mark.parametrize(("width", "height", "share"), [(320, 240, 0.25), (143, 107, 0.05)])
+def test_the_share_of_the_picture_is_that_of_the_hull(width, height, share):
+    # The picture is divided into 64 cells each way: a rim of half a cell is in doubt.
+    doubt = (width / 640 + height / 480) / 64 + 0.001
+    assert covered([corners(100, 90, width, height)], 640, 480) == pytest.approx(share, abs=doubt)
+
+
+def test_views_in_the_same_place_cover_no_more():
+    one, beside = corners(0, 0, 320, 240), corners(320, 240, 319, 239)
+    assert covered([one, one], 640, 480) == covered([one], 640, 480)
+    assert covered([one, beside], 640, 480) == pytest.approx(0.5, abs=0.04)
+
+
+@pytest.mark.parametrize(("size", "named"), [(0.22, True), (0.6, False)])
+def test_only_a_small_board_is_noted(tmp_path, size, named):
+    rig = load_rig("rigs/one-pair.yaml")
+    (pair,) = rig.pairs
+    width, height = pair.camera.width, pair.camera.height
+    views = [
+        BoardView(
+            pair=pair.name,
+            shot=f"shot{number}",
+            board=rig.boards[0].name,
+            corner_ids=np.arange(48),
+            pixels=corners(0.2 * width, 0.2 * height, size * width, size * height),
+        )
+        for number in range(3)
+    ]
+    notes = coverage_notes(rig, views)
+    assert bool(notes) == named
+    if named:
+        assert pair.name in notes[0]
+        assert "5 %" in notes[0]
+        assert "closer" in notes[0]

@@ -1,0 +1,85 @@
+"""A projector that moves between the shots of a calibration is noticed, and its shots named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lit_boards import BODY_POSES, CHAPTER_POSES, Scene, Uneven, body_scene, chapter_scene
+
+from bodyscan.calibration.boundary_points import BoundaryPoints, join
+from bodyscan.calibration.stripe_agreement import Disagreement, find_disagreement
+
+MORE_POSES = (
+    *BODY_POSES,
+    ([10.0, 60.0, 1300.0], [0.25, -0.25, 0.3]),
+    ([-20.0, -60.0, 1200.0], [-0.3, -0.2, -0.2]),
+    ([0.0, 100.0, 1350.0], [0.3, 0.35, 0.0]),
+)
+
+
+def disagreement(scene: Scene, poses, moved: Scene | None = None, shots=()) -> Disagreement | None:
+    """Boards of a scene; of the `shots`, as they are once its projector has moved."""
+    parts = []
+    for number, pose in enumerate(poses):
+        of = moved if moved is not None and number in shots else scene
+        data = of.boundaries([of.looking_at(*pose)], seed=number)
+        parts.append(replace(data, board=np.full_like(data.board, number)))
+    data: BoundaryPoints = join(parts)
+    return find_disagreement(data, scene.camera, scene.projector.stripes, scene.direction)
+
+
+def pushed(scene: Scene, push) -> Scene:
+    projector = scene.projector
+    centre = projector.centre + np.array(push)
+    return replace(scene, projector=replace(projector, centre=centre))
+
+
+def turned(scene: Scene, degrees: float) -> Scene:
+    projector = scene.projector
+    moved = projector.projector_from_camera.moved(np.array([np.radians(degrees), 0, 0, 0, 0, 0]))
+    return replace(scene, projector=replace(projector, projector_from_camera=moved))
+
+
+@pytest.mark.parametrize("scene", [body_scene(0.0), body_scene(-0.12, 0.05)])
+def test_a_projector_that_stays_is_not_suspected(scene):
+    assert disagreement(scene, MORE_POSES) is None
+
+
+def test_a_mirror_that_stays_is_not_suspected():
+    assert disagreement(chapter_scene(smile=0.5), CHAPTER_POSES) is None
+
+
+def test_uneven_stripes_are_no_move():
+    scene = chapter_scene()
+    uneven = replace(scene, projector=Uneven(scene.projector, 0.3))
+    assert disagreement(uneven, CHAPTER_POSES) is None
+
+
+def test_a_move_between_shots_tells_those_before_from_those_after():
+    scene = body_scene(-0.05)
+    found = disagreement(scene, MORE_POSES, turned(scene, 0.1), shots=(3, 4, 5, 6))
+    assert found is not None
+    assert not found.one_board
+    np.testing.assert_array_equal(found.kept, [0, 1, 2])
+    np.testing.assert_array_equal(found.others, [3, 4, 5, 6])
+    assert found.together_px > 3.0 * found.apart_px
+
+
+@pytest.mark.parametrize("shot", [0, 2, 6])
+def test_a_shot_of_its_own_is_named(shot):
+    scene = body_scene(-0.05)
+    found = disagreement(scene, MORE_POSES, turned(scene, -0.1), shots=(shot,))
+    assert found is not None
+    assert found.one_board
+    assert found.others == [shot]
+
+
+def test_of_three_poses_something_is_noticed():
+    scene = chapter_scene()
+    found = disagreement(scene, CHAPTER_POSES, pushed(scene, (0.0, 0.0, 3.0)), shots=(2,))
+    assert found is not None
+
+
+def test_two_boards_say_nothing():
+    scene = chapter_scene()
+    assert disagreement(scene, CHAPTER_POSES[:2], pushed(scene, (3.0, 0.0, 0.0)), (1,)) is None
