@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.stripe_images import StripeImages
+from bodyscan.capture.stripe_images import ScanLines
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -50,7 +50,7 @@ class Brightness:
     shading: NDArray[np.float32]
 
     @staticmethod
-    def of(images: StripeImages, variance: NDArray[np.float32], usable: Mask) -> Brightness:
+    def of(images: ScanLines, variance: NDArray[np.float32], usable: Mask) -> Brightness:
         """variance: (256,) of each grey level.  usable: (L, P) pixels on a lit surface."""
         contrast = np.maximum(images.contrast, 1.0)
         logarithm = np.log(contrast)

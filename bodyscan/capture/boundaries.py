@@ -10,7 +10,7 @@ from scipy.special import erfinv
 
 from bodyscan.capture.albedo_edges import Brightness
 from bodyscan.capture.gray_code import bit_that_flips
-from bodyscan.capture.stripe_images import StripeImages
+from bodyscan.capture.stripe_images import ScanLines
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -46,7 +46,7 @@ class Boundaries:
 
 
 def find_boundaries(
-    images: StripeImages,
+    images: ScanLines,
     brightness: Brightness,
     codes: NDArray[np.int32],
     usable: Mask,
@@ -73,7 +73,7 @@ def find_boundaries(
     sigma = np.hypot((1.0 - fraction) * left_sigma, fraction * right_sigma)
     sigma = np.hypot(sigma / np.abs(left - right), LEAST_SIGMA_PX)
     position = before + fraction
-    joined = _joined(line, index, position) & _whole(before, usable, line)
+    joined = joined_to_next(line, before, position, index, usable)
     blur2 = edges.blur2(position, joined)
     return Boundaries(
         line=line,
@@ -87,34 +87,28 @@ def find_boundaries(
     )
 
 
-def _joined(line: Ints, index: Ints, position: Floats) -> Mask:
-    """(N - 1,) whether the next boundary ends the stripe that this one begins."""
-    return (
-        (np.diff(line) == 0) & (np.abs(np.diff(index)) == 1) & (np.diff(position) > MIN_STRIPE_PX)
-    )
+def joined_to_next(line: Ints, before: Ints, position: Floats, index: Ints, usable: Mask) -> Mask:
+    """(N - 1,) whether the next boundary ends the stripe that this one begins.
 
-
-def _whole(before: Ints, usable: Mask, line: Ints) -> Mask:
-    """(N - 1,) whether all pixels from one boundary to the next can be used: where one cannot, the
-    surface may end, and another that happens to show the next stripe begin."""
+    All pixels between the two must be usable (L, P): where one is not, the surface may end, and
+    another that happens to show the next stripe begin.
+    """
+    joined = (np.diff(line) == 0) & (np.abs(np.diff(index)) == 1)
+    joined &= np.diff(position) > MIN_STRIPE_PX
     bad = np.cumsum(~usable.ravel())
     at = line * usable.shape[1] + before
-    return bad[at[1:]] == bad[at[:-1]]
+    return joined & (bad[at[1:]] == bad[at[:-1]])
 
 
 def _straightened(
-    images: StripeImages, variance: NDArray[np.float32], bit: Ints, at: Ints, contrast: Floats
+    images: ScanLines, variance: NDArray[np.float32], bit: Ints, at: Ints, contrast: Floats
 ) -> tuple[Floats, Floats]:
     """Distance from the boundary in units of sqrt(2) blurs (with a sign), and its sigma."""
-    place = bit * images.lit.size + at
-    pattern = images.patterns.ravel()[place]
-    inverse = images.inverses.ravel()[place]
-    difference = np.subtract(pattern, inverse, dtype=np.float32)
+    difference, noise = images.difference(bit, at, variance)
     ratio = difference / contrast
     scaled = (np.clip(ratio, -MAX_RATIO, MAX_RATIO) / MAX_RATIO + 1.0) * (TABLE_SIZE / 2)
     entry = np.rint(scaled).astype(np.int32)
-    noise = np.sqrt(variance[pattern] + variance[inverse]) / contrast
-    return _STRAIGHT[entry], noise * _STRETCH[entry]
+    return _STRAIGHT[entry], noise / contrast * _STRETCH[entry]
 
 
 _RATIOS = np.linspace(-MAX_RATIO, MAX_RATIO, TABLE_SIZE + 1)

@@ -1,71 +1,97 @@
-"""Gray-coded stripes: the images for a projector, and reading camera images of them."""
+"""The codes by which stripes are told apart: what to project, and reading what a camera saw of it.
+
+`ProjectorSpec.code` says which; `ProjectorSpec.frame_counts` which images it takes, in order.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.albedo_edges import Brightness, without_edges_across
-from bodyscan.capture.boundaries import find_boundaries
-from bodyscan.capture.gray_code import bits_needed, gray_from_stripe, stripe_from_gray
-from bodyscan.capture.grey_noise import noise_variance
-from bodyscan.capture.rig import ProjectorSpec
-from bodyscan.capture.sequence import check_codes, check_exposure, check_frames
-from bodyscan.capture.stripe_coordinates import interpolate_stripes
-from bodyscan.capture.stripe_images import StripeImages
+from bodyscan.capture import bit_codes, light_section, phase_shift, stripe_index
+from bodyscan.capture.rig import FrameKind, ProjectorSpec
+from bodyscan.capture.sequence import check_sizes
 from bodyscan.capture.views import StripeMap
-from bodyscan.errors import BadInput
+from bodyscan.errors import BadInput, DecodingFailed
 
 Images = NDArray[np.uint8]
 
 
 def pattern_frames(spec: ProjectorSpec, width: int, height: int) -> Images:
-    """Images to project, (bits, height, width) uint8 of 0 and 255; their inverses are 255 - these.
+    """Images to project, (F, height, width) uint8, read-only, in the order of `spec.frame_counts`.
 
     The stripes divide the projector's image evenly. Raises BadInput if they are narrower than one
-    of its pixels.
+    of its pixels, or if the code is one that its instrument projects by itself.
     """
+    if spec.code == "stripe-index":
+        raise BadInput(
+            "a stripe-index image is what an instrument hands out: it projects stripes of its own",
+            remedy="choose another code for a projector that shows images",
+        )
     across = height if spec.direction == "horizontal" else width
     if spec.stripes > across:
         raise BadInput(
             f"{spec.stripes} stripes do not fit on {across} projector pixels",
             remedy="project fewer stripes",
         )
-    stripe = np.arange(across) * spec.stripes // across
-    gray = gray_from_stripe(stripe)
-    shift = np.arange(bits_needed(spec.stripes))[::-1]
-    lines = ((gray >> shift[:, None] & 1) * 255).astype(np.uint8)
-    lines = lines[:, :, None] if spec.direction == "horizontal" else lines[:, None, :]
-    return np.ascontiguousarray(np.broadcast_to(lines, (len(shift), height, width)))
+    s = (np.arange(across) + 0.5) * spec.stripes / across
+    lines = np.concatenate([_light(kind, spec, s) for kind in spec.frame_counts])
+    grey = np.rint(255.0 * lines).astype(np.uint8)
+    grey = grey[:, :, None] if spec.direction == "horizontal" else grey[:, None, :]
+    return np.broadcast_to(grey, (len(grey), height, width))
+
+
+def _light(kind: FrameKind, spec: ProjectorSpec, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Light, 0 to 1, of the images of one kind at stripe coordinates s (N,): (images, N)."""
+    if kind == "phase":
+        return phase_shift.light(spec, s)
+    if kind == "stripe":
+        return light_section.light(spec, s)
+    bits = bit_codes.light(spec, s)
+    return bits if kind == "pattern" else 1.0 - bits
+
+
+def read_code(
+    spec: ProjectorSpec, lit: Images, dark: Images | None, coded: Images, *, where: str = ""
+) -> StripeMap:
+    """The stripe coordinate of every pixel, from one pair's images of one shot.
+
+    lit, dark: (H, W); dark may be None if the code can do without (see docs/formats.md).
+    coded: (F, H, W), the images of the code in the order of `spec.frame_counts`.
+
+    Raises DecodingFailed, naming the image where it can be told, if they do not add up.
+    """
+    try:
+        check_sizes(lit, dark, coded, sum(spec.frame_counts.values()))
+        readers = {
+            "gray": bit_codes.read,
+            "binary": bit_codes.read,
+            "light-section": light_section.read,
+            "stripe-index": stripe_index.read,
+            "phase-shift": phase_shift.read,
+        }
+        return readers[spec.code](spec, lit, dark, coded)
+    except DecodingFailed as error:
+        raise DecodingFailed(error.what, where=where, remedy=error.remedy) from error
 
 
 def read_stripes(
-    lit: NDArray[np.uint8],
-    dark: NDArray[np.uint8] | None,
+    lit: Images,
+    dark: Images | None,
     patterns: Images,
     inverses: Images,
     *,
     stripes: int,
     direction: str,
 ) -> StripeMap:
-    """The stripe coordinate of every pixel, from one pair's frames of one shot.
-
-    lit, dark: (H, W); without a dark frame it is taken from the patterns and their inverses.
-    patterns, inverses: (bits, H, W), most significant bit first. direction: the way the stripes
-    run in the projector's image, "horizontal" or "vertical", and roughly in the camera's.
-
-    Raises DecodingFailed, naming the frame where it can be told, if the frames do not add up.
-    """
-    check_frames(lit, dark, patterns, inverses, bits_needed(stripes))
-    images = StripeImages.along_lines(lit, dark, patterns, inverses, direction)
-    check_exposure(images)
-    gray = images.gray()
-    check_codes(images, gray, stripes)
-    codes = stripe_from_gray(gray)
-    variance = noise_variance(images)
-    usable = images.usable(codes, variance, stripes)
-    brightness = Brightness.of(images, variance, usable)
-    boundaries = find_boundaries(images, brightness, codes, usable, variance)
-    s, sigma = interpolate_stripes(boundaries, codes, usable)
-    s, sigma = without_edges_across(s, sigma, brightness, boundaries.blur2)
-    return images.stripe_map(lit, s, sigma, boundaries, stripes)
+    """`read_code` of a Gray code with inverses. patterns, inverses: (bits, H, W)."""
+    spec = ProjectorSpec.model_validate({"stripes": stripes, "direction": direction})
+    for name, frames in (("patterns", patterns), ("inverses", inverses)):
+        if len(frames) != spec.bits:
+            raise DecodingFailed(
+                f"{len(frames)} {name}, but the code has {spec.bits} bits",
+                remedy="give one pattern and one inverse for each bit, or correct `stripes`",
+            )
+        if frames.shape[1:] != lit.shape:
+            raise DecodingFailed(f"{name} of {frames.shape[1:]} px, lit frame of {lit.shape} px")
+    return read_code(spec, lit, dark, np.concatenate([patterns, inverses]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bodyscan.capture.codes import read_stripes
+from bodyscan.capture.codes import read_code
 from bodyscan.capture.folder import Sequence
 from bodyscan.capture.images import read_sequence
 from bodyscan.capture.rig import Pair
@@ -20,14 +20,4 @@ def decode_sequence(sequence: Sequence, pair: Pair, *, workers: int = 1) -> Stri
     if pair.projector is None:
         raise DecodingFailed("this pair has no projector", where=where)
     images = read_sequence(sequence, pair.camera, workers=workers)
-    try:
-        return read_stripes(
-            images.lit,
-            images.dark,
-            images.patterns,
-            images.inverses,
-            stripes=pair.projector.stripes,
-            direction=pair.projector.direction,
-        )
-    except DecodingFailed as error:
-        raise DecodingFailed(error.what, where=where, remedy=error.remedy) from error
+    return read_code(pair.projector, images.lit, images.dark, images.coded, where=where)

@@ -24,29 +24,28 @@ Kind = Literal["calibration", "scan"]
 class Sequence:
     """The images that one pair took, or should have taken, in one shot.
 
-    patterns, inverses: one path a bit, most significant first; () where only the lit image was
-    taken. dark: None where there is no such image. missing: those of the paths that are not there.
+    coded: the images of the stripe code, in the order of `FrameNames.of_code`; () where only the
+    lit image was taken. dark: None where there is no such image. missing: those of the paths that
+    are not there.
     """
 
     pair: str
     shot: str
     lit: Path
     dark: Path | None
-    patterns: tuple[Path, ...]
-    inverses: tuple[Path, ...]
+    coded: tuple[Path, ...]
     missing: tuple[Path, ...]
 
     @property
     def has_stripes(self) -> bool:
         """Whether this is a stripe sequence rather than a lit image alone."""
-        return bool(self.patterns)
+        return bool(self.coded)
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Lit, dark, then each pattern and its inverse."""
+        """Lit, dark, then those of the code."""
         dark = () if self.dark is None else (self.dark,)
-        bits = zip(self.patterns, self.inverses, strict=True)
-        return (self.lit, *dark, *(path for bit in bits for path in bit))
+        return (self.lit, *dark, *self.coded)
 
 
 @dataclass(frozen=True)
@@ -136,6 +135,18 @@ def open_scan(rig: Rig, folder: Path) -> Captures:
     return _open(rig, Path(folder), "scan", rig.files, None)
 
 
+def open_check(rig: Rig, folder: Path) -> tuple[Kind, Captures]:
+    """Captures of either kind, for a check: what its captures.yaml says; without one a scan, unless
+    more than one shot lies in it. Raises as `open_scan`."""
+    listing = Listing(Path(folder))
+    file = load_captures_file(Path(folder), rig) if listing.has(FILE_NAME) else None
+    kind: Kind = file.kind if file is not None else "scan"
+    captures = _open(rig, Path(folder), kind, rig.files, None)
+    if file is None and len(captures.shots) > 1:
+        kind = "calibration"
+    return kind, captures
+
+
 def join(parts: tuple[Captures, ...]) -> Captures:
     """Captures of several folders as one; a shot of the same name in two is the same moment.
 
@@ -195,7 +206,7 @@ def _open(
 
 
 def _discover(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
-    """Shots told from the names of the files: those with a lit image or a first pattern."""
+    """Shots told from the names of the files: those with a lit image or the first of a code."""
     if not has_field(template, "shot"):
         name = listing.root.resolve().name
         if re.fullmatch(SHOT, name) and len(name) <= 64:
@@ -209,7 +220,7 @@ def _discover(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
     for pair in rig.pairs:
         frames = [rig.frames.lit]
         if pair.projector:
-            frames += rig.frames.pattern_names(pair.projector.bits)[:1]
+            frames += rig.frames.of_code(pair.projector)[:1]
         for frame in frames:
             found |= _shots_matching(listing, shot_pattern(template, pair.name, frame), "", None)
     return tuple(sorted((name for name in found if len(name) <= 64), key=_natural))
@@ -246,8 +257,7 @@ def _sequences(rig: Rig, listing: Listing, template: str, shot: ShotEntry) -> It
         whole = _sequence(rig, listing, template, shot.name, pair, stripes=True)
         alone = _sequence(rig, listing, template, shot.name, pair, stripes=False)
         if look:
-            stripes_there = {*whole.patterns, *whole.inverses} - set(whole.missing)
-            if stripes_there:
+            if set(whole.coded) - set(whole.missing):
                 yield whole
             elif not alone.missing:
                 yield alone
@@ -268,24 +278,22 @@ def _sequence(
     rig: Rig, listing: Listing, template: str, shot: str, pair: Pair, *, stripes: bool
 ) -> Sequence:
     frames = rig.frames
-    stripes = stripes and pair.projector is not None and has_field(template, "frame")
-    bits = pair.projector.bits if pair.projector and stripes else 0
+    projector = pair.projector if stripes and has_field(template, "frame") else None
 
     def files(*names: str) -> tuple[str, ...]:
         return tuple(fill(template, shot=shot, pair=pair.name, frame=name) for name in names)
 
     lit = files(frames.lit)
-    dark = files(frames.dark) if stripes and frames.dark is not None else ()
-    patterns = files(*frames.pattern_names(bits)) if bits else ()
-    inverses = files(*frames.inverse_names(bits)) if bits else ()
-    missing = [name for name in (*lit, *dark, *patterns, *inverses) if not listing.has(name)]
+    takes_dark = projector is not None and projector.takes_dark and frames.dark is not None
+    dark = files(frames.dark or "") if takes_dark else ()
+    coded = files(*frames.of_code(projector)) if projector else ()
+    missing = [name for name in (*lit, *dark, *coded) if not listing.has(name)]
     root = listing.root
     return Sequence(
         pair=pair.name,
         shot=shot,
         lit=root / lit[0],
         dark=root / dark[0] if dark else None,
-        patterns=tuple(root / name for name in patterns),
-        inverses=tuple(root / name for name in inverses),
+        coded=tuple(root / name for name in coded),
         missing=tuple(root / name for name in missing),
     )

@@ -1,11 +1,13 @@
-"""The reflected binary code: stripe i is written as i ^ (i >> 1), most significant bit first.
+"""Stripes written in bits, most significant first: the reflected binary (Gray) and the plain code.
 
-From one stripe to the next exactly one bit flips, so a pixel at a boundary is never off by more
-than the stripe next to it.
+Gray code writes stripe i as i ^ (i >> 1). From one stripe to the next exactly one bit flips, so a
+pixel at a boundary is never off by more than the stripe next to it. The plain code writes i itself.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,35 @@ def stripe_from_gray(gray: NDArray[np.uint16]) -> NDArray[np.int32]:
 
 
 def bit_that_flips(boundary: NDArray[np.int64], bits: int) -> NDArray[np.int64]:
-    """Which bit (0 the most significant) flips at boundary i > 0, between stripes i - 1 and i."""
+    """Which bit (0 the most significant) flips at boundary i > 0, between stripes i - 1 and i.
+
+    Of the plain code, in which several do, it is the coarsest.
+    """
     lowest_set = np.frexp((boundary & -boundary).astype(np.float64))[1].astype(np.int64) - 1
     return bits - 1 - lowest_set
+
+
+@dataclass(frozen=True)
+class WordCode:
+    """How stripes are written in words, and words read.
+
+    single: neighbours differ in one bit.  doubt_px: added to the sigma of boundaries, where the
+    finest pattern's stripes are one wide and not two, and blur into each other (seen in tests).
+    """
+
+    words: Callable[[NDArray[Any]], NDArray[Any]]
+    stripes: Callable[[NDArray[np.uint16]], NDArray[np.int32]]
+    single: bool
+    doubt_px: float
+
+
+def _as_it_is(numbers: NDArray[Any]) -> NDArray[Any]:
+    return numbers
+
+
+def _as_stripes(words: NDArray[np.uint16]) -> NDArray[np.int32]:
+    return words.astype(np.int32)
+
+
+GRAY = WordCode(gray_from_stripe, stripe_from_gray, single=True, doubt_px=0.0)
+BINARY = WordCode(_as_it_is, _as_stripes, single=False, doubt_px=0.04)

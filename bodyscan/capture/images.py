@@ -26,15 +26,15 @@ SHOWS_NOTHING_BELOW = 8
 class StripeImages:
     """The images of one stripe sequence, grey levels 0 to 255.
 
-    lit, dark: (H, W) uint8. patterns, inverses: (B, H, W) uint8, most significant bit first.
+    lit, dark: (H, W) uint8; dark is None where none was taken. coded: (F, H, W) uint8, the images
+    of the code in the order of `FrameNames.of_code`.
     """
 
     pair: str
     shot: str
     lit: Grey
-    dark: Grey
-    patterns: Grey
-    inverses: Grey
+    dark: Grey | None
+    coded: Grey
 
 
 def read_image(
@@ -81,9 +81,7 @@ def read_lit(sequence: Sequence, camera: CameraSpec) -> Grey:
 def read_sequence(sequence: Sequence, camera: CameraSpec, *, workers: int = 2) -> StripeImages:
     """All images of a stripe sequence.
 
-    Where no dark image is taken, the darkest of all patterns and inverses stands in pixel by pixel:
-    every stripe is dark in one of each two. Raises ImageError as `read_image`, and where the
-    sequence is a lit image alone.
+    Raises ImageError as `read_image`, and where the sequence is a lit image alone.
     """
     if not sequence.has_stripes:
         raise ImageError(
@@ -96,16 +94,14 @@ def read_sequence(sequence: Sequence, camera: CameraSpec, *, workers: int = 2) -
         names = {"pair": sequence.pair, "shot": sequence.shot}
         return read_image(path, camera.width, camera.height, lit=path == sequence.lit, **names)
 
-    bits = len(sequence.patterns)
-    coded = np.empty((2, bits, camera.height, camera.width), np.uint8)
+    coded = np.empty((len(sequence.coded), camera.height, camera.width), np.uint8)
 
     def read_into(place: int) -> None:
-        paths = sequence.patterns if place < bits else sequence.inverses
-        coded[place // bits, place % bits] = read(paths[place % bits])
+        coded[place] = read(sequence.coded[place])
 
     with ThreadPoolExecutor(workers) as pool:
         lit = pool.submit(read, sequence.lit)
         dark = pool.submit(read, sequence.dark) if sequence.dark else None
-        list(pool.map(read_into, range(2 * bits)))
-    dark_image = dark.result() if dark else coded.min(axis=(0, 1))
-    return StripeImages(sequence.pair, sequence.shot, lit.result(), dark_image, coded[0], coded[1])
+        list(pool.map(read_into, range(len(coded))))
+    dark_image = dark.result() if dark else None
+    return StripeImages(sequence.pair, sequence.shot, lit.result(), dark_image, coded)

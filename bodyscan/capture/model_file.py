@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -88,6 +88,28 @@ def load_model(
     if problems:
         raise report(path, problems, error, remedy)
     return loaded
+
+
+def revised(model: M, changes: Mapping[Where, Any], error: type[BadInput]) -> M:
+    """`model` with the values at some paths replaced, checked anew.
+
+    Raises `error` that names every change that is wrong by its path.
+    """
+    data: dict[Any, Any] = model.model_dump(mode="json", exclude_unset=True)
+    for where, value in changes.items():
+        inside = data
+        for part in where[:-1]:
+            deeper = inside.setdefault(part, {})
+            if not isinstance(deeper, dict):
+                raise error(f"--set {dotted(where)}: {part} has nothing inside")
+            inside = deeper
+        inside[where[-1]] = value
+    try:
+        return type(model).model_validate_json(json.dumps(data), strict=True)
+    except ValidationError as refused:
+        problems = _translated(refused, Document(data), type(model))
+        told = "\n".join(f"--set {problem.path}: {problem.text}" for problem in problems)
+        raise error(told, remedy="docs/formats.md explains every key") from None
 
 
 def report(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat
@@ -50,17 +50,74 @@ class CameraSpec(Model):
     height: Pixels
 
 
-class ProjectorSpec(Model):
-    """The stripes a projector throws. `direction` is the way the stripes run in the image."""
+FrameKind = Literal["pattern", "inverse", "phase", "stripe", "index"]
+"""What an image of a code is; `FrameNames` has a name for each."""
 
-    code: Literal["gray"] = "gray"
+DEFAULT_STEPS = 4
+DEFAULT_PERIOD = 8
+
+
+class ProjectorSpec(Model):
+    """The stripes a projector throws. `direction` is the way the stripes run in the image.
+
+    inverses: whether each pattern of a Gray or binary code is thrown inverted as well.
+    steps, period: of phase-shift, images in one period and stripes in it.
+    """
+
+    code: Literal["gray", "binary", "light-section", "stripe-index", "phase-shift"] = "gray"
     stripes: Annotated[int, Field(ge=2, le=65535)]
     direction: Literal["horizontal", "vertical"]
+    inverses: bool | None = None
+    steps: Annotated[int, Field(ge=3, le=64)] | None = None
+    period: Annotated[int, Field(ge=2, le=65535)] | None = None
+
+    @property
+    def words(self) -> int:
+        """Code words thrown: one a stripe; of phase-shift, one each half period."""
+        if self.code == "phase-shift":
+            return -(-2 * self.stripes // self.period_stripes)
+        return self.stripes
 
     @property
     def bits(self) -> int:
-        """Patterns of the Gray code: ceil(log2(stripes))."""
-        return (self.stripes - 1).bit_length()
+        """Patterns of the Gray or binary code: ceil(log2(words)); 0 for codes without any."""
+        wordless = self.code in ("light-section", "stripe-index")
+        return 0 if wordless else max(1, (self.words - 1).bit_length())
+
+    @property
+    def has_inverses(self) -> bool:
+        """Whether patterns are thrown inverted as well."""
+        return self.bits > 0 and self.inverses is not False
+
+    @property
+    def phase_steps(self) -> int:
+        """Images in a period of phase-shift, 0 for other codes."""
+        return (self.steps or DEFAULT_STEPS) if self.code == "phase-shift" else 0
+
+    @property
+    def period_stripes(self) -> int:
+        """Stripes in a period of phase-shift."""
+        return self.period or DEFAULT_PERIOD
+
+    @property
+    def takes_dark(self) -> bool:
+        """Whether the code has use for a dark image."""
+        return self.code not in ("light-section", "stripe-index")
+
+    @property
+    def frame_counts(self) -> Mapping[FrameKind, int]:
+        """How many images of each kind the code takes, in their order, besides lit and dark."""
+        counts: dict[FrameKind, int] = {
+            "pattern": self.bits,
+            "inverse": self.bits * self.has_inverses,
+            "phase": self.phase_steps,
+            "stripe": self.stripes * (self.code == "light-section"),
+            "index": 1 * (self.code == "stripe-index"),
+        }
+        return {kind: count for kind, count in counts.items() if count}
+
+    def problems(self) -> Iterator[Problem]:
+        return rig_checks.projector_problems(self)
 
 
 class Placing(Model):
@@ -92,21 +149,29 @@ class Pair(Model):
 class FrameNames(Model):
     """What `{frame}` becomes in the file-name template, for each kind of image.
 
-    `pattern` and `inverse` hold `{bit}` (0 is the most significant) or are lists, one name a bit.
+    `pattern` and `inverse` hold `{bit}` (0 is the most significant), `phase` holds `{step}` and
+    `stripe` `{stripe}`; or they are lists, one name an image.
     """
 
     lit: str = "lit"
     dark: str | None = "dark"
     pattern: str | tuple[str, ...] = "bit{bit:02d}"
     inverse: str | tuple[str, ...] = "bit{bit:02d}-inverse"
+    phase: str | tuple[str, ...] = "phase{step:02d}"
+    stripe: str | tuple[str, ...] = "stripe{stripe:03d}"
+    index: str = "index"
 
-    def pattern_names(self, bits: int) -> tuple[str, ...]:
-        """Names of the patterns of a code of so many bits, most significant first."""
-        return _bit_names(self.pattern, bits)
+    def of_kind(self, kind: FrameKind, count: int) -> tuple[str, ...]:
+        """Names of so many images of one kind, in the code's order."""
+        names = getattr(self, kind)
+        if isinstance(names, str):
+            return tuple(names.format(bit=i, step=i, stripe=i) for i in range(count))
+        return tuple(names)
 
-    def inverse_names(self, bits: int) -> tuple[str, ...]:
-        """Names of the inverse patterns, in the same order."""
-        return _bit_names(self.inverse, bits)
+    def of_code(self, projector: ProjectorSpec) -> tuple[str, ...]:
+        """Names of a code's images, lit and dark left out, in the order of `frame_counts`."""
+        counts = projector.frame_counts.items()
+        return tuple(name for kind, count in counts for name in self.of_kind(kind, count))
 
     def problems(self) -> Iterator[Problem]:
         return rig_checks.frame_problems(self)
@@ -199,9 +264,3 @@ class Rig(Model):
 
     def problems(self) -> Iterator[Problem]:
         return rig_checks.rig_problems(rig_checks.RigParts.of(self))
-
-
-def _bit_names(names: str | tuple[str, ...], bits: int) -> tuple[str, ...]:
-    if isinstance(names, str):
-        return tuple(names.format(bit=bit) for bit in range(bits))
-    return names

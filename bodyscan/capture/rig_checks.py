@@ -13,9 +13,27 @@ from bodyscan.capture.model import Problem, duplicates
 from bodyscan.capture.templates import frame_name_faults, path_fault, template_faults
 
 if TYPE_CHECKING:
-    from bodyscan.capture.rig import Board, CaptureFolder, FrameNames, Pair, Rig, RigFrame
+    from bodyscan.capture.rig import (
+        Board,
+        CaptureFolder,
+        FrameKind,
+        FrameNames,
+        Pair,
+        ProjectorSpec,
+        Rig,
+        RigFrame,
+    )
 
-_MOST_BITS = 16
+NUMBERED: dict[FrameKind, str] = {
+    "pattern": "bit",
+    "inverse": "bit",
+    "phase": "step",
+    "stripe": "stripe",
+}
+"""Kinds of images of which there are several, and what numbers them."""
+
+_MOST = {"bit": 16, "step": 64, "stripe": 1000}
+_LARGEST_INDEX = 254
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
@@ -48,27 +66,46 @@ def board_problems(board: Board) -> Iterator[Problem]:
         )
 
 
+def projector_problems(projector: ProjectorSpec) -> Iterator[Problem]:
+    code = projector.code
+    if projector.inverses is not None and not projector.bits:
+        yield ("inverses",), f"is for codes with bits; {code} has none"
+    if code == "stripe-index" and projector.stripes > _LARGEST_INDEX:
+        wrong = f"must be {_LARGEST_INDEX} or less for stripe-index (got {projector.stripes})"
+        yield ("stripes",), wrong
+    if code != "phase-shift":
+        for key in ("steps", "period"):
+            if getattr(projector, key) is not None:
+                yield (key,), f"is for code: phase-shift (the code here is {code})"
+    elif projector.period_stripes > projector.stripes:
+        wrong = f"must be {projector.stripes} (stripes) or less (got {projector.period_stripes})"
+        yield ("period",), wrong
+
+
 def frame_problems(frames: FrameNames) -> Iterator[Problem]:
     all_names = []
-    for kind, name in (("lit", frames.lit), ("dark", frames.dark)):
+    for kind, name in (("lit", frames.lit), ("dark", frames.dark), ("index", frames.index)):
         fault = path_fault(name) if name is not None else None
         if fault:
             yield (kind,), fault
         all_names.append(name)
-    for kind, names in (("pattern", frames.pattern), ("inverse", frames.inverse)):
-        faults = list(_bit_name_faults(kind, names))
+    for kind, number in NUMBERED.items():
+        names = getattr(frames, kind)
+        faults = list(_numbered_name_faults(kind, number, names))
         yield from faults
         if not faults and isinstance(names, str):
-            all_names += [names.format(bit=bit) for bit in range(_MOST_BITS)]
+            all_names += [names.format(**{number: i}) for i in range(_MOST[number])]
         elif not faults:
             all_names += names
     for _, twice in duplicates(tuple(all_names)):
         yield (), f"gives two images the same name ({twice!r})"
 
 
-def _bit_name_faults(kind: str, names: str | tuple[str, ...]) -> Iterator[Problem]:
+def _numbered_name_faults(
+    kind: str, number: str, names: str | tuple[str, ...]
+) -> Iterator[Problem]:
     if isinstance(names, str):
-        for fault in [*frame_name_faults(names), *filter(None, [path_fault(names)])]:
+        for fault in [*frame_name_faults(names, number), *filter(None, [path_fault(names)])]:
             yield (kind,), fault
         return
     for index, name in enumerate(names):
@@ -125,7 +162,7 @@ def rig_problems(parts: RigParts) -> Iterator[Problem]:
         for index, name in duplicates(names):
             yield (key, index, "name"), f"is given to two {key}: every name once (got {name!r})"
     yield from _marker_overlaps(parts.boards)
-    yield from _wrong_counts_of_frames(parts)
+    yield from _wrong_frames(parts)
     yield from _template_problems(parts)
     yield from _unknown_references(parts)
 
@@ -148,19 +185,28 @@ def _marker_overlaps(boards: Sequence[Board | None]) -> Iterator[Problem]:
         taken.append((board, own))
 
 
-def _wrong_counts_of_frames(parts: RigParts) -> Iterator[Problem]:
-    for key in ("pattern", "inverse"):
-        names = getattr(parts.frames, key, "")
+def _wrong_frames(parts: RigParts) -> Iterator[Problem]:
+    projectors = [(pair.name, pair.projector) for pair in parts.pairs if pair and pair.projector]
+    for kind, number in NUMBERED.items():
+        names = getattr(parts.frames, kind, "")
         if isinstance(names, str):
             continue
-        for pair in parts.pairs:
-            if pair and pair.projector and pair.projector.bits != len(names):
+        for pair, projector in projectors:
+            count = projector.frame_counts.get(kind, len(names))
+            if count != len(names):
                 yield (
-                    ("frames", key),
-                    f"has {len(names)} names, but the {pair.projector.stripes} stripes of pair"
-                    f" {pair.name} take {pair.projector.bits} bits",
+                    ("frames", kind),
+                    f"has {len(names)} names, but the {projector.stripes} stripes of pair"
+                    f" {pair} take {count} {number}s",
                 )
                 break
+    if parts.frames is None or parts.frames.dark is not None:
+        return
+    for pair, projector in projectors:
+        if projector.bits and not projector.has_inverses:
+            wrong = f"is needed: pair {pair} takes no inverses, so only it shows what black is"
+            yield ("frames", "dark"), wrong
+            break
 
 
 def _template_problems(parts: RigParts) -> Iterator[Problem]:

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.gray_code import stripe_from_gray
-from bodyscan.capture.stripe_images import SATURATED, StripeImages
+from bodyscan.capture.gray_code import WordCode
+from bodyscan.capture.stripe_images import SATURATED, ScanLines
 from bodyscan.errors import DecodingFailed
 
 Codes = NDArray[np.uint16]
+Greys = NDArray[np.int16]
+Mask = NDArray[np.bool_]
 
 STEP = 3
 """Only every third line and place is looked at where the whole picture is meant."""
@@ -28,35 +31,36 @@ MAX_SHARE_BEYOND = 0.05
 MIN_FLIPS = 50
 WRONG_WAY = 2.0
 MIN_SHARE_IN_STEP = 0.6
+MIN_SHARE_WITHOUT_INVERSES = 0.75
+MAX_SHARE_FOLDED = 0.3
 CONVINCING = 0.8
 MAX_PAIRS = 100_000
 
 
-def check_frames(
-    lit: NDArray[np.uint8],
-    dark: NDArray[np.uint8] | None,
-    patterns: NDArray[np.uint8],
-    inverses: NDArray[np.uint8],
-    bits: int,
+def check_sizes(
+    lit: NDArray[np.uint8], dark: NDArray[np.uint8] | None, coded: NDArray[np.uint8], count: int
 ) -> None:
-    """Raises DecodingFailed if there are too few or too many frames, or of different sizes."""
-    for name, frames in (("patterns", patterns), ("inverses", inverses)):
-        if len(frames) != bits:
-            raise DecodingFailed(
-                f"{len(frames)} {name}, but the code has {bits} bits",
-                remedy="give one pattern and one inverse for each bit, or correct `stripes`",
-            )
-        if frames.shape[1:] != lit.shape:
-            raise DecodingFailed(f"{name} of {frames.shape[1:]} px, lit frame of {lit.shape} px")
+    """Raises DecodingFailed if there are too few or too many frames, or of different sizes.
+
+    lit, dark: (H, W).  coded: (F, H, W).  count: how many the code has.
+    """
+    if len(coded) != count:
+        raise DecodingFailed(
+            f"{len(coded)} images of the code, but it has {count}",
+            remedy="give every image of the code, or correct `code` and `stripes`",
+        )
+    if coded.shape[1:] != lit.shape:
+        raise DecodingFailed(f"images of {coded.shape[1:]} px, lit frame of {lit.shape} px")
     if dark is not None and dark.shape != lit.shape:
         raise DecodingFailed(f"dark frame of {dark.shape} px, lit frame of {lit.shape} px")
 
 
-def check_exposure(images: StripeImages) -> None:
+def check_exposure(images: ScanLines) -> None:
     """Raises DecodingFailed for frames that are black, overexposed, or do not add up in light.
 
     Each pattern and its inverse together are as bright as the lit and the dark frame together,
-    and most pixels are lit in only one of them.
+    and most pixels are lit in only one of them. Without an inverse, a pattern is at least nowhere
+    brighter than lit or darker than dark.
     """
     lit, dark = (frame[::STEP, ::STEP].astype(np.int16) for frame in (images.lit, images.dark))
     seen = lit - dark >= MIN_CONTRAST
@@ -65,6 +69,23 @@ def check_exposure(images: StripeImages) -> None:
             "the dark frame is brighter than the lit frame",
             remedy="see whether the names of the two are exchanged in the rig file",
         )
+    check_light(seen, lit)
+    bright = seen & (lit < SATURATED)
+    bright &= lit - dark >= np.median((lit - dark)[bright])
+    for bit in range(len(images.patterns)):
+        pattern = images.patterns[bit, ::STEP, ::STEP][bright].astype(np.int16)
+        if images.inverses is None:
+            _check_range(bit, pattern, lit[bright], dark[bright])
+        else:
+            inverse = images.inverses[bit, ::STEP, ::STEP][bright].astype(np.int16)
+            _check_sum(bit, pattern, inverse, lit[bright], dark[bright])
+
+
+def check_light(seen: Mask, lit: NDArray[Any]) -> None:
+    """Raises DecodingFailed where the projector lights next to nothing, or most of it too bright.
+
+    seen: pixels that are lit.  lit: how bright they are then, grey levels.
+    """
     if np.mean(seen) < MIN_SHARE_LIT:
         raise DecodingFailed(
             f"the projector lights only {np.mean(seen):.2%} of the picture",
@@ -75,109 +96,140 @@ def check_exposure(images: StripeImages) -> None:
         raise DecodingFailed(
             f"{saturated:.0%} of the lit pixels are saturated", remedy="expose for a shorter time"
         )
-    bright = seen & (lit < SATURATED)
-    bright &= lit - dark >= np.median((lit - dark)[bright])
-    contrast = (lit - dark)[bright].astype(np.float32)
-    both = (lit + dark)[bright]
-    for bit in range(len(images.patterns)):
-        pattern = images.patterns[bit, ::STEP, ::STEP][bright].astype(np.int16)
-        inverse = images.inverses[bit, ::STEP, ::STEP][bright].astype(np.int16)
-        if np.median(np.abs(pattern - inverse) / contrast) < MIN_DIFFERENCE:
-            raise DecodingFailed(
-                f"pattern and inverse of bit {bit} look alike",
-                remedy="see whether one of the two frames is missing or was taken twice",
-            )
-        excess = np.maximum(np.abs(pattern + inverse - both) - NOISE_GREY, 0)
-        error = np.mean(np.minimum(excess / contrast, 1.0))
-        if error > MAX_SUM_ERROR:
-            raise DecodingFailed(
-                f"pattern and inverse of bit {bit} do not add up to the lit frame "
-                f"(off by {error:.0%} of its contrast)",
-                remedy="see whether one of the two frames is missing, belongs to another bit or "
-                "was exposed differently",
-            )
 
 
-def check_codes(images: StripeImages, gray: Codes, stripes: int) -> None:
+def _check_sum(bit: int, pattern: Greys, inverse: Greys, lit: Greys, dark: Greys) -> None:
+    contrast = (lit - dark).astype(np.float32)
+    if np.median(np.abs(pattern - inverse) / contrast) < MIN_DIFFERENCE:
+        raise DecodingFailed(
+            f"pattern and inverse of bit {bit} look alike",
+            remedy="see whether one of the two frames is missing or was taken twice",
+        )
+    excess = np.maximum(np.abs(pattern + inverse - lit - dark) - NOISE_GREY, 0)
+    error = np.mean(np.minimum(excess / contrast, 1.0))
+    if error > MAX_SUM_ERROR:
+        raise DecodingFailed(
+            f"pattern and inverse of bit {bit} do not add up to the lit frame "
+            f"(off by {error:.0%} of its contrast)",
+            remedy="see whether one of the two frames is missing, belongs to another bit or "
+            "was exposed differently",
+        )
+
+
+def _check_range(bit: int, pattern: Greys, lit: Greys, dark: Greys) -> None:
+    beyond = np.maximum(pattern - lit, dark - pattern)
+    error = np.mean(np.minimum(np.maximum(beyond - NOISE_GREY, 0) / (lit - dark), 1.0))
+    if error > MAX_SUM_ERROR:
+        raise DecodingFailed(
+            f"the pattern of bit {bit} is brighter than the lit frame or darker than the dark one "
+            f"(by {error:.0%} of their contrast)",
+            remedy="see whether it was exposed as they were",
+        )
+
+
+def check_codes(images: ScanLines, words: Codes, code: WordCode, stripes: int) -> None:
     """Raises DecodingFailed if neighbouring pixels do not lie in neighbouring stripes.
 
-    gray: (L, P) code words as read. Where just one bit differs between two pixels, their stripes
-    must be neighbours, whichever bit it is. An exchange of the coarsest pattern and its inverse
-    turns the whole order round; it shows only in codes beyond the last stripe, and not at all if
-    the stripes are a power of two.
+    words: (L, P) code words as read. Where just one bit of a Gray code differs between two pixels,
+    their stripes must be neighbours, whichever bit it is. Without inverses a pattern may be missing
+    unnoticed; then stripes count up and down along a line, which they must not. An exchange of the
+    coarsest pattern and its inverse turns the whole order round; it shows only in codes beyond the
+    last stripe, and not at all if the stripes are a power of two.
     """
     bits = len(images.patterns)
     contrast = images.contrast
     lit = contrast >= MIN_CONTRAST
     # Darker pixels are misread too often by themselves to tell anything.
     good = lit & (contrast >= np.median(contrast[::STEP, ::STEP][lit[::STEP, ::STEP]]))
-    one, other = _single_flips(gray, good)
-    _check_direction(images, gray, good)
-    words = gray[::STEP, ::STEP][good[::STEP, ::STEP]]
-    in_step, beyond = _in_step(one, other, bits), _beyond(words, stripes)
-    failing = [bit for bit, share in in_step.items() if share < MIN_SHARE_IN_STEP]
+    check_direction(words, good, images.turned)
+    one, other = _changes(words, good, code)
+    least = MIN_SHARE_IN_STEP
+    if images.inverses is None:
+        _check_folds(one, other, code)
+        least = MIN_SHARE_WITHOUT_INVERSES
+    seen = words[::STEP, ::STEP][good[::STEP, ::STEP]]
+    in_step, beyond = _in_step(one, other, code, bits), _beyond(seen, code, stripes)
+    failing = [bit for bit, share in in_step.items() if share < least]
     if not failing and beyond <= MAX_SHARE_BEYOND:
         return
     found = [f"{beyond:.0%} of the codes lie beyond the last stripe"] if beyond > 0.01 else []
     if failing:
         names = ", ".join(str(bit) for bit in failing)
         found.append(f"where bit {names} flips, stripes do not follow each other")
-    cause = next(_causes(one, other, words, bits, stripes), None)
+    cause = next(_causes(one, other, seen, code, bits, stripes), None)
     raise DecodingFailed(
         "the patterns do not make a stripe code: " + "; ".join(found or ["no order in them"]),
         remedy=f"it would fit if {cause}" if cause else "see whether frames are in their order",
     )
 
 
-def _check_direction(images: StripeImages, gray: Codes, good: NDArray[np.bool_]) -> None:
-    """Raises DecodingFailed if the stripes change from line to line rather than along lines."""
+def _check_folds(one: Codes, other: Codes, code: WordCode) -> None:
+    """Raises DecodingFailed if stripes count up and down: a pattern shows no stripes then."""
+    step = code.stripes(other) - code.stripes(one)
+    up, down = np.count_nonzero(step == 1), np.count_nonzero(step == -1)
+    if min(up, down) > max(MAX_SHARE_FOLDED * (up + down), MIN_FLIPS):
+        raise DecodingFailed(
+            "the patterns do not make a stripe code: stripes count up and down in turn",
+            remedy="see whether the pattern of bit 0 is missing or another one's stands in for it",
+        )
+
+
+def check_direction(numbers: NDArray[Any], good: Mask, turned: bool) -> None:
+    """Raises DecodingFailed if stripes change from line to line rather than along lines.
+
+    numbers: (L, P) code words or stripes.  turned: see `ScanLines`.
+    """
     flips = [
-        np.count_nonzero((np.diff(gray, axis=axis) != 0) & _both(good, axis)) for axis in (0, 1)
+        np.count_nonzero((np.diff(numbers, axis=axis) != 0) & _both(good, axis)) for axis in (0, 1)
     ]
     if flips[0] > WRONG_WAY * flips[1]:
-        seen, said = ("vertical", "horizontal") if images.turned else ("horizontal", "vertical")
+        seen, said = ("vertical", "horizontal") if turned else ("horizontal", "vertical")
         raise DecodingFailed(
             f"the stripes run {seen}ly in the picture, not {said}ly",
             remedy=f"write `direction: {seen}` in the rig file if this camera stands so",
         )
 
 
-def _both(good: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
+def _both(good: Mask, axis: int) -> Mask:
     """Whether neighbours along the axis are both good."""
     return good[1:] & good[:-1] if axis == 0 else good[:, 1:] & good[:, :-1]
 
 
-def _single_flips(gray: Codes, good: NDArray[np.bool_]) -> tuple[Codes, Codes]:
-    """Code words (N,) of neighbours along lines that differ in exactly one bit."""
-    difference = gray[:, 1:] ^ gray[:, :-1]
-    single = (difference != 0) & (difference & (difference - 1) == 0)
-    single &= _both(good, 1)
-    at = np.flatnonzero(single)
+def _changes(words: Codes, good: Mask, code: WordCode) -> tuple[Codes, Codes]:
+    """Code words (N,) of neighbours along lines that differ: of a Gray code in just one bit."""
+    difference = words[:, 1:] ^ words[:, :-1]
+    changes = (difference != 0) & _both(good, 1)
+    if code.single:
+        changes &= difference & (difference - 1) == 0
+    at = np.flatnonzero(changes)
     at = at[:: max(1, len(at) // MAX_PAIRS)]
-    line, place = np.divmod(at, single.shape[1])
-    return gray[line, place], gray[line, place + 1]
+    line, place = np.divmod(at, changes.shape[1])
+    return words[line, place], words[line, place + 1]
 
 
-def _in_step(one: Codes, other: Codes, bits: int) -> dict[int, float]:
-    """For each bit that flips often enough: how often the stripes then are neighbours."""
-    step = np.abs(stripe_from_gray(one) - stripe_from_gray(other))
+def _in_step(one: Codes, other: Codes, code: WordCode, bits: int) -> dict[int, float]:
+    """For each bit that flips often enough (the coarsest, where several do): how often the stripes
+    then are neighbours."""
+    step = np.abs(code.stripes(one) - code.stripes(other))
     bit = bits - np.frexp((one ^ other).astype(np.float64))[1]
     flips = np.bincount(bit, minlength=bits)
     neighbours = np.bincount(bit, step == 1, minlength=bits)
     return {k: neighbours[k] / flips[k] for k in range(bits) if flips[k] >= MIN_FLIPS}
 
 
-def _beyond(words: Codes, stripes: int) -> float:
+def _beyond(words: Codes, code: WordCode, stripes: int) -> float:
     """Share of code words that no stripe has."""
-    return float(np.mean(stripe_from_gray(words) >= stripes)) if words.size else 0.0
+    return float(np.mean(code.stripes(words) >= stripes)) if words.size else 0.0
 
 
-def _causes(one: Codes, other: Codes, words: Codes, bits: int, stripes: int) -> Iterator[str]:
+def _causes(
+    one: Codes, other: Codes, words: Codes, code: WordCode, bits: int, stripes: int
+) -> Iterator[str]:
     """What, undone, would make the code whole; the simplest first."""
     for cause, undo in _mistakes(bits):
-        in_step = _in_step(undo(one), undo(other), bits)
+        in_step = _in_step(undo(one), undo(other), code, bits)
         whole = bool(in_step) and min(in_step.values()) > CONVINCING
-        if whole and _beyond(undo(words), stripes) <= MAX_SHARE_BEYOND:
+        if whole and _beyond(undo(words), code, stripes) <= MAX_SHARE_BEYOND:
             yield cause
 
 

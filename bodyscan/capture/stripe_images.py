@@ -24,44 +24,68 @@ WHOLLY_COVERED = 0.7
 
 
 @dataclass(frozen=True, eq=False)
-class StripeImages:
+class ScanLines:
     """Frames as scan lines: L lines, each of P positions across the stripes.
 
-    lit, dark: (L, P) uint8.  patterns, inverses: (bits, L, P) uint8.
+    lit, dark: (L, P) uint8.  patterns: (F, L, P) uint8, the images of the code.
+    inverses: (F, L, P) uint8, None where none are thrown.
     turned: the lines are the camera image's columns (its stripes are horizontal).
     """
 
     lit: Bytes
     dark: Bytes
     patterns: Bytes
-    inverses: Bytes
+    inverses: Bytes | None
     turned: bool
 
     @staticmethod
     def along_lines(
-        lit: Bytes, dark: Bytes | None, patterns: Bytes, inverses: Bytes, direction: str
-    ) -> StripeImages:
-        """From images (H, W) and stacks (bits, H, W)."""
-        if dark is None:
-            dark = np.minimum(patterns, inverses).min(axis=0)
-        turned = direction == "horizontal"
-        if turned:
-            lit, dark = cv2.transpose(lit), cv2.transpose(dark)
-            patterns = np.stack([cv2.transpose(image) for image in patterns])
-            inverses = np.stack([cv2.transpose(image) for image in inverses])
-        return StripeImages(lit, dark, patterns, inverses, turned)
+        lit: Bytes, dark: Bytes, patterns: Bytes, inverses: Bytes | None, direction: str
+    ) -> ScanLines:
+        """From images (H, W) and stacks (F, H, W)."""
+        if direction != "horizontal":
+            return ScanLines(lit, dark, patterns, inverses, False)
+        lit, dark = cv2.transpose(lit), cv2.transpose(dark)
+        turned = None if inverses is None else transposed(inverses)
+        return ScanLines(lit, dark, transposed(patterns), turned, True)
 
     @property
     def contrast(self) -> NDArray[np.float32]:
         """Lit minus dark, (L, P), grey levels."""
         return cv2.subtract(self.lit, self.dark, dtype=cv2.CV_32F)
 
-    def gray(self) -> NDArray[np.uint16]:
-        """(L, P) code words: a bit is 1 where the pattern is brighter than its inverse."""
+    def words(self) -> NDArray[np.uint16]:
+        """(L, P) code words, the first pattern the most significant bit."""
         words = np.zeros(self.lit.shape, np.uint16)
-        for pattern, inverse in zip(self.patterns, self.inverses, strict=True):
-            words = (words << 1) | (pattern > inverse)
+        for bit in range(len(self.patterns)):
+            words <<= 1
+            words |= self.bright(bit)
         return words
+
+    def bright(self, bit: int) -> Mask:
+        """(L, P): where a pattern is brighter than its inverse, or than the middle between lit and
+        dark if there is no inverse."""
+        if self.inverses is not None:
+            return np.asarray(self.patterns[bit] > self.inverses[bit])
+        middle = cv2.add(self.lit, self.dark, dtype=cv2.CV_16S)
+        return np.asarray(2 * self.patterns[bit].astype(np.int16) > middle)
+
+    def difference(
+        self, bit: NDArray[np.int64], at: NDArray[np.int64], variance: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Pattern minus inverse of bits (N,) at flat pixels (N,), and its noise, grey levels.
+
+        Without inverses, twice what the pattern is above the middle of lit and dark.
+        """
+        place = bit * self.lit.size + at
+        pattern = self.patterns.ravel()[place]
+        if self.inverses is not None:
+            inverse = self.inverses.ravel()[place]
+            noise = np.sqrt(variance[pattern] + variance[inverse])
+            return np.subtract(pattern, inverse, dtype=np.float32), noise
+        lit, dark = self.lit.ravel()[at], self.dark.ravel()[at]
+        difference = 2.0 * pattern.astype(np.float32) - lit - dark
+        return difference, np.sqrt(4.0 * variance[pattern] + variance[lit] + variance[dark])
 
     def usable(self, codes: NDArray[np.int32], variance: NDArray[np.float32], stripes: int) -> Mask:
         """(L, P): pixels whose stripes `codes` can be relied on.
@@ -101,6 +125,11 @@ class StripeImages:
             boundary_sigma_px=boundaries.sigma_px.astype(np.float32),
             stripes=stripes,
         )
+
+
+def transposed(images: Bytes) -> Bytes:
+    """Each image of a stack (F, H, W) transposed."""
+    return np.stack([cv2.transpose(image) for image in images])
 
 
 def half_covered(contrast: NDArray[np.float32], lit: Mask) -> Mask:

@@ -46,8 +46,8 @@ def template_faults(template: str, *, many_pairs: bool, needs_frame: bool) -> It
         yield fault
 
 
-def frame_name_faults(name: str) -> Iterator[str]:
-    """What is wrong with a name of `frames.pattern` that holds `{bit}`."""
+def frame_name_faults(name: str, number: str) -> Iterator[str]:
+    """What is wrong with a name such as that of `frames.pattern`, which holds `{bit}` (`number`)."""
     try:
         parts = list(Formatter().parse(name))
     except ValueError as error:
@@ -55,10 +55,10 @@ def frame_name_faults(name: str) -> Iterator[str]:
         return
     fields = [(field, spec, how) for _, field, spec, how in parts if field is not None]
     if not fields:
-        yield "needs {bit}, or must be a list of one name a bit"
+        yield f"needs {{{number}}}, or must be a list of one name a {number}"
     for field, spec, how in fields:
-        if field != "bit" or how or not re.fullmatch(r"0?[1-9]?d?", spec or ""):
-            yield f"may only hold {{bit}} or such as {{bit:02d}}, not {{{field}}}"
+        if field != number or how or not re.fullmatch(r"0?[1-9]?d?", spec or ""):
+            yield f"may only hold {{{number}}} or such as {{{number}:02d}}, not {{{field}}}"
 
 
 def path_fault(path: str) -> str | None:

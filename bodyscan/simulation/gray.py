@@ -1,11 +1,12 @@
 """What the projector throws: reflected binary code, most significant bit first, and its light.
 
-Written for the simulator alone; it shares nothing with `bodyscan.capture.codes`.
+Written for the simulator alone; it shares nothing with `bodyscan.capture`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,17 +56,23 @@ def table_index(
 
 
 def light_table(
-    lit: NDArray[np.bool_], blurs: NDArray[np.float64], jitter: NDArray[np.float64] | None = None
+    lit: NDArray[Any],
+    blurs: NDArray[np.float64],
+    jitter: NDArray[np.float64] | None = None,
+    parts: int = 1,
 ) -> LightTable:
     """Light of one frame: the stripes that are lit, smeared by Gaussians.
 
-    lit: (S,).  blurs: (B,) standard deviations in stripes.
-    jitter: (S + 1,) how far each boundary strays, in stripes.
+    lit: (S,), or (S * parts,) where light changes inside stripes.  blurs: (B,) standard deviations
+    in stripes.  jitter: (S + 1,) how far each boundary strays, in stripes.
     """
-    stripes = len(lit)
+    stripes = len(lit) // parts
     boundaries = np.arange(stripes + 1, dtype=float)
     if jitter is not None:
         boundaries = np.maximum.accumulate(boundaries + jitter)
+    if parts > 1:
+        within = np.arange(stripes * parts + 1) / parts
+        boundaries = np.interp(within, np.arange(stripes + 1.0), boundaries)
     energy = np.concatenate([[0.0], np.cumsum(lit * np.diff(boundaries))])
     edges = np.arange((stripes + 2 * PAD) * FINE + 1) / FINE - PAD
     sharp = np.diff(np.interp(edges, boundaries, energy)) * FINE

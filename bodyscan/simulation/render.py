@@ -8,16 +8,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.rig import FrameNames
-from bodyscan.simulation.gray import (
-    PAD,
-    LightTable,
-    bit_count,
-    code_bits,
-    light_table,
-    table_index,
-)
+from bodyscan.capture.rig import FrameNames, ProjectorSpec
+from bodyscan.simulation.gray import PAD, LightTable, light_table, table_index
 from bodyscan.simulation.lens import TrueCamera, sampled_directions
+from bodyscan.simulation.patterns import thrown
 from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene, dot
 from bodyscan.simulation.sensor import blurred, off_focus, shade, speckled
@@ -76,17 +70,6 @@ class PixelTruth:
     s: Array
 
 
-def frame_names(frames: FrameNames, bits: int) -> tuple[list[str], list[str]]:
-    """Names of the patterns and of their inverses, as the rig file has them."""
-
-    def names(template: str | tuple[str, ...]) -> list[str]:
-        if isinstance(template, str):
-            return [template.format(bit=bit) for bit in range(bits)]
-        return list(template[:bits])
-
-    return names(frames.pattern), names(frames.inverse)
-
-
 def render_pair(
     scene: Scene,
     view: View,
@@ -96,16 +79,19 @@ def render_pair(
     rng: np.random.Generator,
     *,
     frames: FrameNames | None = None,
+    code: ProjectorSpec | None = None,
     sequence: bool = True,
 ) -> dict[str, Floats]:
     """Images without sensor noise, (height, width) float32 grey levels, by frame name.
 
     scene: in the camera's frame.  rng: for the laser's jitter and speckle.
-    With `sequence` the whole stripe sequence (lit, dark, patterns, inverses), else lit alone.
-    `sensor.expose` makes 8-bit images of them.
+    With `sequence` the whole stripe sequence (lit, dark and those of the code: Gray with inverses
+    if none is given), else lit alone. The dark image of a stripe-index rig, which its instrument
+    keeps to itself, is named "". `sensor.expose` makes 8-bit images of them.
     """
     frames = frames or FrameNames()
-    tables = _tables(projector.stripes, projection, rng, frames, sequence)
+    code = code or ProjectorSpec(stripes=projector.stripes, direction="vertical")
+    tables = _tables(code, projection, rng, frames, sequence)
     shape = (view.camera.height, view.camera.width)
     laser = {name: np.zeros(shape, np.float32) for name in tables}
     ambient, depth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -119,8 +105,9 @@ def render_pair(
         white = np.full_like(s, lamps.ambient_grey)
         ambient[rows] = _pixels(hits.albedo, white, samples).reshape(-1, shape[1])
         depth[rows] = hits.depth.reshape(-1, samples).min(axis=1).reshape(-1, shape[1])
-    if sequence and frames.dark is not None:
-        laser[frames.dark] = np.zeros(shape, np.float32)
+    dark = "" if code.code == "stripe-index" else frames.dark if code.takes_dark else None
+    if sequence and dark is not None:
+        laser[dark] = np.zeros(shape, np.float32)
     shading, focus = shade(view.camera, view.optics), off_focus(depth, lamps.focus_mm)
     return {
         name: blurred(
@@ -168,35 +155,40 @@ def pixel_truth(scene: Scene, camera: TrueCamera, projector: Projector) -> Pixel
 
 
 def _tables(
-    stripes: int,
+    code: ProjectorSpec,
     projection: Projection,
     rng: np.random.Generator,
     frames: FrameNames,
     sequence: bool,
 ) -> dict[str, LightTable]:
     """A table of light for each frame that the laser lights."""
-    names = [frames.lit]
-    if sequence:
-        patterns, inverses = frame_names(frames, bit_count(stripes))
-        names += patterns + inverses
     if projection.jitter_stripes <= 0:
-        return dict(zip(names, _steady_tables(stripes, projection), strict=False))
-    lit = _lit_stripes(stripes)[: len(names)]
-    strays = projection.jitter_stripes * rng.standard_normal((len(names), stripes + 1))
+        steady = _steady_tables(code, frames, projection)
+        return dict(steady if sequence else steady[:1])
+    lights = _lights(code, frames) if sequence else _lights(code, frames)[:1]
+    strays = projection.jitter_stripes * rng.standard_normal((len(lights), code.stripes + 1))
     blurs = _blurs(projection)
-    return {n: light_table(on, blurs, j) for n, on, j in zip(names, lit, strays, strict=True)}
+    return {
+        name: light_table(light, blurs, stray, len(light) // code.stripes)
+        for (name, light), stray in zip(lights, strays, strict=True)
+    }
 
 
 @lru_cache(maxsize=8)
-def _steady_tables(stripes: int, projection: Projection) -> tuple[LightTable, ...]:
-    """Of lit, the patterns and the inverses, when no boundary strays."""
-    return tuple(light_table(lit, _blurs(projection)) for lit in _lit_stripes(stripes))
+def _steady_tables(
+    code: ProjectorSpec, frames: FrameNames, projection: Projection
+) -> tuple[tuple[str, LightTable], ...]:
+    """Of lit and the code's images, when no boundary strays."""
+    blurs = _blurs(projection)
+    return tuple(
+        (name, light_table(light, blurs, parts=len(light) // code.stripes))
+        for name, light in _lights(code, frames)
+    )
 
 
-def _lit_stripes(stripes: int) -> NDArray[np.bool_]:
-    """(1 + 2 bits, stripes): which are on in lit, the patterns, the inverses."""
-    bits = code_bits(stripes)
-    return np.concatenate([np.ones((1, stripes), bool), bits, ~bits])
+def _lights(code: ProjectorSpec, frames: FrameNames) -> list[tuple[str, Array]]:
+    """Lit and the code's images: name, and light along the sweep."""
+    return [(frames.lit, np.ones(code.stripes)), *thrown(code, frames).items()]
 
 
 def _blurs(projection: Projection) -> Array:

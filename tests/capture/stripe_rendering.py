@@ -43,8 +43,41 @@ def checkered(size_px: float, black: float = 0.1, turned_deg: float = 20.0) -> F
     return albedo
 
 
-def render_sequence(
+def render_sequence(s_at: Field, *, stripes: int, **scene) -> Sequence:
+    """Gray code with inverses on the surface on which s is `s_at(u, v)`; see `render`."""
+    bits = gray_bits(np.arange(stripes))
+    lit, dark, coded, s = render(s_at, np.concatenate([bits, 1 - bits]), stripes=stripes, **scene)
+    patterns, inverses = np.split(coded, 2)
+    return Sequence(lit, dark, patterns, inverses, s)
+
+
+def gray_bits(words: np.ndarray) -> np.ndarray:
+    """(bits, N): the reflected binary code of words that count up to the last."""
+    bits = int(np.ceil(np.log2(words.max() + 1)))
+    return (words ^ (words >> 1)) >> np.arange(bits)[::-1, None] & 1
+
+
+def code_light(
+    code: str, stripes: int, *, inverses: bool = True, steps: int = 4, period: int = 8
+) -> np.ndarray:
+    """(images, 16 stripes): light of each image of a code, sixteen values a stripe."""
+    s = (np.arange(16 * stripes) + 0.5) / 16
+    if code == "light-section":
+        return (np.floor(s) == np.arange(stripes)[:, None]).astype(float)
+    if code == "binary":
+        bits = np.floor(s).astype(int) >> np.arange((stripes - 1).bit_length())[::-1, None] & 1
+    else:
+        bits = gray_bits(np.floor(s if code == "gray" else 2 * s / period).astype(int))
+    parts = [bits, 1 - bits] if inverses else [bits]
+    if code == "phase-shift":
+        turns = s / period - np.arange(steps)[:, None] / steps
+        parts.append(0.5 + 0.5 * np.cos(2 * np.pi * turns))
+    return np.concatenate(parts).astype(float)
+
+
+def render(
     s_at: Field,
+    lights: np.ndarray,
     *,
     stripes: int,
     shape: tuple[int, int] = (200, 260),
@@ -55,8 +88,12 @@ def render_sequence(
     light_blur_stripes: float = 0.25,
     noise: float = 1.0,
     seed: int = 0,
-) -> Sequence:
-    """Frames of the surface on which s is `s_at(u, v)`; NaN, or beyond the stripes: dark."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Lit, dark and coded frames of a surface on which s is `s_at(u, v)`, and s at pixel centres.
+
+    Where s is NaN, or beyond the stripes, it is dark. lights: (images, k stripes), the light of
+    each image at evenly spaced s.
+    """
     n = SUPERSAMPLING
     height, width = shape
     u, v = np.meshgrid(
@@ -65,35 +102,34 @@ def render_sequence(
     s, brightness = s_at(u, v), albedo(u, v)
     on = np.isfinite(s) & (s >= 0) & (s < stripes)
     rng = np.random.default_rng(seed)
+    background = np.where(np.isfinite(s), ambient, 0.0)
 
-    def frame(lit_stripes: np.ndarray) -> np.ndarray:
-        table = smeared(lit_stripes.astype(float), light_blur_stripes)
+    def frame(values: np.ndarray) -> np.ndarray:
+        table = smeared(values.astype(float), light_blur_stripes, len(values) // stripes)
         share = np.where(on, table(np.where(on, s, 0.0)), 0.0)
-        fine = (np.where(np.isfinite(s), ambient, 0.0) + light * share) * brightness
+        fine = (background + light * share) * brightness
         image = cv2.GaussianBlur(fine, (0, 0), lens_blur_px * n)
         image = image.reshape(height, n, width, n).mean(axis=(1, 3))
         image = image + rng.normal(0.0, noise, image.shape)
         return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
-    index = np.arange(stripes)
-    bits = int(np.ceil(np.log2(stripes)))
-    gray = index ^ (index >> 1)
-    on_in = [(gray >> (bits - 1 - bit)) & 1 == 1 for bit in range(bits)]
     uc, vc = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
     truth = s_at(uc, vc)
-    return Sequence(
-        lit=frame(np.ones(stripes)),
-        dark=frame(np.zeros(stripes)),
-        patterns=np.stack([frame(stripe_on) for stripe_on in on_in]),
-        inverses=np.stack([frame(~stripe_on) for stripe_on in on_in]),
-        s=np.where((truth >= 0) & (truth < stripes), truth, np.nan),
+    return (
+        frame(np.ones(stripes)),
+        frame(np.zeros(stripes)),
+        np.stack([frame(values) for values in lights]),
+        np.where((truth >= 0) & (truth < stripes), truth, np.nan),
     )
 
 
-def smeared(values: np.ndarray, blur: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Light against s: stripes smeared by a Gaussian of `blur` stripes; beyond the ends as there."""
+def smeared(values: np.ndarray, blur: float, parts: int = 1) -> Callable[[np.ndarray], np.ndarray]:
+    """Light against s, smeared by a Gaussian of `blur` stripes; beyond the ends as there.
+
+    values: of each stripe, or of each of its `parts`.
+    """
     fine = 64
-    padded = np.pad(values, 4, mode="edge").repeat(fine)
+    padded = np.pad(values, 4 * parts, mode="edge").repeat(fine // parts)
     if blur > 0:
         reach = int(4 * blur * fine) + 1
         kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / fine / blur) ** 2)

@@ -57,6 +57,36 @@ def test_missing_images_are_grouped_by_pair_and_shot(rig_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("code", "frames"),
+    [
+        ("code: gray, inverses: false", ["dark", "bit00", "bit01", "bit02", "bit03"]),
+        ("code: light-section", [f"stripe{stripe:03d}" for stripe in range(12)]),
+        ("code: stripe-index", ["index"]),
+        ("code: phase-shift, steps: 3, period: 6",
+         ["dark", *(f"bit0{b}{kind}" for kind in ("", "-inverse") for b in range(2)),
+          "phase00", "phase01", "phase02"]),
+    ],
+)  # fmt: skip
+def test_the_images_that_a_code_takes_are_known(
+    tmp_path: Path, code: str, frames: list[str]
+) -> None:
+    rig_path = write(tmp_path / "rig.yaml", RIG.replace("code: gray", code))
+    for shot in ("b1", "b2", "b3"):
+        write(image(rig_path, shot, "cam", "lit"), picture("lit"))
+        for pair, taken in (("p1", ["lit", *frames]), ("p2", FRAMES)):
+            for frame in taken:
+                write(image(rig_path, shot, pair, frame), picture("lit"))
+    assert check(rig_path).ok
+    image(rig_path, "b2", "p1", frames[-1]).rename(image(rig_path, "b2", "p1", "other"))
+    report = check(rig_path)
+    if len(frames) == 1:  # nothing of the code is left: then the lit image was taken alone
+        assert (report.pairs[0].stripe_shots, report.pairs[0].lit_shots) == (2, 1)
+        return
+    (bad,) = report.bad_images
+    assert (bad.pair, bad.shot, bad.path.stem, bad.what) == ("p1", "b2", frames[-1], "is missing")
+
+
+@pytest.mark.parametrize(
     ("content", "what"),
     [
         (b"", "is an empty file"),

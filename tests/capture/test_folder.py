@@ -55,8 +55,8 @@ def test_files_tell_what_each_pair_took(tmp_path: Path) -> None:
     assert sequence.has_stripes
     assert sequence.lit == folder / "lit.png"
     assert sequence.dark == folder / "dark.png"
-    assert sequence.patterns == tuple(folder / f"bit0{bit}.png" for bit in range(4))
-    assert sequence.inverses == tuple(folder / f"bit0{bit}-inverse.png" for bit in range(4))
+    names = [f"bit0{bit}{kind}.png" for kind in ("", "-inverse") for bit in range(4)]
+    assert sequence.coded == tuple(folder / name for name in names)
     assert sequence.missing == ()
     assert len(set(sequence.paths)) == len(FRAMES)
     camera = captures.sequence("cam", "b1")

@@ -95,6 +95,14 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
          "[1, 2, 3]}", "pairs[2].projector_nominal: needs a projector"),
         ("direction: h", "direction: diagonal-h", "must be 'horizontal' or 'vertical' (got diag"),
         ("stripes: 12", "stripes: 1", "pairs[0].projector.stripes: must be 2 or more (got 1)"),
+        ("code: gray", "code: grey", "8:23: pairs[0].projector.code: must be 'gray', 'binary', 'li"),
+        ("code: gray", "code: light-section, inverses: true", "inverses: is for codes with bits"),
+        ("code: gray", "code: gray, steps: 4", "projector.steps: is for code: phase-shift"),
+        ("code: gray", "code: phase-shift, steps: 2", "projector.steps: must be 3 or more (got 2)"),
+        ("code: gray", "code: phase-shift, period: 20", "period: must be 12 (stripes) or less (got"),
+        ("code: gray, stripes: 12", "code: stripe-index, stripes: 255", "must be 254 or less for s"),
+        ("version: 1", "version: 1\nframes: {stripe: line}", "frames.stripe: needs {stripe}, or"),
+        ("version: 1", "version: 1\nframes: {phase: '{bit}'}", "phase: may only hold {step}"),
         ("version: 1", "version: 2", "1:10: version: must be 1 (got 2)"),
         ("  - folder: captures", "  - folder: a\n  - folder: a/", "folder: is listed twice"),
         ("  - folder: captures", "  folder: captures", "calibration: must be a list (got a map"),
@@ -251,10 +259,34 @@ def test_bits_are_enough_for_the_stripes_and_not_one_too_many(stripes: int) -> N
     assert 2 ** (bits - 1) < stripes <= 2**bits
 
 
+def test_a_code_without_inverses_needs_a_dark_image(tmp_path: Path) -> None:
+    text = changed("code: gray", "code: gray, inverses: false") + "frames: {dark: null}\n"
+    (line,) = refused(tmp_path, text)
+    assert "frames.dark: is needed: pair p1 takes no inverses" in line
+
+
+@pytest.mark.parametrize(
+    ("code", "names"),
+    [
+        ({}, "bit00 bit01 bit02 bit00-inverse bit01-inverse bit02-inverse"),
+        ({"inverses": False}, "bit00 bit01 bit02"),
+        ({"code": "binary", "inverses": False}, "bit00 bit01 bit02"),
+        ({"code": "light-section"}, "stripe000 stripe001 stripe002 stripe003 stripe004"),
+        ({"code": "stripe-index"}, "index"),
+        # 5 stripes are 2.5 periods of 2, and so 5 half periods.
+        ({"code": "phase-shift", "steps": 3, "period": 2, "inverses": False},
+         "bit00 bit01 bit02 phase00 phase01 phase02"),
+    ],
+)  # fmt: skip
+def test_each_code_has_its_images(code: dict, names: str) -> None:
+    spec = ProjectorSpec.model_validate({**code, "stripes": 5, "direction": "vertical"})
+    assert FrameNames().of_code(spec) == tuple(names.split())
+
+
 def test_frame_names() -> None:
     names = FrameNames(inverse=("a", "b", "c"))
-    assert names.pattern_names(3) == ("bit00", "bit01", "bit02")
-    assert names.inverse_names(3) == ("a", "b", "c")
+    assert names.of_kind("pattern", 3) == ("bit00", "bit01", "bit02")
+    assert names.of_kind("inverse", 3) == ("a", "b", "c")
 
 
 @given(

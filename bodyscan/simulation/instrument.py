@@ -1,0 +1,36 @@
+"""An instrument that hands out one image of stripe numbers (the chapter's 4.1), not what it saw."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.capture.rig import FrameNames, ProjectorSpec
+from bodyscan.simulation.gray import bit_count, code_bits
+
+Image = NDArray[np.uint8]
+
+_LEAST_LIGHT = 12
+_NONE, _TOO_BRIGHT = 0, 255
+
+
+def handed_out(
+    images: dict[str, Image], spec: ProjectorSpec, frames: FrameNames
+) -> dict[str, Image]:
+    """The lit image and the stripe-index image, from what its camera saw of its Gray code.
+
+    images: by the names of `patterns.thrown`, with lit and a dark one named "".
+    """
+    lit, dark = images[frames.lit], images[""]
+    seen = [name for name in images if name not in (frames.lit, "")]
+    bits = bit_count(spec.stripes)
+    words = sum(
+        (images[pattern] > images[inverse]).astype(int) << (bits - 1 - bit)
+        for bit, (pattern, inverse) in enumerate(zip(seen[:bits], seen[bits:], strict=True))
+    )
+    number = np.zeros(2**bits, np.uint8)
+    number[(1 << np.arange(bits)[::-1]) @ code_bits(spec.stripes)] = np.arange(spec.stripes) + 1
+    index = number[words]
+    index[lit.astype(int) - dark < _LEAST_LIGHT] = _NONE
+    index[lit == _TOO_BRIGHT] = _TOO_BRIGHT
+    return {frames.lit: lit, frames.index: index}
