@@ -43,6 +43,18 @@ class HalvesComparison:
     over_expected: float
 
     @property
+    def summary(self) -> str:
+        """One line."""
+        shift, sigma = (
+            np.sqrt((values**2).sum(axis=1).mean()) for values in (self.shifts_mm, self.sigmas_mm)
+        )
+        return (
+            f"placed from either half of the shots, cameras differ by {shift:.3f} mm RMS "
+            f"({sigma:.3f} expected); all differences are {self.over_expected:.2f} times what is "
+            "expected"
+        )
+
+    @property
     def lines(self) -> list[str]:
         """A table as text, one line a pair."""
         said = ["pair: shift (expected) mm, turn (expected) degrees, between halves of the shots"]

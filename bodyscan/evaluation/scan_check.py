@@ -1,0 +1,125 @@
+"""What ordinary scans of people say of a rig: a pair that always has to be moved the same way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.calibration.rig_calibration import RigCalibration
+from bodyscan.capture.folder import Captures
+from bodyscan.fusion.cleaning import clean
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import Progress, silent
+from bodyscan.reconstruction.pairs import range_images
+from bodyscan.registration.alignment import BODY_CENTRE_MM, Alignment, align
+
+Array = NDArray[np.float64]
+
+FEWEST_SCANS = 3
+"""A person sways by as much as a pair may have moved: from so many scans on the two are told apart."""
+SIGMAS, LEAST_MM = 4.0, 0.3
+LEAST_SIGMA_MM = 0.05
+OVERLAP_MM = 0.5
+
+
+@dataclass(frozen=True)
+class PairDrift:
+    """shift: mean motion (3,) mm at the body's centre that its overlaps asked for, rig axes; sigma_mm
+    of it, from how much it varies from scan to scan; None with fewer than three scans."""
+
+    pair: str
+    shift: tuple[float, float, float]
+    sigma_mm: float | None
+
+    @property
+    def shift_mm(self) -> float:
+        return float(np.linalg.norm(self.shift))
+
+    @property
+    def moved(self) -> bool:
+        """The same motion in every scan, which no sway explains."""
+        return self.sigma_mm is not None and self.shift_mm > max(SIGMAS * self.sigma_mm, LEAST_MM)
+
+
+@dataclass(frozen=True, eq=False)
+class ScanCheck:
+    """before_mm, after_mm: of each scan, RMS of its overlaps, before and after the pairs were moved.
+
+    pairs: what the overlaps asked of each.  poles: likewise, of poles whose pairs moved alike.
+    """
+
+    before_mm: tuple[float, ...]
+    after_mm: tuple[float, ...]
+    pairs: tuple[PairDrift, ...]
+    poles: tuple[PairDrift, ...]
+
+    @property
+    def decided(self) -> bool:
+        """Whether there are scans enough to tell a move from sway."""
+        return len(self.before_mm) >= FEWEST_SCANS
+
+    @property
+    def quiet(self) -> bool:
+        """Whether nothing calls for an explanation, neither sway nor a move."""
+        still = all(drift.shift_mm < LEAST_MM for drift in self.pairs)
+        return still and max(self.before_mm) < OVERLAP_MM
+
+    @property
+    def valid(self) -> bool:
+        return not any(drift.moved for drift in (*self.pairs, *self.poles))
+
+
+def check_scans(
+    calibration: RigCalibration, scans: Sequence[Captures], progress: Progress = silent
+) -> ScanCheck:
+    """Raises ScanFailed if a scan shows nobody."""
+    alignments = []
+    for captures in scans:
+        images, _ = range_images(calibration, captures, progress)
+        cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
+        seen = [image for image in cleaned if image.valid.any()]
+        alignments.append(align(seen, calibration.rig_from_camera, calibration.covariance))
+    poles = {pair.name: pair.pole for pair in calibration.rig.pairs if pair.pole}
+    return judge_scans(alignments, calibration.rig_from_camera, poles)
+
+
+def judge_scans(
+    alignments: Sequence[Alignment],
+    rig_from_camera: Mapping[str, RigidTransform],
+    poles: Mapping[str, str],
+) -> ScanCheck:
+    """poles: of each pair that stands on one."""
+    shifts = {
+        name: np.array(
+            [
+                (found.rig_from_camera[name] @ at.inverse()).apply(BODY_CENTRE_MM) - BODY_CENTRE_MM
+                for found in alignments
+                if name in found.rig_from_camera
+            ]
+        ).reshape(-1, 3)
+        for name, at in rig_from_camera.items()
+    }
+    pairs = [_drift(name, own) for name, own in sorted(shifts.items()) if len(own)]
+    together = []
+    for pole in sorted(set(poles.values())):
+        own = [shifts[n] for n in sorted(shifts) if poles.get(n) == pole and len(shifts[n])]
+        if len(own) > 1 and len({len(one) for one in own}) == 1:
+            together.append(_drift(f"pole {pole}", np.mean(own, axis=0)))
+    return ScanCheck(
+        tuple(found.rms_before_mm for found in alignments),
+        tuple(found.rms_after_mm for found in alignments),
+        tuple(pairs),
+        tuple(together),
+    )
+
+
+def _drift(name: str, shifts: Array) -> PairDrift:
+    """shifts: (scans, 3) mm."""
+    x, y, z = (float(value) for value in shifts.mean(axis=0))
+    if len(shifts) < FEWEST_SCANS:
+        return PairDrift(name, (x, y, z), None)
+    varies = float(np.sqrt(shifts.var(axis=0, ddof=1).sum() / len(shifts)))
+    return PairDrift(name, (x, y, z), max(varies, LEAST_SIGMA_MM))

@@ -1,0 +1,276 @@
+"""Which pair or pole of a calibrated rig has moved since, told from boards that several pairs see.
+
+Every view of a board says where its camera stands to the board. Seen through the calibration, all
+views of one board must agree; pairs whose views do not, have moved. One pair or one whole pole
+after the other is let go, the one first that explains most, until all that is left fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.calibration.camera import projection_jacobians, twist_jacobian
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform, adjoint
+from bodyscan.registration.located_view import LocatedView
+from bodyscan.registration.uncertainty import PlacingCovariance, point_covariance
+from bodyscan.registration.view_graph import Target
+
+Array = NDArray[np.float64]
+Group = tuple[str, tuple[str, ...]]
+"""A name for people, and the pairs that move as one."""
+
+SIGNIFICANT = 45.0
+"""Chi-squared of six freedoms exceeded once in twenty million: nothing moves by chance."""
+LEAST_MM, LEAST_DEG = 0.1, 0.005
+"""Smaller moves, however surely seen, harm no scan."""
+ROUNDS = 4
+CORRELATED = 3.0
+"""Corners of one view share what lens and detector do to them: so many count as one."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPose:
+    """A board as one pair sees it: `camera_from_board`, with the covariance (6, 6) of its motion in
+    the camera frame (rotation vector in radians, translation in mm)."""
+
+    pair: str
+    target: Target
+    camera_from_board: RigidTransform
+    covariance: Array
+
+
+def seen_pose(view: LocatedView, camera: Camera, sigma_px: float) -> SeenPose:
+    """From a view's corners, each off by `sigma_px` and so many together (see CORRELATED)."""
+    points = view.camera_from_board.apply(view.points)
+    jacobian = projection_jacobians(camera, points)[1] @ twist_jacobian(points)
+    jacobian = jacobian.reshape(-1, 6)
+    information = jacobian.T @ jacobian / (CORRELATED * sigma_px**2)
+    covariance = np.linalg.inv(information)
+    return SeenPose(
+        view.pair, view.target, view.camera_from_board, np.asarray(covariance, np.float64)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """Pairs that moved together: one pair, or all of a pole.
+
+    motion: in the rig frame, `new rig_from_camera = motion @ old`.  covariance: (6, 6) of it.
+    shift_mm, sigma_mm: of the cameras' middle, and its standard deviation.  turn_deg: the rotation.
+    """
+
+    name: str
+    pairs: tuple[str, ...]
+    motion: RigidTransform
+    covariance: Array
+    shift_mm: float
+    sigma_mm: float
+    turn_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """moves: in the order found, the clearest first.  rig_from_board: of the boards used.
+
+    misfit: root mean square over the pairs of how far their views are off, in sigmas, after all
+    moves; `misfit_before`: without any.  lonely: pairs that share no board with another.
+    """
+
+    moves: tuple[Move, ...]
+    rig_from_board: dict[Target, RigidTransform]
+    misfit_before: float
+    misfit: float
+    lonely: tuple[str, ...]
+
+
+def find_drift(
+    poses: Sequence[SeenPose],
+    rig_from_camera: Mapping[str, RigidTransform],
+    prior: PlacingCovariance,
+    poles: Mapping[str, str],
+) -> Drift:
+    """poles: the pole of each pair that stands on one. Boards that one pair alone sees say nothing."""
+    shared = [pose for pose in poses if len({p.pair for p in poses if p.target == pose.target}) > 1]
+    pairs = tuple(sorted({pose.pair for pose in shared}))
+    lonely = tuple(sorted({pose.pair for pose in poses} - set(pairs)))
+    groups = _groups(pairs, poles)
+    state = _State.start(shared, pairs, rig_from_camera, prior)
+    fit = before = state.solved([])
+    moved: list[Group] = []
+    while True:
+        candidates = [
+            group
+            for group in groups
+            if group not in moved and not set(group[1]) & {p for _, own in moved for p in own}
+        ]
+        tried = [(state.solved([*moved, group]), group) for group in candidates]
+        if not tried:
+            break
+        best, group = min(tried, key=lambda one: one[0].cost)
+        if fit.cost - best.cost < SIGNIFICANT:
+            break
+        moved.append(group)
+        fit = best
+    moves = tuple(
+        move
+        for number, group in enumerate(moved)
+        if (move := state.move(group, fit, number)).shift_mm > LEAST_MM or move.turn_deg > LEAST_DEG
+    )
+    freedoms = max(6 * (len(shared) - len(fit.rig_from_board)), 1)
+    return Drift(
+        moves,
+        fit.rig_from_board,
+        float(np.sqrt(before.cost / freedoms)),
+        float(np.sqrt(fit.cost / freedoms)),
+        lonely,
+    )
+
+
+def _groups(pairs: Sequence[str], poles: Mapping[str, str]) -> list[Group]:
+    """Every pair, and every pole with several of them."""
+    groups: list[Group] = [(f"pair {name}", (name,)) for name in pairs]
+    for pole in sorted({poles[name] for name in pairs if name in poles}):
+        own = tuple(name for name in pairs if poles.get(name) == pole)
+        if 1 < len(own) < len(pairs):
+            groups.append((f"pole {pole}", own))
+    return groups
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """cost: chi-squared.  motions: of each group let go, covariance (6G, 6G) of their twists."""
+
+    cost: float
+    motions: list[RigidTransform]
+    covariance: Array
+    rig_from_board: dict[Target, RigidTransform]
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    poses: tuple[SeenPose, ...]
+    pairs: tuple[str, ...]
+    rig_from_camera: Mapping[str, RigidTransform]
+    prior: Array
+    start_boards: dict[Target, RigidTransform]
+
+    @staticmethod
+    def start(
+        poses: Sequence[SeenPose],
+        pairs: tuple[str, ...],
+        rig_from_camera: Mapping[str, RigidTransform],
+        prior: PlacingCovariance,
+    ) -> _State:
+        order = np.concatenate(
+            [np.zeros(0, int), *(6 * prior.names.index(name) + np.arange(6) for name in pairs)]
+        )
+        covariance = prior.matrix[np.ix_(order, order)]
+        # The pair that holds the rig frame has no covariance at all: it is known to a micron.
+        covariance = covariance + np.diag(np.tile([1e-6**2] * 3 + [1e-3**2] * 3, len(pairs)))
+        boards = {
+            target: _agreed([p for p in poses if p.target == target], rig_from_camera)
+            for target in sorted({pose.target for pose in poses})
+        }
+        return _State(tuple(poses), pairs, rig_from_camera, np.linalg.inv(covariance), boards)
+
+    def solved(self, groups: Sequence[Group]) -> _Fit:
+        """Small motions of all pairs as far as the calibration allows, of the groups without limit,
+        and of the boards; Gauss-Newton on twists in the rig frame."""
+        first_group = 6 * len(self.pairs)
+        first_board = first_group + 6 * len(groups)
+        boards = dict(self.start_boards)
+        motions = [RigidTransform.identity()] * len(groups)
+        small = np.zeros((len(self.pairs), 6))
+        for _ in range(ROUNDS):
+            normal, right, cost = self._equations(groups, small, motions, boards)
+            step = np.linalg.lstsq(normal, right, rcond=1e-14)[0].reshape(-1, 6)
+            small = small + step[: len(self.pairs)]
+            of_groups = step[len(self.pairs) : len(self.pairs) + len(groups)]
+            of_boards = step[len(self.pairs) + len(groups) :]
+            motions = [m.moved(twist) for m, twist in zip(motions, of_groups, strict=True)]
+            boards = {
+                target: board.moved(twist)
+                for (target, board), twist in zip(boards.items(), of_boards, strict=True)
+            }
+        own = slice(first_group, first_board)
+        covariance = np.linalg.pinv(normal, hermitian=True)[own, own]
+        return _Fit(cost, motions, np.asarray(covariance, np.float64), boards)
+
+    def _equations(
+        self,
+        groups: Sequence[Group],
+        small: Array,
+        motions: Sequence[RigidTransform],
+        boards: Mapping[Target, RigidTransform],
+    ) -> tuple[Array, Array, float]:
+        """Normal matrix, right side, and chi-squared before the step. Unknown twists: of the pairs,
+        of the groups, of the boards."""
+        pairs, targets = list(self.pairs), list(boards)
+        of_group = {name: g for g, (_, own) in enumerate(groups) for name in own}
+        size = 6 * (len(pairs) + len(groups) + len(targets))
+        held = small.ravel()
+        normal, right = np.zeros((size, size)), np.zeros(size)
+        normal[: held.size, : held.size] = self.prior
+        right[: held.size] = -self.prior @ held
+        cost = float(held @ self.prior @ held)
+        for pose in self.poses:
+            pair, group = pairs.index(pose.pair), of_group.get(pose.pair)
+            camera = self.rig_from_camera[pose.pair].moved(small[pair])
+            unknowns = [(pair, 1.0)]
+            if group is not None:
+                camera = motions[group] @ camera
+                unknowns.append((len(pairs) + group, 1.0))
+            unknowns.append((len(pairs) + len(groups) + targets.index(pose.target), -1.0))
+            twist, weight = _gap(pose, camera, boards[pose.target])
+            cost += float(twist @ weight @ twist)
+            for row, sign in unknowns:
+                right[6 * row : 6 * row + 6] -= sign * weight @ twist
+                for column, other in unknowns:
+                    block = np.s_[6 * row : 6 * row + 6, 6 * column : 6 * column + 6]
+                    normal[block] += sign * other * weight
+        return normal, right, cost
+
+    def move(self, group: Group, fit: _Fit, number: int) -> Move:
+        name, pairs = group
+        motion = fit.motions[number]
+        rows = slice(6 * number, 6 * number + 6)
+        covariance = fit.covariance[rows, rows]
+        middle = np.mean([self.rig_from_camera[pair].translation for pair in pairs], axis=0)
+        spread = point_covariance(covariance, middle)
+        return Move(
+            name,
+            pairs,
+            motion,
+            covariance,
+            float(np.linalg.norm(motion.apply(middle) - middle)),
+            float(np.sqrt(np.trace(spread))),
+            float(np.degrees(motion.angle)),
+        )
+
+
+def _gap(
+    pose: SeenPose, rig_from_camera: RigidTransform, rig_from_board: RigidTransform
+) -> tuple[Array, Array]:
+    """How far (twist in the rig frame) a view puts its board from where it is, and the weight."""
+    gap = rig_from_camera @ pose.camera_from_board @ rig_from_board.inverse()
+    carry = adjoint(rig_from_camera)
+    weight = np.linalg.inv(carry @ pose.covariance @ carry.T)
+    return np.concatenate([gap.rotation_vector, gap.translation]), np.asarray(weight, np.float64)
+
+
+def _agreed(
+    poses: Sequence[SeenPose], rig_from_camera: Mapping[str, RigidTransform]
+) -> RigidTransform:
+    """Where most views say that a board lies: the view from which the others differ least."""
+
+    def off(board: RigidTransform) -> float:
+        """Median distance of all views from a placing, in sigmas squared."""
+        gaps = (_gap(pose, rig_from_camera[pose.pair], board) for pose in poses)
+        return float(np.median([twist @ weight @ twist for twist, weight in gaps]))
+
+    return min((rig_from_camera[pose.pair] @ pose.camera_from_board for pose in poses), key=off)

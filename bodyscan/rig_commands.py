@@ -1,0 +1,96 @@
+"""The commands for a rig that is calibrated, and `reproduce`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add this module's commands to the command line."""
+    for command in (export_rig, sigma_map, check_calibration, reproduce):
+        app.command(command.__name__.replace("_", "-"))(command)
+
+
+def export_rig(
+    calibration: Annotated[Path, typer.Argument(help="What calibrate-rig wrote.")],
+    out: Annotated[Path, typer.Option(help="Folder to write into.")],
+    formats: Annotated[str, typer.Option("--format", help="Comma-separated.")] = "colmap,opencv",
+) -> None:
+    """Write a calibrated rig for other programs: a COLMAP model with rig, OpenCV's YAML."""
+    from bodyscan import console
+    from bodyscan.calibration.storage import load_calibration
+    from bodyscan.export.rig import export_rig as write
+
+    written = write(load_calibration(calibration), out, formats.split(","))
+    console.console.print("\n".join(map(str, written)))
+
+
+def sigma_map(
+    calibration: Annotated[Path, typer.Argument(help="What calibrate-rig wrote.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Default: `sigma-map.png` beside the calibration.")
+    ] = None,
+) -> None:
+    """Draw how well the rig's placing knows each place of the scan volume, front and side."""
+    from bodyscan import console
+    from bodyscan.calibration.storage import load_calibration
+    from bodyscan.report.sigma_map import draw_sigma_map
+
+    rig = load_calibration(calibration)
+    folder = calibration if calibration.is_dir() else calibration.parent
+    cameras = {name: pair.camera for name, pair in rig.pairs.items()}
+    path = out or folder / "sigma-map.png"
+    draw_sigma_map(rig.rig.volume, rig.rig_from_camera, cameras, rig.covariance, path)
+    console.console.print(f"picture: {path}")
+
+
+def check_calibration(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="FOLDER...", help="A board's shots, or scans of people.")
+    ],
+    calibration: Annotated[Path, typer.Option(help="What calibrate-rig wrote.")],
+    repair: Annotated[
+        Path | None,
+        typer.Option(help="Write a calibration with what moved put right into this folder."),
+    ] = None,
+) -> None:
+    """Say whether the rig still is what it was, and which pair or pole moved by how much."""
+    from bodyscan import console
+    from bodyscan.calibration.storage import load_calibration, save_calibration
+    from bodyscan.evaluation.still_valid import look_at
+
+    rig = load_calibration(calibration)
+    with console.stage_clock() as clock:
+        found = look_at(rig, folders, clock)
+    console.console.print("\n".join(found.lines), highlight=False)
+    console.console.print(console.times_table(clock.seconds))
+    if repair is not None:
+        console.console.print(f"repaired: {save_calibration(found.repaired(rig), repair)}")
+    raise typer.Exit(0 if found.valid else 1)
+
+
+def reproduce(
+    out: Annotated[Path, typer.Option(help="Folder for the text and the figures.")],
+    seed: Annotated[int, typer.Option(help="Of all noise.")] = 0,
+    real_light: Annotated[
+        bool, typer.Option("--real-light", help="A bowed board, speckle, jitter, a smile, defocus.")
+    ] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Coarser rendering and fewer shots.")
+    ] = False,
+) -> None:
+    """Simulate the chapter's own set-up: its Tables 1 and 2, its Fig. 6 and 7, and all rivals."""
+    from bodyscan import console
+    from bodyscan.evaluation.reproduce import FIGURES, TEXT
+    from bodyscan.evaluation.reproduce import reproduce as run
+
+    with console.stage_clock() as clock:
+        text = run(out, seed=seed, quick=quick, real_light=real_light, progress=clock)
+    # Tables are wider than most terminals: a line cut in two would be hard to read.
+    typer.echo(text)
+    console.console.print(console.times_table(clock.seconds))
+    files = ", ".join(str(out / name) for name in (TEXT, *FIGURES))
+    console.console.print(f"written: {files}", soft_wrap=True)
