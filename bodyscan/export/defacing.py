@@ -1,0 +1,170 @@
+"""A body without a recognisable face: the head above the neck is replaced, not smoothed.
+
+Smoothing leaves the triangles of the head as they were, and from how dense they lie what the face
+looked like can still be guessed.  So everything above the neck goes, and a plain ellipsoid of usual
+proportions, which knows of the head only how high it stood, is put on the neck.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.errors import FailedWork
+from bodyscan.export.neck import REACH_MM, Neck
+from bodyscan.fusion.body import BodyMesh
+from bodyscan.fusion.topology import (
+    directed_edges,
+    face_components,
+    vertex_normals,
+    without_unused,
+)
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+GREY = 150
+RINGS = 40
+# Of the height from neck to crown: half the head's length and breadth, where it is widest, and
+# where the neck's own shape ends.
+HALF_LENGTH, HALF_BREADTH, WIDEST, NECK_ENDS = 0.36, 0.28, 0.52, 0.45
+HARMONICS = 4  # of the neck's outline, which the head goes on from
+ROUNDED_MM = 10.0  # the head's height is kept no more exactly than this
+_MENDINGS = 50
+
+
+def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
+    """`mesh` with a plain grey head, whose vertices have no sigma and whose faces are `filled`.
+
+    Vertices and faces below the neck keep their order and every bit.  A closed mesh stays closed;
+    an open one (only what was measured) ends at the neck.  Raises FailedWork when nothing stands
+    above the neck, or its rim is no simple line.
+    """
+    head = _head_faces(mesh, neck)
+    closed = not len(_free_edges(mesh.faces))
+    if closed:
+        head = _with_simple_rim(mesh.faces, head)
+    crown_mm = float(mesh.vertices[mesh.faces[head]][..., 2].max())
+    crown_mm = neck.height_mm + ROUNDED_MM * round((crown_mm - neck.height_mm) / ROUNDED_MM)
+    vertices, faces, used = without_unused(mesh.vertices, mesh.faces[~head])
+    number_of = np.full(len(mesh.vertices), -1, np.int64)
+    number_of[used] = np.arange(len(used))
+    # What is free in the head runs the other way along what was kept.
+    rims = _loops(number_of[_free_edges(mesh.faces[head])[:, ::-1]]) if closed else []
+    all_vertices, all_faces = [vertices], [faces]
+    for number, rim in enumerate(sorted(rims, key=len, reverse=True)):
+        start = sum(map(len, all_vertices))
+        cap = vertices[rim].mean(axis=0)[None] if number else _dome(vertices[rim], crown_mm)
+        all_vertices.append(cap)
+        all_faces.append(_stitched(rim, start, len(cap)))
+    return _dressed(mesh, head, used, np.concatenate(all_vertices), np.concatenate(all_faces))
+
+
+def _dressed(
+    mesh: BodyMesh, head: NDArray[np.bool_], used: Indices, vertices: Array, faces: Indices
+) -> BodyMesh:
+    """What was kept as it was, what was added grey, filled and without sigma."""
+    added = len(vertices) - len(used)
+    filled = mesh.filled[~head]
+    return BodyMesh(
+        vertices,
+        faces,
+        np.concatenate([mesh.normals[used], vertex_normals(vertices, faces)[len(used) :]]),
+        np.concatenate([mesh.colours[used], np.full((added, 3), GREY, np.uint8)]),
+        np.concatenate([mesh.sigma_mm[used], np.full(added, np.nan, np.float32)]),
+        np.concatenate([filled, np.ones(len(faces) - len(filled), bool)]),
+    )
+
+
+def _head_faces(mesh: BodyMesh, neck: Neck) -> NDArray[np.bool_]:
+    """(F,) faces that reach above the neck, in pieces that come near the head's axis.
+
+    Hands held up beside the head are other pieces, and stay.
+    """
+    reaching = (mesh.vertices[mesh.faces][..., 2] > neck.height_mm).any(axis=1)
+    faces = mesh.faces[reaching]
+    if not len(faces):
+        raise FailedWork(f"nothing of the mesh stands above the neck, {neck.height_mm:.0f} mm")
+    pieces = face_components(faces, len(mesh.vertices))
+    away = np.linalg.norm(mesh.vertices[faces][..., :2] - neck.axis, axis=-1).min(axis=1)
+    nearest = np.full(pieces.max() + 1, np.inf)
+    np.minimum.at(nearest, pieces, away)
+    head = np.zeros(len(mesh.faces), bool)
+    head[reaching] = nearest[pieces] < REACH_MM / 2.0
+    return head
+
+
+def _with_simple_rim(faces: Indices, head: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Less of the head where its rim touches itself, until each point of the rim has one next."""
+    for _ in range(_MENDINGS):
+        points, times = np.unique(_free_edges(faces[head])[:, 0], return_counts=True)
+        if not (times > 1).any():
+            return head
+        head = head & ~np.isin(faces, points[times > 1]).any(axis=1)
+    raise FailedWork("the mesh cannot be cut at the neck", remedy="look at the mesh there")
+
+
+def _free_edges(faces: Indices) -> Indices:
+    """(E, 2) directed edges that no face runs along the other way."""
+    edges = directed_edges(faces)
+    count = int(faces.max(initial=-1)) + 1
+    twins = np.isin(edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0])
+    return edges[~twins]
+
+
+def _loops(edges: Indices) -> list[Indices]:
+    """Closed lines of vertices, each point of which has one next."""
+    following = dict(edges.tolist())
+    loops = []
+    while following:
+        start, after = following.popitem()
+        loop = [start]
+        while after != start:
+            loop.append(after)
+            after = following.pop(after)
+        loops.append(np.array(loop, np.int64))
+    return loops
+
+
+def _dome(rim: Array, crown_mm: float) -> Array:
+    """(RINGS * N + 1, 3): rings over a rim (N, 3), from its shape to an ellipsoid's, and the top."""
+    line = _smooth(rim)  # the rim itself zigzags from face to face
+    centre = line[:, :2].mean(axis=0)
+    arm, ahead = line[:, :2] - centre, np.roll(line, -1, axis=0)[:, :2] - line[:, :2]
+    turns = np.sign((arm[:, 0] * ahead[:, 1] - arm[:, 1] * ahead[:, 0]).sum())
+    angle = np.arctan2(arm[0, 1], arm[0, 0]) + turns * 2.0 * np.pi * np.arange(len(rim)) / len(rim)
+    height = crown_mm - float(rim[:, 2].mean())
+    ellipse = height * np.stack([HALF_LENGTH * np.cos(angle), HALF_BREADTH * np.sin(angle)], axis=1)
+    half = RINGS // 2
+    rising = np.sin(np.linspace(0.0, np.pi / 2.0, RINGS - half + 1))[:-1]
+    part = np.concatenate(
+        [WIDEST * np.arange(1, half + 1) / (half + 1), WIDEST + (1 - WIDEST) * rising]
+    )
+    up = np.clip(part / NECK_ENDS, 0.0, 1.0)
+    blend = (up * up * (3.0 - 2.0 * up))[:, None, None]
+    narrowing = np.sqrt(1.0 - (np.maximum(part - WIDEST, 0.0) / (1.0 - WIDEST)) ** 2)
+    flat = (1.0 - blend) * arm + blend * narrowing[:, None, None] * ellipse
+    z = (1.0 - part[:, None]) * line[:, 2] + part[:, None] * crown_mm
+    rings = np.concatenate([centre + flat, z[..., None]], axis=-1)
+    return np.concatenate([rings.reshape(-1, 3), [[*centre, crown_mm]]])
+
+
+def _smooth(line: Array) -> Array:
+    """A closed line (N, 3) by its first few harmonics."""
+    waves = np.fft.rfft(line, axis=0)
+    waves[HARMONICS + 1 :] = 0.0
+    return np.fft.irfft(waves, len(line), axis=0)
+
+
+def _stitched(rim: Indices, start: int, count: int) -> Indices:
+    """Faces over a rim (its vertices in the kept faces' sense): rings from `start`, then one top."""
+    size = len(rim)
+    rings = [rim, *(start + np.arange(count - 1)).reshape(-1, size)]
+    faces = []
+    for lower, upper in pairwise(rings):
+        low_next, up_next = np.roll(lower, -1), np.roll(upper, -1)
+        faces += [np.stack([low_next, lower, upper], 1), np.stack([low_next, upper, up_next], 1)]
+    top = np.full(size, start + count - 1)
+    return np.concatenate([*faces, np.stack([np.roll(rings[-1], -1), rings[-1], top], axis=1)])

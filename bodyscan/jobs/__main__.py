@@ -1,0 +1,7 @@
+"""The job's process: `python -m bodyscan.jobs FOLDER`; a batch starts it, nobody needs to type it."""
+
+import sys
+
+from bodyscan.jobs.working import main
+
+sys.exit(main())

@@ -1,0 +1,147 @@
+"""Many jobs: a lock on the output folder, jobs side by side, what is told, and how it ended."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from bodyscan.errors import BadInput, BodyscanError, FailedWork
+from bodyscan.jobs.job import BATCH_LOCK, STAGE, Job, write_job
+from bodyscan.jobs.locking import for_owner_only, locked
+from bodyscan.jobs.sharing import Shares
+from bodyscan.jobs.supervision import COMMAND, Listen, Outcome, deaf, supervise
+
+Run = Callable[[Sequence[Job]], Iterator[Outcome]]
+"""Starts jobs and yields how each ended, as soon as it did."""
+
+Work = Callable[..., Outcome]
+"""What is done with a Job: `supervised`, or on its copy from elsewhere (see object_storage)."""
+
+
+def supervised(job: Job, **how: Any) -> Outcome:
+    """Work on a job in its folder, see `supervise`."""
+    return supervise(str(job.folder), **how)
+
+
+def run_batch(jobs: Sequence[Job], out: Path, run: Run, listen: Listen = deaf) -> list[Outcome]:
+    """Bring every job up to date; outcomes in the order of the jobs.
+
+    A job that fails is set aside with its reason, the others go on.  Raises BadInput when another
+    batch works in `out`, or `out` cannot be written.
+    """
+    with for_owner_only():
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BadInput(f"cannot be written: {error.strerror}", where=str(out)) from error
+        with locked(out / BATCH_LOCK, wait=False):
+            _sweep(out)
+            listen({"event": "batch", "jobs": [job.name for job in jobs]})
+            outcomes: dict[str, Outcome] = {}
+            ready = []
+            for job in jobs:
+                try:
+                    write_job(job)
+                    ready.append(job)
+                except (BodyscanError, OSError) as error:
+                    outcomes[job.name] = Outcome(job.name, "set aside", reason=str(error))
+            for outcome in outcomes.values():
+                _tell(outcome, listen)
+            since = time.monotonic()
+            waiting = {job.name for job in ready if not (job.folder / job.until / STAGE).exists()}
+            for outcome in run(ready):
+                outcomes[outcome.job] = outcome
+                waiting.discard(outcome.job)
+                _tell(outcome, listen)
+                left = seconds_left(list(outcomes.values()), waiting, time.monotonic() - since)
+                ended = {"ended": len(outcomes), "jobs": len(jobs), "seconds_left": left}
+                listen({"event": "progress", **ended})
+    return [outcomes[job.name] for job in jobs]
+
+
+def seconds_left(
+    ended: Sequence[Outcome], waiting: Collection[str], spent_s: float
+) -> float | None:
+    """How long a batch will go on, from how long jobs took that had something to do.
+
+    waiting: jobs that have no result yet; others are found up to date in no time.  None: no job
+    has shown yet how long one takes.
+    """
+    took = [outcome.seconds for outcome in ended if outcome.state == "done" and outcome.stages]
+    if not waiting or not took:
+        return None if waiting else 0.0
+    at_once = max(1.0, sum(outcome.seconds for outcome in ended) / max(spent_s, 1e-3))
+    return round(len(waiting) * sum(took) / len(took) / at_once, 1)
+
+
+def here(
+    shares: Shares,
+    command: Sequence[str] = COMMAND,
+    listen: Listen = deaf,
+    work: Work = supervised,
+) -> Run:
+    """Runs jobs on this machine, `shares.workers` at a time."""
+
+    def run(jobs: Sequence[Job]) -> Iterator[Outcome]:
+        pool = ThreadPoolExecutor(shares.workers)
+        try:
+            futures = [
+                pool.submit(
+                    work,
+                    job,
+                    threads=shares.threads,
+                    limit_s=60.0 * job.pipeline.resources.limit_minutes,
+                    command=command,
+                    listen=listen,
+                )
+                for job in jobs
+            ]
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+    return run
+
+
+def _sweep(out: Path) -> None:
+    """Take away what a batch was writing when it was killed."""
+    for path in (*out.glob(".summary.*.tmp.csv"), *out.glob(".manifest.*.tmp.json")):
+        path.unlink(missing_ok=True)
+
+
+def _tell(outcome: Outcome, listen: Listen) -> None:
+    listen({"event": "job", **asdict(outcome)})
+
+
+def finish(jobs: Sequence[Job], outcomes: Sequence[Outcome], out: Path) -> dict[str, object]:
+    """Write the table and the manifest over all jobs; returns the event that ends a batch.
+
+    Raises FailedWork when they cannot be written.
+    """
+    from bodyscan.jobs.summary import to_repeat, write_out_manifest, write_summary
+
+    try:
+        with for_owner_only():
+            table = write_summary(jobs, outcomes, out)
+            write_out_manifest(out)
+    except OSError as error:
+        raise FailedWork(
+            f"the summary cannot be written: {error.strerror}",
+            where=str(out),
+            remedy="make room, then start the same batch again: what is done stays done",
+        ) from error
+    aside = [outcome.job for outcome in outcomes if outcome.state != "done"]
+    return {
+        "event": "summary",
+        "jobs": len(jobs),
+        "done": len(jobs) - len(aside),
+        "ran": sum(bool(outcome.stages) for outcome in outcomes),
+        "set_aside": aside,
+        "repeat": to_repeat([job for job in jobs if job.name not in aside]),
+        "table": str(table),
+    }

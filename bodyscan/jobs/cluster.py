@@ -1,0 +1,88 @@
+"""The same jobs on many machines: a dask.distributed cluster starts the job command on each worker.
+
+Scans and output lie in folders that all machines see under the same path, or in object storage.
+dask sends a job again when its worker is lost; the lost worker's process ends by itself, its
+half-made results are taken away, and a job that was already done is found done.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+
+from bodyscan.errors import BadInput, FailedWork
+from bodyscan.jobs.batch import Run, Work, supervised
+from bodyscan.jobs.job import Job
+from bodyscan.jobs.supervision import COMMAND, Listen, Outcome, deaf
+
+_TIMEOUT_S = 20
+
+
+def on_cluster(
+    address: str,
+    threads: int,
+    command: Sequence[str] = COMMAND,
+    listen: Listen = deaf,
+    work: Work = supervised,
+) -> Run:
+    """Runs jobs on the cluster whose scheduler listens at `address`, such as tcp://host:8786.
+
+    threads: of each job.  How many jobs run at once is the cluster's matter: one for each thread of
+    each worker (`dask worker --nthreads`).  Raises BadInput when dask.distributed is not installed,
+    FailedWork when nobody answers or there is no worker.
+    """
+    try:
+        from distributed import Client, as_completed
+    except ImportError:
+        raise BadInput(
+            "--cluster needs dask.distributed, which is not installed",
+            remedy="pip install 'bodyscan[cluster]' here and on every worker",
+        ) from None
+
+    def run(jobs: Sequence[Job]) -> Iterator[Outcome]:
+        try:
+            client = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
+            client.wait_for_workers(1, timeout=_TIMEOUT_S)
+        except (OSError, ValueError) as error:
+            raise FailedWork(
+                f"no dask scheduler with a worker answers ({error})",
+                where=address,
+                remedy="start one with `dask scheduler`, and `dask worker ADDRESS` on each machine",
+            ) from error
+        with client:
+            futures = {
+                client.submit(
+                    run_there,
+                    work,
+                    job,
+                    threads,
+                    60.0 * job.pipeline.resources.limit_minutes,
+                    tuple(command),
+                    pure=False,
+                ): job.name
+                for job in jobs
+            }
+            for future in futures:
+                listen({"event": "job", "job": futures[future], "state": "sent"})
+            for future in as_completed(futures, loop=client.loop):
+                lost = future.exception()
+                if lost is None:
+                    yield future.result()
+                else:
+                    yield Outcome(futures[future], "set aside", reason=f"on the cluster: {lost}")
+
+    return run
+
+
+def run_there(
+    work: Work, job: Job, threads: int, limit_s: float, command: Sequence[str]
+) -> Outcome:
+    """What a worker does with one job."""
+    os.umask(0o077)
+    if work is supervised and not job.folder.is_dir():
+        return Outcome(
+            job.name,
+            "set aside",
+            reason=f"{job.folder} is not there on this worker: share folders under one path",
+        )
+    return work(job, threads=threads, limit_s=limit_s, command=command)

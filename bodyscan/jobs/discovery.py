@@ -1,0 +1,92 @@
+"""Which jobs a folder of scans, or of rigs, holds."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from bodyscan.capture.captures_file import FILE_NAME as CAPTURES
+from bodyscan.capture.yaml_file import YamlError, read_yaml
+from bodyscan.errors import BadInput
+from bodyscan.jobs.job import Job, job_name
+from bodyscan.jobs.pipeline import Pipeline
+
+CALIBRATION = "calibration.json"
+RIG_FILE = "rig.yaml"
+
+
+def find_jobs(
+    pipeline: Pipeline, scans: Path, out: Path, calibration: Path | None, until: str
+) -> list[Job]:
+    """One job for every scan (or rig) in `scans`, sorted by name.
+
+    calibration: None for the nearest `calibration` folder: in `scans`, beside it or above it.
+    Raises BadInput when there is no scan, or no calibration for scans.
+    """
+    if not scans.is_dir():
+        raise BadInput("there is no such folder", where=str(scans), remedy="check --scans")
+    if pipeline.kind == "fuse":
+        sources, what = _scans(scans, out), "scan folder"
+        calibration = calibration or _nearest_calibration(scans)
+    else:
+        sources, what, calibration = _rigs(scans, out), f"folder with a {RIG_FILE}", None
+    if not sources:
+        raise BadInput(f"holds no {what}", where=str(scans), remedy="check --scans")
+    return [_job(path, pipeline, out, calibration, until) for path in sources]
+
+
+def _job(path: Path, pipeline: Pipeline, out: Path, calibration: Path | None, until: str) -> Job:
+    name, subject = job_name(path.name), _said(path).get("subject")
+    subject = subject if isinstance(subject, str) else None
+    return Job(name, out.absolute() / name, path, calibration, pipeline, until, subject)
+
+
+def _scans(scans: Path, out: Path) -> list[Path]:
+    """Every folder but hidden ones, results, and captures that say they are no scan.
+
+    A folder that cannot be read as a scan is still a job: it must be said that it failed.
+    """
+    if (scans / CAPTURES).exists():
+        return [scans.absolute()]
+    return [
+        path
+        for path in _folders(scans, out)
+        if not (path / CALIBRATION).exists() and _said(path).get("kind") != "calibration"
+    ]
+
+
+def _rigs(folder: Path, out: Path) -> list[Path]:
+    if (folder / RIG_FILE).exists():
+        return [folder.absolute()]
+    return [path for path in _folders(folder, out) if (path / RIG_FILE).exists()]
+
+
+def _folders(folder: Path, out: Path) -> list[Path]:
+    own = os.path.realpath(out)
+    return [
+        path
+        for path in sorted(folder.absolute().iterdir())
+        if path.is_dir() and not path.name.startswith(".") and os.path.realpath(path) != own
+    ]
+
+
+def _said(folder: Path) -> dict[str, Any]:
+    """What the folder's captures.yaml says, unchecked; nothing if it cannot be read."""
+    try:
+        data = read_yaml(folder / CAPTURES).data
+    except (YamlError, OSError, RecursionError):
+        return {}
+    return data if isinstance(data, dict) else {}
+
+
+def _nearest_calibration(scans: Path) -> Path:
+    absolute = scans.absolute()
+    for above in (absolute, *list(absolute.parents)[:2]):
+        if (above / "calibration" / CALIBRATION).exists():
+            return above / "calibration"
+    raise BadInput(
+        f"no calibration/{CALIBRATION} lies in this folder, beside it or above it",
+        where=str(scans),
+        remedy="name what `bodyscan calibrate-rig` wrote with --calibration",
+    )

@@ -1,0 +1,153 @@
+"""Every file of a subject in a workspace: found by what the files say, never by their names.
+
+A folder is a subject's when its captures.yaml, scan.json or job.json says so; with it goes all below
+it that is no other subject's.  Elsewhere an export is told by the JSON beside it.  Rows of summaries
+and entries of manifests that speak of the subject go too.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bodyscan.capture.captures_file import FILE_NAME as CAPTURES
+from bodyscan.capture.yaml_file import YamlError, read_yaml
+from bodyscan.errors import BadInput
+from bodyscan.files import write_text
+from bodyscan.jobs.job import BATCH_LOCK, JOB, MANIFEST, SUMMARY
+from bodyscan.jobs.locking import for_owner_only, locked
+from bodyscan.jobs.summary import write_out_manifest
+
+# Removed in this order, so that what says whose a folder is goes last: a removal that was
+# interrupted can be taken up again.
+_MARKERS = ("scan.json", JOB, CAPTURES)
+
+
+@dataclass(frozen=True)
+class Found:
+    """files: of the subject.  folders: of the subject alone.  tables: summaries and manifests of
+    batches, which are written anew.  unreadable: files that should say whose a folder is, and do not.
+    """
+
+    files: tuple[Path, ...]
+    folders: tuple[Path, ...]
+    tables: tuple[Path, ...]
+    unreadable: tuple[Path, ...]
+
+
+def find(subject: str, workspace: Path) -> Found:
+    """What `forget` would remove. Raises BadInput when the workspace is no folder."""
+    if not workspace.is_dir():
+        raise BadInput("there is no such folder", where=str(workspace), remedy="check --workspace")
+    files: list[Path] = []
+    folders: list[Path] = []
+    tables: list[Path] = []
+    unreadable: list[Path] = []
+    for folder, names, owner in _walk(workspace, None, unreadable):
+        own = set(names) if owner == subject else _exports(folder, names, subject)
+        files += (folder / name for name in own)
+        if owner == subject and folder != workspace:
+            folders.append(folder)
+        if BATCH_LOCK in names and owner is None:
+            tables.append(folder)
+    files.sort(key=lambda path: (_rank(path.name), path))
+    return Found(tuple(files), tuple(folders), tuple(tables), tuple(unreadable))
+
+
+def forget(subject: str, workspace: Path) -> Found:
+    """Remove every file of a subject in a workspace; links are removed, never followed.
+
+    Raises BadInput when there is nothing of that subject, or a batch is at work in the workspace.
+    """
+    with ExitStack() as locks:
+        locks.enter_context(for_owner_only())
+        found = find(subject, workspace)
+        for out in found.tables:
+            locks.enter_context(locked(out / BATCH_LOCK, wait=False))
+        rows = [out for out in found.tables if _without(subject, out / SUMMARY) is not None]
+        if not found.files and not rows:
+            raise BadInput(
+                f"holds nothing of subject {subject!r}",
+                where=str(workspace),
+                remedy="give the pseudonym as captures.yaml has it, and the --workspace",
+            )
+        for out in rows:
+            write_text(out / SUMMARY, _without(subject, out / SUMMARY) or "")
+        for path in found.files:
+            path.unlink(missing_ok=True)
+        for folder in sorted(found.folders, reverse=True):
+            with suppress(OSError):  # it holds something of another subject
+                folder.rmdir()
+        for out in found.tables:
+            if (out / MANIFEST).exists():
+                write_out_manifest(out)
+    return found
+
+
+def _walk(
+    folder: Path, owner: str | None, unreadable: list[Path]
+) -> Iterator[tuple[Path, list[str], str | None]]:
+    """Every folder with the names of its files (and links), and whose it is."""
+    with os.scandir(folder) as entries:
+        listed = sorted(entries, key=lambda entry: entry.name)
+    names = [entry.name for entry in listed if not entry.is_dir(follow_symlinks=False)]
+    for marker in _MARKERS:
+        if marker in names:
+            try:
+                owner = _subject(folder / marker) or owner
+            except (OSError, ValueError, YamlError, RecursionError):
+                unreadable.append(folder / marker)
+    yield folder, names, owner
+    for entry in listed:
+        if entry.is_dir(follow_symlinks=False):
+            yield from _walk(Path(entry.path), owner, unreadable)
+
+
+def _subject(path: Path) -> str | None:
+    """Whose a file says that its folder is."""
+    is_yaml = path.name == CAPTURES
+    content: Any = read_yaml(path).data if is_yaml else json.loads(path.read_text("utf-8"))
+    if not isinstance(content, dict):
+        raise ValueError("no mapping")
+    subject = content.get("subject")
+    return subject if isinstance(subject, str) else None
+
+
+def _exports(folder: Path, names: list[str], subject: str) -> set[str]:
+    """Exports of the subject in a folder that is nobody's or another's, with their JSON files."""
+    own: set[str] = set()
+    for name in names:
+        if name.endswith(".json") and name.removesuffix(".json") in names:
+            with suppress(OSError, ValueError):
+                if _subject(folder / name) == subject:
+                    own |= {name, name.removesuffix(".json")}
+    return own
+
+
+def _rank(name: str) -> int:
+    return _MARKERS.index(name) + 1 if name in _MARKERS else 0
+
+
+def _without(subject: str, summary: Path) -> str | None:
+    """The summary without the subject's rows; None if it has none."""
+    try:
+        text = summary.read_text("utf-8")
+    except OSError:
+        return None
+    reader = csv.DictReader(io.StringIO(text))
+    rows = list(reader)
+    kept = [row for row in rows if row.get("subject") != subject]
+    if len(kept) == len(rows):
+        return None
+    written = io.StringIO()
+    table = csv.DictWriter(written, reader.fieldnames or ())
+    table.writeheader()
+    table.writerows(kept)
+    return written.getvalue()

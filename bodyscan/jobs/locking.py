@@ -1,0 +1,50 @@
+"""A lock that goes when its process does, however it ends; and files for their owner alone."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from bodyscan.errors import BadInput
+
+
+@contextmanager
+def locked(path: Path, *, wait: bool) -> Iterator[None]:
+    """Hold the lock on `path` (flock: the kernel lets it go, also after `kill -9`).
+
+    wait: for whoever holds it; otherwise raises BadInput that says who does.
+    """
+    try:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+    except OSError as error:
+        raise BadInput(f"cannot be written: {error.strerror}", where=str(path)) from error
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            holder = os.pread(handle, 200, 0).decode("utf-8", "replace").strip() or "someone"
+            raise BadInput(
+                f"another batch is at work here ({holder})",
+                where=str(path.parent),
+                remedy="wait until it has ended, or give another --out",
+            ) from None
+        with suppress(OSError):  # who holds it is good to know, but a full disk is no obstacle
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def for_owner_only() -> Iterator[None]:
+    """Files made inside are readable by their owner alone (0600), folders too (0700)."""
+    before = os.umask(0o077)
+    try:
+        yield
+    finally:
+        os.umask(before)

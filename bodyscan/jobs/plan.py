@@ -1,0 +1,132 @@
+"""What has to be done again, and why: results are held against what they would be made from now."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bodyscan.errors import BodyscanError
+from bodyscan.jobs.hashing import file_hashes, files_below
+from bodyscan.jobs.job import STAGE, STATE, Job
+from bodyscan.jobs.stages import Stage
+
+SCHEMA, VERSION = "bodyscan-stage", 1
+_MOST_NAMED = 3
+
+
+@dataclass(frozen=True)
+class Origin:
+    """All that a stage's results depend on.  inputs: SHA-256 of every file it reads."""
+
+    stage: str
+    stage_version: int
+    settings: dict[str, Any]
+    inputs: dict[str, str]
+
+    def record(self, outputs: Mapping[str, str]) -> dict[str, Any]:
+        """What stage.json says: no time, no place, so that the same work gives the same bytes."""
+        return {
+            "schema": SCHEMA,
+            "version": VERSION,
+            "stage": self.stage,
+            "stage_version": self.stage_version,
+            "settings": self.settings,
+            "inputs": self.inputs,
+            "outputs": dict(outputs),
+        }
+
+
+@dataclass(frozen=True)
+class Step:
+    """A stage, and why it has to run; "" when its results are as they should be."""
+
+    stage: str
+    why: str
+
+
+def origin(job: Job, stage: Stage) -> Origin:
+    """Of a stage if it ran now. Raises BodyscanError or OSError when its inputs cannot be read."""
+    settings = {name: job.pipeline.section(name) for name in stage.sections}
+    return Origin(stage.name, stage.version, settings, file_hashes(stage.inputs(job)))
+
+
+def plan(job: Job, stages: Sequence[Stage]) -> list[Step]:
+    """What a batch would do now, stage by stage."""
+    steps: list[Step] = []
+    for stage in stages:
+        if steps and steps[-1].why:
+            steps.append(Step(stage.name, f"{steps[-1].stage} runs before it"))
+            continue
+        try:
+            why = why_run(job, origin(job, stage))
+        except (BodyscanError, OSError) as error:
+            why = f"its inputs cannot be used as they are: {error}"
+        steps.append(Step(stage.name, why))
+    return steps
+
+
+def why_run(job: Job, now: Origin) -> str:
+    """Why a stage has to run; "" when what lies there was made from just this, and is whole."""
+    folder = job.folder / now.stage
+    try:
+        record = json.loads((folder / STAGE).read_text("utf-8"))
+        version, settings = record["stage_version"], record["settings"]
+        inputs, outputs = dict(record["inputs"]), dict(record["outputs"])
+    except FileNotFoundError:
+        return _last_failure(job) or "there is no result yet"
+    except (OSError, ValueError, KeyError, TypeError):
+        return "what its last result was made from cannot be read"
+    if version != now.stage_version:
+        return f"version {now.stage_version} of the stage, it was {version}"
+    if said := _changes(_flat(settings), _flat(now.settings)):
+        return f"settings changed: {said}"
+    if said := _difference(inputs, now.inputs):
+        return f"inputs changed: {said}"
+    if said := _difference(outputs, result_hashes(folder)):
+        return f"its result was touched: {said}"
+    return ""
+
+
+def result_hashes(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file of a stage's folder but stage.json, by relative path."""
+    paths = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
+    paths.pop(STAGE, None)
+    return file_hashes(paths)
+
+
+def _difference(was: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """Which files changed, came or went, the first few by name."""
+    said = [
+        *(f"{name} has other content" for name in was if name in now and was[name] != now[name]),
+        *(f"{name} is new" for name in now if name not in was),
+        *(f"{name} is gone" for name in was if name not in now),
+    ]
+    more = [f"and {len(said) - _MOST_NAMED} more"] if len(said) > _MOST_NAMED else []
+    return ", ".join([*said[:_MOST_NAMED], *more])
+
+
+def _changes(was: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    return ", ".join(
+        f"{key} {json.dumps(was.get(key))} -> {json.dumps(now.get(key))}"
+        for key in sorted({*was, *now})
+        if was.get(key) != now.get(key)
+    )
+
+
+def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        f"{name}.{key}": value
+        for name, section in settings.items()
+        for key, value in section.items()
+    }
+
+
+def _last_failure(job: Job) -> str:
+    try:
+        state = json.loads((job.folder / STATE).read_text("utf-8"))
+        return f"it failed last time: {state['reason']}" if state.get("reason") else ""
+    except (OSError, ValueError, AttributeError):
+        return ""

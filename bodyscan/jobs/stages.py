@@ -1,0 +1,186 @@
+"""What is done to a scan, or to a rig: stages that read named files and write one folder each."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from bodyscan.capture.captures_file import FILE_NAME as CAPTURES
+from bodyscan.capture.folder import Captures, open_captures, open_scan
+from bodyscan.capture.rig import Rig
+from bodyscan.capture.rig_file import load_rig
+from bodyscan.errors import BadInput, CalibrationFileError, CaptureError
+from bodyscan.jobs.discovery import CALIBRATION, RIG_FILE
+from bodyscan.jobs.hashing import files_below
+from bodyscan.jobs.job import STAGE, Job
+from bodyscan.progress import Progress
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of a job; its results lie in the folder of its name.
+
+    version: raised whenever the same input would give other results than before.
+    sections: of the pipeline file that it obeys.  inputs: the files it reads, each under a name
+    that says what it is for.  run: writes its results into an empty folder.
+    """
+
+    name: str
+    version: int
+    sections: tuple[str, ...]
+    inputs: Callable[[Job], dict[str, Path]]
+    run: Callable[[Job, Path, Progress], None]
+
+
+Kinds = Mapping[str, tuple[Stage, ...]]
+
+
+def wanted(stages: tuple[Stage, ...], until: str) -> tuple[Stage, ...]:
+    """The stages to the one called `until`. Raises BadInput when there is none of that name."""
+    names = [stage.name for stage in stages]
+    if until not in names:
+        raise BadInput(f"there is no stage {until!r}", remedy=f"choose from {', '.join(names)}")
+    return stages[: names.index(until) + 1]
+
+
+def scan_inputs(job: Job) -> dict[str, Path]:
+    """The scan's images and captures.yaml, and the calibration."""
+    if job.source.is_symlink() and not job.source.resolve().is_relative_to(
+        job.source.parent.resolve()
+    ):
+        raise CaptureError(
+            f"is a symbolic link that leads out of the scans' folder, to {job.source.resolve()}",
+            where=str(job.source),
+            remedy="copy what it points to into the scans' folder",
+        )
+    calibration = _calibration(job)
+    files = _images(open_scan(_rig_of(calibration), job.source), job.source)
+    return files | {
+        f"calibration/{name}": calibration / name for name in (CALIBRATION, "calibration.npz")
+    }
+
+
+def run_scan(job: Job, out: Path, progress: Progress) -> None:
+    """As `bodyscan scan` does: cloud, mesh, what they are, pictures."""
+    from bodyscan.calibration.storage import calibration_id, load_calibration
+    from bodyscan.fusion.scan import ScanSettings, scan
+    from bodyscan.fusion.storage import save_scan
+    from bodyscan.registration.alignment import AlignmentSettings
+    from bodyscan.report.scan_pictures import draw_scan
+
+    align = job.pipeline.section("alignment")
+    fusion, mesh = job.pipeline.fusion, job.pipeline.mesh
+    settings = ScanSettings(
+        points=fusion.points,
+        alignment=None if align["matching"] == "none" else AlignmentSettings(**align),
+        window_mm=fusion.window_mm,
+        agreement_mm=fusion.agreement_mm,
+        double_mm=fusion.double_mm,
+        mesh_depth=mesh.depth,
+        mesh_reach_mm=mesh.reach_mm,
+    )
+    calibration = load_calibration(_calibration(job))
+    captures = open_scan(calibration.rig, job.source)
+    result = scan(calibration, captures, settings, progress)
+    save_scan(
+        result,
+        out,
+        calibration_id=calibration_id(_calibration(job)),
+        subject=captures.subject,
+        when=captures.when,
+    )
+    progress("drawing", 0, 1)
+    draw_scan(result, out)
+    progress("drawing", 1, 1)
+
+
+def run_export(job: Job, out: Path, progress: Progress) -> None:
+    """As `bodyscan export` does."""
+    from bodyscan.export.scan import export_scan
+    from bodyscan.fusion.storage import load_scan
+
+    settings = job.pipeline.export
+    progress("exporting", 0, 1)
+    scan = load_scan(job.folder / "scan")
+    export_scan(scan, out, settings.formats, settings.versions, deface=settings.deface)
+    progress("exporting", 1, 1)
+
+
+def rig_inputs(job: Job) -> dict[str, Path]:
+    """The rig file and the images of its calibration captures."""
+    rig_file = job.source / RIG_FILE
+    rig = load_rig(rig_file)
+    return {"rig.yaml": rig_file, **_images(open_captures(rig, rig_file), job.source)}
+
+
+def run_calibrate(job: Job, out: Path, progress: Progress) -> None:
+    """As `bodyscan calibrate-rig` does."""
+    from bodyscan.calibration.rig import calibrate_rig
+    from bodyscan.calibration.storage import save_calibration
+
+    rig_file = job.source / RIG_FILE
+    rig = load_rig(rig_file)
+    save_calibration(calibrate_rig(rig, open_captures(rig, rig_file), progress), out)
+
+
+def run_rig_export(job: Job, out: Path, progress: Progress) -> None:
+    """As `bodyscan export-rig` does."""
+    from bodyscan.calibration.storage import load_calibration
+    from bodyscan.export.rig import export_rig
+
+    progress("exporting", 0, 1)
+    formats = job.pipeline.rig_export.formats
+    export_rig(load_calibration(job.folder / "calibration"), out, formats)
+    progress("exporting", 1, 1)
+
+
+def results_of(stage: str) -> Callable[[Job], dict[str, Path]]:
+    """Inputs that are the results of an earlier stage."""
+
+    def inputs(job: Job) -> dict[str, Path]:
+        folder = job.folder / stage
+        paths = [path for path in files_below(folder) if path.name != STAGE]
+        return {f"{stage}/{path.relative_to(folder).as_posix()}": path for path in paths}
+
+    return inputs
+
+
+KINDS: Kinds = {
+    "fuse": (
+        Stage("scan", 1, ("alignment", "fusion", "mesh"), scan_inputs, run_scan),
+        Stage("export", 1, ("export",), results_of("scan"), run_export),
+    ),
+    "calibrate": (
+        Stage("calibration", 1, (), rig_inputs, run_calibrate),
+        Stage("rig", 1, ("rig_export",), results_of("calibration"), run_rig_export),
+    ),
+}
+
+
+def _calibration(job: Job) -> Path:
+    if job.calibration is None:
+        raise BadInput("the job names no calibration", where=str(job.folder))
+    return job.calibration if job.calibration.is_dir() else job.calibration.parent
+
+
+def _rig_of(calibration: Path) -> Rig:
+    """The rig file's content that a calibration keeps; its arrays are not loaded."""
+    path = calibration / CALIBRATION
+    try:
+        return Rig.model_validate(json.loads(path.read_text("utf-8"))["rig"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CalibrationFileError(
+            f"is not a readable calibration ({type(error).__name__})",
+            where=str(path),
+            remedy="restore the file from a copy, or calibrate again",
+        ) from error
+
+
+def _images(captures: Captures, base: Path) -> dict[str, Path]:
+    """Every image that is there, and the captures.yaml beside them, by path relative to `base`."""
+    paths = [p for s in captures.sequences for p in s.paths if p not in set(s.missing)]
+    paths += [f / CAPTURES for f in captures.folders if (f / CAPTURES).exists()]
+    return {f"captures/{Path(os.path.relpath(path, base)).as_posix()}": path for path in paths}

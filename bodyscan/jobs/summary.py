@@ -1,0 +1,182 @@
+"""The table over all jobs of a batch, and how far the rig drifted over the day."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.files import write_json, write_text
+from bodyscan.jobs.hashing import file_hash
+from bodyscan.jobs.job import MANIFEST, SUMMARY, Job
+from bodyscan.jobs.supervision import Outcome
+
+BODY_CENTRE_MM = np.array([0.0, 0.0, 900.0])
+NEIGHBOURS = 2  # scans before and after that tell drift from the sway of one person
+
+COLUMNS = {
+    "fuse": (
+        "verdict",
+        "verdict_reasons",
+        "points",
+        "faces",
+        "coverage_percent",
+        "sigma_mm",
+        "pairs_measured",
+        "pairs_failed",
+        "overlap_rms_before_mm",
+        "overlap_rms_after_mm",
+        "sway_mm",
+        "sway_pair",
+        "drift_mm",
+        "drift_pair",
+    ),
+    "calibrate": ("pairs", "pairs_failed", "corners_rms_px", "sheets_rms_mm"),
+}
+_FIRST = ("job", "subject", "when", "state", "attempts", "seconds", "stages")
+
+Motions = dict[str, NDArray[np.float64]]
+
+
+def write_summary(jobs: Sequence[Job], outcomes: Sequence[Outcome], out: Path) -> Path:
+    """Write summary.csv (one row a job, docs/formats.md says what each column is); its path."""
+    kind = jobs[0].pipeline.kind
+    rows = [_row(job, outcome) for job, outcome in zip(jobs, outcomes, strict=True)]
+    if kind == "fuse":
+        _add_drift(jobs, rows)
+    text = io.StringIO()
+    table = csv.DictWriter(text, (*_FIRST, *COLUMNS[kind], "reason"), extrasaction="ignore")
+    table.writeheader()
+    table.writerows(rows)
+    write_text(out / SUMMARY, text.getvalue().encode("utf-8", "backslashreplace").decode())
+    return out / SUMMARY
+
+
+def write_out_manifest(out: Path) -> None:
+    """The manifests of all jobs under one hash each, so that a job that vanished is missed."""
+    found = sorted(path for path in out.glob(f"*/{MANIFEST}") if not path.parent.is_symlink())
+    jobs = {path.parent.name: file_hash(path) for path in found}
+    write_json(out / MANIFEST, {"schema": "bodyscan-batch", "version": 1, "jobs": jobs})
+
+
+def to_repeat(jobs: Sequence[Job]) -> list[str]:
+    """Names of the jobs whose scan was fused, but is no good: its verdict is `repeat`."""
+    verdicts = {job.name: _read(job.folder / "scan" / "scan.json").get("verdict") for job in jobs}
+    return [name for name, verdict in verdicts.items() if verdict and verdict["grade"] == "repeat"]
+
+
+def _row(job: Job, outcome: Outcome) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "job": outcome.job,
+        "subject": job.subject,
+        "state": outcome.state,
+        "attempts": outcome.attempts,
+        "seconds": outcome.seconds,
+        "stages": " ".join(outcome.stages),
+        "reason": " ".join(outcome.reason.split()),
+    }
+    if outcome.state != "done":
+        return row
+    if job.pipeline.kind == "calibrate":
+        return row | _rig_figures(_read(job.folder / "calibration" / "calibration.json"))
+    return row | _scan_figures(_read(job.folder / "scan" / "scan.json"))
+
+
+def _scan_figures(facts: Mapping[str, Any]) -> dict[str, Any]:
+    if not facts:
+        return {}
+    counts, alignment = facts["counts"], facts["alignment"]
+    verdict = facts.get("verdict") or {}
+    figures = {
+        "verdict": verdict.get("grade"),
+        "verdict_reasons": "; ".join(verdict.get("reasons", ())),
+        "when": facts["when"],
+        "points": counts["points"],
+        "faces": counts["faces"],
+        "coverage_percent": _rounded(100.0 * (1.0 - counts["filled_faces"] / counts["faces"]), 2),
+        "sigma_mm": _rounded(facts["median_sigma_mm"]),
+        "pairs_measured": sum(points > 0 for points in facts["measured"].values()),
+        "pairs_failed": " ".join(sorted(facts["failed"])),
+    }
+    if alignment and alignment["motion_mm"]:
+        pair, motion = max(alignment["motion_mm"].items(), key=lambda item: item[1])
+        figures |= {
+            "overlap_rms_before_mm": _rounded(alignment["rms_before_mm"]),
+            "overlap_rms_after_mm": _rounded(alignment["rms_after_mm"]),
+            "sway_mm": _rounded(motion),
+            "sway_pair": pair,
+        }
+    return figures
+
+
+def _rig_figures(content: Mapping[str, Any]) -> dict[str, Any]:
+    if not content:
+        return {}
+    qualities = [pair["quality"] for pair in content["pairs"].values()]
+    sheets = [q["planes_rms_mm"] for q in qualities if q["planes_rms_mm"] is not None]
+    return {
+        "pairs": len(qualities),
+        "pairs_failed": " ".join(sorted(content["failed"])),
+        "corners_rms_px": _rounded(max(q["corners_rms_px"] for q in qualities)),
+        "sheets_rms_mm": _rounded(max(sheets)) if sheets else None,
+    }
+
+
+def _add_drift(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> None:
+    """Fill in drift_mm and drift_pair of the scans that have neighbours on the day.
+
+    A person's sway differs from scan to scan; what a pair's motion has in common over a scan and
+    its neighbours in time is the rig's: the median of each coordinate, longest over the pairs.
+    """
+    measured = [
+        (str(row.get("when") or ""), number, motions)
+        for number, (job, row) in enumerate(zip(jobs, rows, strict=True))
+        if row["state"] == "done" and (motions := _motions(job))
+    ]
+    measured.sort(key=lambda one: one[:2])
+    for place, (_, number, own) in enumerate(measured):
+        around = measured[max(0, place - NEIGHBOURS) : place + NEIGHBOURS + 1]
+        if len(around) < 3:
+            continue
+        drift = {
+            pair: float(np.linalg.norm(np.median([m[pair] for *_, m in around if pair in m], 0)))
+            for pair in own
+        }
+        pair = max(drift, key=lambda name: drift[name])
+        rows[number].update(drift_mm=_rounded(drift[pair]), drift_pair=pair)
+
+
+def _motions(job: Job) -> Motions:
+    """(3,) mm of every pair at the body's centre: from where the calibration put it to this scan."""
+    alignment = _read(job.folder / "scan" / "scan.json").get("alignment")
+    if not alignment or job.calibration is None:
+        return {}
+    calibrated = _read(job.calibration / "calibration.json").get("pairs", {})
+    return {
+        pair: _moved(matrix, calibrated[pair]["rig_from_camera"])
+        for pair, matrix in alignment["rig_from_camera"].items()
+        if pair in calibrated and pair not in alignment["refused"]
+    }
+
+
+def _moved(now: Any, calibrated: Any) -> NDArray[np.float64]:
+    change = np.asarray(now, float) @ np.linalg.inv(np.asarray(calibrated, float))
+    return np.asarray(change[:3, :3] @ BODY_CENTRE_MM + change[:3, 3] - BODY_CENTRE_MM)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _rounded(value: float | None, digits: int = 4) -> float | None:
+    return None if value is None else round(value, digits)

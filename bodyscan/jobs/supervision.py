@@ -1,0 +1,183 @@
+"""Starts a job's process, listens to it, tries once more, and then sets the job aside."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from bodyscan.files import write_json
+from bodyscan.jobs.job import LOG, STATE, printable
+
+Listen = Callable[[dict[str, Any]], None]
+
+ATTEMPTS = 2
+COMMAND = ("-m", "bodyscan.jobs")
+_LAST_LINES = 4000
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended.  state: done or set aside.  stages: those that ran; reason: of setting aside."""
+
+    job: str
+    state: str
+    attempts: int = 0
+    stages: tuple[str, ...] = ()
+    seconds: float = 0.0
+    reason: str = ""
+
+
+def deaf(event: dict[str, Any]) -> None:
+    """Whoever does not want to know."""
+
+
+def supervise(
+    folder: str,
+    *,
+    threads: int,
+    limit_s: float,
+    command: Sequence[str] = COMMAND,
+    listen: Listen = deaf,
+) -> Outcome:
+    """Run the job in `folder` in a process of its own, twice if need be.
+
+    command: what follows the name of this Python.  Never raises for what a job does.
+    """
+    path, since = Path(folder), time.monotonic()
+    stages: list[str] = []
+    reason = ""
+    for attempt in range(1, ATTEMPTS + 1):
+        listen({"event": "job", "job": path.name, "state": "running", "attempt": attempt})
+        _note(path, {"state": "running", "attempts": attempt, "reason": reason})
+        reason = _attempt(path, threads, limit_s, command, listen, stages)
+        if not reason:
+            break
+    outcome = Outcome(
+        path.name,
+        "set aside" if reason else "done",
+        attempt,
+        tuple(dict.fromkeys(stages)),
+        round(time.monotonic() - since, 1),
+        reason,
+    )
+    _note(path, asdict(outcome))
+    return outcome
+
+
+def _attempt(
+    folder: Path,
+    threads: int,
+    limit_s: float,
+    command: Sequence[str],
+    listen: Listen,
+    stages: list[str],
+) -> str:
+    """Why it failed; "" if it did not. Adds the stages that ran to `stages`."""
+    try:
+        log = _open_log(folder / LOG)
+    except OSError as error:
+        return f"its log cannot be written: {error.strerror}"
+    with log:
+        try:
+            process = subprocess.Popen(
+                [sys.executable, *command, str(folder)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env=_environment(threads),
+                start_new_session=True,
+            )
+        except OSError as error:
+            return f"its process cannot be started: {error.strerror}"
+        stuck = threading.Timer(limit_s, process.kill)
+        stuck.start()
+        try:
+            said = _listen_to(process, folder.name, listen, stages)
+            status = process.wait()
+        finally:
+            in_time = stuck.is_alive()
+            stuck.cancel()
+            if process.stdin:
+                process.stdin.close()
+    if status == 0:
+        return ""
+    if said:
+        return said
+    if not in_time:
+        return f"was stuck: it took longer than {limit_s / 60.0:g} minutes"
+    return _how_it_died(status, folder / LOG)
+
+
+def _listen_to(
+    process: subprocess.Popen[bytes], job: str, listen: Listen, stages: list[str]
+) -> str:
+    """Hands on what the process tells; returns the reason it gives for failing, if it gives one."""
+    reason = ""
+    assert process.stdout is not None
+    with process.stdout as stream:
+        for line in stream:
+            try:
+                told = json.loads(line)
+            except ValueError:
+                continue
+            if "failed" in told:
+                reason = printable(told["failed"])
+            if "why" in told:
+                stages.append(told["stage"])
+            if "stage" in told:
+                listen({"event": "stage", "job": job, **told})
+    return reason
+
+
+def _how_it_died(status: int, log: Path) -> str:
+    how = f"its process ended with {status}"
+    if status < 0:
+        with suppress(ValueError):
+            how = f"its process was ended by {signal.Signals(-status).name}"
+        if -status == signal.SIGKILL:
+            how += " (was memory short?)"
+    with suppress(OSError), log.open("rb") as stream:
+        stream.seek(max(0, stream.seek(0, os.SEEK_END) - _LAST_LINES))
+        lines = stream.read().decode("utf-8", "replace").split("\n")
+        last = next((line for line in reversed(lines) if line.strip()), "")
+        if last and not last.startswith(_HEADING):
+            how += f"; its last words: {printable(last)}"
+    return how
+
+
+_HEADING = "-- "
+
+
+def _open_log(path: Path) -> Any:
+    """To append to; never through a link, which might lead anywhere."""
+    handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+    stream = os.fdopen(handle, "ab", buffering=0)
+    with suppress(OSError):
+        stream.write(f"{_HEADING}{time.strftime('%Y-%m-%dT%H:%M:%S%z')}\n".encode())
+    return stream
+
+
+def _environment(threads: int) -> dict[str, str]:
+    """Threads of the libraries; BLAS gets one, stages share the rest out themselves."""
+    return os.environ | {
+        "OMP_NUM_THREADS": str(threads),
+        "OPENCV_FOR_THREADS_NUM": str(threads),
+        "OPENBLAS_NUM_THREADS": "1",
+        "MKL_NUM_THREADS": "1",
+    }
+
+
+def _note(folder: Path, state: dict[str, Any]) -> None:
+    """state.json is for people and --explain; a full disk must not end the batch for it."""
+    with suppress(OSError):
+        write_json(folder / STATE, state | {"when": time.strftime("%Y-%m-%dT%H:%M:%S%z")})

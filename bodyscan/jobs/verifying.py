@@ -1,0 +1,111 @@
+"""Every byte held against the manifests: images, calibration, cloud, mesh, exports."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bodyscan.errors import BadInput, BodyscanError
+from bodyscan.jobs.hashing import content_hash, file_hash, files_below
+from bodyscan.jobs.job import MANIFEST, Job, read_job
+from bodyscan.jobs.stages import KINDS, Kinds
+
+
+@dataclass(frozen=True)
+class Verified:
+    """files: how many were looked at.  faults: what is not as it was, one line each."""
+
+    files: int
+    faults: tuple[str, ...]
+
+
+def verify(folder: Path, kinds: Kinds = KINDS) -> Verified:
+    """Of a batch's output folder, or of one job's folder.
+
+    Raises BadInput when there is no manifest at all.
+    """
+    if not (folder / MANIFEST).exists():
+        raise BadInput(
+            f"holds no {MANIFEST}",
+            where=str(folder),
+            remedy="give the --out folder of a batch, or a job's folder in it",
+        )
+    files, faults = 0, []
+    for path, fault in _all(folder, kinds):
+        files += 1
+        if fault:
+            faults.append(f"{path}: {fault}")
+    return Verified(files, tuple(faults))
+
+
+def _all(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
+    content = _load(folder / MANIFEST)
+    jobs = content.get("jobs") if content else None
+    if not isinstance(jobs, dict):
+        yield from _job(folder, kinds)
+        return
+    for name, digest in sorted(jobs.items()):
+        yield _held(folder / name / MANIFEST, digest)
+        if (folder / name / MANIFEST).exists():
+            yield from _job(folder / name, kinds)
+    for path in sorted(folder.glob(f"*/{MANIFEST}")):
+        if path.parent.name not in jobs:
+            yield path, "is in no list of jobs"
+
+
+def _job(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
+    path = folder / MANIFEST
+    content = _load(path)
+    try:
+        own = content.pop("own_sha256")
+        inputs, outputs = dict(content["inputs"]), dict(content["outputs"])
+    except (KeyError, TypeError, ValueError, AttributeError):
+        yield path, "is no manifest"
+        return
+    yield path, "" if content_hash(content) == own else "was changed"
+    for name, digest in outputs.items():
+        yield _held(folder / name, digest)
+    for stage in {name.split("/")[0] for name in outputs}:
+        for found in files_below(folder / stage):
+            if found.relative_to(folder).as_posix() not in outputs:
+                yield found, "is new: no stage wrote it"
+    yield from _inputs(folder, inputs, kinds)
+
+
+def _inputs(folder: Path, inputs: Mapping[str, str], kinds: Kinds) -> Iterator[tuple[Path, str]]:
+    """What the job read, where it lies now."""
+    try:
+        job = read_job(folder)
+        there = _places(job, kinds)
+    except BodyscanError as error:
+        yield folder, f"its inputs cannot be looked at: {error}"
+        return
+    for name, digest in inputs.items():
+        yield _held(there.get(name) or job.source / name.removeprefix("captures/"), digest)
+    for name in there.keys() - inputs.keys():
+        yield there[name], "is new: the job did not read it"
+
+
+def _places(job: Job, kinds: Kinds) -> dict[str, Path]:
+    """Where the inputs from outside the job's folder lie now."""
+    first = kinds[job.pipeline.kind][0]
+    return first.inputs(job)
+
+
+def _held(path: Path, digest: str) -> tuple[Path, str]:
+    try:
+        return path, "" if file_hash(path) == digest else "was changed"
+    except FileNotFoundError:
+        return path, "is gone"
+    except (OSError, BodyscanError) as error:
+        return path, f"cannot be read: {error}"
+
+
+def _load(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,116 @@
+"""How a batch is shown: bars for people, a JSON object a line for other programs."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
+from rich.text import Text
+
+from bodyscan.jobs.supervision import Listen
+
+
+@contextmanager
+def json_lines() -> Iterator[Listen]:
+    """Every event as a line of JSON on standard output, with the time (seconds since 1970)."""
+    lock = threading.Lock()
+
+    def listen(event: dict[str, Any]) -> None:
+        # A reader that has gone away is no reason to stop.
+        with lock, suppress(BrokenPipeError):
+            sys.stdout.write(json.dumps({"time": round(time.time(), 3), **event}) + "\n")
+            sys.stdout.flush()
+
+    yield listen
+
+
+@contextmanager
+def screen() -> Iterator[Listen]:
+    """One bar for all jobs with the time left, a line for each that runs, one for each that ended."""
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=20),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[more]}", markup=False),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+        yield _Screen(bars)
+
+
+class _Screen:
+    """Draws events; they come from several threads."""
+
+    def __init__(self, bars: Progress) -> None:
+        self._bars = bars
+        self._lock = threading.Lock()
+        self._running: dict[str, TaskID] = {}
+        self._all: TaskID | None = None
+
+    def __call__(self, event: dict[str, Any]) -> None:
+        with self._lock:
+            getattr(self, f"_{event['event']}")(event)
+
+    def _batch(self, event: dict[str, Any]) -> None:
+        self._all = self._bars.add_task("all jobs", total=len(event["jobs"]), more="")
+
+    def _shares(self, event: dict[str, Any]) -> None:
+        jobs = "job" if event["workers"] == 1 else "jobs"
+        said = f"{event['workers']} {jobs} at a time, {event['threads']} threads each"
+        self._bars.console.print(Text(f"{said} ({event['why']})", style="dim"), soft_wrap=True)
+
+    def _summary(self, event: dict[str, Any]) -> None:
+        aside = len(event["set_aside"])
+        said = f"{event['done']} of {event['jobs']} jobs done ({event['ran']} of them now)"
+        said += f", {aside} set aside" if aside else ""
+        said += f"\nto be scanned again: {', '.join(event['repeat'])}" if event["repeat"] else ""
+        self._bars.console.print(Text(f"{said}\ntable: {event['table']}"), soft_wrap=True)
+
+    def _progress(self, event: dict[str, Any]) -> None:
+        if self._all is not None:
+            more = f"about {_duration(event['seconds_left'])} left" if event["seconds_left"] else ""
+            self._bars.update(self._all, completed=event["ended"], more=more)
+
+    def _job(self, event: dict[str, Any]) -> None:
+        job, state = event["job"], event["state"]
+        if state in ("running", "sent"):
+            more = f"attempt {event['attempt']}" if event.get("attempt", 1) > 1 else ""
+            if job not in self._running:
+                self._running[job] = self._bars.add_task(job, total=None, more=more)
+            self._bars.update(self._running[job], more=more)
+            return
+        if job in self._running:
+            self._bars.remove_task(self._running.pop(job))
+        style = "" if state == "done" else "red"
+        self._bars.console.print(Text(ending(event), style=style), soft_wrap=True)
+
+    def _stage(self, event: dict[str, Any]) -> None:
+        if event["job"] in self._running:
+            self._bars.update(
+                self._running[event["job"]],
+                description=f"{event['job']}: {event.get('part', event['stage'])}",
+                completed=event.get("done", 0),
+                total=event.get("total"),
+            )
+
+
+def ending(event: dict[str, Any]) -> str:
+    """How a job ended, in a line (or more, when it was set aside)."""
+    if event["state"] != "done":
+        tries = f" after {event['attempts']} attempts" if event["attempts"] else ""
+        return f"{event['job']}: set aside{tries}: {event['reason']}"
+    if not event["stages"]:
+        return f"{event['job']}: up to date"
+    return f"{event['job']}: {', '.join(event['stages'])} in {_duration(event['seconds'])}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

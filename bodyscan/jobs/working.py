@@ -1,0 +1,200 @@
+"""The job's own process: works through the stages, so that a crash in native code costs one job.
+
+Results are made in a folder of another name, flushed to disk, and renamed: whatever has its right
+name is whole. The process tells its parent how far it is on its standard output, a JSON object a
+line, and ends as soon as its parent is gone.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import secrets
+import shutil
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from bodyscan.errors import BodyscanError, CaptureError
+from bodyscan.files import json_text, write_json
+from bodyscan.jobs.hashing import content_hash, file_hash, file_hashes, files_below
+from bodyscan.jobs.job import LOCK, MANIFEST, STAGE, Job, read_job
+from bodyscan.jobs.locking import for_owner_only, locked
+from bodyscan.jobs.plan import Origin, origin, result_hashes, why_run
+from bodyscan.jobs.stages import KINDS, Kinds, Stage, wanted
+
+Tell = Callable[..., None]
+
+SCHEMA, VERSION = "bodyscan-manifest", 1
+_BEING_MADE, _TAKEN_AWAY = ".making-", ".old-"
+
+
+def main(kinds: Kinds = KINDS) -> int:
+    """Work on the job of the folder on the command line; 0: done, 2: bad input, 1: failed."""
+    tell = _take_over_output()
+    _end_with_parent()
+    _be_the_first_to_go()
+    try:
+        with for_owner_only():
+            work(Path(sys.argv[1]), kinds, tell)
+    except BodyscanError as error:
+        tell(failed=str(error))
+        return error.exit_code
+    except Exception as error:
+        full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+        named = str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        tell(failed="the disk is full: make room, then start again" if full else named)
+        with suppress(OSError):  # the log lies on that same disk
+            traceback.print_exc()
+        return 1
+    return 0
+
+
+def work(folder: Path, kinds: Kinds, tell: Tell) -> None:
+    """Bring a job's results up to date. Whoever else works on it is waited for."""
+    with locked(folder / LOCK, wait=True):
+        _tidy(folder)
+        job = read_job(folder)
+        every = kinds[job.pipeline.kind]
+        stages = wanted(every, job.until)
+        for stage in stages:
+            now = origin(job, stage)
+            if why := why_run(job, now):
+                tell(stage=stage.name, why=why)
+                _perform(job, stage, now, tell)
+        for stage in every[len(stages) :]:
+            _drop_if_stale(job, stage)
+        _write_manifest(job, every)
+
+
+def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
+    """Run a stage and put its results in place, if what it read stayed as it was."""
+    made = job.folder / f"{_BEING_MADE}{stage.name}-{secrets.token_hex(4)}"
+    made.mkdir()
+
+    def progress(part: str, done: int, total: int) -> None:
+        tell(stage=stage.name, part=part, done=done, total=total)
+
+    try:
+        stage.run(job, made, progress)
+        if file_hashes(stage.inputs(job)) != before.inputs:
+            raise CaptureError(
+                "changed while it was read",
+                where=str(job.source),
+                remedy="start the batch again when the folder is complete",
+            )
+        write_json(made / STAGE, before.record(result_hashes(made)))
+        _flush(made)
+    except BaseException:
+        shutil.rmtree(made, ignore_errors=True)
+        raise
+    _put_in_place(made, job.folder / stage.name)
+
+
+def _put_in_place(made: Path, place: Path) -> None:
+    """Rename; a folder cannot be put over another in one step, so the old one steps aside first."""
+    old = place.with_name(f"{_TAKEN_AWAY}{place.name}-{secrets.token_hex(4)}")
+    with suppress(FileNotFoundError):
+        place.rename(old)
+    made.rename(place)
+    _flush_one(place.parent)
+    _remove(old)
+
+
+def _drop_if_stale(job: Job, stage: Stage) -> None:
+    """Results of a later stage that belong to other results than now lie before it go."""
+    folder = job.folder / stage.name
+    with suppress(BodyscanError, OSError):
+        if folder.exists() and why_run(job, origin(job, stage)):
+            _remove(folder)
+
+
+def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
+    """One file that ties inputs and results together; it holds its own hash too.
+
+    Results go by their path in the job's folder; what is read from outside by what it is for.
+    """
+    inputs: dict[str, str] = {}
+    outputs: dict[str, str] = {}
+    for stage in stages:
+        path = job.folder / stage.name / STAGE
+        if path.exists():
+            record = json.loads(path.read_text("utf-8"))
+            inputs |= record["inputs"]
+            outputs |= {f"{stage.name}/{name}": h for name, h in record["outputs"].items()}
+            outputs[f"{stage.name}/{STAGE}"] = file_hash(path)
+    inputs = {name: value for name, value in inputs.items() if name not in outputs}
+    content: dict[str, Any] = {
+        "schema": SCHEMA,
+        "version": VERSION,
+        "inputs": inputs,
+        "outputs": outputs,
+    }
+    content["own_sha256"] = content_hash(content)
+    path = job.folder / MANIFEST
+    if not path.exists() or path.read_text("utf-8") != json_text(content):
+        write_json(path, content)
+
+
+def _tidy(folder: Path) -> None:
+    """Take away what was being made when an earlier process was killed."""
+    for path in folder.iterdir():
+        if path.name.startswith((_BEING_MADE, _TAKEN_AWAY)) or path.name.endswith(".tmp.json"):
+            _remove(path)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _flush(folder: Path) -> None:
+    """To the disk, before a name says that it is there."""
+    for path in files_below(folder):
+        _flush_one(path)
+    _flush_one(folder)
+
+
+def _flush_one(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _take_over_output() -> Tell:
+    """Standard output becomes the parent's alone; what libraries print there goes into the log."""
+    stream = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
+    os.dup2(2, 1)
+    lock = threading.Lock()
+
+    def tell(**what: Any) -> None:
+        with lock:
+            stream.write(json.dumps(what) + "\n")
+
+    return tell
+
+
+def _end_with_parent() -> None:
+    """The parent holds the other end of standard input open, and says nothing on it."""
+
+    def watch() -> None:
+        while os.read(0, 1024):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _be_the_first_to_go() -> None:
+    """When memory runs out, Linux should end a job, which is tried again, not the batch."""
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("900")

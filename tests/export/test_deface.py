@@ -1,0 +1,161 @@
+"""A shared export has no face; below the neck it is the same, bit for bit."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from bodyscan.errors import FailedWork
+from bodyscan.export.defacing import GREY, deface
+from bodyscan.export.neck import Neck, find_neck
+from bodyscan.export.ply import read_ply_mesh
+from bodyscan.export.scan import export_scan
+from bodyscan.fusion.body import BodyCloud, BodyMesh
+from bodyscan.fusion.storage import StoredScan
+from bodyscan.fusion.topology import topology, vertex_normals
+from bodyscan.fusion.versions import measured_only
+
+SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
+
+
+@pytest.fixture(scope="module")
+def body():
+    """The free subject in the rig frame, 1633 mm tall; soles and a patch of the face not measured."""
+    read = o3d.io.read_triangle_mesh(str(SUBJECT))
+    vertices = np.asarray(read.vertices) * 1000.0 @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
+    faces = np.asarray(read.triangles).astype(np.int64)
+    rng = np.random.default_rng(3)
+    sigma_mm = rng.uniform(0.01, 0.1, len(vertices)).astype(np.float32)
+    sigma_mm[(vertices[:, 2] < 10.0) | (np.abs(vertices[:, 2] - 1550.0) < 15.0)] = np.nan
+    return BodyMesh(
+        vertices,
+        faces,
+        vertex_normals(vertices, faces),
+        rng.integers(0, 256, vertices.shape).astype(np.uint8),
+        sigma_mm,
+        np.isnan(sigma_mm)[faces].any(axis=1),
+    )
+
+
+@pytest.fixture(scope="module")
+def neck(body):
+    return find_neck(body.vertices, body.faces)
+
+
+def records(mesh):
+    """Every vertex with all that it carries, as bytes."""
+    parts = (mesh.vertices, mesh.normals, mesh.colours, mesh.sigma_mm)
+    return [b"".join(part[k].tobytes() for part in parts) for k in range(len(mesh.vertices))]
+
+
+def below(mesh, height):
+    """Records of the three corners of every face that lies below a height, in order."""
+    every = records(mesh)
+    faces = mesh.faces[(mesh.vertices[mesh.faces][..., 2] <= height).all(axis=1)]
+    return [tuple(every[corner] for corner in face) for face in faces]
+
+
+def test_the_neck_is_between_chin_and_shoulders(body, neck):
+    """Looked up on the subject: the chin's underside is near 1420 mm, the shoulders near 1350."""
+    assert 1370.0 < neck.height_mm < 1425.0
+    assert np.linalg.norm(neck.axis - np.median(body.vertices[:, :2], axis=0)) < 60.0
+
+
+def test_below_the_neck_every_bit_stays_and_above_nothing_does(body, neck):
+    shared = deface(body, neck)
+    kept = below(body, neck.height_mm)
+    assert below(shared, neck.height_mm)[: len(kept)] == kept
+    above = shared.vertices[:, 2] > neck.height_mm
+    assert not set(np.array(records(shared), object)[above]) & set(records(body))
+    assert np.all(shared.colours[above] == GREY)
+    assert np.all(np.isnan(shared.sigma_mm[above]))
+    shape = topology(shared.vertices, shared.faces)
+    assert shape.closed
+    assert shape.manifold
+    assert shape.components == 1
+    assert shape.volume_mm3 > 0
+
+
+def test_two_faces_give_one_head(body, neck):
+    """Whoever the subject is, the head is the same: nothing of the face is left in it."""
+    other = body.vertices.copy()
+    face = (other[:, 2] > 1430.0) & (other[:, 0] > 60.0) & (np.abs(other[:, 1]) < 60.0)
+    other[face, 0] += 15.0 * np.sin(other[face, 2] / 20.0)
+    assert np.abs(other - body.vertices).max() > 10.0
+    changed = BodyMesh(other, body.faces, body.normals, body.colours, body.sigma_mm, body.filled)
+    np.testing.assert_array_equal(deface(changed, neck).vertices, deface(body, neck).vertices)
+
+
+def test_the_head_is_smooth_and_faces_outwards(body, neck):
+    shared = deface(body, neck)
+    corners = shared.vertices[shared.faces]
+    head = (corners[..., 2] > neck.height_mm + 20.0).all(axis=1)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[head]
+    middles = corners[head].mean(axis=1)
+    outwards = middles - [*middles[:, :2].mean(axis=0), neck.height_mm + 100.0]
+    assert np.all(np.einsum("fc,fc->f", normals, outwards) > 0)
+
+
+def test_raised_hands_stay(body, neck):
+    """A pillar beside the head, a separate piece above the neck, keeps every bit."""
+    box = o3d.geometry.TriangleMesh.create_box(40.0, 40.0, 900.0)
+    box.translate([0.0, 250.0, 900.0])
+    more = np.asarray(box.triangles).astype(np.int64) + len(body.vertices)
+    size = len(np.asarray(box.vertices))
+    both = BodyMesh(
+        np.concatenate([body.vertices, np.asarray(box.vertices)]),
+        np.concatenate([body.faces, more]),
+        np.concatenate([body.normals, np.ones((size, 3), np.float32)]),
+        np.concatenate([body.colours, np.full((size, 3), 7, np.uint8)]),
+        np.concatenate([body.sigma_mm, np.full(size, 0.5, np.float32)]),
+        np.concatenate([body.filled, np.zeros(len(more), bool)]),
+    )
+    found = find_neck(both.vertices, both.faces)
+    assert found.height_mm == neck.height_mm
+    assert set(records(both)[-size:]) <= set(records(deface(both, found)))
+
+
+def test_an_open_mesh_ends_at_the_neck(body, neck):
+    shared = deface(measured_only(body), neck)
+    assert shared.vertices[:, 2].max() <= neck.height_mm
+    assert below(shared, neck.height_mm) == below(measured_only(body), neck.height_mm)
+
+
+def test_arms_overhead_are_refused_and_not_taken_for_a_neck(body):
+    """Two cylinders of a forearm's girth over the head: their narrowest is no neck."""
+    parts = [(body.vertices, body.faces)]
+    for side in (-60.0, 60.0):
+        arm = o3d.geometry.TriangleMesh.create_cylinder(35.0, 700.0, 30, 60).translate(
+            [0.0, side, 1900.0]
+        )
+        shape = np.asarray(arm.vertices)
+        shape[:, 0] *= 1.0 + 0.3 * np.abs(shape[:, 2] - 1950.0) / 350.0
+        parts.append((shape, np.asarray(arm.triangles).astype(np.int64)))
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    faces = [faces + start for (_, faces), start in zip(parts, starts, strict=False)]
+    with pytest.raises(FailedWork, match="no neck"):
+        find_neck(np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces))
+
+
+def test_no_neck_no_export(body):
+    ball = o3d.geometry.TriangleMesh.create_sphere(500.0, 40)
+    with pytest.raises(FailedWork, match="no neck"):
+        find_neck(np.asarray(ball.vertices), np.asarray(ball.triangles).astype(np.int64))
+    with pytest.raises(FailedWork, match="nothing of the mesh"):
+        deface(body, Neck(3000.0, np.zeros(2)))
+
+
+def test_exports_say_so(body, tmp_path):
+    empty = BodyCloud(*(np.zeros((0, 3)) for _ in range(2)), *(np.zeros(0) for _ in range(3)))
+    scan = StoredScan(empty, body, {"subject": "s", "calibration_id": "c"})
+    export_scan(scan, tmp_path, ["ply"], ["full", "light", "open"], deface=True)
+    for name in ("body", "body-light", "body-open"):
+        assert json.loads((tmp_path / f"{name}.ply.json").read_text())["defaced"] is True
+        mesh = read_ply_mesh(tmp_path / f"{name}.ply")
+        assert not set(map(bytes, mesh.vertices[mesh.vertices[:, 2] > 1430.0])) & set(
+            map(bytes, body.vertices)
+        )

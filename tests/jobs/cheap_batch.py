@@ -1,0 +1,55 @@
+"""A batch of cheap jobs in a process of its own, and what it left."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cheap_job
+
+from bodyscan.jobs.discovery import find_jobs
+from bodyscan.jobs.hashing import file_hash, files_below
+from bodyscan.jobs.job import Job
+from bodyscan.jobs.pipeline import load_pipeline
+
+
+@dataclass(frozen=True)
+class Done:
+    """A batch that ended: its exit code, what it told, line by line, and its errors."""
+
+    code: int
+    events: list[dict[str, Any]]
+    errors: str
+
+    def endings(self) -> dict[str, dict[str, Any]]:
+        """Of every job, how it ended."""
+        ends = [e for e in self.events if e["event"] == "job" and "reason" in e]
+        return {event["job"]: event for event in ends}
+
+
+def batch_command(scans: Path, out: Path, workers: int = 2) -> list[str]:
+    return [sys.executable, cheap_job.__file__, "batch", str(scans), str(out), str(workers)]
+
+
+def run_cheap(scans: Path, out: Path, workers: int = 2) -> Done:
+    command = batch_command(scans, out, workers)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return Done(
+        done.returncode, [json.loads(line) for line in done.stdout.splitlines()], done.stderr
+    )
+
+
+def jobs_of(scans: Path, out: Path, *changes: str) -> list[Job]:
+    pipeline = load_pipeline(cheap_job.PIPELINE, changes)
+    return find_jobs(pipeline, scans, out, scans, "export")
+
+
+def results(out: Path) -> dict[str, str]:
+    """The hash of every result and manifest; states, logs and locks tell of times and attempts."""
+    running = {"state.json", "log.txt", "lock", "batch.lock", "summary.csv", "job.json", "was here"}
+    paths = [path for path in files_below(out) if path.name not in running]
+    return {str(path.relative_to(out)): file_hash(path) for path in paths}

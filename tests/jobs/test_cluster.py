@@ -1,0 +1,76 @@
+"""Jobs on a local dask cluster of two workers, one of which is killed midway."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+
+import cheap_job
+import pytest
+from cheap_batch import jobs_of, results, run_cheap
+
+from bodyscan.errors import BodyscanError
+from bodyscan.jobs.batch import run_batch
+from bodyscan.jobs.cluster import on_cluster
+
+
+def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(make_scans, tmp_path):
+    distributed = pytest.importorskip(
+        "distributed", reason="dask.distributed is not installed (pip install '.[cluster]')"
+    )
+    scans = make_scans(**{f"s{number}": "sleep 0.4" for number in range(5)})
+    assert run_cheap(scans, tmp_path / "undisturbed").code == 0
+    out, outcomes = tmp_path / "out", []
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL"
+    ) as cluster:
+        run = on_cluster(cluster.scheduler_address, 1, cheap_job.COMMAND)
+        batch = threading.Thread(
+            target=lambda: outcomes.extend(run_batch(jobs_of(scans, out), out, run))
+        )
+        batch.start()
+        job = _a_running_job(out)
+        os.kill(_parent(job), signal.SIGKILL)
+        batch.join(timeout=60)
+        assert not batch.is_alive()
+    assert [outcome.state for outcome in outcomes] == ["done"] * 5, outcomes
+    assert results(out) == {
+        name: value
+        for name, value in results(tmp_path / "undisturbed").items()
+        if name != "manifest.json"  # over all jobs: written when a batch is finished
+    }
+    for job in jobs_of(scans, out):
+        assert (job.folder / "log.txt").read_text().count("made an export") == 1
+    begun = sum((out / f"s{k}" / "log.txt").read_text().count("-- ") for k in range(5))
+    assert begun == 6, "five jobs, one of them begun again on the other worker"
+
+
+def test_a_scheduler_that_is_not_there_is_named(make_scans, tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="dask.distributed is not installed")
+    monkeypatch.setattr("bodyscan.jobs.cluster._TIMEOUT_S", 1)
+    run = on_cluster("tcp://127.0.0.1:9", 1)
+    with pytest.raises(BodyscanError, match="no dask scheduler with a worker answers"):
+        run_batch(jobs_of(make_scans(a="nothing"), tmp_path / "out"), tmp_path / "out", run)
+
+
+def test_without_dask_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
+    with pytest.raises(BodyscanError, match="bodyscan\\[cluster\\]"):
+        on_cluster("tcp://127.0.0.1:9", 1)
+
+
+def _a_running_job(out) -> int:
+    """The process that holds the lock of a job in the middle of its work."""
+    end = time.monotonic() + 30.0
+    while time.monotonic() < end:
+        for making in out.glob("*/.making-scan-*"):
+            return int((making.parent / "lock").read_text().split()[1])
+        time.sleep(0.02)
+    raise AssertionError("no job began")
+
+
+def _parent(process: int) -> int:
+    with open(f"/proc/{process}/stat") as stream:
+        return int(stream.read().rpartition(")")[2].split()[1])

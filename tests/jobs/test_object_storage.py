@@ -1,0 +1,107 @@
+"""Scans and results in object storage, here fsspec's own in memory."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+
+import cheap_job
+import pytest
+from cheap_batch import results, run_cheap
+from typer.testing import CliRunner
+
+from bodyscan.cli import app
+from bodyscan.errors import BadInput
+from bodyscan.jobs.batch import finish, here, run_batch
+from bodyscan.jobs.object_storage import (
+    Store,
+    fetch_figures,
+    find_stored_jobs,
+    put_summary,
+    work_on_stored,
+)
+from bodyscan.jobs.pipeline import load_pipeline
+from bodyscan.jobs.sharing import Shares
+
+fsspec = pytest.importorskip("fsspec", reason="fsspec is not installed (pip install '.[cluster]')")
+
+STORE = Store("memory://day/scans", "memory://day/out", "memory://day/calibration")
+
+
+@pytest.fixture
+def memory(make_scans, tmp_path):
+    """Two scans in the store, and what a batch over the same scans in folders makes of them."""
+    system = fsspec.filesystem("memory")
+    system.store.clear()
+    scans = make_scans(anna="nothing", bert="nothing")
+    for path in scans.glob("*/*"):
+        system.pipe_file(f"/day/scans/{path.relative_to(scans)}", path.read_bytes())
+    system.pipe_file("/day/calibration/calibration.json", b"{}")
+    assert run_cheap(scans, tmp_path / "in folders").code == 0
+    yield system
+    system.store.clear()
+
+
+def batch(tmp_path, name):
+    """What `bodyscan batch` does with URLs, with cheap stages."""
+    work = tmp_path / name
+    jobs = find_stored_jobs(STORE, load_pipeline(cheap_job.PIPELINE), "export", work)
+    task = partial(work_on_stored, store=STORE)
+    outcomes = run_batch(jobs, work / "out", here(Shares(2, 1, ""), cheap_job.COMMAND, work=task))
+    fetch_figures(jobs, STORE)
+    finish(jobs, outcomes, work / "out")
+    put_summary(work / "out", STORE)
+    return {outcome.job: outcome for outcome in outcomes}
+
+
+def test_the_same_bytes_as_in_folders_and_nothing_twice(memory, tmp_path):
+    first = batch(tmp_path, "first")
+    assert {outcome.state for outcome in first.values()} == {"done"}, first
+    memory.get("/day/out", str(tmp_path / "fetched"), recursive=True)
+    assert results(tmp_path / "fetched") == results(tmp_path / "in folders")
+    assert (tmp_path / "fetched" / "summary.csv").exists()
+    again = batch(tmp_path, "again")
+    assert all(outcome.stages == () for outcome in again.values())
+
+
+def test_an_upload_that_was_cut_short_is_made_again(memory, tmp_path):
+    batch(tmp_path, "first")
+    memory.rm("/day/out/anna/scan/stage.json")
+    memory.pipe_file("/day/out/bert/export/body.bin", b"half")
+    again = batch(tmp_path, "again")
+    assert again["anna"].stages == ("scan",)
+    assert again["bert"].stages == ("export",)
+    assert len(memory.cat_file("/day/out/bert/export/body.bin")) > 4
+
+
+def test_names_that_climb_out_are_refused(memory, tmp_path):
+    memory.store["/day/scans/anna/../../../escaped"] = memory.store["/day/scans/anna/do.txt"]
+    outcomes = batch(tmp_path, "first")
+    assert outcomes["anna"].state == "set aside"
+    assert "leads out of its folder" in outcomes["anna"].reason
+    assert outcomes["bert"].state == "done"
+
+
+def test_the_command_takes_urls(memory):
+    """All the way through the real command, whose real stage then refuses this calibration."""
+    places = ("--scans", STORE.scans, "--out", STORE.out, "--calibration", str(STORE.calibration))
+    result = CliRunner().invoke(app, ["batch", str(cheap_job.PIPELINE), *places, "--json"])
+    assert result.exit_code == 1, result.output
+    assert json.loads(result.stdout.splitlines()[-1])["set_aside"] == ["anna", "bert"]
+    table = memory.cat_file("/day/out/summary.csv").decode()
+    assert table.count("is not a readable calibration") == 2
+    state = json.loads(memory.cat_file("/day/out/anna/state.json"))
+    assert state["attempts"] == 2
+    half = CliRunner().invoke(app, ["batch", str(cheap_job.PIPELINE), *places[:3], "out"])
+    assert "either all lie in object storage or none" in str(half.exception)
+
+
+def test_an_unknown_store_is_bad_input(tmp_path):
+    with pytest.raises(BadInput, match="cannot be opened"):
+        find_stored_jobs(
+            replace(STORE, scans="nowhere://x"),
+            load_pipeline(cheap_job.PIPELINE),
+            "export",
+            tmp_path,
+        )

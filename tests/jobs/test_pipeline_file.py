@@ -1,0 +1,96 @@
+"""Pipeline files: those that come with bodyscan, wrong ones, and one-off changes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import yaml
+
+from bodyscan.fusion.scan import ScanSettings
+from bodyscan.jobs.pipeline import (
+    SECTIONS,
+    Alignment,
+    Fusion,
+    Mesh,
+    Pipeline,
+    PipelineError,
+    load_pipeline,
+)
+from bodyscan.registration.alignment import AlignmentSettings
+
+PIPELINES = sorted((Path(__file__).parents[2] / "pipelines").glob("*.yaml"))
+FUSE = next(path for path in PIPELINES if path.stem == "fuse")
+
+
+@pytest.mark.parametrize("path", PIPELINES, ids=lambda path: path.stem)
+def test_every_file_names_every_parameter_with_a_comment(path):
+    pipeline = load_pipeline(path)
+    assert pipeline.name == path.stem
+    written = yaml.safe_load(path.read_text())
+    for name in ("resources", *SECTIONS[pipeline.kind]):
+        assert set(written[name]) == set(type(getattr(pipeline, name)).model_fields)
+    for line in path.read_text().splitlines():
+        if line.startswith("  ") and ":" in line:
+            assert "#" in line, line
+
+
+def test_the_defaults_are_those_of_the_commands():
+    """A batch fuses as `bodyscan scan` does, and fuse.yaml says the same as no word at all."""
+    assert Alignment().model_dump() == asdict(AlignmentSettings())
+    scan = ScanSettings()
+    assert Fusion().model_dump() == {
+        "points": scan.points,
+        "window_mm": scan.window_mm,
+        "agreement_mm": scan.agreement_mm,
+        "double_mm": scan.double_mm,
+    }
+    assert Mesh().model_dump() == {"depth": scan.mesh_depth, "reach_mm": scan.mesh_reach_mm}
+    assert load_pipeline(FUSE) == Pipeline(name="fuse", kind="fuse")
+
+
+def test_changes_are_applied():
+    changed = load_pipeline(
+        FUSE, ["fusion.points=2000", "export.formats=glb", "export.deface=true"]
+    )
+    assert changed.fusion.points == 2000
+    assert changed.export.formats == ("glb",)
+    assert changed.export.deface
+    assert changed.alignment == load_pipeline(FUSE).alignment
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("fusion.points=many", '--set fusion.points: must be a whole number (got "many")'),
+        ("fusion.points=10", "must be 1000 or more"),
+        ("fusion.pionts=5000", "is no key known here"),
+        ("nonsense", "is no change"),
+        ("fusion.points.x=1", "has nothing inside"),
+        ("rig_export.formats=colmap", "is for another kind"),
+    ],
+)
+def test_wrong_changes_are_named(change, said):
+    with pytest.raises(PipelineError) as caught:
+        load_pipeline(FUSE, [change])
+    assert said in str(caught.value)
+
+
+def test_wrong_files_are_told_by_line(tmp_path):
+    path = tmp_path / "p.yaml"
+    path.write_text("name: x\nkind: fuse\nfusion:\n  points: -1\n  colour: red\n")
+    with pytest.raises(PipelineError) as caught:
+        load_pipeline(path)
+    assert f"{path}:4:11: fusion.points: must be 1000 or more" in str(caught.value)
+    assert f"{path}:5:3: fusion.colour: is no key known here" in str(caught.value)
+
+
+def test_a_billion_laughs_end_early(tmp_path):
+    path = tmp_path / "p.yaml"
+    lines = ["a: &a [ha, ha, ha, ha, ha, ha, ha, ha, ha]"]
+    for one, next_ in zip("abcdefgh", "bcdefghi", strict=True):
+        lines.append(f"{next_}: &{next_} [{', '.join([f'*{one}'] * 9)}]")
+    path.write_text("\n".join(lines))
+    with pytest.raises(PipelineError):
+        load_pipeline(path)

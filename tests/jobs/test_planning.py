@@ -1,0 +1,86 @@
+"""What is done again, and why: content counts, names of files' places and times do not."""
+
+from __future__ import annotations
+
+import os
+import shutil
+
+import cheap_job
+import pytest
+from cheap_batch import jobs_of, run_cheap
+
+from bodyscan.jobs.plan import Step, plan
+
+
+@pytest.fixture
+def day(make_scans, tmp_path):
+    """Scans and what a batch made of them, both in one folder."""
+    scans = make_scans(anna="nothing", bert="nothing")
+    assert run_cheap(scans, tmp_path / "out").code == 0
+    return tmp_path
+
+
+def steps(day, *changes, version=1):
+    """Of Anna's job, why each stage would run now."""
+    anna, bert = jobs_of(day / "scans", day / "out", *changes)
+    stages = cheap_job.kinds(version)["fuse"]
+    if not changes and version == 1:
+        assert plan(bert, stages) == [Step("scan", ""), Step("export", "")]
+    return [step.why for step in plan(anna, stages)]
+
+
+def test_times_and_places_do_not_count(day):
+    for path in (day / "scans" / "anna").iterdir():
+        os.utime(path, (1, 1))
+    assert steps(day) == ["", ""]
+    moved = day / "moved"
+    moved.mkdir()
+    for name in ("scans", "out"):
+        shutil.move(day / name, moved / name)
+    assert steps(moved) == ["", ""]
+
+
+def test_another_content_counts(day):
+    (day / "scans" / "anna" / "image.txt").write_text("other")
+    scan, export = steps(day)
+    assert scan == "inputs changed: image.txt has other content"
+    assert export == "scan runs before it"
+
+
+def test_files_that_come_and_go_count(day):
+    folder = day / "scans" / "anna"
+    (folder / "image.txt").rename(folder / "picture.txt")
+    assert steps(day)[0] == "inputs changed: picture.txt is new, image.txt is gone"
+
+
+def test_settings_count_for_the_stages_that_obey_them(day):
+    assert steps(day, "fusion.points=2000") == [
+        "settings changed: fusion.points 1000000 -> 2000",
+        "scan runs before it",
+    ]
+    assert steps(day, "export.formats=ply") == [
+        "",
+        'settings changed: export.formats ["ply", "obj", "stl", "glb"] -> ["ply"]',
+    ]
+    assert steps(day, "resources.threads=1") == ["", ""]
+
+
+def test_the_version_of_a_stage_counts(day):
+    assert steps(day, version=2)[0] == "version 2 of the stage, it was 1"
+
+
+def test_results_that_were_touched_are_made_again(day):
+    result = day / "out" / "anna" / "scan" / "1.bin"
+    result.write_bytes(b"x" + result.read_bytes()[1:])
+    assert steps(day)[0] == "its result was touched: 1.bin has other content"
+    assert run_cheap(day / "scans", day / "out").endings()["anna"]["stages"] == ["scan"]
+    assert steps(day) == ["", ""]
+
+
+def test_a_failure_is_told_the_next_time(make_scans, tmp_path):
+    scans = make_scans(a="raise")
+    run_cheap(scans, tmp_path / "out")
+    (job,) = jobs_of(scans, tmp_path / "out")
+    assert plan(job, cheap_job.kinds()["fuse"])[0].why == (
+        "it failed last time: ValueError: a bad day"
+    )

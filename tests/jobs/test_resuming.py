@@ -1,0 +1,107 @@
+"""Killed anywhere, a batch goes on; nothing is done twice, nothing half-made is taken for done."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import time
+from pathlib import Path
+
+from cheap_batch import batch_command, jobs_of, results, run_cheap
+
+from bodyscan.errors import BadInput
+from bodyscan.jobs.locking import locked
+
+
+def test_ten_kills_leave_the_same_bytes_as_none(make_scans, tmp_path):
+    scans = make_scans(**{f"s{number}": "sleep 0.05" for number in range(6)})
+    assert run_cheap(scans, tmp_path / "undisturbed").code == 0
+    moments = random.Random(1)
+    out = tmp_path / "killed"
+    there: dict[str, int] = {}
+    for _ in range(10):
+        process = subprocess.Popen(batch_command(scans, out), stdout=subprocess.DEVNULL)
+        time.sleep(moments.uniform(0.3, 1.6))
+        process.kill()
+        process.wait()
+        _wait_for(lambda: not any(_is_held(job.folder / "lock") for job in jobs_of(scans, out)))
+        now = _made(out)
+        assert there.items() <= now.items(), "what was there was made again"
+        there = now
+    assert run_cheap(scans, out).code == 0
+    assert there.items() <= _made(out).items()
+    assert results(out) == results(tmp_path / "undisturbed")
+    again = run_cheap(scans, out)
+    assert all(ending["stages"] == [] for ending in again.endings().values())
+
+
+def test_the_processes_of_a_killed_batch_end_with_it(make_scans, tmp_path):
+    scans = make_scans(a="sleep 60")
+    process = subprocess.Popen(batch_command(scans, tmp_path / "out"), stdout=subprocess.DEVNULL)
+    lock = tmp_path / "out" / "a" / "lock"
+    _wait_for(lambda: lock.exists() and "process" in lock.read_text())
+    child = int(lock.read_text().split()[1])
+    process.kill()
+    process.wait()
+    _wait_for(lambda: not _is_alive(child))
+    with locked(tmp_path / "out" / "batch.lock", wait=False):  # kill let it go
+        pass
+
+
+def test_a_second_batch_on_the_same_folder_is_refused(make_scans, tmp_path):
+    scans = make_scans(a="sleep 1.5")
+    out = tmp_path / "out"
+    first = subprocess.Popen(batch_command(scans, out), stdout=subprocess.DEVNULL)
+    _wait_for(lambda: (out / "a" / "lock").exists())
+    second = run_cheap(scans, out)
+    assert second.code != 0
+    assert f"another batch is at work here (process {first.pid}" in second.errors
+    assert first.wait(timeout=60) == 0
+    assert run_cheap(scans, out).endings()["a"]["stages"] == []
+
+
+def test_half_made_folders_are_taken_away_and_not_believed(make_scans, tmp_path):
+    scans = make_scans(a="nothing")
+    out = tmp_path / "out"
+    half = out / "a" / ".making-scan-0123"
+    half.mkdir(parents=True)
+    (half / "0.bin").write_bytes(b"half")
+    (out / ".summary.0123.tmp.csv").write_text("half")
+    (out / "a" / "scan").mkdir()  # without stage.json: nothing vouches for it
+    (out / "a" / "scan" / "0.bin").write_bytes(b"half")
+    assert run_cheap(scans, out).endings()["a"]["stages"] == ["scan", "export"]
+    assert not half.exists()
+    assert not list(out.glob(".summary*"))
+    assert (out / "a" / "scan" / "0.bin").stat().st_size > 4
+
+
+def _made(out: Path) -> dict[str, int]:
+    """When each stage's results that are in place were made."""
+    return {str(path): path.stat().st_mtime_ns for path in out.glob("*/*/stage.json")}
+
+
+def _is_held(lock: Path) -> bool:
+    if not lock.exists():
+        return False
+    try:
+        with locked(lock, wait=False):
+            return False
+    except BadInput:
+        return True
+
+
+def _wait_for(true, seconds=30.0):
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    with open(f"/proc/{process}/stat") as stream:
+        return stream.read().rpartition(")")[2].split()[0] != "Z"

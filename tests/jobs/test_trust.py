@@ -1,0 +1,113 @@
+"""`verify` finds any byte that changed; `forget` leaves nothing of a subject."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+
+import cheap_job
+import pytest
+from cheap_batch import jobs_of, run_cheap
+
+from bodyscan.errors import BadInput
+from bodyscan.jobs.forgetting import find, forget
+from bodyscan.jobs.hashing import files_below
+from bodyscan.jobs.locking import locked
+from bodyscan.jobs.verifying import verify
+
+
+@pytest.fixture
+def day(make_scans, tmp_path):
+    """A workspace: scans of two subjects, what a batch made of them, and an export elsewhere."""
+    scans = make_scans(m1="nothing", m2="nothing", e1="nothing", bad="raise")
+    for name, subject in {"m1": "mallow", "m2": "mallow", "e1": "elder", "bad": "mallow"}.items():
+        text = f"kind: scan\nsubject: {subject}\n"
+        (scans / name / "captures.yaml").write_text(text)
+    assert run_cheap(scans, tmp_path / "out").code == 1
+    for subject in ("mallow", "elder"):
+        (tmp_path / f"{subject}.obj").write_text("o")
+        side = {"file": f"{subject}.obj", "subject": subject}
+        (tmp_path / f"{subject}.obj.json").write_text(json.dumps(side))
+    return tmp_path
+
+
+def test_any_byte_that_changed_is_found(day):
+    kinds = cheap_job.kinds()
+    clean = verify(day / "out", kinds)
+    assert clean.faults == ()
+    checked = [
+        day / "scans" / "m1" / "image.txt",
+        day / "out" / "m1" / "scan" / "0.bin",
+        day / "out" / "m1" / "scan" / "stage.json",
+        day / "out" / "m1" / "export" / "body.bin",
+        day / "out" / "e1" / "manifest.json",
+    ]
+    assert clean.files > len(checked)
+    for path in checked:
+        content = path.read_bytes()
+        for place in (0, len(content) // 2, len(content) - 1):
+            path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+            assert any(str(path) in fault for fault in verify(day / "out", kinds).faults), path
+        path.write_bytes(content)
+    assert verify(day / "out", kinds).faults == ()
+
+
+def test_what_came_and_went_is_found(day):
+    kinds = cheap_job.kinds()
+    (day / "out" / "m1" / "scan" / "0.bin").unlink()
+    (day / "out" / "e1" / "export" / "more.bin").write_text("x")
+    shutil.rmtree(day / "out" / "m2")
+    (day / "scans" / "e1" / "image.txt").unlink()
+    faults = "\n".join(verify(day / "out", kinds).faults)
+    assert "0.bin: is gone" in faults
+    assert "more.bin: is new" in faults
+    assert "m2/manifest.json: is gone" in faults
+    assert "e1/image.txt: is gone" in faults
+    with pytest.raises(BadInput, match="holds no manifest"):
+        verify(day / "scans")
+
+
+def test_forget_removes_a_subject_and_nothing_else(day):
+    (day / "scans" / "m1" / "link").symlink_to(day / "elder.obj")
+    before = set(files_below(day))
+    others = {path: path.read_bytes() for path in before if "e1" in path.parts}
+    found = forget("mallow", day)
+    after = set(files_below(day))
+    assert before - after == set(found.files)
+    gone = {path.relative_to(day).parts[:2] for path in found.files}
+    assert gone == {
+        *(("scans", name) for name in ("m1", "m2", "bad")),
+        *(("out", name) for name in ("m1", "m2", "bad")),
+        ("mallow.obj",),
+        ("mallow.obj.json",),
+    }
+    assert {path: path.read_bytes() for path in others} == others
+    assert (day / "elder.obj").exists()
+    assert not any("mallow" in path.read_text(errors="replace") for path in after)
+    assert not (day / "out" / "m1").exists()
+    with (day / "out" / "summary.csv").open(newline="") as stream:
+        assert [row["job"] for row in csv.DictReader(stream)] == ["e1"]
+    assert verify(day / "out", cheap_job.kinds()).faults == ()
+    with pytest.raises(BadInput, match="holds nothing of subject 'mallow'"):
+        forget("mallow", day)
+
+
+def test_a_forgetting_that_was_cut_short_can_be_taken_up(day):
+    files = find("mallow", day).files
+    for path in files[: len(files) // 2]:
+        path.unlink()
+    rest = forget("mallow", day)
+    assert set(rest.files) == set(files[len(files) // 2 :])
+    assert not any("mallow" in path.read_text(errors="replace") for path in files_below(day))
+
+
+def test_a_batch_at_work_is_not_disturbed(day):
+    with locked(day / "out" / "batch.lock", wait=False), pytest.raises(BadInput, match="at work"):
+        forget("mallow", day)
+    assert len(jobs_of(day / "scans", day / "out")) == 4
+
+
+def test_a_subject_is_never_told_from_a_name(day):
+    with pytest.raises(BadInput, match="holds nothing"):
+        forget("m1", day)

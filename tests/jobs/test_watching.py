@@ -1,0 +1,65 @@
+"""What is shown while a batch runs."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import pytest
+
+from bodyscan.jobs.watching import ending, json_lines, screen
+
+EVENTS = [
+    {"event": "shares", "workers": 2, "threads": 1, "why": "2 cores"},
+    {"event": "batch", "jobs": ["[red]a", "b"]},
+    {"event": "job", "job": "[red]a", "state": "running", "attempt": 1},
+    {"event": "stage", "job": "[red]a", "stage": "scan", "why": "there is no result yet"},
+    {"event": "stage", "job": "[red]a", "stage": "scan", "part": "merging", "done": 1, "total": 2},
+    {"event": "job", "job": "b", "state": "sent"},
+    {"event": "job", "job": "b", "state": "done", "attempts": 1, "stages": [], "seconds": 0.4,
+     "reason": ""},
+    {"event": "progress", "ended": 1, "jobs": 2, "seconds_left": 4000.0},
+    {"event": "job", "job": "[red]a", "state": "running", "attempt": 2},
+    {"event": "job", "job": "[red]a", "state": "set aside", "attempts": 2, "stages": ["scan"],
+     "seconds": 9.0, "reason": "[/bold] broken"},
+    {"event": "summary", "jobs": 2, "done": 1, "ran": 0, "set_aside": ["[red]a"], "repeat": ["b"],
+     "table": "out/summary.csv"},
+]  # fmt: skip
+
+
+def test_people_are_told_what_happened(capsys):
+    with screen() as listen:
+        for event in EVENTS:
+            listen(event)
+    said = capsys.readouterr().err
+    assert "b: up to date" in said
+    assert "[red]a: set aside after 2 attempts: [/bold] broken" in said
+    assert "1 of 2 jobs done (0 of them now), 1 set aside" in said
+    assert "to be scanned again: b" in said
+    assert "out/summary.csv" in said
+
+
+def test_programs_are_told_in_json(capsys):
+    with json_lines() as listen:
+        for event in EVENTS:
+            listen(event)
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [{k: v for k, v in line.items() if k != "time"} for line in lines] == EVENTS
+
+
+def test_a_reader_that_goes_away_stops_nothing(monkeypatch):
+    class Gone:
+        def write(self, text):
+            raise BrokenPipeError
+
+    monkeypatch.setattr(sys, "stdout", Gone())
+    with json_lines() as listen:
+        listen(EVENTS[0])
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"), [(40.2, "40 s"), (600.0, "10 min"), (7200.0, "2.0 h")]
+)
+def test_times_are_said_in_words(seconds, said):
+    event = {"job": "a", "state": "done", "stages": ["scan"], "seconds": seconds}
+    assert ending(event) == f"a: scan in {said}"

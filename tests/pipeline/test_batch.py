@@ -1,0 +1,193 @@
+"""Real scans through the real command, faulty ones among them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import struct
+import zlib
+from pathlib import Path
+
+import pytest
+from conftest import PROJECT, run
+
+from bodyscan.jobs.hashing import file_hash, files_below
+
+SMALL = ("--set", "fusion.points=20000", "--set", "mesh.depth=6", "--set", "export.formats=glb")
+ODD = "б 'q\"\n"
+
+
+def batch(day: Path, *more: object, pipeline: str = "fuse", scans: str = "scans"):
+    return run(
+        "batch",
+        PROJECT / "pipelines" / f"{pipeline}.yaml",
+        "--scans",
+        day / scans,
+        "--out",
+        day / "out",
+        *more,
+    )
+
+
+def events(result) -> list[dict]:
+    return [json.loads(line) for line in result.stdout.splitlines()]
+
+
+def endings(result) -> dict[str, dict]:
+    return {e["job"]: e for e in events(result) if e["event"] == "job" and "reason" in e}
+
+
+@pytest.fixture(scope="module")
+def day(workspace, tmp_path_factory) -> Path:
+    """A day's scans, some of which hold what a bad disk or a bad person may put there."""
+    day = tmp_path_factory.mktemp("day")
+    person = workspace.folder / "captures" / "person"
+    shutil.copytree(workspace.folder / "calibration", day / "calibration")
+    for name in ("anna", ODD, "hurt"):
+        shutil.copytree(person, day / "scans" / name)
+    first, second = (day / "scans" / "hurt" / "s01" / pair for pair in ("p1-2", "p1-3"))
+    (first / "lit.png").write_bytes((first / "lit.png").read_bytes()[:5000])
+    (second / "lit.png").write_bytes(_huge_png())
+    for name, text in {
+        "laughs": _billion_laughs(),
+        "climbing": "kind: scan\nshots: [{name: ../../anna/s01}]\n",
+    }.items():
+        (day / "scans" / name).mkdir()
+        (day / "scans" / name / "captures.yaml").write_text(text)
+    (day / "scans" / "link").symlink_to("/etc")
+    (day / "scans" / "inner").mkdir()
+    (day / "scans" / "inner" / "s01").symlink_to("/etc")
+    return day
+
+
+@pytest.fixture(scope="module")
+def night(day):
+    """The batch over that day, stopped after the first stage, then finished."""
+    first = batch(day, *SMALL, "--json", "--until", "scan")
+    return first, batch(day, *SMALL, "--json")
+
+
+def test_good_scans_are_fused_and_bad_ones_are_named(day, night):
+    first, second = night
+    assert first.exit_code == second.exit_code == 1, second.output
+    odd = next(name for name in endings(first) if name.startswith("q-"))
+    good = {"anna", odd, "hurt"}
+    assert {n for n, end in endings(second).items() if end["state"] == "done"} == good
+    assert all(endings(first)[name]["stages"] == ["scan"] for name in good)
+    assert all(endings(second)[name]["stages"] == ["export"] for name in good)
+    for name, said in {
+        "laughs": "captures.yaml",
+        "climbing": "shots[0].name",
+        "link": "symbolic link that leads out",
+        "inner": "symbolic link that leads out",
+    }.items():
+        end = endings(second)[name]
+        assert end["state"] == "set aside"
+        assert said in end["reason"]
+        assert end["attempts"] == 2
+    facts = json.loads((day / "out" / "hurt" / "scan" / "scan.json").read_text())
+    assert sorted(facts["failed"]) == ["p1-2", "p1-3"]
+    assert "cut short" in facts["failed"]["p1-2"]
+    assert "60000 x 60000" in facts["failed"]["p1-3"]
+    assert (day / "out" / "anna" / "export" / "body-light.glb").exists()
+
+
+def test_the_table_has_a_row_for_every_scan(day, night):
+    with (day / "out" / "summary.csv").open(newline="", encoding="utf-8") as stream:
+        rows = {row["job"]: row for row in csv.DictReader(stream)}
+    assert len(rows) == 7
+    anna = rows["anna"]
+    assert anna["subject"] == "sim-woman-average"
+    assert anna["verdict"] in ("good", "usable", "repeat")
+    assert 15_000 < int(anna["points"]) < 25_000
+    assert 10.0 < float(anna["coverage_percent"]) <= 100.0
+    assert 0.0 < float(anna["overlap_rms_after_mm"]) < 1.0
+    assert 0.0 <= float(anna["sway_mm"]) < 5.0
+    assert rows["hurt"]["pairs_failed"] == "p1-2 p1-3"
+    assert float(anna["drift_mm"]) < 1.0  # three scans with the calibration's own rig
+    assert "symbolic link" in rows["link"]["reason"]
+
+
+def test_the_same_images_give_the_same_bytes(day, night):
+    odd = next((day / "out").glob("q-*"))
+    for stage in ("scan", "export"):
+        one, other = (
+            {p.name: file_hash(p) for p in files_below(day / "out" / job / stage)}
+            for job in ("anna", odd.name)
+        )
+        assert one == other
+
+
+def test_what_is_done_stays_done_and_its_bytes_are_vouched_for(day, night):
+    said = batch(day, *SMALL, "--explain").output.splitlines()
+    assert "anna: scan: up to date" in said
+    assert "anna: export: up to date" in said
+    changed = batch(day, *SMALL, "--set", "fusion.points=30000", "--explain").output
+    assert "anna: scan: will run: settings changed: fusion.points 20000 -> 30000" in changed
+    assert run("verify", day / "out").exit_code == 0
+    path = day / "out" / "anna" / "scan" / "mesh.ply"
+    content = path.read_bytes()
+    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    found = run("verify", day / "out")
+    assert found.exit_code != 0
+    assert f"{path}: was changed" in found.output
+    path.write_bytes(content)
+
+
+def test_a_subject_is_forgotten(day, night, tmp_path):
+    shutil.copytree(day, tmp_path / "day", symlinks=True)
+    result = run("forget", "sim-woman-average", "--workspace", tmp_path / "day", "--yes")
+    assert result.exit_code == 0
+    assert "anna/scan/cloud.ply" in result.output
+    left = {path.relative_to(tmp_path / "day").parts[:2] for path in files_below(tmp_path / "day")}
+    assert ("scans", "anna") not in left
+    assert ("out", "anna") not in left
+    assert ("calibration", "calibration.json") in left
+    assert not (tmp_path / "day" / "scans" / "anna").exists()
+    assert Path("/etc/passwd").exists()  # a link to it lay there
+
+
+def test_rigs_are_calibrated_in_batches(workspace, tmp_path):
+    """The same bytes as the command's, and no more work the second time."""
+    rig = tmp_path / "scans" / "small"
+    rig.mkdir(parents=True)
+    shutil.copy(workspace.folder / "rig.yaml", rig)
+    (rig / "captures").mkdir()
+    shutil.copytree(workspace.folder / "captures" / "calibration", rig / "captures" / "calibration")
+    done = batch(tmp_path, "--json", pipeline="calibrate")
+    assert done.exit_code == 0, done.output
+    made = tmp_path / "out" / "small" / "calibration"
+    assert (made / "calibration.json").exists()  # its notes name images by path, so it differs
+    name = "calibration.npz"
+    assert file_hash(made / name) == file_hash(workspace.folder / "calibration" / name)
+    assert list((tmp_path / "out" / "small" / "rig").iterdir())
+    assert events(batch(tmp_path, "--json", pipeline="calibrate"))[-1]["ran"] == 0
+
+
+def test_no_calibration_is_bad_input(tmp_path):
+    (tmp_path / "scans" / "a").mkdir(parents=True)
+    result = batch(tmp_path)
+    assert result.exit_code != 0
+    assert "no calibration/calibration.json" in str(result.exception)
+
+
+def _huge_png() -> bytes:
+    """A whole PNG of 60,000 x 60,000 grey pixels in a few hundred bytes, or so it says."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        checksum = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + checksum
+
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
+    data = zlib.compress(bytes(60_001))
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    )
+
+
+def _billion_laughs() -> str:
+    lines = ["a: &a [ha, ha, ha, ha, ha, ha, ha, ha, ha]"]
+    for one, after in zip("abcdefgh", "bcdefghi", strict=True):
+        lines.append(f"{after}: &{after} [{', '.join([f'*{one}'] * 9)}]")
+    return "\n".join(lines)
