@@ -13,6 +13,7 @@ from bodyscan.capture.image_faults import header_fault
 from bodyscan.capture.rig import Pair, Rig
 from bodyscan.capture.rig_checks import did_you_mean
 from bodyscan.capture.rig_file import load_rig
+from bodyscan.capture.strangers import strange_images
 from bodyscan.errors import CaptureError
 
 FEWEST_SHOTS = 3
@@ -89,6 +90,7 @@ def check(rig_path: Path, scans: Iterable[Path] = ()) -> CheckReport:
         errors += _frame_errors(calibration)
         errors += filter(None, map(_too_few, rig.pairs, counts))
     warnings = [] if rig.calibration else [f"{rig_path}: names no calibration captures"]
+    warnings += filter(None, map(_strangers, captures))
     return CheckReport(
         rig_path=Path(rig_path),
         rig=rig,
@@ -169,6 +171,17 @@ def _too_few(pair: Pair, count: PairCount) -> str | None:
 def _empty_shots(captures: Captures) -> list[str]:
     taken = {sequence.shot for sequence in captures.sequences}
     return [shot for shot in captures.shots if shot not in taken]
+
+
+def _strangers(captures: Captures) -> str | None:
+    found = strange_images(captures)
+    if not found:
+        return None
+    belong = "belongs" if len(found) == 1 else "belong"
+    return (
+        f"{_several(len(found), 'image')} {belong} to no pair and frame of the rig file, such as "
+        f"{found[0]}; is a name spelt differently?"
+    )
 
 
 def _frame_errors(calibration: Captures) -> list[str]:

@@ -183,3 +183,17 @@ def test_real_captures_are_read_where_they_lie(rig: str, images: int) -> None:
     report = check(path)
     assert report.ok, report_lines(report)
     assert report.images == images
+
+
+def test_a_renamed_folder_is_not_passed_over_in_silence(rig_path: Path) -> None:
+    folder = image(rig_path, "b2", "p1", "lit").parent
+    folder.rename(folder.with_name("P1"))
+    (warning,) = lines_with(rig_path, "spelt differently")
+    assert f"{len(FRAMES)} images belong to no pair" in warning
+    assert str(folder.with_name("P1")) in warning
+
+
+def test_images_of_shots_that_are_not_wanted_are_left_alone(rig_path: Path) -> None:
+    folder = rig_path.parent / "captures"
+    shutil.copytree(folder / "b2", rig_path.parent / "captures" / "elsewhere" / "b9")
+    assert lines_with(rig_path, "spelt differently") == []
