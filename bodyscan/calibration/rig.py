@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
+from bodyscan.calibration.board_doubts import boards_not_found, size_doubt, what_was_found
 from bodyscan.calibration.camera import (
     CameraCalibration,
     PlanarView,
@@ -20,6 +22,7 @@ from bodyscan.calibration.pair import (
 )
 from bodyscan.calibration.pairs import calibrate_pairs
 from bodyscan.calibration.rig_calibration import RigCalibration
+from bodyscan.calibration.seen_corners import seen_corners
 from bodyscan.capture.boards import corner_points
 from bodyscan.capture.decoding import decode_sequence
 from bodyscan.capture.detection import find_boards
@@ -29,8 +32,9 @@ from bodyscan.capture.images import read_lit
 from bodyscan.capture.rig import Board, Rig
 from bodyscan.capture.views import BoardView
 from bodyscan.errors import BodyscanError, FailedWork
-from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.evaluation.rig_halves import compare_halves
 from bodyscan.progress import Progress, silent, threaded
+from bodyscan.registration.advice import advise
 from bodyscan.registration.located_view import LocatedView, board_symmetries
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import PlacedRig, place_rig
@@ -47,39 +51,75 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
     notes: list[str] = []
     views = find_all_boards(rig, captures, notes, progress)
     notes += coverage_notes(rig, views)
+    notes += boards_not_found(rig, views, len(captures.sequences))
     cameras, failed = calibrate_cameras(rig, views, boards, progress)
     if not cameras:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
-        raise FailedWork(f"no pair could be calibrated ({reasons})", where=f"rig {rig.name}")
+        raise FailedWork(
+            f"no pair could be calibrated ({reasons})",
+            where=f"rig {rig.name}",
+            remedy=what_was_found(rig, views, len(captures.sequences)),
+        )
     progress("joining the pairs", 0, 1)
     located = locate_views(views, cameras, boards, notes)
     placed = place_rig(rig, located, {name: c.camera for name, c in cameras.items()})
-
+    failed |= placed.left_out
+    notes += size_doubt(rig, placed.rig_from_camera)
     cameras = {name: own for name, own in cameras.items() if name in placed.rig_from_camera}
     progress("joining the pairs", 1, 1)
     boundaries = decode_on_boards(rig, captures, placed, views, notes, progress)
     pairs = calibrate_pairs(rig, cameras, placed, boundaries, failed, notes, progress)
+    for pair in pairs.values():
+        placed = placed_again(rig, placed, pair)
     return RigCalibration(
         rig,
         pairs,
-        {name: placing_of(rig, placed, pair) for name, pair in pairs.items()},
+        {name: placed.rig_from_camera[name] for name in pairs},
         placed.covariance,
         placed.rig_from_board,
         failed,
         (*notes, *placed.notes),
+        advice_on(rig, placed, progress),
+        seen_corners(placed),
     )
 
 
-def placing_of(rig: Rig, placed: PlacedRig, pair: PairCalibration) -> RigidTransform:
-    """`rig_from_camera`; where the pair's stripes changed its camera, so that the board which fixes
-    the rig frame is still seen where it lies."""
-    target, camera = frame_target(rig), pair.camera
-    view = next((v for v in placed.views if v.pair == pair.name and v.target == target), None)
-    if view is None or camera == placed.cameras[pair.name]:
-        return placed.rig_from_camera[pair.name]
-    seen = PlanarView(view.shot, view.points, view.pixels)
-    camera_from_board, _ = locate_board(camera, seen)
-    return placed.rig_from_board[view.target] @ camera_from_board.inverse()
+def advice_on(rig: Rig, placed: PlacedRig, progress: Progress = silent) -> tuple[str, ...]:
+    """How well the pairs are tied together, whether halves of the shots agree, and what would help
+    most; nothing for one pair."""
+    if len(placed.rig_from_camera) < 2:
+        return ()
+    progress("advice", 0, 1)
+    said = advise(rig, placed).lines
+    try:
+        said.append(compare_halves(rig, placed).summary)
+    except FailedWork as error:
+        said.append(f"the rig cannot be placed from halves of its shots: {error.what}")
+    progress("advice", 1, 1)
+    return tuple(said)
+
+
+def placed_again(rig: Rig, placed: PlacedRig, pair: PairCalibration) -> PlacedRig:
+    """Where a pair's stripes changed its camera: camera and boards as that camera sees them, the
+    board that fixes the rig frame where it lies. Only a pair by itself is refined so."""
+    if pair.camera == placed.cameras[pair.name]:
+        return placed
+    seen = {
+        view.target: locate_board(pair.camera, PlanarView(view.shot, view.points, view.pixels))[0]
+        for view in placed.views
+    }
+    frame = frame_target(rig)
+    rig_from_camera = (
+        placed.rig_from_board[frame] @ seen[frame].inverse()
+        if frame in seen
+        else placed.rig_from_camera[pair.name]
+    )
+    return replace(
+        placed,
+        cameras={pair.name: pair.camera},
+        rig_from_camera={pair.name: rig_from_camera},
+        rig_from_board={target: rig_from_camera @ board for target, board in seen.items()},
+    )
 
 
 def find_all_boards(

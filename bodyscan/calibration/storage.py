@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from bodyscan import __version__
 from bodyscan.calibration.light_choice import HeldOutModel
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.calibration.rig_calibration import RigCalibration
+from bodyscan.calibration.seen_corners import SeenCorners
 from bodyscan.capture.rig import Rig
 from bodyscan.errors import CalibrationFileError
 from bodyscan.files import write_json, write_npz
@@ -39,6 +40,9 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
         if pair.light is not None:
             for key, array in to_arrays(pair.light).items():
                 arrays[f"{name}/light/{key}"] = array
+    for name, seen in calibration.seen.items():
+        for part in fields(seen):
+            arrays[f"{name}/seen/{part.name}"] = getattr(seen, part.name)
     write_npz(folder / ARRAYS_NAME, **arrays)
     content = {
         "schema": SCHEMA,
@@ -54,6 +58,7 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
         "placing_covariance_order": calibration.covariance.names,
         "failed": calibration.failed,
         "notes": calibration.notes,
+        "advice": calibration.advice,
     }
     write_json(folder / FILE_NAME, content)
     return folder / FILE_NAME
@@ -65,6 +70,13 @@ def load_calibration(path: Path) -> RigCalibration:
     Raises CalibrationFileError if files are missing, damaged, or of another schema version.
     """
     file = path / FILE_NAME if path.is_dir() else path
+    if file.suffix in (".yaml", ".yml"):
+        raise CalibrationFileError(
+            "is a rig file, not a calibration",
+            where=str(file),
+            remedy="give the folder that `bodyscan calibrate-rig` wrote, by default `calibration` "
+            "beside the rig file",
+        )
     try:
         content = json.loads(file.read_text("utf-8"))
         if content.get("schema") != SCHEMA or content.get("version") != VERSION:
@@ -144,13 +156,21 @@ def _calibration(content: dict[str, Any], arrays: Any) -> RigCalibration:
         },
         content["failed"],
         tuple(content["notes"]),
+        tuple(content.get("advice", ())),
+        {
+            name: SeenCorners(**_under(f"{name}/seen/", arrays))
+            for name in content["pairs"]
+            if f"{name}/seen/pixels" in arrays.files
+        },
     )
 
 
 def _light(content: dict[str, Any], name: str, arrays: Any) -> LightSheets:
-    prefix = f"{name}/light/"
-    own = {key.removeprefix(prefix): arrays[key] for key in arrays.files if key.startswith(prefix)}
-    return from_arrays(content["kind"], own, content["direction"])
+    return from_arrays(content["kind"], _under(f"{name}/light/", arrays), content["direction"])
+
+
+def _under(prefix: str, arrays: Any) -> dict[str, Any]:
+    return {key.removeprefix(prefix): arrays[key] for key in arrays.files if key.startswith(prefix)}
 
 
 def _quality(content: dict[str, Any]) -> PairQuality:

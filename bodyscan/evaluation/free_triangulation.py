@@ -14,6 +14,7 @@ from bodyscan.capture.rig import Rig
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
 from bodyscan.geometry.triangulation import triangulate
+from bodyscan.registration.board_shape import BoardShape
 from bodyscan.registration.located_view import LocatedView
 from bodyscan.registration.rig_solve import place_rig
 
@@ -23,7 +24,8 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class FreeTriangulation:
     """One shot: corners seen by two or more cameras, RMS reprojection of the triangulated corners
-    (px), RMS distance of the triangulated corners to the rigidly fitted board (mm).
+    (px), RMS distance of the triangulated corners to the rigidly fitted board (mm): as the rig file
+    describes it, and as its shape was found from the other shots (the same where it was not).
     """
 
     shot: str
@@ -31,12 +33,14 @@ class FreeTriangulation:
     observations: int
     rms_px: float
     rms_mm: float
+    rms_shaped_mm: float
 
 
 def triangulate_board(
     views: Sequence[LocatedView],
     cameras: dict[str, Camera],
     rig_from_camera: dict[str, RigidTransform],
+    shape: BoardShape | None = None,
 ) -> FreeTriangulation:
     """The views of one board in one shot, each corner triangulated by itself."""
     corners, number = np.unique(
@@ -59,17 +63,23 @@ def triangulate_board(
     )
     squared = np.sum(residuals**2, axis=-1)
     observed = np.isfinite(squared)
-    off = np.full(1, np.nan)
-    if known.sum() >= 4:
-        rig_from_board = rigid_fit(corners[known], points[known])
-        off = np.sum((rig_from_board.apply(corners[known]) - points[known]) ** 2, axis=1)
+    true = shape.applied(corners) if shape else corners
     return FreeTriangulation(
         views[0].shot,
         int(known.sum()),
         int(observed.sum()),
         float(np.sqrt(np.mean(squared[observed]))) if observed.any() else float("nan"),
-        float(np.sqrt(np.mean(off))),
+        _off_board(corners[known], points[known]),
+        _off_board(true[known], points[known]),
     )
+
+
+def _off_board(corners: Array, points: Array) -> float:
+    """RMS distance (mm) of points (N, 3) to the corners (N, 3) rigidly fitted to them."""
+    if len(corners) < 4:
+        return float("nan")
+    fitted = rigid_fit(corners, points).apply(corners)
+    return float(np.sqrt(np.mean(np.sum((fitted - points) ** 2, axis=1))))
 
 
 def leave_shots_out(rig: Rig, captures: Captures) -> list[FreeTriangulation]:
@@ -88,13 +98,18 @@ def leave_shots_out(rig: Rig, captures: Captures) -> list[FreeTriangulation]:
         )
         left_out = [view for view in views if view.shot == shot]
         if len(left_out) >= 2:
-            results.append(triangulate_board(left_out, placed.cameras, placed.rig_from_camera))
+            shape = placed.board_shapes.get(left_out[0].board)
+            results.append(
+                triangulate_board(left_out, placed.cameras, placed.rig_from_camera, shape)
+            )
     return results
 
 
-def pooled(results: Sequence[FreeTriangulation]) -> tuple[float, float]:
-    """RMS over all shots: reprojection (px) and distance to the board (mm)."""
+def pooled(results: Sequence[FreeTriangulation]) -> tuple[float, float, float]:
+    """RMS over all shots: reprojection (px), distance to the board as described and as found (mm)."""
     px = sum(r.observations * r.rms_px**2 for r in results) / sum(r.observations for r in results)
     known = [r for r in results if np.isfinite(r.rms_mm)]
-    mm = sum(r.corners * r.rms_mm**2 for r in known) / sum(r.corners for r in known)
-    return float(np.sqrt(px)), float(np.sqrt(mm))
+    count = sum(r.corners for r in known)
+    mm = sum(r.corners * r.rms_mm**2 for r in known) / count
+    shaped = sum(r.corners * r.rms_shaped_mm**2 for r in known) / count
+    return float(np.sqrt(px)), float(np.sqrt(mm)), float(np.sqrt(shaped))

@@ -54,7 +54,9 @@ class RigidTransform:
     @property
     def angle(self) -> float:
         """Size of the rotation, radians."""
-        return float(np.linalg.norm(self.rotation_vector))
+        # |R - 1| = 2 sqrt(2) sin(angle / 2), exact for small angles too.
+        half = np.linalg.norm(self.rotation - np.eye(3)) / np.sqrt(8.0)
+        return float(2.0 * np.arcsin(min(half, 1.0)))
 
     def __matmul__(self, other: RigidTransform) -> RigidTransform:
         return RigidTransform(

@@ -18,13 +18,10 @@ from bodyscan.registration.more_shots import (
     Sharpening,
     board_places,
 )
+from bodyscan.registration.normal_equations import normal_equations
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import PlacedRig
-from bodyscan.registration.uncertainty import (
-    normal_equations,
-    point_covariance,
-    position_sigma,
-)
+from bodyscan.registration.uncertainty import point_covariance, position_sigma
 from bodyscan.registration.view_graph import Target, view_graph
 
 WEAK_TIMES = 2.0

@@ -29,6 +29,9 @@ from bodyscan.registration.uncertainty import PlacingCovariance
 Array = NDArray[np.float64]
 
 BODY_CENTRE_MM = np.array([0.0, 0.0, 900.0])
+COARSE = 4  # only one in so many points takes part
+FINE_ROUNDS = 2  # at the end, with all of them
+SWAY_ROOM = 1.5  # standard deviations are believed this much larger than what was found
 
 
 @dataclass(frozen=True)
@@ -37,27 +40,32 @@ class AlignmentSettings:
 
     spacing_mm: of the points that take part.  reach_mm: farthest match, halved each round down to
     `least_reach_mm`.  fewest: matches below which two pairs do not count as overlapping.
-    sway_mm, sway_deg: how far a subject may move between pairs (standard deviations; a rotation
-    about the body's centre); 0 for a rigid object.  limit_sigmas: a pair that wants to move
-    farther than this many standard deviations of its prior stays where it was.
+    sway_mm, sway_deg: how far a subject is believed to move between pairs (standard deviations; a
+    rotation about the body's centre); 0 for a rigid object.  Each round believes what the last one
+    found, from `least_sway` to `most_sway` times that.  limit_sigmas: a pair that wants to move
+    farther than this many standard deviations, most_sway taken, stays where it was.
     correlated: neighbouring points share their errors, so many count as one.
     """
 
     matching: Literal["projected", "nearest"] = "projected"
-    spacing_mm: float = 5.0
+    spacing_mm: float = 3.0
     reach_mm: float = 12.0
     least_reach_mm: float = 3.0
     rounds: int = 5
     fewest: int = 100
     sway_mm: float = 1.0
     sway_deg: float = 0.05
+    least_sway: float = 0.3
+    most_sway: float = 4.0
     limit_sigmas: float = 5.0
-    correlated: float = 10.0
+    correlated: float = 5.0
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """source and target pairs, how many points they share, their distance before and after, mm."""
+    """source and target pairs, about how many points they share, and how far apart those lie before
+    and after, mm.
+    """
 
     source: str
     target: str
@@ -96,21 +104,24 @@ def align(
     names = [image.pair for image in images]
     start = [rig_from_camera[name] for name in names]
     patches = [patch(image, settings.spacing_mm) for image in images]
-    covariance = _prior(names, prior, settings)
     motion = np.zeros((len(names), 6))
-    reach = settings.reach_mm
-    for _ in range(settings.rounds):
+    reach, sway = settings.reach_mm, 1.0
+    coarse = [p.thinned(COARSE) for p in patches]
+    for left in range(settings.rounds, 0, -1):
         moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
-        motion = _solve(_all_matches(patches, moved, reach, settings), motion, covariance, settings)
-        reach = max(reach / 2.0, settings.least_reach_mm)
-    motion, refused = _bounded(names, motion, covariance, settings.limit_sigmas)
+        taken = patches if left <= FINE_ROUNDS else coarse
+        matches = _all_matches(taken, moved, reach, settings)
+        motion = _solve(matches, motion, _prior(names, prior, settings, sway), settings)
+        reach, sway = max(reach / 2.0, settings.least_reach_mm), _sway_of(motion, settings)
+    widest = _prior(names, prior, settings, settings.most_sway)
+    motion, refused = _bounded(names, motion, widest, settings.limit_sigmas)
     moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
-    shift = np.linalg.norm(motion[:, 3:] + np.cross(motion[:, :3], BODY_CENTRE_MM), axis=1)
+    shift = np.linalg.norm(_shifts(motion), axis=1)
     return Alignment(
         dict(zip(names, moved, strict=True)),
         dict(zip(names, shift.tolist(), strict=True)),
         refused,
-        _overlaps(names, patches, start, moved, settings),
+        _overlaps(names, coarse, start, moved, settings),
     )
 
 
@@ -163,13 +174,33 @@ def _solve(
     return np.linalg.solve(normal, right).reshape(-1, 6)
 
 
-def _prior(names: Sequence[str], prior: PlacingCovariance, settings: AlignmentSettings) -> Array:
-    """(6P, 6P): the calibration's covariance, plus sway about the body's centre for each pair."""
+def _shifts(motion: Array) -> Array:
+    """(P, 3) mm: how far motions (P, 6) carry the body's centre."""
+    return motion[:, 3:] + np.cross(motion[:, :3], BODY_CENTRE_MM)
+
+
+def _sway_of(motion: Array, settings: AlignmentSettings) -> float:
+    """How much the subject moved, in multiples of settings.sway_mm, within its bounds.
+
+    A prior too tight would leave a part of the sway in; too wide it would let noise in.
+    """
+    if not settings.sway_mm:
+        return 1.0
+    found = float(np.sqrt(np.mean(_shifts(motion) ** 2))) / settings.sway_mm
+    return float(np.clip(SWAY_ROOM * found, settings.least_sway, settings.most_sway))
+
+
+def _prior(
+    names: Sequence[str], prior: PlacingCovariance, settings: AlignmentSettings, sway: float
+) -> Array:
+    """(6P, 6P): the calibration's covariance, plus for each pair a sway about the body's centre of
+    `sway` times what the settings say.
+    """
     order = np.concatenate([6 * prior.names.index(name) + np.arange(6) for name in names])
-    rotation, translation = np.radians(settings.sway_deg), settings.sway_mm
-    sway = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
+    rotation, translation = sway * np.radians(settings.sway_deg), sway * settings.sway_mm
+    own = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
     carry = adjoint(RigidTransform(np.eye(3), BODY_CENTRE_MM))
-    each = np.kron(np.eye(len(names)), carry @ sway @ carry.T)
+    each = np.kron(np.eye(len(names)), carry @ own @ carry.T)
     return prior.matrix[np.ix_(order, order)] + each
 
 
@@ -201,7 +232,7 @@ def _overlaps(
         Overlap(
             names[i],
             names[j],
-            len(now[i, j].distances),
+            COARSE * len(now[i, j].distances),
             _rms(was[i, j].distances) if (i, j) in was else float("nan"),
             _rms(now[i, j].distances),
         )

@@ -17,7 +17,11 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.visibility import in_image
 from bodyscan.registration.located_view import LocatedView
-from bodyscan.registration.uncertainty import NormalEquations, normal_equations, scaled_inverse
+from bodyscan.registration.normal_equations import (
+    NormalEquations,
+    normal_equations,
+    scaled_inverse,
+)
 
 Array = NDArray[np.float64]
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from bodyscan.capture.rig import Placing, Rig
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.located_view import board_symmetries
 from bodyscan.registration.view_graph import Target
 
 
@@ -27,10 +30,38 @@ def frame_target(rig: Rig) -> Target | None:
     return (shot, board.name) if board and shot else None
 
 
+def frame_board_turn(
+    rig: Rig,
+    root_from_camera: Mapping[str, RigidTransform],
+    root_from_board: Mapping[Target, RigidTransform],
+) -> RigidTransform:
+    """`board_from_seen` of the board that fixes the rig frame, if that board is a plain one.
+
+    Such a board may be numbered from its other end, or lie on its other face, as far as pictures can
+    tell: of all readings, that under which the cameras stand nearest to where they are meant to, or
+    at least above the floor.
+    """
+    target = frame_target(rig)
+    if target is None or target not in root_from_board or rig.board(target[1]).kind == "charuco":
+        return RigidTransform.identity()
+
+    def astray(turn: RigidTransform) -> float:
+        turned = {target: root_from_board[target] @ turn.inverse()}
+        to_rig = rig_from_root(rig, root_from_camera, turned)
+        total = 0.0
+        for name, placing in root_from_camera.items():
+            place, nominal = (to_rig @ placing).translation, rig.pair(name).nominal
+            meant = nominal.position_mm if nominal else [*place[:2], abs(place[2])]
+            total += float(np.linalg.norm(place - np.array(meant)))
+        return total
+
+    return min(board_symmetries(rig.board(target[1])), key=astray)
+
+
 def rig_from_root(
     rig: Rig,
-    root_from_camera: dict[str, RigidTransform],
-    root_from_board: dict[Target, RigidTransform],
+    root_from_camera: Mapping[str, RigidTransform],
+    root_from_board: Mapping[Target, RigidTransform],
 ) -> RigidTransform:
     """Carries the joint solve's root frame into the rig frame.
 

@@ -2,38 +2,51 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.capture.rig import Rig
+from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import cauchy_weights, spread
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.joint_solve import solve_jointly
+from bodyscan.registration.board_shape import BoardShape, ShapedSolution, with_board_shapes
+from bodyscan.registration.disagreement import error_limit, judge, own_errors
+from bodyscan.registration.full_solve import solve_fully
+from bodyscan.registration.joint_solve import JointSolution, solve_jointly
 from bodyscan.registration.located_view import LocatedView
-from bodyscan.registration.rig_frame import frame_target, rig_from_root
-from bodyscan.registration.uncertainty import PlacingCovariance, placing_covariance
+from bodyscan.registration.normal_equations import normal_equations
+from bodyscan.registration.rig_frame import frame_board_turn, frame_target, rig_from_root
+from bodyscan.registration.uncertainty import PlacingCovariance
 from bodyscan.registration.view_graph import (
     Target,
+    not_together,
     place_boards,
     placings,
     view_graph,
 )
 
-BAD_VIEW_SIGMAS = 6.0
-LEAST_BAD_PX = 0.5
 LOSS_PX = 0.3
+COARSE_PX = 30.0
+"""What a view may be off where only the graph has placed the pairs."""
 ROBUST_SIGMAS = 4.0
+ROUNDS = 3
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedRig:
-    """Everything in the rig frame; cameras as the joint solve left them; rms_px of each pair."""
+    """Everything in the rig frame; cameras as the joint solve left them; rms_px of each pair.
+
+    views: those used, their points where the boards' corners really lie.  left_out: pairs that agree
+    with the others in too few shots to be placed, with the reason.  board_shapes: of boards that
+    are not as described, where others' views confirm it.
+    """
 
     rig_from_camera: dict[str, RigidTransform]
     rig_from_board: dict[Target, RigidTransform]
@@ -42,6 +55,16 @@ class PlacedRig:
     rms_px: dict[str, float]
     views: tuple[LocatedView, ...]
     notes: tuple[str, ...]
+    left_out: dict[str, str]
+    board_shapes: dict[str, BoardShape]
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    solution: JointSolution
+    views: list[LocatedView]
+    dropped: list[LocatedView]
+    notes: list[str]
 
 
 def place_rig(
@@ -53,51 +76,98 @@ def place_rig(
 ) -> PlacedRig:
     """Join all pairs by their shared board views.
 
-    Raises RigDisconnected if groups of pairs share no view, or only views whose board numbering
-    leaves their placing open; BadInput if nothing fixes the rig frame.
+    Raises RigDisconnected if groups of pairs share no view, only views whose board numbering leaves
+    their placing open, or only views that contradict each other; BadInput if nothing fixes the rig
+    frame.
     """
-    names = sorted(cameras)
+    start, left_out = placings(views, sorted(cameras))
+    while True:
+        names = sorted(start)
+        own = [view for view in views if view.pair in start]
+        solved = _solve(own, {n: cameras[n] for n in names}, start, refine_cameras)
+        strangers = _strangers(solved)
+        if not strangers:
+            break
+        if 2 * len(strangers) >= len(names):
+            raise RigDisconnected(
+                not_together(names),
+                remedy="synchronise the cameras, or hold the board still until all have taken "
+                "their picture; check the board's description in the rig file too",
+            )
+        left_out |= {name: not_together([name]) for name in strangers}
+        start = {name: placing for name, placing in start.items() if name not in strangers}
+    refine = refine_cameras and len(start) > 1
+    shaped = ShapedSolution(solved.solution, solved.views, {}, ())
+    if refine:
+        root = min(start)
+        shaped = with_board_shapes(solved.views, solved.solution, root=root, refine_cameras=True)
+    return _placed(rig, shaped, refine, (*solved.notes, *shaped.notes), left_out)
+
+
+def _solve(
+    views: Sequence[LocatedView],
+    cameras: dict[str, Camera],
+    start: Mapping[str, RigidTransform],
+    refine_cameras: bool,
+) -> _Solved:
+    """Solve, take out what cannot be true, solve again."""
+    names = sorted(start)
     graph = view_graph(views, names)
     root = max(names, key=lambda name: (graph.degree(name), name))
-    start = placings(views, names, root)
-    kept, boards, notes = place_boards(views, start)
+    to_root = start[root].inverse()
+    placed = {name: to_root @ placing for name, placing in start.items()}
+    kept, boards, doubtful = place_boards(views, placed)
+    gross = judge([v for v in kept if v.target in doubtful], cameras, placed, boards, COARSE_PX)
+    notes, dropped = list(gross.notes), list(gross.wrong)
+    kept = [view for view in kept if view not in gross.wrong]
+    limit = error_limit(own_errors(kept, cameras))
     # One camera alone was solved with its skew already; nothing is left to join.
     refine = refine_cameras and len(names) > 1
-    solution = None
-    for _ in range(2):
-        solution = solve_jointly(
-            kept,
-            dict(cameras),
-            solution.root_from_camera if solution else start,
-            solution.root_from_board if solution else boards,
-            root=root,
-            refine_cameras=refine,
-            loss_px=LOSS_PX,
+    solution = solve_jointly(
+        kept, cameras, placed, boards, root=root, refine_cameras=refine, loss_px=LOSS_PX
+    )
+    for _ in range(ROUNDS):
+        solution = solve_fully(kept, solution, root=root, refine_cameras=refine)
+        found = judge(
+            kept, solution.cameras, solution.root_from_camera, solution.root_from_board, limit
         )
-        errors = [
-            _rms(
-                _residuals(
-                    view, solution.cameras, solution.root_from_camera, solution.root_from_board
-                )
-            )
-            for view in kept
-        ]
-        limit = max(BAD_VIEW_SIGMAS * float(np.median(errors)), LEAST_BAD_PX)
-        bad = [view for view, error in zip(kept, errors, strict=True) if error > limit]
-        if not bad:
+        if not found.wrong:
             break
-        notes += [
-            f"{view.pair}: board {view.board} in shot {view.shot} does not fit the rig "
-            f"({errors[kept.index(view)]:.2f} px, the usual is {np.median(errors):.2f}); not used"
-            for view in bad
-        ]
-        kept = [view for view in kept if view not in bad]
-    assert solution is not None
+        notes += found.notes
+        dropped += found.wrong
+        kept = [view for view in kept if view not in found.wrong]
+        if 2 * len(found.wrong) > len(kept):
+            break  # whole cameras are wrong, see `_strangers`
+        seen = {view.target for view in kept}
+        solution = replace(
+            solution,
+            root_from_board={k: t for k, t in solution.root_from_board.items() if k in seen},
+        )
+    return _Solved(solution, kept, dropped, notes)
+
+
+def _strangers(solved: _Solved) -> list[str]:
+    """Pairs most of whose shared views had to be taken out."""
+    everything = [*solved.views, *solved.dropped]
+    count = Counter(view.target for view in everything)
+    shared = Counter(view.pair for view in everything if count[view.target] > 1)
+    out = Counter(view.pair for view in solved.dropped if count[view.target] > 1)
+    return sorted(name for name, number in shared.items() if 2 * out[name] > number)
+
+
+def _placed(
+    rig: Rig,
+    solved: ShapedSolution,
+    refine: bool,
+    notes: tuple[str, ...],
+    left_out: dict[str, str],
+) -> PlacedRig:
+    """The solution carried into the rig frame, with its covariance there."""
+    solution, kept = _frame_board_turned(rig, solved.solution, solved.views)
     to_rig = rig_from_root(rig, solution.root_from_camera, solution.root_from_board)
     rig_from_camera = {name: to_rig @ t for name, t in solution.root_from_camera.items()}
-    seen = {view.target for view in kept}
-    rig_from_board = {k: to_rig @ t for k, t in solution.root_from_board.items() if k in seen}
-    covariance = placing_covariance(
+    rig_from_board = {target: to_rig @ t for target, t in solution.root_from_board.items()}
+    covariance = normal_equations(
         kept,
         solution.cameras,
         rig_from_camera,
@@ -105,16 +175,16 @@ def place_rig(
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
         fixed_target=frame_target(rig),
         cameras_free=refine,
-    )
+    ).covariance()
     rms = {
         name: _robust_rms(
             [
-                _residuals(v, solution.cameras, rig_from_camera, rig_from_board)
+                corner_residuals(v, solution.cameras, rig_from_camera, rig_from_board)
                 for v in kept
                 if v.pair == name
             ]
         )
-        for name in names
+        for name in sorted(rig_from_camera)
     }
     return PlacedRig(
         rig_from_camera,
@@ -123,22 +193,34 @@ def place_rig(
         covariance,
         rms,
         tuple(kept),
-        tuple(notes),
+        notes,
+        left_out,
+        solved.shapes,
     )
 
 
-def _residuals(
+def _frame_board_turned(
+    rig: Rig, solution: JointSolution, views: list[LocatedView]
+) -> tuple[JointSolution, list[LocatedView]]:
+    target = frame_target(rig)
+    turn = frame_board_turn(rig, solution.root_from_camera, solution.root_from_board)
+    boards = {
+        key: placing @ turn.inverse() if key == target else placing
+        for key, placing in solution.root_from_board.items()
+    }
+    turned = [view.resolved(turn) if view.target == target else view for view in views]
+    return replace(solution, root_from_board=boards), turned
+
+
+def corner_residuals(
     view: LocatedView,
     cameras: Mapping[str, Camera],
     rig_from_camera: Mapping[str, RigidTransform],
     rig_from_board: Mapping[Target, RigidTransform],
 ) -> Array:
+    """(N, 2) px: where a view's corners should be seen less where they are."""
     camera_from_board = rig_from_camera[view.pair].inverse() @ rig_from_board[view.target]
     return cameras[view.pair].project(camera_from_board.apply(view.points)) - view.pixels
-
-
-def _rms(residuals: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
 
 
 def _robust_rms(parts: Sequence[Array]) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -29,7 +29,8 @@ class Tie:
     """What the boards shared by two groups of pairs say of their relative placing.
 
     votes: how many shared targets agree with it.  rivals: votes of the best contradicting placing,
-    which only boards with an ambiguous numbering (or wrong views) can have.
+    which only boards with an ambiguous numbering (or wrong views) can have.  ambiguous: whether any
+    of the boards may be numbered in more than one way.
     """
 
     first_from_second: RigidTransform
@@ -38,14 +39,17 @@ class Tie:
     rivals: int
     corners: int
 
-    @property
-    def decided(self) -> bool:
-        return self.votes > self.rivals
+    ambiguous: bool
 
     @property
-    def strength(self) -> tuple[int, int]:
+    def decided(self) -> bool:
+        """Most boards agree on one placing, more than on any other."""
+        return self.votes > self.rivals and 2 * self.votes > len(self.targets)
+
+    @property
+    def strength(self) -> tuple[bool, int, int]:
         """Decided ties first, then those with most corners."""
-        return min(self.votes - self.rivals, 2), self.corners
+        return self.decided, min(self.votes - self.rivals, 2), self.corners
 
 
 def view_graph(views: Iterable[LocatedView], pairs: Sequence[str]) -> nx.Graph:
@@ -61,14 +65,15 @@ def view_graph(views: Iterable[LocatedView], pairs: Sequence[str]) -> nx.Graph:
 
 
 def placings(
-    views: Sequence[LocatedView], pairs: Sequence[str], root: str
-) -> dict[str, RigidTransform]:
-    """`root_from_camera` of every pair.
+    views: Sequence[LocatedView], pairs: Sequence[str]
+) -> tuple[dict[str, RigidTransform], dict[str, str]]:
+    """Placings of the pairs in a frame they share, and pairs left out, each with the reason.
 
     Groups of placed pairs grow together, the best decided tie first; a tie between two groups is
     voted on by all boards that any pair of the one and any of the other saw at the same moment.
-    Raises RigDisconnected, naming the groups and what would tie them, or the shots whose board's
-    numbering leaves a tie open.
+    Pairs that see the boards elsewhere in every shot are left out if most pairs do agree.
+    Raises RigDisconnected, naming the groups and what would tie them, the shots whose board's
+    numbering leaves a tie open, or the pairs of which no two agree.
     """
     _refuse_disconnected(view_graph(views, pairs))
     targets = _by_target(views)
@@ -81,7 +86,9 @@ def placings(
         found = {key: tie for key, tie in ties.items() if tie is not None}
         (i, j), best = max(found.items(), key=lambda item: item[1].strength)
         if not best.decided:
-            raise _open_tie(groups[i], groups[j], best)
+            if any(tie.ambiguous for tie in found.values()):
+                raise _open_tie(groups[i], groups[j], best)
+            return _most(groups, best)
         merged = groups[i] | {
             name: best.first_from_second @ placing for name, placing in groups[j].items()
         }
@@ -92,20 +99,41 @@ def placings(
             if p in kept and q in kept
         }
         groups = [*(groups[k] for k in kept), merged]
-    to_root = groups[0][root].inverse()
-    return {name: to_root @ placing for name, placing in groups[0].items()}
+    return groups[0], {}
+
+
+def not_together(names: Iterable[str]) -> str:
+    """What is said of pairs whose views agree with those of others in too few shots."""
+    return (
+        f"the relative placing of {', '.join(sorted(names))} that follows from shared boards differs "
+        "from shot to shot: their pictures were not taken together with the others', or the board "
+        "moved meanwhile"
+    )
+
+
+def _most(groups: Sequence[Group], best: Tie) -> tuple[Group, dict[str, str]]:
+    """The group that holds most pairs, if it holds more than half; the others are left out."""
+    largest = max(groups, key=len)
+    others = sorted(name for group in groups if group is not largest for name in group)
+    if 2 * len(largest) <= len(largest) + len(others):
+        raise RigDisconnected(
+            not_together([*largest, *others]),
+            remedy="synchronise the cameras, or hold the board still until all have taken their "
+            f"picture (at best {best.votes} of {len(best.targets)} shots agree)",
+        )
+    return largest, {name: not_together([name]) for name in others}
 
 
 def place_boards(
-    views: Iterable[LocatedView], root_from_camera: dict[str, RigidTransform]
-) -> tuple[list[LocatedView], dict[Target, RigidTransform], list[str]]:
-    """Resolve every view's alternative, place every board, and name the views that fit nowhere.
+    views: Iterable[LocatedView], root_from_camera: Mapping[str, RigidTransform]
+) -> tuple[list[LocatedView], dict[Target, RigidTransform], set[Target]]:
+    """Resolve every view's alternative and place every board.
 
-    Returns the kept views, `root_from_board` of each target, and a line for each dropped view.
+    Returns the views, `root_from_board` of each target, and the targets on which they disagree.
     """
     kept: list[LocatedView] = []
     boards: dict[Target, RigidTransform] = {}
-    dropped: list[str] = []
+    doubtful: set[Target] = set()
     for target, group in _by_target(views).items():
         placing = _agreed_placing(group, root_from_camera)
         boards[target] = placing
@@ -114,19 +142,15 @@ def place_boards(
                 (view.resolved(choice) for choice in view.alternatives),
                 key=lambda r: apart(root_from_camera[r.pair] @ r.camera_from_board, placing, 300.0),
             )
+            kept.append(resolved)
             gap = apart(root_from_camera[view.pair] @ resolved.camera_from_board, placing, 300.0)
-            if gap <= 2.0 * AGREEMENT_MM:
-                kept.append(resolved)
-            else:
-                dropped.append(
-                    f"{view.pair}: board {view.board} in shot {view.shot} lies {gap:.0f} mm from "
-                    "where the other pairs see it; not used"
-                )
-    return kept, boards, dropped
+            if gap > 2.0 * AGREEMENT_MM:
+                doubtful.add(target)
+    return kept, boards, doubtful
 
 
 def _agreed_placing(
-    group: Sequence[LocatedView], root_from_camera: dict[str, RigidTransform]
+    group: Sequence[LocatedView], root_from_camera: Mapping[str, RigidTransform]
 ) -> RigidTransform:
     """The placing of a board that most corners of its views support."""
     candidates = [root_from_camera[view.pair] @ view.camera_from_board for view in group]
@@ -160,6 +184,7 @@ def _tie(first: Group, second: Group, targets: dict[Target, list[LocatedView]]) 
     """Let every target that both groups saw propose `first_from_second`; take the most agreed."""
     proposals: dict[Target, list[RigidTransform]] = {}
     corners: dict[Target, int] = {}
+    ambiguous = False
     for target, seen in targets.items():
         a = max((v for v in seen if v.pair in first), key=_size, default=None)
         b = max((v for v in seen if v.pair in second), key=_size, default=None)
@@ -170,6 +195,7 @@ def _tie(first: Group, second: Group, targets: dict[Target, list[LocatedView]]) 
         turns = a.alternatives if a.ambiguous else b.alternatives
         proposals[target] = [to_board @ turn @ from_board for turn in turns]
         corners[target] = min(_size(a), _size(b))
+        ambiguous |= len(turns) > 1
     if not proposals:
         return None
     everything = [p for proposal in proposals.values() for p in proposal]
@@ -190,6 +216,7 @@ def _tie(first: Group, second: Group, targets: dict[Target, list[LocatedView]]) 
         votes[best],
         max(rivals, default=0),
         sum(corners.values()),
+        ambiguous,
     )
 
 

@@ -50,7 +50,9 @@ def test_held_out_boards_are_measured_best_by_the_chosen_model(captures):
 
 
 def test_four_real_cameras_agree_on_boards_left_out(captures):
-    rms_px, rms_mm = pooled(leave_shots_out(*opened("charuco-ring", captures)))
-    # Others, fitting all shots: 0.22 to 0.54 px and 0.23 to 0.49 mm. Ours are left out.
-    assert rms_px < 0.35
-    assert rms_mm < 0.35
+    rms_px, rms_mm, rms_shaped_mm = pooled(leave_shots_out(*opened("charuco-ring", captures)))
+    # Others, fitting all shots: 0.22 to 0.54 px and 0.23 to 0.49 mm. Ours are left out; reached are
+    # 0.043 px, 0.184 mm against a flat board and 0.027 mm against the board bent as it is.
+    assert rms_px < 0.08
+    assert rms_mm < 0.23
+    assert rms_shaped_mm < 0.05

@@ -35,9 +35,8 @@ def test_cameras_stand_where_they_stand(workspace, calibration):
     held = rig.names.index("p1-2")
     assert np.all(np.abs(rig.centres_mm[held]) < 1e-9)
     others = [k for k in range(len(rig.names)) if k != held]
-    # Errors of corners of one view are correlated, which the sigmas do not know yet: they are half
-    # of the errors on a full rig, less with so few shots. This catches a wrong unit or a lost board.
-    assert np.all(np.abs(rig.centres_mm[others]) < 12.0 * rig.sigmas_mm[others])
+    # Nine errors in units of their sigmas; in trials of this rig the largest were 0.9 to 2.6.
+    assert np.all(np.abs(rig.centres_mm[others]) < 4.0 * rig.sigmas_mm[others])
 
 
 def test_the_cloud_lies_on_the_body(workspace):

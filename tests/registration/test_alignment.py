@@ -108,3 +108,22 @@ def test_a_pair_without_overlap_stays(scanned):
     found = align(alone, two, known_to(two, 1.0, 0.02))
     assert not found.overlaps
     assert max(found.motion_mm.values()) < 1e-9
+
+
+@pytest.mark.parametrize("sway_mm", [0.0, 1.0, 3.0])
+def test_sway_is_found_whatever_its_size(scanned, sway_mm):
+    """The settings know of 1 mm; a person who stands still or sways by far more is as well aligned."""
+    images, truth = scanned
+    rng = np.random.default_rng(7)
+    start = {
+        name: t.moved([*rng.normal(0.0, 1e-4 * sway_mm, 3), *rng.normal(0.0, sway_mm, 3)])
+        for name, t in truth.items()
+    }
+    found = align(images, start, known_to(truth, 0.02, 0.001))
+    # Noise of 0.2 mm on pixels of 3.4 mm; a fixed prior of 1 mm leaves 0.5 mm of the 3.
+    assert disagreement_mm(found.rig_from_camera, truth) < 0.25
+    assert not found.refused
+    if sway_mm:
+        assert max(found.motion_mm.values()) > 0.5 * sway_mm
+    else:
+        assert max(found.motion_mm.values()) < 0.3

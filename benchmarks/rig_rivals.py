@@ -1,0 +1,178 @@
+"""Other programs on the same corners: `python rig_rivals.py METHOD corners.npz found.npz`.
+
+Run as a script of its own, by whichever Python has the rival installed; needs numpy, scipy and OpenCV.
+corners.npz: pixels (C, F, N, 2), NaN where not seen; points (N, 3) mm; size (2,); matrices (C, 3, 3)
+and lenses (C, 5), each camera calibrated by itself.  found.npz: `camera_from_first` (C, 4, 4) and
+`seconds` (wall, CPU).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+Array = NDArray[np.float64]
+Corners = dict[str, Any]
+
+FEWEST = 8
+KEEP = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+
+
+def opencv_multiview(corners: Corners) -> Array:
+    """OpenCV 5's calibrateMultiview, corners not seen marked as its manual says.
+
+    It takes flat patterns only: each face of a two-faced board is a frame of its own.  Metres: it
+    takes points in millimetres for collinear.
+    """
+    pixels, seen = _seen(corners)
+    faces = 1 + int(np.ptp(corners["points"][:, 2]) > 0)
+    front = len(corners["points"]) // faces
+    pixels = np.concatenate(np.split(pixels, faces, axis=2), axis=1)
+    seen = np.concatenate(np.split(seen, faces, axis=2), axis=1)
+    used = (seen.sum(axis=2) >= FEWEST).any(axis=0)
+    pixels, seen = pixels[:, used], seen[:, used]
+    face = np.repeat(np.arange(faces), len(used) // faces)[used]
+    mask = seen.sum(axis=2) >= FEWEST
+    count = len(mask)
+    marked = np.where(seen[..., None], pixels, -1.0).astype(np.float32)
+    printed = corners["points"].reshape(faces, front, 3).astype(np.float32) / 1000.0
+    printed[..., 2] = 0.0
+    _, _, _, rotations, shifts = cv2.calibrateMultiview(
+        [printed[f] for f in face],
+        [list(marked[k]) for k in range(count)],
+        [tuple(int(v) for v in corners["size"])] * count,
+        mask.astype(np.uint8),
+        np.full((count, 1), cv2.CALIB_MODEL_PINHOLE, np.uint8),
+        list(corners["matrices"]),
+        list(corners["lenses"]),
+        None,
+        None,
+        flagsForIntrinsics=np.full((count, 1), KEEP, np.int32),
+        flags=cv2.CALIB_USE_INTRINSIC_GUESS,
+    )
+    vectors = [np.asarray(r, float) for r in rotations]
+    turns = [cv2.Rodrigues(r)[0] if r.size == 3 else r.reshape(3, 3) for r in vectors]
+    return _stacked(np.array(turns), 1000.0 * np.array(shifts, float).reshape(count, 3))
+
+
+def stereo_chain(corners: Corners) -> Array:
+    """cv2.stereoCalibrate along the tree of the links with most corners in common."""
+    pixels, seen = _seen(corners)
+    common = np.einsum("afn,bfn->ab", seen.astype(float), seen.astype(float))
+    tree = minimum_spanning_tree(-np.triu(common, 1))
+    order, before = breadth_first_order(tree, 0, directed=False)
+    found = np.tile(np.eye(4), (len(pixels), 1, 1))
+    for name in order[1:]:
+        first = before[name]
+        both = seen[first] & seen[name]
+        frames = [f for f in range(len(both)) if both[f].sum() >= FEWEST]
+        *_, rotation, shift, _, _ = cv2.stereoCalibrate(
+            [corners["points"][both[f]].astype(np.float32) for f in frames],
+            [pixels[first, f][both[f]].astype(np.float32) for f in frames],
+            [pixels[name, f][both[f]].astype(np.float32) for f in frames],
+            corners["matrices"][first],
+            corners["lenses"][first],
+            corners["matrices"][name],
+            corners["lenses"][name],
+            tuple(int(v) for v in corners["size"]),
+            flags=cv2.CALIB_FIX_INTRINSIC,
+            criteria=(cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9),
+        )
+        found[name] = _stacked(rotation[None], shift.reshape(1, 3))[0] @ found[first]
+    return found
+
+
+def aniposelib(corners: Corners) -> Array:
+    """aniposelib: its tree of poses, then its bundle adjustment with the board as constraint."""
+    # Not a dependency of the project: see RIVALS_PYTHON in rig.py.
+    from aniposelib.cameras import Camera, CameraGroup  # type: ignore[import-not-found]
+    from aniposelib.utils import get_initial_extrinsics  # type: ignore[import-not-found]
+
+    pixels, seen = _seen(corners)
+    count, frames, per_frame = seen.shape
+    rows = []
+    for f in range(frames):
+        row: dict[int, Array] = {}
+        for k in np.flatnonzero(seen[:, f].sum(axis=1) >= FEWEST):
+            chosen = seen[k, f]
+            _, turn, shift = cv2.solvePnP(
+                corners["points"][chosen],
+                pixels[k, f][chosen],
+                corners["matrices"][k],
+                corners["lenses"][k],
+            )
+            row[int(k)] = _stacked(cv2.Rodrigues(turn)[0][None], shift.reshape(1, 3))[0]
+        rows.append(row)
+    rtvecs = np.full((count, frames, 6), np.nan)
+    for f, row in enumerate(rows):
+        for number, pose in row.items():
+            rtvecs[number, f] = [*cv2.Rodrigues(pose[:3, :3])[0].ravel(), *pose[:3, 3]]
+    cameras = [
+        Camera(
+            matrix=corners["matrices"][k],
+            dist=corners["lenses"][k],
+            size=tuple(int(v) for v in corners["size"]),
+            name=str(k),
+        )
+        for k in range(count)
+    ]
+    group = CameraGroup(cameras)
+    turns, shifts = get_initial_extrinsics(rtvecs, group.get_names())
+    group.set_rotations(turns)
+    group.set_translations(shifts)
+    image_points = np.where(seen[..., None], pixels, np.nan).reshape(count, -1, 2)
+    extra = {
+        "objp": np.tile(corners["points"], (frames, 1)),
+        "ids": np.repeat(np.arange(frames), per_frame),
+        "rvecs": np.repeat(rtvecs[:, :, :3], per_frame, axis=1),
+        "tvecs": np.repeat(rtvecs[:, :, 3:], per_frame, axis=1),
+    }
+    twice = seen.reshape(count, -1).sum(axis=0) >= 2
+    extra = {k: v[:, twice] if v.ndim == 3 else v[twice] for k, v in extra.items()}
+    group.bundle_adjust_iter(image_points[:, twice], extra, verbose=False)
+    matrices = [cv2.Rodrigues(np.asarray(c.get_rotation(), float))[0] for c in group.cameras]
+    places = np.array([np.ravel(c.get_translation()) for c in group.cameras])
+    camera_from_world = _stacked(np.array(matrices), places)
+    return camera_from_world @ np.linalg.inv(camera_from_world[0])
+
+
+METHODS: dict[str, Callable[[Corners], Array]] = {
+    "opencv-multiview": opencv_multiview,
+    "stereo-chain": stereo_chain,
+    "aniposelib": aniposelib,
+}
+
+
+def _seen(corners: Corners) -> tuple[Array, NDArray[np.bool_]]:
+    pixels = np.asarray(corners["pixels"], float)
+    return pixels, np.isfinite(pixels[..., 0])
+
+
+def _stacked(rotations: Array, shifts: Array) -> Array:
+    found = np.tile(np.eye(4), (len(rotations), 1, 1))
+    found[:, :3, :3], found[:, :3, 3] = rotations, shifts
+    return found
+
+
+def main() -> None:
+    method, source, target = sys.argv[1:]
+    with np.load(source) as stored:
+        corners = {name: stored[name] for name in stored.files}
+    wall, cpu = time.perf_counter(), time.process_time()
+    with contextlib.redirect_stdout(io.StringIO()):
+        found = METHODS[method](corners)
+    seconds = np.array([time.perf_counter() - wall, time.process_time() - cpu])
+    np.savez(target, camera_from_first=found, seconds=seconds)
+
+
+if __name__ == "__main__":
+    main()

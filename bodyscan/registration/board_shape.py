@@ -1,0 +1,242 @@
+"""Boards as they really are: bent, or printed a little off, found from all views of them together.
+
+As OpenCV's calibrateCameraRO frees the object's points, but for every board of a rig at once, all
+cameras together; and taken only where boards that took no part are met better with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.calibration.camera import projection_jacobians
+from bodyscan.geometry.least_squares import cauchy_weights, spread
+from bodyscan.geometry.transforms import rigid_fit
+from bodyscan.registration.disagreement import fit_board
+from bodyscan.registration.full_solve import solve_fully
+from bodyscan.registration.joint_solve import JointSolution
+from bodyscan.registration.located_view import LocatedView
+
+Array = NDArray[np.float64]
+
+ROUNDS = 15
+HASTE = 1.6
+"""Corners go so many times as far as they would by themselves: cameras and poses follow them."""
+SETTLED_MM = 1e-3
+PRIOR_MM = 1.0
+"""How far a corner lies from where it should, before any picture says more."""
+SUSPECT = 4.0
+"""Offsets are looked into where they lower the squared residuals by so many variances each."""
+CLEARLY = 0.9
+"""They are used where others' views then fit so many times as closely, or closer."""
+FEWEST_TARGETS = 6
+DIGITS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class BoardShape:
+    """Where a board's corners lie: points (N, 3) nominal, offsets (N, 3), board frame, mm.
+
+    The offsets hold no common motion; their size is the file's on average, since pictures alone
+    cannot tell a larger board that is farther away.
+    """
+
+    points: Array
+    offsets: Array
+
+    @property
+    def rms_mm(self) -> float:
+        return float(np.sqrt(np.mean(np.sum(self.offsets**2, axis=1))))
+
+    @property
+    def out_of_plane_mm(self) -> float:
+        """From the lowest to the highest corner of a face."""
+        return max(
+            float(np.ptp(self.offsets[self.points[:, 2] == z, 2]))
+            for z in np.unique(self.points[:, 2])
+        )
+
+    @property
+    def stretch(self) -> tuple[float, float]:
+        """How much longer than said the board is along its columns and its rows, relative."""
+        along = (np.polyfit(self.points[:, axis], self.offsets[:, axis], 1)[0] for axis in range(2))
+        x, y = (float(value) for value in along)
+        return x, y
+
+    def applied(self, points: Array) -> Array:
+        """Nominal points (M, 3) of this board -> where they lie; unknown ones stay."""
+        number = {key: k for k, key in enumerate(_keys(self.points))}
+        chosen = np.array([number.get(key, -1) for key in _keys(points)])
+        return points + np.where(chosen[:, None] >= 0, self.offsets[chosen], 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ShapedSolution:
+    """The solve with boards as found: shapes by board name, views with their true points, notes."""
+
+    solution: JointSolution
+    views: list[LocatedView]
+    shapes: dict[str, BoardShape]
+    notes: tuple[str, ...]
+
+
+def with_board_shapes(
+    views: Sequence[LocatedView], solution: JointSolution, *, root: str, refine_cameras: bool
+) -> ShapedSolution:
+    """Estimate the boards' shapes if the residuals call for it; keep them if held-out boards agree."""
+    plain = ShapedSolution(solution, list(views), {}, ())
+    targets = sorted({view.target for view in views})
+    if len(targets) < FEWEST_TARGETS or _gain_per_unknown(views, solution) < SUSPECT:
+        return plain
+    before, after = _held_out(views, solution, root, refine_cameras)
+    shaped = _estimate(views, solution, root, refine_cameras)
+    sizes = "; ".join(_said(name, shape) for name, shape in sorted(shaped.shapes.items()))
+    figures = f"boards held out fit to {after:.3f} px with it, {before:.3f} without"
+    if after > CLEARLY * before:
+        return replace(plain, notes=(f"{sizes}: not used, {figures}",))
+    return replace(shaped, notes=(f"{sizes}: used, {figures}",))
+
+
+def _said(name: str, shape: BoardShape) -> str:
+    across, down = shape.stretch
+    return (
+        f"board {name} is not as described: corners {shape.rms_mm:.3f} mm RMS off, "
+        f"{shape.out_of_plane_mm:.2f} mm out of plane, "
+        f"{1e3 * (across - down):+.2f} per mille wider than high (its size as a whole cannot be seen)"
+    )
+
+
+def _estimate(
+    views: Sequence[LocatedView], solution: JointSolution, root: str, refine_cameras: bool
+) -> ShapedSolution:
+    """Shapes and everything else in turn, until both stand."""
+    nominal = {
+        name: np.unique(
+            np.round(np.concatenate([v.points for v in views if v.board == name]), DIGITS) + 0.0,
+            axis=0,
+        )
+        for name in sorted({view.board for view in views})
+    }
+    shapes = {name: BoardShape(p, np.zeros_like(p)) for name, p in nominal.items()}
+    shaped = list(views)
+    for _ in range(ROUNDS):
+        steps = _corner_steps(views, shaped, shapes, solution)
+        shapes = {
+            name: _without_motion(replace(shape, offsets=shape.offsets + HASTE * steps[name]))
+            for name, shape in shapes.items()
+        }
+        shaped = [replace(v, points=shapes[v.board].applied(v.points)) for v in views]
+        solution = solve_fully(shaped, solution, root=root, refine_cameras=refine_cameras)
+        if max(float(np.sqrt(np.mean(step**2))) for step in steps.values()) < SETTLED_MM:
+            break
+    return ShapedSolution(solution, shaped, shapes, ())
+
+
+def _without_motion(shape: BoardShape) -> BoardShape:
+    """The same shape, turned, shifted and sized as the nominal board."""
+    moved = shape.points + shape.offsets
+    fitted = rigid_fit(moved, shape.points).apply(moved)
+    middle = shape.points.mean(axis=0)
+    arms, found = shape.points - middle, fitted - fitted.mean(axis=0)
+    size = np.sum(arms * arms) / np.sum(arms * found)
+    return replace(shape, offsets=size * found - arms)
+
+
+def _corner_steps(
+    views: Sequence[LocatedView],
+    shaped: Sequence[LocatedView],
+    shapes: Mapping[str, BoardShape],
+    solution: JointSolution,
+) -> dict[str, Array]:
+    """A Gauss-Newton step (N, 3) mm of every corner by itself, held near the nominal board."""
+    information, pull, variance = _corner_equations(views, shaped, shapes, solution)
+    held = variance / PRIOR_MM**2
+    steps = {}
+    for name, shape in shapes.items():
+        matrix = information[name] + held * np.eye(3)
+        right = pull[name] + held * shape.offsets
+        steps[name] = -np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0], np.float64)
+    return steps
+
+
+def _gain_per_unknown(views: Sequence[LocatedView], solution: JointSolution) -> float:
+    """By how many variances a free corner would lower the squared residuals, per coordinate."""
+    shapes = {
+        name: BoardShape(p, np.zeros_like(p))
+        for name in sorted({view.board for view in views})
+        for p in [np.unique(np.concatenate([v.points for v in views if v.board == name]), axis=0)]
+    }
+    information, pull, variance = _corner_equations(views, views, shapes, solution)
+    gain, unknowns = 0.0, 0
+    for name in shapes:
+        inverse = np.linalg.pinv(information[name], rcond=1e-6, hermitian=True)
+        gain += float(np.einsum("ni,nij,nj->", pull[name], inverse, pull[name]))
+        unknowns += 3 * len(pull[name])
+    return gain / (variance * unknowns)
+
+
+def _corner_equations(
+    views: Sequence[LocatedView],
+    shaped: Sequence[LocatedView],
+    shapes: Mapping[str, BoardShape],
+    solution: JointSolution,
+) -> tuple[dict[str, Array], dict[str, Array], float]:
+    """J^T W J (N, 3, 3), J^T W r (N, 3) of each board's corners, and the variance in px2."""
+    parts = []
+    for view in shaped:
+        camera = solution.cameras[view.pair]
+        camera_from_board = (
+            solution.root_from_camera[view.pair].inverse() @ solution.root_from_board[view.target]
+        )
+        points = camera_from_board.apply(view.points)
+        _, by_point = projection_jacobians(camera, points)
+        parts.append((by_point @ camera_from_board.rotation, camera.project(points) - view.pixels))
+    residuals = np.concatenate([r.ravel() for _, r in parts])
+    weights = cauchy_weights(residuals, 2, 4.0 * spread(residuals))
+    variance = float(np.sum(weights * residuals**2) / np.sum(weights))
+    information = {name: np.zeros((len(s.points), 3, 3)) for name, s in shapes.items()}
+    pull = {name: np.zeros((len(s.points), 3)) for name, s in shapes.items()}
+    number = {name: {key: k for k, key in enumerate(_keys(s.points))} for name, s in shapes.items()}
+    cuts = np.cumsum([r.size for _, r in parts])[:-1]
+    for view, (jacobian, residual), weight in zip(
+        views, parts, np.split(weights, cuts), strict=True
+    ):
+        chosen = np.array([number[view.board][key] for key in _keys(view.points)])
+        weighted = jacobian * weight.reshape(-1, 2, 1)
+        information[view.board][chosen] += np.einsum("npi,npj->nij", weighted, jacobian)
+        pull[view.board][chosen] += np.einsum("npi,np->ni", weighted, residual)
+    return information, pull, variance
+
+
+def _held_out(
+    views: Sequence[LocatedView], solution: JointSolution, root: str, refine_cameras: bool
+) -> tuple[float, float]:
+    """RMS px of boards held out, posed by the rest's cameras: without shapes, with them."""
+    targets = sorted({view.target for view in views})
+    squares: list[tuple[float, float]] = []
+    for part in range(2):
+        held = set(targets[part::2])
+        others = [view for view in views if view.target not in held]
+        kept = {t: p for t, p in solution.root_from_board.items() if t not in held}
+        start = replace(solution, root_from_board=kept)
+        flat = solve_fully(others, start, root=root, refine_cameras=refine_cameras)
+        bent = _estimate(others, flat, root, refine_cameras)
+        for target in held:
+            own = [view for view in views if view.target == target]
+            true = [replace(v, points=bent.shapes[v.board].applied(v.points))
+                    if v.board in bent.shapes else v for v in own]  # fmt: skip
+            placing = solution.root_from_board[target]
+            before = fit_board(own, flat.cameras, flat.root_from_camera, placing).rms_px
+            after = fit_board(
+                true, bent.solution.cameras, bent.solution.root_from_camera, placing
+            ).rms_px
+            squares += list(zip(before**2, after**2, strict=True))
+    before_px, after_px = np.sqrt(np.median(np.array(squares), axis=0))
+    return float(before_px), float(after_px)
+
+
+def _keys(points: Array) -> list[tuple[float, ...]]:
+    return [tuple(point) for point in (np.round(points, DIGITS) + 0.0).tolist()]

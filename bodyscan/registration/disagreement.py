@@ -1,0 +1,233 @@
+"""Views of one board at one moment that cannot all be true: which, and why.
+
+Judged with the cameras as placed: every view by itself fits some pose of the board to within the
+corners' noise; together they must fit one.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.calibration.camera import projection_jacobians, twist_jacobian
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.located_view import LocatedView
+from bodyscan.registration.view_graph import Target
+
+Array = NDArray[np.float64]
+
+TIMES_OWN = 6.0
+LEAST_BAD_PX = 0.2
+OTHER_SIZE = 0.005
+"""A board whose squares seem to differ by this share is another board."""
+SAME_SIZE_SHOTS = 3
+STEPS = 15
+CONVERGED = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """wrong: the views not to be used.  notes: a line for each cause, naming shot and pairs.
+
+    sizes: of a board that seems to have larger or smaller squares, by the board's name.
+    """
+
+    wrong: tuple[LocatedView, ...]
+    notes: tuple[str, ...]
+    sizes: tuple[tuple[str, float], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class BoardFit:
+    """One board pose for several views: RMS px of each view, and how large the board seems."""
+
+    rms_px: Array
+    size: float
+
+
+def own_errors(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> Array:
+    """RMS px (V,) of each view about the pose it was located at by itself."""
+    return np.array(
+        [
+            _rms(
+                cameras[view.pair].project(view.camera_from_board.apply(view.points)) - view.pixels
+            )
+            for view in views
+        ]
+    )
+
+
+def error_limit(own: Array) -> float:
+    """px: a view farther off than this does not fit the rig. own: (V,) from `own_errors`."""
+    return max(TIMES_OWN * float(np.median(own)), LEAST_BAD_PX)
+
+
+def judge(
+    views: Sequence[LocatedView],
+    cameras: Mapping[str, Camera],
+    root_from_camera: Mapping[str, RigidTransform],
+    root_from_board: Mapping[Target, RigidTransform],
+    limit_px: float,
+) -> Verdict:
+    """Find the wrong views among those of each board at each moment."""
+    groups: dict[Target, list[LocatedView]] = defaultdict(list)
+    for view in views:
+        groups[view.target].append(view)
+    wrong: list[LocatedView] = []
+    notes: list[str] = []
+    sizes: list[tuple[str, float]] = []
+    for target, group in sorted(groups.items()):
+        board = root_from_board[target]
+        errors = [_error(view, cameras, root_from_camera, board) for view in group]
+        if max(errors) <= limit_px:
+            continue
+        found = _judge_one(group, cameras, root_from_camera, board, limit_px)
+        wrong += found.wrong
+        notes += found.notes
+        sizes += found.sizes
+    return Verdict(tuple(wrong), (*_wrong_squares(sizes), *notes), tuple(sizes))
+
+
+def _wrong_squares(sizes: Sequence[tuple[str, float]]) -> Iterator[str]:
+    """A line for each board that seems to have the same other size in shot after shot."""
+    for name in sorted({name for name, _ in sizes}):
+        own = np.array([size for board, size in sizes if board == name])
+        usual = float(np.median(own))
+        if len(own) >= SAME_SIZE_SHOTS and np.mean(np.abs(own - usual) < OTHER_SIZE) > 0.5:
+            yield (
+                f"board {name} has squares {usual:.3f} times as large as the rig file says, measured "
+                f"by the other boards in {len(own)} shots: correct its square_mm"
+            )
+
+
+def _judge_one(
+    group: list[LocatedView],
+    cameras: Mapping[str, Camera],
+    root_from_camera: Mapping[str, RigidTransform],
+    start: RigidTransform,
+    limit_px: float,
+) -> Verdict:
+    shot, board = group[0].target
+    own = [fit_board([view], cameras, root_from_camera, start).rms_px[0] for view in group]
+    bad = [view for view, error in zip(group, own, strict=True) if error > limit_px]
+    notes = [
+        f"{view.pair}: board {board} in shot {shot} fits no pose "
+        f"({error:.2f} px); corners may be mixed up; not used"
+        for view, error in zip(group, own, strict=True)
+        if error > limit_px
+    ]
+    kept = [view for view in group if view not in bad]
+    together = fit_board(kept, cameras, root_from_camera, start) if kept else None
+    if together is None or together.rms_px.max() <= limit_px:
+        return Verdict(tuple(bad), tuple(notes))
+    resized = fit_board(kept, cameras, root_from_camera, start, free_size=True)
+    if resized.rms_px.max() <= limit_px and abs(resized.size - 1.0) > OTHER_SIZE:
+        said = (
+            f"shot {shot}: what {_names(kept)} took for board {board} has squares {resized.size:.3f} "
+            "times as large: another board? not used"
+        )
+        return Verdict(tuple(group), (*notes, said), ((board, resized.size),))
+    agreeing = _largest_agreement(kept, cameras, root_from_camera, start, limit_px)
+    others = [view for view in kept if view not in agreeing]
+    said = (
+        f"shot {shot}: board {board} stood elsewhere when {_names(others)} saw it "
+        f"({together.rms_px.max():.2f} px off, usual is below {limit_px:.2f}): it moved, or the "
+        "pictures were not taken together; not used"
+    )
+    return Verdict((*bad, *others), (*notes, said))
+
+
+def _largest_agreement(
+    views: list[LocatedView],
+    cameras: Mapping[str, Camera],
+    root_from_camera: Mapping[str, RigidTransform],
+    start: RigidTransform,
+    limit_px: float,
+) -> list[LocatedView]:
+    """Leave out views one by one, each time the one without which the others agree best; none are
+    left where two disagree, since nothing says which is right."""
+    kept = list(views)
+    while len(kept) > 2:
+        rests = [[view for view in kept if view is not out] for out in kept]
+        fits = [fit_board(rest, cameras, root_from_camera, start).rms_px for rest in rests]
+        best = int(np.argmin([np.sum(rms**2) for rms in fits]))
+        kept = rests[best]
+        if fits[best].max() <= limit_px:
+            return kept
+    return []
+
+
+def fit_board(
+    views: Sequence[LocatedView],
+    cameras: Mapping[str, Camera],
+    root_from_camera: Mapping[str, RigidTransform],
+    start: RigidTransform,
+    *,
+    free_size: bool = False,
+) -> BoardFit:
+    """The board pose (and size) that fits all views, from the first view's own pose or `start`."""
+    own = root_from_camera[views[0].pair] @ views[0].camera_from_board
+    first = _descend(views, cameras, root_from_camera, own, free_size)
+    if len(views) == 1:
+        return first
+    second = _descend(views, cameras, root_from_camera, start, free_size)
+    return min(first, second, key=lambda fit: float(np.sum(fit.rms_px**2)))
+
+
+def _descend(
+    views: Sequence[LocatedView],
+    cameras: Mapping[str, Camera],
+    root_from_camera: Mapping[str, RigidTransform],
+    placing: RigidTransform,
+    free_size: bool,
+) -> BoardFit:
+    size, unknowns = 1.0, 7 if free_size else 6
+    rms = np.full(len(views), np.inf)
+    for _ in range(STEPS):
+        normal, gradient, errors = np.zeros((7, 7)), np.zeros(7), []
+        for view in views:
+            camera = cameras[view.pair]
+            camera_from_root = root_from_camera[view.pair].inverse()
+            in_root = placing.apply(size * view.points)
+            in_camera = camera_from_root.apply(in_root)
+            _, by_point = projection_jacobians(camera, in_camera)
+            by_root = by_point @ camera_from_root.rotation
+            by_size = by_root @ placing.rotate(view.points)[..., None]
+            jacobian = np.concatenate([by_root @ twist_jacobian(in_root), by_size], axis=2)
+            residuals = camera.project(in_camera) - view.pixels
+            errors.append(_rms(residuals))
+            flat = jacobian.reshape(-1, 7)
+            normal += flat.T @ flat
+            gradient += flat.T @ residuals.ravel()
+        rms = np.array(errors)
+        scale = 1.0 / np.sqrt(np.diag(normal)[:unknowns])
+        reduced = normal[:unknowns, :unknowns] * np.outer(scale, scale) + 1e-9 * np.eye(unknowns)
+        step = -scale * np.linalg.solve(reduced, scale * gradient[:unknowns])
+        placing = placing.moved(step[:6])
+        size += float(step[6]) if free_size else 0.0
+        if np.linalg.norm(step / scale) < CONVERGED * max(float(np.linalg.norm(rms)), LEAST_BAD_PX):
+            break
+    return BoardFit(rms, size)
+
+
+def _error(
+    view: LocatedView,
+    cameras: Mapping[str, Camera],
+    root_from_camera: Mapping[str, RigidTransform],
+    root_from_board: RigidTransform,
+) -> float:
+    camera_from_board = root_from_camera[view.pair].inverse() @ root_from_board
+    return _rms(cameras[view.pair].project(camera_from_board.apply(view.points)) - view.pixels)
+
+
+def _rms(residuals: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
+
+
+def _names(views: Sequence[LocatedView]) -> str:
+    return ", ".join(sorted(view.pair for view in views))

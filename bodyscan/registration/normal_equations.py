@@ -1,0 +1,186 @@
+"""What all corners say of all unknowns of a rig: the normal equations of the joint solve.
+
+They give the covariance of every placing, what further shots would add, and the last steps of the
+solve itself, with what COLMAP's cameras lack (skew, pixels that are not square).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.calibration.camera import INTRINSICS, projection_jacobians, twist_jacobian
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.least_squares import cauchy_weights, spread
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.located_view import LocatedView
+from bodyscan.registration.uncertainty import PlacingCovariance
+from bodyscan.registration.view_graph import Target
+
+Array = NDArray[np.float64]
+
+LENS = len(INTRINSICS)
+PRIOR_SIGMA = np.array([50.0, 50.0, 5.0, 50.0, 50.0, 0.5, 0.5])
+"""Cameras are known to about this much before the shots of the rig say more, by INTRINSICS."""
+ROBUST_SPREADS = 4.0
+TINY = 1e-12  # keeps a step finite where an unknown has no influence
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """matrix: J^T W J, px2 per unit of either unknown.  gradient: J^T W r.
+
+    Unknowns: motions of the pairs `names` (6 each), motions of the boards `targets` (6 each), then
+    INTRINSICS of each pair if `cameras_free`.  held: unknowns that the rig frame's definition
+    fixes.  variance_px2: of a corner's coordinate.
+    """
+
+    names: tuple[str, ...]
+    targets: tuple[Target, ...]
+    cameras_free: bool
+    matrix: Array
+    gradient: Array
+    held: NDArray[np.int64]
+    variance_px2: float
+
+    @property
+    def first_board(self) -> int:
+        return 6 * len(self.names)
+
+    @property
+    def first_lens(self) -> int:
+        return self.first_board + 6 * len(self.targets)
+
+    @property
+    def free(self) -> NDArray[np.int64]:
+        return np.setdiff1d(np.arange(len(self.matrix)), self.held)
+
+    def step(self) -> Array:
+        """The Gauss-Newton step of all unknowns; 0 for those held."""
+        free = self.free
+        matrix = self.matrix[np.ix_(free, free)]
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        reduced = matrix * np.outer(scale, scale) + TINY * np.eye(len(free))
+        step = np.zeros(len(self.matrix))
+        step[free] = -scale * np.linalg.solve(reduced, scale * self.gradient[free])
+        return step
+
+    def covariance(self) -> PlacingCovariance:
+        """Of the pairs' motions, the corners' variance taken from the residuals."""
+        free = self.free
+        full = np.zeros(self.matrix.shape)
+        full[np.ix_(free, free)] = self.variance_px2 * scaled_inverse(
+            self.matrix[np.ix_(free, free)]
+        )
+        pairs = slice(0, self.first_board)
+        return PlacingCovariance(self.names, full[pairs, pairs])
+
+    def without_boards(self) -> Array:
+        """(13P, 13P), or (6P, 6P): information on pairs and lenses, the boards eliminated.
+
+        A board that holds the rig frame is known instead. Source: Schur complement, Triggs et al.,
+        Bundle Adjustment - A Modern Synthesis, 2000, 6.1.
+        """
+        size = len(self.matrix)
+        boards = np.arange(self.first_board, self.first_lens)
+        rest = np.setdiff1d(np.arange(size), boards)
+        boards = np.setdiff1d(boards, self.held)
+        cross = self.matrix[np.ix_(rest, boards)]
+        inverse = scaled_inverse(self.matrix[np.ix_(boards, boards)])
+        return self.matrix[np.ix_(rest, rest)] - cross @ inverse @ cross.T
+
+
+def scaled_inverse(matrix: Array) -> Array:
+    """Pseudo-inverse of a symmetric matrix whose unknowns have units of very different size."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    reduced = matrix * np.outer(scale, scale)
+    inverse = np.linalg.pinv(reduced, rcond=1e-14, hermitian=True)
+    return np.asarray(inverse * np.outer(scale, scale))
+
+
+def normal_equations(
+    views: Sequence[LocatedView],
+    cameras: Mapping[str, Camera],
+    rig_from_camera: Mapping[str, RigidTransform],
+    rig_from_board: Mapping[Target, RigidTransform],
+    *,
+    fixed_pair: str | None,
+    fixed_target: Target | None,
+    cameras_free: bool,
+    lens_prior: bool = True,
+) -> NormalEquations:
+    """The joint solve's normal equations where it stands; Cauchy weights, a corner at a time.
+
+    A corner q of the rig frame is seen at R^T (q - t); a motion of the board and the opposite
+    motion of the camera change that alike, so both share one Jacobian.  `lens_prior` adds what is
+    known of lenses beforehand; leave it out where views are to be added to other views.
+    """
+    names = tuple(sorted(rig_from_camera))
+    targets = sorted(rig_from_board)
+    first_board = 6 * len(names)
+    first_lens = first_board + 6 * len(targets)
+    size = first_lens + (LENS * len(names) if cameras_free else 0)
+    normal, gradient = np.zeros((size, size)), np.zeros(size)
+    parts = [_view_jacobian(view, cameras, rig_from_camera, rig_from_board) for view in views]
+    residuals = np.concatenate([residual for _, residual in parts])
+    weights = cauchy_weights(residuals, 2, ROBUST_SPREADS * spread(residuals))
+    number_of = {name: number for number, name in enumerate(names)}
+    board_of = {target: number for number, target in enumerate(targets)}
+    cuts = np.cumsum([len(residual) for _, residual in parts])[:-1]
+    for view, (jacobian, residual), weight in zip(
+        views, parts, np.split(weights, cuts), strict=True
+    ):
+        number = number_of[view.pair]
+        columns = np.concatenate(
+            [
+                6 * number + np.arange(6),
+                first_board + 6 * board_of[view.target] + np.arange(6),
+                first_lens + LENS * number + np.arange(LENS) if cameras_free else [],
+            ]
+        ).astype(int)
+        block = jacobian[:, : len(columns)]
+        weighted = block * weight[:, None]
+        normal[np.ix_(columns, columns)] += block.T @ weighted
+        gradient[columns] += weighted.T @ residual
+    held = _held(names, targets, first_board, fixed_pair, fixed_target)
+    degrees = max(float(np.sum(weights)) - (size - len(held)), 1.0)
+    variance = float(np.sum(weights * residuals**2)) / degrees
+    if cameras_free and lens_prior:
+        lens = np.arange(first_lens, size)
+        normal[lens, lens] += max(variance, 1e-12) * np.tile(PRIOR_SIGMA**-2, len(names))
+    return NormalEquations(names, tuple(targets), cameras_free, normal, gradient, held, variance)
+
+
+def _held(
+    names: tuple[str, ...],
+    targets: list[Target],
+    first_board: int,
+    fixed_pair: str | None,
+    fixed_target: Target | None,
+) -> NDArray[np.int64]:
+    if fixed_target is not None:
+        start = first_board + 6 * targets.index(fixed_target)
+    else:
+        start = 6 * names.index(fixed_pair or names[0])
+    return np.arange(start, start + 6)
+
+
+def _view_jacobian(
+    view: LocatedView,
+    cameras: Mapping[str, Camera],
+    rig_from_camera: Mapping[str, RigidTransform],
+    rig_from_board: Mapping[Target, RigidTransform],
+) -> tuple[Array, Array]:
+    """d(pixels) (2N, 19) by camera motion, board motion, INTRINSICS; residuals (2N,)."""
+    camera = cameras[view.pair]
+    in_rig = rig_from_board[view.target].apply(view.points)
+    camera_from_rig = rig_from_camera[view.pair].inverse()
+    points = camera_from_rig.apply(in_rig)
+    lens, by_point = projection_jacobians(camera, points)
+    by_motion = by_point @ camera_from_rig.rotation @ twist_jacobian(in_rig)
+    jacobian = np.concatenate([-by_motion, by_motion, lens], axis=2)
+    residuals = camera.project(points) - view.pixels
+    return jacobian.reshape(-1, jacobian.shape[2]), residuals.ravel()

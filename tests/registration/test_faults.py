@@ -1,0 +1,175 @@
+"""What goes wrong on a rig of twelve cameras: found, named, and of no effect on the rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
+
+from bodyscan.calibration.camera import PlanarView, locate_board
+from bodyscan.errors import RigDisconnected
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.rig_solve import place_rig
+
+PLACINGS, CAMERAS = ring_of_cameras()
+
+
+def place(views):
+    return place_rig(ring_rig(PLACINGS), views, CAMERAS)
+
+
+def rms(placed):
+    errors = [
+        placed.rig_from_camera[name].translation - PLACINGS[name].translation
+        for name in placed.rig_from_camera
+    ]
+    return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
+
+
+@pytest.fixture(scope="module")
+def seen():
+    views, truth = ring_views(PLACINGS, CAMERAS)
+    return views, truth, rms(place(views))
+
+
+def seen_anew(view, rig_from_board, rng, size=1.0):
+    """The view as it would have been with the board there, its squares so many times as large."""
+    camera = CAMERAS[view.pair]
+    camera_from_board = PLACINGS[view.pair].inverse() @ rig_from_board
+    pixels = camera.project(camera_from_board.apply(size * view.points))
+    pixels += rng.normal(0.0, 0.03, pixels.shape)
+    pose, _ = locate_board(camera, PlanarView(view.shot, view.points, pixels))
+    return replace(view, pixels=pixels, camera_from_board=pose)
+
+
+def busiest(views):
+    """The shot with most views, and the pairs that see it."""
+    shots = [view.shot for view in views]
+    shot = max(sorted(set(shots)), key=shots.count)
+    return shot, sorted(view.pair for view in views if view.shot == shot)
+
+
+def test_a_camera_with_half_its_shots_missing(seen):
+    views, _, clean = seen
+    own = [view for view in views if view.pair == "p2-3"]
+    missing = {view.shot for view in own[::2]}
+    placed = place([v for v in views if not (v.pair == "p2-3" and v.shot in missing)])
+    others = [
+        np.linalg.norm(placed.rig_from_camera[n].translation - PLACINGS[n].translation)
+        for n in PLACINGS
+        if n != "p2-3"
+    ]
+    assert not placed.notes
+    assert np.sqrt(np.mean(np.square(others))) < 1.2 * clean
+
+
+def test_a_pair_entirely_absent(seen):
+    views, _, clean = seen
+    cameras = {name: camera for name, camera in CAMERAS.items() if name != "p3-2"}
+    rig = ring_rig(PLACINGS)
+    placed = place_rig(rig, [view for view in views if view.pair != "p3-2"], cameras)
+    assert sorted(placed.rig_from_camera) == sorted(cameras)
+    assert rms(placed) < 1.2 * clean
+
+
+def test_shuffled_corners(seen):
+    views, _, clean = seen
+    number = next(k for k, v in enumerate(views) if v.pair == "p2-2" and len(v.pixels) > 30)
+    order = np.random.default_rng(1).permutation(len(views[number].pixels))
+    shuffled = replace(views[number], pixels=views[number].pixels[order])
+    pose, _ = locate_board(CAMERAS["p2-2"], PlanarView("", shuffled.points, shuffled.pixels))
+    placed = place(
+        [*views[:number], replace(shuffled, camera_from_board=pose), *views[number + 1 :]]
+    )
+    assert len(placed.notes) == 1
+    assert "p2-2" in placed.notes[0]
+    assert views[number].shot in placed.notes[0]
+    assert rms(placed) < 1.2 * clean
+
+
+@pytest.mark.parametrize("slip_mm", [1.5, 60.0])
+def test_a_board_that_slipped_between_exposures(seen, slip_mm):
+    views, truth, clean = seen
+    shot, pairs = busiest(views)
+    late = pairs[-2:]
+    rng = np.random.default_rng(2)
+    slip = RigidTransform.from_rotation_vector([0.0, 0.0, 0.002], [0.0, slip_mm, -slip_mm])
+    moved = slip @ truth[shot, CHARUCO.name]
+    changed = [seen_anew(v, moved, rng) if v.shot == shot and v.pair in late else v for v in views]
+    placed = place(changed)
+    assert len(placed.notes) == 1
+    assert f"shot {shot}" in placed.notes[0]
+    assert all(name in placed.notes[0] for name in late)
+    assert not any(name in placed.notes[0] for name in pairs[:-2])
+    assert rms(placed) < 1.2 * clean
+
+
+@pytest.mark.parametrize("size", [0.8, 1.02])
+def test_a_different_board_in_one_shot(seen, size):
+    views, truth, clean = seen
+    shot, pairs = busiest(views)
+    rng = np.random.default_rng(3)
+    changed = [
+        seen_anew(v, truth[shot, CHARUCO.name], rng, size) if v.shot == shot else v for v in views
+    ]
+    placed = place(changed)
+    assert len(placed.notes) == 1
+    assert f"shot {shot}" in placed.notes[0]
+    assert f"{size:.3f} times" in placed.notes[0]
+    assert all(name in placed.notes[0] for name in pairs)
+    assert rms(placed) < 1.2 * clean
+
+
+@pytest.mark.parametrize("step_mm", [10.0, 400.0])
+def test_a_camera_that_took_its_pictures_at_other_times(seen, step_mm):
+    views, truth, clean = seen
+    rng = np.random.default_rng(4)
+    changed = [
+        seen_anew(v, drifted(truth[v.target], step_mm, rng), rng) if v.pair == "p1-3" else v
+        for v in views
+    ]
+    placed = place(changed)
+    assert list(placed.left_out) == ["p1-3"]
+    assert "p1-3" in placed.left_out["p1-3"]
+    assert "taken together" in placed.left_out["p1-3"]
+    assert rms(placed) < 1.2 * clean
+
+
+@pytest.mark.parametrize("step_mm", [10.0, 400.0])
+def test_pictures_none_of_which_were_taken_together_are_refused(seen, step_mm):
+    views, truth, _ = seen
+    rng = np.random.default_rng(5)
+    changed = [seen_anew(v, drifted(truth[v.target], step_mm, rng), rng) for v in views]
+    with pytest.raises(RigDisconnected, match="taken together") as caught:
+        place(changed)
+    assert all(name in str(caught.value) for name in CAMERAS)
+    assert "synchronise" in str(caught.value)
+
+
+def drifted(rig_from_board, step_mm, rng):
+    """The board as it stood at some other moment."""
+    turn = RigidTransform.from_rotation_vector(
+        rng.normal(0.0, step_mm / 2000.0, 3), rng.normal(0.0, step_mm / 2.0, 3)
+    )
+    middle = rig_from_board.apply(np.array([315.0, 245.0, 0.0]))
+    to_middle = RigidTransform(np.eye(3), middle)
+    return to_middle @ turn @ to_middle.inverse() @ rig_from_board
+
+
+def test_one_of_two_boards_with_other_squares_than_the_rig_file_says(seen):
+    views, truth, clean = seen
+    rng = np.random.default_rng(6)
+    second = {f"s{number:02d}" for number in range(0, 40, 4)}
+    changed = [
+        replace(seen_anew(v, truth[v.target], rng, 1.03), board="other") if v.shot in second else v
+        for v in views
+    ]
+    other = CHARUCO.model_copy(update={"name": "other", "first_marker": 200})
+    rig = ring_rig(PLACINGS).model_copy(update={"boards": (CHARUCO, other)})
+    placed = place_rig(rig, changed, CAMERAS)
+    (said,) = [note for note in placed.notes if "square_mm" in note]
+    assert "board other has squares 1.030 times" in said
+    without = place([v for v in views if v.shot not in second])
+    assert rms(placed) < 1.2 * max(rms(without), clean)
