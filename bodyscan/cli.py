@@ -9,12 +9,15 @@ from typing import Annotated
 
 import typer
 
-from bodyscan import __version__
+from bodyscan import __version__, rig_commands
 from bodyscan.errors import BadInput, BodyscanError
+from bodyscan.jobs import commands as jobs
+from bodyscan.report import commands as reports
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, help=__doc__
 )
+
 
 RigFile = Annotated[Path, typer.Argument(metavar="RIG.YAML", help="The rig file.")]
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER")]
@@ -25,6 +28,7 @@ def main() -> None:
     # Work is shared out by stages, in threads of their own; BLAS threads inside them only get in
     # each other's way (measured: 15 s instead of 1 s for twelve cameras on two cores).
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.umask(0o077)  # images and models of people are for their owner alone
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     try:
@@ -83,6 +87,9 @@ def simulate(
     projector: Annotated[
         str, typer.Option(help="mirror (laser and rotating mirror) or pinhole (with a lens).")
     ] = "mirror",
+    sway_mm: Annotated[
+        float, typer.Option(min=0.0, help="How far the person moves while the pairs capture.")
+    ] = 0.0,
     board_shots: Annotated[
         int | None, typer.Option(min=3, help="Number of board poses; 40 for twelve pairs.")
     ] = None,
@@ -109,11 +116,32 @@ def simulate(
             subject=subject,
             scale=scale,
             seed=seed,
-            settings=settings_for(projector),
+            settings=settings_for(projector, sway_mm=sway_mm),
             board_shots=board_shots,
             progress=clock,
         )
     console.console.print(f"captures: {out / 'captures'}\nrig file: {out / 'rig.yaml'}")
+
+
+@app.command()
+def patterns(
+    rig_file: RigFile,
+    out: Annotated[Path, typer.Option(help="Folder to write into.")],
+    width: Annotated[int, typer.Option(min=1, max=32767, help="Of the projector, px.")] = 1920,
+    height: Annotated[int, typer.Option(min=1, max=32767, help="Of the projector, px.")] = 1080,
+) -> None:
+    """Write the images that a rig's projectors are to show, as PNG, with their order."""
+    from bodyscan.capture.pattern_files import uneven_stripes, write_patterns
+    from bodyscan.capture.rig_file import load_rig
+
+    _refuse_file(out)
+    rig = load_rig(rig_file)
+    written = write_patterns(rig, out, width, height)
+    for note in uneven_stripes(rig, width, height):
+        typer.secho(f"note: {note}", fg="yellow")
+    typer.echo(
+        "\n".join(f"patterns: {path.parent}, in the order of {path.name}" for path in written)
+    )
 
 
 @app.command("calibrate-rig")
@@ -141,6 +169,8 @@ def calibrate_rig(
     for name, reason in calibration.failed.items():
         console.console.print(f"failed: {name}: {reason}", style="red", highlight=False)
     console.console.print(console.calibration_table(calibration))
+    for line in calibration.advice:
+        console.console.print(line, highlight=False)
     console.console.print(console.times_table(clock.seconds))
     console.console.print(f"calibration: {saved}")
 
@@ -157,39 +187,50 @@ def scan(
             help="Range images: projected, nearest (Open3D's ICP), or none (boards only)."
         ),
     ] = "projected",
+    empty: Annotated[
+        Path | None,
+        typer.Option(help="Captures of the rig with nobody in it: cut away what they show."),
+    ] = None,
+    e57: Annotated[
+        bool, typer.Option("--e57", help="Write each pair's raw cloud too: `raw.e57` (pye57).")
+    ] = False,
 ) -> None:
     """Fuse one person's captures into a body cloud and a closed mesh."""
     from bodyscan import console
     from bodyscan.calibration.storage import calibration_id, load_calibration
     from bodyscan.capture.folder import open_scan
-    from bodyscan.fusion.scan import ScanSettings, alignment_settings, warnings
+    from bodyscan.errors import ScanFailed
+    from bodyscan.fusion.scan import ScanSettings, alignment_settings
     from bodyscan.fusion.scan import scan as fuse
-    from bodyscan.fusion.storage import save_scan
+    from bodyscan.fusion.storage import save_failure, save_scan
     from bodyscan.report.scan_pictures import draw_scan
 
     _refuse_file(out)
     rig_calibration = load_calibration(calibration)
     captures = open_scan(rig_calibration.rig, folder)
     settings = ScanSettings(points, alignment_settings(align))
-    with console.stage_clock() as clock:
-        result = fuse(rig_calibration, captures, settings, clock)
     out = out or folder.with_name(f"{folder.name}-model")
-    saved = save_scan(
-        result,
-        out,
-        calibration_id=calibration_id(calibration),
-        subject=captures.subject,
-        when=captures.when,
-    )
+    background = open_scan(rig_calibration.rig, empty) if empty else None
+    subject, when = captures.subject, captures.when
+    origin = calibration_id(calibration)
+    try:
+        with console.stage_clock() as clock:
+            result = fuse(rig_calibration, captures, settings, clock, empty=background)
+    except ScanFailed as error:
+        save_failure(error, out, calibration_id=origin, subject=subject, when=when)
+        raise
+    saved = save_scan(result, out, calibration_id=origin, subject=subject, when=when)
+    if e57:
+        from bodyscan.export.e57 import export_raw_clouds
+
+        export_raw_clouds(out / "raw.e57", result, subject=subject, calibration_id=origin)
     with console.errors.status("drawing"):
         pictures = draw_scan(result, out)
-    for name, reason in result.failed.items():
-        console.console.print(f"left out: {name}: {reason}", style="red", highlight=False)
-    for warning in warnings(result):
-        console.console.print(f"warning: {warning}", style="yellow", highlight=False)
     console.console.print(console.scan_table(result))
     console.console.print(console.times_table(clock.seconds))
     console.console.print(f"result: {saved}\npictures: {', '.join(map(str, pictures))}")
+    console.print_verdict(result.verdict)
+    raise typer.Exit(1 if result.verdict.grade == "repeat" else 0)
 
 
 @app.command()
@@ -197,6 +238,10 @@ def export(
     result: Folder,
     out: Annotated[Path | None, typer.Option(help="Default: `export` inside the result.")] = None,
     formats: Annotated[str, typer.Option("--format", help="Comma-separated.")] = "ply,obj,stl,glb",
+    deface: Annotated[
+        bool, typer.Option("--deface", help="A plain head for sharing; goes into `shared`.")
+    ] = False,
+    frame: Annotated[str, typer.Option(help="rig, or body: under it, x the way it faces.")] = "rig",
 ) -> None:
     """Write a scan's mesh as PLY, OBJ, STL and GLB for other programs."""
     from bodyscan import console
@@ -205,8 +250,37 @@ def export(
 
     _refuse_file(out)
     with console.errors.status("exporting"):
-        written = export_scan(load_scan(result), out or result / "export", formats.split(","))
+        folder = out or result / ("shared" if deface else "export")
+        written = export_scan(
+            load_scan(result), folder, formats.split(","), deface=deface, frame=frame
+        )
     console.console.print("\n".join(map(str, written)))
+
+
+@app.command()
+def measure(
+    result: Folder,
+    heights: Annotated[
+        str | None, typer.Option(help="Of slices over the floor, mm: 800,1050. Default: every 100.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Default: `measurements.json` inside the result.")
+    ] = None,
+) -> None:
+    """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
+    from bodyscan import console
+    from bodyscan.files import write_json
+    from bodyscan.fusion.storage import load_scan
+    from bodyscan.measurement.measuring import heights_from, measure
+    from bodyscan.measurement.reporting import document, tables
+
+    levels = None if heights is None else heights_from(heights)
+    stored = load_scan(result)
+    measured = measure(stored.mesh, levels)
+    path = out or result / "measurements.json"
+    write_json(path, document(measured, stored.facts))
+    console.console.print(*tables(measured), sep="\n")
+    console.console.print(f"measurements: {path}")
 
 
 @app.command()
@@ -220,61 +294,6 @@ def evaluate(workspace: Folder) -> None:
     console.console.print(text, highlight=False)
 
 
-@app.command("export-rig")
-def export_rig(
-    calibration: Annotated[Path, typer.Argument(help="What calibrate-rig wrote.")],
-    out: Annotated[Path, typer.Option(help="Folder to write into.")],
-    formats: Annotated[str, typer.Option("--format", help="Comma-separated.")] = "colmap,opencv",
-) -> None:
-    """Write a calibrated rig for other programs: a COLMAP model with rig, OpenCV's YAML."""
-    from bodyscan import console
-    from bodyscan.calibration.storage import load_calibration
-    from bodyscan.export.rig import export_rig as write
-
-    written = write(load_calibration(calibration), out, formats.split(","))
-    console.console.print("\n".join(map(str, written)))
-
-
-@app.command("sigma-map")
-def sigma_map(
-    calibration: Annotated[Path, typer.Argument(help="What calibrate-rig wrote.")],
-    out: Annotated[
-        Path | None, typer.Option(help="Default: `sigma-map.png` beside the calibration.")
-    ] = None,
-) -> None:
-    """Draw how well the rig's placing knows each place of the scan volume, front and side."""
-    from bodyscan import console
-    from bodyscan.calibration.storage import load_calibration
-    from bodyscan.report.sigma_map import draw_sigma_map
-
-    rig = load_calibration(calibration)
-    folder = calibration if calibration.is_dir() else calibration.parent
-    cameras = {name: pair.camera for name, pair in rig.pairs.items()}
-    path = out or folder / "sigma-map.png"
-    draw_sigma_map(rig.rig.volume, rig.rig_from_camera, cameras, rig.covariance, path)
-    console.console.print(f"picture: {path}")
-
-
-@app.command()
-def reproduce(
-    out: Annotated[Path, typer.Option(help="Folder for the text and the figures.")],
-    seed: Annotated[int, typer.Option(help="Of all noise.")] = 0,
-    real_light: Annotated[
-        bool, typer.Option("--real-light", help="A bowed board, speckle, jitter, a smile, defocus.")
-    ] = False,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Coarser rendering and fewer shots.")
-    ] = False,
-) -> None:
-    """Simulate the chapter's own set-up: its Tables 1 and 2, its Fig. 6 and 7, and all rivals."""
-    from bodyscan import console
-    from bodyscan.evaluation.reproduce import FIGURES, TEXT
-    from bodyscan.evaluation.reproduce import reproduce as run
-
-    with console.stage_clock() as clock:
-        text = run(out, seed=seed, quick=quick, real_light=real_light, progress=clock)
-    # Tables are wider than most terminals: a line cut in two would be hard to read.
-    typer.echo(text)
-    console.console.print(console.times_table(clock.seconds))
-    files = ", ".join(str(out / name) for name in (TEXT, *FIGURES))
-    console.console.print(f"written: {files}", soft_wrap=True)
+rig_commands.register(app)
+jobs.register(app)
+reports.register(app)

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.fusion.scan import Scan
+from bodyscan.fusion.verdict import Verdict
 
 # Tables keep their lines whole when the output goes into a file.
 console = Console() if sys.stdout.isatty() else Console(width=120)
@@ -107,6 +108,12 @@ def calibration_table(calibration: RigCalibration) -> Table:
     for name in calibration.failed:
         table.add_row(name, "failed", *["-"] * 6, style="red")
     return table
+
+
+def print_verdict(verdict: Verdict) -> None:
+    """Good, usable or repeat, and the reasons."""
+    style = {"good": "green", "usable": "yellow", "repeat": "red"}[verdict.grade]
+    console.print(str(verdict), style=style, highlight=False, markup=False)
 
 
 def scan_table(scan: Scan) -> Table:

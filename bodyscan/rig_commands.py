@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from bodyscan.errors import BadInput
+
 
 def register(app: typer.Typer) -> None:
     """Add this module's commands to the command line."""
@@ -43,6 +45,8 @@ def sigma_map(
     folder = calibration if calibration.is_dir() else calibration.parent
     cameras = {name: pair.camera for name, pair in rig.pairs.items()}
     path = out or folder / "sigma-map.png"
+    if path.suffix.lower() != ".png":
+        raise BadInput("the map is drawn as PNG", where=str(path), remedy="name it .png")
     draw_sigma_map(rig.rig.volume, rig.rig_from_camera, cameras, rig.covariance, path)
     console.console.print(f"picture: {path}")
 

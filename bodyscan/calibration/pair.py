@@ -35,6 +35,8 @@ class PairQuality:
     held_out: every model of the light tried on boards it was not fitted to, simplest first.
     refinement: of a pair by itself, whether camera, boards and light were refined together and why;
     flatness_mm: RMS of held-out boards about their own planes, before and after.
+    boards_mm: mean and RMS over the boards of how far the stripes measure them from where the
+    corners of all cameras put them.
     """
 
     corners_rms_px: float
@@ -46,6 +48,7 @@ class PairQuality:
     held_out: tuple[HeldOutModel, ...] = ()
     refinement: str = ""
     flatness_mm: tuple[float, float] | None = None
+    boards_mm: tuple[float, float] | None = None
 
     @property
     def light_model(self) -> str | None:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bodyscan.calibration.boundary_points import BoundaryPoints, binned
 from bodyscan.calibration.camera import CameraCalibration, PlanarView
 from bodyscan.calibration.joint_refinement import striped_board
@@ -16,12 +19,14 @@ from bodyscan.calibration.pair import (
     boundaries_on_boards,
 )
 from bodyscan.calibration.refinement_choice import refine_where_better
-from bodyscan.calibration.stripe_agreement import Disagreement, find_disagreement
+from bodyscan.calibration.stripe_agreement import Disagreement, boards_off, find_disagreement
 from bodyscan.capture.rig import Rig
 from bodyscan.errors import BodyscanError, PairFailed
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.registration.located_view import LocatedView
 from bodyscan.registration.rig_solve import PlacedRig
+
+Array = NDArray[np.float64]
 
 
 def calibrate_pairs(
@@ -98,11 +103,16 @@ def _calibrate_pair(
         stripes_calibrated=fit.stripes_calibrated,
         stripes_projected=projector.stripes - 1,
         held_out=fit.held_out,
+        boards_mm=_mean_and_rms(boards_off(points, fit.sheets)),
     )
     pair = PairCalibration(name, camera, own.covariance, fit.sheets, quality)
     # In a rig of several pairs the boards are held by all cameras together, far better than
     # one pair's stripes could.
     return pair if len(placed.cameras) > 1 else _refined(pair, own, lit, points)
+
+
+def _mean_and_rms(values: Array) -> tuple[float, float] | None:
+    return (float(values.mean()), float(np.sqrt((values**2).mean()))) if values.size else None
 
 
 def agreeing(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from bodyscan.calibration.board_doubts import boards_not_found, size_doubt, what_was_found
@@ -79,7 +79,7 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
         placed.rig_from_board,
         failed,
         (*notes, *placed.notes),
-        advice_on(rig, placed, progress),
+        (*advice_on(rig, placed, progress), *through_the_stripes(pairs)),
         seen_corners(placed),
     )
 
@@ -97,6 +97,19 @@ def advice_on(rig: Rig, placed: PlacedRig, progress: Progress = silent) -> tuple
         said.append(f"the rig cannot be placed from halves of its shots: {error.what}")
     progress("advice", 1, 1)
     return tuple(said)
+
+
+def through_the_stripes(pairs: Mapping[str, PairCalibration]) -> Iterator[str]:
+    """A line on whether stripes measure the boards where the corners put them."""
+    boards = {n: p.quality.boards_mm for n, p in pairs.items() if p.quality.boards_mm is not None}
+    if boards:
+        worst = max(sorted(boards), key=lambda name: boards[name][1])
+        mean = sum(mean for mean, _ in boards.values()) / len(boards)
+        rms = (sum(rms**2 for _, rms in boards.values()) / len(boards)) ** 0.5
+        yield (
+            f"measured by the stripes, boards lie {mean:+.3f} mm (mean) and {rms:.3f} mm (RMS) from "
+            f"where the corners put them; worst: {worst}, {boards[worst][1]:.3f} mm"
+        )
 
 
 def placed_again(rig: Rig, placed: PlacedRig, pair: PairCalibration) -> PlacedRig:

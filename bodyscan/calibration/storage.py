@@ -175,10 +175,8 @@ def _under(prefix: str, arrays: Any) -> dict[str, Any]:
 
 def _quality(content: dict[str, Any]) -> PairQuality:
     tried = tuple(HeldOutModel(**figures) for figures in content["held_out"])
-    flatness = content["flatness_mm"]
-    return PairQuality(
-        **content | {"held_out": tried, "flatness_mm": tuple(flatness) if flatness else None}
-    )
+    two = {name: tuple(content[name]) for name in ("flatness_mm", "boards_mm") if content.get(name)}
+    return PairQuality(**content | {"held_out": tried} | two)
 
 
 def _transform(matrix: Any) -> RigidTransform:

@@ -8,12 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.boundary_points import BoundaryPoints, binned, part, thinned
+from bodyscan.calibration.boundary_points import (
+    BoundaryPoints,
+    binned,
+    board_errors,
+    part,
+    thinned,
+)
 from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.sheet_fit import fit_sheets
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.light_planes import Axis
+from bodyscan.geometry.light_planes import Axis, LightSheets
+from bodyscan.geometry.measuring import measure
 
 Array = NDArray[np.float64]
 Boards = NDArray[np.int64]
@@ -65,6 +72,21 @@ def find_disagreement(
         key=lambda tried: tried.apart_px,
     )
     return best if CLEARLY * best.apart_px < together else None
+
+
+def boards_off(data: BoundaryPoints, sheets: LightSheets) -> Array:
+    """(B,) mm: how far from its place, by the corners of all cameras, each board is measured by the
+    stripes: median along its normal, positive away from the camera."""
+    rays = data.points / data.points[:, 2:]
+    depth = measure(sheets, rays, data.index.astype(float)).depth
+    off = (depth - data.points[:, 2]) * board_errors(data).facing
+    medians = [np.nanmedian(own) for own in _by_board(off, data.board) if np.isfinite(own).any()]
+    return np.array(medians, np.float64)
+
+
+def _by_board(values: Array, board: Boards) -> Iterator[Array]:
+    for number in np.unique(board):
+        yield values[board == number]
 
 
 def _partitions(boards: Boards) -> Iterator[tuple[Boards, Boards, list[Boards]]]:

@@ -117,12 +117,20 @@ def coverage(
     within `spacing_mm`, since even a perfect cloud has gaps between its points.
     """
     spots, normals = sample_surface(vertices, faces, samples, seed)
+    return float(np.mean(covered(points, spots, normals, within_mm, spacing_mm)))
+
+
+def covered(
+    points: Array, spots: Array, normals: Array, within_mm: float = 1.0, spacing_mm: float = 2.0
+) -> NDArray[np.bool_]:
+    """(N,) which spots (N, 3) of a surface with normals (N, 3) points (M, 3) cover: see `coverage`."""
     distance, index = cKDTree(points).query(spots, k=4, distance_upper_bound=spacing_mm + within_mm)
     found = np.isfinite(distance)
     offset = points[np.where(found, index, 0)] - spots[:, None]
     along = np.einsum("nkc,nc->nk", offset, normals)
     sideways = np.sqrt(np.maximum(np.sum(offset**2, axis=-1) - along**2, 0.0))
-    return float(np.mean((found & (np.abs(along) < within_mm) & (sideways < spacing_mm)).any(1)))
+    close = found & (np.abs(along) < within_mm) & (sideways < spacing_mm)
+    return np.asarray(close.any(axis=1))
 
 
 def sample_surface(

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.calibration.storage import load_calibration
 from bodyscan.errors import BadInput
+from bodyscan.evaluation.body import coverage_of_seen, girth_errors, settled
 from bodyscan.evaluation.surface import Deviation, deviation, signed_distances
-from bodyscan.fusion.storage import load_scan
+from bodyscan.export.scan import carried
+from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.fusion.topology import topology
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.report.pictures import draw_deviation
@@ -59,7 +61,9 @@ def load_truth(folder: Path) -> Truth:
         facts = json.loads((folder / "truth.json").read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise BadInput(
-            f"has no readable truth ({error})",
+            "has no truth.json"
+            if isinstance(error, FileNotFoundError)
+            else "has a truth.json that cannot be read",
             where=str(folder),
             remedy="only workspaces made by `bodyscan simulate` can be held against the truth",
         ) from error
@@ -99,9 +103,18 @@ def evaluate_workspace(workspace: Path) -> str:
     if not (folder / "scan.json").exists() or truth.vertices is None or truth.faces is None:
         return "\n".join([*lines, "  no scan to compare yet"])
     stored = load_scan(folder)
-    cloud = signed_distances(stored.cloud.points, truth.vertices, truth.faces)
-    measured = np.unique(stored.mesh.faces[~stored.mesh.filled])
-    mesh = signed_distances(stored.mesh.vertices[measured], truth.vertices, truth.faces)
+    pairs = truth.facts["pairs"]
+    place = settled(_placings(stored, calibration), pairs, truth.vertices)
+    still_from_rig = RigidTransform.identity()
+    if truth.facts["settings"]["person"]["sway_mm"]:
+        still_from_rig = place.rig_from_still.inverse()  # who sways stands nowhere in particular
+    body = carried(stored.mesh, still_from_rig)
+    points = still_from_rig.apply(stored.cloud.points)
+    cloud = signed_distances(points, truth.vertices, truth.faces)
+    measured = np.unique(body.faces[~body.filled])
+    mesh = signed_distances(body.vertices[measured], truth.vertices, truth.faces)
+    girths = girth_errors(body, truth.vertices, truth.faces)
+    seen, covered = coverage_of_seen(points, truth.vertices, truth.faces, pairs)
     shape = topology(stored.mesh.vertices, stored.mesh.faces)
     pictures = [folder / "cloud-deviation.png", folder / "mesh-deviation.png"]
     draw_deviation(stored.cloud.points, cloud, pictures[0], normals=stored.cloud.normals)
@@ -115,6 +128,12 @@ def evaluate_workspace(workspace: Path) -> str:
         f"{'manifold' if shape.manifold else 'not manifold'}, {shape.components} piece(s), "
         f"{'outward' if shape.volume_mm3 > 0 else 'inward'} faces, "
         f"{shape.volume_mm3 / 1e6:.2f} litres",
+        f"  torso girths (tape)     RMS {girths.rms_mm:.2f}, worst {girths.worst_mm:.2f} mm at "
+        f"{girths.worst_at_mm:.0f} mm, {girths.heights} heights; stature "
+        f"{girths.stature_mm:+.2f} mm",
+        f"  covered within 1 mm     {100.0 * covered:.1f} % of the {100.0 * seen:.1f} % of the "
+        "surface that a camera and its projector see",
+        f"  pairs to each other     {place.apart_mm:.3f} mm RMS over the body, along and across",
         "results:",
         f"  calibration {workspace / 'calibration' / 'calibration.json'}",
         f"  cloud       {folder / 'cloud.ply'}",
@@ -123,6 +142,17 @@ def evaluate_workspace(workspace: Path) -> str:
         f"  pictures    {', '.join(str(path) for path in sorted(folder.glob('*.png')))}",
     ]
     return "\n".join(lines)
+
+
+def _placings(stored: StoredScan, calibration: RigCalibration) -> dict[str, RigidTransform]:
+    """rig_from_camera of the pairs in the scan, aligned where they were."""
+    measured = [name for name, points in stored.facts["measured"].items() if points]
+    alignment = stored.facts["alignment"]
+    if alignment is None:
+        return {name: calibration.rig_from_camera[name] for name in measured}
+    return {
+        name: RigidTransform.from_matrix(alignment["rig_from_camera"][name]) for name in measured
+    }
 
 
 def _figures(d: Deviation) -> str:

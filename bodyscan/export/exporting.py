@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from bodyscan.export.ply import write_ply
 from bodyscan.export.stl import write_stl
 from bodyscan.files import write_json
 from bodyscan.fusion.body import BodyCloud, BodyMesh
+from bodyscan.fusion.topology import face_areas
+from bodyscan.geometry.transforms import RigidTransform
 
 CLOUD_FORMATS = (".ply", ".glb")
 MESH_FORMATS = (".ply", ".obj", ".stl", ".glb")
@@ -23,10 +26,17 @@ MESH_FORMATS = (".ply", ".obj", ".stl", ".glb")
 
 @dataclass(frozen=True)
 class Origin:
-    """What a body was made from: the subject's pseudonym (if any) and the calibration."""
+    """What a body was made from: the subject's pseudonym (if any) and the calibration.
+
+    defaced: the head was replaced by a plain one.  found: what the scan says of itself (verdict,
+    sway, pairs left out).  rig_from_body: where the body's own frame lies, if the body is in that.
+    """
 
     subject: str | None
     calibration_id: str
+    defaced: bool = False
+    found: Mapping[str, Any] = field(default_factory=dict)
+    rig_from_body: RigidTransform | None = None
 
 
 def export(path: Path, body: BodyCloud | BodyMesh, origin: Origin) -> None:
@@ -57,22 +67,30 @@ def description(path: Path, body: BodyCloud | BodyMesh, origin: Origin) -> dict[
     """What the JSON beside an export says."""
     metres = path.suffix.lower() == ".glb"
     axes = {"x": "front", "y": "left", "z": "up"}
-    said: dict[str, Any] = {
+    in_body = origin.rig_from_body
+    said: dict[str, Any] = dict(origin.found) | {
         "file": path.name,
         "units": "m" if metres else "mm",
         "axes": {"x": "left", "y": "up", "z": "front"} if metres else axes,
-        "origin": "on the floor, at the rig's centre",
+        "frame": "rig" if in_body is None else "body",
+        "origin": f"on the floor, {'at the rig centre' if in_body is None else 'under the body'}",
+        "rig_from_frame": (in_body or RigidTransform.identity()).matrix,
         "software": f"bodyscan {__version__}",
         "subject": origin.subject,
         "calibration_id": origin.calibration_id,
+        "defaced": origin.defaced,
         "kind": "cloud" if isinstance(body, BodyCloud) else "mesh",
     }
     if isinstance(body, BodyCloud):
         return said | {"points": len(body.points), "sigma_mm": _middle(body.sigma_mm)}
+    areas = face_areas(body.vertices, body.faces)
     return said | {
         "vertices": len(body.vertices),
         "faces": len(body.faces),
         "filled_faces": int(np.count_nonzero(body.filled)),
+        "area_mm2": float(areas.sum()),
+        "filled_area_mm2": float(areas[body.filled].sum()),
+        "coverage": float(areas[~body.filled].sum() / areas.sum()) if len(areas) else 0.0,
         "sigma_mm": _middle(body.sigma_mm),
     }
 

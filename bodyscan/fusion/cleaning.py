@@ -23,6 +23,7 @@ Mask = NDArray[np.bool_]
 STEEPEST = 5.0  # depth per sideways step on a surface still worth having: tan 79 degrees
 # Half of the 24 neighbours in a square window (rows, columns): the others are their mirror images.
 HALF_WINDOW = [(r, c) for r in range(3) for c in range(-2, 3) if r > 0 or c > 0]
+BACKGROUND_MM = 4.0  # a subject stands out from the background by more than this
 QUANTUM_MM = 0.25  # cv2.filterSpeckles works on 16-bit integers: +-8 m in steps of this
 
 
@@ -31,17 +32,22 @@ def clean(
     rig_from_camera: dict[str, RigidTransform],
     volume: Volume,
     *,
+    empty: Sequence[RangeImage] = (),
     smallest_patch_mm2: float = 150.0,
     workers: int = 2,
 ) -> list[RangeImage]:
     """The same range images with NaN where a pixel shows no part of the subject.
 
-    Cut away are: what lies outside the scan volume (floor, walls), flying pixels at silhouettes,
+    Cut away are: what lies outside the scan volume (floor, walls), what the rig sees without a
+    subject (`empty`: range images of that, of some or all pairs), flying pixels at silhouettes,
     grazing surfaces, and disconnected patches smaller than `smallest_patch_mm2`.
     """
+    nobody = {image.pair: image for image in empty}
 
     def one(image: RangeImage) -> RangeImage:
         kept = inside(image, rig_from_camera[image.pair], volume)
+        if image.pair in nobody:
+            kept &= in_front_of(image, nobody[image.pair])
         box = crop_of(kept)
         if box is not None:
             depth = np.where(kept[box], image.points[box][..., 2], 0.0)
@@ -73,6 +79,17 @@ def inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -
     with np.errstate(invalid="ignore"):
         within = (x * x + y * y < volume.radius_mm**2) & (z > volume.bottom_mm)
         return within & (z < volume.top_mm) & image.valid
+
+
+def in_front_of(image: RangeImage, empty: RangeImage) -> Mask:
+    """(height, width): measured in front of what the same camera sees without a subject.
+
+    The nearest background of the pixels around counts, for the edges of things in the room.
+    """
+    window = np.ones((3, 3), np.uint8)
+    far = np.where(empty.valid, empty.points[..., 2], np.float32(np.inf))
+    with np.errstate(invalid="ignore"):
+        return image.points[..., 2] < cv2.erode(far, window) - BACKGROUND_MM
 
 
 def without_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -> Floats:

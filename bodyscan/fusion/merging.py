@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.body import BodyCloud
+from bodyscan.fusion.brightness import gains, log_ratio
 from bodyscan.fusion.grid import Floats, carried, rotated
 from bodyscan.fusion.quadratics import NORMAL_MEDIAN
 from bodyscan.fusion.smoothing import Surface, smooth
@@ -75,17 +76,18 @@ def merge(
     Raises ScanFailed if the range images show next to nothing.
     """
     with ThreadPoolExecutor(workers) as pool:
-        found = pool.map(
+        smoothed = pool.map(
             lambda image: smooth(image, rig_from_camera[image.pair], window_mm=window_mm),
             range_images,
         )
-        surfaces = [surface for surface in found if surface is not None]
+        surfaces = [surface for surface in smoothed if surface is not None]
         samples = thinned(surfaces, points)
         evidence = pool.map(
             lambda number: compare(samples, surfaces[number], number, agreement_mm, double_mm),
             range(len(surfaces)),
         )
-        return averaged(samples, list(evidence))
+        found = list(evidence)
+    return averaged(samples, found, _evened(samples, found))
 
 
 def thinned(surfaces: Sequence[Surface], points: int) -> Samples:
@@ -180,23 +182,38 @@ def _seen_from(
     return index[there], (rows[there], columns[there])
 
 
-def averaged(samples: Samples, evidence: Sequence[Evidence]) -> BodyCloud:
-    """Weighted means of each sample and what agrees with it; the outvoted are dropped."""
+def _evened(samples: Samples, evidence: Sequence[Evidence]) -> Floats:
+    """(P,) factors for the surfaces' grey levels, from where two of them show one spot."""
+    ratios = []
+    for b, one in enumerate(evidence):
+        source = samples.source[one.index]
+        for a in np.unique(source):
+            shared = source == a
+            ratio, spots = log_ratio(samples.colours[one.index[shared]], one.colours[shared])
+            ratios.append((int(a), b, ratio, spots))
+    return gains([ratio for ratio in ratios if ratio[-1]], len(evidence))
+
+
+def averaged(samples: Samples, evidence: Sequence[Evidence], gain: Floats) -> BodyCloud:
+    """Weighted means of each sample and what agrees with it; the outvoted are dropped.
+
+    gain: (P,) factors for the surfaces' grey levels.
+    """
     weight = samples.weight.astype(np.float64)
     against = np.zeros_like(weight)
     shift, shift2 = np.zeros_like(weight), np.zeros_like(weight)
     spread = np.square(samples.weight * samples.sigma_mm, dtype=np.float64)
     normals = samples.normals * samples.weight[:, None]
-    colours = samples.colours * samples.weight
+    colours = samples.colours * samples.weight * gain[samples.source]
     seen = np.ones(len(weight), np.uint8)
-    for one in evidence:
+    for number, one in enumerate(evidence):
         at = one.index
         weight[at] += one.weight
         shift[at] += one.weight * one.shift_mm
         shift2[at] += one.weight * one.shift_mm**2
         spread[at] += np.square(one.weight * one.sigma_mm, dtype=np.float64)
         normals[at] += one.normals * one.weight[:, None]
-        colours[at] += one.colours * one.weight
+        colours[at] += one.colours * one.weight * gain[number]
         seen[at] += 1
         against[one.against_index] += one.against
     kept = against < weight

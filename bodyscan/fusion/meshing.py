@@ -28,6 +28,7 @@ Indices = NDArray[np.int64]
 
 FEWEST_POINTS = 1000
 ROUGH_POINTS = 100_000
+LIFTED = 0.2  # of the reach: 0.8 mm of 4
 
 
 def mesh(
@@ -87,10 +88,18 @@ def largest_piece(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
 def dressed(
     vertices: Array, faces: Indices, cloud: BodyCloud, tree: cKDTree, reach_mm: float
 ) -> BodyMesh:
-    """With normals, the nearest points' colours and sigmas, and which faces were made up."""
+    """With normals, the nearest points' colours and sigmas, and which faces were made up.
+
+    A vertex far from all points was measured by nobody; one that Poisson's smoothness lifts off its
+    nearest point's tangent plane (fingertips, between toes) is not what was measured either.
+    """
     distance, nearest = (np.asarray(found) for found in tree.query(vertices, workers=2))
     sigma_mm = cloud.sigma_mm[nearest]
-    sigma_mm[distance > reach_mm] = np.nan
+    offset = vertices - cloud.points[nearest]
+    lifted = np.abs(np.einsum("vc,vc->v", offset, cloud.normals[nearest]))
+    sigma_mm[(distance > reach_mm) | (lifted > np.maximum(LIFTED * reach_mm, 4.0 * sigma_mm))] = (
+        np.nan
+    )
     return BodyMesh(
         vertices,
         faces,

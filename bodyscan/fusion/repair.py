@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from bodyscan.fusion.topology import corner_fans, directed_edges, without_unused
+from bodyscan.fusion.topology import corner_fans, directed_edges, is_among, without_unused
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -37,7 +37,7 @@ def _unsound(faces: Indices, count: int) -> NDArray[np.bool_]:
     often[order[1:][same]] = often[order[:-1][same]] = True
     # The same edge's other side must go too, or it would be sewn to the wrong partner.
     undirected = edges.min(axis=1) * count + edges.max(axis=1)
-    bad = np.isin(undirected, undirected[often]) | (edges[:, 0] == edges[:, 1])
+    bad = is_among(undirected, undirected[often]) | (edges[:, 0] == edges[:, 1])
     return bad.reshape(3, -1).any(axis=0)
 
 
@@ -46,7 +46,7 @@ def _holes_filled(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
     edges, count = directed_edges(faces), len(vertices)
     here = edges[:, 0] * count + edges[:, 1]
     there = edges[:, 1] * count + edges[:, 0]
-    rim = edges[~np.isin(here, there)]
+    rim = edges[~is_among(here, there)]
     if not len(rim):
         return vertices, faces
     graph = coo_array((np.ones(len(rim), np.int8), (rim[:, 0], rim[:, 1])), shape=(count, count))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from bodyscan.calibration.rig_calibration import RigCalibration
@@ -11,26 +12,35 @@ from bodyscan.fusion.body import BodyCloud, BodyMesh
 from bodyscan.fusion.cleaning import clean
 from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import mesh
+from bodyscan.fusion.verdict import Verdict, judge
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, silent
 from bodyscan.reconstruction.pairs import range_images
+from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.alignment import Alignment, AlignmentSettings, align
-
-MOST_FILLED = 0.25
-MOST_DISAGREEMENT_MM = 0.8
 
 
 @dataclass(frozen=True)
 class ScanSettings:
-    """points: size of the body cloud.  alignment: of range images; None: not at all."""
+    """points: size of the body cloud.  alignment: of range images; None: not at all.
+
+    window_mm, agreement_mm, double_mm: see `merge`.  mesh_depth, mesh_reach_mm: see `mesh`.
+    """
 
     points: int = 1_000_000
     alignment: AlignmentSettings | None = field(default_factory=AlignmentSettings)
+    window_mm: float = 7.0
+    agreement_mm: float = 1.5
+    double_mm: float = 6.0
+    mesh_depth: int = 9
+    mesh_reach_mm: float = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A body model and how it came about.  measured: points of each pair's cleaned range image.
-    failed: pairs that gave none, with the reason.
+    """A body model, how it came about and whether it is good.  measured: points of each pair's
+    cleaned range image.  failed: pairs that gave none, with the reason.  range_images: cleaned, of
+    the pairs that saw the subject; rig_from_camera: where each stood to it, after alignment.
     """
 
     cloud: BodyCloud
@@ -38,6 +48,9 @@ class Scan:
     alignment: Alignment | None
     measured: dict[str, int]
     failed: dict[str, str]
+    verdict: Verdict
+    range_images: tuple[RangeImage, ...]
+    rig_from_camera: dict[str, RigidTransform]
 
 
 def alignment_settings(matching: str) -> AlignmentSettings | None:
@@ -59,14 +72,35 @@ def scan(
     captures: Captures,
     settings: ScanSettings = ScanSettings(),
     progress: Progress = silent,
+    *,
+    empty: Captures | None = None,
 ) -> Scan:
     """Person images in, body model and mesh out.
 
+    empty: captures of the rig without anybody in it, whose surfaces are no part of the subject.
     Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left.
     """
     images, failed = range_images(calibration, captures, progress)
+    background = range_images(calibration, empty, progress)[0] if empty else ()
+    return fuse(calibration, images, failed, settings, progress, empty=background)
+
+
+def fuse(
+    calibration: RigCalibration,
+    images: Sequence[RangeImage],
+    failed: dict[str, str],
+    settings: ScanSettings = ScanSettings(),
+    progress: Progress = silent,
+    *,
+    empty: Sequence[RangeImage] = (),
+) -> Scan:
+    """Range images of one person, background and all, to body model and mesh.
+
+    failed: pairs that gave none, with the reason. empty: as in `clean`. Raises ScanFailed if they
+    show no body.
+    """
     progress("cleaning", 0, 1)
-    cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
+    cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume, empty=empty)
     seen = [image for image in cleaned if image.valid.any()]
     progress("cleaning", 1, 1)
     if not seen:
@@ -82,28 +116,20 @@ def scan(
         placing |= alignment.rig_from_camera
         progress("aligning", 1, 1)
     progress("merging", 0, 1)
-    cloud = merge(seen, placing, points=settings.points)
+    cloud = merge(
+        seen,
+        placing,
+        points=settings.points,
+        window_mm=settings.window_mm,
+        agreement_mm=settings.agreement_mm,
+        double_mm=settings.double_mm,
+    )
     progress("merging", 1, 1)
     progress("meshing", 0, 1)
-    surface = mesh(cloud, images, placing)
+    surface = mesh(
+        cloud, images, placing, depth=settings.mesh_depth, reach_mm=settings.mesh_reach_mm
+    )
     progress("meshing", 1, 1)
     measured = {image.pair: int(image.valid.sum()) for image in cleaned}
-    return Scan(cloud, surface, alignment, measured, failed)
-
-
-def warnings(result: Scan) -> list[str]:
-    """What an operator should know before trusting the model."""
-    found = []
-    filled = float(result.mesh.filled.mean())
-    if filled > MOST_FILLED:
-        found.append(
-            f"{100.0 * filled:.0f} % of the mesh is made up: the pairs that measured do not see "
-            "the body from all sides"
-        )
-    alignment = result.alignment
-    if alignment is not None and alignment.rms_after_mm > MOST_DISAGREEMENT_MM:
-        found.append(
-            f"the pairs disagree by {alignment.rms_after_mm:.2f} mm where they overlap: is this the "
-            "calibration of this rig, has nothing moved since, did the person stand still?"
-        )
-    return found
+    verdict = judge(cloud, surface, alignment, failed, calibration.rig.volume)
+    return Scan(cloud, surface, alignment, measured, failed, verdict, tuple(seen), placing)

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from bodyscan import __version__
-from bodyscan.errors import ResultError
+from bodyscan.errors import ResultError, ScanFailed
 from bodyscan.export.ply import read_ply_cloud, read_ply_mesh, write_ply
 from bodyscan.files import write_json
 from bodyscan.fusion.body import BodyCloud, BodyMesh
 from bodyscan.fusion.scan import Scan
+from bodyscan.fusion.verdict import Verdict
 
 SCHEMA = "bodyscan-scan"
 VERSION = 1
@@ -47,15 +48,8 @@ def save_scan(
     write_ply(folder / MESH_NAME, scan.mesh)
     write_json(
         folder / FILE_NAME,
-        {
-            "schema": SCHEMA,
-            "version": VERSION,
-            "software": f"bodyscan {__version__}",
-            "units": "mm",
-            "axes": "origin on the floor at the rig's centre, x forward, y to the left, z up",
-            "subject": subject,
-            "when": when.isoformat() if when else None,
-            "calibration_id": calibration_id,
+        _origin(calibration_id, subject, when)
+        | {
             "sha256": {name: _sha256(folder / name) for name in (CLOUD_NAME, MESH_NAME)},
             "counts": {
                 "points": len(scan.cloud.points),
@@ -64,6 +58,7 @@ def save_scan(
                 "filled_faces": int(np.count_nonzero(scan.mesh.filled)),
             },
             "median_sigma_mm": float(np.nanmedian(scan.cloud.sigma_mm)),
+            "verdict": asdict(scan.verdict),
             "measured": scan.measured,
             "failed": scan.failed,
             "alignment": _alignment(scan),
@@ -72,12 +67,49 @@ def save_scan(
     return folder / FILE_NAME
 
 
+def save_failure(
+    error: ScanFailed,
+    folder: Path,
+    *,
+    calibration_id: str,
+    subject: str | None,
+    when: datetime | None,
+) -> Path:
+    """Write a scan.json that says why there is no model; one of an earlier try goes."""
+    for name in (FILE_NAME, CLOUD_NAME, MESH_NAME):
+        (folder / name).unlink(missing_ok=True)
+    reasons = tuple(line.strip() for line in str(error).splitlines())
+    write_json(
+        folder / FILE_NAME,
+        _origin(calibration_id, subject, when) | {"verdict": asdict(Verdict("repeat", reasons))},
+    )
+    return folder / FILE_NAME
+
+
+def _origin(calibration_id: str, subject: str | None, when: datetime | None) -> dict[str, Any]:
+    return {
+        "schema": SCHEMA,
+        "version": VERSION,
+        "software": f"bodyscan {__version__}",
+        "units": "mm",
+        "axes": "origin on the floor at the rig's centre, x forward, y to the left, z up",
+        "subject": subject,
+        "when": when.isoformat() if when else None,
+        "calibration_id": calibration_id,
+    }
+
+
 def load_scan(folder: Path) -> StoredScan:
-    """Read what `save_scan` wrote. Raises ResultError if it is missing, incomplete or damaged."""
+    """Read what `save_scan` wrote. Raises ResultError if it is missing, incomplete or damaged, or
+    if the scan gave no model.
+    """
     file = folder / FILE_NAME
     remedy = "scan again, or give the folder that `bodyscan scan` wrote"
     try:
         facts = json.loads(file.read_text("utf-8"))
+        if "sha256" not in facts and "verdict" in facts:
+            reasons = "; ".join(facts["verdict"]["reasons"])
+            raise ResultError(f"this scan gave no model: {reasons}", where=str(file))
         for name, digest in facts["sha256"].items():
             if _sha256(folder / name) != digest:
                 raise ResultError(

@@ -30,7 +30,7 @@ class Topology:
 
 def topology(vertices: Array, faces: Indices) -> Topology:
     """Of a mesh with vertices (V, 3) and faces (F, 3); unused vertices do not count."""
-    used = np.unique(faces)
+    used = used_vertices(faces, len(vertices))
     count = len(vertices)
     edges = directed_edges(faces)
     keys = np.sort(edges[:, 0] * count + edges[:, 1])
@@ -71,6 +71,12 @@ def signed_volume(vertices: Array, faces: Indices) -> float:
     return float(np.einsum("fc,fc->", a, np.cross(b, c)) / 6.0)
 
 
+def face_areas(vertices: Array, faces: Indices) -> Array:
+    """(F,) mm2."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
 def vertex_normals(vertices: Array, faces: Indices) -> NDArray[np.float32]:
     """(V, 3) unit normals, the mean of the faces around weighted by area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -88,10 +94,26 @@ def vertex_normals(vertices: Array, faces: Indices) -> NDArray[np.float32]:
 
 def without_unused(vertices: Array, faces: Indices) -> tuple[Array, Indices, Indices]:
     """Vertices that faces use, the faces renumbered, and which old vertices stayed."""
-    used = np.unique(faces)
+    used = used_vertices(faces, len(vertices))
     number = np.full(len(vertices), -1, np.int64)
     number[used] = np.arange(used.size)
     return vertices[used], number[faces], used
+
+
+def used_vertices(faces: Indices, count: int) -> Indices:
+    """Numbers of the vertices (of `count`) that faces use, rising."""
+    used = np.zeros(count, bool)
+    used[faces] = True
+    return np.flatnonzero(used)
+
+
+def is_among(values: Indices, others: Indices) -> NDArray[np.bool_]:
+    """(N,) which values are also in others; numpy's own isin is slow on the keys of edges."""
+    if not others.size:
+        return np.zeros(values.shape, bool)
+    known = np.sort(others)
+    place = np.minimum(np.searchsorted(known, values), known.size - 1)
+    return known[place] == values
 
 
 def corner_fans(faces: Indices) -> tuple[Indices, int]:

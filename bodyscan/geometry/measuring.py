@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.plane_table import PlaneTable
 
 Array = NDArray[np.float64]
 
@@ -28,9 +30,13 @@ class Measured:
 
 def measure(sheets: LightSheets, rays: Array, s: Array) -> Measured:
     """Rays (..., 3) with z = 1, camera frame, at real stripe coordinates s (...)."""
-    depth = sheets.depth(rays, s)
-    variance = sheets.variance_mm2(rays, s, depth)
-    per_stripe = sheets.depth_per_stripe(rays, s, depth)
+    if isinstance(sheets, BowedSheets) and sheets.kind == "smooth-planes":
+        flat = PlaneTable.of(sheets).measure(rays.reshape(-1, 3), np.ravel(s))
+        depth, per_stripe, variance = (values.reshape(np.shape(s)) for values in flat)
+    else:
+        depth = sheets.depth(rays, s)
+        variance = sheets.variance_mm2(rays, s, depth)
+        per_stripe = sheets.depth_per_stripe(rays, s, depth)
     unsure = variance > (MOST_SIGMA * depth) ** 2
     depth, per_stripe, variance = (
         np.where(unsure, np.nan, values) for values in (depth, per_stripe, variance)

@@ -50,31 +50,35 @@ def grid_normals(points: NDArray[np.float32]) -> NDArray[np.float32]:
     """Unit normals (H, W, 3) towards the camera, from the points (H, W, 3) of a small window.
 
     A plane fitted to 1/z, which is affine in the image coordinates on a plane; NaN where the
-    window holds too few points.
+    window is not whole: what lies at a rim is not to be relied on.
     """
-    known = np.isfinite(points[..., 2])
-    z = np.where(known, points[..., 2], 1.0)
-    x, y = (np.where(known, points[..., k] / z, 0.0) for k in (0, 1))
-    inverse = np.where(known, 1000.0 / z, 0.0)
-    weight = known.astype(np.float32)
+    x, y, z = cv2.split(points)
+    known = np.isfinite(z)
+    window = np.ones((NORMAL_WINDOW_PX, NORMAL_WINDOW_PX), np.uint8)
+    whole = cv2.erode(known.astype(np.uint8), window, borderValue=0) > 0
+    z[~known] = np.inf
+    inverse = np.float32(1000.0) / z
+    x, y = (np.where(known, values / z, np.float32(0.0)) for values in (x, y))
+    (i_u, i_v), (x_u, x_v), (y_u, y_v) = (_slopes(values) for values in (inverse, x, y))
+    # From slopes by column and row to slopes by x and y.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        determinant = x_u * y_v - x_v * y_u
+        slope_x = (i_u * y_v - i_v * y_u) / determinant
+        slope_y = (i_v * x_u - i_u * x_v) / determinant
+        # 1/z = p x + q y + r is the plane p X + q Y + r Z = 1, whose normal (p, q, r) points away.
+        rest = inverse - slope_x * x - slope_y * y
+        size = -np.sqrt(slope_x * slope_x + slope_y * slope_y + rest * rest)
+        size[~whole] = np.nan
+        return cv2.merge([slope_x / size, slope_y / size, rest / size])
 
-    def mean(image: NDArray[np.float32]) -> NDArray[np.float64]:
-        window = (NORMAL_WINDOW_PX, NORMAL_WINDOW_PX)
-        return cv2.boxFilter(image.astype(np.float64), cv2.CV_64F, window)
 
-    count = np.maximum(mean(weight), 1e-12)
-    mx, my, mi = mean(x) / count, mean(y) / count, mean(inverse) / count
-    xx, yy, xy = (
-        mean(x * x) / count - mx * mx,
-        mean(y * y) / count - my * my,
-        mean(x * y) / count - mx * my,
+def _slopes(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Slopes per column and per row of planes fitted in whole windows."""
+    reach = NORMAL_WINDOW_PX // 2
+    offsets = np.arange(-reach, reach + 1.0)
+    ramp, one = offsets / (NORMAL_WINDOW_PX * np.sum(offsets**2)), np.ones(NORMAL_WINDOW_PX)
+    along = {"ddepth": cv2.CV_32F, "borderType": cv2.BORDER_CONSTANT}
+    return (
+        cv2.sepFilter2D(values, kernelX=ramp, kernelY=one, **along),
+        cv2.sepFilter2D(values, kernelX=one, kernelY=ramp, **along),
     )
-    xi, yi = mean(x * inverse) / count - mx * mi, mean(y * inverse) / count - my * mi
-    determinant = xx * yy - xy * xy
-    enough = known & (determinant > 1e-4 * xx * yy) & (count > 0.4)
-    determinant = np.where(enough, determinant, 1.0)
-    slope_x, slope_y = (xi * yy - yi * xy) / determinant, (yi * xx - xi * xy) / determinant
-    # 1/z = p x + q y + r is the plane p X + q Y + r Z = 1, whose normal (p, q, r) points away.
-    normal = -np.stack([slope_x, slope_y, mi - slope_x * mx - slope_y * my], axis=-1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
-    return np.where(enough[..., None], normal, np.nan).astype(np.float32)

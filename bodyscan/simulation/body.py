@@ -54,18 +54,30 @@ def skin(vertices: Array, person: Person, rng: np.random.Generator) -> Array:
     return person.skin * (1.0 + person.skin_variation * waves / 4.0)
 
 
-def draw_sway(person: Person, height_mm: float, rng: np.random.Generator) -> RigidTransform:
-    """`swayed_from_still`: a lean about the feet and a shift, together at most sway_mm at the head.
+def draw_sways(
+    person: Person, height_mm: float, count: int, rng: np.random.Generator
+) -> list[RigidTransform]:
+    """`swayed_from_still` at `count` moments one after another: a smooth walk from standing still.
 
-    Seven tenths of it come from leaning, as a standing person sways like a pole on its ankles.
+    At each moment a lean about the feet and a shift the same way, which together come to sway_mm at
+    the head at the farthest, and a little turn. Seven tenths come from leaning, as a standing person
+    sways like a pole on its ankles.
     """
     if person.sway_mm == 0:
-        return RigidTransform.identity()
-    size, way = rng.uniform(0.3, 1.0), rng.uniform(0.0, 2.0 * np.pi)
-    lean, turn = 0.7 * size * person.sway_mm / height_mm, rng.normal(0.0, 0.2)
-    axis = np.array([-np.sin(way), np.cos(way), turn]) * lean
-    shift = 0.3 * size * person.sway_mm * np.array([np.cos(way), np.sin(way), 0.0])
-    return RigidTransform.from_rotation_vector(axis, shift)
+        return [RigidTransform.identity()] * count
+    moment = np.linspace(0.0, 1.0, count)[:, None]
+    path = np.zeros((count, 3))  # to x, to y, turn
+    for waves in (0.5, 1.0, 1.5):
+        size, phase = rng.standard_normal(3) / waves, rng.uniform(0.0, 2.0 * np.pi, 3)
+        path += size * (np.sin(2.0 * np.pi * waves * moment + phase) - np.sin(phase))
+    at_head = np.linalg.norm(path[:, :2], axis=1).max()
+    x, y, turn = path.T * person.sway_mm / max(at_head, 1e-9)
+    angles = np.stack([-0.7 * y, 0.7 * x, 0.3 * turn], axis=1) / height_mm
+    shifts = 0.3 * np.stack([x, y, np.zeros(count)], axis=1)
+    return [
+        RigidTransform.from_rotation_vector(angle, shift)
+        for angle, shift in zip(angles, shifts, strict=True)
+    ]
 
 
 def save_truth(surface: Surface, path: Path) -> None:

@@ -128,7 +128,8 @@ class BoardMaking:
 @dataclass(frozen=True)
 class Person:
     """skin: mean albedo.  skin_variation: how much it varies over the body, relative.
-    sway_mm: between pairs the person moves as a whole, by at most this much at head height.
+    sway_mm: while the pairs capture one after another, in the rig file's order, the person moves
+    as a whole, by this much at the farthest and at head height.
     subdivisions: Loop subdivisions of the subject's mesh."""
 
     skin: float = 0.62
@@ -149,6 +150,17 @@ class Room:
 
 
 @dataclass(frozen=True)
+class InterReflection:
+    """Laser light that surfaces throw on each other, once (see `inter_reflection`).
+
+    facet_mm: it comes from facets of about this size, a few times smaller than what is hollow; 0:
+    there is none.  It costs time: a form factor for each pixel and lit facet.
+    """
+
+    facet_mm: float = 0.0
+
+
+@dataclass(frozen=True)
 class SimulationSettings:
     """All of them."""
 
@@ -159,3 +171,4 @@ class SimulationSettings:
     board: BoardMaking = field(default_factory=BoardMaking)
     person: Person = field(default_factory=Person)
     room: Room = field(default_factory=Room)
+    inter_reflection: InterReflection = field(default_factory=InterReflection)

@@ -18,9 +18,11 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, silent
 from bodyscan.simulation import body, files
 from bodyscan.simulation.board import make_board
+from bodyscan.simulation.instrument import handed_out
 from bodyscan.simulation.layout import TruePair, build_pairs
 from bodyscan.simulation.plan import default_shots, plan_boards
-from bodyscan.simulation.render import Lamps, View, render_pair
+from bodyscan.simulation.lamps import Lamps
+from bodyscan.simulation.render import View, render_pair
 from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Scene, Surface
 from bodyscan.simulation.sensor import expose, exposure
@@ -38,7 +40,7 @@ _PAIRS, _BOARDS, _PLAN, _SKIN, _SWAY, _RAYS, _NOISE = range(1, 8)
 
 
 @dataclass(frozen=True, eq=False)
-class _Task:
+class Task:
     """One pair's images of one shot: what stands there besides the room, and where."""
 
     number: int
@@ -94,7 +96,7 @@ def _decide(
     def stream(*purpose: int) -> np.random.Generator:
         return np.random.default_rng([seed, *purpose])
 
-    pairs = build_pairs(rig, settings, lambda number: stream(_PAIRS, number))
+    pairs = true_pairs(rig, settings, seed)
     boards = {
         board.name: make_board(board, settings.board, stream(_BOARDS, number))
         for number, board in enumerate(rig.boards)
@@ -104,19 +106,22 @@ def _decide(
         return Truth(rig.name, seed, settings, pairs, boards, tuple(plan), None, None, {})
     person = body.load_subject(subject, settings.person, stream(_SKIN))
     height = float(person.vertices[:, 2].max())
-    sways = {
-        name: body.draw_sway(settings.person, height, stream(_SWAY, number))
-        for number, name in enumerate(pairs)
-    }
+    sways = body.draw_sways(settings.person, height, len(pairs), stream(_SWAY))
+    by_pair = dict(zip(pairs, sways, strict=True))
     pseudonym = f"sim-{subject.stem.replace('_', '-')}"
-    return Truth(rig.name, seed, settings, pairs, boards, tuple(plan), pseudonym, person, sways)
+    return Truth(rig.name, seed, settings, pairs, boards, tuple(plan), pseudonym, person, by_pair)
 
 
-def _tasks(truth: Truth, pair: str) -> list[_Task]:
+def true_pairs(rig: Rig, settings: SimulationSettings, seed: int) -> dict[str, TruePair]:
+    """The pairs of a data set made with these settings and seed, wherever they are asked for."""
+    return build_pairs(rig, settings, lambda number: np.random.default_rng([seed, _PAIRS, number]))
+
+
+def _tasks(truth: Truth, pair: str) -> list[Task]:
     """What one pair captures: its board shots, then the person."""
     light = truth.settings.lighting
     tasks = [
-        _Task(
+        Task(
             number=number,
             shot=shot.name,
             folder=CALIBRATION,
@@ -132,7 +137,7 @@ def _tasks(truth: Truth, pair: str) -> list[_Task]:
         still, has_stripes = truth.sways[pair], truth.pairs[pair].has_stripes
         number, shown = len(truth.plan), (truth.person,)
         tasks.append(
-            _Task(number, PERSON_SHOT, PERSON, shown, still, light.person_grey, has_stripes)
+            Task(number, PERSON_SHOT, PERSON, shown, still, light.person_grey, has_stripes)
         )
     return tasks
 
@@ -148,7 +153,7 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
         view = View.of(pair.camera, truth.settings.optics, rays)
         for task in tasks[pair.name]:
             noise = np.random.default_rng([truth.seed, _NOISE, number, task.number])
-            _render(rig, pair, view, room, task, truth.settings, out, noise)
+            render_task(rig, pair, view, room, task, truth.settings, out, noise)
             tell()
 
     with ThreadPoolExecutor(workers) as pool:
@@ -175,12 +180,12 @@ def _counter(stage: str, total: int, progress: Progress) -> Callable[[], None]:
     return tell
 
 
-def _render(
+def render_task(
     rig: Rig,
     pair: TruePair,
     view: View,
     room: Sequence[Surface],
-    task: _Task,
+    task: Task,
     settings: SimulationSettings,
     out: Path,
     rng: np.random.Generator,
@@ -194,6 +199,7 @@ def _render(
     )
     light, reach = settings.lighting, pair.reach_mm
     lamps = Lamps(light.laser_grey, light.ambient_grey, _BRIGHT_AT * reach, reach)
+    code = rig.pair(pair.name).projector
     images = render_pair(
         scene,
         view,
@@ -202,9 +208,14 @@ def _render(
         settings.projection,
         rng,
         frames=rig.frames,
+        code=code,
         sequence=task.sequence,
+        inter_reflection=settings.inter_reflection,
     )
     length = exposure(images[rig.frames.lit], task.bright_grey, light)
-    for frame, image in images.items():
+    exposed = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}
+    if code and code.code == "stripe-index" and task.sequence:
+        exposed = handed_out(exposed, code, rig.frames)
+    for frame, image in exposed.items():
         name = fill(rig.files, shot=task.shot, pair=pair.name, frame=frame)
-        files.write_image(out / task.folder / name, expose(image * length, settings.noise, rng))
+        files.write_image(out / task.folder / name, image)

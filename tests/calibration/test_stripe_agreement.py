@@ -7,7 +7,8 @@ import pytest
 from lit_boards import BODY_POSES, CHAPTER_POSES, Scene, Uneven, body_scene, chapter_scene
 
 from bodyscan.calibration.boundary_points import BoundaryPoints, join
-from bodyscan.calibration.stripe_agreement import Disagreement, find_disagreement
+from bodyscan.calibration.light import fit_light
+from bodyscan.calibration.stripe_agreement import Disagreement, boards_off, find_disagreement
 
 MORE_POSES = (
     *BODY_POSES,
@@ -83,3 +84,15 @@ def test_of_three_poses_something_is_noticed():
 def test_two_boards_say_nothing():
     scene = chapter_scene()
     assert disagreement(scene, CHAPTER_POSES[:2], pushed(scene, (3.0, 0.0, 0.0)), (1,)) is None
+
+
+def test_a_board_that_stands_elsewhere_is_measured_there():
+    scene = body_scene(0.0)
+    poses = [scene.looking_at(*pose) for pose in MORE_POSES]
+    data = scene.boundaries(poses, corner_px=0.0)
+    fit = fit_light(data, scene.projector.stripes, scene.direction, scene.camera)
+    # By its corners, board 2 lies 0.5 mm nearer than it does.
+    nearer = np.where(data.board[:, None] == 2, data.points * (1.0 - 0.5 / 1400.0), data.points)
+    off = boards_off(replace(data, points=nearer), fit.sheets)
+    assert 0.25 < off[2] < 0.55
+    assert np.abs(np.delete(off, 2)).max() < 0.05

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,12 @@ from bodyscan.errors import BadInput
 from bodyscan.export.exporting import CLOUD_FORMATS, MESH_FORMATS, Origin, export
 from bodyscan.export.glb import write_glb
 from bodyscan.export.obj import write_obj
+from bodyscan.export.ply import read_ply_mesh
 from bodyscan.export.scan import export_scan
 from bodyscan.export.stl import write_stl
 from bodyscan.export.text import fixed, lines, whole
 from bodyscan.fusion.storage import StoredScan
+from bodyscan.geometry.transforms import RigidTransform
 
 ORIGIN = Origin("S-0042", "3f2a")
 
@@ -203,3 +206,36 @@ def test_a_scan_in_several_versions(tmp_path: Path):
     for formats, versions in ((["fbx"], ["full"]), (["ply"], ["heavy"])):
         with pytest.raises(BadInput, match="to export"):
             export_scan(scan, tmp_path, formats, versions)
+
+
+def test_in_the_body_frame_the_body_faces_x_over_the_origin(tmp_path: Path):
+    """A flat upright body, turned by 30 degrees and put aside: in its own frame it stands straight."""
+    flat = ball()
+    straight = flat.vertices * [1.0, 3.0, 1.0]
+    placing = RigidTransform.from_rotation_vector([0.0, 0.0, np.radians(30.0)], [200.0, -90.0, 0.0])
+    askew = replace(flat, vertices=placing.apply(straight))
+    facts = {
+        "subject": "S-0042",
+        "calibration_id": "3f2a",
+        "verdict": {"grade": "usable", "reasons": ["left out: p1-1: is missing"]},
+        "failed": {"p1-1": "is missing"},
+        "alignment": {"motion_mm": {"p1-2": 1.25}},
+    }
+    written = export_scan(StoredScan(points(), askew, facts), tmp_path, ["ply"], frame="body")
+    exported = read_ply_mesh(written[0])
+    width, depth = np.ptp(exported.vertices[:, 1]), np.ptp(exported.vertices[:, 0])
+    assert width == pytest.approx(np.ptp(straight[:, 1]), rel=1e-3)
+    assert depth == pytest.approx(np.ptp(straight[:, 0]), rel=1e-3)
+    assert np.abs(exported.vertices.mean(axis=0)[:2]).max() < 1e-3 * width
+    told = json.loads((tmp_path / "body.ply.json").read_text())
+    assert told["frame"] == "body"
+    back = np.array(told["rig_from_frame"])
+    np.testing.assert_allclose(
+        exported.vertices @ back[:3, :3].T + back[:3, 3], askew.vertices, atol=1e-6
+    )
+    assert told["verdict"]["grade"] == "usable"
+    assert told["left_out"] == {"p1-1": "is missing"}
+    assert told["sway_mm"] == {"p1-2": 1.25}
+    assert told["coverage"] == pytest.approx(1.0 - told["filled_area_mm2"] / told["area_mm2"])
+    with pytest.raises(BadInput, match="'room' to export"):
+        export_scan(StoredScan(points(), askew, facts), tmp_path, ["ply"], frame="room")

@@ -143,3 +143,20 @@ def _mix_silhouettes(depth, valid, flying, rng):
     chosen = rim & (rng.random(depth.shape) < flying * valid.sum() / max(rim.sum(), 1))
     reach = np.where(high - low > 15.0, np.minimum(high - low, 300.0), 60.0)
     return np.where(chosen, low + reach * rng.random(depth.shape), depth)
+
+
+def without(
+    image: RangeImage, rig_from_camera: RigidTransform, low_mm: float, high_mm: float
+) -> RangeImage:
+    """The range image with nothing measured between two heights: black cloth, hair."""
+    height = rig_from_camera.apply(image.points.astype(float))[..., 2]
+    gone = (height > low_mm) & (height < high_mm)
+    nan = np.float32(np.nan)
+    return RangeImage(
+        image.pair,
+        image.camera,
+        np.where(gone[..., None], nan, image.points),
+        np.where(gone[..., None], nan, image.normals),
+        np.where(gone, nan, image.sigma_mm),
+        image.colours,
+    )

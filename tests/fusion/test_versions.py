@@ -8,8 +8,13 @@ import pytest
 
 from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.fusion.body import BodyMesh
-from bodyscan.fusion.topology import topology, vertex_normals
+from bodyscan.fusion.topology import face_areas, topology, vertex_normals
 from bodyscan.fusion.versions import light, measured_only
+
+
+def filled_share(mesh: BodyMesh) -> float:
+    areas = face_areas(mesh.vertices, mesh.faces)
+    return float(areas[mesh.filled].sum() / areas.sum())
 
 
 def test_the_light_version_is_close_and_closed(body: BodyMesh):
@@ -24,7 +29,8 @@ def test_the_light_version_is_close_and_closed(body: BodyMesh):
     off = deviation(signed_distances(lean.vertices, body.vertices, body.faces))
     # Faces of 12 mm: on a radius of 40 mm a flat one is off by up to 0.3 mm.
     assert off.p95_mm < 0.3
-    assert lean.filled.mean() == pytest.approx(body.filled.mean(), abs=0.05)
+    # Of the area: the light mesh has its faces where the body is curved, at fingers and toes.
+    assert filled_share(lean) == pytest.approx(filled_share(body), abs=0.05)
     np.testing.assert_array_equal(lean.filled, np.isnan(lean.sigma_mm)[lean.faces].any(axis=1))
 
 

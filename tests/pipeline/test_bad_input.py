@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import cv2
@@ -13,6 +14,8 @@ from bodyscan.calibration.rig import calibrate_cameras, find_all_boards
 from bodyscan.calibration.storage import load_calibration
 from bodyscan.capture.folder import open_captures
 from bodyscan.capture.rig_file import load_rig
+from bodyscan.errors import ResultError
+from bodyscan.fusion.storage import load_scan
 
 
 @pytest.fixture
@@ -118,6 +121,34 @@ def test_a_scan_with_one_pair_missing_goes_on_and_says_so(workspace, copy):
     )
     assert result.exit_code == 0, result.output
     assert "left out: p2-3" in result.output
+    verdict = json.loads((copy / "scan" / "scan.json").read_text())["verdict"]
+    assert verdict["grade"] == "usable"
+    assert any("p2-3" in reason for reason in verdict["reasons"])
+
+
+def test_a_scan_of_nobody_ends_in_a_verdict(workspace, copy):
+    """All images black but for the lit ones' noise: no pair can be read, and the JSON says so."""
+    for path in (copy / "captures" / "person").rglob("*.png"):
+        cv2.imwrite(str(path), np.full((512, 640), 12, np.uint8))
+    arguments = (copy / "captures" / "person", "--calibration", workspace.folder / "calibration")
+    result = run("scan", *arguments, "--out", copy / "scan")
+    assert result.exit_code == 1
+    verdict = json.loads((copy / "scan" / "scan.json").read_text())["verdict"]
+    assert verdict["grade"] == "repeat"
+    assert any("p1-2" in reason for reason in verdict["reasons"])
+    with pytest.raises(ResultError, match="gave no model"):
+        load_scan(copy / "scan")
+
+
+def test_a_scan_with_one_frame_missing_names_it(workspace, copy):
+    (copy / "captures" / "person" / "s01" / "p1-3" / "bit04-inverse.png").unlink()
+    arguments = (copy / "captures" / "person", "--calibration", workspace.folder / "calibration")
+    result = run("scan", *arguments, "--out", copy / "scan", "--points", 50_000)
+    assert result.exit_code == 0, result.output
+    assert "verdict: usable" in result.output
+    said = " ".join(result.output.split())
+    assert "left out: p1-3" in said
+    assert "bit04-inverse.png" in said
 
 
 def test_a_damaged_calibration_is_refused(workspace, tmp_path):

@@ -16,7 +16,7 @@ import yaml
 from bodyscan.capture.rig_file import load_rig
 from bodyscan.errors import BadInput
 from bodyscan.simulation import SimulationSettings, settings_for, simulate
-from bodyscan.simulation.body import draw_sway, load_subject
+from bodyscan.simulation.body import draw_sways, load_subject
 from bodyscan.simulation.settings import Person
 
 PROJECT = Path(__file__).parents[2]
@@ -151,17 +151,20 @@ def test_progress_counts_every_image_set(tmp_path: Path) -> None:
     assert told == [(k, 3) for k in range(4)]
 
 
-def test_sway_is_bounded_at_the_head() -> None:
-    person = Person(sway_mm=8.0)
-    sizes = []
-    for seed in range(200):
-        sway = draw_sway(person, 1700.0, np.random.default_rng(seed))
-        body = np.array([[0.0, 0, 0], [0, 0, 850], [0, 0, 1700.0]])
-        sizes.append(np.linalg.norm(sway.apply(body) - body, axis=1))
-    moved = np.array(sizes)
-    assert moved[:, 2].max() <= 8.0 + 1e-3
-    assert moved[:, 2].max() > 6.0
-    assert (moved[:, 0] < moved[:, 2]).all()  # the feet stay where they are, or nearly
+def test_sway_is_a_smooth_walk_bounded_at_the_head() -> None:
+    body = np.array([[0.0, 0, 0], [0, 0, 850], [0, 0, 1700.0]])
+    for seed in range(50):
+        sways = draw_sways(Person(sway_mm=8.0), 1700.0, 12, np.random.default_rng(seed))
+        places = np.array([sway.apply(body) for sway in sways])
+        moved = np.linalg.norm(places - body, axis=2)
+        assert moved[0].max() == 0  # from standing still
+        assert moved[:, 2].max() == pytest.approx(8.0, abs=0.01)
+        # Three tenths at the feet: the rest is leaning.
+        assert moved[:, 0].max() == pytest.approx(0.3 * 8.0, abs=0.01)
+        # Three waves of at most a period and a half: no step of twelve is the whole way.
+        assert np.linalg.norm(np.diff(places[:, 2], axis=0), axis=1).max() < 0.7 * 16.0
+    still = draw_sways(Person(), 1700.0, 3, np.random.default_rng(0))
+    assert all(np.array_equal(sway.matrix, np.eye(4)) for sway in still)
 
 
 def test_a_subject_that_is_no_mesh_is_refused(tmp_path: Path) -> None:

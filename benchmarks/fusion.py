@@ -1,0 +1,305 @@
+"""From range images to cloud and mesh: our way and two others on the same range images, in one run.
+
+Each step runs in a process of its own, so that its peak memory is its own:
+python -m benchmarks.fusion STEP WORKSPACE FOLDER
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import pickle
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import three_pole
+from bodyscan.fusion.body import BodyCloud
+
+Figures = dict[str, Any]
+POINTS = 1_000_000
+ICP_VOXEL_MM, ICP_REACH_MM = 3.0, 6.0
+MEASURED_MM = 4.0  # a vertex nearer than this to a point of the cloud was measured
+STEPS = ("read", "ours", "mesh", "open3d", "open3d-poisson-9", "open3d-poisson-10", "pymeshlab")
+NAMES = {
+    "read": "reading and decompressing the PNGs",
+    "ours": "bodyscan: PNGs to the cloud",
+    "mesh": "bodyscan: mesh",
+    "open3d": "Open3D: multiway ICP, voxels",
+    "open3d-poisson-9": "Open3D: Poisson, depth 9",
+    "open3d-poisson-10": "Open3D: Poisson, depth 10",
+    "pymeshlab": "pymeshlab: screened Poisson, depth 9",
+}
+
+
+def report(workspace: Path | None = None) -> str:
+    """The section of docs/results.md; the workspace is three_pole's, simulated and calibrated."""
+    workspace = workspace or Path(os.environ.get("BODYSCAN_BENCH", three_pole.WORKSPACE))
+    with tempfile.TemporaryDirectory() as folder:
+        found = {step: _in_a_process(step, workspace, Path(folder)) for step in STEPS}
+    rows = "\n".join(_row(step, figures, found) for step, figures in found.items() if figures)
+    skipped = "" if found["pymeshlab"] else "\npymeshlab was not installed and was left out.\n"
+    stages = ", ".join(f"{name} {s:.1f}" for name, s in found["ours"]["stages"].items())
+    ratio = found["ours"]["seconds"] / found["read"]["seconds"]
+    processor = found["ours"]["cpu"] / found["read"]["cpu"]
+    return f"""## Range images to cloud and mesh, against others, in one run
+
+The scan of `{workspace.name}` (12 pairs, 22 images each); all others get our cleaned range images,
+placed by our calibration. Seconds of wall clock and of processor, peak memory; distances to the
+truth in mm (nothing aligned to it): of all points of a cloud, of a mesh's vertices within
+{MEASURED_MM:g} mm of a point of its cloud. Times of Open3D and pymeshlab begin at the range images.
+
+| | s | cpu s | GiB | bias | RMS | 95 % | worst |
+|---|---|---|---|---|---|---|---|
+{rows}
+{skipped}
+From PNGs to the cloud takes {ratio:.1f} times as long as reading the PNGs with as many threads
+({processor:.1f} times the processor time). Stages, s: {stages}.
+Pairs to each other (overlaps, RMS): {found["ours"]["overlap_mm"]:.3f} mm.
+"""
+
+
+def _row(step: str, figures: Figures, found: dict[str, Figures]) -> str:
+    measured = figures.get("deviation")
+    distances = (
+        [f"{measured[key]:{sign}.3f}" for key, sign in _COLUMNS.items()] if measured else [""] * 4
+    )
+    cells = [NAMES[step], f"{figures['seconds']:.1f}", f"{figures['cpu']:.1f}"]
+    return "| " + " | ".join([*cells, f"{figures['gib']:.1f}", *distances]) + " |"
+
+
+_COLUMNS = {"bias_mm": "+", "rms_mm": "", "p95_mm": "", "worst_mm": ""}
+
+
+def _in_a_process(step: str, workspace: Path, folder: Path) -> Figures:
+    if step == "pymeshlab" and importlib.util.find_spec("pymeshlab") is None:
+        return {}
+    line = [sys.executable, "-m", "benchmarks.fusion", step, str(workspace), str(folder)]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{step} failed:\n{done.stdout}\n{done.stderr}")
+    figures: Figures = json.loads(done.stdout.splitlines()[-1])
+    return figures
+
+
+def main(step: str, workspace: Path, folder: Path) -> None:
+    """One step; the last line it prints are its figures as JSON."""
+    work, finish = _STEPS[step](workspace, folder)
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = work()
+    figures: Figures = {
+        "seconds": time.perf_counter() - wall,
+        "cpu": time.process_time() - cpu,
+        "gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+    }
+    print(json.dumps(figures | finish(result)))
+
+
+Step = tuple[Callable[[], Any], Callable[[Any], Figures]]
+
+
+def _read(workspace: Path, folder: Path) -> Step:
+    from bodyscan.capture.images import read_sequence
+    from bodyscan.progress import threaded
+
+    calibration, captures = _scan_of(workspace)
+    cameras = {pair.name: pair.camera for pair in calibration.rig.pairs}
+
+    def read(sequence: Any) -> None:
+        read_sequence(sequence, cameras[sequence.pair], workers=1)
+
+    return lambda: threaded(read, captures.sequences, stage="reading"), lambda _: {}
+
+
+def _ours(workspace: Path, folder: Path) -> Step:
+    from bodyscan.fusion.cleaning import clean
+    from bodyscan.fusion.merging import merge
+    from bodyscan.reconstruction.pairs import range_images
+    from bodyscan.registration.alignment import align
+
+    calibration, captures = _scan_of(workspace)
+    stages: dict[str, float] = {}
+
+    def stage(name: str, work: Callable[[], Any]) -> Any:
+        started = time.perf_counter()
+        result = work()
+        stages[name] = time.perf_counter() - started
+        return result
+
+    def work() -> Any:
+        images, _ = stage("range images", lambda: range_images(calibration, captures))
+        placed = calibration.rig_from_camera
+        cleaned = stage("cleaning", lambda: clean(images, placed, calibration.rig.volume))
+        seen = [image for image in cleaned if image.valid.any()]
+        alignment = stage("aligning", lambda: align(seen, placed, calibration.covariance))
+        placing = {**placed, **alignment.rig_from_camera}
+        cloud = stage("merging", lambda: merge(seen, placing, points=POINTS))
+        return images, seen, placed, placing, cloud, alignment
+
+    def finish(result: Any) -> Figures:
+        images, seen, placed, placing, cloud, alignment = result
+        _keep(folder / "ours", (images, seen, placed, placing, cloud))
+        return {
+            "stages": stages,
+            "overlap_mm": alignment.rms_after_mm,
+            "deviation": _deviation(workspace, cloud.points),
+        }
+
+    return work, finish
+
+
+def _mesh(workspace: Path, folder: Path) -> Step:
+    from bodyscan.fusion.meshing import mesh
+
+    images, _, _, placing, cloud = _kept(folder / "ours")
+
+    def finish(found: Any) -> Figures:
+        measured = np.unique(found.faces[~found.filled])
+        return {"deviation": _deviation(workspace, found.vertices[measured])}
+
+    return lambda: mesh(cloud, images, placing), finish
+
+
+def _open3d(workspace: Path, folder: Path) -> Step:
+    """What Open3D's own tutorial does: ICP of every two, pose graph, all points into voxels."""
+    _, seen, placed, _, cloud = _kept(folder / "ours")
+    spacing = _spacing(cloud)
+
+    def finish(merged: Any) -> Figures:
+        points = np.asarray(merged.points)
+        _keep(folder / "open3d", (points, np.asarray(merged.normals)))
+        return {"deviation": _deviation(workspace, points)}
+
+    return lambda: multiway(seen, placed, spacing), finish
+
+
+def multiway(seen: Any, placed: Any, voxel_mm: float) -> Any:
+    """Open3D's multiway registration of range images from where calibration puts them, merged."""
+    import open3d as o3d
+
+    registration = o3d.pipelines.registration
+    clouds = []
+    for image in seen:
+        placing, where = placed[image.pair], image.valid & np.isfinite(image.normals[..., 0])
+        one = o3d.geometry.PointCloud(
+            o3d.utility.Vector3dVector(placing.apply(image.points[where].astype(float)))
+        )
+        one.normals = o3d.utility.Vector3dVector(placing.rotate(image.normals[where].astype(float)))
+        clouds.append(one)
+    thin = [one.voxel_down_sample(ICP_VOXEL_MM) for one in clouds]
+    graph = registration.PoseGraph()
+    graph.nodes.extend(registration.PoseGraphNode(np.eye(4)) for _ in clouds)
+    method = registration.TransformationEstimationPointToPlane()
+    for i, j in combinations(range(len(thin)), 2):
+        overlap = registration.evaluate_registration(thin[i], thin[j], ICP_REACH_MM)
+        if overlap.fitness < 0.02:
+            continue
+        found = registration.registration_icp(thin[i], thin[j], ICP_REACH_MM, np.eye(4), method)
+        information = registration.get_information_matrix_from_point_clouds(
+            thin[i], thin[j], ICP_REACH_MM, found.transformation
+        )
+        edge = registration.PoseGraphEdge(i, j, found.transformation, information, uncertain=True)
+        graph.edges.append(edge)
+    registration.global_optimization(
+        graph,
+        registration.GlobalOptimizationLevenbergMarquardt(),
+        registration.GlobalOptimizationConvergenceCriteria(),
+        registration.GlobalOptimizationOption(
+            max_correspondence_distance=ICP_REACH_MM, edge_prune_threshold=0.25, reference_node=0
+        ),
+    )
+    merged = o3d.geometry.PointCloud()
+    for one, node in zip(clouds, graph.nodes, strict=True):
+        merged += one.transform(node.pose)
+    return merged.voxel_down_sample(voxel_mm)
+
+
+def _open3d_poisson(depth: int) -> Callable[[Path, Path], Step]:
+    def step(workspace: Path, folder: Path) -> Step:
+        from bodyscan.fusion.meshing import poisson
+
+        points, normals = _kept(folder / "open3d")
+        return lambda: poisson(points, normals, depth), lambda mesh: _near(workspace, *mesh, points)
+
+    return step
+
+
+def _pymeshlab(workspace: Path, folder: Path) -> Step:
+    import pymeshlab
+
+    points, normals = _kept(folder / "open3d")
+
+    def work() -> Any:
+        meshes = pymeshlab.MeshSet()
+        meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals))
+        meshes.generate_surface_reconstruction_screened_poisson(depth=9, threads=1)
+        made = meshes.current_mesh()
+        return made.vertex_matrix(), made.face_matrix()
+
+    return work, lambda mesh: _near(workspace, *mesh, points)
+
+
+_STEPS: dict[str, Callable[[Path, Path], Step]] = {
+    "read": _read,
+    "ours": _ours,
+    "mesh": _mesh,
+    "open3d": _open3d,
+    "open3d-poisson-9": _open3d_poisson(9),
+    "open3d-poisson-10": _open3d_poisson(10),
+    "pymeshlab": _pymeshlab,
+}
+
+
+def _scan_of(workspace: Path) -> tuple[Any, Any]:
+    from bodyscan.calibration.storage import load_calibration
+    from bodyscan.capture.folder import open_scan
+
+    calibration = load_calibration(workspace / "calibration")
+    return calibration, open_scan(calibration.rig, workspace / "captures" / "person")
+
+
+def _spacing(cloud: BodyCloud) -> float:
+    """Edge of the voxels that give about as many points as ours."""
+    from bodyscan.fusion.thinning import voxel_size_for
+
+    return voxel_size_for(cloud.points.astype(np.float32), len(cloud.points))
+
+
+def _near(workspace: Path, vertices: Any, faces: Any, points: Any) -> Figures:
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(points).query(vertices, distance_upper_bound=MEASURED_MM)[0] < np.inf
+    return {"deviation": _deviation(workspace, np.asarray(vertices)[near])}
+
+
+def _deviation(workspace: Path, points: Any) -> Figures:
+    from dataclasses import asdict
+
+    from bodyscan.evaluation.surface import deviation, signed_distances
+    from bodyscan.evaluation.workspace import load_truth
+
+    truth = load_truth(workspace / "truth")
+    assert truth.vertices is not None
+    assert truth.faces is not None
+    return asdict(deviation(signed_distances(points, truth.vertices, truth.faces)))
+
+
+def _keep(path: Path, things: Any) -> None:
+    path.write_bytes(pickle.dumps(things))  # between two steps of one run, nowhere else
+
+
+def _kept(path: Path) -> Any:
+    return pickle.loads(path.read_bytes())
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))

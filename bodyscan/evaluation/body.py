@@ -1,0 +1,144 @@
+"""A scanned body held against the simulated one: sway left in, girths, stature, coverage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from bodyscan.evaluation.surface import covered, sample_surface
+from bodyscan.fusion.body import BodyMesh
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform, rigid_fit
+from bodyscan.measurement.measuring import Slice, measure
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+STEP_MM = 20.0
+TORSO = (0.46, 0.86)  # of the stature: crotch to shoulders
+WHOLE = 0.97  # of a girth measured; what is filled is a guess and said to be one
+STEEPEST_COSINE = 0.17  # seen at more than 80 degrees does not count as seen
+SPOTS = 60_000
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """rig_from_still: where the model has the body of the truth.  apart_mm: RMS over pairs and the
+    body of what is left of calibration error and sway, along all axes.
+    """
+
+    rig_from_still: RigidTransform
+    apart_mm: float
+
+
+def settled(
+    found: Mapping[str, RigidTransform], true_pairs: Mapping[str, Any], vertices: Array
+) -> Settled:
+    """found: rig_from_camera as the scan used it; true_pairs: `pairs` of truth.json."""
+    body = vertices[:: max(1, len(vertices) // 500)]
+    placed = []
+    for name, placing in found.items():
+        true = true_pairs[name]
+        camera = RigidTransform.from_matrix(true["rig_from_camera"])
+        swayed = RigidTransform.from_matrix(true["swayed_from_still"])
+        placed.append((placing @ camera.inverse() @ swayed).apply(body))
+    mean = np.mean(placed, axis=0)
+    apart = float(np.sqrt(np.mean(np.sum((np.array(placed) - mean) ** 2, axis=-1))))
+    return Settled(rigid_fit(body, mean), apart)
+
+
+@dataclass(frozen=True)
+class GirthErrors:
+    """Tape girths of the trunk, mesh minus truth, where at least 97 % of the girth was measured.
+
+    worst_mm, rms_mm over `heights` slices; stature_mm: its error.
+    """
+
+    heights: int
+    rms_mm: float
+    worst_mm: float
+    worst_at_mm: float
+    stature_mm: float
+
+
+def girth_errors(mesh: BodyMesh, vertices: Array, faces: Indices) -> GirthErrors:
+    """mesh in the truth's frame; vertices, faces: the truth."""
+    truth = _plain(vertices, faces)
+    stature = float(vertices[:, 2].max())
+    levels = np.arange(TORSO[0] * stature, TORSO[1] * stature, STEP_MM).tolist()
+    ours, true = measure(mesh, levels), measure(truth, levels)
+    errors = {
+        one.height_mm: error
+        for one, other in zip(ours.slices, true.slices, strict=True)
+        if (error := _trunk_error(one, other)) is not None
+    }
+    sizes = np.abs(list(errors.values())) if errors else np.array([np.nan])
+    return GirthErrors(
+        len(errors),
+        float(np.sqrt(np.mean(sizes**2))),
+        float(sizes.max()),
+        list(errors)[int(np.argmax(sizes))] if errors else float("nan"),
+        ours.stature_mm - true.stature_mm,
+    )
+
+
+def _trunk_error(ours: Slice, true: Slice) -> float | None:
+    one, other = ours.of("trunk"), true.of("trunk")
+    if one is None or other is None or one.measured < WHOLE:
+        return None
+    return one.tape_mm - other.tape_mm
+
+
+def _plain(vertices: Array, faces: Indices) -> BodyMesh:
+    count = len(vertices)
+    return BodyMesh(
+        vertices,
+        faces,
+        np.zeros((count, 3), np.float32),
+        np.zeros((count, 3), np.uint8),
+        np.zeros(count, np.float32),
+        np.zeros(len(faces), bool),
+    )
+
+
+def coverage_of_seen(
+    points: Array, vertices: Array, faces: Indices, true_pairs: Mapping[str, Any]
+) -> tuple[float, float]:
+    """Share of the truth that some camera and its projector see, and of it, what points cover.
+
+    points in the truth's frame; covered within 1 mm along the normal.
+    """
+    spots, normals = sample_surface(vertices, faces, SPOTS, seed=0)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
+    seen = np.zeros(len(spots), bool)
+    for pair in true_pairs.values():
+        still_from_camera = RigidTransform.from_matrix(
+            pair["swayed_from_still"]
+        ).inverse() @ RigidTransform.from_matrix(pair["rig_from_camera"])
+        camera = Camera(**pair["camera"])
+        in_camera = still_from_camera.inverse().apply(spots)
+        ahead = in_camera[:, 2] > 100.0
+        u, v = camera.project(np.where(ahead[:, None], in_camera, 1.0)).T
+        inside = ahead & (u > 0) & (u < camera.width - 1) & (v > 0) & (v < camera.height - 1)
+        index = np.flatnonzero(inside & ~seen)
+        for eye in (np.zeros(3), np.array(pair["projector"]["centre"])):
+            index = index[_open(scene, spots[index], normals[index], still_from_camera.apply(eye))]
+        seen[index] = True
+    return float(seen.mean()), float(covered(points, spots[seen], normals[seen]).mean())
+
+
+def _open(scene: Any, spots: Array, normals: Array, eye: Array) -> NDArray[np.bool_]:
+    """(N,) which spots face the eye, with nothing between."""
+    way = eye - spots
+    distance = np.linalg.norm(way, axis=1)
+    facing = np.sum(way * normals, axis=1) > STEEPEST_COSINE * distance
+    start = spots + 0.2 * normals  # clear of the surface itself
+    rays = np.concatenate([start, eye - start], axis=1).astype(np.float32)
+    hidden = scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=1.0).numpy()
+    return np.asarray(facing & ~hidden)

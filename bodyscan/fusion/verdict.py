@@ -1,0 +1,179 @@
+"""Whether a scan is good, usable for some purposes, or to be taken again, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from bodyscan.capture.rig import Volume
+from bodyscan.fusion.body import BodyCloud, BodyMesh
+from bodyscan.fusion.rings import rings
+from bodyscan.fusion.topology import face_areas
+from bodyscan.registration.alignment import Alignment
+
+Array = NDArray[np.float64]
+Grade = Literal["good", "usable", "repeat"]
+Finding = tuple[Grade, str]
+GRADES: tuple[Grade, ...] = ("good", "usable", "repeat")
+
+SOME_FILLED, MOST_FILLED = 0.12, 0.5
+SOME_DISAGREEMENT_MM, MOST_DISAGREEMENT_MM = 0.4, 0.8
+SOME_MOTION_MM, MOST_MOTION_MM = 3.0, 6.0
+CELL_MM = 50.0
+SIDE_BY_SIDE = 0.4  # of the taller one's height
+SMALL_PIECE = 0.01
+OUTSIDE_MM = 15.0
+SOME_OUTSIDE, MOST_OUTSIDE = 0.01, 0.2
+RIM_MM, AT_RIM = 10.0, 3e-4
+BAND_MM = 50.0
+SOLES_MM = 50.0
+UNKNOWN_BAND = 0.5
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """good; usable, with the reasons for care; or repeat: not to be measured, take it again."""
+
+    grade: Grade
+    reasons: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return "\n  ".join([f"verdict: {self.grade}", *self.reasons])
+
+
+def judge(
+    cloud: BodyCloud,
+    mesh: BodyMesh,
+    alignment: Alignment | None,
+    failed: Mapping[str, str],
+    volume: Volume,
+) -> Verdict:
+    """The worst of all findings decides; the reasons come worst first."""
+    findings = [
+        *_pairs(failed, alignment),
+        *_motion(alignment),
+        *_company(cloud),
+        *_cut_off(cloud, volume),
+        *_left_out(cloud, mesh),
+        *_contacts(mesh),
+        *_unmeasured(mesh),
+    ]
+    worst_first = sorted(findings, key=lambda finding: -GRADES.index(finding[0]))
+    grade = worst_first[0][0] if worst_first else "good"
+    return Verdict(grade, tuple(reason for _, reason in worst_first))
+
+
+def _pairs(failed: Mapping[str, str], alignment: Alignment | None) -> Iterator[Finding]:
+    for name, reason in failed.items():
+        yield "usable", f"left out: {name}: {reason}"
+    for name in alignment.refused if alignment else ():
+        yield (
+            "repeat",
+            f"pair {name} does not fit the others: it was moved since the calibration, or the "
+            "person moved far",
+        )
+
+
+def _motion(alignment: Alignment | None) -> Iterator[Finding]:
+    if alignment is None:
+        return
+    rms = alignment.rms_after_mm
+    if rms > SOME_DISAGREEMENT_MM:
+        yield (
+            "repeat" if rms > MOST_DISAGREEMENT_MM else "usable",
+            f"the pairs disagree by {rms:.2f} mm where they overlap: is this the calibration of "
+            "this rig, has nothing moved since, did the person stand still?",
+        )
+    name, motion = max(alignment.motion_mm.items(), key=lambda item: item[1])
+    if motion > SOME_MOTION_MM:
+        yield (
+            "repeat" if motion > MOST_MOTION_MM else "usable",
+            f"the person moved by {motion:.1f} mm (pair {name}) while the pairs fired",
+        )
+
+
+def _company(cloud: BodyCloud) -> Iterator[Finding]:
+    """Bodies that stand beside each other, and pieces that nothing joins."""
+    cells = np.floor((cloud.points - cloud.points.min(axis=0)) / CELL_MM).astype(np.int64)
+    taken = np.zeros(cells.max(axis=0) + 1, bool)
+    taken[tuple(cells.T)] = True
+    label = ndimage.label(taken, np.ones((3, 3, 3)))[0][tuple(cells.T)]
+    share = np.bincount(label)[1:] / len(label)
+    order = np.argsort(-share)
+    extents = [np.percentile(cloud.points[label == k + 1, 2], [1, 99]) for k in order[:4]]
+    low, high = extents[0]
+    for k, (bottom, top) in zip(order[1:4], extents[1:], strict=True):
+        beside = min(top, high) - max(bottom, low)
+        if beside > SIDE_BY_SIDE * (high - low):
+            yield "repeat", f"two bodies stand in the scan volume ({share[k]:.0%} in the second)"
+        elif share[k] > SMALL_PIECE:
+            yield (
+                "usable",
+                f"a piece between {bottom:.0f} and {top:.0f} mm ({share[k]:.0%} of the points) is "
+                "not joined to the rest by anything measured",
+            )
+
+
+def _cut_off(cloud: BodyCloud, volume: Volume) -> Iterator[Finding]:
+    x, y, z = cloud.points.T
+    if np.mean(z > volume.top_mm - RIM_MM) > AT_RIM:
+        yield "usable", f"cut off at the scan volume's top, {volume.top_mm:.0f} mm: no stature"
+    if np.mean(np.hypot(x, y) > volume.radius_mm - RIM_MM) > AT_RIM:
+        yield "usable", f"cut off at the scan volume's side, {volume.radius_mm:.0f} mm"
+
+
+def _left_out(cloud: BodyCloud, mesh: BodyMesh) -> Iterator[Finding]:
+    """Points that the mesh, one closed piece, has no surface for."""
+    some = cloud.points[:: max(1, len(cloud.points) // 20_000)]
+    distance = cKDTree(mesh.vertices).query(some, distance_upper_bound=OUTSIDE_MM)[0]
+    outside = np.isinf(distance)
+    share = float(np.mean(outside))
+    if share > SOME_OUTSIDE:
+        low, high = np.percentile(some[outside, 2], [1, 99])
+        yield (
+            "repeat" if share > MOST_OUTSIDE else "usable",
+            f"{share:.0%} of the points, between {low:.0f} and {high:.0f} mm, are not in the mesh",
+        )
+
+
+def _contacts(mesh: BodyMesh) -> Iterator[Finding]:
+    if mesh.filled.mean() > MOST_FILLED:
+        return  # what is made up touches anywhere
+    middle = 0.5 * (mesh.vertices[:, 1].min() + mesh.vertices[:, 1].max())
+    for ring in rings(mesh.vertices, mesh.faces):
+        side = "left" if ring.y_mm > middle else "right"
+        yield (
+            "usable",
+            f"parts of the body touch: a closed ring on the {side} from {ring.low_mm:.0f} to "
+            f"{ring.high_mm:.0f} mm (a hand on the hip?); girths there hold both parts",
+        )
+
+
+def _unmeasured(mesh: BodyMesh) -> Iterator[Finding]:
+    """The made-up share of all, and of each height."""
+    area = face_areas(mesh.vertices, mesh.faces)
+    filled = float(area[mesh.filled].sum() / area.sum())
+    if filled > SOME_FILLED:
+        yield (
+            "repeat" if filled > MOST_FILLED else "usable",
+            f"{filled:.0%} of the surface is made up: nothing was measured there",
+        )
+    height = mesh.vertices[mesh.faces, 2].mean(axis=1)
+    band = np.maximum(height / BAND_MM, 0.0).astype(np.int64)
+    share = np.bincount(band, area * mesh.filled) / np.maximum(np.bincount(band, area), 1e-9)
+    unknown = (share > UNKNOWN_BAND) & (BAND_MM * np.arange(len(share)) >= SOLES_MM)
+    starts = np.flatnonzero(unknown & ~np.roll(unknown, 1))
+    ends = np.flatnonzero(unknown & ~np.roll(unknown, -1)) + 1
+    for low, high in zip(starts, ends, strict=True):
+        crown = high == len(share)
+        yield (
+            "usable",
+            f"next to nothing was measured from {BAND_MM * low:.0f} to {BAND_MM * high:.0f} mm "
+            f"(hair, black cloth, or out of view){': the stature is a guess' if crown else ''}",
+        )

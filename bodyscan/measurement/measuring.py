@@ -1,0 +1,151 @@
+"""First measurements of a body mesh, in the pose in which it stood."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.errors import BadInput
+from bodyscan.fusion.body import BodyMesh
+from bodyscan.fusion.topology import face_areas, signed_volume
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.measurement.body_frame import rig_from_body
+from bodyscan.measurement.slices import Loop, loops_at
+
+Array = NDArray[np.float64]
+
+STEP_MM = 100.0
+SPECK_MM2 = 50.0  # less than a fingertip
+CROWN_MM = 20.0
+
+
+@dataclass(frozen=True)
+class Girth:
+    """One part of the body in a horizontal slice.
+
+    part: trunk (neck and head too), left leg, right leg, left arm, right arm.  girth_mm: along the
+    surface.  tape_mm: as a tape runs (convex hull).  width_mm, depth_mm: extent to the side and
+    forward.  centre_mm: (x, y), body frame.  measured: share of girth_mm that was measured, not filled.
+    """
+
+    part: str
+    girth_mm: float
+    tape_mm: float
+    width_mm: float
+    depth_mm: float
+    area_mm2: float
+    centre_mm: tuple[float, float]
+    measured: float
+
+
+@dataclass(frozen=True)
+class Slice:
+    """The parts of the body at one height over the floor."""
+
+    height_mm: float
+    girths: tuple[Girth, ...]
+
+    def of(self, part: str) -> Girth | None:
+        """The largest loop of that part, None if the slice has none."""
+        found = [girth for girth in self.girths if girth.part == part]
+        return max(found, key=lambda girth: girth.area_mm2) if found else None
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """stature_mm: highest point over the floor, in pose.  stature_measured: share of the crown's
+    surface (its top 20 mm) that was measured.  measured: share of the whole surface.
+    """
+
+    stature_mm: float
+    stature_measured: float
+    volume_l: float
+    area_m2: float
+    measured: float
+    slices: tuple[Slice, ...]
+    rig_from_body: RigidTransform
+
+
+def measure(mesh: BodyMesh, heights_mm: Sequence[float] | None = None) -> Measurements:
+    """Stature, volume, area, and the slices at heights (every 100 mm if none are given).
+
+    Raises BadInput for a height at which there is no body.
+    """
+    stature = float(mesh.vertices[:, 2].max())
+    frame = rig_from_body(mesh.vertices)
+    vertices = frame.inverse().apply(mesh.vertices)
+    if heights_mm is None:
+        heights_mm = np.arange(STEP_MM, stature, STEP_MM).tolist()
+    areas = face_areas(mesh.vertices, mesh.faces)
+    crown = mesh.vertices[mesh.faces, 2].max(axis=1) > stature - CROWN_MM
+    return Measurements(
+        stature,
+        _share(areas, ~mesh.filled, crown),
+        signed_volume(mesh.vertices, mesh.faces) / 1e6,
+        float(areas.sum()) / 1e6,
+        _share(areas, ~mesh.filled, np.ones_like(crown)),
+        tuple(_slice(vertices, mesh, float(height)) for height in heights_mm),
+        frame,
+    )
+
+
+def heights_from(text: str) -> list[float]:
+    """Heights written as "800,1050", mm. Raises BadInput if one is no number."""
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError as error:
+        raise BadInput(
+            f"{text!r} is no list of heights", remedy="Write mm with commas between: 800,1050."
+        ) from error
+
+
+def _share(areas: Array, which: NDArray[np.bool_], among: NDArray[np.bool_]) -> float:
+    return float(areas[which & among].sum() / max(areas[among].sum(), 1e-12))
+
+
+def _slice(vertices: Array, mesh: BodyMesh, height_mm: float) -> Slice:
+    loops = loops_at(vertices, mesh.faces, height_mm, mesh.filled)
+    loops = tuple(loop for loop in loops if loop.area_mm2 > SPECK_MM2)
+    if not loops:
+        low, high = vertices[:, 2].min(), vertices[:, 2].max()
+        raise BadInput(
+            f"there is no body at a height of {height_mm:g} mm",
+            remedy=f"Give heights between {low:.0f} and {high:.0f} mm.",
+        )
+    girths = [_girth(part, loop) for part, loop in zip(parts(loops), loops, strict=True)]
+    return Slice(height_mm, tuple(sorted(girths, key=lambda girth: (girth.part, -girth.area_mm2))))
+
+
+def parts(loops: Sequence[Loop]) -> list[str]:
+    """Which part of the body each loop of a slice is; body frame, largest loop first.
+
+    A loop that holds the middle (y = 0) well inside is the trunk; then all others are arms. If
+    none does, the largest on each side is a leg.
+    """
+    reach = [(loop.segments[..., 1].min(), loop.segments[..., 1].max()) for loop in loops]
+    is_trunk = [min(high, -low) > 0.15 * (high - low) for low, high in reach]
+    names: list[str] = []
+    for (low, high), trunk in zip(reach, is_trunk, strict=True):
+        side = "left" if low + high > 0 else "right"
+        leg = not any(is_trunk) and f"{side} leg" not in names
+        names.append("trunk" if trunk else f"{side} leg" if leg else f"{side} arm")
+    return names
+
+
+def _girth(part: str, loop: Loop) -> Girth:
+    corners = loop.segments[:, 0]
+    depth, width = np.ptp(corners, axis=0)
+    x, y = loop.centre
+    return Girth(
+        part,
+        loop.girth_mm,
+        loop.tape_mm,
+        float(width),
+        float(depth),
+        loop.area_mm2,
+        (float(x), float(y)),
+        loop.measured_share,
+    )

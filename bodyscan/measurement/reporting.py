@@ -1,0 +1,65 @@
+"""Measurements as a table and as a JSON document."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from typing import Any
+
+from rich.table import Table
+
+from bodyscan import __version__
+from bodyscan.measurement.measuring import Measurements
+
+MOSTLY = 0.5
+LITTLE = 0.95
+
+
+def tables(measured: Measurements) -> Iterator[Table]:
+    """The whole body, then one row for each part of each slice, from the top down."""
+    body = Table("", "", title="body", show_header=False)
+    body.columns[1].justify = "right"
+    guess = "" if measured.stature_measured >= MOSTLY else " (guessed: the crown was not measured)"
+    body.add_row("stature in pose", f"{measured.stature_mm:.1f} mm{guess}")
+    body.add_row("volume", f"{measured.volume_l:.2f} l")
+    body.add_row("area", f"{measured.area_m2:.3f} m2")
+    body.add_row("of it measured", f"{100.0 * measured.measured:.1f} %")
+    yield body
+    slices = Table(title="horizontal slices, mm")
+    headings = ("height", "part", "tape (hull)", "along surface", "width", "depth", "measured")
+    for heading in headings:
+        slices.add_column(heading, justify="left" if heading == "part" else "right")
+    for level in sorted(measured.slices, key=lambda level: -level.height_mm):
+        for girth in level.girths:
+            slices.add_row(
+                f"{level.height_mm:.0f}",
+                girth.part,
+                f"{girth.tape_mm:.1f}",
+                f"{girth.girth_mm:.1f}",
+                f"{girth.width_mm:.1f}",
+                f"{girth.depth_mm:.1f}",
+                f"{100.0 * girth.measured:.0f} %",
+                style="" if girth.measured >= LITTLE else "yellow",
+            )
+    yield slices
+
+
+def document(measured: Measurements, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """What `measurements.json` says; facts: of the scan, as in its scan.json."""
+    return {
+        "schema": "bodyscan-measurements",
+        "version": 1,
+        "software": f"bodyscan {__version__}",
+        "units": {"lengths": "mm", "volume_l": "l", "area_m2": "m2", "area_mm2": "mm2"},
+        "subject": facts.get("subject"),
+        "when": facts.get("when"),
+        "calibration_id": facts.get("calibration_id"),
+        "verdict": facts.get("verdict"),
+        "stature_mm": measured.stature_mm,
+        "stature_measured": measured.stature_measured,
+        "volume_l": measured.volume_l,
+        "area_m2": measured.area_m2,
+        "measured": measured.measured,
+        "rig_from_body": measured.rig_from_body.matrix,
+        "slices": [asdict(level) for level in measured.slices],
+    }

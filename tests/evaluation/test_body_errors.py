@@ -1,0 +1,102 @@
+"""The measures themselves, on bodies that are off by a known amount."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from bodyscan.evaluation.body import coverage_of_seen, girth_errors, settled
+from bodyscan.fusion.body import BodyMesh
+from bodyscan.fusion.topology import vertex_normals
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+
+CAMERA = Camera(300.0, 300.0, 0.0, 160.0, 128.0, 0.0, 0.0, 320, 256)
+
+
+def column(radius: float, height: float = 1700.0) -> tuple[np.ndarray, np.ndarray]:
+    made = o3d.geometry.TriangleMesh.create_cylinder(radius, height, resolution=90, split=80)
+    vertices = np.asarray(made.vertices) + [0.0, 0.0, height / 2]
+    return vertices, np.asarray(made.triangles).astype(np.int64)
+
+
+def mesh_of(vertices: np.ndarray, faces: np.ndarray) -> BodyMesh:
+    count = len(vertices)
+    return BodyMesh(
+        vertices,
+        faces,
+        vertex_normals(vertices, faces),
+        np.zeros((count, 3), np.uint8),
+        np.zeros(count, np.float32),
+        np.zeros(len(faces), bool),
+    )
+
+
+def test_a_body_half_a_millimetre_too_thick():
+    vertices, faces = column(150.0)
+    found = girth_errors(mesh_of(*column(150.5, 1701.0)), vertices, faces)
+    assert found.heights > 30
+    assert found.rms_mm == pytest.approx(2 * np.pi * 0.5, rel=1e-2)
+    assert found.worst_mm == pytest.approx(found.rms_mm, rel=1e-3)
+    assert found.stature_mm == pytest.approx(1.0)
+
+
+def test_what_was_filled_is_not_judged():
+    vertices, faces = column(150.0)
+    thick, _ = column(160.0)
+    filled = np.ones(len(faces), bool)
+    body = BodyMesh(
+        thick,
+        faces,
+        vertex_normals(thick, faces),
+        np.zeros((len(thick), 3), np.uint8),
+        np.zeros(len(thick), np.float32),
+        filled,
+    )
+    assert girth_errors(body, vertices, faces).heights == 0
+
+
+def pairs(sways: list[RigidTransform]) -> dict[str, dict]:
+    """Cameras in front of the column, each with its projector 300 mm above it."""
+    turn = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    camera = RigidTransform(turn, np.array([1500.0, 0.0, 850.0]))
+    return {
+        f"p{k}": {
+            "camera": asdict(CAMERA),
+            "rig_from_camera": camera.matrix,
+            "projector": {"centre": [0.0, -300.0, 0.0]},
+            "swayed_from_still": sway.matrix,
+        }
+        for k, sway in enumerate(sways)
+    }
+
+
+def test_sway_left_in_is_told_and_a_common_motion_is_not():
+    vertices, _ = column(150.0)
+    common = RigidTransform.from_rotation_vector([0.0, 0.0, 0.01], [5.0, -2.0, 0.0])
+    aside = RigidTransform(np.eye(3), np.array([0.0, 0.6, 0.0]))
+    true = pairs([RigidTransform.identity(), RigidTransform.identity()])
+    cameras = {name: RigidTransform.from_matrix(p["rig_from_camera"]) for name, p in true.items()}
+    together = settled({name: common @ t for name, t in cameras.items()}, true, vertices)
+    assert together.apart_mm < 1e-9
+    np.testing.assert_allclose(together.rig_from_still.matrix, common.matrix, atol=1e-6)
+    apart = settled({"p0": cameras["p0"], "p1": aside @ cameras["p1"]}, true, vertices)
+    assert apart.apart_mm == pytest.approx(0.3)
+
+
+def test_only_what_camera_and_projector_see_counts():
+    vertices, faces = column(150.0)
+    seen, covered = coverage_of_seen(vertices, vertices, faces, pairs([RigidTransform.identity()]))
+    # Less than the half that faces the camera; of 0.85 m x 1.1 m at 1.35 m.
+    assert 0.15 < seen < 0.45
+    assert covered < 0.2  # the column's own vertices lie 10 mm and more apart
+    rng = np.random.default_rng(0)
+    angle, height = rng.uniform(-np.pi, np.pi, 1_000_000), rng.uniform(0.0, 1700.0, 1_000_000)
+    dense = np.stack([150.0 * np.cos(angle), 150.0 * np.sin(angle), height], axis=-1)
+    true = pairs([RigidTransform.identity()])
+    assert coverage_of_seen(dense, vertices, faces, true)[1] > 0.98
+    off = dense + [1.5, 0.0, 0.0]
+    assert coverage_of_seen(off, vertices, faces, true)[1] < 0.6

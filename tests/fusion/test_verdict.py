@@ -1,0 +1,194 @@
+"""Scans that went wrong, each with its verdict; quarter-size images, so that a pixel is 2.8 mm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import open3d as o3d
+import pytest
+from ray_cast_scan import Truth, cast_scan, load_body, load_rig, looking, without
+
+from bodyscan.calibration.rig_calibration import RigCalibration
+from bodyscan.capture.rig import Volume
+from bodyscan.errors import ScanFailed
+from bodyscan.fusion.scan import Scan, ScanSettings, fuse
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.registration.alignment import AlignmentSettings
+from bodyscan.registration.uncertainty import PlacingCovariance
+
+RIG = load_rig()
+SETTINGS = ScanSettings(
+    points=60_000,
+    alignment=AlignmentSettings(spacing_mm=6.0),
+    mesh_depth=7,
+    mesh_reach_mm=14.0,  # a cell of the octree, as 4 mm is at depth 9
+)
+
+
+def moved(truth: Truth, shift) -> Truth:
+    return Truth(truth.vertices + np.asarray(shift), truth.faces)
+
+
+def joined(*truths: Truth) -> Truth:
+    starts = np.cumsum([0, *(len(truth.vertices) for truth in truths)])
+    return Truth(
+        np.concatenate([truth.vertices for truth in truths]),
+        np.concatenate([t.faces + start for t, start in zip(truths, starts, strict=False)]),
+    )
+
+
+def bar(start, end, radius: float) -> Truth:
+    """A round bar between two places."""
+    made = o3d.geometry.TriangleMesh.create_cylinder(radius, 1.0, resolution=40)
+    start, way = np.asarray(start, float), np.subtract(end, start)
+    vertices = np.asarray(made.vertices) * [1.0, 1.0, np.linalg.norm(way)]
+    turn = o3d.geometry.get_rotation_matrix_from_axis_angle([-np.pi / 2, 0.0, 0.0])
+    assert np.allclose(way / np.linalg.norm(way), turn @ [0.0, 0.0, 1.0])  # along y alone
+    return Truth(vertices @ turn.T + start + way / 2, np.asarray(made.triangles).astype(np.int64))
+
+
+def ball(centre, radius: float) -> Truth:
+    made = o3d.geometry.TriangleMesh.create_sphere(radius, resolution=40)
+    return Truth(np.asarray(made.vertices) + centre, np.asarray(made.triangles).astype(np.int64))
+
+
+@pytest.fixture(scope="module")
+def person() -> Truth:
+    return load_body(subdivisions=1)
+
+
+@pytest.fixture(scope="module")
+def images(person: Truth) -> list[RangeImage]:
+    return photographed(person)
+
+
+def photographed(truth: Truth) -> list[RangeImage]:
+    return cast_scan(truth, RIG, scale=0.25, noise_mm=0.1).range_images
+
+
+def placings() -> dict[str, RigidTransform]:
+    return {pair.name: looking(pair.nominal) for pair in RIG.pairs}
+
+
+def fused(images, *, placed=None, failed=None, volume: Volume = RIG.volume, empty=()) -> Scan:
+    """What `bodyscan scan` makes of range images, with a calibration good to 0.05 mm."""
+    placed = placed or placings()
+    sigmas = np.tile([2e-5] * 3 + [0.05] * 3, len(placed))
+    covariance = PlacingCovariance(tuple(placed), np.diag(sigmas**2))
+    rig = RIG.model_copy(update={"volume": volume})
+    calibration = RigCalibration(rig, {}, placed, covariance, {}, {}, ())
+    return fuse(calibration, images, failed or {}, SETTINGS, empty=empty)
+
+
+def said(scan: Scan) -> str:
+    return " | ".join(scan.verdict.reasons)
+
+
+def test_a_good_scan(images):
+    verdict = fused(images).verdict
+    assert (verdict.grade, verdict.reasons) == ("good", ())
+
+
+def test_nobody_in_the_volume(person):
+    empty = photographed(moved(person, [5000.0, 0.0, 0.0]))
+    with pytest.raises(ScanFailed, match="nobody stands in the scan volume"):
+        fused(empty)
+
+
+def test_two_people(person):
+    both = joined(moved(person, [-230.0, 0.0, 0.0]), moved(person, [230.0, 0.0, 0.0]))
+    scan = fused(photographed(both))
+    assert scan.verdict.grade == "repeat"
+    assert "two bodies" in said(scan)
+
+
+def test_what_always_stands_there_is_cut_away_by_an_empty_scan(person):
+    """A post beside the person: part of the model, unless a scan of the empty rig shows it."""
+    post = ball([-350.0, 350.0, 1000.0], 120.0)
+    with_post = photographed(joined(person, post))
+    empty = photographed(post)
+    taken, cut = fused(with_post), fused(with_post, empty=empty)
+    assert "a piece between 9" in said(taken) or "not in the mesh" in said(taken)
+    assert cut.verdict.grade == "good", said(cut)
+    near = np.linalg.norm(cut.cloud.points - [-350.0, 350.0, 1000.0], axis=1) < 130.0
+    assert not near.any()
+    assert len(cut.cloud.points) > 0.9 * len(taken.cloud.points) - 3000
+
+
+def test_a_failed_pair_is_named(images):
+    without_one = [image for image in images if image.pair != "p2-3"]
+    scan = fused(without_one, failed={"p2-3": "bit03.png is missing"})
+    assert scan.verdict.grade == "usable"
+    assert "p2-3: bit03.png is missing" in said(scan)
+
+
+def test_half_the_pairs_give_half_a_body(images):
+    """One pole of three: the other side is all made up, and the verdict says so."""
+    one_pole = [image for image in images if image.pair in ("p2-2", "p2-3")]
+    scan = fused(one_pole, failed={"p1-2": "is missing", "p3-2": "is missing"})
+    assert scan.verdict.grade == "repeat"
+    assert "of the surface is made up" in said(scan)
+
+
+def test_cut_off_at_the_top_of_the_volume(images):
+    low = RIG.volume.model_copy(update={"top_mm": 1500.0})
+    scan = fused(images, volume=low)
+    assert scan.verdict.grade == "usable"
+    assert "cut off at the scan volume's top, 1500 mm" in said(scan)
+
+
+def test_hair_that_gives_no_data(images):
+    placed = placings()
+    scan = fused([without(image, placed[image.pair], 1500.0, 2000.0) for image in images])
+    assert scan.verdict.grade == "usable"
+    assert "the stature is a guess" in said(scan)
+
+
+def test_black_trousers(images):
+    placed = placings()
+    scan = fused([without(image, placed[image.pair], 350.0, 780.0) for image in images])
+    assert scan.verdict.grade == "usable"
+    assert "next to nothing was measured from" in said(scan)
+    assert "not in the mesh" in said(scan)  # shins and feet: no surface leads there
+
+
+def test_a_hand_that_touches_the_hip(person):
+    touching = joined(person, bar([-10.0, 120.0, 850.0], [-10.0, 400.0, 850.0], 25.0))
+    scan = fused(photographed(touching))
+    assert scan.verdict.grade == "usable"
+    assert "closed ring on the left" in said(scan)
+    assert "on the right" not in said(scan)
+
+
+def test_the_calibration_of_another_rig(images):
+    rng = np.random.default_rng(3)
+    other = {
+        name: placing
+        @ RigidTransform.from_rotation_vector(rng.normal(0.0, 0.02, 3), rng.normal(0.0, 20.0, 3))
+        for name, placing in placings().items()
+    }
+    scan = fused(images, placed=other)
+    assert scan.verdict.grade == "repeat"
+    assert "calibration" in said(scan)
+
+
+def test_a_person_who_stepped_aside(images):
+    """Twelve millimetres between one pole's turn and the next."""
+    away = {
+        name: RigidTransform(t.rotation, t.translation + [0.0, 12.0 * name.startswith("p3"), 0.0])
+        for name, t in placings().items()
+    }
+    scan = fused(images, placed=away)
+    assert scan.verdict.grade == "repeat"
+    assert "moved" in said(scan)
+
+
+def test_alignment_takes_no_part_if_not_wanted(images):
+    calibration = RigCalibration(
+        RIG, {}, placings(), PlacingCovariance((), np.zeros((0, 0))), {}, {}, ()
+    )
+    scan = fuse(calibration, images, {}, replace(SETTINGS, alignment=None))
+    assert scan.alignment is None
+    assert scan.verdict.grade == "good"

@@ -1,0 +1,109 @@
+"""Measurements of a made body and of a subject's surface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from made_bodies import cylinder, ellipsoid, mesh_of, together
+
+from bodyscan.errors import BadInput
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.measurement.measuring import measure
+from bodyscan.measurement.reporting import document, tables
+
+SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
+
+
+@pytest.fixture(scope="module")
+def subject():
+    """Facing x, mm, made smooth as the simulator does."""
+    read = o3d.io.read_triangle_mesh(str(SUBJECT)).subdivide_loop(1)
+    x, y, z = 1000.0 * np.asarray(read.vertices).T
+    return mesh_of(np.stack([-y, x, z], axis=-1), np.asarray(read.triangles))
+
+
+def turned(body, degrees: float, shift):
+    turn = RigidTransform.from_rotation_vector([0.0, 0.0, np.radians(degrees)], shift)
+    return mesh_of(turn.apply(body.vertices), body.faces)
+
+
+def test_the_subject_measures_what_its_description_says(subject):
+    # data/subjects/README.md: 1.633 m, hip 1014 mm (at 800 mm), waist 727 mm (the narrowest).
+    found = measure(subject, [800.0])
+    assert found.stature_mm == pytest.approx(1633.0, abs=2.0)
+    assert found.slices[0].of("trunk").tape_mm == pytest.approx(1014.0, abs=2.0)
+    waists = measure(subject, np.arange(980.0, 1120.0, 5.0))
+    assert min(s.of("trunk").tape_mm for s in waists.slices) == pytest.approx(727.0, abs=2.0)
+    assert found.measured == 1.0
+
+
+def test_parts_by_height(subject):
+    shins, hips, breast = measure(subject, [350.0, 850.0, 1150.0]).slices
+    assert {girth.part for girth in shins.girths} == {"left leg", "right leg"}
+    every = {"left arm", "right arm", "trunk"}
+    assert {girth.part for girth in hips.girths} == every
+    assert {girth.part for girth in breast.girths} == every
+    left, right = shins.of("left leg"), shins.of("right leg")
+    assert left.centre_mm[1] > 0 > right.centre_mm[1]
+    assert left.tape_mm == pytest.approx(right.tape_mm, abs=1.0)  # the subject is symmetric
+    assert breast.of("left leg") is None
+
+
+@pytest.mark.parametrize("degrees", [-60.0, 25.0, 80.0])
+def test_how_the_subject_stands_changes_nothing(subject, degrees: float):
+    straight = measure(subject, [350.0, 900.0])
+    askew = measure(turned(subject, degrees, [120.0, -80.0, 0.0]), [350.0, 900.0])
+    assert askew.stature_mm == pytest.approx(straight.stature_mm, abs=1e-6)
+    assert askew.volume_l == pytest.approx(straight.volume_l, rel=1e-9)
+    for one, other in zip(straight.slices, askew.slices, strict=True):
+        assert [g.part for g in one.girths] == [g.part for g in other.girths]
+        for a, b in zip(one.girths, other.girths, strict=True):
+            assert b.tape_mm == pytest.approx(a.tape_mm, abs=1e-6)
+            assert b.width_mm == pytest.approx(a.width_mm, abs=0.01)
+    turn = askew.rig_from_body.rotation @ straight.rig_from_body.rotation.T
+    assert np.degrees(np.arctan2(turn[1, 0], turn[0, 0])) == pytest.approx(degrees, abs=0.01)
+
+
+def test_volume_area_and_crown_of_an_ellipsoid():
+    vertices, faces = ellipsoid((100.0, 200.0, 800.0), (0.0, 0.0, 800.0))
+    filled = vertices[faces].mean(axis=1)[:, 2] > 1500.0
+    found = measure(mesh_of(vertices, faces, filled))
+    assert found.volume_l == pytest.approx(4 / 3 * np.pi * 0.1 * 0.2 * 0.8 * 1e3, rel=1e-3)
+    assert found.stature_mm == pytest.approx(1600.0)
+    assert found.stature_measured == 0.0
+    assert 0.9 < found.measured < 1.0
+    assert len(found.slices) == 15  # every 100 mm below 1600
+
+
+def test_a_cylinder_has_its_formulas_area():
+    found = measure(mesh_of(*cylinder(100.0, 0.0, 1000.0)))
+    assert found.area_m2 == pytest.approx(2 * np.pi * (0.1 * 1.0 + 0.01), rel=1e-4)
+
+
+def test_fingers_are_no_legs():
+    """Two legs, and hands beside them that hang lower than the crotch."""
+    limbs = together(
+        cylinder(70.0, 0.0, 900.0, y=90.0),
+        cylinder(70.0, 0.0, 900.0, y=-90.0),
+        cylinder(15.0, 500.0, 1300.0, y=300.0),
+        cylinder(15.0, 500.0, 1300.0, y=-300.0),
+    )
+    (level,) = measure(mesh_of(*limbs), [600.0]).slices
+    assert [g.part for g in level.girths] == ["left arm", "left leg", "right arm", "right leg"]
+    assert level.of("left leg").tape_mm == pytest.approx(2 * np.pi * 70.0, rel=1e-3)
+
+
+def test_no_body_at_that_height(subject):
+    with pytest.raises(BadInput, match="no body at a height of 2500"):
+        measure(subject, [2500.0])
+
+
+def test_table_and_document_say_the_same(subject):
+    found = measure(subject, [900.0])
+    said = document(found, {"subject": "s1", "calibration_id": "c", "when": None})
+    assert said["stature_mm"] == found.stature_mm
+    assert said["slices"][0]["girths"][-1]["tape_mm"] == found.slices[0].of("trunk").tape_mm
+    assert [table.row_count for table in tables(found)] == [4, 3]

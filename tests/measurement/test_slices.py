@@ -1,0 +1,75 @@
+"""Slices of bodies whose girths are known from formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from made_bodies import arrays, cylinder, ellipsoid, together
+from scipy.special import ellipe
+
+from bodyscan.measurement.slices import loops_at
+
+
+@pytest.mark.parametrize("height", [55.0, 100.0, 123.4])  # 100 lies on a ring of vertices
+def test_a_cylinder_is_cut_in_a_circle(height: float):
+    (loop,) = loops_at(*cylinder(80.0, 0.0, 200.0), height)
+    # 400 corners on a circle: shorter by pi^2 / (6 * 400^2), a hundred-thousandth.
+    assert loop.girth_mm == pytest.approx(2 * np.pi * 80.0, rel=2e-5)
+    assert loop.tape_mm == pytest.approx(2 * np.pi * 80.0, rel=2e-5)
+    assert loop.area_mm2 == pytest.approx(np.pi * 80.0**2, rel=5e-5)
+    assert loop.centre == pytest.approx([0.0, 0.0], abs=1e-6)
+
+
+@given(share=st.floats(-0.9, 0.9))
+def test_an_ellipsoid_is_cut_in_an_ellipse(share: float):
+    (loop,) = loops_at(*ELLIPSOID, 250.0 * share)
+    long, short = np.array([150.0, 90.0]) * np.sqrt(1.0 - share**2)
+    girth = 4.0 * long * ellipe(1.0 - (short / long) ** 2)
+    # 400 facets around and 200 from pole to pole: flat where the body is round.
+    assert loop.girth_mm == pytest.approx(girth, rel=2e-4)
+    assert loop.tape_mm == pytest.approx(girth, rel=2e-4)
+    assert loop.area_mm2 == pytest.approx(np.pi * long * short, rel=4e-4)
+
+
+ELLIPSOID = ellipsoid((150.0, 90.0, 250.0))
+
+
+def test_a_hollow_is_followed_by_the_surface_and_spanned_by_the_tape():
+    """A torus that stands upright, cut above its hole's bottom: two circles; the lying one: a ring."""
+    vertices, faces = arrays(o3d.geometry.TriangleMesh.create_torus(100.0, 30.0, 200, 100))
+    outer, inner = loops_at(vertices, faces, 0.0)
+    assert outer.girth_mm == pytest.approx(2 * np.pi * 130.0, rel=1e-3)
+    assert inner.girth_mm == pytest.approx(2 * np.pi * 70.0, rel=1e-3)
+    assert outer.area_mm2 + inner.area_mm2 == pytest.approx(np.pi * (130.0**2 - 70.0**2), rel=2e-3)
+    upright = vertices[:, [2, 0, 1]]
+    one, other = loops_at(upright, faces, 0.0)
+    for loop in (one, other):
+        assert loop.girth_mm == pytest.approx(2 * np.pi * 30.0, rel=2e-3)
+    assert sorted([one.centre[1], other.centre[1]]) == pytest.approx([-100.0, 100.0], abs=0.1)
+    # Just above the hole's edge the two have run together, with a waist between them.
+    (both,) = loops_at(upright, faces, 75.0)
+    assert both.tape_mm < both.girth_mm - 5.0
+    assert both.area_mm2 > 0
+
+
+def test_legs_are_loops_of_their_own():
+    legs = together(cylinder(70.0, 0.0, 700.0, y=90.0), cylinder(60.0, 0.0, 700.0, y=-90.0))
+    left, right = loops_at(*legs, 333.0)
+    assert left.girth_mm == pytest.approx(2 * np.pi * 70.0, rel=2e-5)
+    assert right.girth_mm == pytest.approx(2 * np.pi * 60.0, rel=2e-5)
+    assert left.centre[1] == pytest.approx(90.0)
+
+
+def test_what_is_made_up_is_told():
+    vertices, faces = ellipsoid((100.0, 100.0, 100.0))
+    filled = vertices[faces].mean(axis=1)[:, 0] > 0
+    (loop,) = loops_at(vertices, faces, 10.0, filled)
+    assert loop.measured_share == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_plane_beside_the_body_cuts_nothing():
+    assert loops_at(*ELLIPSOID, 251.0) == ()
+    assert loops_at(*ELLIPSOID, -251.0) == ()
