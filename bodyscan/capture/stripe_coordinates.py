@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ from bodyscan.capture.boundaries import MIN_STRIPE_PX, Boundaries
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Indices = NDArray[np.integer[Any]]
 
 SMOOTHERS = (
     np.array([-3.0, 12.0, 17.0, 12.0, -3.0]) / 35.0,
@@ -45,14 +48,14 @@ def interpolate_stripes(
     stripes = _Segments.of(boundaries, joined)
     last = _last_boundary(boundaries, codes.shape)
     wanted = np.flatnonzero(usable & (last >= 0))
-    stripes.fill(s, sigma, wanted, last.ravel()[wanted], codes)
+    stripes.fill(s, sigma, wanted, last.ravel()[wanted], codes, stripes.within)
     for neighbour in (-1, 1):
         wanted = np.flatnonzero(usable & np.isnan(s))
         segment = last.ravel()[wanted] + neighbour
         within = (segment >= 0) & (segment < len(joined))
         wanted, segment = wanted[within], segment[within]
         here = boundaries.line[segment + (neighbour < 0)] == wanted // codes.shape[1]
-        stripes.fill(s, sigma, wanted[here], segment[here], codes)
+        stripes.fill(s, sigma, wanted[here], segment[here], codes, stripes.beside)
     return s, sigma
 
 
@@ -94,38 +97,49 @@ class _Segments:
         start, index = position[:-1], boundaries.index[:-1].astype(float)
         return _Segments(start, width, index, rise, slope_in, slope_out, pull, sigma)
 
-    def at(self, segment: NDArray[np.integer], place: NDArray[np.integer]) -> tuple[Floats, Floats]:
-        """s and its standard deviation at places (px) on segments, and somewhat outside of them.
+    def within(self, segment: Indices, place: Indices) -> tuple[Floats, Floats]:
+        """s and its standard deviation at places (px) between a segment's boundaries."""
+        width, secant = self.width, self.rise / self.width
+        square = (3.0 * secant - 2.0 * self.slope_in - self.slope_out) / width
+        cube = (self.slope_in + self.slope_out - 2.0 * secant) / width**2
+        x = place - self.start[segment]
+        value = cube[segment] * x
+        value += square[segment]
+        value *= x
+        value += self.slope_in[segment]
+        value *= x
+        value += (self.index - self.pull)[segment]
+        return value, self.sigma[segment]
 
-        Outside, the bend of the segment's end goes on, and s is doubted by as much as that adds.
-        """
-        width, rise = self.width[segment], self.rise[segment]
-        share = (place - self.start[segment]) / width
-        inside = np.clip(share, 0.0, 1.0)
-        first, last = self.slope_in[segment] * width, self.slope_out[segment] * width
-        bend = inside * (1.0 - inside)
-        within = inside * rise + bend * ((1.0 - inside) * (first - rise) - inside * (last - rise))
-        beyond = share - inside
-        bending = 0.5 * beyond**2 * (last - first)
-        outside = beyond * np.where(beyond < 0.0, first, last) + bending
-        doubt = np.where(beyond == 0.0, 1.0, BEYOND_DOUBT) * self.sigma[segment]
-        value = self.index[segment] + within + outside - self.pull[segment]
-        return value, np.hypot(doubt, bending)
+    def beside(self, segment: Indices, place: Indices) -> tuple[Floats, Floats]:
+        """s and its standard deviation at places (px) before or behind a segment: its bend goes on,
+        and s is doubted by as much as that adds."""
+        width = self.width[segment]
+        x = place - self.start[segment]
+        behind = x > 0.5 * width
+        x = np.where(behind, x - width, x)
+        slope_in, slope_out = self.slope_in[segment], self.slope_out[segment]
+        bending = 0.5 * x**2 * (slope_out - slope_in) / width
+        value = self.index[segment] - self.pull[segment] + x * np.where(behind, slope_out, slope_in)
+        value += bending + np.where(behind, self.rise[segment], 0.0)
+        return value, np.hypot(BEYOND_DOUBT * self.sigma[segment], bending)
 
     def fill(
         self,
         s: NDArray[np.float32],
         sigma: NDArray[np.float32],
-        pixels: NDArray[np.intp],
-        segment: NDArray[np.integer],
+        pixels: Indices,
+        segment: Indices,
         codes: NDArray[np.int32],
+        evaluate: Callable[[Indices, Indices], tuple[Floats, Floats]],
     ) -> None:
         """Writes s and sigma at flat `pixels` from their segments, where the code agrees and the
-        segment is left by no more than a part of a stripe."""
+        segment is left by no more than a part of a stripe. evaluate: `within` or `beside`."""
         segment = np.minimum(segment, len(self.start) - 1)
-        value, spread = self.at(segment, pixels % s.shape[1])
+        value, spread = evaluate(segment, pixels % s.shape[1])
         off_code = np.abs(value - codes.ravel()[pixels] - 0.5)
-        off_segment = np.abs(value - self.index[segment] - 0.5 * self.rise[segment])
+        middle = self.index + 0.5 * self.rise
+        off_segment = np.abs(value - middle[segment])
         takes = (off_code < 0.5 + SLACK) & (off_segment < 0.5 + BEYOND)
         s.ravel()[pixels[takes]] = value[takes]
         sigma.ravel()[pixels[takes]] = spread[takes]
