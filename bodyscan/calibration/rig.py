@@ -80,7 +80,7 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
         failed,
         (*notes, *placed.notes),
         (*advice_on(rig, placed, progress), *through_the_stripes(pairs)),
-        seen_corners(placed),
+        seen_corners(placed, pairs),
     )
 
 

@@ -3,6 +3,7 @@ be: for a look at where in the picture the boards were, and where the lens does 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,11 +25,11 @@ class SeenCorners:
     target: NDArray[np.int16]
 
 
-def seen_corners(placed: PlacedRig) -> dict[str, SeenCorners]:
-    """By the pair's name, for all pairs that were placed."""
+def seen_corners(placed: PlacedRig, names: Iterable[str]) -> dict[str, SeenCorners]:
+    """By the pair's name, for those of `names` that were placed."""
     number = {target: k for k, target in enumerate(sorted(placed.rig_from_board))}
     found = {}
-    for name in sorted(placed.rig_from_camera):
+    for name in sorted(set(names) & set(placed.rig_from_camera)):
         own = [view for view in placed.views if view.pair == name]
         if not own:
             continue

@@ -102,7 +102,9 @@ def draw_mesh(
         o3d.core.Tensor(mesh.faces.astype(np.uint32)),
     )
     panels = [
-        _cast_view(scene, centre, base, _Frame.of(mesh.vertices, _view(view), height_px))
+        _named(
+            _cast_view(scene, centre, base, _Frame.of(mesh.vertices, _view(view), height_px)), view
+        )
         for view in views
     ]
     _save(path, panels)
@@ -144,9 +146,10 @@ def draw_deviation(
     *,
     normals: NDArray[np.floating] | None = None,
     height_px: int = 900,
+    caption: str = "from truth, mm",
 ) -> None:
     """Points coloured by signed distance to a known surface: blue inside, red outside."""
-    scale = Scale(-limit_mm, limit_mm, "from truth, mm", _blue_white_red())
+    scale = Scale(-limit_mm, limit_mm, caption, _blue_white_red())
     colours = scale.colours(signed_mm)
     draw_points(points, normals, colours, path, views, height_px, scale=scale)
 
@@ -167,7 +170,7 @@ def draw_points(
     panels = []
     for view in views:
         frame = _Frame.of(points, _view(view), height_px)
-        panels.append(_splat_view(points, normals, colours, frame, dot_mm, shaded))
+        panels.append(_named(_splat_view(points, normals, colours, frame, dot_mm, shaded), view))
     _save(path, panels if scale is None else [*panels, _bar(scale, height_px)])
 
 
@@ -201,6 +204,13 @@ class _Frame:
 
 def _view(view: str | View) -> View:
     return VIEWS[view] if isinstance(view, str) else view
+
+
+def _named(panel: Image, view: str | View) -> Image:
+    """The panel with the name of its view, if it has one, in its upper left corner."""
+    if isinstance(view, str):
+        _write(panel, view, (6, 16))
+    return panel
 
 
 def _cast_view(

@@ -1,0 +1,183 @@
+"""Acceptance by artefacts: spheres and a plate of known size, measured at several places.
+
+The figures are modelled on VDI/VDE 2634 parts 2 and 3 and on ISO 20685-2: what is computed is said
+here; it is no test by these standards, which ask for more (artefacts, places, operators).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import ConvexHull
+
+from bodyscan.errors import FailedWork
+from bodyscan.evaluation.planes import best_plane
+from bodyscan.evaluation.spheres import Sphere, find_spheres, fit_sphere
+
+Array = NDArray[np.float64]
+
+REJECTED = 0.003
+"""So many of the points may be left out, the farthest off, as VDI/VDE 2634 allows."""
+SHELL_SHARE = 0.9
+"""ISO 20685-2 asks for the shell that holds nine tenths of the points."""
+REACH = 0.15
+"""Points so far off a sphere's surface, in radii, are not taken for its own."""
+FACING = 0.8
+"""Nor those whose normal is farther than 37 degrees from the radius: a stand, a rim."""
+TRIES, TRY_POINTS = 600, 3000
+NEAR_PLATE_MM, RIM_MM, CELL_MM = 4.0, 12.0, 10.0
+FEWEST_ON_PLATE = 300
+
+
+@dataclass(frozen=True, eq=False)
+class SphereReading:
+    """One sphere, from points (all pairs merged, or one pair's).
+
+    form_mm: range of the radial distances from the best sphere, 3 per mille of the points left
+    out.  shell_mm: width that holds 90 %.  size_mm: its diameter less the calibrated one.
+    """
+
+    fitted: Sphere
+    points: int
+    form_mm: float
+    shell_mm: float
+    size_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class PlateReading:
+    """flatness_mm: range of the distances from the best plane, 3 per mille left out.  rms_mm: of
+    all.  area_mm2: of the hull of what was measured, before its rim was left out."""
+
+    points: int
+    flatness_mm: float
+    rms_mm: float
+    area_mm2: float
+
+
+def locate_spheres(
+    points: Array, normals: Array, radius_mm: float, centres_mm: Array
+) -> list[Sphere]:
+    """The artefact's spheres among points (N, 3) with outward normals, in the artefact's order.
+
+    Raises FailedWork if not all are found.
+    """
+    found = find_spheres(points[None], normals[None], radius_mm, len(centres_mm))
+    wanted = _distances(centres_mm)
+    places = np.stack([sphere.centre for sphere in found])
+    order = min(
+        permutations(range(len(found))),
+        key=lambda some: float(np.sum((_distances(places[list(some)]) - wanted) ** 2)),
+    )
+    return [found[k] for k in order]
+
+
+def read_sphere(points: Array, normals: Array, near: Sphere, radius_mm: float) -> SphereReading:
+    """The sphere `near` a place, from those of points (N, 3) that are its own.
+
+    Raises FailedWork for too few.
+    """
+    arm = points - near.centre
+    length = np.linalg.norm(arm, axis=1)
+    own = np.abs(length - radius_mm) < REACH * radius_mm
+    own &= np.einsum("nc,nc->n", arm, normals) > FACING * length
+    fitted = fit_sphere(points[own])
+    off = _kept(fitted.distances(points[own]))
+    return SphereReading(
+        fitted,
+        int(own.sum()),
+        float(np.ptp(off)),
+        _shell(off),
+        2.0 * (fitted.radius - radius_mm),
+    )
+
+
+def spacing_errors(readings: list[SphereReading], centres_mm: Array) -> Array:
+    """(K,) mm: distances of the spheres' centres less the calibrated ones, for every two."""
+    return _distances(np.stack([one.fitted.centre for one in readings])) - _distances(centres_mm)
+
+
+def read_plate(points: Array, normals: Array, seed: int = 0) -> PlateReading:
+    """The largest plane among points (N, 3) with normals, either way, its rim and all that is not
+    joined to it left out. Raises FailedWork if there is none."""
+    if len(points) < FEWEST_ON_PLATE:
+        raise FailedWork(f"{len(points)} points are too few for a plate")
+    normal, offset = _largest_plane(points, np.random.default_rng(seed))
+    for _ in range(3):
+        near = np.abs(points @ normal - offset) < NEAR_PLATE_MM
+        near &= np.abs(normals @ normal) > FACING
+        if near.sum() < FEWEST_ON_PLATE:
+            raise FailedWork("no plate is among the points")
+        normal, offset = best_plane(points[near])
+    on_plate = points[near]
+    flat = on_plate @ _in_plane(normal)
+    joined = _largest_piece(flat)
+    inside, area = _within_rim(flat[joined])
+    kept = on_plate[joined][inside]
+    if len(kept) < FEWEST_ON_PLATE:
+        raise FailedWork("no plate is among the points")
+    normal, offset = best_plane(kept)
+    off = kept @ normal - offset
+    return PlateReading(len(kept), float(np.ptp(_kept(off))), float(np.sqrt(np.mean(off**2))), area)
+
+
+def _distances(centres: Array) -> Array:
+    first, second = np.triu_indices(len(centres), 1)
+    return np.linalg.norm(centres[first] - centres[second], axis=1)
+
+
+def _kept(off: Array) -> Array:
+    """Signed distances (N,) without the 3 per mille that are largest."""
+    size = np.abs(off)
+    return off[np.argsort(size, kind="stable")[: max(1, round((1.0 - REJECTED) * len(off)))]]
+
+
+def _shell(off: Array) -> float:
+    """The narrowest interval that holds nine tenths of the distances (N,)."""
+    ordered = np.sort(off)
+    held = max(1, round(SHELL_SHARE * len(ordered)))
+    return float(np.min(ordered[held - 1 :] - ordered[: len(ordered) - held + 1]))
+
+
+def _largest_plane(points: Array, rng: np.random.Generator) -> tuple[Array, float]:
+    """The plane through three of the points that most of them lie near (Fischler and Bolles 1981)."""
+    some = points[rng.choice(len(points), min(TRY_POINTS, len(points)), replace=False)]
+    a, b, c = np.moveaxis(some[rng.integers(0, len(some), (TRIES, 3))], 1, 0)
+    normals = np.cross(b - a, c - a)
+    doubled_area = np.linalg.norm(normals, axis=1, keepdims=True)
+    wide = doubled_area[:, 0] > CELL_MM**2  # three of one place, or in a line, make no plane
+    normals, a = normals[wide] / doubled_area[wide], a[wide]
+    if not len(normals):
+        raise FailedWork("no plate is among the points")
+    offsets = np.einsum("kc,kc->k", normals, a)
+    votes = np.sum(np.abs(some @ normals.T - offsets) < NEAR_PLATE_MM, axis=0)
+    best = int(np.argmax(votes))
+    return normals[best], float(offsets[best])
+
+
+def _in_plane(normal: Array) -> Array:
+    """(3, 2) two directions at right angles in the plane."""
+    right = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(normal, right)], axis=1)
+
+
+def _largest_piece(flat: Array) -> NDArray[np.bool_]:
+    """(N,) which of flat points (N, 2) belong to the piece with most of them; cells of it touch."""
+    cells = np.floor((flat - flat.min(axis=0)) / CELL_MM).astype(np.int64)
+    taken = np.zeros(cells.max(axis=0) + 1, bool)
+    taken[tuple(cells.T)] = True
+    piece = ndimage.label(taken, np.ones((3, 3)))[0][tuple(cells.T)]
+    return np.asarray(piece == np.argmax(np.bincount(piece)))
+
+
+def _within_rim(flat: Array) -> tuple[NDArray[np.bool_], float]:
+    """(N,) which of flat points (N, 2) lie farther than the rim's width inside their hull, and the
+    hull's area."""
+    hull = ConvexHull(flat)
+    inward = -(flat @ hull.equations[:, :2].T + hull.equations[:, 2])
+    return inward.min(axis=1) > RIM_MM, float(hull.volume)

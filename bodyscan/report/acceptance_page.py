@@ -1,0 +1,115 @@
+"""What an acceptance test's report says, on screen and as a page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.table import Table as ScreenTable
+
+from bodyscan.evaluation.acceptance_run import ALL, Figure, Readings
+from bodyscan.report.page import Column, Lines, Number, Numbers, Page, Section, Table, shown
+
+NO_STANDARD = (
+    "Modelled on VDI/VDE 2634 parts 2 and 3 and ISO 20685-2; it is no test by these standards, "
+    "which ask for more artefacts and places, and for calibrated ones."
+)
+
+
+def verdict_of(found: Sequence[Figure], readings: Readings) -> tuple[str, tuple[str, ...]]:
+    """accepted, not accepted, or not judged where no limit was given; and the reasons."""
+    reasons = [
+        f"{one.name}: {_signed(one.value_mm)} mm ({one.where}), limit {one.limit_mm:g} mm"
+        if one.value_mm is not None
+        else f"{one.name}: not measured, though it has a limit"
+        for one in found
+        if one.exceeded
+    ]
+    reasons += readings.problems
+    if reasons:
+        return "not accepted", tuple(reasons)
+    if all(one.limit_mm is None for one in found):
+        return "not judged", ("no limits were given",)
+    return "accepted", ()
+
+
+def screen_table(found: Sequence[Figure], synthetic: bool) -> ScreenTable:
+    table = ScreenTable(title=f"acceptance{' (synthetic)' if synthetic else ''}")
+    for heading in ("figure", "mm", "limit", "where"):
+        table.add_column(heading, justify="right" if heading in ("mm", "limit") else "left")
+    for one in found:
+        table.add_row(
+            one.name.removesuffix("_mm").replace("_", " "),
+            _signed(one.value_mm),
+            "–" if one.limit_mm is None else f"{one.limit_mm:g}",
+            one.where,
+            style="red" if one.exceeded else None,
+        )
+    return table
+
+
+def acceptance_page(
+    found: Sequence[Figure], readings: Readings, rig: str, calibration_id: str, synthetic: bool
+) -> Page:
+    grade, reasons = verdict_of(found, readings)
+    numbers = Numbers(
+        tuple(
+            Number(
+                one.name.removesuffix("_mm").replace("_", " "),
+                None if one.value_mm is None else abs(one.value_mm),
+                "mm",
+                f"{one.meaning}; the largest: {one.where}",
+                one.limit_mm,
+            )
+            for one in found
+        )
+    )
+    spheres = Table(
+        (
+            Column("place, shot, sphere"),
+            Column("by"),
+            Column("points"),
+            Column("form", "mm", "probing form."),
+            Column("shell", "mm", "width of the shell that holds 90 % of the points."),
+            Column("size", "mm", "probing size."),
+        ),
+        tuple(
+            (f"{r.place}, {r.shot}, {r.sphere}", r.view, r.points, r.form_mm, r.shell_mm, r.size_mm)
+            for r in readings.spheres
+            if r.view == ALL
+        ),
+    )
+    spacings = Table(
+        (Column("place, shot"), Column("spheres"), Column("spacing error", "mm")),
+        tuple((f"{r.place}, {r.shot}", r.between, r.error_mm) for r in readings.spacings),
+    )
+    plates = Table(
+        (
+            Column("place, shot"),
+            Column("by"),
+            Column("points"),
+            Column("flatness", "mm", "range of the distances from the best plane."),
+            Column("RMS", "mm", "of the distances from the best plane."),
+            Column("measured", "%", "of the plate's area.", digits=0),
+        ),
+        tuple(
+            (f"{r.place}, {r.shot}", r.view, r.points, r.flatness_mm, r.rms_mm, r.measured_percent)
+            for r in readings.plates
+        ),
+    )
+    return Page(
+        f"Acceptance of rig {rig}",
+        grade,
+        reasons,
+        synthetic,
+        (("calibration", calibration_id[:12]),),
+        [
+            Section("Figures", NO_STANDARD, [numbers]),
+            Section("Spheres, all pairs merged", "", [spheres, spacings]),
+            Section("Plate", "", [plates]),
+            Section("Problems", "", [Lines(readings.problems or ("None.",))]),
+        ],
+    )
+
+
+def _signed(value: float | None) -> str:
+    return shown(value) if value is None else f"{value:.3f}"

@@ -1,0 +1,119 @@
+"""A scan's body as a model to turn: a light mesh, coloured in every way that is known of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bodyscan.errors import ScanFailed
+from bodyscan.fusion.body import BodyCloud, BodyMesh
+from bodyscan.fusion.versions import light
+from bodyscan.report.comparison import Comparison
+from bodyscan.report.model import Layer, Shape, css, ramp_legend
+from bodyscan.report.pictures import FILLED_TINT, _blue_white_red, _turbo
+
+Colours = NDArray[np.uint8]
+
+FACES = (50_000, 44_000, 38_000)
+"""Tried in turn: reduced to one number of faces a mesh may fold, and not to another."""
+UNKNOWN = (150, 150, 150)
+SKIN = (214, 210, 205)
+PAIRS = (
+    (70, 50, 125),
+    (60, 100, 170),
+    (40, 150, 150),
+    (95, 185, 100),
+    (190, 205, 60),
+    (250, 210, 50),
+)
+"""Of one pair, two, ... and six or more."""
+
+
+def light_mesh(mesh: BodyMesh) -> BodyMesh | None:
+    """The mesh with about 50,000 faces; None if it closes with none of the numbers tried."""
+    for faces in FACES:
+        try:
+            return light(mesh, faces=faces)
+        except ScanFailed:
+            continue
+    return None
+
+
+def layers(
+    small: BodyMesh,
+    mesh: BodyMesh,
+    cloud: BodyCloud,
+    comparison: Comparison | None,
+    limit_mm: float,
+) -> list[Layer]:
+    """By photo, plain, number of pairs, sigma, filled and, if compared, deviation."""
+    made_up = np.zeros(len(small.vertices), bool)
+    made_up[small.faces[small.filled]] = True
+    top = _round_up(float(np.nanpercentile(cloud.sigma_mm, 98)))
+    sigma = _ramp(np.nan_to_num(small.sigma_mm / top), _turbo()[:, ::-1])
+    nearest = np.asarray(cKDTree(cloud.points).query(small.vertices, workers=2)[1])
+    pairs = np.array(PAIRS, np.uint8)[np.clip(cloud.pairs_seen[nearest], 1, len(PAIRS)) - 1]
+    tint = FILLED_TINT[::-1]
+    plain = np.full(small.vertices.shape, SKIN, np.uint8)
+    grey = (css(UNKNOWN), "made up, nothing measured")
+    found = [
+        Layer("photo", small.colours, None, unlit=True),
+        Layer("shape", plain),
+        Layer("pairs", _without(pairs, made_up), {"caption": "pairs that measured it", "swatches": [
+            *((css(c), f"{k}{' or more' if k == len(PAIRS) else ''}") for k, c in enumerate(PAIRS, 1)),
+            grey,
+        ]}),
+        Layer("sigma", _without(sigma, made_up), {
+            **ramp_legend("sigma along the normal, mm", _turbo()[:, ::-1], ("0", f"{top:g}")),
+            "swatches": [grey],
+        }),
+        Layer("filled", np.where(made_up[:, None], tint, SKIN).astype(np.uint8), {
+            "swatches": [(css(SKIN), "measured"), (css(tint), "made up to close the mesh")],
+        }),
+    ]  # fmt: skip
+    if comparison is not None:
+        found.append(_deviation(small, mesh, comparison, made_up, limit_mm))
+    return found
+
+
+def shape_of(mesh: BodyMesh) -> Shape:
+    return Shape(mesh.vertices, mesh.faces, mesh.normals)
+
+
+def _deviation(
+    small: BodyMesh,
+    mesh: BodyMesh,
+    comparison: Comparison,
+    made_up: NDArray[np.bool_],
+    limit_mm: float,
+) -> Layer:
+    """Of the nearest vertex of the full mesh: the light one is a few tenths of a mm off itself."""
+    tree = cKDTree(mesh.vertices[comparison.vertices])
+    signed = comparison.signed_mm[np.asarray(tree.query(small.vertices, workers=2)[1])]
+    table = _blue_white_red()[:, ::-1]
+    legend = ramp_legend(
+        f"from {comparison.name}, mm (red: outside it)",
+        table,
+        (f"−{limit_mm:g}", f"+{limit_mm:g}"),
+    )
+    colours = _ramp(0.5 + 0.5 * signed / limit_mm, table)
+    return Layer(
+        "deviation",
+        _without(colours, made_up),
+        legend | {"swatches": [(css(UNKNOWN), "made up, not compared")]},
+    )
+
+
+def _ramp(share: NDArray[np.floating], table: Colours) -> Colours:
+    return table[np.clip(np.rint(255 * share), 0, 255).astype(np.int64)]
+
+
+def _without(colours: Colours, unknown: NDArray[np.bool_]) -> Colours:
+    return np.where(unknown[:, None], UNKNOWN, colours).astype(np.uint8)
+
+
+def _round_up(value: float) -> float:
+    """To two digits."""
+    power = 10.0 ** (np.floor(np.log10(max(value, 1e-6))) - 1)
+    return float(np.ceil(value / power) * power)

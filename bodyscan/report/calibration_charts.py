@@ -1,0 +1,236 @@
+"""Charts of a calibration: coverage, residuals, the planes of light, models tried, the view graph."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import cv2
+import matplotlib
+import numpy as np
+from matplotlib.collections import PolyCollection
+from numpy.typing import NDArray
+
+from bodyscan.calibration.pair import PairCalibration
+from bodyscan.calibration.rig_calibration import RigCalibration
+from bodyscan.calibration.seen_corners import SeenCorners
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
+from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, plt, style, svg
+
+Array = NDArray[np.float64]
+
+COLUMNS = 4
+CELLS = (10, 8)
+"""The picture is divided so for residuals, across and down."""
+FEWEST = 3
+ARROW = 0.08
+"""Long arrows are such a share of a picture's width."""
+POLES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
+"""Okabe and Ito's, told apart by the colour-blind too."""
+DASHES = ("-", "--", "-.", ":")
+
+
+def coverage_chart(calibration: RigCalibration) -> bytes:
+    """Of each camera: its picture, and where each view of a board lay in it."""
+    with style():
+        figure, axes = grid_of(len(calibration.seen), COLUMNS, (2.6, 2.3))
+        for axis, (name, seen) in zip(axes, calibration.seen.items(), strict=True):
+            views = [seen.pixels[seen.target == k] for k in np.unique(seen.target)]
+            hulls = [cv2.convexHull(view).reshape(-1, 2) for view in views]
+            axis.add_collection(
+                PolyCollection(hulls, facecolor=BLUE, alpha=0.16, edgecolor=BLUE, linewidth=0.5)
+            )
+            axis.plot(*seen.pixels.T, ",", color=INK, alpha=0.5)
+            _picture_frame(axis, calibration.pairs[name].camera)
+            axis.set_title(f"{name}: {len(views)} views", fontsize=9.0)
+    return svg(figure)
+
+
+def residual_chart(calibration: RigCalibration) -> tuple[bytes, float]:
+    """Of each camera: RMS of the corners' residuals over its picture (colour) and their mean
+    (arrows); also how many times too long the arrows are."""
+    maps = {
+        name: _residual_map(seen, calibration.pairs[name].camera)
+        for name, seen in calibration.seen.items()
+    }
+    rms_known = _finite([rms for rms, _, _ in maps.values()])
+    lengths = _finite([np.linalg.norm(mean, axis=-1) for _, mean, _ in maps.values()])
+    top = float(np.percentile(rms_known, 98))
+    widest = max(calibration.pairs[name].camera.width for name in maps)
+    times = _one_digit(ARROW * widest / max(float(np.percentile(lengths, 98)), 1e-6))
+    with style():
+        figure, axes = grid_of(len(maps), COLUMNS, (2.6, 2.3))
+        for axis, (name, (rms, mean, middles)) in zip(axes, maps.items(), strict=True):
+            camera = calibration.pairs[name].camera
+            extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
+            shown = axis.imshow(rms, cmap="YlGnBu", vmin=0.0, vmax=top, extent=extent)
+            axis.quiver(
+                *np.moveaxis(middles, -1, 0),
+                *np.moveaxis(times * mean, -1, 0),
+                angles="xy",
+                scale_units="xy",
+                scale=1.0,
+                width=0.008,
+                color=RED,
+            )
+            _picture_frame(axis, camera)
+            axis.set_title(name, fontsize=9.0)
+        figure.colorbar(shown, ax=axes, shrink=0.6, label="RMS, px")
+    return svg(figure), times
+
+
+def planes_chart(calibration: RigCalibration) -> bytes:
+    """Fig. 6 of every pair: baseline, projection angle, tilt of the light planes over s."""
+    colour, dash = line_styles(calibration)
+    with style():
+        figure, axes = plt.subplots(3, 1, figsize=(9.6, 8.4), sharex=True, constrained_layout=True)
+        for name, pair in calibration.pairs.items():
+            planes = planes_of(pair)
+            if planes is None or pair.light is None:
+                continue
+            length, angle, tilt = baseline_angle_tilt(planes, pair.light.direction)
+            s = np.arange(len(planes))
+            for axis, values in zip(
+                axes, (length, np.degrees(angle), np.degrees(tilt)), strict=True
+            ):
+                axis.plot(
+                    s, values, color=colour[name], linestyle=dash[name], linewidth=1.2, label=name
+                )
+        for axis, label in zip(
+            axes, ("baseline, mm", "projection angle, degrees", "tilt, degrees"), strict=True
+        ):
+            axis.set_ylabel(label)
+            axis.grid(color=GREY, alpha=0.25, linewidth=0.6)
+        axes[-1].set_xlabel("stripe coordinate s")
+        handles, labels = axes[0].get_legend_handles_labels()
+        if handles:
+            figure.legend(handles, labels, loc="outside right upper", frameon=False)
+    return svg(figure)
+
+
+def planes_of(pair: PairCalibration) -> Array | None:
+    """(S + 1, 4) of Eq. 6 at the stripes' boundaries; tangent planes where the sheets are bent."""
+    if isinstance(pair.light, LightPlanes):
+        return pair.light.coefficients
+    if isinstance(pair.light, SmoothSheets):
+        return pair.light.tangent_planes(np.arange(pair.light.stripes + 1.0))
+    return None
+
+
+def held_out_chart(calibration: RigCalibration) -> bytes:
+    """Mean error on held-out boards of every model tried, by pair; the model used is filled."""
+    tried = {n: pair.quality.held_out for n, pair in calibration.pairs.items()}
+    models = list(dict.fromkeys(one.model for every in tried.values() for one in every))
+    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, max(len(models), 1)))
+    with style():
+        figure, axis = plt.subplots(figsize=(9.6, 3.4), constrained_layout=True)
+        for k, (model, colour) in enumerate(zip(models, colours, strict=True)):
+            shift = 0.6 * ((k + 0.5) / len(models) - 0.5)
+            own = [
+                (place + shift, one.mean_mm, one.chosen)
+                for place, every in enumerate(tried.values())
+                for one in every
+                if one.model == model
+            ]
+            x, y, chosen = (np.array(part) for part in zip(*own, strict=True))
+            axis.plot(x, y, "o", color=colour, markerfacecolor="none", markersize=5.0, label=model)
+            axis.plot(x[chosen], y[chosen], "o", color=colour, markersize=6.5)
+        axis.set_xticks(range(len(tried)), list(tried))
+        axis.set_yscale("log")
+        for ticks in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
+            ticks("{x:g}")
+        axis.set_ylabel("mean error, mm")
+        axis.grid(axis="y", which="both", color=GREY, alpha=0.25, linewidth=0.6)
+        if models:
+            figure.legend(loc="outside right upper", frameon=False)
+    return svg(figure)
+
+
+def view_graph_chart(calibration: RigCalibration) -> bytes:
+    """Pairs around a circle, joined where they saw a board at the same moment: the more, the
+    thicker."""
+    names = list(calibration.seen)
+    together = shared_boards(calibration)
+    turn = 2.0 * np.pi * np.arange(len(names)) / max(len(names), 1)
+    places = np.stack([np.sin(turn), np.cos(turn)], axis=1)
+    colour, _ = line_styles(calibration)
+    top = max(float(np.max(together, initial=0.0)), 1.0)
+    with style():
+        figure, axis = plt.subplots(figsize=(5.6, 5.2), constrained_layout=True)
+        for i, j in combinations(range(len(names)), 2):
+            if together[i, j]:
+                share = together[i, j] / top
+                axis.plot(
+                    *places[[i, j]].T,
+                    color=INK,
+                    linewidth=0.4 + 4.0 * share,
+                    alpha=0.18 + 0.4 * share,
+                )
+        for place, name in zip(places, names, strict=True):
+            axis.plot(*place, "o", color=colour[name], markersize=13.0)
+            axis.annotate(name, 1.17 * place, ha="center", va="center")
+        axis.set(xlim=(-1.35, 1.35), ylim=(-1.3, 1.3), aspect="equal")
+        axis.axis("off")
+    return svg(figure)
+
+
+def shared_boards(calibration: RigCalibration) -> Array:
+    """(P, P) how many boards two pairs saw at the same moment, in the order of `seen`; NaN for one
+    and itself."""
+    seen = [set(one.target.tolist()) for one in calibration.seen.values()]
+    count = np.array([[float(len(a & b)) for b in seen] for a in seen])
+    np.fill_diagonal(count, 0.0)
+    return count
+
+
+def line_styles(calibration: RigCalibration) -> tuple[dict[str, str], dict[str, str]]:
+    """A colour for each pole's pairs, and a dash for each pair of a pole."""
+    pairs = calibration.rig.pairs
+    poles = list(dict.fromkeys(pair.pole or pair.name for pair in pairs))
+    colour, dash, used = {}, {}, dict.fromkeys(poles, 0)
+    for pair in pairs:
+        pole = pair.pole or pair.name
+        colour[pair.name] = POLES[poles.index(pole) % len(POLES)]
+        dash[pair.name] = DASHES[used[pole] % len(DASHES)]
+        used[pole] += 1
+    return colour, dash
+
+
+def _residual_map(seen: SeenCorners, camera: Camera) -> tuple[Array, Array, Array]:
+    """RMS (rows, columns) and mean (rows, columns, 2) of residuals, px, and the cells' middles; NaN
+    where there are fewer than three corners."""
+    columns, rows = CELLS
+    size = np.array([camera.width, camera.height])
+    cell = np.clip(((seen.pixels + 0.5) / size * CELLS).astype(int), 0, np.array(CELLS) - 1)
+    number = cell[:, 1] * columns + cell[:, 0]
+    count = np.bincount(number, minlength=columns * rows).astype(float)
+    enough = np.where(count >= FEWEST, count, np.nan)
+    residuals = seen.residuals_px.astype(float)
+    square = np.bincount(number, np.sum(residuals**2, axis=1), columns * rows) / enough
+    mean = [np.bincount(number, residuals[:, k], columns * rows) / enough for k in (0, 1)]
+    x, y = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
+    middles = np.stack([x / columns, y / rows], axis=-1) * size - 0.5
+    return (
+        np.sqrt(square).reshape(rows, columns),
+        np.stack(mean, axis=-1).reshape(rows, columns, 2),
+        middles,
+    )
+
+
+def _picture_frame(axis: plt.Axes, camera: Camera) -> None:
+    axis.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5), aspect="equal")
+    axis.set_xticks([])
+    axis.set_yticks([])
+    axis.spines[:].set_visible(True)
+
+
+def _finite(arrays: list[Array]) -> Array:
+    """All known values of some arrays, (1,) of 1 if there are none."""
+    known = np.concatenate([array[np.isfinite(array)] for array in arrays])
+    return known if known.size else np.ones(1)
+
+
+def _one_digit(value: float) -> float:
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(np.floor(value / power) * power)

@@ -1,0 +1,263 @@
+"""What a calibration's report says: how well each pair and the whole rig are known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from bodyscan.calibration.rig_calibration import RigCalibration
+from bodyscan.calibration.storage import FILE_NAME, calibration_id, load_calibration
+from bodyscan.report import calibration_charts as draw
+from bodyscan.report import calibration_verdict as limits
+from bodyscan.report import charts
+from bodyscan.report.calibration_verdict import PairFigures, figures_of, judge
+from bodyscan.report.origin import is_synthetic
+from bodyscan.report.page import Block, Column, Lines, Page, Picture, Section, Table, Viewer
+from bodyscan.report.rig_model import rig_model
+from bodyscan.report.scan_page import drawn
+from bodyscan.report.sigma_map import draw_sigma_map
+
+SVG = "image/svg+xml"
+NOT_STORED = (
+    "This calibration was made before corners were kept with it: calibrate again to see where the "
+    "boards lay in each picture and how far their corners are off."
+)
+
+
+def calibration_page(folder: Path) -> Page:
+    """The report of the calibration in `folder`. Raises CalibrationFileError."""
+    calibration = load_calibration(folder)
+    grade, reasons = judge(calibration)
+    shots = len({shot for shot, _ in calibration.rig_from_board})
+    return Page(
+        f"Calibration of rig {calibration.rig.name}",
+        grade,
+        reasons,
+        is_synthetic(folder),
+        (
+            ("pairs", f"{len(calibration.pairs)} of {len(calibration.rig.pairs)}"),
+            ("shots of boards", str(shots)),
+            ("calibration", calibration_id(folder)[:12]),
+            ("made by", str(json.loads((folder / FILE_NAME).read_text("utf-8"))["software"])),
+        ),
+        [
+            _rig(calibration),
+            _pairs(figures_of(calibration), calibration),
+            _advice(calibration),
+            _boards(calibration),
+            _planes(calibration),
+            _view_graph(calibration),
+            _sigma(calibration),
+            _notes(calibration),
+        ],
+    )
+
+
+def _rig(calibration: RigCalibration) -> Section:
+    model, times = rig_model(calibration)
+    return Section(
+        "The rig",
+        "",
+        [
+            Viewer(
+                "Cameras in the rig frame",
+                "Pyramids: cameras and what they see. Ellipsoids: one sigma of each camera's place "
+                f"in the rig frame as the joint solve knows it, drawn {times:,.0f} times too large. "
+                "Grey: boards as they were held, and the scan volume. Red, green and blue: the rig's "
+                "axes x, y and z.",
+                model,
+            )
+        ],
+    )
+
+
+def _pairs(figures: list[PairFigures], calibration: RigCalibration) -> Section:
+    columns = (
+        Column("pair"),
+        Column(
+            "corners",
+            "px RMS",
+            "distance of the boards' corners from where camera and placing put them.",
+            limits.CORNERS_RMS_PX,
+        ),
+        Column("poses", "", "views of a board that were used.", limits.POSES, True, 0),
+        Column(
+            "covered",
+            "% of picture",
+            "by the boards' corners together; beyond, the lens is a guess.",
+            limits.COVERED_PERCENT,
+            True,
+            0,
+        ),
+        Column(
+            "sheets",
+            "mm RMS",
+            "distance of stripe boundaries on the boards from their sheet of light.",
+            limits.SHEETS_RMS_MM,
+        ),
+        Column(
+            "held out",
+            "mm mean",
+            "distance of measured points from boards that the light was not fitted to; outliers "
+            "capped.",
+            limits.HELD_OUT_MM,
+        ),
+        Column(
+            "striped", "", "boards on which stripes were decoded.", limits.STRIPE_SHOTS, True, 0
+        ),
+        Column(
+            "stripes",
+            "% known",
+            "boundaries between stripes that have a sheet, of those projected; the others fell "
+            "beyond the boards.",
+            limits.STRIPES_PERCENT,
+            True,
+            0,
+        ),
+        Column(
+            "sigma",
+            "mm",
+            "of the camera's place in the rig frame, all axes together, from the covariance of the "
+            "joint solve.",
+            limits.SIGMA_MM,
+        ),
+        Column("light", "", "model of the sheets of light that held-out boards chose."),
+    )
+    rows = tuple(
+        (
+            one.name,
+            one.corners_rms_px,
+            one.poses,
+            one.covered_percent,
+            one.sheets_rms_mm,
+            one.held_out_mm,
+            one.stripe_shots,
+            one.stripes_percent,
+            one.sigma_mm,
+            calibration.pairs[one.name].quality.light_model,
+        )
+        for one in figures
+    )
+    return Section("Pairs", "", [Table(columns, rows)])
+
+
+def _advice(calibration: RigCalibration) -> Section:
+    lines = calibration.advice or ("Nothing was advised: one pair has nothing to be tied to.",)
+    return Section("How well the pairs are tied, and what would help", "", [Lines(lines)])
+
+
+def _boards(calibration: RigCalibration) -> Section:
+    if not calibration.seen:
+        return Section("Boards in the pictures", "", [Lines((NOT_STORED,))])
+    residuals, times = draw.residual_chart(calibration)
+    return Section(
+        "Boards in the pictures",
+        "",
+        [
+            Picture(
+                "Coverage of each camera by boards",
+                "Each camera's picture, and the hull of the corners of every board seen in it. Empty "
+                "corners of a picture are where its lens is known least.",
+                draw.coverage_chart(calibration),
+                SVG,
+            ),
+            Picture(
+                "Residuals of corners",
+                "Colour: RMS over each part of the picture, px. Arrows: their mean, "
+                f"{times:,.0f} times too long; arrows that all point one way in a part of the picture "
+                "mean that the lens model does not fit there. Empty: fewer than three corners.",
+                residuals,
+                SVG,
+            ),
+        ],
+    )
+
+
+def _planes(calibration: RigCalibration) -> Section:
+    if all(pair.light is None for pair in calibration.pairs.values()):
+        return Section("Planes of light", "", [Lines(("No pair has a projector.",))])
+    return Section(
+        "Planes of light",
+        "",
+        [
+            Picture(
+                "Baseline, projection angle and tilt",
+                "Eq. 7-9 and Fig. 6 of the method's chapter, for every stripe boundary s, camera "
+                "frame: where the plane cuts the baseline axis (mm from the optical centre), its "
+                "angle about the axis the stripes run along, and how far it leans. For horizontal "
+                "stripes x and y are exchanged. Smooth curves are right; a projector's lens bends "
+                "them, a rotating mirror hardly does. Of bent sheets: their tangent planes.",
+                draw.planes_chart(calibration),
+                SVG,
+            ),
+            Picture(
+                "Models of the light on held-out boards",
+                "Each model was fitted without a board and tried on it; mean distance from that board "
+                "(mm, outliers capped). Filled: the model in use, the simplest that is as good as "
+                "the best within 15 %.",
+                draw.held_out_chart(calibration),
+                SVG,
+            ),
+        ],
+    )
+
+
+def _view_graph(calibration: RigCalibration) -> Section:
+    if len(calibration.seen) < 2:
+        return Section("Who shares boards with whom", "", [Lines(("There is nothing to share.",))])
+    together = draw.shared_boards(calibration)
+    return Section(
+        "Who shares boards with whom",
+        "Two pairs are tied together by boards that both saw at the same moment.",
+        [
+            Picture(
+                "View graph",
+                "Thicker: more boards in common.",
+                draw.view_graph_chart(calibration),
+                SVG,
+            ),
+            Picture(
+                "Boards in common",
+                "Number of boards seen by both at the same moment. Empty: none.",
+                charts.matrix(
+                    list(calibration.seen),
+                    np.where(together > 0, together, np.nan),
+                    "boards",
+                    ".0f",
+                ),
+                SVG,
+            ),
+        ],
+    )
+
+
+def _sigma(calibration: RigCalibration) -> Section:
+    cameras = {name: pair.camera for name, pair in calibration.pairs.items()}
+    picture = Picture(
+        "Sigma over the scan volume",
+        "How far the rig's placing alone may put a point wrong (one sigma, all axes together, mm), in "
+        "two upright planes through the rig's axis. No noise of stripes and no swaying subject is "
+        "in it. Light grey: no camera sees anything.",
+        drawn(
+            lambda path: draw_sigma_map(
+                calibration.rig.volume,
+                calibration.rig_from_camera,
+                cameras,
+                calibration.covariance,
+                path,
+                height_px=760,
+            )
+        ),
+    )
+    return Section("How well each place is known", "", [picture])
+
+
+def _notes(calibration: RigCalibration) -> Section:
+    blocks: list[Block] = []
+    if calibration.failed:
+        failed = (f"failed: {name}: {why}" for name, why in calibration.failed.items())
+        blocks.append(Lines(tuple(failed)))
+    blocks.append(Lines(calibration.notes or ("Every image and view was used.",)))
+    return Section("What was not used, and notes", "", blocks)

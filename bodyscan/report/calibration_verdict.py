@@ -1,0 +1,105 @@
+"""Whether a calibration is good, usable, or to be done again, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.calibration.coverage import covered
+from bodyscan.calibration.rig_calibration import RigCalibration
+from bodyscan.registration.uncertainty import position_sigma
+
+CORNERS_RMS_PX = 0.3
+"""Corners are found to less than a tenth of a pixel in sharp, well lit pictures."""
+SHEETS_RMS_MM, HELD_OUT_MM = 0.3, 0.5
+"""A scan's overlaps are called in doubt from 0.4 mm on (fusion/verdict.py)."""
+COVERED_PERCENT = 40.0
+"""Of the picture: a lens is only known where boards were."""
+POSES, STRIPE_SHOTS = 6, 4
+STRIPES_PERCENT = 50.0
+SIGMA_MM = 0.5
+FAR_BEYOND = 2.0
+"""A limit exceeded so many times asks for a new calibration, by less for care."""
+
+
+@dataclass(frozen=True)
+class PairFigures:
+    """What a calibrated pair is judged by; None where it does not apply or was not stored."""
+
+    name: str
+    corners_rms_px: float
+    poses: int
+    covered_percent: float | None
+    sheets_rms_mm: float | None
+    held_out_mm: float | None
+    stripe_shots: int | None
+    stripes_percent: float | None
+    sigma_mm: float
+
+    def beyond(self) -> Iterator[tuple[float, str]]:
+        """(how many times beyond, in words) of each limit that is not kept."""
+        checks = (
+            ("corners are off by", self.corners_rms_px, CORNERS_RMS_PX, "px RMS", False),
+            ("was calibrated from", self.poses, POSES, "board poses", True),
+            ("boards covered", self.covered_percent, COVERED_PERCENT, "% of its picture", True),
+            ("light sheets are off by", self.sheets_rms_mm, SHEETS_RMS_MM, "mm RMS", False),
+            ("is off on held-out boards by", self.held_out_mm, HELD_OUT_MM, "mm", False),
+            ("stripes were decoded on", self.stripe_shots, STRIPE_SHOTS, "boards", True),
+            ("has planes for", self.stripes_percent, STRIPES_PERCENT, "% of its stripes", True),
+            ("its place is known to", self.sigma_mm, SIGMA_MM, "mm", False),
+        )
+        for words, value, limit, unit, at_least in checks:
+            if value is None or (value >= limit if at_least else value <= limit):
+                continue
+            times = limit / max(value, 1e-9) if at_least else value / limit
+            side = "at least" if at_least else "at most"
+            yield times, f"{words} {value:.3g} {unit} ({side} {limit:g} is good)"
+
+
+def figures_of(calibration: RigCalibration) -> list[PairFigures]:
+    """Of every calibrated pair, in the order of the rig."""
+    return [
+        _figures(calibration, pair.name)
+        for pair in calibration.rig.pairs
+        if pair.name in calibration.pairs
+    ]
+
+
+def judge(calibration: RigCalibration) -> tuple[str, tuple[str, ...]]:
+    """good, usable or recalibrate, and the reasons, worst first."""
+    findings = [
+        (np.inf, f"recalibrate: pair {name} failed: {reason}")
+        for name, reason in calibration.failed.items()
+    ]
+    for pair in figures_of(calibration):
+        for times, words in pair.beyond():
+            far = times > FAR_BEYOND
+            findings.append((times, f"{'recalibrate: ' if far else ''}pair {pair.name}: {words}"))
+    findings.sort(key=lambda finding: -finding[0])
+    worst = findings[0][0] if findings else 0.0
+    grade = "recalibrate" if worst > FAR_BEYOND else "usable" if findings else "good"
+    return grade, tuple(words for _, words in findings)
+
+
+def _figures(calibration: RigCalibration, name: str) -> PairFigures:
+    pair = calibration.pairs[name]
+    quality, camera, seen = pair.quality, pair.camera, calibration.seen.get(name)
+    place = calibration.rig_from_camera[name].translation
+    striped = pair.light is not None
+    share = None
+    if seen is not None:
+        views = [seen.pixels[seen.target == k].astype(float) for k in np.unique(seen.target)]
+        share = 100.0 * covered(views, camera.width, camera.height)
+    return PairFigures(
+        name,
+        quality.corners_rms_px,
+        quality.poses,
+        share,
+        quality.planes_rms_mm,
+        next((tried.mean_mm for tried in quality.held_out if tried.chosen), None),
+        quality.stripe_shots if striped else None,
+        100.0 * quality.stripes_calibrated / max(quality.stripes_projected, 1) if striped else None,
+        float(np.linalg.norm(position_sigma(calibration.covariance, name, place))),
+    )

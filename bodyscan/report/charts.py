@@ -1,0 +1,129 @@
+"""Small charts as SVG, all in one style. Matplotlib is imported here and in `figures` alone."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+INK, GREY, BLUE, RED = "#1d2430", "#8a93a0", "#0072b2", "#d55e00"
+STYLE: Any = {
+    "svg.hashsalt": "bodyscan",
+    "font.size": 9.0,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "image.interpolation": "nearest",
+}
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    with matplotlib.rc_context(STYLE):
+        yield
+
+
+def svg(figure: Figure) -> bytes:
+    """The same figure gives the same bytes: no date, no random ids."""
+    stream = io.BytesIO()
+    with style():
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+    plt.close(figure)
+    return stream.getvalue()
+
+
+def histogram(values: Array, limit: float, label: str) -> bytes:
+    """Of signed values; what lies beyond the limits is counted in the outermost bins."""
+    with style():
+        figure, axis = plt.subplots(figsize=(8.2, 2.8), constrained_layout=True)
+        edges = np.linspace(-limit, limit, 81)
+        counts, _ = np.histogram(np.clip(values, -limit, limit), edges)
+        share = 100.0 * counts / max(len(values), 1)
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        colours = matplotlib.colormaps["RdBu_r"](0.5 + 0.5 * middle / limit)
+        axis.bar(middle, share, np.diff(edges), color=colours, edgecolor=GREY, linewidth=0.3)
+        axis.axvline(float(np.mean(values)), color=INK, linewidth=1.0)
+        axis.set(xlabel=label, ylabel="share, %", xlim=(-limit, limit))
+    return svg(figure)
+
+
+def bars(values: Mapping[str, float], label: str, limits: Sequence[float] = ()) -> bytes:
+    """One bar a name, with limits as lines where they are in reach."""
+    with style():
+        width = min(10.0, 1.6 + 0.55 * len(values))
+        figure, axis = plt.subplots(figsize=(max(width, 4.0), 2.6), constrained_layout=True)
+        axis.bar(list(values), list(values.values()), color=BLUE, width=0.65)
+        top = max([*values.values(), 1e-9])
+        for limit in limits:
+            if limit < 4.0 * top:
+                axis.axhline(limit, color=RED, linewidth=1.0)
+                axis.annotate(
+                    f"limit {limit:g}",
+                    (1.0, limit),
+                    (-2, 2),
+                    xycoords=("axes fraction", "data"),
+                    textcoords="offset points",
+                    ha="right",
+                    color=RED,
+                )
+        axis.set_ylabel(label)
+        axis.tick_params(axis="x", length=0)
+    return svg(figure)
+
+
+def matrix(names: Sequence[str], values: Array, label: str, form: str = ".2f") -> bytes:
+    """Numbers between every two names (rows see columns), NaN left empty."""
+    with style():
+        size = max(3.0, 0.4 * len(names) + 1.2)
+        figure, axis = plt.subplots(figsize=(size + 1.0, size), constrained_layout=True)
+        known = values[np.isfinite(values)]
+        top = float(known.max()) if known.size else 1.0
+        shown = axis.imshow(values, cmap="YlGnBu", vmin=0.0, vmax=top or 1.0)
+        for row, column in zip(*np.nonzero(np.isfinite(values)), strict=True):
+            dark = values[row, column] > 0.55 * top
+            axis.text(
+                column,
+                row,
+                format(values[row, column], form),
+                ha="center",
+                va="center",
+                fontsize=7.5,
+                color="white" if dark else INK,
+            )
+        axis.set_xticks(range(len(names)), names, rotation=45, ha="right")
+        axis.set_yticks(range(len(names)), names)
+        axis.tick_params(length=0)
+        axis.spines[:].set_visible(False)
+        figure.colorbar(shown, ax=axis, shrink=0.7, label=label)
+    return svg(figure)
+
+
+def grid_of(count: int, columns: int, cell: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+    """`count` axes in rows of `columns`, each `cell` inches; those left over are hidden."""
+    rows = -(-count // columns)
+    figure, axes = plt.subplots(
+        rows,
+        columns,
+        figsize=(cell[0] * columns, cell[1] * rows),
+        constrained_layout=True,
+        squeeze=False,
+    )
+    flat = list(axes.ravel())
+    for axis in flat[count:]:
+        axis.set_visible(False)
+    return figure, flat[:count]

@@ -1,0 +1,128 @@
+"""Meshes and lines packed small for the report's viewer (viewer.js): whole numbers, base64."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Colours = NDArray[np.uint8]
+Legend = dict[str, Any]
+
+MOST_VERTICES = 65_536
+"""As many as a 16-bit index tells apart."""
+STEPS = 65_535
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """One way to colour a mesh: colours (V, 3) red, green, blue, and what they mean."""
+
+    name: str
+    colours: Colours
+    legend: Legend | None = None
+    unlit: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """vertices (V, 3) mm, faces (F, 3), normals (V, 3)."""
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    normals: NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Strokes:
+    """Straight lines: ends (L, 2, 3) mm, colours (L, 3) red, green, blue."""
+
+    ends: Array
+    colours: Colours
+
+
+@dataclass(frozen=True)
+class Standpoint:
+    """Where the viewer stands at first: degrees from x towards y and upwards."""
+
+    azimuth_deg: float = 25.0
+    elevation_deg: float = 6.0
+
+
+def pack(
+    shape: Shape | None,
+    layers: Sequence[Layer] = (),
+    *,
+    strokes: Strokes | None = None,
+    labels: Sequence[tuple[str, Array]] = (),
+    standpoint: Standpoint = Standpoint(),
+) -> dict[str, Any]:
+    """What `viewer.js` reads. A place is `low + step * whole`, to the 65,535th part of the longest
+    side. Raises ValueError for a mesh of more than 65,536 vertices.
+    """
+    if shape is not None and len(shape.vertices) > MOST_VERTICES:
+        raise ValueError(f"{len(shape.vertices)} vertices; a viewer's mesh has {MOST_VERTICES}")
+    places = [shape.vertices] if shape is not None else []
+    places += [strokes.ends.reshape(-1, 3)] if strokes is not None else []
+    everything = np.concatenate(places)
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    step = float((high - low).max()) / STEPS or 1.0
+
+    def whole(points: Array) -> str:
+        return encoded(np.rint((points - low) / step).astype("<u2"))
+
+    packed: dict[str, Any] = {
+        "low": low.tolist(),
+        "step": step,
+        "layers": [],
+        "lines": None,
+        "faces": None,
+        "labels": [[text, *map(float, np.round(at, 1))] for text, at in labels],
+        "view": {
+            "azimuth": float(np.radians(standpoint.azimuth_deg)),
+            "elevation": float(np.radians(standpoint.elevation_deg)),
+            "target": (0.5 * (low + high)).tolist(),
+            "size": float(np.linalg.norm(high - low)),
+        },
+    }
+    if shape is not None:
+        normals = np.clip(np.rint(127 * np.nan_to_num(shape.normals)), -127, 127)
+        packed |= {
+            "positions": whole(shape.vertices),
+            "normals": encoded(normals.astype(np.int8)),
+            "faces": encoded(shape.faces.astype("<u2")),
+        }
+    packed["layers"] = [
+        {
+            "name": layer.name,
+            "colours": encoded(layer.colours),
+            "legend": layer.legend,
+            "unlit": layer.unlit,
+        }
+        for layer in layers
+    ] or [{"name": "", "colours": "", "legend": None, "unlit": False}]
+    if strokes is not None:
+        packed["lines"] = {
+            "positions": whole(strokes.ends.reshape(-1, 3)),
+            "colours": encoded(np.repeat(strokes.colours, 2, axis=0)),
+        }
+    return packed
+
+
+def encoded(array: NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
+
+
+def ramp_legend(caption: str, table: Colours, ends: tuple[str, str]) -> Legend:
+    """A colour bar; table (256, 3) red, green, blue."""
+    some = table[np.linspace(0, 255, 12).astype(int)]
+    return {"caption": caption, "gradient": [css(c) for c in some], "ends": list(ends)}
+
+
+def css(colour: Sequence[int] | Colours) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*(int(part) for part in colour))

@@ -1,0 +1,188 @@
+"""A report as a page: sections of numbers, tables, pictures and models, in one HTML file."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any, Literal
+
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from bodyscan import __version__
+
+Mark = Literal["", "good", "usable", "bad"]
+GOOD, CAREFUL = ("good", "accepted"), ("usable", "not judged")
+
+
+@dataclass(frozen=True)
+class Number:
+    """One figure that explains itself: what it is, its unit, and what it should stay within."""
+
+    name: str
+    value: float | str | None
+    unit: str
+    meaning: str
+    limit: float | None = None
+    at_least: bool = False
+    digits: int = 3
+
+    @property
+    def kept(self) -> bool | None:
+        """Whether the limit is kept; None without a limit or without a value."""
+        if self.limit is None or not isinstance(self.value, float | int):
+            return None
+        return self.value >= self.limit if self.at_least else self.value <= self.limit
+
+    @property
+    def mark(self) -> Mark:
+        return {None: "", True: "good", False: "bad"}[self.kept]  # type: ignore[return-value]
+
+    @property
+    def text(self) -> str:
+        return shown(self.value, self.digits)
+
+    @property
+    def limit_text(self) -> str:
+        if self.limit is None:
+            return "–"
+        return f"{'at least' if self.at_least else 'at most'} {shown(self.limit, self.digits)}"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A table's column: its heading, unit, and what stands in it."""
+
+    name: str
+    unit: str = ""
+    meaning: str = ""
+    limit: float | None = None
+    at_least: bool = False
+    digits: int = 3
+
+    def cell(self, value: float | str | None) -> Number:
+        return Number(self.name, value, self.unit, "", self.limit, self.at_least, self.digits)
+
+    @property
+    def limit_text(self) -> str:
+        return self.cell(None).limit_text
+
+
+@dataclass(frozen=True)
+class Numbers:
+    items: tuple[Number, ...]
+    kind: Literal["numbers"] = "numbers"
+
+
+@dataclass(frozen=True)
+class Table:
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[float | str | None, ...], ...]
+    kind: Literal["table"] = "table"
+
+    @property
+    def cells(self) -> list[list[Number]]:
+        return [[c.cell(v) for c, v in zip(self.columns, row, strict=True)] for row in self.rows]
+
+    @property
+    def defined(self) -> list[Column]:
+        return [column for column in self.columns if column.meaning]
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Sentences, one a line."""
+
+    lines: tuple[str, ...]
+    kind: Literal["lines"] = "lines"
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """An image as its file's bytes, `image/png` or `image/svg+xml`."""
+
+    title: str
+    caption: str
+    data: bytes
+    media: str = "image/png"
+    kind: Literal["picture"] = "picture"
+
+    @property
+    def source(self) -> str:
+        return f"data:{self.media};base64,{base64.b64encode(self.data).decode('ascii')}"
+
+
+@dataclass(frozen=True, eq=False)
+class Viewer:
+    """A model to turn: see `model.py`."""
+
+    title: str
+    caption: str
+    model: dict[str, Any]
+    kind: Literal["viewer"] = "viewer"
+
+    @property
+    def json(self) -> Markup:
+        """For a script element: a `<` cannot end it."""
+        text = json.dumps(self.model, separators=(",", ":"), allow_nan=False)
+        return Markup(text.replace("<", "\\u003c"))
+
+
+Block = Numbers | Table | Lines | Picture | Viewer
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    title: str
+    intro: str
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """grade: one of GOOD or CAREFUL, or a word for bad (repeat, recalibrate), with its reasons.
+
+    synthetic: whether what is reported was simulated.  facts: what it is, as (name, value).
+    subject: pseudonym of the person it shows.
+    """
+
+    title: str
+    grade: str
+    reasons: tuple[str, ...]
+    synthetic: bool
+    facts: tuple[tuple[str, str], ...]
+    sections: Sequence[Section] = ()
+    subject: str | None = None
+
+    @property
+    def mark(self) -> Mark:
+        return "good" if self.grade in GOOD else "usable" if self.grade in CAREFUL else "bad"
+
+
+def render(page: Page) -> str:
+    """One HTML document that needs nothing else: style, script, pictures and models are in it."""
+    here = files("bodyscan.report")
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    template = environment.from_string((here / "page.html.j2").read_text("utf-8"))
+    return template.render(
+        page=page,
+        style=Markup((here / "page.css").read_text("utf-8")),
+        script=Markup((here / "viewer.js").read_text("utf-8")),
+        software=f"bodyscan {__version__}",
+    )
+
+
+def shown(value: float | str | None, digits: int = 3) -> str:
+    """A value as people read it."""
+    if value is None:
+        return "–"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", "\u202f")
+    return f"{value:.{digits}f}"

@@ -1,0 +1,135 @@
+"""A calibrated rig as a model to turn: cameras, how well their places are known, boards, volume."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.calibration.rig_calibration import RigCalibration
+from bodyscan.registration.uncertainty import point_covariance
+from bodyscan.report.calibration_charts import line_styles
+from bodyscan.report.model import Layer, Shape, Standpoint, Strokes, pack
+
+Array = NDArray[np.float64]
+
+SHOWN_MM = 140.0
+"""The largest ellipsoid's longest half axis as it is drawn."""
+LEAST_MM = 1e-3
+"""A rig of one pair is known by definition: there is nothing to draw larger."""
+FRUSTUM_MM = 220.0
+RINGS, SECTORS = 16, 24
+GROUND, BOARD, VOLUME = (150, 158, 170), (190, 197, 207), (120, 130, 145)
+AXES = ((200, 40, 40), (30, 140, 60), (40, 80, 200))
+
+
+def rig_model(calibration: RigCalibration) -> tuple[dict[str, object], float]:
+    """What the viewer reads, and how many times too large the ellipsoids of one sigma are."""
+    spread = {
+        name: point_covariance(calibration.covariance.of(name), placing.translation)
+        for name, placing in calibration.rig_from_camera.items()
+    }
+    longest = max(float(np.sqrt(np.linalg.eigvalsh(one)[-1])) for one in spread.values())
+    times = _two_digits(SHOWN_MM / max(longest, LEAST_MM))
+    shapes = {
+        name: _ellipsoid(placing.translation, times**2 * spread[name])
+        for name, placing in calibration.rig_from_camera.items()
+    }
+    colours, _ = line_styles(calibration)
+    shape, tint = _joined(shapes, {name: _rgb(colours[name]) for name in shapes})
+    labels = [(name, t.translation) for name, t in calibration.rig_from_camera.items()]
+    return (
+        pack(
+            shape,
+            [Layer("ellipsoids", tint)],
+            strokes=_strokes(calibration),
+            labels=[
+                *labels,
+                ("x", np.array([340.0, 0.0, 0.0])),
+                ("y", np.array([0.0, 340.0, 0.0])),
+            ],
+            standpoint=Standpoint(20.0, 22.0),
+        ),
+        times,
+    )
+
+
+def _ellipsoid(middle: Array, covariance: Array) -> Shape:
+    """Of one sigma: the unit sphere carried by the covariance's root."""
+    down = np.linspace(0.0, np.pi, RINGS + 1)[:, None]
+    round_ = 2.0 * np.pi * np.arange(SECTORS) / SECTORS
+    sphere = np.stack(
+        np.broadcast_arrays(
+            np.sin(down) * np.cos(round_), np.sin(down) * np.sin(round_), np.cos(down)
+        ),
+        axis=-1,
+    ).reshape(-1, 3)
+    values, vectors = np.linalg.eigh(covariance)
+    axes = np.sqrt(np.maximum(values, 1e-9))
+    normals = (sphere / axes) @ vectors.T
+    row, column = np.meshgrid(np.arange(RINGS), np.arange(SECTORS), indexing="ij")
+    after = (column + 1) % SECTORS
+    a, b = row * SECTORS + column, row * SECTORS + after
+    faces = np.stack([a, a + SECTORS, b, b, a + SECTORS, b + SECTORS], axis=-1).reshape(-1, 3)
+    return Shape(
+        middle + (sphere * axes) @ vectors.T,
+        faces,
+        normals / np.linalg.norm(normals, axis=1, keepdims=True),
+    )
+
+
+def _joined(
+    shapes: dict[str, Shape], tints: dict[str, NDArray[np.uint8]]
+) -> tuple[Shape, NDArray[np.uint8]]:
+    counts = [len(shape.vertices) for shape in shapes.values()]
+    starts = np.cumsum([0, *counts[:-1]])
+    every = list(shapes.values())
+    shape = Shape(
+        np.concatenate([one.vertices for one in every]),
+        np.concatenate([one.faces + start for one, start in zip(every, starts, strict=True)]),
+        np.concatenate([one.normals for one in every]),
+    )
+    return shape, np.repeat([tints[name] for name in shapes], counts, axis=0).astype(np.uint8)
+
+
+def _strokes(calibration: RigCalibration) -> Strokes:
+    """Cameras' fields of view, boards' outlines, the scan volume, and the rig's axes."""
+    colours, _ = line_styles(calibration)
+    parts: list[tuple[Array, NDArray[np.uint8]]] = []
+    for name, placing in calibration.rig_from_camera.items():
+        camera = calibration.pairs[name].camera
+        right, bottom = camera.width - 0.5, camera.height - 0.5
+        corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
+        far = placing.apply(FRUSTUM_MM * camera.rays(corners))
+        sides = np.stack([np.broadcast_to(placing.translation, far.shape), far], axis=1)
+        parts.append((np.concatenate([sides, _closed(far)]), _rgb(colours[name])))
+    for (_, board_name), rig_from_board in calibration.rig_from_board.items():
+        board = calibration.rig.board(board_name)
+        x, y = board.columns * board.square_mm, board.rows * board.square_mm
+        outline = np.array([[0.0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]])
+        parts.append((_closed(rig_from_board.apply(outline)), np.array(BOARD, np.uint8)))
+    volume = calibration.rig.volume
+    turn = 2.0 * np.pi * np.arange(48) / 48
+    circle = volume.radius_mm * np.stack([np.cos(turn), np.sin(turn), np.zeros(48)], axis=1)
+    for height in (volume.bottom_mm, volume.top_mm):
+        parts.append((_closed(circle + [0.0, 0.0, height]), np.array(VOLUME, np.uint8)))
+    upright = circle[::6, None] + np.array([[0.0, 0, volume.bottom_mm], [0.0, 0, volume.top_mm]])
+    parts.append((upright, np.array(VOLUME, np.uint8)))
+    for axis, colour in zip(np.eye(3), AXES, strict=True):
+        parts.append((300.0 * np.stack([np.zeros(3), axis])[None], np.array(colour, np.uint8)))
+    ends = np.concatenate([part for part, _ in parts])
+    tint = np.repeat([colour for _, colour in parts], [len(part) for part, _ in parts], axis=0)
+    return Strokes(ends, tint.astype(np.uint8))
+
+
+def _closed(corners: Array) -> Array:
+    """(N, 2, 3) sides of a polygon (N, 3)."""
+    return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+
+
+def _rgb(colour: str) -> NDArray[np.uint8]:
+    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], np.uint8)
+
+
+def _two_digits(value: float) -> float:
+    power = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(np.floor(value / power) * power)

@@ -1,0 +1,385 @@
+"""What a scan's report says: the body, how well it was measured, where it was not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from bodyscan.errors import ResultError
+from bodyscan.evaluation.surface import Deviation
+from bodyscan.fusion import verdict as limits
+from bodyscan.fusion.storage import FILE_NAME, SCHEMA, StoredScan, load_scan
+from bodyscan.fusion.topology import face_areas, topology
+from bodyscan.report import charts
+from bodyscan.report.body_model import layers, light_mesh, shape_of
+from bodyscan.report.comparison import Comparison, compare
+from bodyscan.report.holes import holes
+from bodyscan.report.model import pack
+from bodyscan.report.origin import is_synthetic
+from bodyscan.report.page import (
+    Column,
+    Lines,
+    Number,
+    Numbers,
+    Page,
+    Picture,
+    Section,
+    Table,
+    Viewer,
+)
+from bodyscan.report.pictures import draw_cloud, draw_deviation, draw_mesh
+
+HEIGHT_PX = 760
+MOST_HOLES = 8
+SMALL_HOLE_MM2 = 100.0
+NO_VERDICT = (
+    "this scan was made by a version of bodyscan that gave no verdict: scan again to have one"
+)
+
+
+def scan_page(folder: Path, other: Path | None = None) -> Page:
+    """The report of the scan in `folder`, held against `other` if given.
+
+    A scan that gave no model has a report too: its reasons. Raises ResultError, BadInput.
+    """
+    facts = _facts(folder)
+    subject = facts.get("subject")
+    verdict = facts.get("verdict") or {"grade": "usable", "reasons": [NO_VERDICT]}
+    sections: list[Section] = []
+    if "sha256" in facts:
+        scan = load_scan(folder)
+        found = compare(scan.mesh, other) if other is not None else []
+        sections = _sections(scan, found)
+    return Page(
+        f"Scan of {subject}" if subject else f"Scan {folder.resolve().name}",
+        verdict["grade"],
+        tuple(verdict["reasons"]),
+        is_synthetic(folder, subject),
+        (
+            ("taken", str(facts.get("when") or "not known")),
+            ("calibration", str(facts["calibration_id"])[:12]),
+            ("made by", str(facts["software"])),
+            ("folder", folder.resolve().name),
+        ),
+        sections,
+        subject,
+    )
+
+
+def _facts(folder: Path) -> dict[str, Any]:
+    """The content of scan.json, of a scan that gave a model or did not."""
+    file = folder / FILE_NAME
+    try:
+        facts = json.loads(file.read_text("utf-8"))
+        known = facts["schema"] == SCHEMA and bool(facts["calibration_id"])
+    except (OSError, ValueError, KeyError, TypeError):
+        known = False
+    if not known:
+        raise ResultError(
+            "is no readable scan result",
+            where=str(file),
+            remedy="give the folder that `bodyscan scan` wrote",
+        )
+    return dict(facts)
+
+
+def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
+    # A person stands elsewhere in each scan, but a truth stands where it is true.
+    shown = next((one for one in found if one.fitted == one.is_scan), None)
+    limit = _limit(shown) if shown else 1.0
+    sections = [
+        Section("The body", "", [_viewer(scan, shown, limit)]),
+        Section("Figures", "", [_numbers(scan)]),
+    ]
+    if shown:
+        sections.append(_comparison(scan, found, shown, limit))
+    sections += [_pictures(scan), _pairs(scan.facts), _holes(scan)]
+    return sections
+
+
+def _viewer(scan: StoredScan, shown: Comparison | None, limit: float) -> Viewer | Lines:
+    small = light_mesh(scan.mesh)
+    if small is None:
+        return Lines(("The mesh folds when it is made small, so there is no model to turn here.",))
+    return Viewer(
+        "Body model",
+        f"The mesh reduced to {len(small.faces):,} faces, a few tenths of a millimetre from the full "
+        f"one ({len(scan.mesh.faces):,}), which the figures are of. Colours are those of the measured "
+        "points: photo, number of pairs, sigma; grey or orange is what nothing measured.",
+        pack(shape_of(small), layers(small, scan.mesh, scan.cloud, shown, limit)),
+    )
+
+
+def _numbers(scan: StoredScan) -> Numbers:
+    facts, mesh = scan.facts, scan.mesh
+    area = face_areas(mesh.vertices, mesh.faces)
+    made_up = 100.0 * float(area[mesh.filled].sum() / area.sum())
+    largest = next((hole.area_mm2 / 100.0 for hole in holes(mesh)), 0.0)
+    shape = topology(mesh.vertices, mesh.faces)
+    items = [
+        Number("points", len(scan.cloud.points), "", "in the cloud, after pairs were merged"),
+        Number("faces", len(mesh.faces), "", "triangles of the closed mesh"),
+        Number(
+            "sigma, median",
+            float(np.nanmedian(scan.cloud.sigma_mm)),
+            "mm",
+            "standard deviation of a point along its normal: half of the points have less. From the "
+            "contrast of the stripes, the angles of view and light, and the calibration",
+        ),
+        Number(
+            "sigma, 95 %",
+            float(np.nanpercentile(scan.cloud.sigma_mm, 95)),
+            "mm",
+            "95 of 100 points have less",
+        ),
+        Number(
+            "made up",
+            made_up,
+            "% of area",
+            "of the mesh's surface, filled to close it where nothing was measured",
+            100.0 * limits.SOME_FILLED,
+            digits=1,
+        ),
+        Number("largest hole", largest, "cm²", "area of the largest filled patch", digits=1),
+        Number(
+            "mesh",
+            "closed" if shape.closed and shape.manifold else "open",
+            "",
+            f"{shape.components} piece(s); closed: every edge belongs to two faces",
+        ),
+        Number("volume", shape.volume_mm3 / 1e6, "l", "inside the mesh", digits=2),
+    ]
+    return Numbers((*items, *_alignment_numbers(facts)))
+
+
+def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
+    alignment = facts.get("alignment")
+    if alignment is None:
+        return [Number("overlaps", "not aligned", "", "pairs stand where the boards placed them")]
+    farthest, motion = max(alignment["motion_mm"].items(), key=lambda item: item[1])
+    return [
+        Number(
+            "overlap residual",
+            alignment["rms_after_mm"],
+            "mm RMS",
+            "distance between what two pairs measured of the same place, after alignment",
+            limits.SOME_DISAGREEMENT_MM,
+        ),
+        Number(
+            "overlap residual before",
+            alignment["rms_before_mm"],
+            "mm RMS",
+            "the same where the calibration alone places the pairs",
+        ),
+        Number(
+            "sway",
+            motion,
+            "mm",
+            "how far the subject moved between pairs at most, as the alignment found it: pair "
+            f"{farthest}, at the body's middle",
+            limits.SOME_MOTION_MM,
+            digits=2,
+        ),
+    ]
+
+
+def _pictures(scan: StoredScan) -> Section:
+    cloud, mesh = scan.cloud, scan.mesh
+    views = "From the front, from the subject's left side, from the back. "
+    return Section(
+        "Pictures",
+        "",
+        [
+            Picture(
+                "Measured points, as photographed",
+                views + "White: nothing was measured there.",
+                drawn(lambda path: draw_cloud(cloud, path, height_px=HEIGHT_PX)),
+            ),
+            Picture(
+                "Mesh",
+                views + "Orange: made up to close the mesh.",
+                drawn(lambda path: draw_mesh(mesh, path, height_px=HEIGHT_PX)),
+            ),
+            Picture(
+                "Sigma of the points",
+                views + "Standard deviation of each point along its normal, mm.",
+                drawn(lambda path: draw_cloud(cloud, path, colour="sigma", height_px=HEIGHT_PX)),
+            ),
+            Picture(
+                "Pairs",
+                views + "How many pairs measured each place.",
+                drawn(
+                    lambda path: draw_cloud(cloud, path, colour="pairs_seen", height_px=HEIGHT_PX)
+                ),
+            ),
+        ],
+    )
+
+
+def drawn(draw: Callable[[Path], object]) -> bytes:
+    """What a function that draws into a file draws."""
+    with TemporaryDirectory(prefix="bodyscan-") as folder:
+        draw(Path(folder) / "picture.png")
+        return (Path(folder) / "picture.png").read_bytes()
+
+
+def _pairs(facts: Mapping[str, Any]) -> Section:
+    alignment = facts.get("alignment") or {"motion_mm": {}, "overlaps": [], "refused": {}}
+    motion, overlaps = alignment["motion_mm"], alignment["overlaps"]
+    rows = tuple(
+        (name, points, motion.get(name), _pair_residual(overlaps, name))
+        for name, points in sorted(facts["measured"].items())
+    )
+    columns = (
+        Column("pair"),
+        Column("points", "", "measured on the subject after cleaning."),
+        Column(
+            "moved",
+            "mm",
+            "by the alignment, at the body's middle: sway of the subject and error of the pair's "
+            "placing together.",
+            limits.SOME_MOTION_MM,
+            digits=3,
+        ),
+        Column(
+            "residual",
+            "mm RMS",
+            "from the other pairs' surfaces where they overlap, after alignment.",
+            limits.SOME_DISAGREEMENT_MM,
+        ),
+    )
+    lost = [f"{name} gave nothing: {reason}" for name, reason in facts["failed"].items()]
+    lost += [
+        f"{name} was left where the boards placed it: it asked for {sigmas:.1f} sigmas"
+        for name, sigmas in alignment["refused"].items()
+    ]
+    blocks: list[Any] = [Table(columns, rows)]
+    if lost:
+        blocks.append(Lines(tuple(lost)))
+    if overlaps:
+        blocks += [_overlap_picture(overlaps), _sway_picture(motion)]
+    return Section("Pairs and their overlaps", "", blocks)
+
+
+def _pair_residual(overlaps: list[dict[str, Any]], name: str) -> float | None:
+    own = [o for o in overlaps if o["source"] == name and o["rms_after_mm"] is not None]
+    points = sum(o["points"] for o in own)
+    if not points:
+        return None
+    return float(np.sqrt(sum(o["points"] * o["rms_after_mm"] ** 2 for o in own) / points))
+
+
+def _overlap_picture(overlaps: list[dict[str, Any]]) -> Picture:
+    names = sorted({o[end] for o in overlaps for end in ("source", "target")})
+    values = np.full((len(names), len(names)), np.nan)
+    for o in overlaps:
+        if o["rms_after_mm"] is not None:
+            values[names.index(o["source"]), names.index(o["target"])] = o["rms_after_mm"]
+    return Picture(
+        "Residuals of the overlaps",
+        "RMS distance (mm) of the points of the pair at the left from the surface of the pair below, "
+        "after alignment. Empty: the two share too little of the subject.",
+        charts.matrix(names, values, "mm RMS"),
+        "image/svg+xml",
+    )
+
+
+def _sway_picture(motion: Mapping[str, float]) -> Picture:
+    return Picture(
+        "Sway",
+        "How far the alignment moved each pair against the subject, at the body's middle.",
+        charts.bars(dict(sorted(motion.items())), "moved, mm", (limits.SOME_MOTION_MM,)),
+        "image/svg+xml",
+    )
+
+
+def _holes(scan: StoredScan) -> Section:
+    found = [hole for hole in holes(scan.mesh) if hole.area_mm2 >= SMALL_HOLE_MM2]
+    rows = tuple(
+        (str(k), hole.area_mm2 / 100.0, hole.middle[2], hole.middle[0], hole.middle[1], hole.faces)
+        for k, hole in enumerate(found[:MOST_HOLES], start=1)
+    )
+    columns = (
+        Column("hole"),
+        Column("area", "cm²", digits=1),
+        Column("height", "mm", digits=0),
+        Column("x", "mm", digits=0),
+        Column("y", "mm", digits=0),
+        Column("faces"),
+    )
+    intro = (
+        f"Patches of at least 1 cm² that nothing measured and that were filled: {len(found)}"
+        + (f", of which the {MOST_HOLES} largest are listed" if len(found) > MOST_HOLES else "")
+        + ". Height and place are of the patch's middle."
+    )
+    return Section("Holes", intro, [Table(columns, rows)] if rows else [])
+
+
+def _comparison(
+    scan: StoredScan, found: list[Comparison], shown: Comparison, limit: float
+) -> Section:
+    columns = (
+        Column("the scan"),
+        Column("bias", "mm", "mean signed distance, outside is positive."),
+        Column("median", "mm", "of the absolute distances."),
+        Column("RMS", "mm", "root of the mean squared distance."),
+        Column("95 %", "mm", "of the absolute distances are less."),
+        Column("worst", "mm", "the largest of the absolute distances.", digits=2),
+    )
+    rows: tuple[tuple[float | str | None, ...], ...] = tuple(
+        (_standing(one), *_row(one.figures)) for one in found
+    )
+    points = scan.mesh.vertices[shown.vertices]
+    normals = scan.mesh.normals[shown.vertices]
+    laid = found[-1].other_from_scan
+    moved = float(np.linalg.norm(laid.apply(points.mean(axis=0)) - points.mean(axis=0)))
+    return Section(
+        f"Compared with {shown.name}",
+        f"Distances of the {len(points):,} measured vertices of this scan's mesh from the surface of "
+        f"{shown.name}; what was made up is left out. To lay one on the other the scan was moved "
+        f"by {moved:.2f} mm and turned by {np.degrees(laid.angle):.3f} degrees as a whole.",
+        [
+            Table(columns, rows),
+            Picture(
+                "Deviation map",
+                f"Front, left side, back; the scan {_standing(shown)}. Red: outside of {shown.name}, "
+                "blue: inside. Beyond the ends of the scale the colour is that of the end.",
+                drawn(
+                    lambda path: draw_deviation(
+                        points,
+                        shown.signed_mm,
+                        path,
+                        limit,
+                        normals=normals,
+                        height_px=HEIGHT_PX,
+                        caption="deviation, mm",
+                    )
+                ),
+            ),
+            Picture(
+                "How the deviations are distributed",
+                "The line stands at their mean; the outermost bars hold all that lies beyond.",
+                charts.histogram(shown.signed_mm, limit, "signed distance, mm"),
+                "image/svg+xml",
+            ),
+        ],
+    )
+
+
+def _row(figures: Deviation) -> tuple[float, ...]:
+    return figures.bias_mm, figures.median_mm, figures.rms_mm, figures.p95_mm, figures.worst_mm
+
+
+def _standing(one: Comparison) -> str:
+    return "laid on the other as a whole" if one.fitted else "as it stands in its rig frame"
+
+
+def _limit(one: Comparison) -> float:
+    """The map's end, mm: a round number that most deviations stay below."""
+    power = 10.0 ** np.floor(np.log10(max(one.figures.p95_mm, 1e-3)))
+    return float(next(s * power for s in (1.0, 2.0, 5.0, 10.0) if s * power >= one.figures.p95_mm))

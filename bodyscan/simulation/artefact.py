@@ -1,0 +1,151 @@
+"""Captures of a measured artefact, spheres or a flat plate, by the rig of a simulated workspace."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from bodyscan.capture.rig import Rig
+from bodyscan.capture.rig_file import load_rig
+from bodyscan.errors import BadInput
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import Progress, silent, threaded
+from bodyscan.simulation import files
+from bodyscan.simulation.layout import TruePair
+from bodyscan.simulation.render import View
+from bodyscan.simulation.room import build_room
+from bodyscan.simulation.scene import Surface, grid_surface
+from bodyscan.simulation.settings import SimulationSettings
+from bodyscan.simulation.simulate import Task, render_task, true_pairs
+
+Array = NDArray[np.float64]
+
+ALBEDO = 0.7
+RINGS = 200
+"""Facets of a sphere of 60 mm then lie less than 0.002 mm inside it."""
+GREY = 225.0
+_RAYS, _NOISE = 11, 12
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedRig:
+    """The rig of a workspace as it truly is."""
+
+    rig: Rig
+    settings: SimulationSettings
+    seed: int
+    pairs: dict[str, TruePair]
+
+
+def open_workspace(workspace: Path) -> SimulatedRig:
+    """The rig that `bodyscan simulate` built there. Raises BadInput if it is none of this version."""
+    remedy = "give a folder that this version of `bodyscan simulate` wrote"
+    try:
+        truth = json.loads((workspace / "truth" / "truth.json").read_text("utf-8"))
+        settings, seed = _settings(truth["settings"]), int(truth["seed"])
+        placings = {name: pair["rig_from_camera"] for name, pair in truth["pairs"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise BadInput(
+            f"is no simulated workspace ({type(error).__name__}: {error})",
+            where=str(workspace),
+            remedy=remedy,
+        ) from error
+    rig = load_rig(workspace / "rig.yaml")
+    pairs = true_pairs(rig, settings, seed)
+    for name, pair in pairs.items():
+        if not np.allclose(pair.rig_from_camera.matrix, placings.get(name, np.nan), atol=1e-6):
+            raise BadInput(
+                f"pair {name} stands elsewhere than its truth says",
+                where=str(workspace),
+                remedy=remedy,
+            )
+    return SimulatedRig(rig, settings, seed, pairs)
+
+
+def sphere_surfaces(centres: Array, radius_mm: float) -> tuple[Surface, ...]:
+    """White balls at centres (N, 3)."""
+    mesh = o3d.geometry.TriangleMesh.create_sphere(radius_mm, resolution=RINGS)
+    arms, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+    return tuple(
+        Surface(arms + centre, triangles, ALBEDO, normals=arms / radius_mm) for centre in centres
+    )
+
+
+def plate_surface(width_mm: float, height_mm: float) -> tuple[Surface, ...]:
+    """A white plate in the plane x = 0 about the origin, seen from either side."""
+    across, up = np.array([0.0, width_mm, 0.0]), np.array([0.0, 0.0, height_mm])
+    return (grid_surface(-0.5 * (across + up), across, up, albedo=ALBEDO),)
+
+
+def capture_artefact(
+    simulated: SimulatedRig,
+    surfaces: Sequence[Surface],
+    rig_from_artefact: RigidTransform,
+    out: Path,
+    *,
+    shots: int = 1,
+    number: int = 0,
+    workers: int = 2,
+    progress: Progress = silent,
+) -> Path:
+    """Write a scan folder `out` of the artefact at one place, taken `shots` times over.
+
+    number: of the place; every place and shot has noise of its own.  Pairs in whose picture nothing
+    of it lies take no part.
+    """
+    rig, settings = simulated.rig, simulated.settings
+    room = build_room(simulated.pairs.values(), settings.room)
+    order = {name: k for k, name in enumerate(simulated.pairs)}
+    taking = [
+        pair
+        for pair in simulated.pairs.values()
+        if pair.has_stripes and _in_picture(pair, surfaces, rig_from_artefact)
+    ]
+    names = [f"s{k + 1:02d}" for k in range(shots)]
+
+    def work(pair: TruePair) -> None:
+        rays = np.random.default_rng([simulated.seed, _RAYS, order[pair.name]])
+        view = View.of(pair.camera, settings.optics, rays)
+        for k, name in enumerate(names):
+            seed = [simulated.seed, _NOISE, order[pair.name], number, k]
+            task = Task(k, name, out.name, tuple(surfaces), rig_from_artefact, GREY, True)
+            noise = np.random.default_rng(seed)
+            render_task(rig, pair, view, room, task, settings, out.parent, noise)
+
+    threaded(work, taking, stage=f"simulating {out.name}", progress=progress, workers=workers)
+    striped = [pair.name for pair in taking]
+    files.write_captures(out, "scan", [(name, striped, []) for name in names], "sim-artefact")
+    return out
+
+
+def _in_picture(
+    pair: TruePair, surfaces: Sequence[Surface], rig_from_artefact: RigidTransform
+) -> bool:
+    camera_from_artefact = pair.rig_from_camera.inverse() @ rig_from_artefact
+    points = camera_from_artefact.apply(np.concatenate([s.vertices for s in surfaces]))
+    points = points[points[:, 2] > 1.0]
+    u, v = pair.camera.image(points).T
+    return bool(np.any((u >= 0) & (v >= 0) & (u < pair.camera.width) & (v < pair.camera.height)))
+
+
+def _settings(values: dict[str, Any]) -> SimulationSettings:
+    """What `dataclasses.asdict` made of the settings, read back."""
+    defaults = SimulationSettings()
+    parts = {}
+    for field in fields(SimulationSettings):
+        kind = type(getattr(defaults, field.name))
+        own = values.get(field.name, {})
+        parts[field.name] = kind(
+            **{
+                key: tuple(value) if isinstance(value, list) else value
+                for key, value in own.items()
+            }
+        )
+    return SimulationSettings(**parts)

@@ -1,0 +1,133 @@
+"""The report of a calibration with known faults: what it says of them, and what it draws."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ring import ring_of_cameras, ring_rig
+
+from bodyscan.calibration.pair import PairCalibration, PairQuality
+from bodyscan.calibration.rig_calibration import RigCalibration
+from bodyscan.calibration.seen_corners import SeenCorners
+from bodyscan.calibration.storage import load_calibration, save_calibration
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.uncertainty import PlacingCovariance
+from bodyscan.report.calibration_charts import shared_boards
+from bodyscan.report.calibration_page import calibration_page
+from bodyscan.report.calibration_verdict import judge
+from bodyscan.report.page import render
+from bodyscan.report.rig_model import RINGS, SECTORS, rig_model
+
+SIGMA_MM = np.array([0.01, 0.02, 0.05])
+SHOTS = {("b1", "board"): 0, ("b2", "board"): 1, ("b3", "board"): 2}
+
+
+def corners(camera, targets: list[int], share: float = 0.9) -> SeenCorners:
+    """A grid over so much of the picture's width and height, in each of the shots."""
+    x, y = np.meshgrid(np.linspace(0.5 - share / 2, 0.5 + share / 2, 9), np.linspace(0.1, 0.9, 7))
+    pixels = np.stack([x.ravel() * camera.width, y.ravel() * camera.height], axis=1)
+    residuals = np.random.default_rng(1).normal(0.0, 0.05, (len(targets) * len(pixels), 2))
+    return SeenCorners(
+        np.tile(pixels, (len(targets), 1)).astype(np.float32),
+        residuals.astype(np.float32),
+        np.repeat(targets, len(pixels)).astype(np.int16),
+    )
+
+
+@pytest.fixture
+def calibration() -> RigCalibration:
+    """A ring of cameras, each known apart from the others, without rotation, by SIGMA_MM."""
+    placings, cameras = ring_of_cameras(heights=(700, 1200))
+    pairs = {
+        name: PairCalibration(name, camera, np.eye(7), None, PairQuality(0.05, 9))
+        for name, camera in cameras.items()
+    }
+    one = np.diag([0.0, 0.0, 0.0, *SIGMA_MM**2])
+    covariance = PlacingCovariance(tuple(pairs), np.kron(np.eye(len(pairs)), one))
+    boards = {target: RigidTransform.identity() for target in SHOTS}
+    seen = {
+        name: corners(camera, [0, 1] if k else [1, 2])
+        for k, (name, camera) in enumerate(cameras.items())
+    }
+    return RigCalibration(
+        ring_rig(placings), pairs, placings, covariance, boards, {}, ("n1",), ("a1",), seen
+    )
+
+
+def worse(calibration: RigCalibration, name: str, **changes) -> RigCalibration:
+    pair = calibration.pairs[name]
+    quality = replace(pair.quality, **changes)
+    return replace(calibration, pairs=calibration.pairs | {name: replace(pair, quality=quality)})
+
+
+def test_a_calibration_within_all_limits_is_good(calibration):
+    assert judge(calibration) == ("good", ())
+
+
+def test_what_exceeds_a_limit_is_named_with_pair_value_and_limit(calibration):
+    name = min(calibration.pairs)
+    grade, reasons = judge(worse(calibration, name, corners_rms_px=0.4))
+    assert grade == "usable"
+    assert reasons == (f"pair {name}: corners are off by 0.4 px RMS (at most 0.3 is good)",)
+    grade, reasons = judge(worse(calibration, name, corners_rms_px=0.7, poses=5))
+    assert grade == "recalibrate"
+    assert reasons[0].startswith(f"recalibrate: pair {name}: corners are off by 0.7 px")
+    assert "5 board poses (at least 6 is good)" in reasons[1]
+
+
+def test_a_failed_pair_asks_for_a_new_calibration(calibration):
+    grade, reasons = judge(replace(calibration, failed={"c9": "saw nothing"}))
+    assert grade == "recalibrate"
+    assert reasons == ("recalibrate: pair c9 failed: saw nothing",)
+
+
+def test_a_picture_that_boards_hardly_cover_is_named(calibration):
+    name = min(calibration.pairs)
+    narrow = corners(calibration.pairs[name].camera, [0, 1], share=0.3)
+    grade, reasons = judge(replace(calibration, seen=calibration.seen | {name: narrow}))
+    assert grade == "usable"
+    # 30 % of the width and 80 % of the height.
+    assert f"pair {name}: boards covered 2" in reasons[0]
+
+
+def test_boards_in_common_are_counted_shot_by_shot(calibration):
+    together = shared_boards(calibration)
+    assert together[0, 1] == together[1, 0] == 1
+    assert together[1, 2] == 2
+    assert np.all(np.diag(together) == 0)
+
+
+def test_ellipsoids_are_as_large_as_the_covariance_says(calibration):
+    model, times = rig_model(calibration)
+    whole = np.frombuffer(base64.b64decode(model["positions"]), "<u2").reshape(-1, 3)
+    vertices = np.array(model["low"]) + model["step"] * whole
+    each = vertices.reshape(len(calibration.pairs), (RINGS + 1) * SECTORS, 3)
+    for ellipsoid, placing in zip(each, calibration.rig_from_camera.values(), strict=True):
+        half = 0.5 * np.ptp(ellipsoid, axis=0)
+        assert half == pytest.approx(times * SIGMA_MM, rel=0.02)
+        middle = 0.5 * (ellipsoid.max(axis=0) + ellipsoid.min(axis=0))
+        assert middle == pytest.approx(placing.translation, abs=1.0)
+
+
+def test_everything_is_said_and_read_back_from_disk(calibration, tmp_path: Path):
+    failed = replace(calibration, failed={"c9": "saw nothing"})
+    save_calibration(failed, tmp_path)
+    stored = load_calibration(tmp_path)
+    for name, seen in calibration.seen.items():
+        assert np.array_equal(stored.seen[name].pixels, seen.pixels)
+        assert np.array_equal(stored.seen[name].target, seen.target)
+    text = render(calibration_page(tmp_path))
+    assert text == render(calibration_page(tmp_path))
+    for part in ("Verdict: recalibrate", "c9: saw nothing", "<li>n1</li>", "<li>a1</li>"):
+        assert part in text
+
+
+def test_a_calibration_of_before_has_a_report_too(calibration, tmp_path: Path):
+    save_calibration(replace(calibration, seen={}), tmp_path)
+    text = render(calibration_page(tmp_path))
+    assert "calibrate again to see where the boards lay" in text
+    assert "Sigma over the scan volume" in text

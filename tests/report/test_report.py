@@ -1,0 +1,232 @@
+"""The report of a scan: what it says, that it is one file, and that a browser shows the body."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import open3d as o3d
+import pytest
+from browser import browser_page, find_browser
+from made_scan import MIDDLE_MM, SEMI_AXES_MM, MadeScan, egg, make_scan
+from typer.testing import CliRunner
+
+from bodyscan.cli import app
+from bodyscan.errors import BadInput, ResultError
+from bodyscan.files import write_json
+from bodyscan.jobs.forgetting import find
+from bodyscan.report.comparison import compare
+from bodyscan.report.holes import holes
+from bodyscan.report.model import Layer, Shape, pack
+from bodyscan.report.page import Number, render
+from bodyscan.report.result import page_of
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> MadeScan:
+    return make_scan(tmp_path_factory.mktemp("workspace") / "scan")
+
+
+@pytest.fixture(scope="module")
+def html(scan: MadeScan) -> str:
+    result = CliRunner().invoke(app, ["report", str(scan.folder)])
+    assert result.exit_code == 0, result.output
+    return (scan.folder / "report.html").read_text("utf-8")
+
+
+def test_the_verdict_comes_first_with_its_reason_as_text(html: str):
+    body = html[html.index("<body>") :]
+    assert "Verdict: usable" in body
+    assert "the person moved by 3.4 mm &lt;/script&gt;&lt;b&gt;" in body
+    assert body.index("Verdict") < body.index("<canvas") < body.index("Holes</h2>")
+    assert "no light" in body
+
+
+def test_a_report_elsewhere_is_found_when_its_subject_is_forgotten(scan: MadeScan, tmp_path: Path):
+    path = tmp_path / "elsewhere" / "r.html"
+    result = CliRunner().invoke(app, ["report", str(scan.folder), "--out", str(path)])
+    assert result.exit_code == 0, result.output
+    assert path in find("s-17", tmp_path).files
+    assert find("s-18", tmp_path).files == ()
+
+
+def test_nothing_lies_outside_of_the_file(html: str):
+    assert len(html) < 8_000_000
+    assert re.findall(r"""(?:src|href)=["'](?!data:|#)""", html) == []
+    assert "default-src 'none'" in html
+    assert "@import" not in html
+    assert "compliant" not in html.lower()
+
+
+def test_the_same_result_gives_the_same_bytes(scan: MadeScan, html: str):
+    assert render(page_of(scan.folder)) == html
+
+
+def test_simulated_is_said_and_only_where_it_is_known(tmp_path: Path, html: str):
+    assert "synthetic" not in html[html.index("<body>") :]
+    beside = make_scan(tmp_path / "w" / "scan")
+    write_json(tmp_path / "w" / "truth" / "truth.json", {})
+    assert page_of(beside.folder).synthetic
+    assert page_of(make_scan(tmp_path / "x" / "scan", subject="sim-woman").folder).synthetic
+
+
+def test_the_body_is_packed_to_a_fraction_of_a_millimetre(html: str, scan: MadeScan):
+    model = json.loads(re.search(r'<script type="application/json">(.*?)</script>', html)[1])
+    whole = np.frombuffer(base64.b64decode(model["positions"]), "<u2").reshape(-1, 3)
+    vertices = np.array(model["low"]) + model["step"] * whole
+    faces = np.frombuffer(base64.b64decode(model["faces"]), "<u2").reshape(-1, 3)
+    # 14,000 faces are few enough to be taken as they are: half a step of 1700 / 65535 mm is left.
+    assert np.abs(vertices - scan.mesh.vertices).max() < 0.014
+    assert np.array_equal(faces, scan.mesh.faces)
+    names = [layer["name"] for layer in model["layers"]]
+    assert names == ["photo", "shape", "pairs", "sigma", "filled"]
+    orange = np.frombuffer(base64.b64decode(model["layers"][4]["colours"]), np.uint8).reshape(-1, 3)
+    made_up = np.unique(scan.mesh.faces[scan.mesh.filled])
+    assert np.array_equal(np.flatnonzero(orange[:, 0] == 255), made_up)
+
+
+def test_a_mesh_too_large_for_its_indices_is_refused():
+    many = np.zeros((65_537, 3))
+    with pytest.raises(ValueError, match="65537"):
+        pack(Shape(many, np.zeros((1, 3), np.int64), many), [Layer("", many.astype(np.uint8))])
+
+
+def test_holes_are_found_where_nothing_was_measured():
+    mesh = egg()
+    height = mesh.vertices[mesh.faces][:, :, 2].mean(axis=1)
+    (sole, crown) = height < 80.0, height > 1600.0
+    both = replace(mesh, filled=sole | crown)
+    found = sorted(holes(both), key=lambda hole: hole.middle[2])
+    assert [hole.faces for hole in found] == ["down", "up"]
+    for hole, chosen in zip(found, (sole, crown), strict=True):
+        patch = o3d.geometry.TriangleMesh(
+            o3d.utility.Vector3dVector(mesh.vertices),
+            o3d.utility.Vector3iVector(mesh.faces[chosen]),
+        )
+        assert hole.area_mm2 == pytest.approx(patch.get_surface_area(), rel=1e-9)
+        assert height[chosen].min() < hole.middle[2] < height[chosen].max()
+    assert holes(replace(mesh, filled=np.zeros_like(mesh.filled))) == []
+
+
+def test_a_larger_body_lies_outside_of_a_smaller_one(tmp_path: Path):
+    small, large = make_scan(tmp_path / "small"), make_scan(tmp_path / "large", grown_mm=0.5)
+    standing, laid = compare(large.mesh, small.folder)
+    assert (standing.fitted, laid.fitted) == (False, True)
+    # A vertex went outwards by 0.5 mm of its place on the unit sphere; the normal has its share of it.
+    place = (small.mesh.vertices[standing.vertices] - MIDDLE_MM) / SEMI_AXES_MM
+    normal = place / SEMI_AXES_MM / np.linalg.norm(place / SEMI_AXES_MM, axis=1, keepdims=True)
+    expected = 0.5 * np.sum(place * normal, axis=1)
+    # Facets lie up to 0.03 mm inside of the egg whose vertices they join, where it is bent most.
+    assert standing.signed_mm == pytest.approx(expected, abs=0.03)
+    page = render(page_of(large.folder, small.folder))
+    assert "Deviation map" in page
+    assert "Compared with small" in page
+
+
+def test_a_scan_that_stood_elsewhere_is_laid_on_the_other(tmp_path: Path):
+    other = make_scan(tmp_path / "there")
+    mesh = egg()
+    away = replace(mesh, vertices=mesh.vertices + np.array([6.0, -4.0, 2.0]))
+    standing, laid = compare(away, other.folder)
+    assert standing.figures.median_mm > 1.0
+    assert laid.figures.p95_mm < 0.05
+    assert laid.other_from_scan.translation == pytest.approx([-6.0, 4.0, -2.0], abs=0.3)
+
+
+def test_a_surface_in_metres_is_refused(tmp_path: Path):
+    ball = o3d.geometry.TriangleMesh.create_sphere(0.9)
+    o3d.io.write_triangle_mesh(str(tmp_path / "metres.ply"), ball)
+    with pytest.raises(BadInput, match="millimetres"):
+        compare(egg(20), tmp_path / "metres.ply")
+
+
+def test_a_scan_without_a_model_has_a_report_of_why(tmp_path: Path):
+    facts = {
+        "schema": "bodyscan-scan",
+        "software": "bodyscan 0.1.0",
+        "calibration_id": "01",
+        "subject": None,
+        "when": None,
+        "verdict": {"grade": "repeat", "reasons": ["nobody stands in the scan volume"]},
+    }
+    write_json(tmp_path / "scan.json", facts)
+    text = render(page_of(tmp_path))
+    assert "Verdict: repeat" in text
+    assert "nobody stands" in text
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]", '{"schema": "bodyscan-scan"}'])
+def test_what_is_no_result_is_said(tmp_path: Path, content: str):
+    with pytest.raises(BadInput, match="neither"):
+        page_of(tmp_path)
+    (tmp_path / "scan.json").write_text(content)
+    with pytest.raises(ResultError, match="no readable scan"):
+        page_of(tmp_path)
+
+
+def test_a_slip_of_the_pen_is_not_taken_for_the_folder_above(scan: MadeScan):
+    with pytest.raises(BadInput, match="no such file"):
+        page_of(scan.folder / "scam.json")
+    with pytest.raises(BadInput, match="neither"):
+        page_of(scan.folder / "mesh.ply")
+    assert page_of(scan.folder / "scan.json").title == "Scan of s-17"
+
+
+def test_limits_are_kept_or_not():
+    assert Number("n", 0.4, "mm", "", 0.4).kept
+    assert not Number("n", 0.41, "mm", "", 0.4).kept
+    assert Number("n", 7, "", "", 6, at_least=True).kept
+    assert Number("n", None, "", "", 6).kept is None
+    assert Number("n", 0.4, "mm", "").limit_text == "–"
+
+
+@pytest.fixture(scope="module")
+def executable() -> str:
+    found = find_browser()
+    if found is None:
+        pytest.skip("no chromium here (apt-get install chromium)")
+    return found
+
+
+def test_a_browser_shows_the_body_and_turns_it(
+    scan: MadeScan, html: str, executable: str, tmp_path: Path
+):
+    with browser_page(executable, tmp_path / "profile") as page:
+        page.open(scan.folder / "report.html")
+        page.evaluate("document.querySelector('.stage').scrollIntoView()")
+        page.settle()
+        box = page.box("canvas")
+        before = page.picture(box)
+        top = page.evaluate("document.querySelector('canvas').getBoundingClientRect().y")
+        page.drag((box[0] + 0.5 * box[2], top + 0.5 * box[3]), (180.0, 0.0))
+        after = page.picture(box)
+        page.evaluate("document.querySelectorAll('.layers button')[4].click()")
+        page.settle()
+        filled = page.picture(box)
+        pdf = page.pdf()
+        requests, errors = page.requests, page.errors
+    assert [url for url in requests if not url.startswith(("data:", "file:"))] == []
+    assert len([url for url in requests if url.startswith("file:")]) == 1
+    assert [error for error in errors if "GPU stall" not in error] == []
+    assert coloured(before) > 10_000  # of 660,000: an egg that stands upright in the middle
+    assert moved(before, after) > 3_000
+    assert moved(after, filled) > 3_000
+    orange = np.all(np.abs(filled.astype(int) - [60, 160, 255]) < 90, axis=-1)
+    assert orange.sum() > 30
+    assert pdf.startswith(b"%PDF")
+
+
+def coloured(picture: np.ndarray) -> int:
+    """Pixels with a colour of their own: paper and words are grey, the egg is tinted."""
+    hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
+    return int(np.count_nonzero(hsv[..., 1] > 60))
+
+
+def moved(first: np.ndarray, second: np.ndarray) -> int:
+    """Pixels that differ visibly."""
+    return int(np.count_nonzero(np.abs(first.astype(int) - second).max(axis=-1) > 25))
