@@ -1,9 +1,9 @@
 """Other programs on the same corners: `python rig_rivals.py METHOD corners.npz found.npz`.
 
 Run as a script of its own, by whichever Python has the rival installed; needs numpy, scipy and OpenCV.
-corners.npz: pixels (C, F, N, 2), NaN where not seen; points (N, 3) mm; size (2,); matrices (C, 3, 3)
-and lenses (C, 5), each camera calibrated by itself.  found.npz: `camera_from_first` (C, 4, 4) and
-`seconds` (wall, CPU).
+corners.npz: pixels (C, F, N, 2), NaN where not seen; points (N, 3) mm; size (2,); grid (squares across,
+down, mm a square); matrices (C, 3, 3) and lenses (C, 5), each camera calibrated by itself.  found.npz:
+`camera_from_first` (C, 4, 4), `matrices` and `lenses` as the rival leaves them, `seconds` (wall, CPU).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import io
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import cv2
@@ -22,12 +23,14 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 Array = NDArray[np.float64]
 Corners = dict[str, Any]
+Found = tuple[Array, Array, Array]
+"""camera_from_first (C, 4, 4), matrices (C, 3, 3), lenses (C, 5)."""
 
 FEWEST = 8
 KEEP = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
 
 
-def opencv_multiview(corners: Corners) -> Array:
+def opencv_multiview(corners: Corners) -> Found:
     """OpenCV 5's calibrateMultiview, corners not seen marked as its manual says.
 
     It takes flat patterns only: each face of a two-faced board is a frame of its own.  Metres: it
@@ -46,7 +49,7 @@ def opencv_multiview(corners: Corners) -> Array:
     marked = np.where(seen[..., None], pixels, -1.0).astype(np.float32)
     printed = corners["points"].reshape(faces, front, 3).astype(np.float32) / 1000.0
     printed[..., 2] = 0.0
-    _, _, _, rotations, shifts = cv2.calibrateMultiview(
+    _, matrices, lenses, rotations, shifts = cv2.calibrateMultiview(
         [printed[f] for f in face],
         [list(marked[k]) for k in range(count)],
         [tuple(int(v) for v in corners["size"])] * count,
@@ -61,10 +64,11 @@ def opencv_multiview(corners: Corners) -> Array:
     )
     vectors = [np.asarray(r, float) for r in rotations]
     turns = [cv2.Rodrigues(r)[0] if r.size == 3 else r.reshape(3, 3) for r in vectors]
-    return _stacked(np.array(turns), 1000.0 * np.array(shifts, float).reshape(count, 3))
+    placings = _stacked(np.array(turns), 1000.0 * np.array(shifts, float).reshape(count, 3))
+    return placings, np.array(matrices, float), np.array([np.ravel(lens)[:5] for lens in lenses])
 
 
-def stereo_chain(corners: Corners) -> Array:
+def stereo_chain(corners: Corners) -> Found:
     """cv2.stereoCalibrate along the tree of the links with most corners in common."""
     pixels, seen = _seen(corners)
     common = np.einsum("afn,bfn->ab", seen.astype(float), seen.astype(float))
@@ -88,11 +92,14 @@ def stereo_chain(corners: Corners) -> Array:
             criteria=(cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9),
         )
         found[name] = _stacked(rotation[None], shift.reshape(1, 3))[0] @ found[first]
-    return found
+    return found, corners["matrices"], corners["lenses"]
 
 
-def aniposelib(corners: Corners) -> Array:
-    """aniposelib: its tree of poses, then its bundle adjustment with the board as constraint."""
+def aniposelib(corners: Corners, *, lenses_kept: bool = False) -> Found:
+    """aniposelib: its tree of poses, then its bundle adjustment with the board as constraint.
+
+    It refines one focal length, k1 and k2 (without extra_dist it sets k2 to nothing), or no lens.
+    """
     # Not a dependency of the project: see RIVALS_PYTHON in rig.py.
     from aniposelib.cameras import Camera, CameraGroup  # type: ignore[import-not-found]
     from aniposelib.utils import get_initial_extrinsics  # type: ignore[import-not-found]
@@ -122,6 +129,7 @@ def aniposelib(corners: Corners) -> Array:
             dist=corners["lenses"][k],
             size=tuple(int(v) for v in corners["size"]),
             name=str(k),
+            extra_dist=True,
         )
         for k in range(count)
     ]
@@ -138,17 +146,80 @@ def aniposelib(corners: Corners) -> Array:
     }
     twice = seen.reshape(count, -1).sum(axis=0) >= 2
     extra = {k: v[:, twice] if v.ndim == 3 else v[twice] for k, v in extra.items()}
-    group.bundle_adjust_iter(image_points[:, twice], extra, verbose=False)
+    group.bundle_adjust_iter(
+        image_points[:, twice], extra, only_extrinsics=lenses_kept, verbose=False
+    )
     matrices = [cv2.Rodrigues(np.asarray(c.get_rotation(), float))[0] for c in group.cameras]
     places = np.array([np.ravel(c.get_translation()) for c in group.cameras])
     camera_from_world = _stacked(np.array(matrices), places)
-    return camera_from_world @ np.linalg.inv(camera_from_world[0])
+    return (
+        camera_from_world @ np.linalg.inv(camera_from_world[0]),
+        np.array([c.get_camera_matrix() for c in group.cameras], float),
+        np.array([np.ravel(c.get_distortions())[:5] for c in group.cameras], float),
+    )
 
 
-METHODS: dict[str, Callable[[Corners], Array]] = {
+def caliscope(corners: Corners) -> Found:
+    """caliscope's whole pipeline: pairwise poses, bundle adjustment with the board's distances as
+    constraints, outliers out, once more.  Metres; boards with one face only."""
+    from caliscope.api import (  # type: ignore[import-not-found]
+        CameraArray,
+        CameraData,
+        Charuco,
+        ConstraintSet,
+        ImagePoints,
+        calibrate_extrinsics,
+    )
+    from pandas import DataFrame  # type: ignore[import-untyped]
+
+    pixels, seen = _seen(corners)
+    columns, rows, square = corners["grid"]
+    board = Charuco.from_squares(
+        columns=int(columns), rows=int(rows), square_size_cm=float(square) / 10.0
+    )
+    # Its constraints name corners as OpenCV's board does: row by row.
+    across, down = (np.round(corners["points"][:, k] / square).astype(int) - 1 for k in (0, 1))
+    names = down * (int(columns) - 1) + across
+    camera, frame, corner = np.nonzero(seen)
+    table = DataFrame(
+        {
+            "sync_index": frame,
+            "cam_id": camera,
+            "object_id": 0,
+            "keypoint_id": names[corner],
+            **{f"img_loc_{axis}": pixels[seen][:, k] for k, axis in enumerate("xy")},
+            **{f"obj_loc_{a}": corners["points"][corner, k] / 1e3 for k, a in enumerate("xyz")},
+        }
+    )
+    cameras = {
+        k: CameraData(
+            cam_id=k,
+            size=tuple(int(v) for v in corners["size"]),
+            matrix=corners["matrices"][k],
+            distortions=corners["lenses"][k],
+        )
+        for k in range(len(seen))
+    }
+    constraints = ConstraintSet.from_charuco(board)
+    run = calibrate_extrinsics(ImagePoints(table), CameraArray(cameras), constraints)
+    found = [run.capture_volume.camera_array.cameras[k] for k in range(len(seen))]
+    camera_from_world = _stacked(
+        np.array([c.rotation for c in found], float),
+        1000.0 * np.array([np.ravel(c.translation) for c in found], float),
+    )
+    return (
+        camera_from_world @ np.linalg.inv(camera_from_world[0]),
+        np.array([c.matrix for c in found], float),
+        np.array([np.ravel(c.distortions)[:5] for c in found], float),
+    )
+
+
+METHODS: dict[str, Callable[[Corners], Found]] = {
     "opencv-multiview": opencv_multiview,
     "stereo-chain": stereo_chain,
     "aniposelib": aniposelib,
+    "aniposelib-lenses-kept": partial(aniposelib, lenses_kept=True),
+    "caliscope": caliscope,
 }
 
 
@@ -167,11 +238,13 @@ def main() -> None:
     method, source, target = sys.argv[1:]
     with np.load(source) as stored:
         corners = {name: stored[name] for name in stored.files}
+    # aniposelib draws its samples from numpy's own generator.
+    np.random.seed(0)  # noqa: NPY002
     wall, cpu = time.perf_counter(), time.process_time()
     with contextlib.redirect_stdout(io.StringIO()):
-        found = METHODS[method](corners)
+        placings, matrices, lenses = METHODS[method](corners)
     seconds = np.array([time.perf_counter() - wall, time.process_time() - cpu])
-    np.savez(target, camera_from_first=found, seconds=seconds)
+    np.savez(target, camera_from_first=placings, matrices=matrices, lenses=lenses, seconds=seconds)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from bodyscan.calibration.rig import calibrate_cameras, find_all_boards, locate_views
 from bodyscan.capture.folder import Captures
 from bodyscan.capture.rig import Rig
+from bodyscan.capture.views import BoardView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
 from bodyscan.geometry.triangulation import triangulate
 from bodyscan.registration.board_shape import BoardShape
 from bodyscan.registration.located_view import LocatedView
-from bodyscan.registration.rig_solve import place_rig
+from bodyscan.registration.rig_solve import PlacedRig, place_rig
 
 Array = NDArray[np.float64]
 
@@ -82,26 +83,60 @@ def _off_board(corners: Array, points: Array) -> float:
     return float(np.sqrt(np.mean(np.sum((fitted - points) ** 2, axis=1))))
 
 
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """cameras: each calibrated by itself without the shots left out; `used` views of the others and
+    the rig placed by them; `left_out`: views of the shots left out."""
+
+    cameras: dict[str, Camera]
+    used: tuple[LocatedView, ...]
+    placed: PlacedRig
+    left_out: tuple[LocatedView, ...]
+
+
+def without_shots(rig: Rig, found: Sequence[BoardView], shots: Collection[str]) -> HeldOut:
+    """The rig calibrated by all views but those of `shots`.
+
+    Raises what `place_rig` raises.
+    """
+    boards = {board.name: board for board in rig.boards}
+    others = [view for view in found if view.shot not in shots]
+    calibrated, _ = calibrate_cameras(rig, others, boards)
+    views = locate_views(found, calibrated, boards, [])
+    used = tuple(view for view in views if view.shot not in shots)
+    cameras = {name: own.camera for name, own in calibrated.items()}
+    left_out = tuple(view for view in views if view.shot in shots)
+    return HeldOut(cameras, used, place_rig(rig, used, cameras), left_out)
+
+
+def triangulate_shots(
+    views: Sequence[LocatedView],
+    cameras: dict[str, Camera],
+    rig_from_camera: dict[str, RigidTransform],
+    shapes: Mapping[str, BoardShape],
+) -> list[FreeTriangulation]:
+    """The board of every shot that two or more cameras saw; shapes: by board's name."""
+    by_shot = {
+        shot: [view for view in views if view.shot == shot]
+        for shot in sorted({view.shot for view in views})
+    }
+    return [
+        triangulate_board(seen, cameras, rig_from_camera, shapes.get(seen[0].board))
+        for seen in by_shot.values()
+        if len(seen) >= 2
+    ]
+
+
 def leave_shots_out(rig: Rig, captures: Captures) -> list[FreeTriangulation]:
     """Each shot in turn left out of the joint solve, then its board triangulated by that rig."""
-    boards = {board.name: board for board in rig.boards}
     found = find_all_boards(rig, captures, [])
     results = []
     for shot in captures.shots:
-        others = [view for view in found if view.shot != shot]
-        calibrated, _ = calibrate_cameras(rig, others, boards)
-        views = locate_views(found, calibrated, boards, [])
-        placed = place_rig(
-            rig,
-            [view for view in views if view.shot != shot],
-            {name: c.camera for name, c in calibrated.items()},
+        held = without_shots(rig, found, [shot])
+        placed = held.placed
+        results += triangulate_shots(
+            held.left_out, placed.cameras, placed.rig_from_camera, placed.board_shapes
         )
-        left_out = [view for view in views if view.shot == shot]
-        if len(left_out) >= 2:
-            shape = placed.board_shapes.get(left_out[0].board)
-            results.append(
-                triangulate_board(left_out, placed.cameras, placed.rig_from_camera, shape)
-            )
     return results
 
 

@@ -109,6 +109,18 @@ def run_export(job: Job, out: Path, progress: Progress) -> None:
     progress("exporting", 1, 1)
 
 
+def run_report(job: Job, out: Path, progress: Progress) -> None:
+    """As `bodyscan report` does."""
+    from bodyscan.files import write_text
+    from bodyscan.report.page import render
+    from bodyscan.report.result import page_of
+
+    progress("reporting", 0, 1)
+    folder = job.folder / ("scan" if job.pipeline.kind == "fuse" else "calibration")
+    write_text(out / "report.html", render(page_of(folder)))
+    progress("reporting", 1, 1)
+
+
 def rig_inputs(job: Job) -> dict[str, Path]:
     """The rig file and the images of its calibration captures."""
     rig_file = job.source / RIG_FILE
@@ -152,10 +164,12 @@ KINDS: Kinds = {
     "fuse": (
         Stage("scan", 1, ("alignment", "fusion", "mesh"), scan_inputs, run_scan),
         Stage("export", 1, ("export",), results_of("scan"), run_export),
+        Stage("report", 1, (), results_of("scan"), run_report),
     ),
     "calibrate": (
         Stage("calibration", 1, (), rig_inputs, run_calibrate),
         Stage("rig", 1, ("rig_export",), results_of("calibration"), run_rig_export),
+        Stage("report", 1, (), results_of("calibration"), run_report),
     ),
 }
 

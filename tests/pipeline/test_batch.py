@@ -75,7 +75,7 @@ def test_good_scans_are_fused_and_bad_ones_are_named(day, night):
     good = {"anna", odd, "hurt"}
     assert {n for n, end in endings(second).items() if end["state"] == "done"} == good
     assert all(endings(first)[name]["stages"] == ["scan"] for name in good)
-    assert all(endings(second)[name]["stages"] == ["export"] for name in good)
+    assert all(endings(second)[name]["stages"] == ["export", "report"] for name in good)
     for name, said in {
         "laughs": "captures.yaml",
         "climbing": "shots[0].name",
@@ -91,6 +91,7 @@ def test_good_scans_are_fused_and_bad_ones_are_named(day, night):
     assert "cut short" in facts["failed"]["p1-2"]
     assert "60000 x 60000" in facts["failed"]["p1-3"]
     assert (day / "out" / "anna" / "export" / "body-light.glb").exists()
+    assert (day / "out" / "anna" / "report" / "report.html").exists()
 
 
 def test_the_table_has_a_row_for_every_scan(day, night):
@@ -111,7 +112,7 @@ def test_the_table_has_a_row_for_every_scan(day, night):
 
 def test_the_same_images_give_the_same_bytes(day, night):
     odd = next((day / "out").glob("q-*"))
-    for stage in ("scan", "export"):
+    for stage in ("scan", "export", "report"):
         one, other = (
             {p.name: file_hash(p) for p in files_below(day / "out" / job / stage)}
             for job in ("anna", odd.name)
