@@ -1,6 +1,6 @@
 """Run all benchmarks, or those named, and write what they print into docs/results.md.
 
-python -m benchmarks [three-pole | procam | charuco-ring] ...
+python -m benchmarks [three-pole | fusion | rig | procam | charuco-ring | codes | lens] ...
 """
 
 from __future__ import annotations
@@ -14,15 +14,19 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks import charuco_ring, procam, three_pole
+from benchmarks import charuco_ring, codes, fusion, lens, procam, rig, three_pole
 from bodyscan.files import write_text
 
 PROJECT = Path(__file__).parents[1]
 RESULTS = PROJECT / "docs" / "results.md"
 BENCHMARKS: dict[str, Callable[[], str]] = {
     "three-pole": three_pole.report,
+    "fusion": fusion.report,
+    "rig": rig.report,
     "procam": procam.report,
     "charuco-ring": charuco_ring.report,
+    "codes": codes.report,
+    "lens": lens.report,
 }
 
 

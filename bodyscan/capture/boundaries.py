@@ -10,6 +10,7 @@ from scipy.special import erfinv
 
 from bodyscan.capture.albedo_edges import Brightness
 from bodyscan.capture.gray_code import bit_that_flips
+from bodyscan.capture.indirect_light import imbalance
 from bodyscan.capture.stripe_images import ScanLines
 
 Floats = NDArray[np.float64]
@@ -22,6 +23,8 @@ LEAST_SIGMA_PX = 0.008
 """What blur that is not Gaussian and a sensor that is not quite linear leave, seen in tests."""
 
 MIN_STRIPE_PX = 0.2
+FARTHEST_PX = 1.0
+"""How far a boundary may lie from where the code changes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +54,14 @@ def find_boundaries(
     codes: NDArray[np.int32],
     usable: Mask,
     variance: NDArray[np.float32],
+    finest_run: int = 2,
 ) -> Boundaries:
     """All places where the code changes by one between two usable pixels of a line.
 
     Only one bit flips there. Its pattern minus its inverse, divided by lit minus dark (which takes
-    out most of the surface's own black and white), is an error function of the distance from the
-    boundary whatever the blur; the inverse error function makes it a straight line, whose zero is
-    the boundary. `variance` (256,) is that of each grey level.
+    out most of the surface's own black and white) and less its `imbalance`, is an error function of
+    the distance from the boundary whatever the blur; the inverse error function makes it a straight
+    line, whose zero is the boundary. variance: (256,) of each grey level.  finest_run: see `WordCode`.
     """
     change = np.diff(codes, axis=1)
     crossing = (np.abs(change) == 1) & usable[:, 1:] & usable[:, :-1]
@@ -67,9 +71,13 @@ def find_boundaries(
     index = np.maximum(codes.ravel()[at], codes.ravel()[at + 1]).astype(np.int64)
     bit = bit_that_flips(index, len(images.patterns))
     edges = brightness.at(at)
-    left, left_sigma = _straightened(images, variance, bit, at, edges.before)
-    right, right_sigma = _straightened(images, variance, bit, at + 1, edges.behind)
-    fraction = np.clip(left / (left - right), 0.0, 1.0)
+    clear = (index & -index) * finest_run // 2  # stripes: half the way to where the bit flips again
+    middle = imbalance(images, codes, usable, variance, bit, index, at, clear)
+    left, left_sigma = _straightened(images, variance, bit, at, edges.before, middle)
+    right, right_sigma = _straightened(images, variance, bit, at + 1, edges.behind, middle)
+    # The code changes where the difference is 0; the boundary may lie beyond these two pixels.
+    beyond = np.where(middle[0] != 0.0, FARTHEST_PX, 0.0)
+    fraction = np.clip(left / (left - right), -beyond, 1.0 + beyond)
     sigma = np.hypot((1.0 - fraction) * left_sigma, fraction * right_sigma)
     sigma = np.hypot(sigma / np.abs(left - right), LEAST_SIGMA_PX)
     position = before + fraction
@@ -101,14 +109,19 @@ def joined_to_next(line: Ints, before: Ints, position: Floats, index: Ints, usab
 
 
 def _straightened(
-    images: ScanLines, variance: NDArray[np.float32], bit: Ints, at: Ints, contrast: Floats
+    images: ScanLines,
+    variance: NDArray[np.float32],
+    bit: Ints,
+    at: Ints,
+    contrast: Floats,
+    middle: tuple[Floats, Floats],
 ) -> tuple[Floats, Floats]:
     """Distance from the boundary in units of sqrt(2) blurs (with a sign), and its sigma."""
     difference, noise = images.difference(bit, at, variance)
-    ratio = difference / contrast
+    ratio = difference / contrast - middle[0]
     scaled = (np.clip(ratio, -MAX_RATIO, MAX_RATIO) / MAX_RATIO + 1.0) * (TABLE_SIZE / 2)
     entry = np.rint(scaled).astype(np.int32)
-    return _STRAIGHT[entry], noise / contrast * _STRETCH[entry]
+    return _STRAIGHT[entry], np.hypot(noise / contrast, middle[1]) * _STRETCH[entry]
 
 
 _RATIOS = np.linspace(-MAX_RATIO, MAX_RATIO, TABLE_SIZE + 1)

@@ -54,6 +54,15 @@ class WordCode:
     single: bool
     doubt_px: float
 
+    @property
+    def finest_run(self) -> int:
+        """How many stripes wide those of the finest pattern are."""
+        return 2 if self.single else 1
+
+    def two_wide(self, bits: int) -> int:
+        """The bit whose stripes are two wide: Gray code's finest, and the plain code's next."""
+        return bits - 1 if self.single else max(bits - 2, 0)
+
 
 def _as_it_is(numbers: NDArray[Any]) -> NDArray[Any]:
     return numbers

@@ -57,9 +57,10 @@ def read(spec: ProjectorSpec, lit: Images, dark: Images | None, coded: Images) -
     """See `codes.read_code`."""
     words, waves = np.split(coded, [len(coded) - spec.phase_steps])
     images = bit_codes.bit_lines(spec, lit, dark, words)
-    halves = bit_codes.word_code(spec).stripes(bit_codes.checked_words(spec, images))
+    code = bit_codes.word_code(spec)
+    halves = code.stripes(bit_codes.checked_words(spec, images))
     variance = noise_variance(images)
-    usable = images.usable(halves, variance, spec.words)
+    usable = images.usable(halves, variance, spec.words, code.two_wide(spec.bits))
     waves = transposed(waves) if images.turned else waves
     _check_waves(images, waves, usable)
     turn, amplitude, middle = _wave(waves)

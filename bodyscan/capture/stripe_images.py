@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.capture.indirect_light import mostly_direct
 from bodyscan.capture.views import StripeMap
 
 if TYPE_CHECKING:
@@ -87,19 +88,23 @@ class ScanLines:
         difference = 2.0 * pattern.astype(np.float32) - lit - dark
         return difference, np.sqrt(4.0 * variance[pattern] + variance[lit] + variance[dark])
 
-    def usable(self, codes: NDArray[np.int32], variance: NDArray[np.float32], stripes: int) -> Mask:
+    def usable(
+        self, codes: NDArray[np.int32], variance: NDArray[np.float32], stripes: int, fine_bit: int
+    ) -> Mask:
         """(L, P): pixels whose stripes `codes` can be relied on.
 
         Not low contrast, saturation, codes that were not projected, pixels that the surface's rim
-        covers only in part, and pixels beside a jump of the code by more than one (a mixed pixel
-        at a depth jump is one). variance: (256,) of each grey level.
+        covers only in part, pixels beside a jump of the code by more than one (a mixed pixel at a
+        depth jump is one), and pixels that other surfaces light more than the projector does.
+        variance: (256,) of each grey level.  fine_bit: see `mostly_direct`.
         """
         noise = np.sqrt(variance)[cv2.max(self.lit, self.dark)]
         contrast = self.contrast
         usable = contrast >= np.maximum(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * noise)
         usable &= ~half_covered(contrast, usable)
         usable &= (self.lit < SATURATED) & (codes < stripes)
-        return usable & ~beside_jumps(codes, usable)
+        usable &= ~beside_jumps(codes, usable)
+        return usable & mostly_direct(self, usable, fine_bit, variance)
 
     def stripe_map(
         self,

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.capture.rig import FrameNames, ProjectorSpec
-from bodyscan.simulation.gray import PAD, LightTable, light_table, table_index
+from bodyscan.simulation.gray import LightTable, light_table, table_index
+from bodyscan.simulation.inter_reflection import LitFacets, lit_facets
+from bodyscan.simulation.lamps import Lamps, laser_light
 from bodyscan.simulation.lens import TrueCamera, sampled_directions
 from bodyscan.simulation.patterns import thrown
 from bodyscan.simulation.projector import Projector
-from bodyscan.simulation.scene import Hits, Scene, dot
+from bodyscan.simulation.scene import Hits, Scene
 from bodyscan.simulation.sensor import blurred, off_focus, shade, speckled
-from bodyscan.simulation.settings import Optics, Projection
+from bodyscan.simulation.settings import InterReflection, Optics, Projection
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -44,21 +47,6 @@ class View:
         return View(camera, optics, tuple(bands))
 
 
-@dataclass(frozen=True)
-class Lamps:
-    """How bright, and where it is sharp.
-
-    laser_grey: grey level of a white surface that faces the projector at reach_mm.
-    ambient_grey: what the room's own light makes of a white surface.
-    focus_mm: distance at which the projector and the camera are focused.
-    """
-
-    laser_grey: float
-    ambient_grey: float
-    reach_mm: float
-    focus_mm: float
-
-
 @dataclass(frozen=True, eq=False)
 class PixelTruth:
     """What lies at each pixel's centre. depth: (height, width) mm along z, NaN where nothing is.
@@ -81,6 +69,7 @@ def render_pair(
     frames: FrameNames | None = None,
     code: ProjectorSpec | None = None,
     sequence: bool = True,
+    inter_reflection: InterReflection | None = None,
 ) -> dict[str, Floats]:
     """Images without sensor noise, (height, width) float32 grey levels, by frame name.
 
@@ -95,6 +84,9 @@ def render_pair(
     shape = (view.camera.height, view.camera.width)
     laser = {name: np.zeros(shape, np.float32) for name in tables}
     ambient, depth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    between = None
+    if inter_reflection is not None and inter_reflection.facet_mm > 0:
+        between = _Between.of(scene, projector, lamps, projection, tables, inter_reflection)
     samples = view.optics.samples**2
     for rows, directions in view.bands:
         hits = scene.cast(directions)
@@ -104,6 +96,10 @@ def render_pair(
             laser[name][rows] = _pixels(weight, table.at(index), samples).reshape(-1, shape[1])
         white = np.full_like(s, lamps.ambient_grey)
         ambient[rows] = _pixels(hits.albedo, white, samples).reshape(-1, shape[1])
+        if between is not None:
+            albedo = _pixels(hits.albedo, np.ones_like(s), samples)
+            for name, light in between.at(hits, samples).items():
+                laser[name][rows] += (albedo * light).reshape(-1, shape[1])
         depth[rows] = hits.depth.reshape(-1, samples).min(axis=1).reshape(-1, shape[1])
     dark = "" if code.code == "stripe-index" else frames.dark if code.takes_dark else None
     if sequence and dark is not None:
@@ -117,29 +113,40 @@ def render_pair(
     }
 
 
+@dataclass(frozen=True, eq=False)
+class _Between:
+    """Light between surfaces. radiosity: (frames, facets) grey levels, in the order of `names`."""
+
+    names: tuple[str, ...]
+    facets: LitFacets
+    radiosity: Floats
+
+    @staticmethod
+    def of(
+        scene: Scene,
+        projector: Projector,
+        lamps: Lamps,
+        projection: Projection,
+        tables: Mapping[str, LightTable],
+        chosen: InterReflection,
+    ) -> _Between:
+        facets = lit_facets(scene, projector, lamps, chosen.facet_mm)
+        blur = _blur_rows(facets.samples, projection, lamps)
+        index = table_index(facets.s, projector.stripes, blur)
+        light = np.stack([facets.radiosity(table.at(index)) for table in tables.values()])
+        return _Between(tuple(tables), facets, light)
+
+    def at(self, hits: Hits, samples: int) -> dict[str, Floats]:
+        """By frame, what white pixels get (pixels,): it changes slowly, one sample of each tells."""
+        middle = Hits(*(getattr(hits, f.name)[samples // 2 :: samples] for f in fields(Hits)))
+        found = self.facets.irradiance(middle, self.radiosity)
+        return dict(zip(self.names, found, strict=True))
+
+
 def _pixels(weight: Floats, light: Floats, samples: int) -> Floats:
     """Mean over each pixel's samples of weight times light."""
     total = np.einsum("ij,ij->i", weight.reshape(-1, samples), light.reshape(-1, samples))
     return total * np.float32(1.0 / samples)
-
-
-def laser_light(
-    scene: Scene, hits: Hits, projector: Projector, lamps: Lamps
-) -> tuple[Floats, Floats]:
-    """Grey level that each hit would get from a lit stripe (cosine, 1/r^2, shadow), and its s."""
-    s = projector.stripe(hits.points)
-    reached = np.isfinite(hits.depth) & (s > -PAD) & (s < projector.stripes + PAD)
-    chosen = np.flatnonzero(reached)
-    points, normals = hits.points.take(chosen, axis=0), hits.normals.take(chosen, axis=0)
-    towards = projector.source(s[chosen]) - points
-    square, height = dot(towards, towards), dot(towards, normals)
-    front = height * dot(points, normals) < 0  # light and viewer are on the same side
-    cosine = np.abs(height) / np.sqrt(square * dot(normals, normals))
-    shadow = scene.shadowed(points, towards, hits.surface[chosen])
-    bright = np.float32(lamps.laser_grey * lamps.reach_mm**2) * cosine / square
-    weight = np.zeros(len(s), np.float32)
-    weight[chosen] = bright * (front & ~shadow) * hits.albedo[chosen]
-    return weight, s
 
 
 def pixel_truth(scene: Scene, camera: TrueCamera, projector: Projector) -> PixelTruth:

@@ -107,6 +107,39 @@ class Scene:
         points = directions * np.where(np.isfinite(depth), depth, np.float32(0.0))[:, None]
         return Hits(depth, points, normals, albedo, surface)
 
+    def places(self, number: int, triangles: NDArray[np.integer], uv: Floats) -> Hits:
+        """Places on one surface as if rays had met it there: its triangles (N,), and barycentric
+        coordinates (N, 2) on them."""
+        surface, finish = self.surfaces[number], self._finish[number]
+        corners = surface.vertices[surface.triangles[triangles]]
+        first, sides = corners[:, 0], corners[:, 1:] - corners[:, :1]
+        points = first + np.einsum("nk,nkc->nc", uv, sides)
+        normals = np.cross(sides[:, 0], sides[:, 1])
+        if finish.normals is not None:
+            normals = _spread(finish.normals, triangles, uv)
+        albedo = np.broadcast_to(finish.albedo_at(triangles, uv), len(points))
+        return Hits(
+            depth=points[:, 2].astype(np.float32),
+            points=points.astype(np.float32),
+            normals=normals.astype(np.float32),
+            albedo=albedo.astype(np.float32),
+            surface=np.full(len(points), number, np.uint32),
+        )
+
+    def joined(self, starts: Floats, ends: Floats) -> NDArray[np.bool_]:
+        """(N,) whether nothing stands between two places (N, 3) each that lie on surfaces."""
+        way = ends - starts
+        reach = np.maximum(np.sqrt(dot(way, way)), np.float32(3.0 * _LIFT_MM))
+        lift = (np.float32(_LIFT_MM) / reach)[:, None] * way
+        rays = np.concatenate([starts + lift, way - 2.0 * lift], axis=1)
+        hidden = self._rays.test_occlusions(
+            Tensor.from_numpy(np.ascontiguousarray(rays, np.float32)),
+            tnear=0.0,
+            tfar=1.0,
+            nthreads=_THREADS,
+        )
+        return np.asarray(~hidden.numpy())
+
     def shadowed(
         self, points: Floats, towards: Floats, surface: NDArray[np.uint32]
     ) -> NDArray[np.bool_]:
@@ -185,7 +218,7 @@ class _Finish:
         """Whether nothing varies over the surface."""
         return self.albedos is None and self.places is None and self.normals is None
 
-    def albedo_at(self, triangles: NDArray[np.uint32], uv: Floats) -> Floats | float:
+    def albedo_at(self, triangles: NDArray[np.integer], uv: Floats) -> Floats | float:
         if self.printed is not None and self.places is not None:
             return self.printed.albedo(_spread(self.places, triangles, uv))
         if self.albedos is not None:
@@ -193,7 +226,7 @@ class _Finish:
         return self.albedo
 
 
-def _spread(corners: Floats, triangles: NDArray[np.uint32], uv: Floats) -> Floats:
+def _spread(corners: Floats, triangles: NDArray[np.integer], uv: Floats) -> Floats:
     """Values (N, k) at barycentric coordinates uv (N, 2) of the triangles that were hit."""
     picked = corners.take(triangles, axis=0)
     return picked[:, 0] + uv[:, :1] * picked[:, 1] + uv[:, 1:] * picked[:, 2]

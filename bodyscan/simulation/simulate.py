@@ -19,9 +19,9 @@ from bodyscan.progress import Progress, silent
 from bodyscan.simulation import body, files
 from bodyscan.simulation.board import make_board
 from bodyscan.simulation.instrument import handed_out
+from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import TruePair, build_pairs
 from bodyscan.simulation.plan import default_shots, plan_boards
-from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.render import View, render_pair
 from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Scene, Surface

@@ -11,10 +11,11 @@ import pytest
 
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.simulation.gray import code_bits
+from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import build_mirror, build_pinhole
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector
-from bodyscan.simulation.render import Lamps, View, pixel_truth, render_pair
+from bodyscan.simulation.render import View, pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.sensor import blurred, expose
 from bodyscan.simulation.settings import Noise, Optics, Projection

@@ -18,10 +18,11 @@ from bodyscan.capture.rig import Board, ProjectorSpec
 from bodyscan.capture.views import StripeMap
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.simulation.board import MadeBoard, make_board
+from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import build_mirror
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector
-from bodyscan.simulation.render import Lamps, PixelTruth, View, pixel_truth, render_pair
+from bodyscan.simulation.render import PixelTruth, View, pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.sensor import expose
 from bodyscan.simulation.settings import (

@@ -1,0 +1,51 @@
+"""How bright the projector makes a surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.simulation.gray import PAD
+from bodyscan.simulation.projector import Projector
+from bodyscan.simulation.scene import Hits, Scene, dot
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Lamps:
+    """How bright, and where it is sharp.
+
+    laser_grey: grey level of a white surface that faces the projector at reach_mm.
+    ambient_grey: what the room's own light makes of a white surface.
+    focus_mm: distance at which the projector and the camera are focused.
+    """
+
+    laser_grey: float
+    ambient_grey: float
+    reach_mm: float
+    focus_mm: float
+
+
+def laser_light(
+    scene: Scene, hits: Hits, projector: Projector, lamps: Lamps, *, seen: bool = True
+) -> tuple[Floats, Floats]:
+    """Grey level that each hit would get from a lit stripe (cosine, 1/r^2, shadow), and its s.
+
+    seen: only where the light falls on the side that the camera sees.
+    """
+    s = projector.stripe(hits.points)
+    reached = np.isfinite(hits.depth) & (s > -PAD) & (s < projector.stripes + PAD)
+    chosen = np.flatnonzero(reached)
+    points, normals = hits.points.take(chosen, axis=0), hits.normals.take(chosen, axis=0)
+    towards = projector.source(s[chosen]) - points
+    square, height = dot(towards, towards), dot(towards, normals)
+    front = height * dot(points, normals) < 0  # light and viewer are on the same side
+    cosine = np.abs(height) / np.sqrt(square * dot(normals, normals))
+    shadow = scene.shadowed(points, towards, hits.surface[chosen])
+    bright = np.float32(lamps.laser_grey * lamps.reach_mm**2) * cosine / square
+    weight = np.zeros(len(s), np.float32)
+    weight[chosen] = bright * ((front | (not seen)) & ~shadow) * hits.albedo[chosen]
+    return weight, s
