@@ -12,7 +12,7 @@ from bodyscan.errors import BadInput
 
 def register(app: typer.Typer) -> None:
     """Add this module's commands to the command line."""
-    for command in (export_rig, sigma_map, check_calibration, reproduce):
+    for command in (export_rig, sigma_map, refine_rig, check_calibration, reproduce):
         app.command(command.__name__.replace("_", "-"))(command)
 
 
@@ -49,6 +49,42 @@ def sigma_map(
         raise BadInput("the map is drawn as PNG", where=str(path), remedy="name it .png")
     draw_sigma_map(rig.rig.volume, rig.rig_from_camera, cameras, rig.covariance, path)
     console.console.print(f"picture: {path}")
+
+
+def refine_rig(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="A scan of a rigid object that stood still.")
+    ],
+    calibration: Annotated[Path, typer.Option(help="What calibrate-rig wrote.")],
+    out: Annotated[Path, typer.Option(help="Folder for the refined calibration.")],
+) -> None:
+    """Bring the pairs closer together on an object they scanned, within what the boards allow."""
+    from dataclasses import replace
+
+    from bodyscan import console
+    from bodyscan.calibration.storage import load_calibration, save_calibration
+    from bodyscan.capture.folder import open_scan
+    from bodyscan.errors import FailedWork
+    from bodyscan.fusion.cleaning import clean
+    from bodyscan.reconstruction.pairs import range_images
+    from bodyscan.registration.object_refinement import refine_on_object
+
+    rig = load_calibration(calibration)
+    with console.stage_clock() as clock:
+        images, failed = range_images(rig, open_scan(rig.rig, folder), clock)
+        clock("aligning", 0, 1)
+        cleaned = clean(images, rig.rig_from_camera, rig.rig.volume)
+        seen = [image for image in cleaned if image.valid.any()]
+        found = refine_on_object(seen, rig.rig_from_camera, rig.covariance)
+        clock("aligning", 1, 1)
+    for name, reason in failed.items():
+        console.console.print(f"left out: {name}: {reason}", style="red", highlight=False)
+    console.console.print("\n".join(found.lines), highlight=False)
+    if not found.better:
+        raise FailedWork("the overlaps do not come closer: the calibration is better as it is")
+    notes = (*rig.notes, *(f"refined on {folder.name}: {line}" for line in found.lines))
+    refined = replace(rig, rig_from_camera=found.rig_from_camera, notes=notes)
+    console.console.print(f"calibration: {save_calibration(refined, out)}")
 
 
 def check_calibration(

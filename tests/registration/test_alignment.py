@@ -5,11 +5,13 @@ import open3d as o3d
 import pytest
 from ring import looking_at
 
+from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.triangulation import grid_normals
 from bodyscan.registration.alignment import AlignmentSettings, align
+from bodyscan.registration.object_refinement import refine_on_object
 from bodyscan.registration.uncertainty import PlacingCovariance
 
 CAMERA = Camera(380.0, 380.0, 0.0, 160.0, 128.0, 0.0, 0.0, 320, 256)
@@ -127,3 +129,16 @@ def test_sway_is_found_whatever_its_size(scanned, sway_mm):
         assert max(found.motion_mm.values()) > 0.5 * sway_mm
     else:
         assert max(found.motion_mm.values()) < 0.3
+
+
+def test_a_rig_is_refined_on_a_still_object(scanned):
+    images, truth = scanned
+    start = pushed(truth, 0.8, seed=2) | {"unseen": truth["p0"]}
+    prior = known_to(start, 0.8, 0.02)
+    refined = refine_on_object(images, start, prior)
+    assert refined.better
+    assert disagreement_mm({n: refined.rig_from_camera[n] for n in truth}, truth) < 0.3
+    assert refined.rig_from_camera["unseen"] is start["unseen"]
+    assert "mm RMS before" in refined.lines[0]
+    with pytest.raises(FailedWork, match="no two pairs"):
+        refine_on_object([i for i in images if i.pair in ("p0", "p2")], start, prior)
