@@ -63,6 +63,7 @@ def run_commands(
             workspace / "calibration",
             "--out",
             result,
+            "--overwrite",
         ],
         "export": [result, "--out", workspace / "export"],
         "evaluate": [workspace],

@@ -15,7 +15,10 @@ from bodyscan.jobs import commands as jobs
 from bodyscan.report import commands as reports
 
 app = typer.Typer(
-    add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, help=__doc__
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Calibrate a rig of projector-camera pairs and fuse its scans of a person into a body model.",
 )
 
 
@@ -28,6 +31,8 @@ def main() -> None:
     # Work is shared out by stages, in threads of their own; BLAS threads inside them only get in
     # each other's way (measured: 15 s instead of 1 s for twelve cameras on two cores).
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # What OpenCV warns of, we say in our own words, with the place in the rig file.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     os.umask(0o077)  # images and models of people are for their owner alone
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
@@ -40,17 +45,23 @@ def main() -> None:
         sys.exit(error.exit_code)
 
 
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"bodyscan {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
 def _options(
     debug: Annotated[
         bool, typer.Option("--debug", help="Show tracebacks (may stand anywhere).")
     ] = False,
-    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version."),
+    ] = False,
 ) -> None:
     """Calibrate a rig of projector-camera pairs and fuse its scans of a person into a body model."""
-    if version:
-        typer.echo(f"bodyscan {__version__}")
-        raise typer.Exit
 
 
 def _refuse_file(folder: Path | None) -> None:
@@ -191,6 +202,9 @@ def scan(
         Path | None,
         typer.Option(help="Captures of the rig with nobody in it: cut away what they show."),
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a result, with all that was made of it.")
+    ] = False,
     e57: Annotated[
         bool, typer.Option("--e57", help="Write each pair's raw cloud too: `raw.e57` (pye57).")
     ] = False,
@@ -202,10 +216,11 @@ def scan(
     from bodyscan.errors import ScanFailed
     from bodyscan.fusion.scan import ScanSettings, alignment_settings
     from bodyscan.fusion.scan import scan as fuse
-    from bodyscan.fusion.storage import save_failure, save_scan
+    from bodyscan.fusion.storage import clear, make_room, save_failure, save_scan
     from bodyscan.report.scan_pictures import draw_scan
 
     _refuse_file(out)
+    make_room(out or folder.with_name(f"{folder.name}-model"), overwrite)
     rig_calibration = load_calibration(calibration)
     captures = open_scan(rig_calibration.rig, folder)
     settings = ScanSettings(points, alignment_settings(align))
@@ -217,8 +232,10 @@ def scan(
         with console.stage_clock() as clock:
             result = fuse(rig_calibration, captures, settings, clock, empty=background)
     except ScanFailed as error:
+        clear(out)
         save_failure(error, out, calibration_id=origin, subject=subject, when=when)
         raise
+    clear(out)
     saved = save_scan(result, out, calibration_id=origin, subject=subject, when=when)
     if e57:
         from bodyscan.export.e57 import export_raw_clouds

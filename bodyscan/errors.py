@@ -21,6 +21,11 @@ class BodyscanError(Exception):
         return f"{text}\n  {self.remedy}" if self.remedy else text
 
 
+def plainly(error: BodyscanError) -> str:
+    """What went wrong and what to do, where the place is said already."""
+    return f"{error.what}\n  {error.remedy}" if error.remedy else error.what
+
+
 class BadInput(BodyscanError):
     """The input cannot be used as it is."""
 

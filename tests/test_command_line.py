@@ -56,3 +56,9 @@ def test_no_captures_is_named():
     done = bodyscan("check", RIGS / "three-pole-12.yaml")
     assert done.returncode == 2
     assert "captures/calibration" in done.stdout
+
+
+def test_the_version_needs_no_command():
+    done = bodyscan("--version")
+    assert done.returncode == 0
+    assert done.stdout.startswith("bodyscan ")

@@ -31,8 +31,9 @@ def boards_not_found(rig: Rig, views: Sequence[BoardView], images: int) -> list[
     """A line for each board that none of the images shows as the rig file describes it."""
     seen = {view.board for view in views}
     return [
-        f"{described(board)} was found in none of {images} images: check its columns, rows and kind "
-        "in the rig file against the board itself (they count squares, not corners)"
+        f"{described(board)} was found in none of {images} images: check it against the board "
+        "itself: kind, columns and rows (they count squares, not corners)"
+        + (", dictionary, and square_mm against marker_mm" if board.marker_mm else "")
         for board in rig.boards
         if board.name not in seen and images
     ]
@@ -70,7 +71,7 @@ def size_doubt(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> list[
         for a, b in combinations(sorted(set(nominal) & set(rig_from_camera)), 2)
         if np.linalg.norm(nominal[a] - nominal[b]) > LEAST_APART_MM
     ]
-    if len(ratios) < 3 or abs(float(np.median(ratios)) - 1.0) < OTHER_SIZE:
+    if not ratios or abs(float(np.median(ratios)) - 1.0) < OTHER_SIZE:
         return []
     ratio = float(np.median(ratios))
     boards = ", ".join(f"{board.name}: {board.square_mm:g}" for board in rig.boards)

@@ -21,7 +21,7 @@ from bodyscan.calibration.pair import (
 from bodyscan.calibration.refinement_choice import refine_where_better
 from bodyscan.calibration.stripe_agreement import Disagreement, boards_off, find_disagreement
 from bodyscan.capture.rig import Rig
-from bodyscan.errors import BodyscanError, PairFailed
+from bodyscan.errors import BodyscanError, PairFailed, plainly
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.registration.located_view import LocatedView
 from bodyscan.registration.rig_solve import PlacedRig
@@ -47,7 +47,7 @@ def calibrate_pairs(
                 rig, name, cameras[name], placed, boundaries, own_notes
             ), own_notes
         except BodyscanError as error:
-            return str(error), own_notes
+            return plainly(error), own_notes
 
     names = sorted(cameras)
     results = threaded(calibrate, names, stage="fitting light sheets", progress=progress)

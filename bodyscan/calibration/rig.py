@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from bodyscan.calibration.board_doubts import boards_not_found, size_doubt, what_was_found
+from bodyscan.calibration.board_stripes import decode_on_boards
 from bodyscan.calibration.camera import (
     CameraCalibration,
     PlanarView,
@@ -14,9 +15,7 @@ from bodyscan.calibration.camera import (
 )
 from bodyscan.calibration.coverage import coverage_notes
 from bodyscan.calibration.pair import (
-    BoardBoundaries,
     PairCalibration,
-    boundaries_near,
     planar_view,
     usable,
 )
@@ -24,14 +23,13 @@ from bodyscan.calibration.pairs import calibrate_pairs
 from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.calibration.seen_corners import seen_corners
 from bodyscan.capture.boards import corner_points
-from bodyscan.capture.decoding import decode_sequence
 from bodyscan.capture.detection import find_boards
 from bodyscan.capture.folder import Captures
 from bodyscan.capture.folder import Sequence as ImageSequence
 from bodyscan.capture.images import read_lit
 from bodyscan.capture.rig import Board, Rig
 from bodyscan.capture.views import BoardView
-from bodyscan.errors import BodyscanError, FailedWork
+from bodyscan.errors import BadInput, BodyscanError, FailedWork
 from bodyscan.evaluation.rig_halves import compare_halves
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.registration.advice import advise
@@ -54,21 +52,28 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
     notes += boards_not_found(rig, views, len(captures.sequences))
     cameras, failed = calibrate_cameras(rig, views, boards, progress)
     if not cameras:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
-        raise FailedWork(
-            f"no pair could be calibrated ({reasons})",
-            where=f"rig {rig.name}",
-            remedy=what_was_found(rig, views, len(captures.sequences)),
-        )
+        remedy = what_was_found(rig, views, len(captures.sequences))
+        raise _nothing_calibrated(rig, failed, remedy)
     progress("joining the pairs", 0, 1)
     located = locate_views(views, cameras, boards, notes)
-    placed = place_rig(rig, located, {name: c.camera for name, c in cameras.items()})
+    try:
+        placed = place_rig(rig, located, {name: c.camera for name, c in cameras.items()})
+    except BadInput as error:
+        # The board or pair that fixes the frame may be missing because pairs failed before.
+        before = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
+        remedy = f"{error.remedy}\n  left out before: {before}" if before else error.remedy
+        raise BadInput(error.what, where=error.where, remedy=remedy) from error
     failed |= placed.left_out
     notes += size_doubt(rig, placed.rig_from_camera)
     cameras = {name: own for name, own in cameras.items() if name in placed.rig_from_camera}
     progress("joining the pairs", 1, 1)
-    boundaries = decode_on_boards(rig, captures, placed, views, notes, progress)
-    pairs = calibrate_pairs(rig, cameras, placed, boundaries, failed, notes, progress)
+    decoded = decode_on_boards(rig, captures, placed, views, progress)
+    notes += decoded.notes
+    failed |= decoded.failed
+    cameras = {name: own for name, own in cameras.items() if name not in failed}
+    pairs = calibrate_pairs(rig, cameras, placed, decoded.boundaries, failed, notes, progress)
+    if not pairs:
+        raise _nothing_calibrated(rig, failed)
     for pair in pairs.values():
         placed = placed_again(rig, placed, pair)
     return RigCalibration(
@@ -79,8 +84,15 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
         placed.rig_from_board,
         failed,
         (*notes, *placed.notes),
-        (*advice_on(rig, placed, progress), *through_the_stripes(pairs)),
+        (*(advice_on(rig, placed, progress) if not failed else ()), *through_the_stripes(pairs)),
         seen_corners(placed, pairs),
+    )
+
+
+def _nothing_calibrated(rig: Rig, failed: Mapping[str, str], remedy: str = "") -> FailedWork:
+    reasons = "".join(f"\n  {name}: {reason}" for name, reason in failed.items())
+    return FailedWork(
+        f"no pair could be calibrated:{reasons}", where=f"rig {rig.name}", remedy=remedy
     )
 
 
@@ -212,39 +224,3 @@ def locate_views(
             )
         )
     return located
-
-
-def decode_on_boards(
-    rig: Rig,
-    captures: Captures,
-    placed: PlacedRig,
-    views: Sequence[BoardView],
-    notes: list[str],
-    progress: Progress = silent,
-) -> dict[tuple[str, str, str], BoardBoundaries]:
-    """Stripe boundaries near each board, by (pair, shot, board); bad sequences go into `notes`."""
-    kept = {(view.pair, view.shot, view.board) for view in placed.views}
-    wanted: dict[tuple[str, str], list[BoardView]] = {}
-    for view in views:
-        if (view.pair, view.shot, view.board) in kept:
-            wanted.setdefault((view.pair, view.shot), []).append(view)
-    sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
-
-    def decode(sequence: ImageSequence) -> dict[tuple[str, str, str], BoardBoundaries] | str:
-        try:
-            stripes = decode_sequence(sequence, rig.pair(sequence.pair))
-        except BodyscanError as error:
-            return str(error)
-        return {
-            (view.pair, view.shot, view.board): boundaries_near(stripes, view)
-            for view in wanted[sequence.pair, sequence.shot]
-        }
-
-    results = threaded(decode, sequences, stage="decoding stripes", progress=progress)
-    notes += [result for result in results if isinstance(result, str)]
-    return {
-        key: found
-        for result in results
-        if not isinstance(result, str)
-        for key, found in result.items()
-    }

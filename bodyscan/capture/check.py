@@ -17,6 +17,9 @@ from bodyscan.capture.strangers import strange_images
 from bodyscan.errors import CaptureError
 
 FEWEST_SHOTS = 3
+ENOUGH_SHOTS = 6
+MANY_SHOTS = 3
+"""Where more shots than this have the same fault, they share a line."""
 _READERS = 8  # waiting for a disk or a server, not computing
 
 
@@ -91,6 +94,7 @@ def check(rig_path: Path, scans: Iterable[Path] = ()) -> CheckReport:
         errors += filter(None, map(_too_few, rig.pairs, counts))
     warnings = [] if rig.calibration else [f"{rig_path}: names no calibration captures"]
     warnings += filter(None, map(_strangers, captures))
+    warnings += filter(None, map(_few, rig.pairs, counts)) if calibration else ()
     return CheckReport(
         rig_path=Path(rig_path),
         rig=rig,
@@ -168,6 +172,14 @@ def _too_few(pair: Pair, count: PairCount) -> str | None:
     )
 
 
+def _few(pair: Pair, count: PairCount) -> str | None:
+    """Enough to calibrate, hardly enough to trust it."""
+    have = count.stripe_shots + (0 if pair.projector else count.lit_shots)
+    if not FEWEST_SHOTS <= have < ENOUGH_SHOTS:
+        return None
+    return f"pair {pair.name}: {have} board poses will do, {ENOUGH_SHOTS} or more are better"
+
+
 def _empty_shots(captures: Captures) -> list[str]:
     taken = {sequence.shot for sequence in captures.sequences}
     return [shot for shot in captures.shots if shot not in taken]
@@ -193,12 +205,22 @@ def _frame_errors(calibration: Captures) -> list[str]:
 
 
 def _bad_lines(bad: tuple[BadImage, ...]) -> list[str]:
-    """One line a pair, shot and fault, with the first file of each; same faults in a row joined."""
+    """One line a pair, shot and fault, with the first file of each; one a pair and fault where many
+    shots have it."""
+    shots_of: dict[tuple[str, str], set[str]] = {}
+    for image in bad:
+        shots_of.setdefault((image.pair, image.what), set()).add(image.shot)
+
+    def key(image: BadImage) -> tuple[str, str, str]:
+        shots = shots_of[image.pair, image.what]
+        where = f"{len(shots)} shots" if len(shots) > MANY_SHOTS else f"shot {image.shot}"
+        return image.pair, where, image.what
+
     lines = []
-    for (pair, shot, what), group in groupby(bad, key=lambda b: (b.pair, b.shot, b.what)):
+    for (pair, where, what), group in groupby(sorted(bad, key=key), key=key):
         files = [image.path for image in group]
         rest = f" and {len(files) - 1} more" if len(files) > 1 else ""
-        lines.append(f"error: pair {pair}, shot {shot}: {files[0]}{rest}: {what}")
+        lines.append(f"error: pair {pair}, {where}: {files[0]}{rest}: {what}")
     return lines
 
 

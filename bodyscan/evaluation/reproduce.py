@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-SEEDS, STAGE_STOPS, SAMPLES = 50, 7, 5
+SEEDS, STAGE_STOPS, SAMPLES = 250, 7, 5
 QUICK_SEEDS, QUICK_STAGE_STOPS, QUICK_SAMPLES = 5, 3, 3
 FIGURES = ("fig6-projector.png", "fig7-range-data.png")
 TEXT = "reproduction.md"

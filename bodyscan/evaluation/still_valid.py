@@ -23,6 +23,9 @@ class Findings:
 
     @property
     def valid(self) -> bool:
+        """Whether the rig is known to be what it was; False where a check cannot tell."""
+        if isinstance(self.check, ScanCheck) and not self.check.decided:
+            return self.check.quiet
         return self.check.valid
 
     def repaired(self, calibration: RigCalibration) -> RigCalibration:
@@ -39,6 +42,8 @@ class Findings:
                 remedy="only a new calibration of that pair mends this: capture the stripes on the "
                 "board again and run calibrate-rig",
             )
+        if not self.check.drift.moves:
+            raise FailedWork("nothing moved: there is nothing to repair")
         return repaired(calibration, self.check.drift.moves)
 
 
@@ -83,7 +88,7 @@ def _of_boards(check: BoardCheck) -> Findings:
     said = [
         "valid: all that see the board agree"
         if check.valid
-        else "NOT valid: calibrate again, or mend it with --repair"
+        else "NOT valid: something moved; --repair writes a calibration with that put right"
     ]
     said += [move_line(move) for move in drift.moves]
     said += [
@@ -117,17 +122,20 @@ def _of_scans(check: ScanCheck) -> Findings:
         said = ["valid: no pair moves the same way in all scans"]
     else:
         said = [
-            f"undecided: {len(check.before_mm)} scans cannot tell a moved pair from a person's sway; "
-            "give three or more, or a shot of the board"
+            f"undecided: from {_scans(check)} a moved pair cannot be told from a person's sway; give "
+            "three scans or more, or a shot of the board"
         ]
         if check.quiet:
             said = ["valid: all pairs see the same surface, and alignment moves none of them"]
     for drift in moved:
         said.append(f"{drift.pair}: {drift.shift_mm:.2f} mm (sigma {drift.sigma_mm:.2f})")
     before, after = max(check.before_mm), max(check.after_mm)
-    said.append(
-        f"overlaps of {len(check.before_mm)} scans: {before:.2f} mm RMS at most, {after:.2f} aligned"
-    )
+    said.append(f"overlaps in {_scans(check)}: {before:.2f} mm RMS at most, {after:.2f} aligned")
     farthest = max(check.pairs, key=lambda drift: drift.shift_mm)
     said.append(f"most moved on average: {farthest.pair}, {farthest.shift_mm:.2f} mm")
     return Findings(check, tuple(said))
+
+
+def _scans(check: ScanCheck) -> str:
+    count = len(check.before_mm)
+    return "1 scan" if count == 1 else f"{count} scans"

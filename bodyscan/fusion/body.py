@@ -39,3 +39,10 @@ class BodyMesh:
     colours: NDArray[np.uint8]
     sigma_mm: NDArray[np.float32]
     filled: NDArray[np.bool_]
+
+    @property
+    def filled_share(self) -> float:
+        """Share of the surface's area that was made up."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        return float(area[self.filled].sum() / area.sum()) if area.any() else 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -23,6 +24,10 @@ SCHEMA = "bodyscan-scan"
 VERSION = 1
 FILE_NAME = "scan.json"
 CLOUD_NAME, MESH_NAME = "cloud.ply", "mesh.ply"
+DERIVED = (
+    *(CLOUD_NAME, MESH_NAME, "raw.e57", "report.html", "measurements.json", "export", "shared"),
+    *("cloud.png", "sigma.png", "pairs.png", "mesh.png", "*-deviation.png"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +37,31 @@ class StoredScan:
     cloud: BodyCloud
     mesh: BodyMesh
     facts: dict[str, Any]
+
+
+def make_room(folder: Path, overwrite: bool) -> None:
+    """Raises ResultError if a model lies in `folder` already and may not be replaced."""
+    if (folder / FILE_NAME).exists() and (folder / CLOUD_NAME).exists() and not overwrite:
+        raise ResultError(
+            "a scan's result lies here already",
+            where=str(folder),
+            remedy="give another --out, or say --overwrite: it and all that was made of it go",
+        )
+
+
+def clear(folder: Path) -> None:
+    """Remove a result and what was made of it: nothing of one person stays beside another's.
+
+    A folder that holds no result is left as it is.
+    """
+    if not (folder / FILE_NAME).exists():
+        return
+    for pattern in (FILE_NAME, *DERIVED):
+        for path in folder.glob(pattern):
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
 
 
 def save_scan(
@@ -56,6 +86,7 @@ def save_scan(
                 "vertices": len(scan.mesh.vertices),
                 "faces": len(scan.mesh.faces),
                 "filled_faces": int(np.count_nonzero(scan.mesh.filled)),
+                "filled_share": scan.mesh.filled_share,
             },
             "median_sigma_mm": float(np.nanmedian(scan.cloud.sigma_mm)),
             "verdict": asdict(scan.verdict),

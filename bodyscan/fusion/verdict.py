@@ -158,7 +158,7 @@ def _contacts(mesh: BodyMesh) -> Iterator[Finding]:
 def _unmeasured(mesh: BodyMesh) -> Iterator[Finding]:
     """The made-up share of all, and of each height."""
     area = face_areas(mesh.vertices, mesh.faces)
-    filled = float(area[mesh.filled].sum() / area.sum())
+    filled = mesh.filled_share
     if filled > SOME_FILLED:
         yield (
             "repeat" if filled > MOST_FILLED else "usable",

@@ -13,6 +13,8 @@ from bodyscan.jobs.job import Job, job_name
 from bodyscan.jobs.pipeline import Pipeline
 
 CALIBRATION = "calibration.json"
+RESULTS = (CALIBRATION, "scan.json")
+"""Folders with one of these hold what bodyscan wrote, not what a camera did."""
 RIG_FILE = "rig.yaml"
 
 
@@ -43,7 +45,7 @@ def _job(path: Path, pipeline: Pipeline, out: Path, calibration: Path | None, un
 
 
 def _scans(scans: Path, out: Path) -> list[Path]:
-    """Every folder but hidden ones, results, and captures that say they are no scan.
+    """Every folder but hidden and empty ones, results, and captures that say they are no scan.
 
     A folder that cannot be read as a scan is still a job: it must be said that it failed.
     """
@@ -52,7 +54,9 @@ def _scans(scans: Path, out: Path) -> list[Path]:
     return [
         path
         for path in _folders(scans, out)
-        if not (path / CALIBRATION).exists() and _said(path).get("kind") != "calibration"
+        if not any((path / name).exists() for name in RESULTS)
+        and any(path.iterdir())
+        and _said(path).get("kind") != "calibration"
     ]
 
 

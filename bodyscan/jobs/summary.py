@@ -95,11 +95,11 @@ def _scan_figures(facts: Mapping[str, Any]) -> dict[str, Any]:
     verdict = facts.get("verdict") or {}
     figures = {
         "verdict": verdict.get("grade"),
-        "verdict_reasons": "; ".join(verdict.get("reasons", ())),
+        "verdict_reasons": "; ".join(" ".join(r.split()) for r in verdict.get("reasons", ())),
         "when": facts["when"],
         "points": counts["points"],
         "faces": counts["faces"],
-        "coverage_percent": _rounded(100.0 * (1.0 - counts["filled_faces"] / counts["faces"]), 2),
+        "coverage_percent": _rounded(100.0 * (1.0 - counts["filled_share"]), 2),
         "sigma_mm": _rounded(facts["median_sigma_mm"]),
         "pairs_measured": sum(points > 0 for points in facts["measured"].values()),
         "pairs_failed": " ".join(sorted(facts["failed"])),

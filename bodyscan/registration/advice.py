@@ -24,6 +24,8 @@ from bodyscan.registration.rig_solve import PlacedRig
 from bodyscan.registration.uncertainty import point_covariance, position_sigma
 from bodyscan.registration.view_graph import Target, view_graph
 
+WORTH = 0.8
+"""Further shots that leave more than this share of a sigma are not worth taking."""
 WEAK_TIMES = 2.0
 """A link is weak if its sigma is so many times that of the usual link of the best chain."""
 
@@ -211,11 +213,31 @@ def _between(knowledge: Knowledge, place: BoardPlace, pair: str, shots: int) -> 
     return min(combinations(place.seen_by, 2), key=left)
 
 
+def _facing(degrees: float) -> str:
+    """In words; x is the way the subject faces, y the subject's left."""
+    ways = (
+        "front",
+        "front left",
+        "left",
+        "back left",
+        "back",
+        "back right",
+        "right",
+        "front right",
+    )
+    return f"the subject's {ways[round(degrees / 45.0) % 8]}"
+
+
 def _shots(count: int) -> str:
     return "1 shot" if count == 1 else f"{count} shots"
 
 
 def _sentence(more: MoreShots) -> str:
+    if more.after_mm > WORTH * more.before_mm:
+        return (
+            f"no further shots of this board would help {more.pair} much: {more.shots} more bring "
+            f"{more.before_mm:.3f} to {more.after_mm:.3f} mm"
+        )
     a, b = more.between
     place = more.place
     x, y, z = place.centre_mm
@@ -229,7 +251,7 @@ def _sentence(more: MoreShots) -> str:
     return (
         f"{more.shots} more {'shot' if more.shots == 1 else 'shots'} seen by both {a} and {b}{also}, "
         f"board at {place.height} height "
-        f"(middle at {x:.0f}, {y:.0f}, {z:.0f} mm, facing {place.facing_deg:.0f} degrees from the "
-        f"rig's x axis to its y axis, tilted this way and that), {effect}: {more.before_mm:.3f} to "
+        f"(middle at {x:.0f}, {y:.0f}, {z:.0f} mm, facing {_facing(place.facing_deg)}, tilted this way "
+        f"and that), {effect}: {more.before_mm:.3f} to "
         f"{more.after_mm:.3f} mm"
     )

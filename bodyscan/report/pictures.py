@@ -271,17 +271,27 @@ def _dot_size(points: Array) -> float:
 
 
 def _bar(scale: Scale, height_px: int) -> Image:
-    """A colour bar with its ends, its middle and its caption."""
+    """A colour bar with round numbers beside it, and its caption."""
     panel = np.full((height_px, 130, 3), BACKGROUND, np.uint8)
     top, bottom = height_px // 6, height_px - height_px // 6
     ramp = scale.table[np.linspace(255, 0, bottom - top).astype(np.uint8)]
     panel[top:bottom, 20:50] = ramp[:, None]
-    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+    for value in round_ticks(scale.low, scale.high):
+        share = (value - scale.low) / (scale.high - scale.low)
         row = round(bottom - share * (bottom - top))
-        value = scale.low + share * (scale.high - scale.low)
-        _write(panel, f"{value:.3g}", (56, row + 5))
+        panel[row, 50:54] = INK
+        _write(panel, f"{value:g}", (58, row + 5))
     _write(panel, scale.caption, (8, top - 20))
     return panel
+
+
+def round_ticks(low: float, high: float) -> list[float]:
+    """Three to six round numbers from low to high; whole ones where they reach far enough."""
+    rough = (high - low) / 5.0
+    unit = 10.0 ** np.floor(np.log10(rough))
+    step = next(unit * times for times in (1.0, 2.0, 5.0, 10.0) if unit * times >= rough * 0.999)
+    first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
+    return [float(np.round(k * step, 10)) for k in np.arange(first, last + 1)]
 
 
 def _write(panel: Image, text: str, corner: tuple[int, int]) -> None:

@@ -14,7 +14,7 @@ from bodyscan.errors import ResultError
 from bodyscan.evaluation.surface import Deviation
 from bodyscan.fusion import verdict as limits
 from bodyscan.fusion.storage import FILE_NAME, SCHEMA, StoredScan, load_scan
-from bodyscan.fusion.topology import face_areas, topology
+from bodyscan.fusion.topology import topology
 from bodyscan.report import charts
 from bodyscan.report.body_model import layers, light_mesh, shape_of
 from bodyscan.report.comparison import Comparison, compare
@@ -117,8 +117,7 @@ def _viewer(scan: StoredScan, shown: Comparison | None, limit: float) -> Viewer 
 
 def _numbers(scan: StoredScan) -> Numbers:
     facts, mesh = scan.facts, scan.mesh
-    area = face_areas(mesh.vertices, mesh.faces)
-    made_up = 100.0 * float(area[mesh.filled].sum() / area.sum())
+    made_up = 100.0 * mesh.filled_share
     largest = next((hole.area_mm2 / 100.0 for hole in holes(mesh)), 0.0)
     shape = topology(mesh.vertices, mesh.faces)
     items = [

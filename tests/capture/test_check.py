@@ -197,3 +197,19 @@ def test_images_of_shots_that_are_not_wanted_are_left_alone(rig_path: Path) -> N
     folder = rig_path.parent / "captures"
     shutil.copytree(folder / "b2", rig_path.parent / "captures" / "elsewhere" / "b9")
     assert lines_with(rig_path, "spelt differently") == []
+
+
+def test_few_poses_are_warned_of(rig_path: Path) -> None:
+    warnings = lines_with(rig_path, "or more are better")
+    assert len(warnings) == 3
+    assert "pair p1: 3 board poses" in warnings[0]
+
+
+def test_the_same_fault_in_many_shots_is_one_line(rig_path: Path) -> None:
+    captures = rig_path.parent / "captures"
+    for shot in ("b4", "b5"):
+        shutil.copytree(captures / "b2", captures / shot)
+    shots = [path.unlink() for path in captures.glob("b*/p1/lit.png")]
+    (line,) = lines_with(rig_path, "error: pair p1, ")
+    assert f"{len(shots)} shots: " in line
+    assert f"and {len(shots) - 1} more" in line

@@ -38,7 +38,7 @@ def day(make_scans, tmp_path):
         shifts = {"a": rng.normal(0, 0.5, 3), "b": rng.normal(0, 0.5, 3) + [0, 0.5 * number, 0]}
         facts = {
             "when": f"2026-11-21T{10 + number}:00:00",
-            "counts": {"points": 10, "faces": 200, "filled_faces": 15},
+            "counts": {"points": 10, "faces": 200, "filled_faces": 15, "filled_share": 0.075},
             "median_sigma_mm": 0.02,
             "measured": {"a": 9, "b": 0},
             "failed": {},

@@ -8,7 +8,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from conftest import run
+from small_workspace import run
 
 from bodyscan.calibration.rig import calibrate_cameras, find_all_boards
 from bodyscan.calibration.storage import load_calibration

@@ -10,7 +10,7 @@ import zlib
 from pathlib import Path
 
 import pytest
-from conftest import PROJECT, run
+from small_workspace import PROJECT, run
 
 from bodyscan.jobs.hashing import file_hash, files_below
 

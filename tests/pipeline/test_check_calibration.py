@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import run
+from small_workspace import run
 
 from bodyscan.calibration.storage import load_calibration, save_calibration
 from bodyscan.evaluation.scan_check import judge_scans
@@ -64,7 +64,7 @@ def test_a_scan_of_a_person_is_checked_too(workspace):
     person = workspace.folder / "captures" / "person"
     result = run("check-calibration", person, "--calibration", workspace.folder / "calibration")
     assert result.exit_code == 0, result.output
-    assert "overlaps of 1 scans" in result.output
+    assert "overlaps in 1 scan:" in result.output
 
 
 def test_boards_and_people_are_not_mixed(workspace, board_shots):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from conftest import PROJECT, run
+from small_workspace import PROJECT, run
 
 from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.calibration.storage import load_calibration

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from conftest import PROJECT, run
+from small_workspace import PROJECT, run
 
 from bodyscan.calibration.storage import load_calibration
 

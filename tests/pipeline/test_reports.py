@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import run
+from small_workspace import run
 
 from bodyscan.calibration.storage import load_calibration, save_calibration
 from bodyscan.evaluation.acceptance_file import load_acceptance

@@ -12,7 +12,7 @@ import pytest
 
 from bodyscan.fusion.body import BodyCloud, BodyMesh
 from bodyscan.fusion.topology import vertex_normals
-from bodyscan.report.pictures import View, draw_cloud, draw_deviation, draw_mesh
+from bodyscan.report.pictures import View, draw_cloud, draw_deviation, draw_mesh, round_ticks
 
 RADIUS = 100.0
 CENTRE = np.array([5.0, 7.0, 900.0])
@@ -162,3 +162,16 @@ def test_unknown_colours_are_refused(tmp_path: Path):
         draw_mesh(ball(), tmp_path / "m.png", colour="pink")
     with pytest.raises(ValueError, match="pink"):
         draw_cloud(dots(100), tmp_path / "c.png", colour="pink")
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "ticks"),
+    [
+        (0.0, 6.0, [0, 2, 4, 6]),
+        (0.0, 0.137, [0, 0.05, 0.1]),
+        (-0.3, 0.3, [-0.2, 0, 0.2]),
+        (1.0, 4.0, [1, 2, 3, 4]),
+    ],
+)
+def test_colour_bars_have_round_numbers(low, high, ticks):
+    assert round_ticks(low, high) == pytest.approx(ticks)
