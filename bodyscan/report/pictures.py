@@ -291,7 +291,7 @@ def round_ticks(low: float, high: float) -> list[float]:
     unit = 10.0 ** np.floor(np.log10(rough))
     step = next(unit * times for times in (1.0, 2.0, 5.0, 10.0) if unit * times >= rough * 0.999)
     first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
-    return [float(np.round(k * step, 10)) for k in np.arange(first, last + 1)]
+    return [float(np.round(k * step, 10)) + 0.0 for k in np.arange(first, last + 1)]
 
 
 def _write(panel: Image, text: str, corner: tuple[int, int]) -> None:

@@ -175,3 +175,4 @@ def test_unknown_colours_are_refused(tmp_path: Path):
 )
 def test_colour_bars_have_round_numbers(low, high, ticks):
     assert round_ticks(low, high) == pytest.approx(ticks)
+    assert "-0.0" not in map(str, round_ticks(low, high))
