@@ -45,7 +45,7 @@ def _job(path: Path, pipeline: Pipeline, out: Path, calibration: Path | None, un
 
 
 def _scans(scans: Path, out: Path) -> list[Path]:
-    """Every folder but hidden and empty ones, results, and captures that say they are no scan.
+    """Every folder but hidden ones, results, and captures that say they are no scan.
 
     A folder that cannot be read as a scan is still a job: it must be said that it failed.
     """
@@ -55,7 +55,6 @@ def _scans(scans: Path, out: Path) -> list[Path]:
         path
         for path in _folders(scans, out)
         if not any((path / name).exists() for name in RESULTS)
-        and any(path.iterdir())
         and _said(path).get("kind") != "calibration"
     ]
 

@@ -86,9 +86,8 @@ def test_a_failure_is_told_the_next_time(make_scans, tmp_path):
     )
 
 
-def test_models_beside_scans_and_empty_folders_are_no_jobs(make_scans, tmp_path):
+def test_models_beside_scans_are_no_jobs(make_scans, tmp_path):
     scans = make_scans(anna="nothing")
     (scans / "anna-model").mkdir()
     (scans / "anna-model" / "scan.json").write_text("{}")
-    (scans / "notes").mkdir()
     assert [job.name for job in jobs_of(scans, tmp_path / "out")] == ["anna"]
