@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -99,6 +100,13 @@ def deviation(signed_mm: Array) -> Deviation:
         float(np.percentile(size, 95)),
         float(size.max()),
     )
+
+
+def honesty(signed_mm: Array, sigma_mm: NDArray[np.floating[Any]]) -> tuple[float, float]:
+    """Errors over their sigmas: robust spread (1 if honest), and the share beyond three sigmas (0.003
+    if Gaussian)."""
+    over = np.abs(signed_mm / sigma_mm)
+    return float(np.median(over) / 0.6745), float(np.mean(over > 3.0))
 
 
 def coverage(

@@ -15,7 +15,7 @@ from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.calibration.storage import load_calibration
 from bodyscan.errors import BadInput
 from bodyscan.evaluation.body import coverage_of_seen, girth_errors, settled
-from bodyscan.evaluation.surface import Deviation, deviation, signed_distances
+from bodyscan.evaluation.surface import Deviation, deviation, honesty, signed_distances
 from bodyscan.export.scan import carried
 from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.fusion.topology import topology
@@ -115,6 +115,7 @@ def evaluate_workspace(workspace: Path) -> str:
     mesh = signed_distances(body.vertices[measured], truth.vertices, truth.faces)
     girths = girth_errors(body, truth.vertices, truth.faces)
     seen, covered = coverage_of_seen(points, truth.vertices, truth.faces, pairs)
+    spread, beyond = honesty(cloud, stored.cloud.sigma_mm)
     shape = topology(stored.mesh.vertices, stored.mesh.faces)
     pictures = [folder / "cloud-deviation.png", folder / "mesh-deviation.png"]
     draw_deviation(stored.cloud.points, cloud, pictures[0], normals=stored.cloud.normals)
@@ -123,6 +124,8 @@ def evaluate_workspace(workspace: Path) -> str:
     )
     lines += [
         f"  cloud, {len(stored.cloud.points):,} points   {_figures(deviation(cloud))}",
+        f"  error over sigma        {spread:.2f} (robust; 1 is honest), {100.0 * beyond:.2f} % of the "
+        "points beyond three sigmas",
         f"  mesh, measured vertices {_figures(deviation(mesh))}",
         f"  mesh: {'closed' if shape.closed else 'open'}, "
         f"{'manifold' if shape.manifold else 'not manifold'}, {shape.components} piece(s), "

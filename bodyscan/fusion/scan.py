@@ -10,6 +10,7 @@ from bodyscan.capture.folder import Captures
 from bodyscan.errors import BadInput, ScanFailed
 from bodyscan.fusion.body import BodyCloud, BodyMesh
 from bodyscan.fusion.cleaning import clean
+from bodyscan.fusion.error_bar import with_placing
 from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.verdict import Verdict, judge
@@ -124,6 +125,8 @@ def fuse(
         agreement_mm=settings.agreement_mm,
         double_mm=settings.double_mm,
     )
+    there = {image.pair: placing[image.pair] for image in seen}
+    cloud = with_placing(cloud, there, calibration.covariance)
     progress("merging", 1, 1)
     progress("meshing", 0, 1)
     surface = mesh(

@@ -1,0 +1,59 @@
+"""Error bars hold how well the pairs are placed."""
+
+import numpy as np
+import pytest
+
+from bodyscan.fusion.body import BodyCloud
+from bodyscan.fusion.error_bar import with_placing
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.uncertainty import PlacingCovariance
+
+
+@pytest.fixture
+def cloud():
+    """Points of an upright cylinder, and one on top."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
+    outward = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    normals = np.vstack([outward, [[0.0, 0.0, 1.0]]])
+    points = np.vstack([150.0 * outward + [0, 0, 900.0], [[0.0, 0.0, 1700.0]]])
+    count = len(points)
+    return BodyCloud(
+        points,
+        normals.astype(np.float32),
+        np.full(count, 0.03, np.float32),
+        np.zeros((count, 3), np.uint8),
+        np.ones(count, np.uint8),
+    )
+
+
+def placed(*places):
+    return {
+        f"p{k}": RigidTransform(np.eye(3), np.array(place, float)) for k, place in enumerate(places)
+    }
+
+
+def test_a_pair_that_is_shifted_along_x_errs_where_it_looks_along_x(cloud):
+    covariance = np.diag([0.0, 0.0, 0.0, 0.04**2, 0.0, 0.0])
+    prior = PlacingCovariance(("p0",), covariance)
+    found = with_placing(cloud, placed([1300, 0, 900]), prior)
+    front = cloud.normals[:, 0] > 0.999
+    assert found.sigma_mm[front] == pytest.approx(0.05, rel=1e-3)
+    assert found.sigma_mm[cloud.normals[:, 0] < 0.0] == pytest.approx(0.03)
+    assert found.points is cloud.points
+
+
+def test_draws_of_the_placing_spread_by_the_error_bar(cloud):
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(6, 6)) * np.array([1e-5] * 3 + [0.02] * 3)[:, None]
+    prior = PlacingCovariance(("p0",), root @ root.T)
+    place = placed([1300, 0, 900])
+    alone = BodyCloud(
+        cloud.points, cloud.normals, 0 * cloud.sigma_mm, cloud.colours, cloud.pairs_seen
+    )
+    sigma = with_placing(alone, place, prior).sigma_mm
+    twists = rng.normal(size=(4000, 6)) @ root.T
+    moved = np.array([RigidTransform.identity().moved(t).apply(cloud.points) for t in twists])
+    along = np.einsum("knc,nc->kn", moved - cloud.points, cloud.normals.astype(float))
+    seen = sigma > 0
+    assert seen.sum() > 20
+    assert sigma[seen] == pytest.approx(along.std(axis=0)[seen], rel=0.06)
