@@ -186,9 +186,9 @@ def test_a_person_who_stepped_aside(images):
 
 
 def test_alignment_takes_no_part_if_not_wanted(images):
-    calibration = RigCalibration(
-        RIG, {}, placings(), PlacingCovariance((), np.zeros((0, 0))), {}, {}, ()
-    )
+    placed = placings()
+    known = PlacingCovariance(tuple(placed), np.zeros((6 * len(placed), 6 * len(placed))))
+    calibration = RigCalibration(RIG, {}, placed, known, {}, {}, ())
     scan = fuse(calibration, images, {}, replace(SETTINGS, alignment=None))
     assert scan.alignment is None
     assert scan.verdict.grade == "good"
