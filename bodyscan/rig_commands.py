@@ -65,7 +65,7 @@ def refine_rig(
     from bodyscan.calibration.storage import load_calibration, save_calibration
     from bodyscan.capture.folder import open_scan
     from bodyscan.errors import FailedWork
-    from bodyscan.fusion.cleaning import clean
+    from bodyscan.fusion.cleaning import clean, with_subject
     from bodyscan.reconstruction.pairs import range_images
     from bodyscan.registration.object_refinement import refine_on_object
 
@@ -74,8 +74,7 @@ def refine_rig(
         images, failed = range_images(rig, open_scan(rig.rig, folder), clock)
         clock("aligning", 0, 1)
         cleaned = clean(images, rig.rig_from_camera, rig.rig.volume)
-        seen = [image for image in cleaned if image.valid.any()]
-        found = refine_on_object(seen, rig.rig_from_camera, rig.covariance)
+        found = refine_on_object(with_subject(cleaned), rig.rig_from_camera, rig.covariance)
         clock("aligning", 1, 1)
     for name, reason in failed.items():
         console.console.print(f"left out: {name}: {reason}", style="red", highlight=False)

@@ -44,12 +44,11 @@ def mostly_direct(images: ScanLines, usable: Mask, bit: int, variance: NDArray[n
     flips its difference is small whatever the light; such dips along the lines are filled.
     usable: (L, P) that are looked at.  variance: (256,) of each grey level.
     """
-    everywhere = np.arange(images.lit.size)
     contrast = np.maximum(images.contrast, 1.0)
     dips = np.ones((1, WIDEST_DIP_PX), np.uint8)
     for fine in range(bit, max(bit - FINE_BITS, -1), -1):
-        difference, noise = images.difference(np.full_like(everywhere, fine), everywhere, variance)
-        share = (np.abs(difference) + noise).reshape(contrast.shape) / contrast
+        difference, noise = images.difference_image(fine, variance)
+        share = (np.abs(difference) + noise) / contrast
         filled = cv2.morphologyEx(np.asarray(share, np.float32), cv2.MORPH_CLOSE, dips)
         if usable.any() and np.percentile(filled[usable], BEST) >= SHARP:
             return np.asarray(filled >= LEAST_DIRECT)

@@ -249,6 +249,11 @@ class Rig(Model):
         return {board.name: board for board in self.boards}[name]
 
     @property
+    def poles(self) -> dict[str, str]:
+        """The pole of each pair that stands on one."""
+        return {pair.name: pair.pole for pair in self.pairs if pair.pole}
+
+    @property
     def frame_pair(self) -> Pair | None:
         """The pair that fixes the rig frame, or None where a board in a shot does."""
         if self.rig_frame.shot is not None:

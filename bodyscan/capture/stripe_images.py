@@ -81,12 +81,16 @@ class ScanLines:
         place = bit * self.lit.size + at
         pattern = self.patterns.ravel()[place]
         if self.inverses is not None:
-            inverse = self.inverses.ravel()[place]
-            noise = np.sqrt(variance[pattern] + variance[inverse])
-            return np.subtract(pattern, inverse, dtype=np.float32), noise
-        lit, dark = self.lit.ravel()[at], self.dark.ravel()[at]
-        difference = 2.0 * pattern.astype(np.float32) - lit - dark
-        return difference, np.sqrt(4.0 * variance[pattern] + variance[lit] + variance[dark])
+            return _against(pattern, self.inverses.ravel()[place], variance)
+        return _above_middle(pattern, self.lit.ravel()[at], self.dark.ravel()[at], variance)
+
+    def difference_image(
+        self, bit: int, variance: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """`difference` of one bit at all pixels, (L, P)."""
+        if self.inverses is not None:
+            return _against(self.patterns[bit], self.inverses[bit], variance)
+        return _above_middle(self.patterns[bit], self.lit, self.dark, variance)
 
     def usable(
         self, codes: NDArray[np.int32], variance: NDArray[np.float32], stripes: int, fine_bit: int
@@ -135,6 +139,20 @@ class ScanLines:
 def transposed(images: Bytes) -> Bytes:
     """Each image of a stack (F, H, W) transposed."""
     return np.stack([cv2.transpose(image) for image in images])
+
+
+def _against(
+    pattern: Bytes, inverse: Bytes, variance: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    noise = np.sqrt(variance[pattern] + variance[inverse])
+    return np.subtract(pattern, inverse, dtype=np.float32), noise
+
+
+def _above_middle(
+    pattern: Bytes, lit: Bytes, dark: Bytes, variance: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    difference = 2.0 * pattern.astype(np.float32) - lit - dark
+    return difference, np.sqrt(4.0 * variance[pattern] + variance[lit] + variance[dark])
 
 
 def half_covered(contrast: NDArray[np.float32], lit: Mask) -> Mask:

@@ -85,8 +85,9 @@ def check_boards(
         seen_pose(view, calibration.pairs[view.pair].camera, _noise_px(calibration, view.pair))
         for view in located
     ]
-    poles = {pair.name: pair.pole for pair in calibration.rig.pairs if pair.pole}
-    drift = find_drift(poses, calibration.rig_from_camera, calibration.covariance, poles)
+    drift = find_drift(
+        poses, calibration.rig_from_camera, calibration.covariance, calibration.rig.poles
+    )
     if not drift.rig_from_board:
         raise BoardNotFound(
             "no board is seen by two calibrated pairs at once",

@@ -146,8 +146,7 @@ def _placed_by(
 
 def _motion(first: RigidTransform, second: RigidTransform) -> Array:
     """(6,) twist about the rig's origin that carries the first placing to the second."""
-    moved = second @ first.inverse()
-    return np.concatenate([moved.rotation_vector, moved.translation])
+    return (second @ first.inverse()).twist
 
 
 def _without_common_motion(centres: Array, ahead: Array) -> Array:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.capture.folder import Captures
-from bodyscan.fusion.cleaning import clean
+from bodyscan.fusion.cleaning import clean, with_subject
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, silent
 from bodyscan.reconstruction.pairs import range_images
@@ -80,10 +80,9 @@ def check_scans(
     for captures in scans:
         images, _ = range_images(calibration, captures, progress)
         cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
-        seen = [image for image in cleaned if image.valid.any()]
+        seen = with_subject(cleaned)
         alignments.append(align(seen, calibration.rig_from_camera, calibration.covariance))
-    poles = {pair.name: pair.pole for pair in calibration.rig.pairs if pair.pole}
-    return judge_scans(alignments, calibration.rig_from_camera, poles)
+    return judge_scans(alignments, calibration.rig_from_camera, calibration.rig.poles)
 
 
 def judge_scans(

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.fusion.topology import face_areas
+
 
 @dataclass(frozen=True, eq=False)
 class BodyCloud:
@@ -43,6 +45,5 @@ class BodyMesh:
     @property
     def filled_share(self) -> float:
         """Share of the surface's area that was made up."""
-        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        area = face_areas(self.vertices, self.faces)
         return float(area[self.filled].sum() / area.sum()) if area.any() else 0.0

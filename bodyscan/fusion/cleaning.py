@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.capture.rig import Volume
+from bodyscan.errors import ScanFailed
 from bodyscan.fusion.grid import Floats, carried, crop_of
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -60,6 +61,17 @@ def clean(
 
     with ThreadPoolExecutor(workers) as pool:
         return list(pool.map(one, range_images))
+
+
+def with_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:
+    """Those that show something of the subject. Raises ScanFailed if none does."""
+    seen = [image for image in cleaned if image.valid.any()]
+    if not seen:
+        raise ScanFailed(
+            "nobody stands in the scan volume",
+            remedy="look at the lit images; check `volume` in the rig file",
+        )
+    return seen
 
 
 def masked(image: RangeImage, kept: Mask) -> RangeImage:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.capture.folder import Captures
-from bodyscan.errors import BadInput, ScanFailed
+from bodyscan.errors import BadInput
 from bodyscan.fusion.body import BodyCloud, BodyMesh
-from bodyscan.fusion.cleaning import clean
+from bodyscan.fusion.cleaning import clean, with_subject
 from bodyscan.fusion.error_bar import with_placing
 from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import mesh
@@ -102,13 +102,8 @@ def fuse(
     """
     progress("cleaning", 0, 1)
     cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume, empty=empty)
-    seen = [image for image in cleaned if image.valid.any()]
+    seen = with_subject(cleaned)
     progress("cleaning", 1, 1)
-    if not seen:
-        raise ScanFailed(
-            "nobody stands in the scan volume",
-            remedy="look at the lit images; check `volume` in the rig file",
-        )
     placing = dict(calibration.rig_from_camera)
     alignment = None
     if settings.alignment is not None and len(seen) > 1:

@@ -52,6 +52,11 @@ class RigidTransform:
         return Rotation.from_matrix(self.rotation).as_rotvec()
 
     @property
+    def twist(self) -> Array:
+        """(6,) rotation vector (radians), then translation (mm): what `moved` takes."""
+        return np.concatenate([self.rotation_vector, self.translation])
+
+    @property
     def angle(self) -> float:
         """Size of the rotation, radians."""
         # |R - 1| = 2 sqrt(2) sin(angle / 2), exact for small angles too.

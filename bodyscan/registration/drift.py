@@ -260,7 +260,7 @@ def _gap(
     gap = rig_from_camera @ pose.camera_from_board @ rig_from_board.inverse()
     carry = adjoint(rig_from_camera)
     weight = np.linalg.inv(carry @ pose.covariance @ carry.T)
-    return np.concatenate([gap.rotation_vector, gap.translation]), np.asarray(weight, np.float64)
+    return gap.twist, np.asarray(weight, np.float64)
 
 
 def _agreed(
