@@ -8,6 +8,7 @@ stripes holds there. So boundaries are moved by that much: by up to 0.6 px on a 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.capture.stripe_images import ScanLines
+from bodyscan.compiled import compiled
 
 Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 USUAL_BLUR2 = 0.45
@@ -52,34 +55,17 @@ class Brightness:
     @staticmethod
     def of(images: ScanLines, variance: NDArray[np.float32], usable: Mask) -> Brightness:
         """variance: (256,) of each grey level.  usable: (L, P) pixels on a lit surface."""
-        contrast = np.maximum(images.contrast, 1.0)
-        logarithm = np.log(contrast)
-        noise2 = (variance[images.lit] + variance[images.dark]) / contrast**2
+        logarithm, noise2 = np.empty((2, *images.lit.shape), np.float32)
+        _measure(images.lit, images.dark, variance, _LOGARITHMS, logarithm, noise2)
         along, across = gentle_gradient(logarithm, usable)
-        difference = (logarithm[2:] - logarithm[:-2]) / 2 - across[1:-1]
-        across[1:-1] += _significant(difference, (noise2[2:] + noise2[:-2]) / 4)
+        _sharpen(logarithm, noise2, across)
         return Brightness(logarithm, noise2, across, along)
 
     def at(self, place: NDArray[np.int64]) -> BrightnessEdges:
         """Between the pixels at flat places `place` (N,) and those behind them."""
-        before, behind, across, shading, noise2 = (
-            image.ravel()[where].astype(np.float64)
-            for image, where in (
-                (self.logarithm, place),
-                (self.logarithm, place + 1),
-                (self.across, place),
-                (self.shading, place),
-                (self.noise2, place),
-            )
-        )
-        along = shading + _significant(behind - before - shading, 2.0 * noise2)
-        middle = (before + behind) / 2
+        logarithm, noise2 = self.logarithm.ravel(), self.noise2.ravel()
         return BrightnessEdges(
-            before=np.exp(middle - along / 2),
-            behind=np.exp(middle + along / 2),
-            along=along,
-            across=across,
-            sigma=np.sqrt(2.0 * noise2),
+            *_between(logarithm, noise2, self.across.ravel(), self.shading.ravel(), place)
         )
 
 
@@ -105,18 +91,14 @@ class BrightnessEdges:
         next of the same run. Where there are not edges enough to tell, a usual value: that of a
         lens of 0.6 px and a pixel.
         """
-        middle = np.flatnonzero(joined[:-1] & joined[1:]) + 1
-        bend = position[middle] - (position[middle - 1] + position[middle + 1]) / 2
-        steepness = self.along[middle] - (self.along[middle - 1] + self.along[middle + 1]) / 2
-        steep = np.abs(steepness) > np.maximum(STEEP, STEEP_TO_NOISE * self.sigma[middle])
-        if steep.sum() < ENOUGH:
+        shifts = _shifts_at_edges(self.along, self.sigma, position, joined)
+        if shifts.size < ENOUGH:
             return USUAL_BLUR2
-        return float(np.clip(-np.median(bend[steep] / steepness[steep]), 0.0, LARGEST_BLUR2))
+        return float(np.clip(-np.median(shifts), 0.0, LARGEST_BLUR2))
 
     def doubt(self, blur2: float) -> Floats:
         """Standard deviation (N,) px of the shift blur2 * (along, across)."""
-        noise = np.minimum(self.sigma, np.abs(self.along))
-        return blur2 * np.hypot(UNEXPLAINED * np.hypot(self.along, self.across), noise)
+        return _doubt(self.along, self.across, self.sigma, blur2)
 
 
 def without_edges_across(
@@ -126,47 +108,162 @@ def without_edges_across(
 
     A pixel tells s at its light's centre of mass, which lies off the line by blur2 * across.
     """
-    slope = np.zeros_like(s)
-    slope[1:-1] = (s[2:] - s[:-2]) / 2
-    # At the end of the surface only the change on the inner side is known.
-    one_sided = np.diff(s, axis=0)
-    for target, change in ((slope[1:], one_sided), (slope[:-1], one_sided)):
-        missing = np.isnan(target)
-        target[missing] = change[missing]
-    slope[~(np.abs(slope) < MAX_SLOPE)] = 0.0
-    shift = np.clip(blur2 * brightness.across, -MAX_SHIFT_PX, MAX_SHIFT_PX)
-    pull = slope * shift
-    return s - pull, np.hypot(sigma, 2.0 * UNEXPLAINED * pull)
+    freed, doubt = np.empty(s.shape, np.float32), np.empty(s.shape, np.float32)
+    s, sigma, across = map(np.ascontiguousarray, (s, sigma, brightness.across))
+    _pull_out(s, sigma, across, blur2, freed, doubt)
+    return freed, doubt
 
 
-def gentle_gradient(
-    image: NDArray[np.float32], usable: Mask
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Gradient along and across the lines (L, P), 1/px: least squares over the usable pixels of a
-    small window; 0 where there are too few."""
+def gentle_gradient(image: Image, usable: Mask) -> tuple[Image, Image]:
+    """Gradient along and across the lines (L, P), 1/px, at usable pixels: least squares over the
+    usable ones of a small window; 0 where there are too few, and elsewhere."""
     offset = np.arange(-GENTLE_PX, GENTLE_PX + 1, dtype=np.float32)
-    flat = np.ones_like(offset)
-    inside = usable.astype(np.float32)
-    weighted = np.where(usable, image, np.float32(0.0))
+    inside = usable.view(np.uint8)
+    weighted = image * inside
 
-    def moment(of: NDArray[np.float32], along: int, across: int) -> NDArray[Any]:
-        kernels = (offset**power if power else flat for power in (along, across))
+    def moment(of: NDArray[Any], along: int, across: int) -> Image:
+        kernels = (offset**along, offset**across)
         return cv2.sepFilter2D(of, cv2.CV_32F, *kernels, borderType=cv2.BORDER_CONSTANT)
 
-    count = moment(inside, 0, 0)
-    enough = count > LEAST_PIXELS - 0.5
-    count = np.where(enough, count, np.float32(1.0))
-    x, y = moment(inside, 1, 0) / count, moment(inside, 0, 1) / count
-    mean = moment(weighted, 0, 0) / count
-    xx = moment(inside, 2, 0) / count - x * x
-    yy = moment(inside, 0, 2) / count - y * y
-    xy = moment(inside, 1, 1) / count - x * y
-    xv, yv = moment(weighted, 1, 0) / count - x * mean, moment(weighted, 0, 1) / count - y * mean
-    enough &= xx * yy - xy * xy > LEAST_SPREAD
-    area = np.where(enough, xx * yy - xy * xy, np.float32(np.inf))
-    return (yy * xv - xy * yv) / area, (xx * yv - xy * xv) / area
+    orders = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+    shape = tuple(moment(inside, *order) for order in orders)
+    values = tuple(moment(weighted, *order) for order in orders[:3])
+    gradient = np.zeros((2, *image.shape), np.float32)
+    _fit_windows(usable, shape, values, gradient[0], gradient[1])
+    return gradient[0], gradient[1]
 
 
-def _significant(gradient: NDArray[Any], variance: NDArray[Any]) -> NDArray[Any]:
-    """Gradients, those that noise may explain brought near zero."""
-    return gradient * gradient**2 / (gradient**2 + SIGNIFICANCE**2 * variance + 1e-12)
+@compiled
+def _fit_windows(
+    usable: Mask, shape: tuple[Image, ...], values: tuple[Image, ...], along: Image, across: Image
+) -> None:
+    """Writes the gradient (L, P) from sums over windows of 1, x, y, xx, xy, yy and of v, xv, yv."""
+    n, sum_x, sum_y, sum_xx, sum_xy, sum_yy = shape
+    sum_v, sum_xv, sum_yv = values
+    for line in range(usable.shape[0]):
+        for place in range(usable.shape[1]):
+            count = n[line, place]
+            if not usable[line, place] or count < LEAST_PIXELS - 0.5:
+                continue
+            share = np.float32(1.0) / count
+            x, y, v = sum_x[line, place] * share, sum_y[line, place] * share, sum_v[line, place]
+            xx, yy = sum_xx[line, place] * share - x * x, sum_yy[line, place] * share - y * y
+            xy = sum_xy[line, place] * share - x * y
+            v *= share
+            xv, yv = sum_xv[line, place] * share - x * v, sum_yv[line, place] * share - y * v
+            area = xx * yy - xy * xy
+            if area > LEAST_SPREAD:
+                along[line, place] = (yy * xv - xy * yv) / area
+                across[line, place] = (xx * yv - xy * xv) / area
+
+
+@compiled
+def _significant(gradient: float, variance: float) -> float:
+    """A gradient, brought near zero if noise may explain it."""
+    square = gradient * gradient
+    return gradient * square / (square + SIGNIFICANCE**2 * variance + 1e-12)
+
+
+@compiled
+def _measure(
+    lit: NDArray[np.uint8],
+    dark: NDArray[np.uint8],
+    variance: Image,
+    logarithms: Image,
+    logarithm: Image,
+    noise2: Image,
+) -> None:
+    """Writes the logarithm of lit minus dark (L, P), and its variance."""
+    for line in range(lit.shape[0]):
+        for place in range(lit.shape[1]):
+            light, black = lit[line, place], dark[line, place]
+            contrast = max(np.int32(light) - np.int32(black), np.int32(1))
+            logarithm[line, place] = logarithms[contrast]
+            square = np.float32(contrast * contrast)
+            noise2[line, place] = (variance[light] + variance[black]) / square
+
+
+@compiled
+def _sharpen(logarithm: Image, noise2: Image, across: Image) -> None:
+    """Adds to the gentle gradient from line to line (L, P) what noise does not explain."""
+    for line in range(1, logarithm.shape[0] - 1):
+        for place in range(logarithm.shape[1]):
+            seen = (logarithm[line + 1, place] - logarithm[line - 1, place]) / np.float32(2)
+            variance = (noise2[line + 1, place] + noise2[line - 1, place]) / np.float32(4)
+            across[line, place] += _significant(seen - across[line, place], variance)
+
+
+@compiled
+def _between(
+    logarithm: Image, noise2: Image, across: Image, shading: Image, place: NDArray[np.int64]
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Fields of BrightnessEdges at flat places (N,)."""
+    before, behind = np.empty(place.size), np.empty(place.size)
+    along, sideways, sigma = np.empty(place.size), np.empty(place.size), np.empty(place.size)
+    for k in range(place.size):
+        at = place[k]
+        one, other = np.float64(logarithm[at]), np.float64(logarithm[at + 1])
+        variance = 2.0 * np.float64(noise2[at])
+        gentle = np.float64(shading[at])
+        along[k] = gentle + _significant(other - one - gentle, variance)
+        sideways[k], sigma[k] = across[at], math.sqrt(variance)
+        middle, half = math.exp((one + other) / 2), math.exp(along[k] / 2)
+        before[k], behind[k] = middle / half, middle * half
+    return before, behind, along, sideways, sigma
+
+
+@compiled
+def _shifts_at_edges(along: Floats, sigma: Floats, position: Floats, joined: Mask) -> Floats:
+    """Of boundaries within runs that lie on edges: how far they lie off the middle of their
+    neighbours, over how much steeper the brightness is there."""
+    shifts, count = np.empty(along.size), 0
+    for k in range(1, along.size - 1):
+        if not (joined[k - 1] and joined[k]):
+            continue
+        steepness = along[k] - (along[k - 1] + along[k + 1]) / 2
+        if abs(steepness) > max(STEEP, STEEP_TO_NOISE * sigma[k]):
+            bend = position[k] - (position[k - 1] + position[k + 1]) / 2
+            shifts[count] = bend / steepness
+            count += 1
+    return shifts[:count].copy()
+
+
+@compiled
+def _doubt(along: Floats, across: Floats, sigma: Floats, blur2: float) -> Floats:
+    doubt = np.empty(along.size)
+    for k in range(along.size):
+        noise = min(sigma[k], abs(along[k]))
+        unexplained = UNEXPLAINED**2 * (along[k] ** 2 + across[k] ** 2)
+        doubt[k] = blur2 * math.sqrt(unexplained + noise * noise)
+    return doubt
+
+
+@compiled
+def _pull_out(
+    s: Image, sigma: Image, across: Image, blur2: float, freed: Image, doubt: Image
+) -> None:
+    """`without_edges_across`, written to freed and doubt (L, P)."""
+    lines = s.shape[0]
+    for line in range(lines):
+        for place in range(s.shape[1]):
+            here = s[line, place]
+            freed[line, place] = doubt[line, place] = np.nan
+            if math.isnan(here):
+                continue
+            above = s[line - 1, place] if line > 0 else np.float32(np.nan)
+            below = s[line + 1, place] if line + 1 < lines else np.float32(np.nan)
+            slope = (below - above) / np.float32(2)
+            # At the end of the surface only the change on the inner side is known.
+            if math.isnan(slope):
+                slope = here - above if math.isnan(below) else below - here
+            pull = 0.0
+            if abs(slope) < MAX_SLOPE:
+                shift = min(max(blur2 * across[line, place], -MAX_SHIFT_PX), MAX_SHIFT_PX)
+                pull = slope * shift
+            freed[line, place] = here - pull
+            doubt[line, place] = math.sqrt(
+                sigma[line, place] ** 2 + (2.0 * UNEXPLAINED * pull) ** 2
+            )
+
+
+_LOGARITHMS = np.log(np.maximum(np.arange(256), 1)).astype(np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +13,10 @@ from bodyscan.capture.albedo_edges import Brightness
 from bodyscan.capture.gray_code import bit_that_flips
 from bodyscan.capture.indirect_light import imbalance
 from bodyscan.capture.stripe_images import ScanLines
+from bodyscan.compiled import compiled
 
 Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
@@ -25,6 +28,10 @@ LEAST_SIGMA_PX = 0.008
 MIN_STRIPE_PX = 0.2
 FARTHEST_PX = 1.0
 """How far a boundary may lie from where the code changes."""
+
+_RATIOS = np.linspace(-MAX_RATIO, MAX_RATIO, TABLE_SIZE + 1)
+_STRAIGHT = erfinv(_RATIOS)
+_STRETCH = np.sqrt(np.pi) / 2.0 * np.exp(_STRAIGHT**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,23 +70,20 @@ def find_boundaries(
     the distance from the boundary whatever the blur; the inverse error function makes it a straight
     line, whose zero is the boundary. variance: (256,) of each grey level.  finest_run: see `WordCode`.
     """
-    change = np.diff(codes, axis=1)
-    crossing = (np.abs(change) == 1) & usable[:, 1:] & usable[:, :-1]
-    flat = np.flatnonzero(crossing)
-    line, before = np.divmod(flat, crossing.shape[1])
-    at = line * codes.shape[1] + before
+    at = _crossings(codes, usable)
+    line, before = np.divmod(at, codes.shape[1])
     index = np.maximum(codes.ravel()[at], codes.ravel()[at + 1]).astype(np.int64)
     bit = bit_that_flips(index, len(images.patterns))
     edges = brightness.at(at)
     clear = (index & -index) * finest_run // 2  # stripes: half the way to where the bit flips again
     middle = imbalance(images, codes, usable, variance, bit, index, at, clear)
-    left, left_sigma = _straightened(images, variance, bit, at, edges.before, middle)
-    right, right_sigma = _straightened(images, variance, bit, at + 1, edges.behind, middle)
-    # The code changes where the difference is 0; the boundary may lie beyond these two pixels.
-    beyond = np.where(middle[0] != 0.0, FARTHEST_PX, 0.0)
-    fraction = np.clip(left / (left - right), -beyond, 1.0 + beyond)
-    sigma = np.hypot((1.0 - fraction) * left_sigma, fraction * right_sigma)
-    sigma = np.hypot(sigma / np.abs(left - right), LEAST_SIGMA_PX)
+    beside = np.stack([at, at + 1], axis=-1)
+    fraction, sigma = _zeros(
+        *images.difference(bit, beside, variance),
+        edges.before,
+        edges.behind,
+        *middle,
+    )
     position = before + fraction
     joined = joined_to_next(line, before, position, index, usable)
     blur2 = edges.blur2(position, joined)
@@ -88,7 +92,7 @@ def find_boundaries(
         before=before,
         position=position + blur2 * edges.along,
         line_position=line + blur2 * edges.across,
-        sigma_px=np.hypot(sigma, edges.doubt(blur2)),
+        sigma_px=np.sqrt(sigma**2 + edges.doubt(blur2) ** 2),
         index=index,
         joined=joined,
         blur2=blur2,
@@ -101,29 +105,72 @@ def joined_to_next(line: Ints, before: Ints, position: Floats, index: Ints, usab
     All pixels between the two must be usable (L, P): where one is not, the surface may end, and
     another that happens to show the next stripe begin.
     """
-    joined = (np.diff(line) == 0) & (np.abs(np.diff(index)) == 1)
-    joined &= np.diff(position) > MIN_STRIPE_PX
-    bad = np.cumsum(~usable.ravel())
-    at = line * usable.shape[1] + before
-    return joined & (bad[at[1:]] == bad[at[:-1]])
+    return _joined(line, before, position, index, usable)
 
 
-def _straightened(
-    images: ScanLines,
-    variance: NDArray[np.float32],
-    bit: Ints,
-    at: Ints,
-    contrast: Floats,
-    middle: tuple[Floats, Floats],
+@compiled
+def _joined(line: Ints, before: Ints, position: Floats, index: Ints, usable: Mask) -> Mask:
+    joined = np.zeros(max(line.size - 1, 0), np.bool_)
+    for k in range(joined.size):
+        if line[k + 1] != line[k] or abs(index[k + 1] - index[k]) != 1:
+            continue
+        whole = position[k + 1] - position[k] > MIN_STRIPE_PX
+        for place in range(before[k] + 1, before[k + 1] + 1):
+            whole &= usable[line[k], place]
+        joined[k] = whole
+    return joined
+
+
+@compiled
+def _crossings(codes: NDArray[np.int32], usable: Mask) -> Ints:
+    """(N,) flat pixels, usable as the next of their line is, whose codes differ by one."""
+    found, count = np.empty(codes.size, np.int64), 0
+    for line in range(codes.shape[0]):
+        for place in range(codes.shape[1] - 1):
+            if not (usable[line, place] and usable[line, place + 1]):
+                continue
+            if abs(codes[line, place + 1] - codes[line, place]) == 1:
+                found[count] = line * codes.shape[1] + place
+                count += 1
+    return found[:count].copy()
+
+
+@compiled
+def _zeros(
+    difference: Image,
+    noise: Image,
+    before: Floats,
+    behind: Floats,
+    middle: Floats,
+    middle_sigma: Floats,
 ) -> tuple[Floats, Floats]:
+    """Where the difference is the middle one, px behind the pixel before it, and its sigma.
+
+    difference, noise: (N, 2) in the pixels before and behind; before, behind: (N,) lit minus dark.
+    """
+    fraction, sigma = np.empty(before.size), np.empty(before.size)
+    for k in range(before.size):
+        left, left_sigma = _straightened(
+            difference[k, 0], noise[k, 0], before[k], middle[k], middle_sigma[k]
+        )
+        right, right_sigma = _straightened(
+            difference[k, 1], noise[k, 1], behind[k], middle[k], middle_sigma[k]
+        )
+        # The code changes where the difference is 0; the boundary may lie beyond these two pixels.
+        beyond = FARTHEST_PX if middle[k] != 0.0 else 0.0
+        share = min(max(left / (left - right), -beyond), 1.0 + beyond)
+        doubt2 = ((1.0 - share) * left_sigma) ** 2 + (share * right_sigma) ** 2
+        fraction[k] = share
+        sigma[k] = math.sqrt(doubt2 / (left - right) ** 2 + LEAST_SIGMA_PX**2)
+    return fraction, sigma
+
+
+@compiled
+def _straightened(
+    difference: float, noise: float, contrast: float, middle: float, middle_sigma: float
+) -> tuple[float, float]:
     """Distance from the boundary in units of sqrt(2) blurs (with a sign), and its sigma."""
-    difference, noise = images.difference(bit, at, variance)
-    ratio = difference / contrast - middle[0]
-    scaled = (np.clip(ratio, -MAX_RATIO, MAX_RATIO) / MAX_RATIO + 1.0) * (TABLE_SIZE / 2)
-    entry = np.rint(scaled).astype(np.int32)
-    return _STRAIGHT[entry], np.hypot(noise / contrast, middle[1]) * _STRETCH[entry]
-
-
-_RATIOS = np.linspace(-MAX_RATIO, MAX_RATIO, TABLE_SIZE + 1)
-_STRAIGHT = erfinv(_RATIOS)
-_STRETCH = np.sqrt(np.pi) / 2.0 * np.exp(_STRAIGHT**2)
+    ratio = min(max(difference / contrast - middle, -MAX_RATIO), MAX_RATIO)
+    entry = int(np.rint((ratio / MAX_RATIO + 1.0) * (TABLE_SIZE / 2)))
+    doubt = math.sqrt((noise / contrast) ** 2 + middle_sigma**2)
+    return _STRAIGHT[entry], doubt * _STRETCH[entry]

@@ -6,12 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.capture.stripe_images import ScanLines
+from bodyscan.compiled import compiled
 
 Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Sums = NDArray[np.int64]
 
 LEVELS = 16
 ENOUGH_PIXELS = 500
 LARGEST_DIFFERENCE = 24
+BRIGHTEST = 250
 LEAST_VARIANCE = 0.15
 """Rounding to whole grey levels (1/12), and a little."""
 
@@ -25,14 +29,12 @@ def noise_variance(images: ScanLines) -> NDArray[np.float32]:
     measured for each band of grey levels, because light itself is noisy (and a laser's speckle
     more so), and smoothed by a line a + b grey that is nowhere falling.
     """
-    once, again = _seen_twice(images)
-    difference = again.astype(np.float32) - once
-    plain = (np.abs(difference) <= LARGEST_DIFFERENCE) & (once < 250)
-    band, difference = once[plain] // LEVELS, difference[plain]
-    count = np.bincount(band, minlength=LEVELS)
-    mean = np.bincount(band, difference, LEVELS) / np.maximum(count, 1)
-    square = np.bincount(band, difference**2, LEVELS) / np.maximum(count, 1)
-    variance = (square - mean**2) / 2.0
+    nothing = np.empty((0, 0), np.uint8)
+    inverse = nothing if images.inverses is None else images.inverses[0]
+    bright = images.bright(0) if images.inverses is None else nothing.astype(bool)
+    count, total, square = _sums(images.lit, images.dark, images.patterns[0], inverse, bright)
+    mean = total / np.maximum(count, 1)
+    variance = (square / np.maximum(count, 1) - mean**2) / 2.0
     known = count >= ENOUGH_PIXELS
     grey = LEVELS * (np.arange(LEVELS) + 0.5)
     if not known.any():
@@ -47,13 +49,31 @@ def noise_variance(images: ScanLines) -> NDArray[np.float32]:
     return np.maximum(base + rise * np.arange(256), LEAST_VARIANCE).astype(np.float32)
 
 
-def _seen_twice(images: ScanLines) -> tuple[Bytes, Bytes]:
-    """Grey levels (N,) of pixels in two frames that differ by noise alone."""
-    pattern, half = images.patterns[0], slice(None, None, 2)
-    if images.inverses is None:
-        once = np.where(images.bright(0), images.lit, images.dark)
-        return once.ravel()[half], pattern.ravel()[half]
-    inverse = images.inverses[0]
-    once = np.concatenate([images.lit.ravel()[half], images.dark.ravel()[half]])
-    again = [np.maximum(pattern, inverse).ravel()[half], np.minimum(pattern, inverse).ravel()[half]]
-    return once, np.concatenate(again)
+@compiled
+def _sums(lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, bright: Mask) -> Sums:
+    """How many, sum and sum of squares (LEVELS,) of what differs between two frames that show the
+    same, by bands of grey levels; of every other pixel of a line.
+
+    Without an inverse (0, 0), `bright` (L, P) says where the pattern shows what the lit frame does.
+    """
+    sums = np.zeros((3, LEVELS), np.int64)
+    for line in range(lit.shape[0]):
+        for place in range(0, lit.shape[1], 2):
+            seen, light, black = pattern[line, place], lit[line, place], dark[line, place]
+            if inverse.size:
+                other = inverse[line, place]
+                _add(sums, light, max(seen, other))
+                _add(sums, black, min(seen, other))
+            else:
+                _add(sums, light if bright[line, place] else black, seen)
+    return sums
+
+
+@compiled
+def _add(sums: Sums, once: int, again: int) -> None:
+    difference = np.int64(again) - np.int64(once)
+    if abs(difference) <= LARGEST_DIFFERENCE and once < BRIGHTEST:
+        band = once // LEVELS
+        sums[0, band] += 1
+        sums[1, band] += difference
+        sums[2, band] += difference * difference

@@ -9,16 +9,21 @@ boundary lies where the difference is J, not 0: in the middle between the values
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.compiled import compiled
+
 if TYPE_CHECKING:
     from bodyscan.capture.stripe_images import ScanLines
 
+Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
@@ -44,15 +49,26 @@ def mostly_direct(images: ScanLines, usable: Mask, bit: int, variance: NDArray[n
     flips its difference is small whatever the light; such dips along the lines are filled.
     usable: (L, P) that are looked at.  variance: (256,) of each grey level.
     """
-    contrast = np.maximum(images.contrast, 1.0)
     dips = np.ones((1, WIDEST_DIP_PX), np.uint8)
     for fine in range(bit, max(bit - FINE_BITS, -1), -1):
+        share = np.empty(usable.shape, np.float32)
         difference, noise = images.difference_image(fine, variance)
-        share = (np.abs(difference) + noise) / contrast
-        filled = cv2.morphologyEx(np.asarray(share, np.float32), cv2.MORPH_CLOSE, dips)
-        if usable.any() and np.percentile(filled[usable], BEST) >= SHARP:
+        _direct_share(images.lit, images.dark, difference, noise, share)
+        filled = cv2.morphologyEx(share, cv2.MORPH_CLOSE, dips)
+        sharp = np.count_nonzero((filled >= SHARP) & usable)
+        if sharp and sharp >= (1.0 - BEST / 100.0) * np.count_nonzero(usable):
             return np.asarray(filled >= LEAST_DIRECT)
     return np.ones_like(usable)
+
+
+@compiled
+def _direct_share(lit: Bytes, dark: Bytes, difference: Image, noise: Image, share: Image) -> None:
+    """Writes what part (L, P) of lit minus dark the projector gives, or as much as noise allows."""
+    for line in range(lit.shape[0]):
+        for place in range(lit.shape[1]):
+            contrast = np.float32(lit[line, place]) - np.float32(dark[line, place])
+            most = abs(difference[line, place]) + noise[line, place]
+            share[line, place] = most / max(contrast, np.float32(1.0))
 
 
 def imbalance(
@@ -71,30 +87,57 @@ def imbalance(
     surely keeps its value. It is 0 where noise may explain it, and for the finest bit, which has
     no room beside its boundaries and whose J is least.
     """
-    width = images.lit.shape[1]
-    place = at % width
-    reach = np.where(reach >= FEWEST_STRIPES, reach, 0)
-    contrast = images.contrast.ravel()
-    total, size, noise2, count = np.zeros((4, len(at)))
-    for step in BESIDE_PX:
-        inside = (place >= step) & (place + 1 + step < width)
-        pixels = [np.where(inside, at - step, at), np.where(inside, at + 1 + step, at)]
-        off = [codes.ravel()[pixel] + 0.5 - index for pixel in pixels]
-        clear = inside & (off[0] * off[1] < 0.0) & (np.abs(off).max(axis=0) < reach)
-        clear &= usable.ravel()[pixels[0]] & usable.ravel()[pixels[1]]
-        for pixel in pixels:
-            difference, noise = images.difference(bit, pixel, variance)
-            bright = np.maximum(contrast[pixel], 1.0)
-            total += np.where(clear, difference / bright, 0.0)
-            size += np.where(clear, np.abs(difference) / bright, 0.0)
-            noise2 += np.where(clear, (noise / bright) ** 2, 0.0)
-            count += clear
-    count = np.maximum(count, 1.0)
-    mean, variance2, indirect = (
-        total / count,
-        noise2 / count**2,
-        np.maximum(1.0 - size / count, 0.0),
+    mean, doubt = np.zeros(len(at)), np.zeros(len(at))
+    roomy = np.flatnonzero(reach >= FEWEST_STRIPES)
+    pixels = _beside(codes, usable, at[roomy], index[roomy], reach[roomy])
+    difference, noise = images.difference(bit[roomy], pixels, variance)
+    mean[roomy], doubt[roomy] = _mean_imbalance(
+        images.lit.ravel(), images.dark.ravel(), pixels, difference, noise
     )
-    mean = np.clip(mean, -indirect, indirect)  # |J| <= I
-    kept = mean * mean**2 / (mean**2 + SIGNIFICANCE**2 * variance2 + 1e-12)
-    return kept, np.hypot(np.minimum(np.sqrt(variance2), np.abs(kept)), UNEXPLAINED * np.abs(kept))
+    return mean, doubt
+
+
+@compiled
+def _beside(codes: NDArray[np.int32], usable: Mask, at: Ints, index: Ints, reach: Ints) -> Ints:
+    """(N, 2 * len(BESIDE_PX)) flat pixels on both sides of boundaries, clear of this one and of where
+    the bit flips again; -1 instead of both where one is not."""
+    width = codes.shape[1]
+    found = np.full((at.size, 2 * len(BESIDE_PX)), -1)
+    for k in range(at.size):
+        line, place = divmod(at[k], width)
+        for n, step in enumerate(BESIDE_PX):
+            one, other = place - step, place + 1 + step
+            if one < 0 or other >= width or not (usable[line, one] and usable[line, other]):
+                continue
+            off, off_there = codes[line, one] + 0.5 - index[k], codes[line, other] + 0.5 - index[k]
+            if off * off_there < 0.0 and max(abs(off), abs(off_there)) < reach[k]:
+                found[k, 2 * n], found[k, 2 * n + 1] = line * width + one, line * width + other
+    return found
+
+
+@compiled
+def _mean_imbalance(
+    lit: Bytes, dark: Bytes, pixels: Ints, difference: Image, noise: Image
+) -> tuple[Floats, Floats]:
+    """See `imbalance`: (N,) from the differences (N, K) at pixels beside each boundary."""
+    result, doubt = np.zeros(len(pixels)), np.zeros(len(pixels))
+    for k in range(len(pixels)):
+        total, size, noise2, count = 0.0, 0.0, 0.0, 0
+        for n in range(pixels.shape[1]):
+            pixel = pixels[k, n]
+            if pixel < 0:
+                continue
+            bright = max(np.float64(lit[pixel]) - np.float64(dark[pixel]), 1.0)
+            total += difference[k, n] / bright
+            size += abs(difference[k, n]) / bright
+            noise2 += (noise[k, n] / bright) ** 2
+            count += 1
+        if count:
+            indirect = max(1.0 - size / count, 0.0)
+            mean = min(max(total / count, -indirect), indirect)  # |J| <= I
+            variance = noise2 / count**2
+            kept = mean * mean**2 / (mean**2 + SIGNIFICANCE**2 * variance + 1e-12)
+            unsure = min(math.sqrt(variance), abs(kept))
+            result[k] = kept
+            doubt[k] = math.sqrt(unsure**2 + (UNEXPLAINED * kept) ** 2)
+    return result, doubt

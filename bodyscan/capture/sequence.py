@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from bodyscan.capture.gray_code import WordCode
 from bodyscan.capture.stripe_images import SATURATED, ScanLines
+from bodyscan.compiled import compiled
 from bodyscan.errors import DecodingFailed
 
 Codes = NDArray[np.uint16]
-Greys = NDArray[np.int16]
+Greys = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 STEP = 3
@@ -63,22 +64,25 @@ def check_exposure(images: ScanLines) -> None:
     brighter than lit or darker than dark.
     """
     lit, dark = (frame[::STEP, ::STEP].astype(np.int16) for frame in (images.lit, images.dark))
-    seen = lit - dark >= MIN_CONTRAST
-    if np.mean(dark - lit >= MIN_CONTRAST) > max(float(np.mean(seen)), MIN_SHARE_LIT):
+    contrast = lit - dark
+    seen = contrast >= MIN_CONTRAST
+    if np.mean(contrast <= -MIN_CONTRAST) > max(float(np.mean(seen)), MIN_SHARE_LIT):
         raise DecodingFailed(
             "the dark frame is brighter than the lit frame",
             remedy="see whether the names of the two are exchanged in the rig file",
         )
     check_light(seen, lit)
     bright = seen & (lit < SATURATED)
-    bright &= lit - dark >= np.median((lit - dark)[bright])
+    bright &= contrast >= np.median(contrast[bright])
+    line, place = np.nonzero(bright)
+    at = STEP * (line * images.lit.shape[1] + place)
+    frames = (images.lit.ravel(), images.dark.ravel())
     for bit in range(len(images.patterns)):
-        pattern = images.patterns[bit, ::STEP, ::STEP][bright].astype(np.int16)
+        pattern = images.patterns[bit].ravel()
         if images.inverses is None:
-            _check_range(bit, pattern, lit[bright], dark[bright])
+            _check_range(bit, _out_of_range(*frames, pattern, at))
         else:
-            inverse = images.inverses[bit, ::STEP, ::STEP][bright].astype(np.int16)
-            _check_sum(bit, pattern, inverse, lit[bright], dark[bright])
+            _check_sum(bit, *_in_sum(*frames, pattern, images.inverses[bit].ravel(), at))
 
 
 def check_light(seen: Mask, lit: NDArray[Any]) -> None:
@@ -98,15 +102,13 @@ def check_light(seen: Mask, lit: NDArray[Any]) -> None:
         )
 
 
-def _check_sum(bit: int, pattern: Greys, inverse: Greys, lit: Greys, dark: Greys) -> None:
-    contrast = (lit - dark).astype(np.float32)
-    if np.median(np.abs(pattern - inverse) / contrast) < MIN_DIFFERENCE:
+def _check_sum(bit: int, alike: float, error: float) -> None:
+    """alike, error: see `_in_sum`."""
+    if alike > 0.5:
         raise DecodingFailed(
             f"pattern and inverse of bit {bit} look alike",
             remedy="see whether one of the two frames is missing or was taken twice",
         )
-    excess = np.maximum(np.abs(pattern + inverse - lit - dark) - NOISE_GREY, 0)
-    error = np.mean(np.minimum(excess / contrast, 1.0))
     if error > MAX_SUM_ERROR:
         raise DecodingFailed(
             f"pattern and inverse of bit {bit} do not add up to the lit frame "
@@ -116,15 +118,43 @@ def _check_sum(bit: int, pattern: Greys, inverse: Greys, lit: Greys, dark: Greys
         )
 
 
-def _check_range(bit: int, pattern: Greys, lit: Greys, dark: Greys) -> None:
-    beyond = np.maximum(pattern - lit, dark - pattern)
-    error = np.mean(np.minimum(np.maximum(beyond - NOISE_GREY, 0) / (lit - dark), 1.0))
+def _check_range(bit: int, error: float) -> None:
+    """error: see `_out_of_range`."""
     if error > MAX_SUM_ERROR:
         raise DecodingFailed(
             f"the pattern of bit {bit} is brighter than the lit frame or darker than the dark one "
             f"(by {error:.0%} of their contrast)",
             remedy="see whether it was exposed as they were",
         )
+
+
+@compiled
+def _in_sum(
+    lit: Greys, dark: Greys, pattern: Greys, inverse: Greys, at: NDArray[np.int64]
+) -> tuple[float, float]:
+    """At flat pixels (N,): the share at which pattern and inverse look alike, and by how much of its
+    contrast their sum differs from the lit frame's and the dark one's."""
+    alike, error = 0, 0.0
+    for pixel in at:
+        light, black = int(lit[pixel]), int(dark[pixel])
+        seen, other = int(pattern[pixel]), int(inverse[pixel])
+        contrast = light - black
+        alike += abs(seen - other) < MIN_DIFFERENCE * contrast
+        excess = max(abs(seen + other - light - black) - NOISE_GREY, 0)
+        error += min(excess / contrast, 1.0)
+    return alike / at.size, error / at.size
+
+
+@compiled
+def _out_of_range(lit: Greys, dark: Greys, pattern: Greys, at: NDArray[np.int64]) -> float:
+    """At flat pixels (N,): by how much of its contrast a pattern is brighter than the lit frame or
+    darker than the dark one."""
+    error = 0.0
+    for pixel in at:
+        light, black, seen = int(lit[pixel]), int(dark[pixel]), int(pattern[pixel])
+        excess = max(max(seen - light, black - seen) - NOISE_GREY, 0)
+        error += min(excess / (light - black), 1.0)
+    return error / at.size
 
 
 def check_codes(images: ScanLines, words: Codes, code: WordCode, stripes: int) -> None:

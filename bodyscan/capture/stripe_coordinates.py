@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.capture.boundaries import MIN_STRIPE_PX, Boundaries
+from bodyscan.compiled import compiled
 
 Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-Indices = NDArray[np.integer[Any]]
+Ints = NDArray[np.int64]
 
 SMOOTHERS = (
     np.array([-3.0, 12.0, 17.0, 12.0, -3.0]) / 35.0,
@@ -34,7 +35,7 @@ MAX_PULL = 0.05
 
 def interpolate_stripes(
     boundaries: Boundaries, codes: NDArray[np.int32], usable: Mask
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Image, Image]:
     """s and its standard deviation, (L, P) each, NaN where there is none.
 
     Between two boundaries s is a cubic with the slopes that the boundaries around them tell
@@ -42,28 +43,12 @@ def interpolate_stripes(
     """
     s = np.full(codes.shape, np.nan, np.float32)
     sigma = s.copy()
-    joined = boundaries.joined
-    if not joined.any():
-        return s, sigma
-    stripes = _Segments.of(boundaries, joined)
-    last = _last_boundary(boundaries, codes.shape)
-    wanted = np.flatnonzero(usable & (last >= 0))
-    stripes.fill(s, sigma, wanted, last.ravel()[wanted], codes, stripes.within)
-    for neighbour in (-1, 1):
-        wanted = np.flatnonzero(usable & np.isnan(s))
-        segment = last.ravel()[wanted] + neighbour
-        within = (segment >= 0) & (segment < len(joined))
-        wanted, segment = wanted[within], segment[within]
-        here = boundaries.line[segment + (neighbour < 0)] == wanted // codes.shape[1]
-        stripes.fill(s, sigma, wanted[here], segment[here], codes, stripes.beside)
+    if boundaries.joined.any():
+        found = _Segments.of(boundaries)
+        segments = (found.start, found.width, found.index, found.rise, found.sigma)
+        bends = (found.slope_in, found.slope_out, found.pull)
+        _fill(s, sigma, codes, usable, boundaries.line, boundaries.before, segments, bends)
     return s, sigma
-
-
-def _last_boundary(boundaries: Boundaries, shape: tuple[int, ...]) -> NDArray[np.int32]:
-    """(L, P): which boundary was last crossed at or before each pixel, over all lines; or -1."""
-    crossed = np.zeros(shape, np.int32)
-    crossed[boundaries.line, boundaries.before + 1] = 1
-    return np.cumsum(crossed.ravel(), dtype=np.int32).reshape(shape) - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,66 +70,96 @@ class _Segments:
     sigma: Floats
 
     @staticmethod
-    def of(boundaries: Boundaries, joined: Mask) -> _Segments:
-        position, sigma_px = smoothed(boundaries, joined)
-        width = np.where(joined, np.diff(position), np.nan)
+    def of(boundaries: Boundaries) -> _Segments:
+        position, sigma_px = smoothed(boundaries, boundaries.joined)
+        width = np.where(boundaries.joined, np.diff(position), np.nan)
         width[width < MIN_STRIPE_PX] = np.nan
         rise = np.diff(boundaries.index).astype(float)
-        slope_in, slope_out = end_slopes(rise / width, width)
-        pull = 0.5 * boundaries.blur2 * (slope_out - slope_in) / width
-        pull = np.clip(pull, -MAX_PULL, MAX_PULL)
-        sigma = np.abs(rise / width) * np.sqrt((sigma_px[1:] ** 2 + sigma_px[:-1] ** 2) / 2)
+        secant = rise / width
+        slope_in, slope_out = end_slopes(secant, width)
+        pull = np.clip(0.5 * boundaries.blur2 * (slope_out - slope_in) / width, -MAX_PULL, MAX_PULL)
+        variance = sigma_px * sigma_px
+        sigma = np.abs(secant) * np.sqrt((variance[1:] + variance[:-1]) / 2)
         start, index = position[:-1], boundaries.index[:-1].astype(float)
         return _Segments(start, width, index, rise, slope_in, slope_out, pull, sigma)
 
-    def within(self, segment: Indices, place: Indices) -> tuple[Floats, Floats]:
-        """s and its standard deviation at places (px) between a segment's boundaries."""
-        width, secant = self.width, self.rise / self.width
-        square = (3.0 * secant - 2.0 * self.slope_in - self.slope_out) / width
-        cube = (self.slope_in + self.slope_out - 2.0 * secant) / width**2
-        x = place - self.start[segment]
-        value = cube[segment] * x
-        value += square[segment]
-        value *= x
-        value += self.slope_in[segment]
-        value *= x
-        value += (self.index - self.pull)[segment]
-        return value, self.sigma[segment]
 
-    def beside(self, segment: Indices, place: Indices) -> tuple[Floats, Floats]:
-        """s and its standard deviation at places (px) before or behind a segment: its bend goes on,
-        and s is doubted by as much as that adds."""
-        width = self.width[segment]
-        x = place - self.start[segment]
-        behind = x > 0.5 * width
-        x = np.where(behind, x - width, x)
-        slope_in, slope_out = self.slope_in[segment], self.slope_out[segment]
-        bending = 0.5 * x**2 * (slope_out - slope_in) / width
-        value = self.index[segment] - self.pull[segment] + x * np.where(behind, slope_out, slope_in)
-        value += bending + np.where(behind, self.rise[segment], 0.0)
-        return value, np.hypot(BEYOND_DOUBT * self.sigma[segment], bending)
+@compiled
+def _fill(
+    s: Image,
+    sigma: Image,
+    codes: NDArray[np.int32],
+    usable: Mask,
+    line: Ints,
+    before: Ints,
+    segments: tuple[Floats, ...],
+    bends: tuple[Floats, ...],
+) -> None:
+    """Writes s and sigma (L, P) of usable pixels from the segments they lie in; beyond a run's
+    ends from the run's last one, the one before the pixel rather than the one behind.
 
-    def fill(
-        self,
-        s: NDArray[np.float32],
-        sigma: NDArray[np.float32],
-        pixels: Indices,
-        segment: Indices,
-        codes: NDArray[np.int32],
-        evaluate: Callable[[Indices, Indices], tuple[Floats, Floats]],
-    ) -> None:
-        """Writes s and sigma at flat `pixels` from their segments, where the code agrees and the
-        segment is left by no more than a part of a stripe. evaluate: `within` or `beside`."""
-        segment = np.minimum(segment, len(self.start) - 1)
-        value, spread = evaluate(segment, pixels % s.shape[1])
-        off_code = np.abs(value - codes.ravel()[pixels] - 0.5)
-        middle = self.index + 0.5 * self.rise
-        off_segment = np.abs(value - middle[segment])
-        takes = (off_code < 0.5 + SLACK) & (off_segment < 0.5 + BEYOND)
-        s.ravel()[pixels[takes]] = value[takes]
-        sigma.ravel()[pixels[takes]] = spread[takes]
+    line, before: (N,) of the boundaries. segments, bends: (N - 1,) each, see `_Segments`.
+    """
+    last, count = -1, line.size
+    for row in range(codes.shape[0]):
+        for place in range(codes.shape[1]):
+            while last + 1 < count and (
+                line[last + 1] < row or (line[last + 1] == row and before[last + 1] < place)
+            ):
+                last += 1
+            if not usable[row, place]:
+                continue
+            code, passed = codes[row, place], last >= 0 and line[last] == row
+            value, doubt = np.nan, np.nan
+            if passed and last + 1 < count:
+                value, doubt = _within(place, code, last, segments, bends)
+            if passed and last >= 1 and math.isnan(value):
+                value, doubt = _beside(place, code, last - 1, segments, bends)
+            if last + 2 < count and line[last + 1] == row and math.isnan(value):
+                value, doubt = _beside(place, code, last + 1, segments, bends)
+            s[row, place], sigma[row, place] = value, doubt
 
 
+@compiled
+def _within(
+    place: int, code: int, k: int, segments: tuple[Floats, ...], bends: tuple[Floats, ...]
+) -> tuple[float, float]:
+    """s and its standard deviation at a place (px) between the boundaries of segment k, or NaN."""
+    start, width, index, rise, sigma = segments
+    slope_in, slope_out, pull = bends
+    x, secant = place - start[k], rise[k] / width[k]
+    square = (3.0 * secant - 2.0 * slope_in[k] - slope_out[k]) / width[k]
+    cube = (slope_in[k] + slope_out[k] - 2.0 * secant) / (width[k] * width[k])
+    value = ((cube * x + square) * x + slope_in[k]) * x + index[k] - pull[k]
+    return _credible(value, sigma[k], code, index[k] + 0.5 * rise[k])
+
+
+@compiled
+def _beside(
+    place: int, code: int, k: int, segments: tuple[Floats, ...], bends: tuple[Floats, ...]
+) -> tuple[float, float]:
+    """s and its standard deviation at a place (px) before or behind segment k, or NaN: its bend
+    goes on, and s is doubted by as much as that adds."""
+    start, width, index, rise, sigma = segments
+    slope_in, slope_out, pull = bends
+    x, base, slope = place - start[k], index[k] - pull[k], slope_in[k]
+    if x > 0.5 * width[k]:
+        x, base, slope = x - width[k], base + rise[k], slope_out[k]
+    bending = 0.5 * x * x * (slope_out[k] - slope_in[k]) / width[k]
+    doubt = math.sqrt((BEYOND_DOUBT * sigma[k]) ** 2 + bending * bending)
+    return _credible(base + x * slope + bending, doubt, code, index[k] + 0.5 * rise[k])
+
+
+@compiled
+def _credible(value: float, doubt: float, code: int, middle: float) -> tuple[float, float]:
+    """Both, or NaN where the pixel's code says otherwise or the segment (its middle's s is given)
+    is left by more than a part of a stripe."""
+    if abs(value - code - 0.5) < 0.5 + SLACK and abs(value - middle) < 0.5 + BEYOND:
+        return value, doubt
+    return np.nan, np.nan
+
+
+@compiled
 def end_slopes(secant: Floats, width: Floats) -> tuple[Floats, Floats]:
     """Slopes of s at both ends of every segment from the segments beside it; their own secant where
     there are none.
@@ -153,18 +168,25 @@ def end_slopes(secant: Floats, width: Floats) -> tuple[Floats, Floats]:
     a run's end the parabola of the one segment goes on. Segments in which s runs the other way
     tell nothing of this one.
     """
-    nothing = np.array([np.nan])
-    secant_before, width_before = np.r_[nothing, secant[:-1]], np.r_[nothing, width[:-1]]
-    slope = (width_before * secant + width * secant_before) / (width_before + width)
-    slope = np.where(secant_before * secant > 0.0, slope, np.nan)
-    slope_out = np.r_[slope[1:], nothing]
-    return _completed(slope, slope_out, secant), _completed(slope_out, slope, secant)
+    count = secant.size
+    slope_in, slope_out = np.full(count, np.nan), np.full(count, np.nan)
+    for k in range(1, count):
+        if secant[k - 1] * secant[k] > 0.0:
+            both = width[k - 1] * secant[k] + width[k] * secant[k - 1]
+            slope_in[k] = slope_out[k - 1] = both / (width[k - 1] + width[k])
+    for k in range(count):
+        first, last = slope_in[k], slope_out[k]
+        slope_in[k] = _completed(first, last, secant[k])
+        slope_out[k] = _completed(last, first, secant[k])
+    return slope_in, slope_out
 
 
-def _completed(slope: Floats, other: Floats, secant: Floats) -> Floats:
-    """Slopes at one end; where unknown, of the parabola with slope `other` at the other end."""
-    slope = np.where(np.isnan(slope), 2.0 * secant - other, slope)
-    return np.where(np.isnan(slope), secant, slope)
+@compiled
+def _completed(slope: float, other: float, secant: float) -> float:
+    """The slope at one end; if unknown, of the parabola with slope `other` at the other end."""
+    if not math.isnan(slope):
+        return slope
+    return secant if math.isnan(other) else 2.0 * secant - other
 
 
 def smoothed(boundaries: Boundaries, joined: Mask) -> tuple[Floats, Floats]:
@@ -176,17 +198,29 @@ def smoothed(boundaries: Boundaries, joined: Mask) -> tuple[Floats, Floats]:
     """
     position, sigma = boundaries.position.copy(), boundaries.sigma_px.copy()
     for weights in SMOOTHERS:
-        half = len(weights) // 2
-        if len(position) < len(weights):
-            continue
-        inner = slice(half, len(position) - half)
-        broken = np.concatenate([[0], np.cumsum(~joined)])
-        whole = broken[2 * half :] == broken[: -2 * half]
-        seen = boundaries.position
-        whole &= seen[2 * half :] - seen[: -2 * half] < 2 * REACH_PX
-        fitted = np.convolve(seen, weights, mode="valid")
-        moved = np.abs(fitted - seen[inner])
-        take = whole & (moved < MAX_STRAY * boundaries.sigma_px[inner])
-        position[inner][take] = fitted[take]
-        sigma[inner][take] = boundaries.sigma_px[inner][take] * np.linalg.norm(weights)
+        _smooth(boundaries.position, boundaries.sigma_px, joined, weights, position, sigma)
     return position, sigma
+
+
+@compiled
+def _smooth(
+    seen: Floats,
+    sigma_px: Floats,
+    joined: Mask,
+    weights: Floats,
+    position: Floats,
+    sigma: Floats,
+) -> None:
+    """One filter of `smoothed`; overwrites position and sigma (N,) where it fits."""
+    half = weights.size // 2
+    share = math.sqrt(np.sum(weights * weights))
+    run = 0  # how many boundaries before this one belong to its run
+    for last in range(1, seen.size):
+        run = run + 1 if joined[last - 1] else 0
+        if run < 2 * half or seen[last] - seen[last - 2 * half] >= 2 * REACH_PX:
+            continue
+        middle, fitted = last - half, 0.0
+        for k in range(weights.size):
+            fitted += weights[k] * seen[last - 2 * half + k]
+        if abs(fitted - seen[middle]) < MAX_STRAY * sigma_px[middle]:
+            position[middle], sigma[middle] = fitted, sigma_px[middle] * share

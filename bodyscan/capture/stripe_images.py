@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -11,12 +12,16 @@ from numpy.typing import NDArray
 
 from bodyscan.capture.indirect_light import mostly_direct
 from bodyscan.capture.views import StripeMap
+from bodyscan.compiled import compiled
 
 if TYPE_CHECKING:
     from bodyscan.capture.boundaries import Boundaries
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+Image = NDArray[np.float32]
+Words = NDArray[np.uint16]
 
 SATURATED = 254
 MIN_CONTRAST = 4.0
@@ -59,8 +64,11 @@ class ScanLines:
         """(L, P) code words, the first pattern the most significant bit."""
         words = np.zeros(self.lit.shape, np.uint16)
         for bit in range(len(self.patterns)):
-            words <<= 1
-            words |= self.bright(bit)
+            if self.inverses is None:
+                words <<= 1
+                words |= self.bright(bit)
+            else:
+                _append_bit(words.ravel(), self.patterns[bit].ravel(), self.inverses[bit].ravel())
         return words
 
     def bright(self, bit: int) -> Mask:
@@ -74,23 +82,30 @@ class ScanLines:
     def difference(
         self, bit: NDArray[np.int64], at: NDArray[np.int64], variance: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Pattern minus inverse of bits (N,) at flat pixels (N,), and its noise, grey levels.
+        """Pattern minus inverse of bits (N,) at flat pixels (N, K), and its noise, grey levels.
 
-        Without inverses, twice what the pattern is above the middle of lit and dark.
+        Pixels below 0 get 0. Without inverses, twice what the pattern is above the middle of lit
+        and dark.
         """
-        place = bit * self.lit.size + at
-        pattern = self.patterns.ravel()[place]
-        if self.inverses is not None:
-            return _against(pattern, self.inverses.ravel()[place], variance)
-        return _above_middle(pattern, self.lit.ravel()[at], self.dark.ravel()[at], variance)
+        patterns, inverses = self.patterns.reshape(-1), self._inverses.reshape(-1)
+        return _differences(
+            self.lit.ravel(), self.dark.ravel(), patterns, inverses, bit, at, variance
+        )
 
     def difference_image(
         self, bit: int, variance: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """`difference` of one bit at all pixels, (L, P)."""
-        if self.inverses is not None:
-            return _against(self.patterns[bit], self.inverses[bit], variance)
-        return _above_middle(self.patterns[bit], self.lit, self.dark, variance)
+        inverse = self._inverses[bit : bit + 1].reshape(-1)
+        difference, noise = _difference_image(
+            self.lit.ravel(), self.dark.ravel(), self.patterns[bit].ravel(), inverse, variance
+        )
+        return difference.reshape(self.lit.shape), noise.reshape(self.lit.shape)
+
+    @property
+    def _inverses(self) -> Bytes:
+        """(F, L, P), or (0, L, P) where none are thrown."""
+        return self.patterns[:0] if self.inverses is None else self.inverses
 
     def usable(
         self, codes: NDArray[np.int32], variance: NDArray[np.float32], stripes: int, fine_bit: int
@@ -102,11 +117,10 @@ class ScanLines:
         depth jump is one), and pixels that other surfaces light more than the projector does.
         variance: (256,) of each grey level.  fine_bit: see `mostly_direct`.
         """
-        noise = np.sqrt(variance)[cv2.max(self.lit, self.dark)]
-        contrast = self.contrast
-        usable = contrast >= np.maximum(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * noise)
-        usable &= ~half_covered(contrast, usable)
-        usable &= (self.lit < SATURATED) & (codes < stripes)
+        bright = np.empty(self.lit.shape, bool)
+        _mark_bright(self.lit.ravel(), self.dark.ravel(), variance, bright.ravel())
+        bright &= ~half_covered(cv2.subtract(self.lit, self.dark), bright)
+        usable = bright & (self.lit < SATURATED) & (codes < stripes)
         usable &= ~beside_jumps(codes, usable)
         return usable & mostly_direct(self, usable, fine_bit, variance)
 
@@ -141,37 +155,99 @@ def transposed(images: Bytes) -> Bytes:
     return np.stack([cv2.transpose(image) for image in images])
 
 
-def _against(
-    pattern: Bytes, inverse: Bytes, variance: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    noise = np.sqrt(variance[pattern] + variance[inverse])
-    return np.subtract(pattern, inverse, dtype=np.float32), noise
+@compiled
+def _append_bit(words: Words, pattern: Bytes, inverse: Bytes) -> None:
+    """Makes room for one bit in code words (N,) and sets it where the pattern is brighter."""
+    for at in range(words.size):
+        words[at] = (words[at] << 1) | (pattern[at] > inverse[at])
 
 
-def _above_middle(
-    pattern: Bytes, lit: Bytes, dark: Bytes, variance: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    difference = 2.0 * pattern.astype(np.float32) - lit - dark
-    return difference, np.sqrt(4.0 * variance[pattern] + variance[lit] + variance[dark])
+@compiled
+def _difference(
+    pattern: int, inverse: int, lit: int, dark: int, inverted: bool, variance: Image
+) -> tuple[float, float]:
+    """See `ScanLines.difference`; of one pixel."""
+    if inverted:
+        apart = float(pattern) - float(inverse)
+        return apart, math.sqrt(variance[pattern] + variance[inverse])
+    above = 2.0 * pattern - float(lit) - float(dark)
+    return above, math.sqrt(4 * variance[pattern] + variance[lit] + variance[dark])
 
 
-def half_covered(contrast: NDArray[np.float32], lit: Mask) -> Mask:
+@compiled
+def _differences(
+    lit: Bytes, dark: Bytes, patterns: Bytes, inverses: Bytes, bit: Ints, at: Ints, variance: Image
+) -> tuple[Image, Image]:
+    difference, noise = np.zeros(at.shape, np.float32), np.zeros(at.shape, np.float32)
+    inverted = inverses.size > 0
+    for k in range(at.shape[0]):
+        for n in range(at.shape[1]):
+            pixel = at[k, n]
+            if pixel < 0:
+                continue
+            place = bit[k] * lit.size + pixel
+            inverse = inverses[place] if inverted else patterns[place]
+            difference[k, n], noise[k, n] = _difference(
+                patterns[place], inverse, lit[pixel], dark[pixel], inverted, variance
+            )
+    return difference, noise
+
+
+@compiled
+def _difference_image(
+    lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, variance: Image
+) -> tuple[Image, Image]:
+    difference, noise = np.empty(lit.size, np.float32), np.empty(lit.size, np.float32)
+    inverted = inverse.size > 0
+    for at in range(lit.size):
+        difference[at], noise[at] = _difference(
+            pattern[at],
+            inverse[at] if inverted else pattern[at],
+            lit[at],
+            dark[at],
+            inverted,
+            variance,
+        )
+    return difference, noise
+
+
+@compiled
+def _mark_bright(lit: Bytes, dark: Bytes, variance: Image, bright: Mask) -> None:
+    """Pixels (N,) whose contrast stands out from the noise."""
+    for at in range(lit.size):
+        contrast = np.float32(lit[at]) - np.float32(dark[at])
+        noise = math.sqrt(variance[max(lit[at], dark[at])])
+        bright[at] = contrast >= max(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * noise)
+
+
+def half_covered(contrast: NDArray[Any], lit: Mask) -> Mask:
     """(L, P): pixels beside one that is not lit and much darker than their brightest neighbour.
 
     They straddle the rim of the surface, and tell s of its part of them, not of their middle.
     """
     around = np.ones((3, 3), np.uint8)
-    at_rim = cv2.erode(lit.astype(np.uint8), around, borderValue=1) == 0
+    at_rim = cv2.erode(lit.view(np.uint8), around, borderValue=1) == 0
     return at_rim & (contrast < WHOLLY_COVERED * cv2.dilate(contrast, around))
 
 
 def beside_jumps(codes: NDArray[np.int32], usable: Mask) -> Mask:
     """(L, P): pixels whose code differs from a usable neighbour's by more than one."""
     jumps = np.zeros(codes.shape, bool)
-    across = (np.abs(np.diff(codes, axis=1)) > 1) & usable[:, 1:] & usable[:, :-1]
-    jumps[:, 1:] |= across
-    jumps[:, :-1] |= across
-    along = (np.abs(np.diff(codes, axis=0)) > 1) & usable[1:] & usable[:-1]
-    jumps[1:] |= along
-    jumps[:-1] |= along
+    _mark_jumps(codes, usable, jumps)
     return jumps
+
+
+@compiled
+def _mark_jumps(codes: NDArray[np.int32], usable: Mask, jumps: Mask) -> None:
+    lines, places = codes.shape
+    for line in range(lines):
+        for place in range(places):
+            if not usable[line, place]:
+                continue
+            code = codes[line, place]
+            for down, on in ((0, 1), (1, 0)):
+                other_line, other = line + down, place + on
+                if other_line == lines or other == places or not usable[other_line, other]:
+                    continue
+                if abs(codes[other_line, other] - code) > 1:
+                    jumps[line, place] = jumps[other_line, other] = True
