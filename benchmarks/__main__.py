@@ -1,6 +1,6 @@
 """Run all benchmarks, or those named, and write what they print into docs/results.md.
 
-python -m benchmarks [three-pole | fusion | rig | procam | charuco-ring | codes | lens] ...
+python -m benchmarks [NAME ...]    (the names are the keys of BENCHMARKS)
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks import charuco_ring, codes, fusion, lens, procam, rig, three_pole
+from benchmarks import charuco_ring, codes, full_size, fusion, lens, procam, rig
 from bodyscan.files import write_text
 
 PROJECT = Path(__file__).parents[1]
 RESULTS = PROJECT / "docs" / "results.md"
 BENCHMARKS: dict[str, Callable[[], str]] = {
-    "three-pole": three_pole.report,
+    "three-pole": full_size.three_pole,
+    "four-pole": full_size.four_pole,
+    "sway": full_size.sway,
     "fusion": fusion.report,
     "rig": rig.report,
     "procam": procam.report,

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import three_pole
+from benchmarks import full_size
 from bodyscan.fusion.body import BodyCloud
 
 Figures = dict[str, Any]
@@ -42,8 +42,8 @@ NAMES = {
 
 
 def report(workspace: Path | None = None) -> str:
-    """The section of docs/results.md; the workspace is three_pole's, simulated and calibrated."""
-    workspace = workspace or Path(os.environ.get("BODYSCAN_BENCH", three_pole.WORKSPACE))
+    """The section of docs/results.md; the workspace is full_size.s, simulated and calibrated."""
+    workspace = workspace or Path(os.environ.get("BODYSCAN_BENCH", full_size.WORKSPACE))
     with tempfile.TemporaryDirectory() as folder:
         found = {step: _in_a_process(step, workspace, Path(folder)) for step in STEPS}
     rows = "\n".join(_row(step, figures, found) for step, figures in found.items() if figures)

@@ -1,0 +1,124 @@
+"""Rigs at full size: simulated, calibrated, a subject scanned, all of it held against the truth."""
+
+from __future__ import annotations
+
+import re
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+PROJECT = Path(__file__).parents[1]
+WORKSPACE = PROJECT / "bench" / "three-pole-12"
+SWAY_MM = 5
+FEWEST_SHOTS = 3
+
+
+def three_pole() -> str:
+    """The section of docs/results.md of three poles, twelve pairs and the woman."""
+    return _report("Three poles, twelve pairs", "three-pole-12", "woman_average")
+
+
+def four_pole() -> str:
+    """The section of docs/results.md of four poles, sixteen pairs and the man."""
+    return _report("Four poles, sixteen pairs", "four-pole-16", "man_average")
+
+
+def sway() -> str:
+    """The section of docs/results.md of the woman swaying, on the calibration of `three_pole`."""
+    workspace = PROJECT / "bench" / "sway"
+    rig, subject = PROJECT / "rigs" / "three-pole-12.yaml", _subject("woman_average")
+    commands = _commands(rig, workspace, subject)
+    commands["simulate"] += ["--sway-mm", SWAY_MM, "--board-shots", FEWEST_SHOTS]
+    del commands["calibrate-rig"], commands["export"]
+    shutil.rmtree(workspace / "calibration", ignore_errors=True)
+    shutil.copytree(WORKSPACE / "calibration", workspace / "calibration")
+    outputs, _, _ = run_commands(commands, workspace)
+    return f"""## A subject that sways, full size (synthetic)
+
+The woman and the rig of `three-pole-12`, calibrated there, who now moves by up to {SWAY_MM} mm
+between the pairs (`bodyscan simulate --sway-mm {SWAY_MM}`).
+
+```
+{_against_truth(outputs)}
+```
+
+```
+{outputs["scan"].strip()}
+```
+"""
+
+
+def _report(title: str, rig: str, subject: str) -> str:
+    workspace = PROJECT / "bench" / rig
+    commands = _commands(PROJECT / "rigs" / f"{rig}.yaml", workspace, _subject(subject))
+    outputs, seconds, memory = run_commands(commands, workspace)
+    rows = "\n".join(f"| `{name}` | {seconds[name]:.1f} | {memory[name]:.1f} |" for name in outputs)
+    return f"""## {title}, full size (synthetic)
+
+`rigs/{rig}.yaml` with `{subject}` simulated at 1280 x 1024, 640 stripes, mirror projectors,
+default noise, then the commands a user would type. Seconds of wall clock and peak memory of each:
+
+| command | s | GiB |
+|---|---|---|
+{rows}
+
+```
+{_against_truth(outputs)}
+```
+
+Calibration:
+
+```
+{outputs["calibrate-rig"].strip()}
+```
+
+Scan:
+
+```
+{outputs["scan"].strip()}
+```
+"""
+
+
+def _subject(name: str) -> Path:
+    return PROJECT / "data" / "subjects" / f"{name}.ply"
+
+
+def _against_truth(outputs: dict[str, str]) -> str:
+    found = re.search(r"against the truth.*?(?=results:)", outputs["evaluate"], re.DOTALL)
+    return found.group(0).rstrip() if found else outputs["evaluate"]
+
+
+def _commands(rig: Path, workspace: Path, subject: Path) -> dict[str, list[object]]:
+    """The arguments of what a user would type, in order."""
+    result = workspace / "scan"
+    person, calibration = workspace / "captures" / "person", workspace / "calibration"
+    return {
+        "simulate": [rig, "--out", workspace, "--subject", subject],
+        "calibrate-rig": [workspace / "rig.yaml"],
+        "scan": [person, "--calibration", calibration, "--out", result, "--overwrite"],
+        "export": [result, "--out", workspace / "export"],
+        "evaluate": [workspace],
+    }
+
+
+def run_commands(
+    commands: dict[str, list[object]], workspace: Path
+) -> tuple[dict[str, str], dict[str, float], dict[str, float]]:
+    """What each command printed, how long it took (s), and its peak memory (GiB)."""
+    outputs, seconds, memory = {}, {}, {}
+    for name, arguments in commands.items():
+        if name == "simulate" and (workspace / "truth" / "truth.json").exists():
+            continue  # the same rig gives the same bytes
+        started = time.perf_counter()
+        line = [sys.executable, "-m", "bodyscan", name, *map(str, arguments)]
+        done = subprocess.run(line, capture_output=True, text=True, check=False)
+        seconds[name] = time.perf_counter() - started
+        memory[name] = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+        if done.returncode:
+            raise SystemExit(f"{name} failed:\n{done.stdout}\n{done.stderr}")
+        outputs[name] = done.stdout
+    return outputs, seconds, memory
