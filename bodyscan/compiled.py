@@ -21,7 +21,11 @@ def compiled(function: Function) -> Function:
 
     Division by zero gives infinity or NaN, as in numpy. Numba looks at a file's date to see whether
     what it kept is still good, and not at the functions called from other files: compiled functions
-    call only those of their own file.
+    call only those of their own file. int() of a uint8 is unsigned there, and differences of such
+    wrap round: write float(), or np.int64().
     """
-    compiler = numba.njit(cache=True, nogil=True, error_model="numpy")
-    return cast(Function, compiler(function))
+    options = {"nogil": True, "error_model": "numpy"}
+    try:
+        return cast(Function, numba.njit(cache=True, **options)(function))
+    except RuntimeError:  # neither beside the source nor in the user's cache can files be kept
+        return cast(Function, numba.njit(**options)(function))

@@ -7,6 +7,7 @@ from functools import partial
 from itertools import combinations
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -136,11 +137,11 @@ def _in_sum(
     contrast their sum differs from the lit frame's and the dark one's."""
     alike, error = 0, 0.0
     for pixel in at:
-        light, black = int(lit[pixel]), int(dark[pixel])
-        seen, other = int(pattern[pixel]), int(inverse[pixel])
+        light, black = float(lit[pixel]), float(dark[pixel])
+        seen, other = float(pattern[pixel]), float(inverse[pixel])
         contrast = light - black
         alike += abs(seen - other) < MIN_DIFFERENCE * contrast
-        excess = max(abs(seen + other - light - black) - NOISE_GREY, 0)
+        excess = max(abs(seen + other - light - black) - NOISE_GREY, 0.0)
         error += min(excess / contrast, 1.0)
     return alike / at.size, error / at.size
 
@@ -151,8 +152,8 @@ def _out_of_range(lit: Greys, dark: Greys, pattern: Greys, at: NDArray[np.int64]
     darker than the dark one."""
     error = 0.0
     for pixel in at:
-        light, black, seen = int(lit[pixel]), int(dark[pixel]), int(pattern[pixel])
-        excess = max(max(seen - light, black - seen) - NOISE_GREY, 0)
+        light, black, seen = float(lit[pixel]), float(dark[pixel]), float(pattern[pixel])
+        excess = max(max(seen - light, black - seen) - NOISE_GREY, 0.0)
         error += min(excess / (light - black), 1.0)
     return error / at.size
 
@@ -167,10 +168,10 @@ def check_codes(images: ScanLines, words: Codes, code: WordCode, stripes: int) -
     last stripe, and not at all if the stripes are a power of two.
     """
     bits = len(images.patterns)
-    contrast = images.contrast
-    lit = contrast >= MIN_CONTRAST
+    contrast = cv2.subtract(images.lit, images.dark)
+    some = contrast[::STEP, ::STEP]
     # Darker pixels are misread too often by themselves to tell anything.
-    good = lit & (contrast >= np.median(contrast[::STEP, ::STEP][lit[::STEP, ::STEP]]))
+    good = contrast >= np.median(some[some >= MIN_CONTRAST])
     check_direction(words, good, images.turned)
     one, other = _changes(words, good, code)
     least = MIN_SHARE_IN_STEP

@@ -152,7 +152,10 @@ class ScanLines:
 
 def transposed(images: Bytes) -> Bytes:
     """Each image of a stack (F, H, W) transposed."""
-    return np.stack([cv2.transpose(image) for image in images])
+    turned = np.empty((len(images), *images.shape[:0:-1]), np.uint8)
+    for image, target in zip(images, turned, strict=True):
+        cv2.transpose(image, dst=target)
+    return turned
 
 
 @compiled
