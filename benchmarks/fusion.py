@@ -42,7 +42,7 @@ NAMES = {
 
 
 def report(workspace: Path | None = None) -> str:
-    """The section of docs/results.md; the workspace is full_size.s, simulated and calibrated."""
+    """The section of docs/results.md; the workspace is `full_size`, simulated and calibrated."""
     workspace = workspace or Path(os.environ.get("BODYSCAN_BENCH", full_size.WORKSPACE))
     with tempfile.TemporaryDirectory() as folder:
         found = {step: _in_a_process(step, workspace, Path(folder)) for step in STEPS}
@@ -65,6 +65,7 @@ truth in mm (nothing aligned to it): of all points of a cloud, of a mesh's verti
 From PNGs to the cloud takes {ratio:.1f} times as long as reading the PNGs with as many threads
 ({processor:.1f} times the processor time). Stages, s: {stages}.
 Pairs to each other (overlaps, RMS): {found["ours"]["overlap_mm"]:.3f} mm.
+{_versions_line(found["mesh"])}
 """
 
 
@@ -164,9 +165,53 @@ def _mesh(workspace: Path, folder: Path) -> Step:
 
     def finish(found: Any) -> Figures:
         measured = np.unique(found.faces[~found.filled])
-        return {"deviation": _deviation(workspace, found.vertices[measured])}
+        return {
+            "deviation": _deviation(workspace, found.vertices[measured]),
+            "filled": found.filled_share,
+            **versions(found),
+        }
 
     return lambda: mesh(cloud, images, placing), finish
+
+
+def versions(full: Any) -> Figures:
+    """How far the light version and the full one are from each other, and where each meets itself.
+
+    Distances, mm, are those of random spots of the light mesh and of all vertices of the full one.
+    """
+    from bodyscan.evaluation.self_intersections import self_intersections
+    from bodyscan.evaluation.surface import sample_surface, signed_distances
+    from bodyscan.fusion.versions import light
+
+    lean = light(full)
+    spots = sample_surface(lean.vertices, lean.faces, 500_000)[0]
+    distances = np.abs(
+        np.concatenate(
+            [
+                signed_distances(spots, full.vertices, full.faces),
+                signed_distances(full.vertices, lean.vertices, lean.faces),
+            ]
+        )
+    )
+    return {
+        "light_faces": len(lean.faces),
+        "light_rms_mm": float(np.sqrt(np.mean(distances**2))),
+        "light_p999_mm": float(np.percentile(distances, 99.9)),
+        "light_worst_mm": float(distances.max()),
+        "light_self_intersections": len(self_intersections(lean.vertices, lean.faces)),
+        "self_intersections": len(self_intersections(full.vertices, full.faces)),
+    }
+
+
+def _versions_line(figures: Figures) -> str:
+    return (
+        f"Of our mesh {100 * figures['filled']:.1f} % is made up. The light version"
+        f" ({figures['light_faces']} faces) and the full one lie {figures['light_rms_mm']:.3f} mm RMS"
+        f" from each other, {figures['light_p999_mm']:.2f} at 99.9 %,"
+        f" {figures['light_worst_mm']:.2f} at most. Edges that pierce a face:"
+        f" {figures['self_intersections']} of the full mesh,"
+        f" {figures['light_self_intersections']} of the light one."
+    )
 
 
 def _open3d(workspace: Path, folder: Path) -> Step:

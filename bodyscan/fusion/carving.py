@@ -111,11 +111,16 @@ def _skin(voxels: Voxels, removed: Mask, measured: cKDTree) -> tuple[Array, Arra
     places = voxels.origin + VOXEL_MM * index
     nearby = measured.query(places, distance_upper_bound=CLEARANCE_MM, workers=2)[0] < np.inf
     index, places = index[~nearby], places[~nearby]
-    slopes = [
-        ndimage.map_coordinates(np.gradient(soft, axis=axis), index.T, order=1) for axis in range(3)
-    ]
-    normals = -np.stack(slopes, axis=-1).astype(np.float64)
+    normals = -_slopes(soft, index)
     return places, normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+def _slopes(values: Floats, index: Array) -> Array:
+    """(N, 3) central differences at places (N, 3) between voxels, interpolated linearly."""
+    around = index + np.concatenate([np.eye(3), -np.eye(3)])[:, None]
+    found = ndimage.map_coordinates(values, around.reshape(-1, 3).T, order=1, output=np.float64)
+    ahead, behind = found.reshape(2, 3, -1)
+    return np.asarray(0.5 * (ahead - behind).T)
 
 
 def _crossings(soft: Floats, axis: int) -> Array:

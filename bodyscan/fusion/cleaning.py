@@ -14,16 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.capture.rig import Volume
+from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
-from bodyscan.fusion.grid import Floats, carried, crop_of
+from bodyscan.fusion.dark_gaps import dark_gaps
+from bodyscan.fusion.grid import Floats, crop_of
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
+Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 STEEPEST = 5.0  # depth per sideways step on a surface still worth having: tan 79 degrees
-# Half of the 24 neighbours in a square window (rows, columns): the others are their mirror images.
-HALF_WINDOW = [(r, c) for r in range(3) for c in range(-2, 3) if r > 0 or c > 0]
+DISTANCES_PX = np.hypot(*np.mgrid[-2:3, -2:3])  # of a pixel's neighbours
 BACKGROUND_MM = 4.0  # a subject stands out from the background by more than this
 QUANTUM_MM = 0.25  # cv2.filterSpeckles works on 16-bit integers: +-8 m in steps of this
 
@@ -41,7 +43,8 @@ def clean(
 
     Cut away are: what lies outside the scan volume (floor, walls), what the rig sees without a
     subject (`empty`: range images of that, of some or all pairs), flying pixels at silhouettes,
-    grazing surfaces, and disconnected patches smaller than `smallest_patch_mm2`.
+    grazing surfaces, narrow dark gaps (see there), and disconnected patches smaller than
+    `smallest_patch_mm2`.
     """
     nobody = {image.pair: image for image in empty}
 
@@ -51,8 +54,10 @@ def clean(
             kept &= in_front_of(image, nobody[image.pair])
         box = crop_of(kept)
         if box is not None:
-            depth = np.where(kept[box], image.points[box][..., 2], 0.0)
-            pixel_mm = float(np.median(depth[depth > 0])) / image.camera.alpha
+            kept[box] &= ~dark_gaps(image.colours[box])
+        if box is not None and kept.any():
+            depth = np.where(kept[box], image.points[box][..., 2], np.float32(np.nan))
+            pixel_mm = float(np.median(depth[kept[box]])) / image.camera.alpha
             solid = without_flying_pixels(depth, STEEPEST * pixel_mm)
             kept[box] = without_speckles(
                 solid, STEEPEST * pixel_mm, smallest_patch_mm2 / pixel_mm**2
@@ -76,21 +81,19 @@ def with_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:
 
 def masked(image: RangeImage, kept: Mask) -> RangeImage:
     """The range image with NaN where `kept` (height, width) is false."""
-    nan = np.float32(np.nan)
-    return replace(
-        image,
-        points=np.where(kept[..., None], image.points, nan),
-        normals=np.where(kept[..., None], image.normals, nan),
-        sigma_mm=np.where(kept, image.sigma_mm, nan),
-    )
+    points, normals = np.full_like(image.points, np.nan), np.full_like(image.normals, np.nan)
+    sigma_mm = np.full_like(image.sigma_mm, np.nan)
+    given = (image.points, image.normals, image.sigma_mm)
+    _keep(kept, given, (points, normals, sigma_mm))
+    return replace(image, points=points, normals=normals, sigma_mm=sigma_mm)
 
 
 def inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> Mask:
     """(height, width): measured, and within the scan volume's upright cylinder."""
-    x, y, z = cv2.split(carried(image.points, rig_from_camera))
-    with np.errstate(invalid="ignore"):
-        within = (x * x + y * y < volume.radius_mm**2) & (z > volume.bottom_mm)
-        return within & (z < volume.top_mm) & image.valid
+    within = np.empty(image.sigma_mm.shape, np.bool_)
+    size = (volume.radius_mm, volume.bottom_mm, volume.top_mm)
+    _inside(image.points, image.sigma_mm, rig_from_camera.matrix[:3], size, within)
+    return within
 
 
 def in_front_of(image: RangeImage, empty: RangeImage) -> Mask:
@@ -105,39 +108,82 @@ def in_front_of(image: RangeImage, empty: RangeImage) -> Mask:
 
 
 def without_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -> Floats:
-    """Depth (h, w), 0 where there is none, of the pixels that enough neighbours agree with.
+    """Depth (h, w), NaN where there is none, of the pixels that enough neighbours agree with.
 
     A straight rim of a surface leaves a pixel 14 of its 24 neighbours; a flying pixel hangs between
     the front and the back and finds few within `step_mm` per step. Two passes: the second no
     longer counts what the first cut.
     """
+    limits = np.where(DISTANCES_PX > 0, step_mm * DISTANCES_PX, -1.0).astype(np.float32)
     for _ in range(2):
-        there = depth > 0
-        count = np.zeros(depth.shape, np.uint8)
-        for rows, columns in HALF_WINDOW:
-            here, away = _shifted(rows, columns)
-            close = np.abs(depth[here] - depth[away]) < step_mm * np.hypot(rows, columns)
-            close &= there[here] & there[away]
-            count[here] += close
-            count[away] += close
-        depth = np.where(count >= supporters, depth, np.float32(0.0))
+        padded, depth = np.pad(depth, 2, constant_values=np.nan), np.empty_like(depth)
+        _supported(padded, limits, supporters, depth)
     return depth
 
 
 def without_speckles(depth: Floats, step_mm: float, smallest_px: float) -> Mask:
     """(h, w): pixels in connected patches of at least `smallest_px`; jumps in depth cut."""
-    quanta = np.clip(depth / QUANTUM_MM, 0, 32767).astype(np.int16)
+    quanta = np.clip(np.nan_to_num(depth) / QUANTUM_MM, 0, 32767).astype(np.int16)
     patches, _ = cv2.filterSpeckles(quanta, 0, int(smallest_px), step_mm / QUANTUM_MM)
     return patches > 0
 
 
-def _shifted(rows: int, columns: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Slices `here`, `there` such that there is (rows, columns) away from here."""
+@compiled
+def _inside(
+    points: Floats,
+    sigma_mm: Floats,
+    rig_from_camera: Array,
+    size: tuple[float, float, float],
+    within: Mask,
+) -> None:
+    """within (H, W): which points (H, W, 3) that have a sigma lie in an upright cylinder.
 
-    def pair(step: int) -> tuple[slice, slice]:
-        if step >= 0:
-            return slice(0, -step or None), slice(step, None)
-        return slice(-step, None), slice(0, step)
+    rig_from_camera: (3, 4).  size: of the cylinder, its radius, bottom and top, mm.
+    """
+    m, (radius, bottom, top) = rig_from_camera, size
+    for v in range(within.shape[0]):
+        for u in range(within.shape[1]):
+            x, y, z = points[v, u, 0], points[v, u, 1], points[v, u, 2]
+            rig_x = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
+            rig_y = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
+            rig_z = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+            around = rig_x * rig_x + rig_y * rig_y < radius * radius
+            measured = sigma_mm[v, u] < np.inf
+            within[v, u] = around & (rig_z > bottom) & (rig_z < top) & measured
 
-    (here_rows, there_rows), (here_columns, there_columns) = pair(rows), pair(columns)
-    return (here_rows, here_columns), (there_rows, there_columns)
+
+@compiled
+def _supported(padded: Floats, limits: Floats, supporters: int, kept: Floats) -> None:
+    """kept (h, w): the depths that at least `supporters` neighbours agree with, else NaN.
+
+    padded: (h + 4, w + 4) depths, two more pixels on all sides.  limits: (5, 5) how far each
+    neighbour's depth may be off.
+    """
+    height, width = kept.shape
+    count = np.empty(width, np.uint8)
+    for v in range(height):
+        here = padded[v + 2, 2:]
+        count[:] = 0
+        for row in range(5):
+            for column in range(5):
+                there, limit = padded[v + row, column:], limits[row, column]
+                for u in range(width):
+                    count[u] += abs(there[u] - here[u]) < limit
+        for u in range(width):
+            kept[v, u] = here[u] if count[u] >= supporters else np.float32(np.nan)
+
+
+@compiled
+def _keep(
+    kept: Mask, given: tuple[Floats, Floats, Floats], left: tuple[Floats, Floats, Floats]
+) -> None:
+    """Copies points (H, W, 3), normals (H, W, 3) and sigma_mm (H, W) where kept (H, W)."""
+    points, normals, sigma_mm = given
+    left_points, left_normals, left_sigma_mm = left
+    for v in range(kept.shape[0]):
+        for u in range(kept.shape[1]):
+            if kept[v, u]:
+                for k in range(3):
+                    left_points[v, u, k] = points[v, u, k]
+                    left_normals[v, u, k] = normals[v, u, k]
+                left_sigma_mm[v, u] = sigma_mm[v, u]

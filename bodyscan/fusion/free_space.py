@@ -9,7 +9,7 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from bodyscan.fusion.grid import Floats, carried
+from bodyscan.fusion.grid import Floats, carried, rotated
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -56,32 +56,44 @@ def seen_through(
     inside = ahead & (columns >= 0) & (columns < image.camera.width)
     inside &= (rows >= 0) & (rows < image.camera.height)
     index = np.flatnonzero(inside)
+    through = np.zeros(len(points), bool)
+    if not index.size:
+        return through
     columns, rows = columns[index], rows[index]
     # The nearest depth around, 0 if anything is missing: rims and flying pixels prove nothing.
     depth = np.where(image.valid, image.points[..., 2], 0.0)
     nearest = cv2.erode(depth, np.ones((5, 5), np.uint8))
-    through = np.zeros(len(points), bool)
     through[index] = in_camera[index, 2] < nearest[rows, columns] - margin_mm
     stride = _stride(image.camera, rig_from_camera)
-    through[index] |= gaps(guess, image, rig_from_camera, stride)[rows // stride, columns // stride]
+    block_rows, block_columns = rows // stride, columns // stride
+    top, left = block_rows.min(), block_columns.min()
+    blocks = slice(top, block_rows.max() + 1), slice(left, block_columns.max() + 1)
+    open_ = gaps(guess, image, rig_from_camera, stride, blocks)
+    through[index] |= open_[block_rows - top, block_columns - left]
     return through
 
 
-def gaps(guess: Guess, image: RangeImage, rig_from_camera: RigidTransform, stride: int) -> Mask:
-    """Blocks of stride x stride pixels that look through a gap of the body.
+def gaps(
+    guess: Guess,
+    image: RangeImage,
+    rig_from_camera: RigidTransform,
+    stride: int,
+    blocks: tuple[slice, slice],
+) -> Mask:
+    """Blocks of stride x stride pixels, of those in a window, that look through a gap of the body.
 
     There nothing was measured, the ray meets the guessed surface in made-up faces only, and there
     is measured surface to the left and to the right: between the legs, between arm and trunk.
     A ray that enters or leaves through measured surface looks at a part in shadow instead; and a
     part of the outline that nobody measured (dark hair) has measured surface on one side at most.
     """
-    rays = _rays(image.camera, rig_from_camera, stride)
+    rows, columns = (stride * np.arange(some.start, some.stop) + stride // 2 for some in blocks)
+    rays = _rays(image.camera, rig_from_camera, rows, columns)
     first = guess.scene.cast_rays(o3d.core.Tensor(rays))["primitive_ids"].numpy()
     hit = first != o3d.t.geometry.RaycastingScene.INVALID_ID
     made_up = np.zeros(hit.shape, bool)
     made_up[hit] = guess.filled[first[hit]]
     body = hit & ~made_up
-    rows, columns = (stride * np.arange(size) + stride // 2 for size in hit.shape)
     near = np.ones((2 * stride + 1, 2 * stride + 1), np.uint8)
     measured = np.pad(cv2.dilate(image.valid.astype(np.uint8), near), stride)
     reach = int(WIDEST_GAP_MM / RAY_SPACING_MM)
@@ -99,13 +111,18 @@ def _stride(camera: Camera, rig_from_camera: RigidTransform) -> int:
     return max(1, round(RAY_SPACING_MM / pixel_mm))
 
 
-def _rays(camera: Camera, rig_from_camera: RigidTransform, stride: int) -> Floats:
-    """(h, w, 6) rays through the middles of the image's blocks, rig frame."""
-    rows, columns = (-(-size // stride) for size in (camera.height, camera.width))
-    v, u = stride * np.mgrid[:rows, :columns].astype(float) + stride // 2
-    directions = rig_from_camera.rotate(camera.rays(np.stack([u, v], axis=-1)))
-    origins = np.broadcast_to(rig_from_camera.translation, directions.shape)
-    return np.concatenate([origins, directions], axis=-1).astype(np.float32)
+def _rays(
+    camera: Camera,
+    rig_from_camera: RigidTransform,
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+) -> Floats:
+    """(h, w, 6) rays through pixels of h rows and w columns, rig frame."""
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).astype(float)
+    rays = np.empty((*pixels.shape[:2], 6), np.float32)
+    rays[..., :3] = rig_from_camera.translation
+    rays[..., 3:] = rotated(camera.rays(pixels).astype(np.float32), rig_from_camera)
+    return rays
 
 
 def _within(mask: Mask, reach: int) -> Mask:

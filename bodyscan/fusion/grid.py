@@ -6,9 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 
 
 def carried(points: Floats, a_from_b: RigidTransform) -> Floats:
@@ -30,17 +32,7 @@ def crop_of(valid: NDArray[np.bool_]) -> tuple[slice, slice] | None:
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
-def product(rows: Floats, matrix: Floats) -> Floats:
-    """rows (n, k) @ matrix (k, m), on the calling thread alone.
-
-    In stages that already run in several threads OpenBLAS's own ones only stand in each other's
-    way, spinning; it starts none for products smaller than 2^18.
-    """
-    many, inner = rows.shape
-    size = max(1, 2**17 // (inner * matrix.shape[1]))
-    whole = many - many % size
-    result = np.empty((many, matrix.shape[1]), np.float32)
-    stacked = result[:whole].reshape(-1, size, matrix.shape[1])
-    np.matmul(rows[:whole].reshape(-1, size, inner), matrix, out=stacked)
-    np.matmul(rows[whole:], matrix, out=result[whole:])
-    return result
+def lens_of(camera: Camera) -> Doubles:
+    """(7,) for compiled functions: alpha, beta, gamma, u0, v0 (Eq. 1), k1, k2 (Eq. 3-5)."""
+    sizes = (camera.alpha, camera.beta, camera.gamma, camera.u0, camera.v0)
+    return np.array([*sizes, camera.k1, camera.k2])

@@ -13,6 +13,7 @@ from bodyscan.errors import ScanFailed
 from bodyscan.fusion.body import BodyCloud, BodyMesh
 from bodyscan.fusion.carving import hints
 from bodyscan.fusion.repair import closed
+from bodyscan.fusion.support import settled, support
 from bodyscan.fusion.topology import (
     face_components,
     signed_volume,
@@ -28,7 +29,6 @@ Indices = NDArray[np.int64]
 
 FEWEST_POINTS = 1000
 ROUGH_POINTS = 100_000
-LIFTED = 0.2  # of the reach: 0.8 mm of 4
 
 
 def mesh(
@@ -52,27 +52,34 @@ def mesh(
             f"a cloud of {len(cloud.points)} points is too small for a mesh",
             remedy="Look at the range images; is the subject inside the scan volume?",
         )
-    tree = cKDTree(cloud.points)
+    # Balancing would cost more than the few queries gain.
+    tree = cKDTree(cloud.points, balanced_tree=False, compact_nodes=False)
     points, normals = cloud.points, cloud.normals.astype(np.float64)
     some = slice(None, None, max(1, len(points) // ROUGH_POINTS))
-    rough = largest_piece(*poisson(points[some], normals[some], depth - 1))
+    rough = largest_piece(*poisson(points[some], normals[some], depth - 1, linear=True))
     made_up = _made_up(*rough, tree, 2.0 * reach_mm)
     extra = hints(*rough, made_up, tree, range_images, rig_from_camera or {}, workers=workers)
     points, normals = np.concatenate([points, extra[0]]), np.concatenate([normals, extra[1]])
-    vertices, faces = largest_piece(*poisson(points, normals, depth))
+    vertices, faces = largest_piece(*poisson(points, normals, depth, linear=True))
     found = topology(vertices, faces)
     if not found.manifold:
         raise ScanFailed(f"no closed surface came out of the cloud ({found})")
     return dressed(vertices, faces, cloud, tree, reach_mm)
 
 
-def poisson(points: Array, normals: Array, depth: int) -> tuple[Array, Indices]:
-    """Vertices and faces of Open3D's screened Poisson surface (Kazhdan and Hoppe 2013)."""
+def poisson(
+    points: Array, normals: Array, depth: int, *, linear: bool = False
+) -> tuple[Array, Indices]:
+    """Vertices and faces of Open3D's screened Poisson surface (Kazhdan and Hoppe 2013).
+
+    linear: vertices are interpolated linearly along the octree's edges, which takes a tenth less
+    time and is a few hundredths of a millimetre less exact.
+    """
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.normals = o3d.utility.Vector3dVector(normals)
     # More threads would add up in another order each time: other bytes for the same input.
     surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-        cloud, depth=depth, n_threads=1
+        cloud, depth=depth, linear_fit=linear, n_threads=1
     )
     return np.asarray(surface.vertices), np.asarray(surface.triangles).astype(np.int64)
 
@@ -88,23 +95,20 @@ def largest_piece(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
 def dressed(
     vertices: Array, faces: Indices, cloud: BodyCloud, tree: cKDTree, reach_mm: float
 ) -> BodyMesh:
-    """With normals, the nearest points' colours and sigmas, and which faces were made up.
+    """Brought onto the points, with normals, the points' colours and sigmas, and what was made up.
 
-    A vertex far from all points was measured by nobody; one that Poisson's smoothness lifts off its
-    nearest point's tangent plane (fingertips, between toes) is not what was measured either.
+    Poisson's surface is smoother than the points are exact; vertices move along their normals to
+    where the points around say, less the farther these are.
     """
-    distance, nearest = (np.asarray(found) for found in tree.query(vertices, workers=2))
-    sigma_mm = cloud.sigma_mm[nearest]
-    offset = vertices - cloud.points[nearest]
-    lifted = np.abs(np.einsum("vc,vc->v", offset, cloud.normals[nearest]))
-    sigma_mm[(distance > reach_mm) | (lifted > np.maximum(LIFTED * reach_mm, 4.0 * sigma_mm))] = (
-        np.nan
-    )
+    normals = vertex_normals(vertices, faces)
+    around = support(vertices, normals, cloud, tree, reach_mm)
+    vertices = settled(vertices, faces, normals, around)
+    sigma_mm = np.where(around.measured, around.sigma_mm, np.float32(np.nan))
     return BodyMesh(
         vertices,
         faces,
         vertex_normals(vertices, faces),
-        cloud.colours[nearest],
+        cloud.colours[around.nearest],
         sigma_mm,
         np.any(np.isnan(sigma_mm)[faces], axis=1),
     )

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from bodyscan.fusion.topology import corner_fans, directed_edges, is_among, without_unused
+from bodyscan.fusion.half_edges import RIM, UNSOUND, corner_fans, twins
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -20,41 +20,32 @@ def closed(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
     are closed with fans of triangles. An octree's surface has a few such places; a closed
     manifold stays as it is, but for the numbers of its vertices.
     """
-    faces = faces[~_unsound(faces, len(vertices))]
-    labels, count = corner_fans(faces)
-    parted = np.empty((count, 3))
-    parted[labels] = vertices[faces.ravel()]
-    return without_unused(*_holes_filled(parted, labels.reshape(-1, 3)))[:2]
+    twin = twins(faces, len(vertices))
+    sound = (twin != UNSOUND).all(axis=1)
+    if not sound.all():
+        faces = faces[sound]
+        twin = twins(faces, len(vertices))
+    parted, count = corner_fans(twin)
+    places = np.empty((count, 3))
+    places[parted] = vertices[faces]
+    following = np.roll(parted, -1, axis=1)
+    return _holes_filled(
+        places, parted, np.stack([parted[twin == RIM], following[twin == RIM]], axis=-1)
+    )
 
 
-def _unsound(faces: Indices, count: int) -> NDArray[np.bool_]:
-    """(F,) faces with a repeated corner, or at an edge that two faces run along the same way."""
-    edges = directed_edges(faces)
-    keys = edges[:, 0] * count + edges[:, 1]
-    order = np.argsort(keys, kind="stable")
-    same = keys[order][1:] == keys[order][:-1]
-    often = np.zeros(len(keys), bool)
-    often[order[1:][same]] = often[order[:-1][same]] = True
-    # The same edge's other side must go too, or it would be sewn to the wrong partner.
-    undirected = edges.min(axis=1) * count + edges.max(axis=1)
-    bad = is_among(undirected, undirected[often]) | (edges[:, 0] == edges[:, 1])
-    return bad.reshape(3, -1).any(axis=0)
-
-
-def _holes_filled(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
-    """Every rim gets a vertex at its middle and a triangle for each of its edges."""
-    edges, count = directed_edges(faces), len(vertices)
-    here = edges[:, 0] * count + edges[:, 1]
-    there = edges[:, 1] * count + edges[:, 0]
-    rim = edges[~is_among(here, there)]
+def _holes_filled(vertices: Array, faces: Indices, rim: Indices) -> tuple[Array, Indices]:
+    """Every rim, of edges (N, 2), gets a vertex at its middle and a triangle for each of them."""
     if not len(rim):
         return vertices, faces
-    graph = coo_array((np.ones(len(rim), np.int8), (rim[:, 0], rim[:, 1])), shape=(count, count))
-    piece = connected_components(graph, directed=False)[1][rim[:, 0]]
-    hole = np.unique(piece, return_inverse=True)[1]
+    corners, ends = np.unique(rim, return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    graph = coo_array((np.ones(len(rim), np.int8), tuple(ends.T)), shape=(len(corners),) * 2)
+    _, piece = connected_components(graph, directed=False)
+    hole = piece[ends[:, 0]]
     size = np.bincount(hole)
     middles = np.stack(
         [np.bincount(hole, vertices[rim[:, 0], axis]) / size for axis in range(3)], axis=-1
     )
-    fans = np.stack([rim[:, 1], rim[:, 0], count + hole], axis=-1)
+    fans = np.stack([rim[:, 1], rim[:, 0], len(vertices) + hole], axis=-1)
     return np.concatenate([vertices, middles]), np.concatenate([faces, fans])

@@ -12,50 +12,44 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.fusion.grid import Floats, carried, crop_of, rotated
+from bodyscan.compiled import compiled
+from bodyscan.fusion.grid import Doubles, Floats, crop_of, lens_of
 from bodyscan.fusion.quadratics import Fit, Mask, fit_quadratics
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
+Numbers = NDArray[np.int32]
+
 JUMP_PX = 8.0  # in depth between neighbours, in widths of a pixel: steeper than STEEPEST_COSINE
 STEEPEST_COSINE = 0.17  # a surface seen at more than 80 degrees is not worth having
+EVERY = 4  # row that is looked at to learn how large a pixel is
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A smoothed range image, cropped to what it shows, rig frame.
+    """A smoothed range image, cropped to what it shows: n points, rig frame.
 
     corner: (column, row) of the crop's first pixel in the camera's image.
-    points, normals: (h, w, 3) float32, mm, unit and towards the camera; NaN where there is nothing.
-    sigma_mm: (h, w) float32, standard deviation of the smoothed point along its normal.
-    rim: (h, w) float32, rises from 0 at the rim to 1 well inside; 0 where there is nothing.
-    weight: (h, w) float32, rim/sigma^2.
-    colours: (h, w) uint8.
+    number: (h, w) int32, of the point that a pixel shows, row by row; -1 where it shows none.
+    points, normals: (n, 3) float32, mm, unit and towards the camera.
+    sigma_mm: (n,) float32, standard deviation of the smoothed point along its normal.
+    rim: (n,) float32, rises from near 0 at the rim to 1 well inside.
+    weight: (n,) float32, rim/sigma^2.
+    colours: (n,) uint8.
     """
 
     pair: str
     camera: Camera
     rig_from_camera: RigidTransform
     corner: tuple[int, int]
+    number: Numbers
     points: Floats
     normals: Floats
     sigma_mm: Floats
     rim: Floats
     weight: Floats
     colours: NDArray[np.uint8]
-
-
-@dataclass(frozen=True, eq=False)
-class Rays:
-    """Ideal normalized coordinates (h, w) of pixels: directions (x, y, 1)."""
-
-    x: Floats
-    y: Floats
-
-    @property
-    def length(self) -> Floats:
-        return np.sqrt(self.x * self.x + self.y * self.y + 1.0)
 
 
 def smooth(
@@ -68,86 +62,151 @@ def smooth(
     box = crop_of(image.valid)
     if box is None:
         return None
-    x, y, depth = cv2.split(image.points[box])
-    valid = np.isfinite(image.sigma_mm[box])
-    pixel_mm = float(np.median(depth[valid])) / image.camera.alpha
+    inverse, noise = _inverse_depths(image.points, image.sigma_mm, _ends(box))
+    some = inverse[::EVERY]
+    pixel_mm = float(np.median(1.0 / some[some > 0])) / image.camera.alpha
     reach = int(np.clip(round(0.5 * window_mm / pixel_mm), 2, 6))
-    with np.errstate(invalid="ignore"):
-        inverse = np.where(valid, 1.0 / depth, np.float32(0.0))
-        rays = Rays(x * inverse, y * inverse)
-        noise = image.sigma_mm[box] * inverse * inverse / rays.length
-    noise[~valid] = 0.0
-
-    fit, fitted = fit_quadratics(inverse, noise, valid, reach, pixel_mm)
-    return _surface(image, rig_from_camera, box, rays, fit, fitted, reach)
+    fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm)
+    return _surface(image, rig_from_camera, box, fit, fitted, reach)
 
 
 def _surface(
     image: RangeImage,
     rig_from_camera: RigidTransform,
     box: tuple[slice, slice],
-    rays: Rays,
     fit: Fit,
     fitted: Mask,
     reach: int,
 ) -> Surface:
-    x, y, length = rays.x, rays.y, rays.length
-    with np.errstate(invalid="ignore", divide="ignore"):
-        depth = 1.0 / fit.value
-        normals = normals_of(image.camera, rays, fit)
-        cosine = -(normals[..., 0] * x + normals[..., 1] * y + normals[..., 2]) / length
-        fitted = fitted & (cosine > STEEPEST_COSINE)
-        # Along the ray a point moves by length * dz; along the normal by its cosine's share.
-        sigma = fit.sigma * depth * depth * length * cosine
-        rim = (
-            np.minimum(
-                _distance_to_rim(fitted, depth, JUMP_PX / image.camera.alpha) / (2.0 * reach), 1.0
-            )
-            * fitted
-        )
-        weight = np.where(fitted, rim / (sigma * sigma), np.float32(0.0))
-    smoothed = cv2.merge([x * depth, y * depth, depth])
-    hidden = ~fitted
-    smoothed[hidden], normals[hidden], sigma[hidden] = np.nan, np.nan, np.nan
+    depth, number = np.zeros_like(fit.value), np.full(fitted.shape, -1, np.int32)
+    most = int(np.count_nonzero(fitted))
+    points, normals = np.empty((most, 3), np.float32), np.empty((most, 3), np.float32)
+    sigma = np.empty(most, np.float32)
+    count = _lay_out(
+        image.points,
+        _ends(box),
+        (fit.value, fit.slope_u, fit.slope_v, fit.sigma),
+        fitted,
+        lens_of(image.camera),
+        (rig_from_camera.rotation, rig_from_camera.translation),
+        (depth, number),
+        (points, normals, sigma),
+    )
+    there = number >= 0
+    distance = _distance_to_rim(depth, JUMP_PX / image.camera.alpha)[there]
+    rim, sigma = np.minimum(distance / np.float32(2 * reach), np.float32(1.0)), sigma[:count]
     return Surface(
         image.pair,
         image.camera,
         rig_from_camera,
         (box[1].start, box[0].start),
-        carried(smoothed, rig_from_camera),
-        rotated(normals, rig_from_camera),
+        number,
+        points[:count],
+        normals[:count],
         sigma,
         rim,
-        weight,
-        image.colours[box],
+        rim / (sigma * sigma),
+        image.colours[box][there],
     )
 
 
-def normals_of(camera: Camera, rays: Rays, fit: Fit) -> Floats:
-    """(h, w, 3) unit normals towards the camera, camera frame, from the slopes of 1/z.
+def _distance_to_rim(depth: Floats, jump: float) -> Floats:
+    """Pixels to the nearest one, from 1, that has no depth (0) or lies `jump` of its depth in front
+    of another."""
+    inner = cv2.dilate(depth, np.ones((3, 3), np.uint8)) < np.float32(1.0 + jump) * depth
+    padded = np.pad(inner.astype(np.uint8), 1)
+    return cv2.distanceTransform(padded, cv2.DIST_L2, 3)[1:-1, 1:-1] + np.float32(1.0)
+
+
+def _ends(box: tuple[slice, slice]) -> tuple[int, int, int, int]:
+    """Top, bottom, left, right."""
+    rows, columns = box
+    return rows.start, rows.stop, columns.start, columns.stop
+
+
+@compiled
+def _inverse_depths(
+    points: Floats, sigma_mm: Floats, ends: tuple[int, int, int, int]
+) -> tuple[Floats, Floats]:
+    """1/z and its standard deviation (h, w), 0 where nothing was measured, within `ends`."""
+    top, bottom, left, right = ends
+    inverse = np.zeros((bottom - top, right - left), np.float32)
+    noise = np.zeros_like(inverse)
+    for row in range(top, bottom):
+        for column in range(left, right):
+            sigma = sigma_mm[row, column]
+            if np.isfinite(sigma):
+                x, y, z = points[row, column, 0], points[row, column, 1], points[row, column, 2]
+                # Along the ray a point moves by its length over z times dz.
+                share = sigma / np.sqrt(x * x + y * y + z * z)
+                inverse[row - top, column - left] = 1.0 / z
+                noise[row - top, column - left] = share / z
+    return inverse, noise
+
+
+@compiled
+def _lay_out(
+    seen: Floats,
+    ends: tuple[int, int, int, int],
+    fit: tuple[Floats, Floats, Floats, Floats],
+    fitted: Mask,
+    lens: Doubles,
+    rig_from_camera: tuple[Doubles, Doubles],
+    images: tuple[Floats, Numbers],
+    surface: tuple[Floats, Floats, Floats],
+) -> int:
+    """Fill in depth and number (h, w), and points, normals and sigmas; how many there are.
+
+    seen: (height, width, 3) measured points, camera frame.  fit: value, slopes, sigma of 1/z.
+    lens: see `lens_of`.  rig_from_camera: rotation and translation.
+    """
+    value, slope_u, slope_v, fit_sigma = fit
+    rotation, translation = rig_from_camera
+    depth, number = images
+    points, normals, sigma = surface
+    n = 0
+    for row in range(fitted.shape[0]):
+        for column in range(fitted.shape[1]):
+            if not fitted[row, column]:
+                continue
+            at = seen[ends[0] + row, ends[2] + column]
+            inverse, slopes = value[row, column], (slope_u[row, column], slope_v[row, column])
+            x, y, z = at[0] / at[2], at[1] / at[2], 1.0 / inverse
+            a, b, c = _normal(x, y, inverse, slopes, lens)
+            length = np.sqrt(x * x + y * y + 1.0)
+            cosine = -(a * x + b * y + c) / length
+            if cosine <= STEEPEST_COSINE:
+                continue
+            depth[row, column], number[row, column] = z, n
+            for k in range(3):
+                along = rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2]
+                points[n, k] = along * z + translation[k]
+                normals[n, k] = rotation[k, 0] * a + rotation[k, 1] * b + rotation[k, 2] * c
+            # Along the ray a point moves by length * dz; along the normal by its cosine's share.
+            sigma[n] = fit_sigma[row, column] * z * z * length * cosine
+            n += 1
+    return n
+
+
+@compiled
+def _normal(
+    x: float, y: float, inverse: float, slopes: tuple[float, float], lens: Doubles
+) -> tuple[float, float, float]:
+    """Unit normal towards the camera, camera frame, from the slopes of 1/z per pixel.
 
     A plane n.P = d has 1/z = n.(x, y, 1) / d in ideal normalized coordinates; the slopes per
     pixel are carried there by the lens's derivative (Eq. 3-5) times A.
     """
-    x, y = rays.x, rays.y
+    alpha, beta, gamma, k1, k2 = lens[0], lens[1], lens[2], lens[5], lens[6]
     r2 = x * x + y * y
-    scale = 1.0 + r2 * (camera.k1 + r2 * camera.k2)
-    growth = 2.0 * camera.k1 + 4.0 * camera.k2 * r2
+    scale = 1.0 + r2 * (k1 + r2 * k2)
+    growth = 2.0 * k1 + 4.0 * k2 * r2
     # Slopes per distorted normalized coordinate, then per ideal one.
-    real_x = camera.alpha * fit.slope_u
-    real_y = camera.gamma * fit.slope_u + camera.beta * fit.slope_v
+    real_x = alpha * slopes[0]
+    real_y = gamma * slopes[0] + beta * slopes[1]
     outward = growth * (x * real_x + y * real_y)
     slope_x, slope_y = scale * real_x + outward * x, scale * real_y + outward * y
-    rest = fit.value - x * slope_x - y * slope_y
+    rest = inverse - x * slope_x - y * slope_y
     # n.P has the sign of d * (1/d), so n looks away from the camera: turn it round.
-    size = -np.sqrt(slope_x**2 + slope_y**2 + rest**2)
-    return cv2.merge([slope_x / size, slope_y / size, rest / size])
-
-
-def _distance_to_rim(fitted: Mask, depth: Floats, jump: float) -> Floats:
-    """Pixels to the nearest one that has no fit or lies `jump` of its depth in front of another."""
-    kernel = np.ones((3, 3), np.uint8)
-    known = np.where(fitted, depth, 0.0)
-    inner = fitted & (cv2.dilate(known, kernel) < (1.0 + jump) * known)
-    padded = np.pad(inner.astype(np.uint8), 1)
-    return cv2.distanceTransform(padded, cv2.DIST_L2, 3)[1:-1, 1:-1] + fitted
+    shrink = -1.0 / np.sqrt(slope_x * slope_x + slope_y * slope_y + rest * rest)
+    return slope_x * shrink, slope_y * shrink, rest * shrink

@@ -1,6 +1,6 @@
 """Is a triangle mesh a closed, oriented, manifold surface, and of how many pieces?
 
-In numpy, linear in the number of faces (Open3D's is_watertight looks for self-intersections too
+Linear in the number of faces (Open3D's is_watertight looks for self-intersections too
 and is quadratic).
 """
 
@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+
+from bodyscan.fusion.half_edges import corner_fans, twins
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -32,21 +34,23 @@ def topology(vertices: Array, faces: Indices) -> Topology:
     """Of a mesh with vertices (V, 3) and faces (F, 3); unused vertices do not count."""
     used = used_vertices(faces, len(vertices))
     count = len(vertices)
-    edges = directed_edges(faces)
-    keys = np.sort(edges[:, 0] * count + edges[:, 1])
-    opposite = np.sort(edges[:, 1] * count + edges[:, 0])
-    once = bool((keys[1:] != keys[:-1]).all()) if keys.size else False
-    closed = once and bool((keys == opposite).all()) and bool((edges[:, 0] != edges[:, 1]).all())
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    edge_count = len(edges) // 2 if closed else np.unique(low * count + high).size
+    twin = twins(faces, count)
+    closed = bool(faces.size) and bool((twin >= 0).all())
+    edge_count = 3 * len(faces) // 2 if closed else len(np.unique(_edge_keys(faces, count)))
     labels = face_components(faces, count)
     return Topology(
         closed,
-        closed and corner_fans(faces)[1] == used.size,
+        closed and corner_fans(twin)[1] == used.size,
         int(labels.max() + 1) if labels.size else 0,
         int(used.size - edge_count + len(faces)),
         signed_volume(vertices, faces),
     )
+
+
+def _edge_keys(faces: Indices, vertex_count: int) -> Indices:
+    """(3 F,) a number for each edge, whichever way it runs."""
+    low, high = np.sort(directed_edges(faces), axis=1).T
+    return low * vertex_count + high
 
 
 def directed_edges(faces: Indices) -> Indices:
@@ -105,31 +109,3 @@ def used_vertices(faces: Indices, count: int) -> Indices:
     used = np.zeros(count, bool)
     used[faces] = True
     return np.flatnonzero(used)
-
-
-def is_among(values: Indices, others: Indices) -> NDArray[np.bool_]:
-    """(N,) which values are also in others; numpy's own isin is slow on the keys of edges."""
-    if not others.size:
-        return np.zeros(values.shape, bool)
-    known = np.sort(others)
-    place = np.minimum(np.searchsorted(known, values), known.size - 1)
-    return known[place] == values
-
-
-def corner_fans(faces: Indices) -> tuple[Indices, int]:
-    """(3 F,) number of the fan that each corner (face by face) belongs to, and how many there are.
-
-    The corners of a fan hang together across edges that two faces share, running opposite ways.
-    Each edge must be run along at most once each way.
-    """
-    edges, size = directed_edges(faces), len(faces)
-    count = int(faces.max(initial=-1)) + 1
-    keys, opposite = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
-    _, here, there = np.intersect1d(keys, opposite, assume_unique=True, return_indices=True)
-    (face, corner), (twin, twin_corner) = ((side % size, side // size) for side in (here, there))
-    # An edge from a to b has its twin from b to a: a is the twin's second corner, b its first.
-    first = np.concatenate([3 * face + corner, 3 * face + (corner + 1) % 3])
-    second = np.concatenate([3 * twin + (twin_corner + 1) % 3, 3 * twin + twin_corner])
-    graph = coo_array((np.ones(len(first), np.int8), (first, second)), shape=(3 * size, 3 * size))
-    fans, labels = connected_components(graph, directed=False)
-    return labels.astype(np.int64), int(fans)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.geometry.lens_points import measure_rays, stripes_of_points
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, skew
@@ -96,30 +97,32 @@ class LensSheets(SmoothSheets):
         return self.offset(points, np.zeros(points.shape[:-1])).value
 
     def offset(self, points: Array, sheet: Array, *, parameters: bool = False) -> Offset:
-        seen = self.projector_from_camera.apply(points)
-        x, y, reach = seen[..., 0] / seen[..., 2], seen[..., 1] / seen[..., 2], seen[..., 2]
-        focal, centre = self.parameters[:SCALE]
-        k1, k2, p1, p2 = np.append(self.parameters[SCALE:], np.zeros(4))[:4]
-        r2 = x**2 + y**2
-        radial, slope = 1.0 + r2 * (k1 + r2 * k2), k1 + 2.0 * k2 * r2
-        slide = y * radial + p1 * (r2 + 2.0 * y**2) + 2.0 * p2 * x * y
-        by_x = focal * (2.0 * x * (y * slope + p1) + 2.0 * p2 * y)
-        by_y = focal * (radial + 2.0 * y**2 * slope + 6.0 * p1 * y + 2.0 * p2 * x)
-        by_seen = np.stack([by_x, by_y, -(by_x * x + by_y * y)], axis=-1) / reach[..., None]
-        jacobian = None
-        if parameters:
-            lens = [y * r2, y * r2**2, r2 + 2.0 * y**2, 2.0 * x * y][: len(self.parameters) - SCALE]
-            columns = [slide, np.ones_like(slide), *(focal * term for term in lens)]
-            jacobian = np.concatenate(
-                [np.cross(seen, by_seen), by_seen, np.stack(columns, axis=-1)], axis=-1
-            )
+        shape, size = points.shape[:-1], len(self.covariance) if parameters else 0
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        stripe, reach = np.empty(len(flat)), np.empty(len(flat))
+        by_point, by_freedom = np.empty((len(flat), 3)), np.empty((len(flat), size))
+        stripes_of_points(*self._frame_and_lens(), flat, stripe, by_point, reach, by_freedom)
         return Offset(
-            focal * slide + centre - sheet,
-            by_seen @ self.projector_from_camera.rotation,
-            np.full_like(slide, -1.0),
-            reach,
-            jacobian,
+            stripe.reshape(shape) - sheet,
+            by_point.reshape(*shape, 3),
+            np.full(shape, -1.0),
+            reach.reshape(shape),
+            by_freedom.reshape(*shape, size) if parameters else None,
         )
+
+    def measure(self, rays: Array, s: Array) -> tuple[Array, Array, Array]:
+        """`depth`, `depth_per_stripe` and `variance_mm2` (N,) of rays (N, 3) at s (N,) in one go."""
+        found = np.empty((3, len(s)))
+        flat, covariance = np.ascontiguousarray(rays), np.ascontiguousarray(self.covariance)
+        frame, lens = self._frame_and_lens()
+        measure_rays(frame, lens, covariance, self.distance_mm, self.stripes, flat, s, found)
+        return found[0], found[1], found[2]
+
+    def _frame_and_lens(self) -> tuple[Array, Array]:
+        """projector_from_camera (3, 4), and f, c, k1, k2, p1, p2; 0 for what the lens lacks."""
+        lens = np.zeros(SCALE + len(LENS_SPREAD))
+        lens[: len(self.parameters)] = self.parameters
+        return np.ascontiguousarray(self.projector_from_camera.matrix[:3]), lens
 
 
 def _frame_and_scale(above: Array, below: Array, x: float) -> tuple[RigidTransform, Array]:

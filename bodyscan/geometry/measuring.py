@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.compiled import compiled
 from bodyscan.geometry.bowed_sheets import BowedSheets
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.pixel_rays import PixelRays
 from bodyscan.geometry.plane_table import PlaneTable
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Way = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 MOST_SIGMA = 1e-3
 """A sheet that leaves a depth uncertain by more than this share of it is as good as none: so far
 from all boards a smooth model only guesses."""
+BAND = 16  # rows at a time: what fits into a processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,15 +39,67 @@ class Measured:
 
 def measure(sheets: LightSheets, rays: Array, s: Array) -> Measured:
     """Rays (..., 3) with z = 1, camera frame, at real stripe coordinates s (...)."""
+    found = _way_to_measure(sheets)(rays.reshape(-1, 3), np.ravel(s))
+    unsure = found[2] > (MOST_SIGMA * found[0]) ** 2
+    return Measured(*(np.where(unsure, np.nan, some).reshape(np.shape(s)) for some in found))
+
+
+def measure_image(
+    sheets: LightSheets, camera: Camera, s: Floats, sigma: Floats
+) -> tuple[Floats, Floats]:
+    """Points (height, width, 3), camera frame, mm, and sigma_mm (height, width) along the viewing
+    rays, of stripe coordinates s with standard deviations sigma (height, width); NaN where no depth
+    can be trusted."""
+    way, pixels = _way_to_measure(sheets), PixelRays.of(camera)
+    points, sigma_mm = np.empty((*s.shape, 3), np.float32), np.empty(s.shape, np.float32)
+    for first in range(0, len(s), BAND):
+        rows = slice(first, first + BAND)
+        wanted = np.isfinite(s[rows])
+        rays = pixels.through(wanted, first)
+        found = way(rays, s[rows][wanted].astype(np.float64))
+        _place(wanted, rays, found, sigma[rows], MOST_SIGMA, points[rows], sigma_mm[rows])
+    return points, sigma_mm
+
+
+def _way_to_measure(sheets: LightSheets) -> Way:
+    """Of rays (N, 3) at s (N,): depth, its change with s and its variance, each (N,)."""
     if isinstance(sheets, BowedSheets) and sheets.kind == "smooth-planes":
-        flat = PlaneTable.of(sheets).measure(rays.reshape(-1, 3), np.ravel(s))
-        depth, per_stripe, variance = (values.reshape(np.shape(s)) for values in flat)
-    else:
+        return PlaneTable.of(sheets).measure
+    if isinstance(sheets, LensSheets):
+        return sheets.measure
+
+    def general(rays: Array, s: Array) -> tuple[Array, Array, Array]:
         depth = sheets.depth(rays, s)
-        variance = sheets.variance_mm2(rays, s, depth)
-        per_stripe = sheets.depth_per_stripe(rays, s, depth)
-    unsure = variance > (MOST_SIGMA * depth) ** 2
-    depth, per_stripe, variance = (
-        np.where(unsure, np.nan, values) for values in (depth, per_stripe, variance)
-    )
-    return Measured(depth, per_stripe, variance)
+        return depth, sheets.depth_per_stripe(rays, s, depth), sheets.variance_mm2(rays, s, depth)
+
+    return general
+
+
+@compiled
+def _place(
+    wanted: Mask,
+    rays: Array,
+    found: tuple[Array, Array, Array],
+    sigma: Floats,
+    most_sigma: float,
+    points: Floats,
+    sigma_mm: Floats,
+) -> None:
+    """Points (rows, W, 3) and sigma_mm (rows, W) of the N pixels `wanted` (rows, W), else NaN.
+
+    rays: (N, 3).  found: depth, dz/ds and variance, each (N,).  sigma: (rows, W), of s.
+    """
+    depths, slopes, variances = found
+    points[:], sigma_mm[:] = np.nan, np.nan
+    n = 0
+    for v in range(wanted.shape[0]):
+        for u in range(wanted.shape[1]):
+            if not wanted[v, u]:
+                continue
+            x, y, depth = rays[n, 0], rays[n, 1], depths[n]
+            decoding, variance = slopes[n] * sigma[v, u], variances[n]
+            along = np.sqrt((decoding * decoding + variance) * (x * x + y * y + 1.0))
+            n += 1
+            if variance <= (most_sigma * depth) ** 2 and along < np.inf:
+                points[v, u, 0], points[v, u, 1], points[v, u, 2] = x * depth, y * depth, depth
+                sigma_mm[v, u] = along

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.compiled import compiled
 from bodyscan.geometry.bowed_sheets import PLANE_DEGREE, BowedSheets
 
 Array = NDArray[np.float64]
 
 NODES_PER_STRIPE = 8
-CHUNK = 1 << 14  # pixels at a time: what fits into a processor's cache
 UPPER = tuple(np.triu_indices(3))
 
 
@@ -61,24 +61,42 @@ class PlaneTable:
     def measure(self, rays: Array, s: Array) -> tuple[Array, Array, Array]:
         """Depth z (N,) mm, dz/ds and the variance of z, for rays (N, 3) at s (N,); NaN where none."""
         found = np.empty((3, len(s)))
-        for start in range(0, len(s), CHUNK):
-            part = slice(start, start + CHUNK)
-            found[:, part] = self._measure(rays[part], s[part])
+        _measure(self._front(), self.rows, np.ascontiguousarray(rays), s, found)
         return found[0], found[1], found[2]
 
-    def _measure(self, rays: Array, s: Array) -> Array:
-        place = np.clip(np.nan_to_num(s), 0.0, self.stripes) * NODES_PER_STRIPE
-        node = np.minimum(place.astype(np.intp), len(self.rows) - 2)
-        low = self.rows[node]
-        row = (low + (place - node)[:, None] * (self.rows[node + 1] - low)).T
-        x, y, _ = rays.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = 1.0 / (row[0] * x + row[1] * y + row[2])
-            change = row[3] * x + row[4] * y + row[5]
-            xx, xy, xz, yy, yz, zz = row[6:]
-            spread = xx * x * x + yy * y * y + zz + 2.0 * (xy * x * y + xz * x + yz * y)
-            good = (depth > 0.0) & (depth * (rays @ self.forward) > self.behind)
-            good &= (s >= 0.0) & (s <= self.stripes)
-            square = depth * depth
-            found = np.stack([depth, -square * change, square * square * spread])
-            return np.where(good, found, np.nan)
+    def _front(self) -> Array:
+        return np.append(self.forward, self.behind)
+
+
+@compiled
+def _measure(front: Array, rows: Array, rays: Array, s: Array, found: Array) -> None:
+    """found (3, N): depth, dz/ds and variance of rays (N, 3) at s (N,).
+
+    front: (4,) forward, behind.  rows: (K, 12).
+    """
+    last = len(rows) - 1
+    for n in range(len(s)):
+        found[0, n] = found[1, n] = found[2, n] = np.nan
+        place = s[n] * NODES_PER_STRIPE
+        if not (place >= 0.0 and place <= last):
+            continue
+        node, x, y = min(int(place), last - 1), rays[n, 0], rays[n, 1]
+        share, low, high = place - node, _at(rows[node], x, y), _at(rows[node + 1], x, y)
+        depth = 1.0 / (low[0] + share * (high[0] - low[0]))
+        if not (depth > 0.0 and depth * (front[0] * x + front[1] * y + front[2]) > front[3]):
+            continue
+        square = depth * depth
+        found[0, n] = depth
+        found[1, n] = -square * (low[1] + share * (high[1] - low[1]))
+        found[2, n] = square * square * (low[2] + share * (high[2] - low[2]))
+
+
+@compiled
+def _at(row: Array, x: float, y: float) -> tuple[float, float, float]:
+    """1/z of the ray (x, y, 1) on the plane of one node, its derivative by s and its variance."""
+    aside = row[6] * x * x + 2.0 * row[7] * x * y + row[9] * y * y
+    return (
+        row[0] * x + row[1] * y + row[2],
+        row[3] * x + row[4] * y + row[5],
+        aside + 2.0 * (row[8] * x + row[10] * y) + row[11],
+    )

@@ -39,7 +39,7 @@ class Alignment(Model):
     reach_mm: Millimetres = 12.0
     least_reach_mm: Millimetres = 3.0
     rounds: int = Field(default=5, ge=1)
-    fewest: int = Field(default=100, ge=6)
+    fewest: int = Field(default=30, ge=6)
     sway_mm: float = Field(default=1.0, ge=0)
     sway_deg: float = Field(default=0.05, ge=0)
     least_sway: float = Field(default=0.3, ge=0)

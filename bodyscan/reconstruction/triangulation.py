@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.capture.views import StripeMap
+from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
-from bodyscan.geometry.measuring import measure
+from bodyscan.geometry.measuring import measure_image
 from bodyscan.reconstruction.range_image import RangeImage
 
+Floats = NDArray[np.float32]
+
 NORMAL_WINDOW_PX = 5
+REACH = NORMAL_WINDOW_PX // 2
 
 
 def range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
@@ -31,54 +34,91 @@ def range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
             where=f"pair {pair.name}",
             remedy="scan with the camera settings of the calibration, or calibrate again",
         )
-    rows, columns = np.nonzero(np.isfinite(stripes.s))
-    rays = camera.rays(np.column_stack([columns, rows]).astype(np.float64))
-    s = stripes.s[rows, columns].astype(np.float64)
-    measured = measure(pair.light, rays, s)
-    depth = measured.depth
-    decoding = (measured.per_stripe * stripes.sigma[rows, columns]) ** 2
-    sigma = np.sqrt(decoding + measured.variance_mm2) * np.linalg.norm(rays, axis=1)
-    points = np.full((camera.height, camera.width, 3), np.nan, np.float32)
-    sigmas = np.full((camera.height, camera.width), np.nan, np.float32)
-    known = np.isfinite(depth) & np.isfinite(sigma)
-    points[rows[known], columns[known]] = (rays * depth[:, None])[known]
-    sigmas[rows[known], columns[known]] = sigma[known]
-    return RangeImage(pair.name, camera, points, grid_normals(points), sigmas, stripes.lit)
+    points, sigma_mm = measure_image(pair.light, camera, stripes.s, stripes.sigma)
+    return RangeImage(pair.name, camera, points, grid_normals(points), sigma_mm, stripes.lit)
 
 
-def grid_normals(points: NDArray[np.float32]) -> NDArray[np.float32]:
+def grid_normals(points: Floats) -> Floats:
     """Unit normals (H, W, 3) towards the camera, from the points (H, W, 3) of a small window.
 
     A plane fitted to 1/z, which is affine in the image coordinates on a plane; NaN where the
     window is not whole: what lies at a rim is not to be relied on.
     """
-    x, y, z = cv2.split(points)
-    known = np.isfinite(z)
-    window = np.ones((NORMAL_WINDOW_PX, NORMAL_WINDOW_PX), np.uint8)
-    whole = cv2.erode(known.astype(np.uint8), window, borderValue=0) > 0
-    z[~known] = np.inf
-    inverse = np.float32(1000.0) / z
-    x, y = (np.where(known, values / z, np.float32(0.0)) for values in (x, y))
-    (i_u, i_v), (x_u, x_v), (y_u, y_v) = (_slopes(values) for values in (inverse, x, y))
-    # From slopes by column and row to slopes by x and y.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        determinant = x_u * y_v - x_v * y_u
-        slope_x = (i_u * y_v - i_v * y_u) / determinant
-        slope_y = (i_v * x_u - i_u * x_v) / determinant
-        # 1/z = p x + q y + r is the plane p X + q Y + r Z = 1, whose normal (p, q, r) points away.
-        rest = inverse - slope_x * x - slope_y * y
-        size = -np.sqrt(slope_x * slope_x + slope_y * slope_y + rest * rest)
-        size[~whole] = np.nan
-        return cv2.merge([slope_x / size, slope_y / size, rest / size])
+    normals = np.empty(points.shape, np.float32)
+    _grid_normals(np.ascontiguousarray(points, np.float32), normals)
+    return normals
 
 
-def _slopes(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Slopes per column and per row of planes fitted in whole windows."""
-    reach = NORMAL_WINDOW_PX // 2
-    offsets = np.arange(-reach, reach + 1.0)
-    ramp, one = offsets / (NORMAL_WINDOW_PX * np.sum(offsets**2)), np.ones(NORMAL_WINDOW_PX)
-    along = {"ddepth": cv2.CV_32F, "borderType": cv2.BORDER_CONSTANT}
-    return (
-        cv2.sepFilter2D(values, kernelX=ramp, kernelY=one, **along),
-        cv2.sepFilter2D(values, kernelX=one, kernelY=ramp, **along),
-    )
+@compiled
+def _grid_normals(points: Floats, normals: Floats) -> None:
+    """The normals (H, W, 3) of points (H, W, 3), row by row.
+
+    recent: x/z, y/z and 1000/z of the last five rows.  A NaN spreads over all windows it is in.
+    """
+    height, width = points.shape[:2]
+    recent = np.full((3, NORMAL_WINDOW_PX, width), np.nan, np.float32)
+    middle = np.empty((3, width), np.float32)
+    slope_u, slope_v = np.empty_like(middle), np.empty_like(middle)
+    normals[:, :REACH] = normals[:, width - REACH :] = np.nan
+    for v in range(height + REACH):
+        newest = v % NORMAL_WINDOW_PX
+        if v < height:
+            _affine_in_image(points[v], recent[0, newest], recent[1, newest], recent[2, newest])
+        else:
+            recent[:, newest] = np.nan
+        if v >= REACH:
+            for k in range(3):
+                _slopes(recent[k], v - REACH, middle[k], slope_u[k], slope_v[k])
+            _normals(middle, slope_u, slope_v, normals[v - REACH])
+
+
+@compiled
+def _affine_in_image(points: Floats, x: Floats, y: Floats, inverse: Floats) -> None:
+    """x/z, y/z and 1000/z (W,) of a row of points (W, 3)."""
+    for u in range(len(points)):
+        per_z = np.float32(1.0) / points[u, 2]
+        x[u], y[u] = points[u, 0] * per_z, points[u, 1] * per_z
+        inverse[u] = np.float32(1000.0) * per_z
+
+
+@compiled
+def _slopes(rows: Floats, v: int, middle: Floats, slope_u: Floats, slope_v: Floats) -> None:
+    """Slopes by column and by row (W,) of the planes fitted in the windows of row v, times 50, and
+    row v itself; from column 2 on, that is of the windows' middles.  Row w is rows[w % 5] (5, W)."""
+    above2, above, here = rows[(v - 2) % 5], rows[(v - 1) % 5], rows[v % 5]
+    below, below2 = rows[(v + 1) % 5], rows[(v + 2) % 5]
+    width = len(here)
+    total, ramp = np.empty(width, np.float32), np.empty(width, np.float32)
+    for u in range(width):
+        total[u] = here[u] + ((above[u] + below[u]) + (above2[u] + below2[u]))
+        outer = below2[u] - above2[u]
+        ramp[u] = (below[u] - above[u]) + (outer + outer)
+    for u in range(width - 4):
+        outer = total[u + 4] - total[u]
+        slope_u[u] = (total[u + 3] - total[u + 1]) + (outer + outer)
+        slope_v[u] = ramp[u + 2] + ((ramp[u + 1] + ramp[u + 3]) + (ramp[u] + ramp[u + 4]))
+        middle[u] = here[u + 2]
+
+
+@compiled
+def _normals(middle: Floats, slope_u: Floats, slope_v: Floats, normals: Floats) -> None:
+    """Normals (W, 3) of a row from what `_slopes` says of x/z, y/z and 1000/z (3, W).
+
+    1/z = p x + q y + r is the plane p X + q Y + r Z = 1, whose normal (p, q, r) points away: from
+    slopes by column and row to those by x and y, all times the determinant.
+    """
+    x, y, inverse = middle
+    x_u, y_u, inverse_u = slope_u
+    x_v, y_v, inverse_v = slope_v
+    windows = len(normals) - 2 * REACH
+    for u in range(windows):
+        determinant = x_u[u] * y_v[u] - x_v[u] * y_u[u]
+        p = inverse_u[u] * y_v[u] - inverse_v[u] * y_u[u]
+        q = inverse_v[u] * x_u[u] - inverse_u[u] * x_v[u]
+        r = determinant * inverse[u] - p * x[u] - q * y[u]
+        size = np.sqrt(p * p + q * q + r * r)
+        scale = np.float32(1.0) / (-size if determinant > 0.0 else size)
+        x[u], y[u], inverse[u] = p * scale, q * scale, r * scale
+    for u in range(windows):
+        for k in range(3):
+            normals[REACH + u, k] = middle[k, u]

@@ -7,10 +7,12 @@ without overlap stay where the boards put them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import permutations
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +26,16 @@ from bodyscan.registration.matching import (
     match_projected,
     patch,
 )
+from bodyscan.registration.pull import Pull
 from bodyscan.registration.uncertainty import PlacingCovariance
 
 Array = NDArray[np.float64]
+Result = TypeVar("Result")
 
 BODY_CENTRE_MM = np.array([0.0, 0.0, 900.0])
 COARSE = 4  # only one in so many points takes part
 FINE_ROUNDS = 2  # at the end, with all of them
+UNKNOWN = 0, float("nan")
 SWAY_ROOM = 1.5  # standard deviations are believed this much larger than what was found
 
 
@@ -52,7 +57,7 @@ class AlignmentSettings:
     reach_mm: float = 12.0
     least_reach_mm: float = 3.0
     rounds: int = 5
-    fewest: int = 100
+    fewest: int = 30
     sway_mm: float = 1.0
     sway_deg: float = 0.05
     least_sway: float = 0.3
@@ -99,76 +104,83 @@ def align(
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PlacingCovariance,
     settings: AlignmentSettings = AlignmentSettings(),
+    *,
+    workers: int = 2,
 ) -> Alignment:
     """Small motions of all range images that bring their overlaps together."""
     names = [image.pair for image in images]
     start = [rig_from_camera[name] for name in names]
-    patches = [patch(image, settings.spacing_mm) for image in images]
     motion = np.zeros((len(names), 6))
     reach, sway = settings.reach_mm, 1.0
-    coarse = [p.thinned(COARSE) for p in patches]
-    for left in range(settings.rounds, 0, -1):
+    pull = partial(Pull.of, correlated=settings.correlated)
+    with ThreadPoolExecutor(workers) as pool:
+        patches = list(pool.map(lambda image: patch(image, settings.spacing_mm), images))
+        coarse = [p.thinned(COARSE) for p in patches]
+        for left in range(settings.rounds, 0, -1):
+            moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
+            taken = patches if left <= FINE_ROUNDS else coarse
+            pulls = _of_overlaps(pull, pool, taken, moved, reach, settings)
+            motion = _solve(pulls, motion, _prior(names, prior, settings, sway))
+            reach, sway = max(reach / 2.0, settings.least_reach_mm), _sway_of(motion, settings)
+        widest = _prior(names, prior, settings, settings.most_sway)
+        motion, refused = _bounded(names, motion, widest, settings.limit_sigmas)
         moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
-        taken = patches if left <= FINE_ROUNDS else coarse
-        matches = _all_matches(taken, moved, reach, settings)
-        motion = _solve(matches, motion, _prior(names, prior, settings, sway), settings)
-        reach, sway = max(reach / 2.0, settings.least_reach_mm), _sway_of(motion, settings)
-    widest = _prior(names, prior, settings, settings.most_sway)
-    motion, refused = _bounded(names, motion, widest, settings.limit_sigmas)
-    moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
+        # Both with the same reach, so that they can be compared.
+        was, now = (
+            _of_overlaps(_gap, pool, coarse, placings, settings.least_reach_mm, settings)
+            for placings in (start, moved)
+        )
     shift = np.linalg.norm(_shifts(motion), axis=1)
     return Alignment(
         dict(zip(names, moved, strict=True)),
         dict(zip(names, shift.tolist(), strict=True)),
         refused,
-        _overlaps(names, coarse, start, moved, settings),
+        tuple(
+            Overlap(names[i], names[j], COARSE * count, was.get((i, j), UNKNOWN)[1], rms_mm)
+            for (i, j), (count, rms_mm) in now.items()
+        ),
     )
 
 
-def _all_matches(
+def _of_overlaps(
+    measure: Callable[[Matches], Result],
+    pool: ThreadPoolExecutor,
     patches: Sequence[Patch],
     placings: Sequence[RigidTransform],
     reach_mm: float,
     settings: AlignmentSettings,
-) -> dict[tuple[int, int], Matches]:
-    """Both ways for every two pairs, so that what one way gets wrong on curves cancels."""
+) -> dict[tuple[int, int], Result]:
+    """What the matches of every two pairs say, if they are enough; both ways, so that what one way
+    gets wrong on curves cancels."""
     match = match_projected if settings.matching == "projected" else match_nearest
-    boxes = [
-        (points.min(axis=0) - reach_mm, points.max(axis=0) + reach_mm)
-        for points in (t.apply(p.points) for p, t in zip(patches, placings, strict=True))
-    ]
-    found = {}
-    for i, j in permutations(range(len(patches)), 2):
-        if np.any(boxes[i][0] > boxes[j][1]) or np.any(boxes[j][0] > boxes[i][1]):
-            continue
+
+    def of_two(both: tuple[int, int]) -> Result | None:
+        i, j = both
         matches = match(patches[i], patches[j], placings[i], placings[j], reach_mm)
-        if len(matches.distances) >= settings.fewest:
-            found[i, j] = matches
-    return found
+        return measure(matches) if len(matches.distances) >= settings.fewest else None
+
+    every_two = list(permutations(range(len(patches)), 2))
+    found = zip(every_two, pool.map(of_two, every_two), strict=True)
+    return {both: said for both, said in found if said is not None}
 
 
-def _solve(
-    matches: Mapping[tuple[int, int], Matches],
-    motion: Array,
-    covariance: Array,
-    settings: AlignmentSettings,
-) -> Array:
+def _gap(matches: Matches) -> tuple[int, float]:
+    """How many matches, and their RMS distance, mm."""
+    return len(matches.distances), float(np.sqrt(np.mean(matches.distances**2)))
+
+
+def _solve(pulls: Mapping[tuple[int, int], Pull], motion: Array, covariance: Array) -> Array:
     """Motions (P, 6), one Gauss-Newton step: matches pull together, the prior holds near zero."""
     normal = np.linalg.inv(covariance)
     right = np.zeros(motion.size)
-    for (a, b), found in matches.items():
+    for (a, b), pull in pulls.items():
         i, j = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
-        jacobian = np.concatenate([np.cross(found.points, found.normals), found.normals], axis=1)
-        sigma = np.hypot(found.sigma_mm, _spread(found.distances))
-        robust = 1.0 / (1.0 + (found.distances / (2.0 * sigma)) ** 2)
-        weights = robust / (sigma**2 * settings.correlated)
-        information = jacobian.T @ (jacobian * weights[:, None])
         # The distance left after the step: d + J (x_i - m_i) - J (x_j - m_j).
-        wanted = information @ (motion[a] - motion[b]) - jacobian.T @ (weights * found.distances)
-        normal[i, i] += information
-        normal[j, j] += information
-        normal[i, j] -= information
-        normal[j, i] -= information
+        wanted = pull.information @ (motion[a] - motion[b]) - pull.gradient
+        normal[i, i] += pull.information
+        normal[j, j] += pull.information
+        normal[i, j] -= pull.information
+        normal[j, i] -= pull.information
         right[i] += wanted
         right[j] -= wanted
     return np.linalg.solve(normal, right).reshape(-1, 6)
@@ -216,36 +228,6 @@ def _bounded(
             refused[name] = sigmas
             kept[k] = 0.0
     return kept, refused
-
-
-def _overlaps(
-    names: Sequence[str],
-    patches: Sequence[Patch],
-    before: Sequence[RigidTransform],
-    after: Sequence[RigidTransform],
-    settings: AlignmentSettings,
-) -> tuple[Overlap, ...]:
-    """Distances in each overlap; both with the same reach, so that they can be compared."""
-    was = _all_matches(patches, before, settings.least_reach_mm, settings)
-    now = _all_matches(patches, after, settings.least_reach_mm, settings)
-    return tuple(
-        Overlap(
-            names[i],
-            names[j],
-            COARSE * len(now[i, j].distances),
-            _rms(was[i, j].distances) if (i, j) in was else float("nan"),
-            _rms(now[i, j].distances),
-        )
-        for i, j in now
-    )
-
-
-def _rms(distances: Array) -> float:
-    return float(np.sqrt(np.mean(distances**2)))
-
-
-def _spread(distances: Array) -> float:
-    return max(1.4826 * float(np.median(np.abs(distances))), 0.01)
 
 
 def _pooled(parts: Sequence[tuple[int, float]]) -> float:

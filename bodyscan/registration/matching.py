@@ -7,20 +7,24 @@ camera's pixel grid, which needs no search and knows where that camera saw nothi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
+from bodyscan.compiled import compiled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Vector = tuple[float, float, float]
 
 FACING = 0.7  # least cosine between the normals of what may be one spot
 EDGE_ON = 0.3  # least cosine between a normal and the viewing ray
+NEAREST_MM = 100.0
 RIM_PX = 4
 
 
@@ -34,21 +38,21 @@ class Patch:
     """
 
     image: RangeImage
-    inner: NDArray[np.bool_]
+    inner: Mask
     points: Array
     normals: Array
     sigma_mm: Array
-    rim: NDArray[np.bool_]
+    rim: Mask
 
     def thinned(self, step: int) -> Patch:
-        """Every `step`th point; their order has nothing to do with where they lie."""
+        """Every `step`th point."""
         some = slice(None, None, step)
         return replace(
             self,
-            points=self.points[some],
-            normals=self.normals[some],
-            sigma_mm=self.sigma_mm[some],
-            rim=self.rim[some],
+            points=self.points[some].copy(),
+            normals=self.normals[some].copy(),
+            sigma_mm=self.sigma_mm[some].copy(),
+            rim=self.rim[some].copy(),
         )
 
 
@@ -65,24 +69,25 @@ class Matches:
 
 
 def patch(image: RangeImage, spacing_mm: float) -> Patch:
-    """About evenly spread points of a range image; surfaces seen edge-on do not take part."""
+    """Points of every so many rows and columns, about `spacing_mm` apart where a surface faces the
+    camera; what is seen edge-on takes no part."""
     window = np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)
     inner = cv2.erode(image.valid.astype(np.uint8), window) > 0
-    rows, columns = np.nonzero(image.valid & np.isfinite(image.normals[..., 0]))
-    points, normals = image.points[rows, columns], image.normals[rows, columns]
-    facing = -_dot(points, normals) / np.maximum(_length(points), np.float32(1e-9))
-    cells = np.floor(points.T * np.float32(1.0 / spacing_mm)).astype(np.int64)
-    keys = (cells[0] * 73856093) ^ (cells[1] * 19349663) ^ (cells[2] * 83492791)
-    usable = np.flatnonzero(facing > EDGE_ON)
-    chosen = usable[np.unique(keys[usable], return_index=True)[1]]
-    rows, columns = rows[chosen], columns[chosen]
+    depth = image.points[::8, ::8, 2]
+    depth = depth[np.isfinite(depth)]
+    pixel_mm = float(np.median(depth)) / image.camera.alpha if len(depth) else spacing_mm
+    step = max(1, round(spacing_mm / pixel_mm))
+    some = slice(step // 2, None, step), slice(step // 2, None, step)
+    points, normals = image.points[some].astype(np.float64), image.normals[some].astype(np.float64)
+    facing = -np.einsum("vuc,vuc->vu", points, normals) / np.linalg.norm(points, axis=-1)
+    chosen = facing > EDGE_ON  # NaN where nothing was measured, which is not more
     return Patch(
         image,
         inner,
-        points[chosen].astype(np.float64),
-        normals[chosen].astype(np.float64),
-        (image.sigma_mm[rows, columns] * facing[chosen]).astype(np.float64),
-        ~inner[rows, columns],
+        points[chosen],
+        normals[chosen],
+        (image.sigma_mm[some] * facing)[chosen],
+        ~inner[some][chosen],
     )
 
 
@@ -94,31 +99,112 @@ def match_projected(
     reach_mm: float,
 ) -> Matches:
     """Each source point against the surface that the target camera saw in its direction."""
-    image = target.image
     target_from_source = rig_from_target.inverse() @ rig_from_source
-    points = target_from_source.apply(source.points)
-    normals = target_from_source.rotate(source.normals)
-    ahead = points[:, 2] > 100.0
-    edge_on = -_dot(points, normals) < EDGE_ON * _length(points)
-    index = np.flatnonzero(ahead & ~edge_on & ~source.rim)
-    pixels = np.rint(image.camera.project(points[index])).astype(np.int64)
-    inside = np.all((pixels >= 0) & (pixels < [image.camera.width, image.camera.height]), axis=1)
-    index, (columns, rows) = index[inside], pixels[inside].T
-    there = image.points[rows, columns].astype(np.float64)
-    across = image.normals[rows, columns].astype(np.float64)
-    mean = normals[index] + across
-    mean /= np.maximum(_length(mean), 1e-9)[:, None]
-    distance = _dot(points[index] - there, mean)
-    same = target.inner[rows, columns] & (np.abs(distance) < reach_mm)
-    same &= _dot(normals[index], across) > FACING
-    facing = np.abs(_dot(points[index], across)) / _length(points[index])
-    sigma = np.hypot(source.sigma_mm[index], image.sigma_mm[rows, columns] * facing)
-    return Matches(
-        rig_from_target.apply(points[index][same]),
-        rig_from_target.rotate(mean[same]),
-        distance[same],
-        sigma[same],
+    size, image, camera = len(source.points), target.image, target.image.camera
+    points, normals = np.empty((size, 3)), np.empty((size, 3))
+    distances, sigma_mm = np.empty(size), np.empty(size)
+    found = _match_projected(
+        np.ascontiguousarray(target_from_source.matrix[:3]),
+        np.array([camera.alpha, camera.beta, camera.gamma, camera.u0, camera.v0]),
+        np.array([camera.k1, camera.k2]),
+        (source.points, source.normals, source.sigma_mm, source.rim),
+        (image.points, image.normals, image.sigma_mm, target.inner),
+        reach_mm,
+        (points, normals, distances, sigma_mm),
     )
+    return Matches(
+        rig_from_target.apply(points[:found]),
+        rig_from_target.rotate(normals[:found]),
+        distances[:found],
+        sigma_mm[:found],
+    )
+
+
+@compiled
+def _match_projected(
+    target_from_source: Array,
+    lens: Array,
+    bend: Array,
+    source: tuple[Array, Array, Array, Mask],
+    target: tuple[Floats, Floats, Floats, Mask],
+    reach_mm: float,
+    matches: tuple[Array, Array, Array, Array],
+) -> int:
+    """How many of the source's points were matched; what of them `matches` holds, target frame.
+
+    target_from_source: (3, 4).  lens: alpha, beta, gamma, u0, v0.  bend: k1, k2.  source: points
+    (N, 3), normals (N, 3), sigma_mm (N,), rim (N,).  target: points (H, W, 3), normals (H, W, 3),
+    sigma_mm (H, W), inner (H, W).  matches: the arrays of `Matches`, room for N.
+    """
+    source_points, source_normals, source_sigma, rim = source
+    target_points, target_normals, target_sigma, inner = target
+    points, normals, distances, sigma_mm = matches
+    height, width = inner.shape
+    found = 0
+    for n in range(len(source_points)):
+        if rim[n]:
+            continue
+        point = _carried(target_from_source, source_points[n], 1.0)
+        normal = _carried(target_from_source, source_normals[n], 0.0)
+        if point[2] <= NEAREST_MM:
+            continue
+        far = np.sqrt(_dot(point, point))
+        if -_dot(point, normal) < EDGE_ON * far:
+            continue
+        u, v = _pixel(lens, bend, point)
+        if not (-0.5 < u < width - 0.5 and -0.5 < v < height - 0.5):
+            continue
+        row, column = int(np.rint(v)), int(np.rint(u))
+        if not inner[row, column]:
+            continue
+        across = _vector(target_normals[row, column])
+        cosine = _dot(normal, across)
+        if not cosine > FACING:
+            continue
+        there = _vector(target_points[row, column])
+        # The length of the sum of two unit vectors, from the angle between them.
+        size = np.sqrt(2.0 + 2.0 * cosine)
+        distance = 0.0
+        for k in range(3):
+            points[found, k], normals[found, k] = point[k], (normal[k] + across[k]) / size
+            distance += (point[k] - there[k]) * normals[found, k]
+        if not abs(distance) < reach_mm:
+            continue
+        ours, theirs = source_sigma[n], target_sigma[row, column] * _dot(point, across) / far
+        distances[found], sigma_mm[found] = distance, np.sqrt(ours * ours + theirs * theirs)
+        found += 1
+    return found
+
+
+@compiled
+def _carried(a_from_b: Array, vector: Array, moved: float) -> Vector:
+    """A vector (3,) turned by a_from_b (3, 4), and moved if `moved` is 1."""
+    m, (x, y, z) = a_from_b, (vector[0], vector[1], vector[2])
+    return (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] * moved,
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] * moved,
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] * moved,
+    )
+
+
+@compiled
+def _pixel(lens: Array, bend: Array, point: Vector) -> tuple[float, float]:
+    """`Camera.project` of one point."""
+    x, y = point[0] / point[2], point[1] / point[2]
+    r2 = x * x + y * y
+    stretch = 1.0 + r2 * (bend[0] + r2 * bend[1])
+    x, y = x * stretch, y * stretch
+    return lens[0] * x + lens[2] * y + lens[3], lens[1] * y + lens[4]
+
+
+@compiled
+def _vector(row: Floats) -> Vector:
+    return np.float64(row[0]), np.float64(row[1]), np.float64(row[2])
+
+
+@compiled
+def _dot(one: Vector, other: Vector) -> float:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
 def match_nearest(
@@ -139,6 +225,7 @@ def match_nearest(
         _cloud(points), _cloud(there), reach_mm
     )
     pairs = np.asarray(found.correspondence_set).reshape(-1, 2)
+    pairs = pairs[np.argsort(pairs[:, 0])]  # Open3D's threads leave them in any order
     i, j = pairs[:, 0], pairs[:, 1]
     same = ~source.rim[i] & ~target.rim[j] & (np.sum(normals[i] * across[j], axis=1) > FACING)
     i, j = i[same], j[same]
@@ -146,15 +233,6 @@ def match_nearest(
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     distance = np.sum((points[i] - there[j]) * mean, axis=1)
     return Matches(points[i], mean, distance, np.hypot(source.sigma_mm[i], target.sigma_mm[j]))
-
-
-def _dot(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
-    """(N,) of (N, 3) and (N, 3); numpy is slow at sums of three."""
-    return np.einsum("nc,nc->n", one, other)
-
-
-def _length(vectors: NDArray[Any]) -> NDArray[Any]:
-    return np.sqrt(_dot(vectors, vectors))
 
 
 def _cloud(points: Array) -> o3d.geometry.PointCloud:

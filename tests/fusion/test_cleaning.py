@@ -9,7 +9,7 @@ import pytest
 from ray_cast_scan import Scan, load_rig
 
 from bodyscan.evaluation.surface import signed_distances
-from bodyscan.fusion.cleaning import clean
+from bodyscan.fusion.cleaning import clean, inside, without_flying_pixels
 from bodyscan.reconstruction.range_image import RangeImage
 
 NOISE_MM = 0.3
@@ -40,6 +40,38 @@ def test_only_the_scan_volume_is_kept(scan: Scan, cleaned: list[RangeImage]):
         x, y, z = scan.rig_from_camera[image.pair].apply(image.points[image.valid].astype(float)).T
         assert np.hypot(x, y).max() <= volume.radius_mm + 1e-2  # float32 at a metre
         assert z.min() >= volume.bottom_mm - 1e-2
+
+
+def test_inside_is_what_lies_in_the_cylinder(scan: Scan):
+    image, volume = scan.range_images[3], load_rig().volume
+    placing = scan.rig_from_camera[image.pair]
+    x, y, z = np.moveaxis(placing.apply(image.points.astype(float)), -1, 0)
+    with np.errstate(invalid="ignore"):
+        expected = np.hypot(x, y) < volume.radius_mm
+        expected &= (z > volume.bottom_mm) & (z < volume.top_mm) & image.valid
+    found = inside(image, placing, volume)
+    assert 0.05 < found.mean() < 0.95
+    assert np.count_nonzero(found != expected) <= 2  # rounding, right at the boundary
+
+
+def test_pixels_stay_that_neighbours_agree_with():
+    """Against a count of the neighbours of one pixel after the other."""
+    rng = np.random.default_rng(8)
+    depth = (1000.0 + 12.0 * rng.random((40, 50))).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = np.nan
+    step_mm, supporters = 4.0, 11
+    expected = depth
+    for _ in range(2):
+        padded, left = np.pad(expected, 2, constant_values=np.nan), np.full_like(depth, np.nan)
+        for v, u in np.ndindex(depth.shape):
+            off = np.abs(padded[v : v + 5, u : u + 5] - expected[v, u])
+            limits = step_mm * np.hypot(*np.mgrid[-2:3, -2:3])
+            if np.count_nonzero(off < limits) >= supporters:  # itself never: 0 < 0 is false
+                left[v, u] = expected[v, u]
+        expected = left
+    found = without_flying_pixels(depth, step_mm, supporters=supporters)
+    assert 0.1 < np.isfinite(found).sum() / np.isfinite(depth).sum() < 0.9
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_a_speckle_in_the_air_goes(scan: Scan, cleaned: list[RangeImage]):

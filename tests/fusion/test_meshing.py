@@ -10,6 +10,7 @@ import pytest
 from ray_cast_scan import Scan
 
 from bodyscan.errors import ScanFailed
+from bodyscan.evaluation.self_intersections import self_intersections
 from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.fusion.body import BodyCloud, BodyMesh
 from bodyscan.fusion.meshing import mesh, poisson
@@ -38,11 +39,15 @@ def test_closed_manifold_one_piece_outward(scan: Scan, body: BodyMesh):
     assert found.closed
     assert found.manifold
     assert found.components == 1
-    assert found.euler == 2
+    # Fingers are one and a half of these cells thick: two may touch, and make one handle.
+    assert found.euler in (0, 2)
     true_volume = signed_volume(scan.truth.vertices, scan.truth.faces)
     # The truth has a mouth and eye sockets that nobody can see into: about half a per cent.
     assert found.volume_mm3 == pytest.approx(true_volume, rel=0.015)
     np.testing.assert_array_equal(np.unique(body.faces), np.arange(len(body.vertices)))
+    # Poisson's surface meets itself nowhere; settling on the points may cross slivers at fingers,
+    # as wide as two of these cells: 0.02 % of 140,000 edges.
+    assert len(self_intersections(body.vertices, body.faces)) <= 28
 
 
 def test_measured_vertices_lie_on_the_body(scan: Scan, body: BodyMesh):

@@ -48,6 +48,13 @@ def test_one_from_each_voxel_and_the_best(count: int, size: float, seed: int):
         assert poor[(where == where[index]).all(axis=1)].all()
 
 
+def test_small_voxels_in_a_large_box():
+    """More blocks of voxels than a table holds: they become larger, and the choice stays."""
+    points = np.concatenate([sphere(2000), sphere(2000, seed=1) + np.float32(3000.0)])
+    chosen = one_per_voxel(points, np.zeros(len(points), bool), 1.0)
+    assert len(chosen) == len(np.unique(cells(points, 1.0), axis=0))
+
+
 def test_evenly_spread():
     points = sphere(600_000)
     size = voxel_size_for(points, 40_000)

@@ -20,10 +20,10 @@ from bodyscan.registration.uncertainty import PlacingCovariance
 
 RIG = load_rig()
 SETTINGS = ScanSettings(
-    points=60_000,
-    alignment=AlignmentSettings(spacing_mm=6.0),
+    points=66_000,
+    alignment=AlignmentSettings(spacing_mm=3.0),
     mesh_depth=7,
-    mesh_reach_mm=14.0,  # a cell of the octree, as 4 mm is at depth 9
+    mesh_reach_mm=16.0,  # four times what it is at depth 9, as the cells are
 )
 
 

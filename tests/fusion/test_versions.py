@@ -6,6 +6,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
+from bodyscan.evaluation.self_intersections import self_intersections
 from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.fusion.body import BodyMesh
 from bodyscan.fusion.topology import face_areas, topology, vertex_normals
@@ -18,8 +19,9 @@ def filled_share(mesh: BodyMesh) -> float:
 
 
 def test_the_light_version_is_close_and_closed(body: BodyMesh):
-    lean = light(body, faces=20_000)
-    assert abs(len(lean.faces) - 20_000) <= 20
+    lean = light(body, faces=20_000, within_mm=0.5)
+    # What the spare faces were not needed for, or more than them.
+    assert abs(len(lean.faces) - 20_000) <= 400
     found = topology(lean.vertices, lean.faces)
     assert found.manifold
     assert found.components == 1
@@ -29,6 +31,12 @@ def test_the_light_version_is_close_and_closed(body: BodyMesh):
     off = deviation(signed_distances(lean.vertices, body.vertices, body.faces))
     # Faces of 12 mm: on a radius of 40 mm a flat one is off by up to 0.3 mm.
     assert off.p95_mm < 0.3
+    assert off.worst_mm <= 0.5
+    back = signed_distances(body.vertices, lean.vertices, lean.faces)
+    assert np.abs(back).max() <= 0.5 + 1e-3
+    # A vertex set beside an edge may fold a face there, at fingers as thick as one face: 0.2 % of
+    # 30,000 edges. (At full size, with 50,000 faces, there are next to none: docs/results.md.)
+    assert len(self_intersections(lean.vertices, lean.faces)) <= 60
     # Of the area: the light mesh has its faces where the body is curved, at fingers and toes.
     assert filled_share(lean) == pytest.approx(filled_share(body), abs=0.05)
     np.testing.assert_array_equal(lean.filled, np.isnan(lean.sigma_mm)[lean.faces].any(axis=1))

@@ -219,3 +219,23 @@ def test_what_is_too_uncertain_is_not_measured():
     kept = np.isfinite(measure(worse, rays, s).depth)
     # Sigma is now about one thousandth of the distance: some are below, some above.
     assert 0 < kept.sum() < inside.sum()
+
+
+@pytest.mark.parametrize("terms", [0, 1, 4])
+def test_a_lens_measures_rays_as_newtons_method_on_its_offset_does(terms):
+    """Depth, its change and its variance in one go, against the ways all smooth sheets share."""
+    model = moved(PINHOLE.with_lens(terms), np.random.default_rng(terms))
+    rng = np.random.default_rng(13)
+    points = MIDDLE + rng.uniform(-400.0, 400.0, (3000, 3))
+    rays, s = points / points[:, 2:], rng.uniform(-20.0, STRIPES + 20.0, 3000)
+    s[::50] = np.nan
+    depth = model.depth(rays, s)
+    known = np.isfinite(depth)
+    assert 0.2 < known.mean() < 0.95
+    found = model.measure(rays, s)
+    for values in found:
+        np.testing.assert_array_equal(np.isfinite(values), known)
+    # Newton's steps end at 1e-7 of the depth, where the next one is the square of that.
+    np.testing.assert_allclose(found[0], depth, rtol=1e-11)
+    np.testing.assert_allclose(found[1], model.depth_per_stripe(rays, s, depth), rtol=1e-8)
+    np.testing.assert_allclose(found[2], model.variance_mm2(rays, s, depth), rtol=1e-8)

@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 from test_light_sheets import MIDDLE, STRIPES, models
 
-from bodyscan.geometry.measuring import measure
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.measuring import MOST_SIGMA, measure, measure_image
 from bodyscan.geometry.plane_table import PlaneTable
 
 
 @pytest.fixture(params=[3, 4, 5])
 def planes(request):
     return next(model for model in models(request.param) if model.kind == "smooth-planes")
+
+
+CAMERA = Camera(500.0, 502.0, -0.5, 100.0, 75.0, -0.15, 0.03, 200, 150)
 
 
 def some_rays(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -55,3 +59,33 @@ def test_measuring_takes_the_table(planes):
     expected = PlaneTable.of(planes).measure(rays, s)[0]
     known = np.isfinite(found.depth.ravel())
     np.testing.assert_array_equal(found.depth.ravel()[known], expected[known])
+
+
+def test_an_image_is_measured_as_its_rays_are(planes):
+    """The same points and sigmas as the sheets' own depth, slope and variance give, pixel by pixel."""
+    rng = np.random.default_rng(4)
+    shape = (CAMERA.height, CAMERA.width)
+    s = rng.uniform(-5.0, STRIPES + 5.0, shape).astype(np.float32)
+    s[rng.random(shape) < 0.1] = np.nan
+    sigma = rng.uniform(0.01, 0.03, shape).astype(np.float32)
+    sigma[rng.random(shape) < 0.05] = np.nan
+    points, sigma_mm = measure_image(planes, CAMERA, s, sigma)
+    assert points.dtype == sigma_mm.dtype == np.float32
+
+    rays, wide = CAMERA.pixel_rays(), s.astype(float)
+    depth = planes.depth(rays, wide)
+    variance = planes.variance_mm2(rays, wide, depth)
+    slope = planes.depth_per_stripe(rays, wide, depth)
+    along = np.sqrt((slope * sigma) ** 2 + variance) * np.linalg.norm(rays, axis=-1)
+    sure = variance <= (MOST_SIGMA * depth) ** 2
+    expected, known = sure & np.isfinite(along), np.isfinite(sigma_mm)
+    np.testing.assert_array_equal(np.isfinite(points).all(axis=-1), known)
+    # The table's variance is 1e-3 off: only what lies that close to the limit may fall otherwise.
+    assert np.mean(expected != known) < 2e-3
+    assert known.sum() > 5000
+    near = expected & known & (depth < 3000.0)
+    # 3e-9 in 1/z (see above), and what float32 holds of a metre.
+    z = points[near][:, 2:].astype(float)
+    np.testing.assert_allclose(1.0 / z[:, 0], 1.0 / depth[near], rtol=2e-7, atol=3e-9)
+    np.testing.assert_allclose(points[near], z * rays[near], rtol=1e-6, atol=1e-4)
+    np.testing.assert_allclose(sigma_mm[near], along[near], rtol=2e-3)

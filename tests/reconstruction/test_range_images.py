@@ -95,6 +95,35 @@ def test_normals_of_a_sphere_point_to_the_camera():
     assert np.min(np.sum(normals[middle] * true[middle], axis=1)) > 0.999
 
 
+def test_a_normal_needs_its_whole_window():
+    rays = CAMERA.pixel_rays()
+    points = (rays * 500.0).astype(np.float32)
+    points[40, 70] = np.nan
+    unknown = np.isnan(grid_normals(points)).any(axis=-1)
+    expected = np.ones_like(unknown)
+    expected[2:-2, 2:-2] = False
+    expected[38:43, 68:73] = True
+    np.testing.assert_array_equal(unknown, expected)
+
+
+def test_normals_are_those_of_planes_fitted_to_the_windows():
+    """Against a least-squares fit of 1/z by column and row, window by window, on a rough surface."""
+    rng = np.random.default_rng(6)
+    camera = Camera(400.0, 400.0, 0.0, 15.0, 10.0, 0.0, 0.0, 30, 20)
+    rays = camera.pixel_rays()
+    points = rays * rng.uniform(480.0, 520.0, rays.shape[:2])[..., None]
+    normals = grid_normals(points.astype(np.float32))
+    for v, u in rng.integers([2, 2], [18, 28], (30, 2)):
+        window = np.s_[v - 2 : v + 3, u - 2 : u + 3]
+        ones = np.ones((25, 1))
+        unknowns = np.hstack([rays[window].reshape(25, 3)[:, :2], ones])
+        slope = np.linalg.lstsq(unknowns, 1.0 / points[window][..., 2].ravel(), rcond=None)[0]
+        rest = 1.0 / points[v, u, 2] - slope[:2] @ rays[v, u, :2]
+        normal = -np.append(slope[:2], rest)
+        # float32 sums of 25 numbers near 1, of which differences of 1e-2 are taken.
+        assert np.allclose(normals[v, u], normal / np.linalg.norm(normal), atol=1e-4)
+
+
 def test_another_image_size_is_refused():
     stripes = stripe_map(np.full((CAMERA.height, CAMERA.width), 480.0))
     small = StripeMap(**{**vars(stripes), "s": stripes.s[:100]})

@@ -11,7 +11,9 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.triangulation import grid_normals
 from bodyscan.registration.alignment import AlignmentSettings, align
+from bodyscan.registration.matching import Matches
 from bodyscan.registration.object_refinement import refine_on_object
+from bodyscan.registration.pull import Pull
 from bodyscan.registration.uncertainty import PlacingCovariance
 
 CAMERA = Camera(380.0, 380.0, 0.0, 160.0, 128.0, 0.0, 0.0, 320, 256)
@@ -142,3 +144,39 @@ def test_a_rig_is_refined_on_a_still_object(scanned):
     assert "mm RMS before" in refined.lines[0]
     with pytest.raises(FailedWork, match="no two pairs"):
         refine_on_object([i for i in images if i.pair in ("p0", "p2")], start, prior)
+
+
+@pytest.mark.parametrize("matching", ["projected", "nearest"])
+def test_threads_change_nothing(scanned, matching):
+    images, truth = scanned
+    start, prior = pushed(truth, 1.5), known_to(truth, 1.5, 0.02)
+    settings = AlignmentSettings(matching=matching)
+    one, many = (align(images, start, prior, settings, workers=n) for n in (1, 3))
+    for name in truth:
+        np.testing.assert_array_equal(
+            one.rig_from_camera[name].matrix, many.rig_from_camera[name].matrix
+        )
+    assert one.overlaps == many.overlaps
+
+
+def test_the_normal_equations_are_those_of_the_distances_jacobian():
+    """By numerical derivative: a small motion of the source changes distances along the normals."""
+    rng = np.random.default_rng(5)
+    points, normals = rng.uniform(-300.0, 300.0, (200, 3)), rng.standard_normal((200, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    matches = Matches(points, normals, rng.normal(0.0, 0.5, 200), rng.uniform(0.1, 0.3, 200))
+    jacobian = np.empty((200, 6))
+    for k, step in enumerate(1e-6 * np.eye(6)):
+        moved = RigidTransform.identity().moved(step).apply(points)
+        jacobian[:, k] = np.sum((moved - points) * normals, axis=1) / 1e-6
+    spread = 1.4826 * np.median(np.abs(matches.distances))
+    sigma = np.hypot(matches.sigma_mm, spread)
+    weights = 1.0 / (1.0 + (matches.distances / (2.0 * sigma)) ** 2) / (sigma**2 * 5.0)
+    found = Pull.of(matches, correlated=5.0)
+    scale = np.sqrt(np.diag(found.information))  # rotations of 300 mm arms beside millimetres
+    information = jacobian.T @ (weights[:, None] * jacobian)
+    np.testing.assert_allclose(
+        found.information / np.outer(scale, scale), information / np.outer(scale, scale), atol=1e-5
+    )
+    gradient = jacobian.T @ (weights * matches.distances)
+    np.testing.assert_allclose(found.gradient / scale, gradient / scale, atol=1e-4)

@@ -1,0 +1,136 @@
+"""Weighted means of what several range images say about each point of a body."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.compiled import compiled
+from bodyscan.fusion.body import BodyCloud
+from bodyscan.fusion.comparing import Evidence, Samples
+from bodyscan.fusion.grid import Doubles, Floats
+from bodyscan.fusion.quadratics import NORMAL_MEDIAN
+from bodyscan.fusion.smoothing import Surface
+
+AT_A_TIME = 1 << 16  # samples whose sums fit into a processor's cache
+EVERY = 8  # spot of an overlap that is looked at to learn how far two surfaces are apart
+# Columns of the sums over the surfaces that show a point, its own among them: weights; weights
+# times shift, its square, grey level, normal; squares of weight times sigma; weights against it.
+WEIGHT, SHIFT, SHIFT2, GREY, SPREAD, AGAINST, NORMAL, SUMS = 0, 1, 2, 3, 4, 5, 6, 9
+
+
+def averaged(
+    samples: Samples,
+    surfaces: Sequence[Surface],
+    evidence: Sequence[Evidence],
+    gain: Floats,
+    workers: int = 2,
+) -> BodyCloud:
+    """Weighted means of each sample and what agrees with it; the outvoted are dropped.
+
+    gain: (surfaces,) factors for their grey levels.
+    """
+    own_gain = np.repeat(gain, np.diff(samples.starts))
+    general = disagreement(samples, surfaces, evidence) ** 2
+
+    def part(start: int) -> tuple[NDArray[Any], ...]:
+        some = slice(start, start + AT_A_TIME)
+        normals, sigma_mm = samples.normals[some], samples.sigma_mm[some]
+        own = normals, sigma_mm, samples.weight[some], samples.colours[some], own_gain[some]
+        sums, seen = _begun(*own)
+        for surface, one, factor in zip(surfaces, evidence, gain, strict=True):
+            facts = (surface.normals, surface.sigma_mm, surface.weight, surface.colours)
+            here = slice(*np.searchsorted(one.index, (some.start, some.stop)))
+            agreed = one.index[here] - start, one.at[here], one.shift_mm[here]
+            _add(facts, factor, *agreed, sums, seen)
+            here = slice(*np.searchsorted(one.against_index, (some.start, some.stop)))
+            weights = surface.weight[one.against_at[here]]
+            sums[one.against_index[here] - start, AGAINST] += weights
+        return _means(samples.points[some], normals, sums, seen, general)
+
+    with ThreadPoolExecutor(workers) as pool:
+        parts = list(pool.map(part, range(0, len(samples.points), AT_A_TIME)))
+    return BodyCloud(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+
+
+def disagreement(
+    samples: Samples, surfaces: Sequence[Surface], evidence: Sequence[Evidence]
+) -> float:
+    """Typical distance between pairs over its standard deviation by their sigmas; at least 1."""
+    ratios = [np.empty(0)]
+    for surface, one in zip(surfaces, evidence, strict=True):
+        ours, theirs = samples.sigma_mm[one.index[::EVERY]], surface.sigma_mm[one.at[::EVERY]]
+        ratios.append(np.abs(one.shift_mm[::EVERY]) / np.hypot(ours, theirs))
+    every = np.concatenate(ratios)
+    return max(1.0, float(np.median(every)) / NORMAL_MEDIAN) if every.size else 1.0
+
+
+@compiled
+def _begun(
+    normals: Floats, sigma_mm: Floats, weights: Floats, colours: NDArray[np.uint8], gain: Floats
+) -> tuple[Doubles, NDArray[np.uint8]]:
+    """Sums (N, 9) over the samples' own surfaces alone, and by how many each was seen."""
+    sums = np.zeros((len(weights), SUMS))
+    for n in range(len(weights)):
+        weight = float(weights[n])
+        sums[n, WEIGHT], sums[n, GREY] = weight, weight * colours[n] * gain[n]
+        sums[n, SPREAD] = (weight * sigma_mm[n]) ** 2
+        for k in range(3):
+            sums[n, NORMAL + k] = weight * normals[n, k]
+    return sums, np.ones(len(weights), np.uint8)
+
+
+@compiled
+def _add(
+    surface: tuple[Floats, Floats, Floats, NDArray[np.uint8]],
+    gain: float,
+    index: NDArray[np.int32],
+    at: NDArray[np.int32],
+    shifts: Floats,
+    sums: Doubles,
+    seen: NDArray[np.uint8],
+) -> None:
+    """Points `at` of a surface (normals, sigma, weight, grey levels) to the sums at `index`."""
+    normals, sigma_mm, weights, colours = surface
+    for n in range(len(index)):
+        here, there = index[n], at[n]
+        weight, shift = float(weights[there]), shifts[n]
+        sums[here, WEIGHT] += weight
+        sums[here, SHIFT] += weight * shift
+        sums[here, SHIFT2] += weight * shift * shift
+        sums[here, GREY] += weight * colours[there] * gain
+        sums[here, SPREAD] += (weight * sigma_mm[there]) ** 2
+        for k in range(3):
+            sums[here, NORMAL + k] += weight * normals[there, k]
+        seen[here] += 1
+
+
+@compiled
+def _means(
+    points: Floats, normals: Floats, sums: Doubles, seen: NDArray[np.uint8], general: float
+) -> tuple[Doubles, Floats, Floats, NDArray[np.uint8], NDArray[np.uint8]]:
+    """The cloud's points, normals, sigmas, colours and how many saw them, of what is not outvoted.
+
+    Pairs that disagree by more than their sigmas say (`general`, in variances) make everything that
+    much less certain, and a place where they do so by more than three times that even more.
+    """
+    kept = np.flatnonzero(sums[:, AGAINST] < sums[:, WEIGHT])
+    where, turned = np.empty((len(kept), 3)), np.empty((len(kept), 3), np.float32)
+    sigma, grey = np.empty(len(kept), np.float32), np.empty((len(kept), 3), np.uint8)
+    for n in range(len(kept)):
+        of = sums[kept[n]]
+        mean = of[SHIFT] / of[WEIGHT]
+        apart = of[SHIFT2] - of[WEIGHT] * mean * mean
+        chi2 = apart / max(seen[kept[n]] - 1, 1)
+        sigma[n] = np.sqrt(of[SPREAD] * max(general, chi2 / 9.0)) / of[WEIGHT]
+        x, y, z = of[NORMAL], of[NORMAL + 1], of[NORMAL + 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        for k in range(3):
+            where[n, k] = points[kept[n], k] + mean * normals[kept[n], k]
+            turned[n, k] = of[NORMAL + k] / length
+            grey[n, k] = min(max(np.rint(of[GREY] / of[WEIGHT]), 0.0), 255.0)
+    return where, turned, sigma, grey, seen[kept]

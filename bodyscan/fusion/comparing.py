@@ -1,0 +1,163 @@
+"""What one smoothed range image says about points that others measured.
+
+A point is projected into the image and compared with the surface at that pixel: no search tree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.compiled import compiled
+from bodyscan.fusion.grid import Doubles, Floats, lens_of
+from bodyscan.fusion.smoothing import Surface
+
+Numbers = NDArray[np.int32]
+
+SAME_WAY = 0.6  # cosine between the normals of what may be one surface
+EDGE_ON = 0.1  # a camera that sees a point flatter than this is not asked about it
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """N points taken from the surfaces, surface by surface, rig frame.
+
+    starts: (surfaces + 1,) where each one's points begin.  weight: as in Surface.
+    """
+
+    points: Floats
+    normals: Floats
+    sigma_mm: Floats
+    weight: Floats
+    colours: NDArray[np.uint8]
+    starts: NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What one other surface says about samples, in their order.
+
+    index: of the samples that it agrees with.  at: number of its point there.  shift_mm: from the
+    sample along its normal to that surface.  against_index, against_at: likewise, where it
+    contradicts the sample.
+    """
+
+    index: Numbers
+    at: Numbers
+    shift_mm: Floats
+    against_index: Numbers
+    against_at: Numbers
+
+
+def compare(
+    samples: Samples, surface: Surface, number: int, agreement_mm: float, double_mm: float
+) -> Evidence:
+    """What `surface` (the `number`th) says about the samples that do not come from it.
+
+    It agrees where it lies within `agreement_mm` of them; it contradicts them where it is a second
+    skin within `double_mm`, or was seen through them.
+    """
+    count = len(samples.points)
+    index, at = np.empty(count, np.int32), np.empty(count, np.int32)
+    shift = np.empty(count, np.float32)
+    against_index, against_at = np.empty(count, np.int32), np.empty(count, np.int32)
+    camera_from_rig = surface.rig_from_camera.inverse()
+    agreed, contradicted = _compare(
+        (samples.points, samples.normals),
+        (int(samples.starts[number]), int(samples.starts[number + 1])),
+        (surface.points, surface.normals, surface.number),
+        surface.corner,
+        lens_of(surface.camera),
+        (camera_from_rig.rotation, camera_from_rig.translation),
+        (agreement_mm, double_mm),
+        (index, at, shift, against_index, against_at),
+    )
+    return Evidence(
+        index[:agreed].copy(),
+        at[:agreed].copy(),
+        shift[:agreed].copy(),
+        against_index[:contradicted].copy(),
+        against_at[:contradicted].copy(),
+    )
+
+
+@compiled
+def _compare(
+    samples: tuple[Floats, Floats],
+    own: tuple[int, int],
+    surface: tuple[Floats, Floats, Numbers],
+    corner: tuple[int, int],
+    lens: Doubles,
+    camera_from_rig: tuple[Doubles, Doubles],
+    limits_mm: tuple[float, float],
+    evidence: tuple[Numbers, Numbers, Floats, Numbers, Numbers],
+) -> tuple[int, int]:
+    """Fill in the evidence; how many samples are agreed with and how many contradicted.
+
+    samples: points and normals.  own: range of samples that are the surface's own.  surface:
+    points, normals and the image of their numbers, which begins at `corner`.  limits_mm: of
+    agreement, and of a second skin.
+    """
+    points, normals = samples
+    surface_points, surface_normals, numbers = surface
+    index, at, shifts, against_index, against_at = evidence
+    centre = -camera_from_rig[0].T @ camera_from_rig[1]
+    agreed = contradicted = 0
+    for n in range(len(points)):
+        if own[0] <= n < own[1] or not _faces(points[n], normals[n], centre):
+            continue
+        pixel = _pixel_of(points[n], camera_from_rig, lens)
+        column, row = pixel[0] - corner[0], pixel[1] - corner[1]
+        if not (0 <= column < numbers.shape[1] and 0 <= row < numbers.shape[0]):
+            continue
+        there = numbers[row, column]
+        if there < 0:
+            continue
+        alike = outward = 0.0
+        for k in range(3):
+            normal = surface_normals[there, k]
+            alike += normals[n, k] * normal
+            outward += (surface_points[there, k] - points[n, k]) * normal
+        same = alike > SAME_WAY
+        # Along the sample's normal to the tangent plane of the surface.
+        shift = outward / alike
+        if same and abs(shift) <= limits_mm[0]:
+            index[agreed], at[agreed], shifts[agreed] = n, there, shift
+            agreed += 1
+        elif (same and abs(shift) < limits_mm[1]) or outward < -limits_mm[0]:
+            # A second skin close by, or a surface that was seen through the sample.
+            against_index[contradicted], against_at[contradicted] = n, there
+            contradicted += 1
+    return agreed, contradicted
+
+
+@compiled
+def _faces(point: Floats, normal: Floats, centre: Doubles) -> bool:
+    """Whether a point looks towards a camera's centre: n.(centre - point) > EDGE_ON * distance."""
+    towards = distance2 = 0.0
+    for k in range(3):
+        away = centre[k] - point[k]
+        towards += normal[k] * away
+        distance2 += away * away
+    return towards > 0 and towards * towards > EDGE_ON**2 * distance2
+
+
+@compiled
+def _pixel_of(
+    point: Floats, camera_from_rig: tuple[Doubles, Doubles], lens: Doubles
+) -> tuple[int, int]:
+    """(column, row) of the pixel that shows a point (Eq. 1, 3-5), (-1, -1) if it is behind."""
+    r, t = camera_from_rig
+    x = r[0, 0] * point[0] + r[0, 1] * point[1] + r[0, 2] * point[2] + t[0]
+    y = r[1, 0] * point[0] + r[1, 1] * point[1] + r[1, 2] * point[2] + t[1]
+    z = r[2, 0] * point[0] + r[2, 1] * point[1] + r[2, 2] * point[2] + t[2]
+    if z <= 1:
+        return -1, -1
+    x, y = x / z, y / z
+    r2 = x * x + y * y
+    scale = 1.0 + r2 * (lens[5] + r2 * lens[6])
+    x, y = x * scale, y * scale
+    column = lens[0] * x + lens[2] * y + lens[3]
+    return int(np.rint(column)), int(np.rint(lens[1] * y + lens[4]))

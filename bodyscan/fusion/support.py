@@ -1,0 +1,148 @@
+"""What the points of a cloud say about each vertex of a surface laid through them.
+
+Every point claims its tangent plane. Around a vertex that was measured there are points enough,
+their planes agree with each other, and they pass close to the vertex.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bodyscan.compiled import compiled
+from bodyscan.fusion.body import BodyCloud
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+NEIGHBOURS = 8
+# Shares of the reach: 2, 1 and 0.5 mm of 4.
+RANGE = 0.5
+LIFTED = 0.25
+TORN = 0.125
+LEAST_WEIGHT = 0.3  # of a point right at the vertex: one point is 3 mm away
+
+STEEPEST_TURN = 0.3  # cosine of the angle by which a face may turn
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """Of V vertices by the points within a reach.
+
+    nearest: (V,) the nearest point.  sigma_mm: (V,) its standard deviation.
+    weight: (V,) of the nearest points together, 1 for one at the vertex itself, 0 if there is none.
+    shift_mm: (V,) from the vertex along its normal to where those points' tangent planes lie on the
+    average.  spread_mm: (V,) RMS of the planes about that average.
+    """
+
+    nearest: Indices
+    sigma_mm: NDArray[np.float32]
+    weight: Array
+    shift_mm: Array
+    spread_mm: Array
+    reach_mm: float
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(V,) whether a vertex lies where the points say, and these agree.
+
+        Not beyond the rim of what was seen (too little weight), not where Poisson's smoothness
+        lifts the surface off the points (fingertips), not where points of different surfaces meet
+        (between toes, at the corner of an eye).
+        """
+        lifted = np.abs(self.shift_mm) > np.maximum(LIFTED * self.reach_mm, 4.0 * self.sigma_mm)
+        torn = self.spread_mm > np.maximum(TORN * self.reach_mm, 2.0 * self.sigma_mm)
+        return np.asarray((self.weight > LEAST_WEIGHT) & ~lifted & ~torn)
+
+
+def support(
+    vertices: Array, normals: NDArray[np.float32], cloud: BodyCloud, tree: cKDTree, reach_mm: float
+) -> Support:
+    """Of vertices (V, 3) with unit normals (V, 3) by a cloud, whose points the tree holds."""
+    found = tree.query(vertices, NEIGHBOURS, distance_upper_bound=reach_mm, workers=2)
+    distance, near = (np.asarray(part) for part in found)
+    weight, shift, spread = _asked(
+        np.ascontiguousarray(vertices),
+        np.ascontiguousarray(normals),
+        distance,
+        near.astype(np.int64),
+        cloud.points,
+        cloud.normals,
+        RANGE * reach_mm,
+    )
+    nearest = np.minimum(near[:, 0], len(cloud.points) - 1)  # of those without: any
+    return Support(nearest, cloud.sigma_mm[nearest], weight, shift, spread, reach_mm)
+
+
+def settled(
+    vertices: Array, faces: Indices, normals: NDArray[np.float32], around: Support
+) -> Array:
+    """The vertices (V, 3), moved along their normals to where the points around say.
+
+    The less the less weight these have: where the points end, the surface has no step. Where a face
+    would fold over, its corners move by half of that, then a quarter, then not at all.
+    """
+    farthest = LIFTED * around.reach_mm
+    move = np.minimum(around.weight, 1.0) * np.clip(around.shift_mm, -farthest, farthest)
+    concerned = np.arange(len(faces))
+    for share in (0.5, 0.5, 0.0):
+        some = faces[concerned]
+        before, after = _normals(vertices, some), _normals(vertices + move[:, None] * normals, some)
+        cosine = np.einsum("fc,fc->f", before, after)
+        lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+        folded = np.unique(some[cosine < STEEPEST_TURN * lengths])
+        move[folded] *= share
+        touched = np.zeros(len(vertices), bool)
+        touched[folded] = True
+        concerned = np.flatnonzero(touched[faces].any(axis=1))
+    return vertices + move[:, None] * normals
+
+
+def _normals(vertices: Array, faces: Indices) -> Array:
+    """(F, 3) normals of faces, as long as twice their areas."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+@compiled
+def _asked(
+    vertices: Array,
+    normals: NDArray[np.float32],
+    distance: Array,
+    near: Indices,
+    points: Array,
+    point_normals: NDArray[np.float32],
+    scale_mm: float,
+) -> tuple[Array, Array, Array]:
+    """Weight, shift and spread as in `Support`, from the nearest points (V, k), as scipy gives them:
+    sorted, infinitely far where there are no more. A point's weight falls off as a Gaussian with
+    its distance; a point that faces another way has no say in the shift, but in the spread.
+    """
+    count, most = near.shape
+    weight, shift, spread = np.zeros(count), np.zeros(count), np.zeros(count)
+    planes, weights = np.empty(most), np.empty(most)
+    for v in range(count):
+        known, total, mean = 0, 0.0, 0.0
+        while known < most and distance[v, known] < np.inf:
+            p = near[v, known]
+            plane, alike = 0.0, 0.0
+            for k in range(3):
+                plane += (points[p, k] - vertices[v, k]) * point_normals[p, k]
+                alike += normals[v, k] * point_normals[p, k]
+            one = np.exp(-0.5 * (distance[v, known] / scale_mm) ** 2)
+            planes[known], weights[known] = plane, one
+            facing = one * max(alike, 0.0) ** 2
+            total += facing
+            mean += facing * plane
+            weight[v] += one
+            known += 1
+        if total > 0.0:
+            shift[v] = mean / total
+        for j in range(known):
+            spread[v] += weights[j] * (planes[j] - shift[v]) ** 2
+        if known > 0:
+            spread[v] = np.sqrt(spread[v] / weight[v])
+    return weight, shift, spread

@@ -1,0 +1,140 @@
+"""A projector with a lens, point by point: what `LensSheets` does for arrays of them.
+
+frame: (3, 4) of projector_from_camera.  lens: (6,) f, c, k1, k2, p1, p2, as in `LensSheets`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.compiled import compiled
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+NEWTON_STEPS = 5
+EXACT, CONVERGED = 1e-7, 1e-6  # the next step would be the square of the last, relatively
+
+
+@compiled
+def stripes_of_points(
+    frame: Array,
+    lens: Array,
+    points: Array,
+    stripe: Array,
+    by_point: Array,
+    reach: Array,
+    by_freedom: Array,
+) -> None:
+    """Fills, for points (N, 3) of the camera frame: stripe (N,), its derivatives by_point (N, 3), the
+    distance along the projector's axis, reach (N,), and, if by_freedom (N, P) has columns, the
+    stripe's derivatives by the freedoms of a fit."""
+    for n in range(len(points)):
+        seen = _seen(frame, points[n, 0], points[n, 1], points[n, 2])
+        bent = _bent(lens, seen[0], seen[1])
+        by_z = -(bent[1] * seen[0] + bent[2] * seen[1])
+        for k in range(3):
+            turned = bent[1] * frame[0, k] + bent[2] * frame[1, k] + by_z * frame[2, k]
+            by_point[n, k] = turned / seen[2]
+        stripe[n], reach[n] = lens[0] * bent[0] + lens[1], seen[2]
+        if by_freedom.shape[1]:
+            _by_freedom(lens, seen, bent, by_freedom[n])
+
+
+@compiled
+def measure_rays(
+    frame: Array,
+    lens: Array,
+    covariance: Array,
+    distance: float,
+    stripes: int,
+    rays: Array,
+    s: Array,
+    found: Array,
+) -> None:
+    """found (3, N): depth z, dz/ds and the variance of z, for rays (N, 3) at s (N,); NaN where none.
+
+    covariance: (P, P) of the freedoms of a fit.  distance: of the boards, where the search starts.
+    """
+    jacobian = np.empty(len(covariance))
+    for n in range(len(s)):
+        found[:, n] = np.nan
+        x, y = rays[n, 0], rays[n, 1]
+        depth = _depth(frame, lens, distance, x, y, s[n])
+        if not (depth > 0.0 and 0.0 <= s[n] <= stripes):
+            continue
+        seen = _seen(frame, x * depth, y * depth, depth)
+        bent = _bent(lens, seen[0], seen[1])
+        per_stripe = seen[2] / _slope_times_reach(frame, seen, bent, x, y)
+        _by_freedom(lens, seen, bent, jacobian)
+        spread = 0.0
+        for i in range(len(jacobian)):
+            row = 0.5 * covariance[i, i] * jacobian[i]
+            for j in range(i):
+                row += covariance[i, j] * jacobian[j]
+            spread += 2.0 * row * jacobian[i]
+        found[0, n], found[1, n], found[2, n] = depth, per_stripe, spread * per_stripe**2
+
+
+@compiled
+def _depth(frame: Array, lens: Array, distance: float, x: float, y: float, s: float) -> float:
+    """z where the ray (x, y, 1) meets the sheet at s, by Newton's method on the offset times the
+    reach, which without a lens is linear along a ray; NaN where there is none."""
+    forward = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2]
+    depth = (distance - frame[2, 3]) / forward
+    step = reach = np.nan
+    for _ in range(NEWTON_STEPS):
+        seen = _seen(frame, x * depth, y * depth, depth)
+        bent = _bent(lens, seen[0], seen[1])
+        reach, off = seen[2], lens[0] * bent[0] + lens[1] - s
+        step = off * reach / (_slope_times_reach(frame, seen, bent, x, y) + off * forward)
+        depth -= step
+        if not abs(step) > EXACT * abs(depth):
+            break
+    return depth if abs(step) < CONVERGED * depth and reach > 0.0 else np.nan
+
+
+@compiled
+def _seen(frame: Array, x: float, y: float, z: float) -> Vector:
+    """X/Z, Y/Z and Z in the projector's frame of a point of the camera's."""
+    reach = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z + frame[2, 3]
+    return (
+        (frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z + frame[0, 3]) / reach,
+        (frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z + frame[1, 3]) / reach,
+        reach,
+    )
+
+
+@compiled
+def _bent(lens: Array, x: float, y: float) -> Vector:
+    """(s - c) / f at x = X/Z, y = Y/Z, and the derivatives of s by x and by y."""
+    focal, k1, k2, p1, p2 = lens[0], lens[2], lens[3], lens[4], lens[5]
+    r2 = x * x + y * y
+    radial, slope = 1.0 + r2 * (k1 + r2 * k2), k1 + 2.0 * k2 * r2
+    by_x = focal * (2.0 * x * (y * slope + p1) + 2.0 * p2 * y)
+    by_y = focal * (radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x)
+    return y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y, by_x, by_y
+
+
+@compiled
+def _slope_times_reach(frame: Array, seen: Vector, bent: Vector, x: float, y: float) -> float:
+    """ds/dz along the ray (x, y, 1), times the reach."""
+    forward = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2]
+    along = frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] - seen[0] * forward
+    across = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] - seen[1] * forward
+    return bent[1] * along + bent[2] * across
+
+
+@compiled
+def _by_freedom(lens: Array, seen: Vector, bent: Vector, jacobian: Array) -> None:
+    """ds (P,) by a small motion of the frame, f, c, and as many of k1, k2, p1, p2 as there are."""
+    (x, y, reach), (slide, by_x, by_y) = seen, bent
+    by_z, r2 = -(by_x * x + by_y * y), x * x + y * y
+    jacobian[0], jacobian[1] = y * by_z - by_y, by_x - x * by_z
+    jacobian[2], jacobian[3] = x * by_y - y * by_x, by_x / reach
+    jacobian[4], jacobian[5] = by_y / reach, by_z / reach
+    jacobian[6], jacobian[7] = slide, 1.0
+    terms = (y * r2, y * r2 * r2, r2 + 2.0 * y * y, 2.0 * x * y)
+    for k in range(len(jacobian) - 8):
+        jacobian[8 + k] = lens[0] * terms[k]

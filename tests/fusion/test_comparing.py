@@ -1,0 +1,85 @@
+"""What one surface says about another's points, on two flat walls seen by two cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.fusion.averaging import averaged
+from bodyscan.fusion.comparing import Evidence, Samples, compare
+from bodyscan.fusion.merging import thinned
+from bodyscan.fusion.smoothing import Surface, smooth
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.reconstruction.range_image import RangeImage
+
+CAMERA = Camera(430.0, 428.0, 0.7, 81.0, 58.0, -0.12, 0.08, 160, 120)
+WALL_MM = 320.0
+ASIDE = RigidTransform(np.eye(3), np.array([40.0, 0.0, 0.0]))
+
+
+def wall(depth: float, grey: int, placing: RigidTransform) -> Surface:
+    """Seen square on, without noise; sigma 0.1 mm."""
+    points = (depth * CAMERA.pixel_rays()).astype(np.float32)
+    sigma = np.full(points.shape[:2], 0.1, np.float32)
+    colours = np.full(points.shape[:2], grey, np.uint8)
+    surface = smooth(RangeImage("pair", CAMERA, points, points, sigma, colours), placing)
+    assert surface is not None
+    return surface
+
+
+def seen_beside(further_mm: float) -> tuple[Samples, list[Surface], Evidence]:
+    """Samples of two walls, the second camera's that much further; what it says about the first's."""
+    surfaces = [
+        wall(WALL_MM, 100, RigidTransform.identity()),
+        wall(WALL_MM + further_mm, 120, ASIDE),
+    ]
+    samples = thinned(surfaces, 10**6)
+    return samples, surfaces, compare(samples, surfaces[1], 1, 1.5, 6.0)
+
+
+@pytest.mark.parametrize("further_mm", [-1.2, 0.0, 0.8])
+def test_near_walls_agree(further_mm: float):
+    samples, surfaces, evidence = seen_beside(further_mm)
+    own = np.arange(samples.starts[1])
+    assert np.isin(evidence.index, own).all()
+    # 40 mm are 54 of 160 pixels: the camera aside shows 66 % of what the other does.
+    assert 0.65 < len(evidence.index) / len(own) < 0.68
+    assert not evidence.against_index.size
+    # Normals look at the cameras: what lies further is behind. float32 at 320 mm, and the lens.
+    np.testing.assert_allclose(evidence.shift_mm, -further_mm, atol=1e-3)
+    apart = surfaces[1].points[evidence.at] - samples.points[evidence.index]
+    # Looked up is the pixel next to the sample: half of 0.75 mm, and the ray's slope (up to 0.4).
+    assert np.abs(apart[:, :2]).max() < 0.4 + 0.4 * abs(further_mm)
+
+
+@pytest.mark.parametrize("further_mm", [3.0, -3.0, 40.0])
+def test_second_skins_and_what_is_seen_through_contradict(further_mm: float):
+    samples, _, evidence = seen_beside(further_mm)
+    assert not evidence.index.size
+    assert len(evidence.against_index) > 0.6 * samples.starts[1]
+
+
+def test_a_wall_in_front_says_nothing():
+    """Only that the second camera does not see what lies behind."""
+    _, _, evidence = seen_beside(-40.0)
+    assert not evidence.index.size
+    assert not evidence.against_index.size
+
+
+def test_means_by_weight():
+    samples, surfaces, evidence = seen_beside(0.8)
+    nothing = compare(samples, surfaces[0], 0, 0.0, 0.0)
+    cloud = averaged(samples, surfaces, [nothing, evidence], np.ones(2, np.float32))
+    assert len(cloud.points) == len(samples.points)
+    inner = np.zeros(len(cloud.points), bool)
+    inner[evidence.index] = True
+    ours, theirs = samples.weight[evidence.index], surfaces[1].weight[evidence.at]
+    share = theirs / (ours + theirs)
+    np.testing.assert_allclose(cloud.points[inner, 2], WALL_MM + 0.8 * share, atol=2e-3)
+    np.testing.assert_allclose(cloud.colours[inner, 0], 100 + 20 * share, atol=0.51)
+    np.testing.assert_allclose(cloud.normals, [[0.0, 0.0, -1.0]] * len(cloud.points), atol=1e-3)
+    assert (cloud.pairs_seen[inner] == 2).all()
+    assert (cloud.pairs_seen[~inner] == 1).all()
+    # 0.8 mm apart with sigmas of 0.025: everything is that much less certain.
+    assert np.median(cloud.sigma_mm) > 0.2

@@ -1,0 +1,149 @@
+"""What points say about vertices: planes, rims, steps and noise whose truth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+import pytest
+from scipy.spatial import cKDTree
+
+from bodyscan.fusion.body import BodyCloud
+from bodyscan.fusion.support import Support, settled, support
+from bodyscan.fusion.topology import vertex_normals
+
+REACH_MM = 4.0
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def cloud_of(points: np.ndarray, normals: np.ndarray, sigma_mm: float = 0.1) -> BodyCloud:
+    count = len(points)
+    return BodyCloud(
+        points.astype(float),
+        np.broadcast_to(normals, points.shape).astype(np.float32),
+        np.full(count, sigma_mm, np.float32),
+        np.full((count, 3), 128, np.uint8),
+        np.ones(count, np.uint8),
+    )
+
+
+def sheet(spacing: float = 1.3, size: int = 20) -> np.ndarray:
+    """Points of the plane z = 0 with x from -size mm to 0, a rim."""
+    x, y = np.meshgrid(np.arange(-size, 0.1, spacing), np.arange(-size, size, spacing))
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
+
+
+def asked(cloud: BodyCloud, vertices: list[list[float]]) -> Support:
+    """Vertices that look up."""
+    places = np.array(vertices, float)
+    normals = np.broadcast_to(UP, places.shape).astype(np.float32)
+    return support(places, normals, cloud, cKDTree(cloud.points), REACH_MM)
+
+
+def test_a_vertex_over_a_plane_knows_how_far():
+    found = asked(cloud_of(sheet(), UP), [[-10.0, 0.0, 0.3], [-10.4, 2.0, -0.5], [-8.0, 1.0, 0.0]])
+    np.testing.assert_allclose(found.shift_mm, [-0.3, 0.5, 0.0], atol=1e-6)
+    np.testing.assert_allclose(found.spread_mm, 0.0, atol=1e-6)
+    assert found.measured.all()
+
+
+@pytest.mark.parametrize(("height", "measured"), [(0.9, True), (1.1, False), (-1.1, False)])
+def test_what_is_lifted_off_the_points_is_not_measured(height: float, measured: bool):
+    # A quarter of the reach is the limit.
+    assert asked(cloud_of(sheet(), UP), [[-10.0, 0.0, height]]).measured == [measured]
+
+
+def test_the_surface_ends_a_little_after_the_points():
+    beyond = np.arange(0.0, 5.1, 0.5)
+    found = asked(cloud_of(sheet(), UP), [[x, 0.2, 0.0] for x in beyond])
+    assert found.measured[beyond <= 2.0].all()
+    assert not found.measured[beyond >= 4.0].any()
+    assert found.weight[-1] == 0.0
+    assert found.shift_mm[-1] == 0.0
+
+
+def test_a_thin_cloud_still_measures_what_lies_between_its_points():
+    cloud = cloud_of(sheet(spacing=3.5, size=40), UP)
+    rng = np.random.default_rng(0)
+    vertices = np.column_stack(
+        [rng.uniform(-30, -10, 200), rng.uniform(-20, 20, 200), np.zeros(200)]
+    )
+    assert asked(cloud, vertices.tolist()).measured.all()
+
+
+def test_between_two_surfaces_that_disagree_nothing_is_measured():
+    """Two toes seen from above end in a gap; the mesh dips into it, near to points of both."""
+    left = sheet()
+    right = np.array([2.0, 0.0, 2.2]) + left * [-1.0, 1.0, 1.0]
+    cloud = cloud_of(np.concatenate([left, right]), UP)
+    found = asked(cloud, [[1.0, 0.0, 1.1], [-6.0, 0.0, 0.0], [8.0, 0.0, 2.2]])
+    np.testing.assert_array_equal(found.measured, [False, True, True])
+
+
+def test_noise_that_the_sigmas_know_of_is_no_contradiction():
+    rng = np.random.default_rng(0)
+    noisy = sheet(spacing=0.7)
+    noisy[:, 2] = rng.normal(0.0, 1.5, len(noisy))
+    vertices = np.column_stack([rng.uniform(-15, -5, 300), rng.uniform(-9, 9, 300), np.zeros(300)])
+    honest = asked(cloud_of(noisy, UP, sigma_mm=1.5), vertices.tolist())
+    assert honest.measured.mean() > 0.99
+    assert asked(cloud_of(noisy, UP, sigma_mm=0.05), vertices.tolist()).measured.mean() < 0.3
+
+
+def test_a_point_that_faces_away_has_no_say_in_the_shift():
+    """The other side of a thin fold: only what faces as the vertex does can be its surface."""
+    front, back = sheet(), sheet() - [0.0, 0.0, 2.0]
+    normals = np.concatenate([np.tile(UP, (len(front), 1)), np.tile(-UP, (len(back), 1))])
+    found = asked(cloud_of(np.concatenate([front, back]), normals), [[-10.0, 0.0, 0.2]])
+    assert found.shift_mm[0] == pytest.approx(-0.2, abs=1e-6)
+
+
+def ball(radius: float) -> tuple[np.ndarray, np.ndarray]:
+    sphere = o3d.geometry.TriangleMesh.create_sphere(radius, resolution=40)
+    return np.asarray(sphere.vertices), np.asarray(sphere.triangles).astype(np.int64)
+
+
+def test_a_surface_settles_on_its_points():
+    vertices, faces = ball(50.0)
+    rng = np.random.default_rng(0)
+    ways = rng.normal(size=(60_000, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    cloud = cloud_of(50.0 * ways, ways)
+    bumpy = vertices * (1.0 + 0.01 * np.sin(vertices[:, :1] / 3.0))
+    normals = vertex_normals(bumpy, faces)
+    around = support(bumpy, normals, cloud, cKDTree(cloud.points), REACH_MM)
+    moved = settled(bumpy, faces, normals, around)
+    off = np.abs(np.linalg.norm(bumpy, axis=1) - 50.0).max()
+    assert off > 0.4
+    # Tangent planes 1 mm away lie 1 / 100 mm over a ball of 50 mm.
+    assert np.abs(np.linalg.norm(moved, axis=1) - 50.0).max() < 0.03
+
+
+def test_no_face_folds_over():
+    """Slivers are narrower than the moves of their corners."""
+    vertices, faces = ball(50.0)
+    rng = np.random.default_rng(0)
+    count = len(vertices)
+    normals = vertex_normals(vertices, faces)
+    shifts = rng.uniform(-1.0, 1.0, count)
+    everywhere = Support(
+        np.zeros(count, np.int64),
+        np.full(count, 0.1, np.float32),
+        np.full(count, 3.0),
+        shifts,
+        np.zeros(count),
+        REACH_MM,
+    )
+    # Near the poles faces are 0.3 mm wide.
+    moved = settled(vertices, faces, normals, everywhere)
+
+    def cosines(places: np.ndarray) -> np.ndarray:
+        before, after = (
+            np.cross(p[faces[:, 1]] - p[faces[:, 0]], p[faces[:, 2]] - p[faces[:, 0]])
+            for p in (vertices, places)
+        )
+        size = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+        return np.sum(before * after, axis=1) / size
+
+    assert cosines(vertices + shifts[:, None] * normals).min() < 0.3
+    assert cosines(moved).min() > 0.3
+    assert np.mean(np.abs(moved - vertices - shifts[:, None] * normals).max(axis=1) < 1e-12) > 0.8
