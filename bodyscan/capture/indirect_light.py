@@ -28,6 +28,9 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 LEAST_DIRECT = 0.5
+WHOLE_SHARE = 128
+"""All of the light, as images of its shares have it."""
+
 WIDEST_DIP_PX = 7
 FINE_BITS = 3
 BEST, SHARP = 90, 0.8
@@ -51,24 +54,12 @@ def mostly_direct(images: ScanLines, usable: Mask, bit: int, variance: NDArray[n
     """
     dips = np.ones((1, WIDEST_DIP_PX), np.uint8)
     for fine in range(bit, max(bit - FINE_BITS, -1), -1):
-        share = np.empty(usable.shape, np.float32)
-        difference, noise = images.difference_image(fine, variance)
-        _direct_share(images.lit, images.dark, difference, noise, share)
+        share = images.direct_share(fine, variance)
         filled = cv2.morphologyEx(share, cv2.MORPH_CLOSE, dips)
-        sharp = np.count_nonzero((filled >= SHARP) & usable)
+        sharp = np.count_nonzero((filled >= SHARP * WHOLE_SHARE) & usable)
         if sharp and sharp >= (1.0 - BEST / 100.0) * np.count_nonzero(usable):
-            return np.asarray(filled >= LEAST_DIRECT)
+            return np.asarray(filled >= LEAST_DIRECT * WHOLE_SHARE)
     return np.ones_like(usable)
-
-
-@compiled
-def _direct_share(lit: Bytes, dark: Bytes, difference: Image, noise: Image, share: Image) -> None:
-    """Writes what part (L, P) of lit minus dark the projector gives, or as much as noise allows."""
-    for line in range(lit.shape[0]):
-        for place in range(lit.shape[1]):
-            contrast = np.float32(lit[line, place]) - np.float32(dark[line, place])
-            most = abs(difference[line, place]) + noise[line, place]
-            share[line, place] = most / max(contrast, np.float32(1.0))
 
 
 def imbalance(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import combinations
@@ -20,8 +21,8 @@ Codes = NDArray[np.uint16]
 Greys = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-STEP = 3
-"""Only every third line and place is looked at where the whole picture is meant."""
+SAMPLES = 50_000
+"""About so many pixels are looked at where the whole picture is meant."""
 
 MIN_CONTRAST = 4
 MIN_SHARE_LIT = 1e-3
@@ -64,7 +65,8 @@ def check_exposure(images: ScanLines) -> None:
     and most pixels are lit in only one of them. Without an inverse, a pattern is at least nowhere
     brighter than lit or darker than dark.
     """
-    lit, dark = (frame[::STEP, ::STEP].astype(np.int16) for frame in (images.lit, images.dark))
+    step = _step(images)
+    lit, dark = (frame[::step, ::step].astype(np.int16) for frame in (images.lit, images.dark))
     contrast = lit - dark
     seen = contrast >= MIN_CONTRAST
     if np.mean(contrast <= -MIN_CONTRAST) > max(float(np.mean(seen)), MIN_SHARE_LIT):
@@ -76,7 +78,7 @@ def check_exposure(images: ScanLines) -> None:
     bright = seen & (lit < SATURATED)
     bright &= contrast >= np.median(contrast[bright])
     line, place = np.nonzero(bright)
-    at = STEP * (line * images.lit.shape[1] + place)
+    at = step * (line * images.lit.shape[1] + place)
     frames = (images.lit.ravel(), images.dark.ravel())
     for bit in range(len(images.patterns)):
         pattern = images.patterns[bit].ravel()
@@ -84,6 +86,11 @@ def check_exposure(images: ScanLines) -> None:
             _check_range(bit, _out_of_range(*frames, pattern, at))
         else:
             _check_sum(bit, *_in_sum(*frames, pattern, images.inverses[bit].ravel(), at))
+
+
+def _step(images: ScanLines) -> int:
+    """From one line or place that is looked at to the next."""
+    return max(1, round(math.sqrt(images.lit.size / SAMPLES)))
 
 
 def check_light(seen: Mask, lit: NDArray[Any]) -> None:
@@ -169,16 +176,17 @@ def check_codes(images: ScanLines, words: Codes, code: WordCode, stripes: int) -
     """
     bits = len(images.patterns)
     contrast = cv2.subtract(images.lit, images.dark)
-    some = contrast[::STEP, ::STEP]
+    some = slice(None, None, _step(images))
+    sampled = contrast[some, some]
     # Darker pixels are misread too often by themselves to tell anything.
-    good = contrast >= np.median(some[some >= MIN_CONTRAST])
+    good = contrast >= np.median(sampled[sampled >= MIN_CONTRAST])
     check_direction(words, good, images.turned)
     one, other = _changes(words, good, code)
     least = MIN_SHARE_IN_STEP
     if images.inverses is None:
         _check_folds(one, other, code)
         least = MIN_SHARE_WITHOUT_INVERSES
-    seen = words[::STEP, ::STEP][good[::STEP, ::STEP]]
+    seen = words[some, some][good[some, some]]
     in_step, beyond = _in_step(one, other, code, bits), _beyond(seen, code, stripes)
     failing = [bit for bit, share in in_step.items() if share < least]
     if not failing and beyond <= MAX_SHARE_BEYOND:

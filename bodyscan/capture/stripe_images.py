@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.indirect_light import mostly_direct
+from bodyscan.capture.indirect_light import WHOLE_SHARE, mostly_direct
 from bodyscan.capture.views import StripeMap
 from bodyscan.compiled import compiled
 
@@ -92,15 +92,14 @@ class ScanLines:
             self.lit.ravel(), self.dark.ravel(), patterns, inverses, bit, at, variance
         )
 
-    def difference_image(
-        self, bit: int, variance: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """`difference` of one bit at all pixels, (L, P)."""
+    def direct_share(self, bit: int, variance: NDArray[np.float32]) -> Bytes:
+        """(L, P): what part of lit minus dark shows in `difference` of one bit, or as much as its
+        noise allows, in 1/WHOLE_SHARE; at most 255."""
+        share = np.empty(self.lit.size, np.uint8)
         inverse = self._inverses[bit : bit + 1].reshape(-1)
-        difference, noise = _difference_image(
-            self.lit.ravel(), self.dark.ravel(), self.patterns[bit].ravel(), inverse, variance
-        )
-        return difference.reshape(self.lit.shape), noise.reshape(self.lit.shape)
+        frames = (self.lit.ravel(), self.dark.ravel(), self.patterns[bit].ravel(), inverse)
+        _share(*frames, variance, share)
+        return share.reshape(self.lit.shape)
 
     @property
     def _inverses(self) -> Bytes:
@@ -117,9 +116,11 @@ class ScanLines:
         depth jump is one), and pixels that other surfaces light more than the projector does.
         variance: (256,) of each grey level.  fine_bit: see `mostly_direct`.
         """
-        bright = np.empty(self.lit.shape, bool)
-        _mark_bright(self.lit.ravel(), self.dark.ravel(), variance, bright.ravel())
-        bright &= ~half_covered(cv2.subtract(self.lit, self.dark), bright)
+        contrast = cv2.subtract(self.lit, self.dark)
+        least = np.maximum(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * np.sqrt(variance))
+        least = np.minimum(np.ceil(least), 255).astype(np.uint8)
+        bright = contrast >= cv2.LUT(cv2.max(self.lit, self.dark), least)
+        bright &= ~half_covered(contrast, bright)
         usable = bright & (self.lit < SATURATED) & (codes < stripes)
         usable &= ~beside_jumps(codes, usable)
         return usable & mostly_direct(self, usable, fine_bit, variance)
@@ -197,13 +198,12 @@ def _differences(
 
 
 @compiled
-def _difference_image(
-    lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, variance: Image
-) -> tuple[Image, Image]:
-    difference, noise = np.empty(lit.size, np.float32), np.empty(lit.size, np.float32)
+def _share(
+    lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, variance: Image, share: Bytes
+) -> None:
     inverted = inverse.size > 0
     for at in range(lit.size):
-        difference[at], noise[at] = _difference(
+        difference, noise = _difference(
             pattern[at],
             inverse[at] if inverted else pattern[at],
             lit[at],
@@ -211,16 +211,8 @@ def _difference_image(
             inverted,
             variance,
         )
-    return difference, noise
-
-
-@compiled
-def _mark_bright(lit: Bytes, dark: Bytes, variance: Image, bright: Mask) -> None:
-    """Pixels (N,) whose contrast stands out from the noise."""
-    for at in range(lit.size):
-        contrast = np.float32(lit[at]) - np.float32(dark[at])
-        noise = math.sqrt(variance[max(lit[at], dark[at])])
-        bright[at] = contrast >= max(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * noise)
+        contrast = max(float(lit[at]) - float(dark[at]), 1.0)
+        share[at] = min(WHOLE_SHARE * (abs(difference) + noise) / contrast, 255.0)
 
 
 def half_covered(contrast: NDArray[Any], lit: Mask) -> Mask:
@@ -230,7 +222,7 @@ def half_covered(contrast: NDArray[Any], lit: Mask) -> Mask:
     """
     around = np.ones((3, 3), np.uint8)
     at_rim = cv2.erode(lit.view(np.uint8), around, borderValue=1) == 0
-    return at_rim & (contrast < WHOLLY_COVERED * cv2.dilate(contrast, around))
+    return at_rim & (contrast < np.float32(WHOLLY_COVERED) * cv2.dilate(contrast, around))
 
 
 def beside_jumps(codes: NDArray[np.int32], usable: Mask) -> Mask:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.compiled import compiled
 from bodyscan.fusion.body import BodyCloud
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.uncertainty import PlacingCovariance
@@ -19,22 +22,56 @@ FACING = 0.2
 
 
 def with_placing(
-    cloud: BodyCloud, rig_from_camera: Mapping[str, RigidTransform], prior: PlacingCovariance
+    cloud: BodyCloud,
+    rig_from_camera: Mapping[str, RigidTransform],
+    prior: PlacingCovariance,
+    *,
+    workers: int = 2,
 ) -> BodyCloud:
     """The cloud with sigmas along the normals that hold the pairs' placing too.
 
     A small motion (w, t) of a pair moves a point p along its normal n by (p x n).w + n.t. The
     variance is the mean over the pairs that face the point: what they share does not average out.
     """
-    points, normals = cloud.points, cloud.normals.astype(np.float64)
-    lever = np.concatenate([np.cross(points, normals), normals], axis=1)
-    total, count = np.zeros(len(points)), np.zeros(len(points))
-    for name, placing in rig_from_camera.items():
-        towards = placing.translation - points
-        dots = np.einsum("nc,nc->n", normals, towards)
-        faces = dots > FACING * np.sqrt(np.einsum("nc,nc->n", towards, towards))
-        own = lever[faces]
-        total[faces] += np.einsum("nc,nc->n", own @ prior.of(name), own)
-        count += faces
-    placing_mm = np.sqrt(total / np.maximum(count, 1.0))
+    centres = np.array([placing.translation for placing in rig_from_camera.values()])
+    covariances = np.array([prior.of(name) for name in rig_from_camera])
+    placing_mm = np.empty(len(cloud.points))
+    ends = np.linspace(0, len(placing_mm), workers + 1).astype(int)
+
+    def fill(start: int, end: int) -> None:
+        part = slice(start, end)
+        _placing(cloud.points[part], cloud.normals[part], centres, covariances, placing_mm[part])
+
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(fill, ends[:-1], ends[1:]))
     return replace(cloud, sigma_mm=np.hypot(cloud.sigma_mm, placing_mm).astype(np.float32))
+
+
+@compiled
+def _placing(
+    points: Array,
+    normals: NDArray[np.float32],
+    centres: Array,
+    covariances: Array,
+    placing_mm: Array,
+) -> None:
+    """Writes standard deviations (N,) along the normals, mm, that come of the placing of the pairs
+    at `centres` (P, 3) with `covariances` (P, 6, 6)."""
+    lever = np.empty(6)
+    for n in range(len(points)):
+        (x, y, z), (a, b, c) = points[n], normals[n]
+        lever[0], lever[1], lever[2] = y * c - z * b, z * a - x * c, x * b - y * a
+        lever[3], lever[4], lever[5] = a, b, c
+        total, count = 0.0, 0
+        for pair in range(len(centres)):
+            dx, dy, dz = centres[pair, 0] - x, centres[pair, 1] - y, centres[pair, 2] - z
+            towards = a * dx + b * dy + c * dz
+            if towards <= FACING * math.sqrt(dx * dx + dy * dy + dz * dz):
+                continue
+            count += 1
+            for row in range(6):
+                part = 0.5 * covariances[pair, row, row] * lever[row]
+                for column in range(row + 1, 6):
+                    part += covariances[pair, row, column] * lever[column]
+                total += 2.0 * part * lever[row]
+        placing_mm[n] = math.sqrt(total / max(count, 1))

@@ -102,7 +102,7 @@ def test_the_table_has_a_row_for_every_scan(day, night):
     assert anna["subject"] == "sim-woman-average"
     assert anna["verdict"] in ("good", "usable", "repeat")
     assert 15_000 < int(anna["points"]) < 25_000
-    assert 10.0 < float(anna["coverage_percent"]) <= 100.0
+    assert 5.0 < float(anna["coverage_percent"]) <= 100.0  # one pole sees but one side
     assert 0.0 < float(anna["overlap_rms_after_mm"]) < 1.0
     assert 0.0 <= float(anna["sway_mm"]) < 5.0
     assert rows["hurt"]["pairs_failed"] == "p1-2 p1-3"
