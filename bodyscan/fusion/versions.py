@@ -12,10 +12,10 @@ from bodyscan.fusion.faithfulness import brought_within
 from bodyscan.fusion.meshing import largest_piece
 from bodyscan.fusion.topology import topology, vertex_normals, without_unused
 
-SPARE = 0.01  # of the faces are kept for where the decimated mesh strays
+SPARE = 0.03  # of the faces are kept for where the decimated mesh strays
 
 
-def light(mesh: BodyMesh, *, faces: int = 50_000, within_mm: float = 0.25) -> BodyMesh:
+def light(mesh: BodyMesh, *, faces: int = 50_000, within_mm: float = 0.19) -> BodyMesh:
     """A closed mesh of about `faces` faces, `within_mm` from the full one.
 
     Quadric decimation (Garland and Heckbert 1997), which knows no such limit, and a few more faces

@@ -21,7 +21,7 @@ def filled_share(mesh: BodyMesh) -> float:
 def test_the_light_version_is_close_and_closed(body: BodyMesh):
     lean = light(body, faces=20_000, within_mm=0.5)
     # What the spare faces were not needed for, or more than them.
-    assert abs(len(lean.faces) - 20_000) <= 400
+    assert abs(len(lean.faces) - 20_000) <= 600
     found = topology(lean.vertices, lean.faces)
     assert found.manifold
     assert found.components == 1
