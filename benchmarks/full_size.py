@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
-import resource
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -114,11 +115,22 @@ def run_commands(
         if name == "simulate" and (workspace / "truth" / "truth.json").exists():
             continue  # the same rig gives the same bytes
         started = time.perf_counter()
-        line = [sys.executable, "-m", "bodyscan", name, *map(str, arguments)]
-        done = subprocess.run(line, capture_output=True, text=True, check=False)
+        outputs[name], memory[name] = _run([name, *map(str, arguments)])
         seconds[name] = time.perf_counter() - started
-        memory[name] = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
-        if done.returncode:
-            raise SystemExit(f"{name} failed:\n{done.stdout}\n{done.stderr}")
-        outputs[name] = done.stdout
     return outputs, seconds, memory
+
+
+def _run(arguments: list[str]) -> tuple[str, float]:
+    """What a bodyscan command printed, and the peak memory (GiB) of its own process."""
+    with tempfile.TemporaryFile("w+") as printed:
+        line = [sys.executable, "-m", "bodyscan", *arguments]
+        process = subprocess.Popen(line, stdout=printed, stderr=subprocess.PIPE, text=True)
+        assert process.stderr is not None
+        complaints = process.stderr.read()
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        printed.seek(0)
+        output = printed.read()
+    if process.returncode:
+        raise SystemExit(f"{' '.join(line)} failed:\n{output}\n{complaints}")
+    return output, usage.ru_maxrss / 2**20
