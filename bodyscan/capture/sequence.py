@@ -28,6 +28,9 @@ MIN_CONTRAST = 4
 MIN_SHARE_LIT = 1e-3
 MAX_SHARE_SATURATED = 0.5
 MIN_DIFFERENCE = 0.06
+MOST_ALIKE = 0.75
+"""Of the pixels: a dark frame in place of a pattern looks like the inverse in half of them."""
+
 NOISE_GREY = 4
 MAX_SUM_ERROR = 0.15
 MAX_SHARE_BEYOND = 0.05
@@ -112,7 +115,7 @@ def check_light(seen: Mask, lit: NDArray[Any]) -> None:
 
 def _check_sum(bit: int, alike: float, error: float) -> None:
     """alike, error: see `_in_sum`."""
-    if alike > 0.5:
+    if alike > MOST_ALIKE:
         raise DecodingFailed(
             f"pattern and inverse of bit {bit} look alike",
             remedy="see whether one of the two frames is missing or was taken twice",
