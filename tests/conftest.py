@@ -10,6 +10,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# What is compiled is compiled at its first call, and machines may be loaded.
+settings.register_profile("bodyscan", deadline=None)
+settings.load_profile("bodyscan")
 
 PROJECT = Path(__file__).parents[1]
 

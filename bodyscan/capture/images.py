@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.capture.folder import Sequence
+from bodyscan.capture.grey_png import decode_grey_png
 from bodyscan.capture.image_faults import header_fault, image_error
 from bodyscan.capture.image_header import png_damage
 from bodyscan.capture.rig import CameraSpec
@@ -52,15 +53,18 @@ def read_image(
     if fault:
         raise image_error(fault, path, pair, shot)
     data = path.read_bytes()
-    damage = png_damage(data) if data.startswith(b"\x89PNG") else None
+    is_png = data.startswith(b"\x89PNG")
+    damage = png_damage(data) if is_png else None
     if damage:
         raise image_error(damage, path, pair, shot)
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    image = decode_grey_png(data, width, height) if is_png else None
+    if image is None:
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None or image.shape != (height, width) or image.dtype != np.uint8:
         raise image_error("cannot be decoded", path, pair, shot)
-    brightest = int(image.max())
-    if lit and brightest <= SHOWS_NOTHING_BELOW:
+    brightest = int(image.max()) if lit else 255
+    if brightest <= SHOWS_NOTHING_BELOW:
         raise image_error(
             f"shows nothing: its brightest pixel is {brightest} of 255",
             path,
