@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,10 +12,12 @@ from bodyscan.compiled import compiled
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Numbers = NDArray[np.uint32]
 
 FIRST_GUESS_MM = 1.2
 CLOSE_ENOUGH = 0.05  # to the wanted number, for the last correction to settle the rest
 ROUNDS = 4
+SOME_LAYERS, MANY = 4, 300_000  # of the blocks of voxels every so many layers tell enough
 MOST_BLOCKS = 1 << 28  # of voxels in the box around all points
 BADNESS_STEPS = np.float32(1 << 29)
 EMPTY = np.int64((1 << 63) - 1)
@@ -22,47 +27,66 @@ def voxel_size_for(points: Floats, wanted: int) -> float:
     """Edge (mm) of the voxels of which about `wanted` are occupied; points (N, 3) mm.
 
     A surface occupies voxels in inverse proportion to their edge squared, as long as its points
-    lie closer together than that; corrections settle it.
+    lie closer together than that; corrections settle it. Of many points a part is looked at.
     """
     size = FIRST_GUESS_MM
     box = _bounds(points)
+    layers = SOME_LAYERS if len(points) > MANY else 1
     for _ in range(ROUNDS):
-        voxels, count = _numbered(points, box, size)
-        ratio = _occupied(voxels, count) / wanted
+        found = _Voxels.of(points, box, size, layers)
+        ratio = layers * _occupied(found.number, found.count) / wanted
         size *= float(np.clip(np.sqrt(ratio), 0.25, 4.0))
         if abs(ratio - 1.0) < CLOSE_ENOUGH:
             break
     return size
 
 
-def one_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDArray[np.intp]:
+def one_per_voxel(
+    points: Floats, second_rate: Mask, voxel_mm: float, *, workers: int = 2
+) -> NDArray[np.intp]:
     """Indices of one point in each occupied voxel: the nearest to its centre.
 
     `second_rate` (N,) points are taken only where a voxel has no other.
     """
-    box = _bounds(points)
-    voxels, count = _numbered(points, box, voxel_mm)
-    return np.flatnonzero(
-        _chosen(points, second_rate, box[0], np.float32(1.0 / voxel_mm), voxels, count)
-    )
+    box, scale = _bounds(points), np.float32(1.0 / voxel_mm)
+    chosen = np.zeros(len(points), np.bool_)
+
+    def choose(layer: int) -> None:
+        found = _Voxels.of(points, box, voxel_mm, workers, layer)
+        _choose(points, second_rate, box[0], scale, found.point, found.number, found.count, chosen)
+
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(choose, range(workers)))
+    return np.flatnonzero(chosen)
 
 
-def _numbered(
-    points: Floats, box: tuple[Floats, Floats], voxel_mm: float
-) -> tuple[NDArray[np.uint32], int]:
-    """(N,) a number for each point's voxel, and how many numbers there are.
+@dataclass(frozen=True, eq=False)
+class _Voxels:
+    """The voxels that points lie in.
 
-    Voxels are numbered by blocks, cubes of them, so that neighbours lie together in memory.
+    They are numbered by blocks, cubes of them, so that neighbours lie together in memory.
+    point: (M,) index of a point.  number: (M,) of its voxel.  count: how many numbers there are.
     """
-    low, high = box
-    scale = np.float32(1.0 / voxel_mm)
-    voxels_across = np.floor((high - low) * scale).astype(int) + 1
-    bits = 2  # blocks of 4 x 4 x 4, or more for a box that has too many of them
-    while np.prod((voxels_across >> bits) + 1.0) > MOST_BLOCKS:
-        bits += 1
-    blocks = np.zeros((voxels_across >> bits) + 1, np.int32)
-    voxels = np.empty(len(points), np.uint32)
-    return voxels, _number(points, low, scale, bits, blocks, voxels) << 3 * bits
+
+    point: Numbers
+    number: Numbers
+    count: int
+
+    @staticmethod
+    def of(
+        points: Floats, box: tuple[Floats, Floats], voxel_mm: float, layers: int, layer: int = 0
+    ) -> _Voxels:
+        """Of the points in every `layers`-th layer of blocks, from `layer` on."""
+        low, high = box
+        scale = np.float32(1.0 / voxel_mm)
+        across = np.floor((high - low) * scale).astype(int) + 1
+        bits = 2  # blocks of 4 x 4 x 4, or more for a box that has too many of them
+        while np.prod((across >> bits) + 1.0) > MOST_BLOCKS:
+            bits += 1
+        blocks = np.zeros((across >> bits) + 1, np.int32)
+        point, number = np.empty((2, len(points)), np.uint32)
+        kept, met = _number(points, low, scale, bits, layers, layer, blocks, point, number)
+        return _Voxels(point[:kept], number[:kept], met << 3 * bits)
 
 
 @compiled
@@ -84,26 +108,33 @@ def _number(
     low: Floats,
     scale: np.float32,
     bits: int,
+    layers: int,
+    layer: int,
     blocks: NDArray[np.int32],
-    voxels: NDArray[np.uint32],
-) -> int:
-    """Fill in `voxels` (N,), numbering blocks (0: not yet met) as they are met; how many."""
-    met, within = 0, (1 << bits) - 1
+    point: Numbers,
+    number: Numbers,
+) -> tuple[int, int]:
+    """Fill in `point` and `number`, numbering blocks (0: not yet met) as they are met; how many
+    points, and how many blocks."""
+    kept, met, within = 0, 0, (1 << bits) - 1
     for n in range(len(points)):
+        z = int((points[n, 2] - low[2]) * scale)
+        if (z >> bits) % layers != layer:
+            continue
         x = int((points[n, 0] - low[0]) * scale)
         y = int((points[n, 1] - low[1]) * scale)
-        z = int((points[n, 2] - low[2]) * scale)
         block = blocks[x >> bits, y >> bits, z >> bits]
         if block == 0:
             met += 1
             block = blocks[x >> bits, y >> bits, z >> bits] = met
         place = ((x & within) << bits | y & within) << bits | z & within
-        voxels[n] = (block - 1) << 3 * bits | place
-    return met
+        point[kept], number[kept] = n, (block - 1) << 3 * bits | place
+        kept += 1
+    return kept, met
 
 
 @compiled
-def _occupied(voxels: NDArray[np.uint32], count: int) -> int:
+def _occupied(voxels: Numbers, count: int) -> int:
     """How many of `count` voxels are among `voxels`."""
     found = np.zeros(count, np.bool_)
     occupied = 0
@@ -114,26 +145,27 @@ def _occupied(voxels: NDArray[np.uint32], count: int) -> int:
 
 
 @compiled
-def _chosen(
+def _choose(
     points: Floats,
     second_rate: Mask,
     low: Floats,
     scale: np.float32,
-    voxels: NDArray[np.uint32],
+    point: Numbers,
+    number: Numbers,
     count: int,
-) -> Mask:
-    """Which points (N,) are the best of their voxels, of which there are `count`."""
+    chosen: Mask,
+) -> None:
+    """Mark in chosen (N,) the best points of their voxels; see `_Voxels`."""
     # Badness and index share one integer, so that each voxel is one place in memory.
     best = np.full(count, EMPTY)
-    for n in range(len(points)):
+    for m in range(len(point)):
+        n = np.int64(point[m])
         bad = np.float32(1.0) if second_rate[n] else np.float32(0.0)
         for k in range(3):
             place = (points[n, k] - low[k]) * scale
             off_centre = place - np.floor(place) - np.float32(0.5)
             bad += off_centre * off_centre  # at most 0.75 in all
-        best[voxels[n]] = min(best[voxels[n]], int(bad * BADNESS_STEPS) << 32 | n)
-    chosen = np.zeros(len(points), np.bool_)
+        best[number[m]] = min(best[number[m]], int(bad * BADNESS_STEPS) << 32 | n)
     for key in best:
         if key != EMPTY:
             chosen[key & 0xFFFFFFFF] = True
-    return chosen
