@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.capture.stripe_images import ScanLines
 from bodyscan.compiled import compiled
+from bodyscan.geometry.crop import crop_of
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -33,8 +32,10 @@ SIGNIFICANCE = 2.5
 MAX_SLOPE = 1.0
 GENTLE_PX = 3
 """Half the window over which shading is taken to change evenly."""
-LEAST_PIXELS = 12
-LEAST_SPREAD = 0.5
+WINDOW = 2 * GENTLE_PX + 1
+LEAST_PIXELS = np.float32(11.5)
+LEAST_SPREAD = np.float32(0.5)
+NOTHING, ONE, TWO, THREE, FOUR, NINE = (np.float32(number) for number in (0, 1, 2, 3, 4, 9))
 MAX_SHIFT_PX = 0.6
 
 
@@ -117,44 +118,131 @@ def without_edges_across(
 def gentle_gradient(image: Image, usable: Mask) -> tuple[Image, Image]:
     """Gradient along and across the lines (L, P), 1/px, at usable pixels: least squares over the
     usable ones of a small window; 0 where there are too few, and elsewhere."""
-    offset = np.arange(-GENTLE_PX, GENTLE_PX + 1, dtype=np.float32)
-    inside = usable.view(np.uint8)
-    weighted = image * inside
-
-    def moment(of: NDArray[Any], along: int, across: int) -> Image:
-        kernels = (offset**along, offset**across)
-        return cv2.sepFilter2D(of, cv2.CV_32F, *kernels, borderType=cv2.BORDER_CONSTANT)
-
-    orders = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-    shape = tuple(moment(inside, *order) for order in orders)
-    values = tuple(moment(weighted, *order) for order in orders[:3])
-    gradient = np.zeros((2, *image.shape), np.float32)
-    _fit_windows(usable, shape, values, gradient[0], gradient[1])
-    return gradient[0], gradient[1]
+    along, across = np.zeros((2, *image.shape), np.float32)
+    shown = crop_of(usable)
+    if shown is not None:
+        lines, places = shown
+        box = (lines.start, lines.stop, places.start, places.stop)
+        _gentle(image, usable, box, along, across)
+    return along, across
 
 
 @compiled
-def _fit_windows(
-    usable: Mask, shape: tuple[Image, ...], values: tuple[Image, ...], along: Image, across: Image
+def _gentle(
+    image: Image, usable: Mask, box: tuple[int, int, int, int], along: Image, across: Image
 ) -> None:
-    """Writes the gradient (L, P) from sums over windows of 1, x, y, xx, xy, yy and of v, xv, yv."""
-    n, sum_x, sum_y, sum_xx, sum_xy, sum_yy = shape
-    sum_v, sum_xv, sum_yv = values
-    for line in range(usable.shape[0]):
-        for place in range(usable.shape[1]):
-            count = n[line, place]
-            if not usable[line, place] or count < LEAST_PIXELS - 0.5:
-                continue
-            share = np.float32(1.0) / count
-            x, y, v = sum_x[line, place] * share, sum_y[line, place] * share, sum_v[line, place]
-            xx, yy = sum_xx[line, place] * share - x * x, sum_yy[line, place] * share - y * y
-            xy = sum_xy[line, place] * share - x * y
-            v *= share
-            xv, yv = sum_xv[line, place] * share - x * v, sum_yv[line, place] * share - y * v
-            area = xx * yy - xy * xy
-            if area > LEAST_SPREAD:
-                along[line, place] = (yy * xv - xy * yv) / area
-                across[line, place] = (xx * yv - xy * xv) / area
+    """Writes the gradient (L, P) line by line of a box that holds all usable pixels.
+
+    inside, values: of the last WINDOW lines, which pixels are usable (1 or 0) and what they show;
+    with zeros on both sides.  columns: see `_sum_columns`, of both.
+    """
+    first, last, left, right = box
+    inner = slice(GENTLE_PX, GENTLE_PX + right - left)
+    inside = np.zeros((WINDOW, right - left + 2 * GENTLE_PX), np.float32)
+    values = np.zeros_like(inside)
+    columns = np.empty((2, 3, inside.shape[1]), np.float32)
+    for line in range(first, last + GENTLE_PX):
+        newest, middle = line % WINDOW, line - GENTLE_PX
+        if line < last:
+            _shown(
+                image[line, left:right],
+                usable[line, left:right],
+                inside[newest, inner],
+                values[newest, inner],
+            )
+        else:
+            inside[newest], values[newest] = 0.0, 0.0
+        if middle >= first:
+            _sum_columns(inside, middle, columns[0])
+            _sum_columns(values, middle, columns[1])
+            _fit_windows(
+                columns,
+                usable[middle, left:right],
+                along[middle, left:right],
+                across[middle, left:right],
+            )
+
+
+@compiled
+def _shown(image: Image, usable: Mask, inside: Image, values: Image) -> None:
+    """Writes of a line (P,) what is usable, as 1 or 0, and what it shows there, else 0."""
+    for u in range(image.size):
+        inside[u] = usable[u]
+        values[u] = image[u] * inside[u]
+
+
+@compiled
+def _sum_columns(rows: Image, middle: int, sums: Image) -> None:
+    """Writes sums (3, P) of v, y v and y^2 v over columns of WINDOW lines (line k is in row k mod
+    WINDOW), where y counts from the line in the middle."""
+    above3, above2, above = (
+        rows[(middle - 3) % WINDOW],
+        rows[(middle - 2) % WINDOW],
+        rows[(middle - 1) % WINDOW],
+    )
+    here, below = rows[middle % WINDOW], rows[(middle + 1) % WINDOW]
+    below2, below3 = rows[(middle + 2) % WINDOW], rows[(middle + 3) % WINDOW]
+    for u in range(here.size):
+        one, two, three = below[u] + above[u], below2[u] + above2[u], below3[u] + above3[u]
+        sums[0, u] = here[u] + one + two + three
+        sums[2, u] = one + FOUR * two + NINE * three
+        one, two, three = below[u] - above[u], below2[u] - above2[u], below3[u] - above3[u]
+        sums[1, u] = one + TWO * two + THREE * three
+
+
+@compiled
+def _fit_windows(columns: Image, usable: Mask, along: Image, across: Image) -> None:
+    """Writes the gradient of a line (P,) from the sums over its columns, (2, 3, P + 2 GENTLE_PX).
+
+    What lies between is in arrays of its own: only then does the compiler know that they do not
+    overlap, and computes eight places at once.
+    """
+    ones, ones_y, values = columns[0, 0], columns[0, 1], columns[1, 0]
+    n, sum_x, sum_xx = _even(ones), _odd(ones), _square(ones)
+    sum_y, sum_xy, sum_yy = _even(ones_y), _odd(ones_y), _even(columns[0, 2])
+    sum_v, sum_xv, sum_yv = _even(values), _odd(values), _even(columns[1, 1])
+    by_x, by_y, area = np.empty_like(n), np.empty_like(n), np.empty_like(n)
+    for u in range(usable.size):
+        share = ONE / n[u]
+        x, y, v = sum_x[u] * share, sum_y[u] * share, sum_v[u] * share
+        xx, yy = sum_xx[u] * share - x * x, sum_yy[u] * share - y * y
+        xy = sum_xy[u] * share - x * y
+        xv, yv = sum_xv[u] * share - x * v, sum_yv[u] * share - y * v
+        area[u] = xx * yy - xy * xy
+        by_x[u], by_y[u] = (yy * xv - xy * yv) / area[u], (xx * yv - xy * xv) / area[u]
+    for u in range(usable.size):
+        known = usable[u] & (n[u] >= LEAST_PIXELS) & (area[u] > LEAST_SPREAD)
+        along[u], across[u] = (by_x[u], by_y[u]) if known else (NOTHING, NOTHING)
+
+
+@compiled
+def _even(row: Image) -> Image:
+    """Sums (P,) over WINDOW places of a row (P + 2 GENTLE_PX,)."""
+    total = np.empty(row.size - 2 * GENTLE_PX, np.float32)
+    for u in range(total.size):
+        near, far = row[u + 2] + row[u + 4], row[u] + row[u + 6]
+        total[u] = row[u + 3] + near + row[u + 1] + row[u + 5] + far
+    return total
+
+
+@compiled
+def _odd(row: Image) -> Image:
+    """The same of x v, where x counts from the window's middle."""
+    total = np.empty(row.size - 2 * GENTLE_PX, np.float32)
+    for u in range(total.size):
+        near, far = row[u + 4] - row[u + 2], row[u + 6] - row[u]
+        total[u] = near + TWO * (row[u + 5] - row[u + 1]) + THREE * far
+    return total
+
+
+@compiled
+def _square(row: Image) -> Image:
+    """The same of x^2 v."""
+    total = np.empty(row.size - 2 * GENTLE_PX, np.float32)
+    for u in range(total.size):
+        near, far = row[u + 4] + row[u + 2], row[u + 6] + row[u]
+        total[u] = near + FOUR * (row[u + 5] + row[u + 1]) + NINE * far
+    return total
 
 
 @compiled

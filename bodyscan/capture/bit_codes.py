@@ -16,6 +16,7 @@ from bodyscan.capture.sequence import check_codes, check_exposure
 from bodyscan.capture.stripe_coordinates import interpolate_stripes
 from bodyscan.capture.stripe_images import ScanLines
 from bodyscan.capture.views import StripeMap
+from bodyscan.capture.wanted_stripes import WantedStripes
 from bodyscan.errors import DecodingFailed
 
 Images = NDArray[np.uint8]
@@ -34,7 +35,13 @@ def light(spec: ProjectorSpec, s: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(words >> shift & 1, float)
 
 
-def read(spec: ProjectorSpec, lit: Images, dark: Images | None, coded: Images) -> StripeMap:
+def read(
+    spec: ProjectorSpec,
+    lit: Images,
+    dark: Images | None,
+    coded: Images,
+    wanted: WantedStripes | None = None,
+) -> StripeMap:
     """See `codes.read_code`."""
     images = bit_lines(spec, lit, dark, coded)
     words = checked_words(spec, images)
@@ -42,13 +49,16 @@ def read(spec: ProjectorSpec, lit: Images, dark: Images | None, coded: Images) -
     codes = code.stripes(words)
     variance = noise_variance(images)
     usable = images.usable(codes, variance, spec.stripes, code.two_wide(spec.bits))
+    beyond = None
+    if wanted is not None:
+        usable, beyond = wanted.split(codes, usable, turned=images.turned)
     brightness = Brightness.of(images, variance, usable)
     boundaries = find_boundaries(images, brightness, codes, usable, variance, code.finest_run)
     sigma_px = np.hypot(boundaries.sigma_px, code.doubt_px)
     boundaries = replace(boundaries, sigma_px=sigma_px)
     s, sigma = interpolate_stripes(boundaries, codes, usable)
     s, sigma = without_edges_across(s, sigma, brightness, boundaries.blur2)
-    return images.stripe_map(lit, s, sigma, boundaries, spec.stripes)
+    return images.stripe_map(lit, s, sigma, boundaries, spec.stripes, beyond)
 
 
 def bit_lines(spec: ProjectorSpec, lit: Images, dark: Images | None, coded: Images) -> ScanLines:

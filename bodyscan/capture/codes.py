@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,7 @@ from bodyscan.capture import bit_codes, light_section, phase_shift, stripe_index
 from bodyscan.capture.rig import FrameKind, ProjectorSpec
 from bodyscan.capture.sequence import check_sizes
 from bodyscan.capture.views import StripeMap
+from bodyscan.capture.wanted_stripes import WantedStripes
 from bodyscan.errors import BadInput, DecodingFailed
 
 Images = NDArray[np.uint8]
@@ -52,27 +55,43 @@ def _light(kind: FrameKind, spec: ProjectorSpec, s: NDArray[np.float64]) -> NDAr
 
 
 def read_code(
-    spec: ProjectorSpec, lit: Images, dark: Images | None, coded: Images, *, where: str = ""
+    spec: ProjectorSpec,
+    lit: Images,
+    dark: Images | None,
+    coded: Images,
+    *,
+    wanted: WantedStripes | None = None,
+    where: str = "",
 ) -> StripeMap:
     """The stripe coordinate of every pixel, from one pair's images of one shot.
 
     lit, dark: (H, W); dark may be None if the code can do without (see docs/formats.md).
     coded: (F, H, W), the images of the code in the order of `spec.frame_counts`.
+    wanted: the stripes that matter; others get no s.
 
     Raises DecodingFailed, naming the image where it can be told, if they do not add up.
     """
     try:
         check_sizes(lit, dark, coded, sum(spec.frame_counts.values()))
+        if spec.code in ("gray", "binary"):
+            return bit_codes.read(spec, lit, dark, coded, wanted)
         readers = {
-            "gray": bit_codes.read,
-            "binary": bit_codes.read,
             "light-section": light_section.read,
             "stripe-index": stripe_index.read,
             "phase-shift": phase_shift.read,
         }
-        return readers[spec.code](spec, lit, dark, coded)
+        found = readers[spec.code](spec, lit, dark, coded)
+        return found if wanted is None else only(found, wanted)
     except DecodingFailed as error:
         raise DecodingFailed(error.what, where=where, remedy=error.remedy) from error
+
+
+def only(found: StripeMap, wanted: WantedStripes) -> StripeMap:
+    """The stripe map with s where it is wanted."""
+    kept, beyond = wanted.split(found.s, np.isfinite(found.s))
+    nothing = np.float32(np.nan)
+    s, sigma = np.where(kept, found.s, nothing), np.where(kept, found.sigma, nothing)
+    return replace(found, s=s, sigma=sigma, beyond=beyond)
 
 
 def read_stripes(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -132,22 +131,23 @@ class ScanLines:
         sigma: NDArray[np.float32],
         boundaries: Boundaries,
         stripes: int,
+        beyond: Mask | None = None,
     ) -> StripeMap:
         """Back to the camera's own layout."""
-        contrast = self.contrast
         pixels = np.stack([boundaries.position, boundaries.line_position], axis=-1)
         if self.turned:
-            s, sigma, contrast = (cv2.transpose(image) for image in (s, sigma, contrast))
+            s, sigma = cv2.transpose(s), cv2.transpose(sigma)
             pixels = pixels[:, ::-1]
+            beyond = None if beyond is None else beyond.T
         return StripeMap(
             s=s,
             sigma=sigma,
             lit=lit,
-            contrast=contrast,
             boundary_index=boundaries.index,
             boundary_pixels=np.ascontiguousarray(pixels, float),
             boundary_sigma_px=boundaries.sigma_px.astype(np.float32),
             stripes=stripes,
+            beyond=beyond,
         )
 
 
@@ -169,13 +169,14 @@ def _append_bit(words: Words, pattern: Bytes, inverse: Bytes) -> None:
 @compiled
 def _difference(
     pattern: int, inverse: int, lit: int, dark: int, inverted: bool, variance: Image
-) -> tuple[float, float]:
+) -> tuple[np.float32, np.float32]:
     """See `ScanLines.difference`; of one pixel."""
+    seen = np.float32(pattern)
     if inverted:
-        apart = float(pattern) - float(inverse)
-        return apart, math.sqrt(variance[pattern] + variance[inverse])
-    above = 2.0 * pattern - float(lit) - float(dark)
-    return above, math.sqrt(4 * variance[pattern] + variance[lit] + variance[dark])
+        return seen - np.float32(inverse), np.sqrt(variance[pattern] + variance[inverse])
+    above = (seen - np.float32(lit)) + (seen - np.float32(dark))
+    twice = variance[pattern] + variance[pattern]
+    return above, np.sqrt(twice + twice + variance[lit] + variance[dark])
 
 
 @compiled
@@ -202,17 +203,13 @@ def _share(
     lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, variance: Image, share: Bytes
 ) -> None:
     inverted = inverse.size > 0
+    other = inverse if inverted else pattern
+    most = np.float32(255.0)
     for at in range(lit.size):
-        difference, noise = _difference(
-            pattern[at],
-            inverse[at] if inverted else pattern[at],
-            lit[at],
-            dark[at],
-            inverted,
-            variance,
-        )
-        contrast = max(float(lit[at]) - float(dark[at]), 1.0)
-        share[at] = min(WHOLE_SHARE * (abs(difference) + noise) / contrast, 255.0)
+        light, black = lit[at], dark[at]
+        difference, noise = _difference(pattern[at], other[at], light, black, inverted, variance)
+        contrast = max(np.float32(light) - np.float32(black), np.float32(1.0))
+        share[at] = min(np.float32(WHOLE_SHARE) * (abs(difference) + noise) / contrast, most)
 
 
 def half_covered(contrast: NDArray[Any], lit: Mask) -> Mask:
@@ -237,15 +234,25 @@ def _mark_jumps(codes: NDArray[np.int32], usable: Mask, jumps: Mask) -> None:
     # Without a branch inside: on a noisy image a processor guesses wrong every other time.
     lines, places = codes.shape
     for line in range(lines):
+        jump = _leaps(codes[line, 1:], codes[line, :-1], usable[line, 1:], usable[line, :-1])
         for place in range(places - 1):
-            jump = abs(codes[line, place + 1] - codes[line, place]) > 1
-            jump &= usable[line, place] & usable[line, place + 1]
-            jumps[line, place] |= jump
-            jumps[line, place + 1] |= jump
+            jumps[line, place] |= jump[place]
+        for place in range(places - 1):
+            jumps[line, place + 1] |= jump[place]
         if line + 1 == lines:
             break
+        jump = _leaps(codes[line + 1], codes[line], usable[line + 1], usable[line])
         for place in range(places):
-            jump = abs(codes[line + 1, place] - codes[line, place]) > 1
-            jump &= usable[line, place] & usable[line + 1, place]
-            jumps[line, place] |= jump
-            jumps[line + 1, place] |= jump
+            jumps[line, place] |= jump[place]
+            jumps[line + 1, place] |= jump[place]
+
+
+@compiled
+def _leaps(
+    one: NDArray[np.int32], other: NDArray[np.int32], usable: Mask, usable_too: Mask
+) -> Mask:
+    """(P,) whether two rows' codes, both usable, differ by more than one."""
+    leap = np.empty(one.size, np.bool_)
+    for place in range(one.size):
+        leap[place] = (abs(one[place] - other[place]) > 1) & usable[place] & usable_too[place]
+    return leap

@@ -34,18 +34,19 @@ class StripeMap:
     s: (height, width) float32, in [0, S]; NaN where there is none.
     sigma: (height, width) float32, standard deviation of s, in stripes; NaN likewise.
     lit: (height, width) uint8, the fully lit image (grey).
-    contrast: (height, width) float32, lit minus dark, grey levels.
     boundary_index: (N,) int64: boundary i lies between stripes i - 1 and i, that is s = i.
     boundary_pixels: (N, 2) float64, where it was seen, px, sub-pixel.
     boundary_sigma_px: (N,) float32, standard deviation across the stripe, px.
     stripes: S, the number of stripes projected.
+    beyond: (height, width) bool, lit by a stripe that lies deeper than wanted; None where all stripes
+    were wanted. s is NaN there (see `WantedStripes`).
     """
 
     s: NDArray[np.float32]
     sigma: NDArray[np.float32]
     lit: NDArray[np.uint8]
-    contrast: NDArray[np.float32]
     boundary_index: NDArray[np.int64]
     boundary_pixels: Array
     boundary_sigma_px: NDArray[np.float32]
     stripes: int
+    beyond: NDArray[np.bool_] | None = None

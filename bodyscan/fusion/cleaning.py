@@ -17,7 +17,8 @@ from bodyscan.capture.rig import Volume
 from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.dark_gaps import dark_gaps
-from bodyscan.fusion.grid import Floats, crop_of
+from bodyscan.fusion.grid import Floats
+from bodyscan.geometry.crop import crop_of
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 

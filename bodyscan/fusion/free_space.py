@@ -61,8 +61,7 @@ def seen_through(
         return through
     columns, rows = columns[index], rows[index]
     # The nearest depth around, 0 if anything is missing: rims and flying pixels prove nothing.
-    depth = np.where(image.valid, image.points[..., 2], 0.0)
-    nearest = cv2.erode(depth, np.ones((5, 5), np.uint8))
+    nearest = cv2.erode(image.open_depth, np.ones((5, 5), np.uint8))
     through[index] = in_camera[index, 2] < nearest[rows, columns] - margin_mm
     stride = _stride(image.camera, rig_from_camera)
     block_rows, block_columns = rows // stride, columns // stride
@@ -95,7 +94,7 @@ def gaps(
     made_up[hit] = guess.filled[first[hit]]
     body = hit & ~made_up
     near = np.ones((2 * stride + 1, 2 * stride + 1), np.uint8)
-    measured = np.pad(cv2.dilate(image.valid.astype(np.uint8), near), stride)
+    measured = np.pad(cv2.dilate((image.open_depth > 0).astype(np.uint8), near), stride)
     reach = int(WIDEST_GAP_MM / RAY_SPACING_MM)
     open_ = made_up & (measured[np.ix_(rows + stride, columns + stride)] == 0)
     open_ &= _within(body, reach) & _within(body[:, ::-1], reach)[:, ::-1]

@@ -24,14 +24,6 @@ def rotated(directions: Floats, a_from_b: RigidTransform) -> Floats:
     return cv2.transform(directions.reshape(1, -1, 3), a_from_b.rotation).reshape(directions.shape)
 
 
-def crop_of(valid: NDArray[np.bool_]) -> tuple[slice, slice] | None:
-    """Slices (rows, columns) of the smallest box around what is true; None if nothing is."""
-    rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
-    if not rows.size:
-        return None
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-
-
 def lens_of(camera: Camera) -> Doubles:
     """(7,) for compiled functions: alpha, beta, gamma, u0, v0 (Eq. 1), k1, k2 (Eq. 3-5)."""
     sizes = (camera.alpha, camera.beta, camera.gamma, camera.u0, camera.v0)

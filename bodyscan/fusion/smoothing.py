@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.compiled import compiled
-from bodyscan.fusion.grid import Doubles, Floats, crop_of, lens_of
+from bodyscan.fusion.grid import Doubles, Floats, lens_of
 from bodyscan.fusion.quadratics import Fit, Mask, fit_quadratics
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.crop import crop_of
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 

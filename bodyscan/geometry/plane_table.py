@@ -8,6 +8,7 @@ s: linear between nodes an eighth of a stripe apart they are good to less than a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ class PlaneTable:
     behind: float
 
     @staticmethod
+    @lru_cache(maxsize=64)
     def of(sheets: BowedSheets) -> PlaneTable:
         """Of sheets without a bow: y' = p + q x' + r w is q X - Y + (p - r) Z + r D = 0."""
         turn, shift = (

@@ -8,6 +8,7 @@ from bodyscan.capture.folder import Captures, Sequence
 from bodyscan.errors import BodyscanError, ScanFailed
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.reconstruction.scan_volume import stripes_in_volume
 from bodyscan.reconstruction.triangulation import range_image
 
 
@@ -16,7 +17,7 @@ def range_images(
 ) -> tuple[list[RangeImage], dict[str, str]]:
     """The range image of every calibrated pair, and the pairs that gave none, with the reason.
 
-    Raises ScanFailed if no pair gives one.
+    They show the scan volume and a little around it. Raises ScanFailed if no pair gives one.
     """
     failed = {
         pair.name: calibration.failed.get(pair.name, "is not calibrated")
@@ -34,8 +35,10 @@ def range_images(
 
     def reconstruct(sequence: Sequence) -> RangeImage | tuple[str, str]:
         try:
-            stripes = decode_sequence(sequence, calibration.rig.pair(sequence.pair))
-            return range_image(calibration.pairs[sequence.pair], stripes)
+            pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
+            wanted = stripes_in_volume(pair, at, calibration.rig.volume)
+            spec = calibration.rig.pair(sequence.pair)
+            return range_image(pair, decode_sequence(sequence, spec, wanted=wanted))
         except BodyscanError as error:
             return sequence.pair, str(error)
 

@@ -18,6 +18,8 @@ class RangeImage:
     normals: (height, width, 3) float32, unit, towards the camera; NaN likewise.
     sigma_mm: (height, width) float32, standard deviation of the point along its viewing ray.
     colours: (height, width) uint8, grey level of the lit image.
+    beyond: (height, width) bool, where the camera saw something behind the scan volume; None if all
+    that was seen has a point.
     """
 
     pair: str
@@ -26,8 +28,15 @@ class RangeImage:
     normals: NDArray[np.float32]
     sigma_mm: NDArray[np.float32]
     colours: NDArray[np.uint8]
+    beyond: NDArray[np.bool_] | None = None
 
     @property
     def valid(self) -> NDArray[np.bool_]:
         """(height, width): where a point was measured."""
         return np.isfinite(self.sigma_mm)
+
+    @property
+    def open_depth(self) -> NDArray[np.float32]:
+        """(height, width): how deep the camera saw, z, mm; inf behind the scan volume, 0 if unknown."""
+        depth = np.where(self.valid, self.points[..., 2], np.float32(0.0))
+        return depth if self.beyond is None else np.where(self.beyond, np.float32(np.inf), depth)

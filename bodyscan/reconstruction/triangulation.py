@@ -9,6 +9,7 @@ from bodyscan.calibration.pair import PairCalibration
 from bodyscan.capture.views import StripeMap
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
+from bodyscan.geometry.crop import crop_of
 from bodyscan.geometry.measuring import measure_image
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -16,6 +17,7 @@ Floats = NDArray[np.float32]
 
 NORMAL_WINDOW_PX = 5
 REACH = NORMAL_WINDOW_PX // 2
+ZERO, ONE = np.float32(0.0), np.float32(1.0)  # a float64 among them would make all of it float64
 
 
 def range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
@@ -35,48 +37,56 @@ def range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
             remedy="scan with the camera settings of the calibration, or calibrate again",
         )
     points, sigma_mm = measure_image(pair.light, camera, stripes.s, stripes.sigma)
-    return RangeImage(pair.name, camera, points, grid_normals(points), sigma_mm, stripes.lit)
+    normals = grid_normals(points, np.isfinite(sigma_mm))
+    return RangeImage(pair.name, camera, points, normals, sigma_mm, stripes.lit, stripes.beyond)
 
 
-def grid_normals(points: Floats) -> Floats:
+def grid_normals(points: Floats, measured: NDArray[np.bool_] | None = None) -> Floats:
     """Unit normals (H, W, 3) towards the camera, from the points (H, W, 3) of a small window.
+
+    measured: (H, W), where there are points, if that is known.
 
     A plane fitted to 1/z, which is affine in the image coordinates on a plane; NaN where the
     window is not whole: what lies at a rim is not to be relied on.
     """
-    normals = np.empty(points.shape, np.float32)
-    _grid_normals(np.ascontiguousarray(points, np.float32), normals)
+    normals = np.full(points.shape, np.nan, np.float32)
+    shown = crop_of(np.isfinite(points[..., 2]) if measured is None else measured)
+    if shown is not None:
+        rows, columns = shown
+        box = (rows.start, rows.stop, columns.start, columns.stop)
+        _grid_normals(np.ascontiguousarray(points, np.float32), box, normals)
     return normals
 
 
 @compiled
-def _grid_normals(points: Floats, normals: Floats) -> None:
-    """The normals (H, W, 3) of points (H, W, 3), row by row.
+def _grid_normals(points: Floats, box: tuple[int, int, int, int], normals: Floats) -> None:
+    """The normals (H, W, 3) of points (H, W, 3), row by row of a box that holds all points.
 
     recent: x/z, y/z and 1000/z of the last five rows.  A NaN spreads over all windows it is in.
     """
-    height, width = points.shape[:2]
+    top, bottom, left, right = box
+    width = right - left
     recent = np.full((3, NORMAL_WINDOW_PX, width), np.nan, np.float32)
     middle = np.empty((3, width), np.float32)
     slope_u, slope_v = np.empty_like(middle), np.empty_like(middle)
-    normals[:, :REACH] = normals[:, width - REACH :] = np.nan
-    for v in range(height + REACH):
+    for v in range(top, bottom + REACH):
         newest = v % NORMAL_WINDOW_PX
-        if v < height:
-            _affine_in_image(points[v], recent[0, newest], recent[1, newest], recent[2, newest])
+        if v < bottom:
+            row = points[v, left:right]
+            _affine_in_image(row, recent[0, newest], recent[1, newest], recent[2, newest])
         else:
             recent[:, newest] = np.nan
-        if v >= REACH:
+        if v >= top + REACH:
             for k in range(3):
                 _slopes(recent[k], v - REACH, middle[k], slope_u[k], slope_v[k])
-            _normals(middle, slope_u, slope_v, normals[v - REACH])
+            _normals(middle, slope_u, slope_v, normals[v - REACH, left:right])
 
 
 @compiled
 def _affine_in_image(points: Floats, x: Floats, y: Floats, inverse: Floats) -> None:
     """x/z, y/z and 1000/z (W,) of a row of points (W, 3)."""
     for u in range(len(points)):
-        per_z = np.float32(1.0) / points[u, 2]
+        per_z = ONE / points[u, 2]
         x[u], y[u] = points[u, 0] * per_z, points[u, 1] * per_z
         inverse[u] = np.float32(1000.0) * per_z
 
@@ -107,18 +117,20 @@ def _normals(middle: Floats, slope_u: Floats, slope_v: Floats, normals: Floats) 
     1/z = p x + q y + r is the plane p X + q Y + r Z = 1, whose normal (p, q, r) points away: from
     slopes by column and row to those by x and y, all times the determinant.
     """
-    x, y, inverse = middle
-    x_u, y_u, inverse_u = slope_u
-    x_v, y_v, inverse_v = slope_v
+    x, y, inverse = middle[0], middle[1], middle[2]
+    x_u, y_u, inverse_u = slope_u[0], slope_u[1], slope_u[2]
+    x_v, y_v, inverse_v = slope_v[0], slope_v[1], slope_v[2]
     windows = len(normals) - 2 * REACH
+    # In arrays of its own, which the compiler knows not to overlap, it computes eight at once.
+    p, q = np.empty(windows, np.float32), np.empty(windows, np.float32)
+    r = np.empty(windows, np.float32)
     for u in range(windows):
         determinant = x_u[u] * y_v[u] - x_v[u] * y_u[u]
-        p = inverse_u[u] * y_v[u] - inverse_v[u] * y_u[u]
-        q = inverse_v[u] * x_u[u] - inverse_u[u] * x_v[u]
-        r = determinant * inverse[u] - p * x[u] - q * y[u]
-        size = np.sqrt(p * p + q * q + r * r)
-        scale = np.float32(1.0) / (-size if determinant > 0.0 else size)
-        x[u], y[u], inverse[u] = p * scale, q * scale, r * scale
+        by_x = inverse_u[u] * y_v[u] - inverse_v[u] * y_u[u]
+        by_y = inverse_v[u] * x_u[u] - inverse_u[u] * x_v[u]
+        by_z = determinant * inverse[u] - by_x * x[u] - by_y * y[u]
+        size = np.sqrt(by_x * by_x + by_y * by_y + by_z * by_z)
+        scale = ONE / (-size if determinant > ZERO else size)
+        p[u], q[u], r[u] = by_x * scale, by_y * scale, by_z * scale
     for u in range(windows):
-        for k in range(3):
-            normals[REACH + u, k] = middle[k, u]
+        normals[REACH + u, 0], normals[REACH + u, 1], normals[REACH + u, 2] = p[u], q[u], r[u]

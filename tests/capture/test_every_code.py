@@ -9,6 +9,7 @@ from stripe_rendering import checkered, code_light, render, white
 from bodyscan.capture.codes import pattern_frames, read_code
 from bodyscan.capture.rig import ProjectorSpec
 from bodyscan.capture.views import StripeMap
+from bodyscan.capture.wanted_stripes import WantedStripes
 from bodyscan.errors import BadInput, DecodingFailed
 
 PLAIN_GRAY = {"code": "gray", "inverses": False}
@@ -218,3 +219,27 @@ def test_black_must_be_known():
     lit, _, coded, _ = captured(PLAIN_GRAY, wavy(3.0), 64, shape=(60, 80))
     with pytest.raises(DecodingFailed, match="show what black is"):
         read_code(spec_of(PLAIN_GRAY, 64), lit, None, coded)
+
+
+@pytest.mark.parametrize("code", [{"code": "gray"}, *ALL], ids=name)
+@pytest.mark.parametrize("rising", [True, False])
+def test_wanted_stripes_are_decoded_as_if_all_were(code, rising):
+    stripes = 60
+    images = captured(code, wavy(2.2), stripes)
+    whole = read(code, images, stripes)
+    low, high = (20.0, 35.0) if rising else (-35.0, -20.0)
+    blocks = np.ones((2, 3), np.float32)
+    wanted = WantedStripes(low * blocks, high * blocks, rising)
+    lit, dark, coded, _ = images
+    part = read_code(spec_of(code, stripes), lit, dark, coded, wanted=wanted)
+    # Within two stripes of the ends a run, and what is smoothed along it, ends earlier.
+    inside = np.isfinite(whole.s) & (whole.s > 22.0) & (whole.s < 33.0)
+    assert inside.sum() > 1000
+    np.testing.assert_allclose(part.s[inside], whole.s[inside], atol=0.02)
+    shown = part.s[np.isfinite(part.s)]
+    assert shown.min() > 19.0
+    assert shown.max() < 36.0
+    deep = whole.s > 36.0 if rising else whole.s < 19.0
+    assert part.beyond[deep].mean() > 0.99
+    assert not part.beyond[whole.s < 34.0 if rising else whole.s > 21.0].any()
+    assert whole.beyond is None

@@ -42,7 +42,6 @@ def stripe_map(depth: np.ndarray) -> StripeMap:
         s,
         np.where(np.isfinite(s), 0.01, np.nan).astype(np.float32),
         np.full(s.shape, 150, np.uint8),
-        np.full(s.shape, 140.0, np.float32),
         empty.astype(np.int64),
         empty.reshape(0, 2),
         empty.astype(np.float32),

@@ -1,0 +1,14 @@
+"""The part of a picture that shows something."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def crop_of(shown: NDArray[np.bool_]) -> tuple[slice, slice] | None:
+    """Slices (rows, columns) of the smallest box around what is true; None if nothing is."""
+    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    if not rows.size:
+        return None
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

@@ -1,0 +1,119 @@
+"""Which stripes are wanted: all that may lie in the scan volume, whatever else is in the room."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_range_images import CAMERA, STRIPES, pair, planes
+
+from bodyscan.capture.rig import Volume
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.measuring import measure_image
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.reconstruction.scan_volume import stripes_in_volume
+
+VOLUME = Volume(radius_mm=120.0, bottom_mm=-100.0, top_mm=150.0)
+
+
+def looking_at_the_middle(distance_mm: float, turn: float, tilt: float) -> RigidTransform:
+    """rig_from_camera of a camera that looks at the rig's origin from some way off."""
+    ahead = np.array(
+        [np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), -np.sin(tilt)]
+    )  # fmt: skip
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return RigidTransform(
+        np.stack([right, np.cross(ahead, right), ahead], axis=-1), -distance_mm * ahead
+    )
+
+
+def calibrated(rising: bool):
+    """The pair of the other tests; with its stripes numbered from the other end, s grows with
+    depth."""
+    sheets = planes()
+    if not rising:
+        return pair()
+    return replace(pair(), light=replace(sheets, coefficients=sheets.coefficients[::-1].copy()))
+
+
+def some_s(seed: int, rising: bool) -> np.ndarray:
+    """A bumpy room: stripe coordinates of all depths, next to each other."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    phase = np.random.default_rng(seed).uniform(0.0, 6.0, 4)
+    waves = np.sin(u / 9 + phase[0]) + np.sin(v / 7 + phase[1]) + np.sin((u + v) / 5 + phase[2])
+    s = STRIPES * (0.5 + 0.16 * waves)
+    return (s if rising else STRIPES - s).clip(0.0, STRIPES).astype(np.float32)
+
+
+@given(
+    st.floats(400.0, 800.0),
+    st.floats(-3.0, 3.0),
+    st.floats(-0.5, 0.5),
+    st.booleans(),
+    st.integers(0, 99),
+)
+def test_all_that_lies_in_the_volume_is_wanted(distance_mm, turn, tilt, rising, seed):
+    one, at = calibrated(rising), looking_at_the_middle(distance_mm, turn, tilt)
+    wanted = stripes_in_volume(one, at, VOLUME)
+    s = some_s(seed, rising)
+    points, _ = measure_image(one.light, one.camera, s, np.full_like(s, 0.01))
+    x, y, z = np.moveaxis(at.apply(points.astype(np.float64)), -1, 0)
+    there = (np.hypot(x, y) < VOLUME.radius_mm) & (z > VOLUME.bottom_mm) & (z < VOLUME.top_mm)
+    kept, beyond = wanted.split(s, np.isfinite(s))
+    assert there.any()
+    assert kept[there].all()
+    assert not beyond[there].any()
+    # Nothing in front of the volume is taken for something behind it: the volume's middle lies
+    # `distance_mm` from the camera, and no part of it is nearer than its half diagonal before that.
+    half = np.hypot(VOLUME.radius_mm, 150.0)
+    assert not beyond[points[..., 2] < distance_mm - half].any()
+
+
+def test_integers_are_stripes_and_columns_may_be_lines():
+    one, at = calibrated(True), looking_at_the_middle(500.0, 0.3, 0.1)
+    wanted = stripes_in_volume(one, at, VOLUME)
+    stripe = np.floor(some_s(1, True)).astype(np.int32)
+    middle = stripe.astype(np.float32) + np.float32(0.5)
+    usable = np.random.default_rng(0).random(stripe.shape) < 0.9
+    for mine, other in zip(wanted.split(stripe, usable), wanted.split(middle, usable), strict=True):
+        np.testing.assert_array_equal(mine, other)
+        assert not mine[~usable].any()
+    turned = wanted.split(stripe.T.copy(), usable.T.copy(), turned=True)
+    np.testing.assert_array_equal(turned[0].T, wanted.split(stripe, usable)[0])
+
+
+def test_a_volume_out_of_sight_is_seen_nowhere():
+    away = looking_at_the_middle(500.0, 0.0, 0.0)
+    behind = RigidTransform(away.rotation, -away.translation)
+    wanted = stripes_in_volume(calibrated(True), behind, VOLUME)
+    kept, beyond = wanted.split(some_s(0, True), np.ones((CAMERA.height, CAMERA.width), bool))
+    assert not kept.any()
+    assert not beyond.any()
+
+
+def test_without_a_projector_or_an_order_in_depth_all_stripes_count():
+    at = looking_at_the_middle(500.0, 0.0, 0.0)
+    assert stripes_in_volume(replace(pair(), light=None), at, VOLUME) is None
+    # Sheets that fan out from a line in the middle of the picture: nearer above, farther below.
+    coefficients = planes().coefficients.copy()
+    coefficients[: STRIPES // 2] = coefficients[: STRIPES // 2][::-1]
+    folded = replace(pair(), light=replace(planes(), coefficients=coefficients))
+    assert stripes_in_volume(folded, at, VOLUME) is None
+
+
+@pytest.mark.parametrize("rising", [True, False])
+def test_most_of_the_room_is_not_wanted(rising):
+    at = looking_at_the_middle(700.0, 0.0, 0.0)
+    larger = Camera(1600.0, 1608.0, -2.0, 320.0, 240.0, -0.1, 0.02, 640, 480)
+    one = replace(calibrated(rising), camera=larger)
+    small = Volume(radius_mm=40.0, bottom_mm=-30.0, top_mm=30.0)
+    s = np.repeat(np.repeat(some_s(2, rising), 4, axis=0), 4, axis=1)
+    kept, beyond = stripes_in_volume(one, at, small).split(s, np.isfinite(s))
+    # The volume is a fifth of the picture wide and two fifths of what s may be deep, with what is
+    # added around it: 64 px on each side, and eight of 64 stripes.
+    assert 0.01 < kept.mean() < 0.25
+    assert beyond.any()
