@@ -12,6 +12,7 @@ import typer
 from bodyscan import __version__, rig_commands
 from bodyscan.errors import BadInput, BodyscanError
 from bodyscan.jobs import commands as jobs
+from bodyscan.memory import keep_freed_memory
 from bodyscan.report import commands as reports
 
 app = typer.Typer(
@@ -33,6 +34,7 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # What OpenCV warns of, we say in our own words, with the place in the rig file.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+    keep_freed_memory()
     os.umask(0o077)  # images and models of people are for their owner alone
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1

@@ -40,7 +40,7 @@ def clean(
     smallest_patch_mm2: float = 150.0,
     workers: int = 2,
 ) -> list[RangeImage]:
-    """The same range images with NaN where a pixel shows no part of the subject.
+    """The same range images with nothing measured where a pixel shows no part of the subject.
 
     Cut away are: what lies outside the scan volume (floor, walls), what the rig sees without a
     subject (`empty`: range images of that, of some or all pairs), flying pixels at silhouettes,
@@ -81,12 +81,8 @@ def with_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:
 
 
 def masked(image: RangeImage, kept: Mask) -> RangeImage:
-    """The range image with NaN where `kept` (height, width) is false."""
-    points, normals = np.full_like(image.points, np.nan), np.full_like(image.normals, np.nan)
-    sigma_mm = np.full_like(image.sigma_mm, np.nan)
-    given = (image.points, image.normals, image.sigma_mm)
-    _keep(kept, given, (points, normals, sigma_mm))
-    return replace(image, points=points, normals=normals, sigma_mm=sigma_mm)
+    """The range image with nothing measured where `kept` (height, width) is false."""
+    return replace(image, sigma_mm=np.where(kept, image.sigma_mm, np.float32(np.nan)))
 
 
 def inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> Mask:
@@ -172,19 +168,3 @@ def _supported(padded: Floats, limits: Floats, supporters: int, kept: Floats) ->
                     count[u] += abs(there[u] - here[u]) < limit
         for u in range(width):
             kept[v, u] = here[u] if count[u] >= supporters else np.float32(np.nan)
-
-
-@compiled
-def _keep(
-    kept: Mask, given: tuple[Floats, Floats, Floats], left: tuple[Floats, Floats, Floats]
-) -> None:
-    """Copies points (H, W, 3), normals (H, W, 3) and sigma_mm (H, W) where kept (H, W)."""
-    points, normals, sigma_mm = given
-    left_points, left_normals, left_sigma_mm = left
-    for v in range(kept.shape[0]):
-        for u in range(kept.shape[1]):
-            if kept[v, u]:
-                for k in range(3):
-                    left_points[v, u, k] = points[v, u, k]
-                    left_normals[v, u, k] = normals[v, u, k]
-                left_sigma_mm[v, u] = sigma_mm[v, u]

@@ -27,6 +27,7 @@ from bodyscan.jobs.job import LOCK, MANIFEST, STAGE, Job, read_job
 from bodyscan.jobs.locking import for_owner_only, locked
 from bodyscan.jobs.plan import Origin, origin, result_hashes, why_run
 from bodyscan.jobs.stages import KINDS, Kinds, Stage, wanted
+from bodyscan.memory import keep_freed_memory
 
 Tell = Callable[..., None]
 
@@ -36,6 +37,7 @@ _BEING_MADE, _TAKEN_AWAY = ".making-", ".old-"
 
 def main(kinds: Kinds = KINDS) -> int:
     """Work on the job of the folder on the command line; 0: done, 2: bad input, 1: failed."""
+    keep_freed_memory()
     tell = _take_over_output()
     _end_with_parent()
     _be_the_first_to_go()

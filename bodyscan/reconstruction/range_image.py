@@ -14,9 +14,10 @@ from bodyscan.geometry.camera import Camera
 class RangeImage:
     """What one pair saw of a subject, on the camera's pixel grid, camera frame.
 
-    points: (height, width, 3) float32, mm; NaN where nothing was measured.
-    normals: (height, width, 3) float32, unit, towards the camera; NaN likewise.
-    sigma_mm: (height, width) float32, standard deviation of the point along its viewing ray.
+    points: (height, width, 3) float32, mm.
+    normals: (height, width, 3) float32, unit, towards the camera; NaN at the rim of a surface.
+    sigma_mm: (height, width) float32, standard deviation of the point along its viewing ray; NaN
+    where nothing was measured, whatever stands in the others.
     colours: (height, width) uint8, grey level of the lit image.
     beyond: (height, width) bool, where the camera saw something behind the scan volume; None if all
     that was seen has a point.

@@ -72,22 +72,23 @@ def patch(image: RangeImage, spacing_mm: float) -> Patch:
     """Points of every so many rows and columns, about `spacing_mm` apart where a surface faces the
     camera; what is seen edge-on takes no part."""
     window = np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)
-    inner = cv2.erode(image.valid.astype(np.uint8), window) > 0
-    depth = image.points[::8, ::8, 2]
-    depth = depth[np.isfinite(depth)]
+    valid = image.valid
+    inner = cv2.erode(valid.view(np.uint8), window) > 0
+    depth = image.points[::8, ::8, 2][valid[::8, ::8]]
     pixel_mm = float(np.median(depth)) / image.camera.alpha if len(depth) else spacing_mm
     step = max(1, round(spacing_mm / pixel_mm))
     some = slice(step // 2, None, step), slice(step // 2, None, step)
-    points, normals = image.points[some].astype(np.float64), image.normals[some].astype(np.float64)
-    facing = -np.einsum("vuc,vuc->vu", points, normals) / np.linalg.norm(points, axis=-1)
-    chosen = facing > EDGE_ON  # NaN where nothing was measured, which is not more
+    seen = valid[some]
+    points, normals = (a[some][seen].astype(np.float64) for a in (image.points, image.normals))
+    facing = -np.einsum("nc,nc->n", points, normals) / np.linalg.norm(points, axis=-1)
+    chosen = facing > EDGE_ON  # a normal of NaN is not more
     return Patch(
         image,
         inner,
         points[chosen],
         normals[chosen],
-        (image.sigma_mm[some] * facing)[chosen],
-        ~inner[some][chosen],
+        (image.sigma_mm[some][seen] * facing)[chosen],
+        ~inner[some][seen][chosen],
     )
 
 

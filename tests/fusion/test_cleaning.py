@@ -96,7 +96,8 @@ def test_the_images_given_are_not_changed(scan: Scan, cleaned: list[RangeImage])
         assert before.valid.sum() > after.valid.sum()
         kept = after.valid
         np.testing.assert_array_equal(after.points[kept], before.points[kept])
-        assert np.isnan(after.points[~kept]).all()
+        np.testing.assert_array_equal(after.sigma_mm[kept], before.sigma_mm[kept])
+        assert np.isnan(after.sigma_mm[~kept]).all()
 
 
 def test_an_image_of_nothing_stays_one(scan: Scan):
