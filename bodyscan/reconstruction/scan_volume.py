@@ -2,62 +2,116 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.capture.rig import Volume
-from bodyscan.capture.wanted_stripes import BLOCK_PX, WantedStripes
+from bodyscan.capture.wanted_stripes import WantedStripes
+from bodyscan.compiled import compiled
+from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.measuring import measure
 from bodyscan.geometry.transforms import RigidTransform
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
-MARGIN_MM = 30.0
-STEP_STRIPES = 4
+BLOCKS_ACROSS = 40
+STEP_STRIPES = 8
+MARGIN_STRIPES = 1.5  # runs of boundaries need a neighbour, and between corners limits are linear
+MARGIN_MM = 30.0  # beside the cylinder and above it
+LAYER_MM, AROUND_MM = 25.0, 60.0  # what lies lower than this is wanted so near to what stands
+NEAREST_MM, FARTHEST_MM = 50.0, 1e5
+ANYTHING = 1e6  # more stripes than there are
 
 
 def stripes_in_volume(
     pair: PairCalibration, rig_from_camera: RigidTransform, volume: Volume
 ) -> WantedStripes | None:
-    """By blocks of pixels, the stripes that light something in the scan volume; a little more.
+    """The stripes that light what stands in the scan volume, or lies beside it at its bottom.
 
-    The rays through the blocks' corners are followed from stripe to stripe; a block has what those
-    of its own corners and of the next ones need. None, that is everything, if the pair has
-    no projector, or if depth does not grow (or fall) with s all over the volume: the projector
-    stands in the picture.
+    None, that is everything, if the pair has no projector, or if depth does not grow (or fall)
+    with s all over the volume: the projector stands in the picture.
     """
     if pair.light is None:
         return None
-    s = np.arange(0.0, pair.light.stripes + STEP_STRIPES, STEP_STRIPES).clip(0, pair.light.stripes)
-    corners = (np.arange(0.0, size + BLOCK_PX, BLOCK_PX) - 0.5 for size in _size(pair))
-    rays = pair.camera.rays(np.stack(np.meshgrid(*corners), axis=-1))[..., None, :]
-    rays = np.broadcast_to(rays, (*rays.shape[:2], len(s), 3))
-    found = measure(pair.light, rays, np.broadcast_to(s, rays.shape[:-1]))
-    there = _inside(rig_from_camera.apply(rays * found.depth[..., None]), volume)
-    growing = found.per_stripe[there] > 0
-    if growing.any() and not growing.all():
+    block_px = max(1, round(pair.camera.width / BLOCKS_ACROSS))
+    rays = _corner_rays(pair.camera, block_px)
+    near, far = passage(rays, rig_from_camera, volume, raised_mm=0.0)
+    standing = passage(rays, rig_from_camera, volume, raised_mm=LAYER_MM)[1]
+    standing = np.maximum(np.minimum(standing, far), near)
+    count = round(pair.light.stripes / STEP_STRIPES) + 1
+    s = np.linspace(0.0, pair.light.stripes, count)
+    along = np.broadcast_to(rays[:, :, None], (*rays.shape[:2], count, 3))
+    found = measure(pair.light, along, np.broadcast_to(s, along.shape[:-1]))
+    within = (found.depth > near[..., None]) & (found.depth < far[..., None])
+    growing = found.per_stripe[within if within.any() else np.isfinite(found.per_stripe)] > 0
+    if growing.any() != growing.all():
         return None
-    rising = bool(growing.all())
-    depth = s if rising else -s
-    near = np.where(there, depth, np.inf).min(axis=-1) - STEP_STRIPES
-    far = np.where(there, depth, -np.inf).max(axis=-1) + STEP_STRIPES
-    # Of 4 x 4 corners, the four in the middle being the block's own.
-    around = np.ones((4, 4), np.uint8)
-    near, far = cv2.erode(near, around)[1:, 1:], cv2.dilate(far, around)[1:, 1:]
-    missed = near > far
-    near[missed], far[missed] = np.nan, np.nan
-    return WantedStripes(near.astype(np.float32), far.astype(np.float32), rising)
+    rising = bool(growing.any())
+    order = slice(None) if rising else slice(None, None, -1)
+    inverse = np.ascontiguousarray(1.0 / found.depth[..., order])
+    depth = s if rising else -s[order]
+    limits = np.full((3, *near.shape), np.nan)
+    for limit, z in zip(limits, (near, far, standing), strict=True):
+        _reach(inverse, depth, 1.0 / z, limit)
+    limits += np.array([-MARGIN_STRIPES, MARGIN_STRIPES, 0.0])[:, None, None]
+    unknown = np.array([-ANYTHING, ANYTHING, ANYTHING])[:, None, None]
+    limits = np.where(np.isnan(limits), unknown, limits).astype(np.float32)
+    pixel_mm = float(np.linalg.norm(rig_from_camera.translation)) / pair.camera.alpha
+    return WantedStripes(
+        limits[0], limits[1], limits[2], rising, block_px, around_px=AROUND_MM / pixel_mm
+    )
 
 
-def _size(pair: PairCalibration) -> tuple[int, int]:
-    return pair.camera.width, pair.camera.height
+def passage(
+    rays: Array, rig_from_camera: RigidTransform, volume: Volume, *, raised_mm: float
+) -> tuple[Array, Array]:
+    """Depths z (...) mm at which rays (..., 3), camera frame, z = 1, enter and leave the scan volume.
+
+    It is taken a little wider and higher, and its bottom raised. Where a ray misses it, it leaves
+    before it enters, or both where it comes nearest to the axis, so that between rays both are
+    smooth.
+    """
+    ahead, start = rig_from_camera.rotate(rays), rig_from_camera.translation
+    radius = volume.radius_mm + MARGIN_MM
+    flat = np.sum(ahead[..., :2] ** 2, axis=-1).clip(1e-12)
+    nearest = -(ahead[..., :2] @ start[:2]) / flat
+    beside2 = np.sum((start[:2] + nearest[..., None] * ahead[..., :2]) ** 2, axis=-1)
+    half = np.sqrt((radius**2 - beside2).clip(0.0) / flat)
+    upward = np.where(np.abs(ahead[..., 2]) < 1e-9, 1e-9, ahead[..., 2])
+    ends = volume.bottom_mm + raised_mm, volume.top_mm + MARGIN_MM
+    floor, ceiling = ((height - start[2]) / upward for height in ends)
+    enter = np.maximum(nearest - half, np.minimum(floor, ceiling))
+    leave = np.minimum(nearest + half, np.maximum(floor, ceiling))
+    # Behind the camera, a ray leaves before it enters.
+    return enter.clip(NEAREST_MM, FARTHEST_MM), leave.clip(NEAREST_MM / 2.0, FARTHEST_MM)
 
 
-def _inside(points: Array, volume: Volume) -> Mask:
-    """(...) points (..., 3), rig frame, in the volume or within a margin around it; NaN is not."""
-    across = np.hypot(points[..., 0], points[..., 1]) < volume.radius_mm + MARGIN_MM
-    height = points[..., 2]
-    return across & (height > volume.bottom_mm - MARGIN_MM) & (height < volume.top_mm + MARGIN_MM)
+def _corner_rays(camera: Camera, block_px: int) -> Array:
+    """(rows, columns, 3) through the corners of blocks of pixels that cover the picture."""
+    sizes = camera.width, camera.height
+    edges = (np.arange(0.0, size + block_px, block_px) - 0.5 for size in sizes)
+    return camera.rays(np.stack(np.meshgrid(*edges), axis=-1))
+
+
+@compiled
+def _reach(inverse: Array, s: Array, wanted: Array, found: Array) -> None:
+    """s (rows, columns) at which rays reach the inverse depths `wanted`, if two sheets tell.
+
+    inverse: (rows, columns, K), falling, of the sheets at s (K,), or NaN. A sheet's inverse depth
+    along a ray is nearly linear in s: so it is taken to be, between the sheets and past the last.
+    """
+    for row in range(wanted.shape[0]):
+        for column in range(wanted.shape[1]):
+            one, other = -1, -1
+            for k in range(s.size):
+                here = inverse[row, column, k]
+                if np.isnan(here):
+                    continue
+                one, other = other, k
+                if one >= 0 and here <= wanted[row, column]:
+                    break
+            if one >= 0:
+                low, high = inverse[row, column, one], inverse[row, column, other]
+                share = (wanted[row, column] - low) / (high - low)
+                found[row, column] = s[one] + share * (s[other] - s[one])

@@ -228,8 +228,8 @@ def test_wanted_stripes_are_decoded_as_if_all_were(code, rising):
     images = captured(code, wavy(2.2), stripes)
     whole = read(code, images, stripes)
     low, high = (20.0, 35.0) if rising else (-35.0, -20.0)
-    blocks = np.ones((2, 3), np.float32)
-    wanted = WantedStripes(low * blocks, high * blocks, rising)
+    corners = np.ones((3, 4), np.float32)
+    wanted = WantedStripes(low * corners, high * corners, high * corners, rising, 64, 5.0)
     lit, dark, coded, _ = images
     part = read_code(spec_of(code, stripes), lit, dark, coded, wanted=wanted)
     # Within two stripes of the ends a run, and what is smoothed along it, ends earlier.

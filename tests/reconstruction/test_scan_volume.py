@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,7 +15,7 @@ from bodyscan.capture.rig import Volume
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.measuring import measure_image
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.reconstruction.scan_volume import stripes_in_volume
+from bodyscan.reconstruction.scan_volume import LAYER_MM, MARGIN_MM, passage, stripes_in_volume
 
 VOLUME = Volume(radius_mm=120.0, bottom_mm=-100.0, top_mm=150.0)
 
@@ -63,10 +64,14 @@ def test_all_that_lies_in_the_volume_is_wanted(distance_mm, turn, tilt, rising, 
     points, _ = measure_image(one.light, one.camera, s, np.full_like(s, 0.01))
     x, y, z = np.moveaxis(at.apply(points.astype(np.float64)), -1, 0)
     there = (np.hypot(x, y) < VOLUME.radius_mm) & (z > VOLUME.bottom_mm) & (z < VOLUME.top_mm)
+    standing = there & (z > VOLUME.bottom_mm + LAYER_MM)
     kept, beyond = wanted.split(s, np.isfinite(s))
-    assert there.any()
-    assert kept[there].all()
-    assert not beyond[there].any()
+    assert standing.any()
+    assert kept[standing].all()
+    # What lies at the bottom is kept beside what stands, and else passes for the floor.
+    beside = cv2.dilate(standing.view(np.uint8), np.ones((21, 21), np.uint8)) > 0
+    assert kept[there & beside].all()
+    assert not beyond[there & beside].any()
     # Nothing in front of the volume is taken for something behind it: the volume's middle lies
     # `distance_mm` from the camera, and no part of it is nearer than its half diagonal before that.
     half = np.hypot(VOLUME.radius_mm, 150.0)
@@ -113,7 +118,20 @@ def test_most_of_the_room_is_not_wanted(rising):
     small = Volume(radius_mm=40.0, bottom_mm=-30.0, top_mm=30.0)
     s = np.repeat(np.repeat(some_s(2, rising), 4, axis=0), 4, axis=1)
     kept, beyond = stripes_in_volume(one, at, small).split(s, np.isfinite(s))
-    # The volume is a fifth of the picture wide and two fifths of what s may be deep, with what is
-    # added around it: 64 px on each side, and eight of 64 stripes.
-    assert 0.01 < kept.mean() < 0.25
+    # With 30 mm around it the volume is a sixth of the picture, and with one and a half stripes of
+    # up to 50 mm at both ends a third of what there is in depth.
+    assert 0.005 < kept.mean() < 0.1
     assert beyond.any()
+
+
+@given(st.floats(100.0, 1500.0), st.floats(-3.0, 3.0), st.floats(-1.3, 1.3), st.integers(0, 99))
+def test_a_ray_is_in_the_volume_between_where_it_enters_and_leaves(distance_mm, turn, tilt, seed):
+    at = looking_at_the_middle(distance_mm, turn, tilt)
+    rng = np.random.default_rng(seed)
+    rays = np.concatenate([rng.uniform(-0.6, 0.6, (200, 2)), np.ones((200, 1))], axis=1)
+    enter, leave = passage(rays, at, VOLUME, raised_mm=20.0)
+    depth = rng.uniform(60.0, 3000.0, 200)
+    x, y, z = at.apply(rays * depth[:, None]).T
+    within = np.hypot(x, y) < VOLUME.radius_mm + MARGIN_MM
+    within &= (z > VOLUME.bottom_mm + 20.0) & (z < VOLUME.top_mm + MARGIN_MM)
+    np.testing.assert_array_equal((depth > enter) & (depth < leave), within)
