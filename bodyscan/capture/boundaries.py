@@ -126,6 +126,8 @@ def _crossings(codes: NDArray[np.int32], usable: Mask) -> Ints:
     """(N,) flat pixels, usable as the next of their line is, whose codes differ by one."""
     found, count = np.empty(codes.size, np.int64), 0
     for line in range(codes.shape[0]):
+        if not usable[line].any():
+            continue
         for place in range(codes.shape[1] - 1):
             # Without a branch: on a noisy image a processor guesses wrong every other time.
             found[count] = line * codes.shape[1] + place

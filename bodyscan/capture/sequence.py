@@ -40,7 +40,7 @@ MIN_SHARE_IN_STEP = 0.6
 MIN_SHARE_WITHOUT_INVERSES = 0.75
 MAX_SHARE_FOLDED = 0.3
 CONVINCING = 0.8
-ENOUGH = 400_000
+ENOUGH = 200_000
 """Of the pixels lines are taken until there are so many, to look at neighbours along them."""
 
 

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from bodyscan.compiled import compiled
 
-Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-TILE_PX = 8
+TILE_PX = 8  # which is what fits into a word of 64 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +46,14 @@ class WantedStripes:
         limits = np.ascontiguousarray(limits.transpose(0, 2, 1)) if turned else limits
         middle = 0.5 if s.dtype.kind == "i" else 0.0
         there, deep = np.empty(s.shape, np.bool_), np.empty(s.shape, np.bool_)
-        tiles = np.zeros([-(-size // TILE_PX) for size in s.shape], np.uint8)
-        _split(s, middle, self.rising, usable, limits, self.block_px, there, deep, tiles)
+        rows, columns = (-(-size // TILE_PX) for size in s.shape)
+        standing = np.zeros((TILE_PX * rows, TILE_PX * columns), np.bool_)
+        _split(s, middle, self.rising, usable, limits, self.block_px, there, deep, standing)
+        eights = standing.view(np.uint64).reshape(rows, TILE_PX, columns)
+        tiles = eights.any(axis=1).view(np.uint8)
         reach = 2 * int(np.ceil(self.around_px / TILE_PX)) + 1
-        _spread(cv2.dilate(tiles, np.ones((reach, reach), np.uint8)), there, deep)
+        tiles = cv2.dilate(tiles, np.ones((reach, reach), np.uint8))
+        _keep(np.repeat(tiles, TILE_PX, axis=1).view(np.bool_), there, deep)
         return there, deep
 
 
@@ -64,49 +67,81 @@ def _split(
     block_px: int,
     there: Mask,
     deep: Mask,
-    tiles: Bytes,
+    standing: Mask,
 ) -> None:
     """Fills in what lies in the volume (L, P), what lies in its lowest layer or beyond (L, P), and
-    the tiles with something that stands higher than that layer.
+    what stands higher than that layer, in a picture of at least that size.
 
     limits: (3, rows, columns), near, far, standing.
     """
     sign = np.float32(1.0 if rising else -1.0)
-    offset, size = sign * np.float32(middle), np.float32(block_px)
+    offset = sign * np.float32(middle)
     lines, places = s.shape
-    standing = np.empty(places, np.bool_)
+    wide = np.empty((3, limits.shape[1], places), np.float32)
+    for kind in range(3):
+        for row in range(limits.shape[1]):
+            _widen(limits[kind, row], block_px, wide[kind, row])
     for line in range(lines):
         row = line // block_px
-        share = np.float32(line + 0.5 - row * block_px) / size
-        edges = limits[:, row] + share * (limits[:, row + 1] - limits[:, row])
-        near, far = _between(edges[0], places, block_px), _between(edges[1], places, block_px)
-        low = _between(edges[2], places, block_px)
-        for place in range(places):
-            depth, lit = sign * np.float32(s[line, place]) + offset, usable[line, place]
-            there[line, place] = lit & (depth >= near[place]) & (depth <= far[place])
-            deep[line, place] = lit & (depth > low[place]) & (far[place] > near[place])
-            standing[place] = there[line, place] & (depth <= low[place])
-        for place in range(places):
-            tiles[line // TILE_PX, place // TILE_PX] |= standing[place]
+        share = np.float32((line + 0.5) / block_px - row)
+        near = _blend(wide[0, row], wide[0, row + 1], share)
+        far = _blend(wide[1, row], wide[1, row + 1], share)
+        low = _blend(wide[2, row], wide[2, row + 1], share)
+        depth = _depths(s[line], sign, offset)
+        _split_line(depth, usable[line], near, far, low, there[line], deep[line])
+        _stand(there[line], deep[line], standing[line])
+
+
+# One line at a time, and one array filled by each loop: only so the compiler takes many at once.
 
 
 @compiled
-def _between(edges: Floats, places: int, block_px: int) -> Floats:
-    """(P,) values at pixels' middles, linear between those at blocks' edges (columns,)."""
-    values = np.empty(places, np.float32)
-    for column in range((places + block_px - 1) // block_px):
-        first = column * block_px
-        step = (edges[column + 1] - edges[column]) / np.float32(block_px)
-        for k in range(min(block_px, places - first)):
-            values[first + k] = edges[column] + (np.float32(k) + np.float32(0.5)) * step
-    return values
+def _blend(one: Floats, other: Floats, share: np.float32) -> Floats:
+    between = np.empty(one.size, np.float32)
+    for place in range(one.size):
+        between[place] = one[place] + share * (other[place] - one[place])
+    return between
 
 
 @compiled
-def _spread(tiles: Bytes, there: Mask, deep: Mask) -> None:
-    """Leaves `there` what lies in one of the tiles, and `deep` what is not there."""
+def _depths(s: NDArray[np.int32] | Floats, sign: np.float32, offset: np.float32) -> Floats:
+    depth = np.empty(s.size, np.float32)
+    for place in range(s.size):
+        depth[place] = sign * np.float32(s[place]) + offset
+    return depth
+
+
+@compiled
+def _split_line(
+    depth: Floats, usable: Mask, near: Floats, far: Floats, low: Floats, there: Mask, deep: Mask
+) -> None:
+    for place in range(depth.size):
+        there[place] = usable[place] & (depth[place] >= near[place]) & (depth[place] <= far[place])
+    for place in range(depth.size):
+        deep[place] = usable[place] & (depth[place] > low[place]) & (far[place] > near[place])
+
+
+@compiled
+def _stand(there: Mask, deep: Mask, standing: Mask) -> None:
+    for place in range(there.size):
+        standing[place] = there[place] & (not deep[place])
+
+
+@compiled
+def _widen(edges: Floats, block_px: int, values: Floats) -> None:
+    """Fills in values (P,) at pixels' middles, linear between those at blocks' edges (columns,)."""
+    for place in range(values.size):
+        column = place // block_px
+        share = np.float32((place + 0.5) / block_px - column)
+        values[place] = edges[column] + share * (edges[column + 1] - edges[column])
+
+
+@compiled
+def _keep(tiles: Mask, there: Mask, deep: Mask) -> None:
+    """Leaves `there` (L, P) what lies in one of the tiles (rows, P or more), and `deep` what is not
+    there."""
     for line in range(there.shape[0]):
+        tile = tiles[line // TILE_PX]
         for place in range(there.shape[1]):
-            there[line, place] &= tiles[line // TILE_PX, place // TILE_PX] > 0
-        for place in range(there.shape[1]):
+            there[line, place] &= tile[place]
             deep[line, place] &= not there[line, place]
