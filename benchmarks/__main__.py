@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks import charuco_ring, codes, full_size, fusion, lens, procam, rig
+from benchmarks import charuco_ring, codes, full_size, fusion, lens, png, procam, rig
 from bodyscan.files import write_text
 
 PROJECT = Path(__file__).parents[1]
@@ -24,6 +24,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "four-pole": full_size.four_pole,
     "sway": full_size.sway,
     "fusion": fusion.report,
+    "png": png.report,
     "rig": rig.report,
     "procam": procam.report,
     "charuco-ring": charuco_ring.report,

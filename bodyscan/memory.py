@@ -13,8 +13,8 @@ def keep_freed_memory() -> None:
     """For processes of ours, before they start threads.
 
     The C library of most Linuxes hands large blocks back to the kernel once they are freed, and
-    the kernel clears them, page by page, when the next image wants as much: 6 % of the time from
-    images to range images (2026-11-22). Other systems' libraries are left as they are.
+    the kernel clears them, page by page, when the next image wants as much. Other systems'
+    libraries are left as they are.
     """
     if not sys.platform.startswith("linux"):
         return
