@@ -15,6 +15,8 @@ Mask = NDArray[np.bool_]
 
 TILE_PX = 8  # which is what fits into a word of 64 bits
 
+LEAST_STANDING = 1e-3  # of what is seen in the volume
+
 
 @dataclass(frozen=True, eq=False)
 class WantedStripes:
@@ -24,7 +26,8 @@ class WantedStripes:
     pixels, linear between; s where it grows with depth and -s where it falls (`rising`), so that
     what lies deeper than wanted is beyond `far` either way. Where far is below near, nothing is.
     standing: likewise, where the volume's lowest layer begins. What lies in that layer, as the
-    floor does, is wanted within `around_px` of something that stands higher.
+    floor does, is wanted within `around_px` of something that stands higher; all of it, where next to
+    nothing does: a plate may lie there.
     """
 
     near: Floats
@@ -49,6 +52,8 @@ class WantedStripes:
         rows, columns = (-(-size // TILE_PX) for size in s.shape)
         standing = np.zeros((TILE_PX * rows, TILE_PX * columns), np.bool_)
         _split(s, middle, self.rising, usable, limits, self.block_px, there, deep, standing)
+        if np.count_nonzero(standing) < LEAST_STANDING * np.count_nonzero(there):
+            return there, deep & ~there
         eights = standing.view(np.uint64).reshape(rows, TILE_PX, columns)
         tiles = eights.any(axis=1).view(np.uint8)
         reach = 2 * int(np.ceil(self.around_px / TILE_PX)) + 1

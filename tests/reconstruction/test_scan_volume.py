@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_range_images import CAMERA, STRIPES, pair, planes
+from test_range_images import CAMERA, STRIPES, pair, planes, stripe_map
 
 from bodyscan.capture.rig import Volume
 from bodyscan.geometry.camera import Camera
@@ -135,3 +135,25 @@ def test_a_ray_is_in_the_volume_between_where_it_enters_and_leaves(distance_mm, 
     within = np.hypot(x, y) < VOLUME.radius_mm + MARGIN_MM
     within &= (z > VOLUME.bottom_mm + 20.0) & (z < VOLUME.top_mm + MARGIN_MM)
     np.testing.assert_array_equal((depth > enter) & (depth < leave), within)
+
+
+def test_what_lies_flat_is_wanted_where_nothing_stands():
+    """A plate on the floor; and the floor beside somebody's feet, but not the rest of it."""
+    at = looking_at_the_middle(900.0, 0.0, 0.6)
+    one = calibrated(True)
+    wanted = stripes_in_volume(one, at, Volume(radius_mm=300.0, bottom_mm=-5.0, top_mm=400.0))
+    rays = at.rotate(CAMERA.pixel_rays())
+    floor = stripe_map((1.0 - at.translation[2]) / rays[..., 2]).s
+    s = np.where(np.isfinite(floor), STRIPES - floor, np.nan).astype(np.float32)
+    flat, deep = wanted.split(s, np.isfinite(s))
+    assert flat.sum() > 3000
+    assert not (flat & deep).any()
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    person = (abs(u - 80) < 6) & (abs(v - 60) < 20) & flat
+    s[person] -= 8.0  # nearer, by far more than the layer
+    beside, deep = wanted.split(s, np.isfinite(s))
+    assert beside[person].all()
+    near = cv2.dilate(person.view(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    np.testing.assert_array_equal(beside & near, flat & near)
+    assert beside.sum() < 0.7 * flat.sum()
+    assert deep[flat & ~beside].all()
