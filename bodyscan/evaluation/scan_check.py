@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,23 +50,26 @@ class ScanCheck:
     """before_mm, after_mm: of each scan, RMS of its overlaps, before and after the pairs were moved.
 
     pairs: what the overlaps asked of each.  poles: likewise, of poles whose pairs moved alike.
+    apart: groups of pairs between which no scan has an overlap, the largest first; empty if there is
+    one group. How groups stand to each other is not seen: moved far enough, they share nothing.
     """
 
     before_mm: tuple[float, ...]
     after_mm: tuple[float, ...]
     pairs: tuple[PairDrift, ...]
     poles: tuple[PairDrift, ...]
+    apart: tuple[tuple[str, ...], ...] = ()
 
     @property
     def decided(self) -> bool:
-        """Whether there are scans enough to tell a move from sway."""
-        return len(self.before_mm) >= FEWEST_SCANS
+        """Whether there are scans enough to tell a move from sway, and all pairs are joined."""
+        return len(self.before_mm) >= FEWEST_SCANS and not self.apart
 
     @property
     def quiet(self) -> bool:
         """Whether nothing calls for an explanation, neither sway nor a move."""
         still = all(drift.shift_mm < LEAST_MM for drift in self.pairs)
-        return still and max(self.before_mm) < OVERLAP_MM
+        return still and max(self.before_mm) < OVERLAP_MM and not self.apart
 
     @property
     def valid(self) -> bool:
@@ -112,7 +116,17 @@ def judge_scans(
         tuple(found.rms_after_mm for found in alignments),
         tuple(pairs),
         tuple(together),
+        _apart(alignments),
     )
+
+
+def _apart(alignments: Sequence[Alignment]) -> tuple[tuple[str, ...], ...]:
+    graph = nx.Graph()
+    for found in alignments:
+        graph.add_nodes_from(found.rig_from_camera)
+        graph.add_edges_from((overlap.source, overlap.target) for overlap in found.overlaps)
+    groups = sorted((tuple(sorted(group)) for group in nx.connected_components(graph)), key=len)
+    return tuple(groups[::-1]) if len(groups) > 1 else ()
 
 
 def _drift(name: str, shifts: Array) -> PairDrift:

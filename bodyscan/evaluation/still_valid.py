@@ -118,6 +118,12 @@ def _of_scans(check: ScanCheck) -> Findings:
     moved = [drift for drift in (*check.poles, *check.pairs) if drift.moved]
     if moved:
         said = ["NOT valid: the same motion in every scan, which no sway explains"]
+    elif check.apart:
+        groups = "; ".join(", ".join(group) for group in check.apart)
+        said = [
+            f"undecided: no surface is seen by more than one of these groups of pairs: {groups}. How "
+            "they stand to each other a scan does not tell; give shots of the board that they share"
+        ]
     elif check.decided:
         said = ["valid: no pair moves the same way in all scans"]
     else:

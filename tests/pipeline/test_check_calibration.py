@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,8 +10,9 @@ from small_workspace import run
 
 from bodyscan.calibration.storage import load_calibration, save_calibration
 from bodyscan.evaluation.scan_check import judge_scans
+from bodyscan.evaluation.still_valid import _of_scans
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.alignment import Alignment
+from bodyscan.registration.alignment import Alignment, Overlap
 
 
 @pytest.fixture
@@ -63,8 +65,12 @@ def test_a_touched_pair_is_named_and_put_right(workspace, board_shots, touched, 
 def test_a_scan_of_a_person_is_checked_too(workspace):
     person = workspace.folder / "captures" / "person"
     result = run("check-calibration", person, "--calibration", workspace.folder / "calibration")
-    assert result.exit_code == 0, result.output
     assert "overlaps in 1 scan:" in result.output
+    # The small rig's two poles stand on either side of the person and see no common surface.
+    assert result.exit_code == 1
+    words = " ".join(result.output.split())
+    assert "undecided: no surface is seen by more than one of these groups of pairs" in words
+    assert "p2-2, p2-3; p1-2, p1-3" in words
 
 
 def test_boards_and_people_are_not_mixed(workspace, board_shots):
@@ -75,9 +81,12 @@ def test_boards_and_people_are_not_mixed(workspace, board_shots):
     assert "cannot be checked together" in str(result.exception)
 
 
-def aligned(motions: dict[str, np.ndarray]) -> Alignment:
+def aligned(motions: dict[str, np.ndarray], joined: bool = True) -> Alignment:
+    """Every pair overlaps with the next one; or all but the last."""
     placing = {name: RigidTransform(np.eye(3), shift) for name, shift in motions.items()}
-    return Alignment(placing, {}, {}, ())
+    names = list(motions) if joined else list(motions)[:-1]
+    overlaps = tuple(Overlap(a, b, 1000, 0.1, 0.1) for a, b in pairwise(names))
+    return Alignment(placing, {}, {}, overlaps)
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.8])
@@ -95,3 +104,24 @@ def test_a_move_is_told_from_sway_by_several_scans(shift):
     # Of two scans nothing can be said.
     assert judge_scans(scans[:2], start, {}).valid
     assert not judge_scans(scans[:2], start, {}).decided
+
+
+def test_pairs_that_share_nothing_with_the_others_are_not_confirmed():
+    """A pole that moved so far that no surface is near enough to its neighbours' leaves overlaps
+    that are as good as ever."""
+    names = ["p1-1", "p1-2", "p2-1", "p3-1"]
+    still = {name: np.zeros(3) for name in names}
+    start = {name: RigidTransform.identity() for name in names}
+    good = judge_scans([aligned(still)], start, {})
+    assert good.quiet
+    assert judge_scans([aligned(still)] * 3, start, {}).decided
+    apart = judge_scans([aligned(still, joined=False)] * 3, start, {})
+    assert not apart.quiet
+    assert not apart.decided
+    assert apart.apart == (("p1-1", "p1-2", "p2-1"), ("p3-1",))
+    findings = _of_scans(apart)
+    assert not findings.valid
+    assert "undecided: no surface is seen by more than one" in findings.lines[0]
+    assert "p1-1, p1-2, p2-1; p3-1" in findings.lines[0]
+    # One scan that joins them is enough.
+    assert judge_scans([aligned(still, joined=False), aligned(still)], start, {}).quiet
