@@ -75,7 +75,8 @@ def with_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:
     if not seen:
         raise ScanFailed(
             "nobody stands in the scan volume",
-            remedy="look at the lit images; check `volume` in the rig file",
+            remedy="look at the lit images; check `volume` in the calibration's calibration.json, and "
+            "that a folder given with --empty shows the rig without anybody",
         )
     return seen
 
