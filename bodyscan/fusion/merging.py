@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -29,7 +30,20 @@ FEWEST_POINTS = 1000
 SPOTS = 5000  # of an overlap are enough to compare exposures
 
 
-def merge(
+@dataclass(frozen=True, eq=False)
+class Merged:
+    """A cloud, and of all that one pair said of another's points the share that spoke against them."""
+
+    cloud: BodyCloud
+    contradicted: float
+
+
+def merge(range_images: Sequence[RangeImage], *placed: Any, **settings: Any) -> BodyCloud:
+    """The cloud of `merged`."""
+    return merged(range_images, *placed, **settings).cloud
+
+
+def merged(
     range_images: Sequence[RangeImage],
     rig_from_camera: dict[str, RigidTransform],
     *,
@@ -38,7 +52,7 @@ def merge(
     agreement_mm: float = 1.5,
     double_mm: float = 6.0,
     workers: int = 2,
-) -> BodyCloud:
+) -> Merged:
     """One evenly spread cloud of about `points` points from aligned, cleaned range images.
 
     Surfaces of two pairs within `agreement_mm` along the normal are averaged by weight; between
@@ -58,7 +72,13 @@ def merge(
         )
         evidence = list(compared)
     gain = _evened(samples, surfaces, evidence)
-    return averaged(samples, surfaces, evidence, gain, workers)
+    cloud = averaged(samples, surfaces, evidence, gain, workers)
+    return Merged(cloud, _contradicted(evidence))
+
+
+def _contradicted(evidence: Sequence[Evidence]) -> float:
+    against = sum(one.against_index.size for one in evidence)
+    return against / max(against + sum(one.index.size for one in evidence), 1)
 
 
 def thinned(surfaces: Sequence[Surface], points: int) -> Samples:

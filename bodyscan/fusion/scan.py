@@ -11,7 +11,7 @@ from bodyscan.errors import BadInput
 from bodyscan.fusion.body import BodyCloud, BodyMesh
 from bodyscan.fusion.cleaning import clean, with_subject
 from bodyscan.fusion.error_bar import with_placing
-from bodyscan.fusion.merging import merge
+from bodyscan.fusion.merging import merged
 from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.verdict import Verdict, judge
 from bodyscan.geometry.transforms import RigidTransform
@@ -112,7 +112,7 @@ def fuse(
         placing |= alignment.rig_from_camera
         progress("aligning", 1, 1)
     progress("merging", 0, 1)
-    cloud = merge(
+    fused = merged(
         seen,
         placing,
         points=settings.points,
@@ -121,7 +121,7 @@ def fuse(
         double_mm=settings.double_mm,
     )
     there = {image.pair: placing[image.pair] for image in seen}
-    cloud = with_placing(cloud, there, calibration.covariance)
+    cloud = with_placing(fused.cloud, there, calibration.covariance)
     progress("merging", 1, 1)
     progress("meshing", 0, 1)
     surface = mesh(
@@ -129,5 +129,5 @@ def fuse(
     )
     progress("meshing", 1, 1)
     measured = {image.pair: int(image.valid.sum()) for image in cleaned}
-    verdict = judge(cloud, surface, alignment, failed, calibration.rig.volume)
+    verdict = judge(cloud, surface, alignment, failed, calibration.rig.volume, fused.contradicted)
     return Scan(cloud, surface, alignment, measured, failed, verdict, tuple(seen), placing)

@@ -24,6 +24,7 @@ GRADES: tuple[Grade, ...] = ("good", "usable", "repeat")
 
 SOME_FILLED, MOST_FILLED = 0.12, 0.5
 SOME_DISAGREEMENT_MM, MOST_DISAGREEMENT_MM = 0.4, 0.8
+SOME_CONTRADICTED, MOST_CONTRADICTED = 0.005, 0.05  # below 0.001 where all is well
 SOME_MOTION_MM, MOST_MOTION_MM = 3.0, 6.0
 CELL_MM = 50.0
 SIDE_BY_SIDE = 0.4  # of the taller one's height
@@ -53,11 +54,13 @@ def judge(
     alignment: Alignment | None,
     failed: Mapping[str, str],
     volume: Volume,
+    contradicted: float = 0.0,
 ) -> Verdict:
-    """The worst of all findings decides; the reasons come worst first."""
+    """The worst of all findings decides; the reasons come worst first. contradicted: see `merged`."""
     findings = [
         *_pairs(failed, alignment),
         *_motion(alignment),
+        *_contradictions(contradicted),
         *_company(cloud),
         *_cut_off(cloud, volume),
         *_left_out(cloud, mesh),
@@ -95,6 +98,17 @@ def _motion(alignment: Alignment | None) -> Iterator[Finding]:
         yield (
             "repeat" if motion > MOST_MOTION_MM else "usable",
             f"the person moved by {motion:.1f} mm (pair {name}) while the pairs fired",
+        )
+
+
+def _contradictions(share: float) -> Iterator[Finding]:
+    """Pairs that see through each other's surfaces, which points near each other do not tell."""
+    if share > SOME_CONTRADICTED:
+        yield (
+            "repeat" if share > MOST_CONTRADICTED else "usable",
+            f"the pairs contradict each other: {share:.1%} of what they say of one "
+            "another's points is that there is no surface; is this the calibration of this rig, has "
+            "nothing moved since, were cables or folders exchanged?",
         )
 
 

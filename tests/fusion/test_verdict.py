@@ -174,6 +174,16 @@ def test_the_calibration_of_another_rig(images):
     assert "calibration" in said(scan)
 
 
+def test_two_pairs_exchanged(images):
+    """Their cables, or their folders: hardly anything overlaps, and what does overlaps well."""
+    placed = placings()
+    placed["p2-2"], placed["p2-3"] = placed["p2-3"], placed["p2-2"]
+    scan = fused(images, placed=placed)
+    assert scan.verdict.grade == "repeat"
+    assert "the pairs contradict each other" in said(scan)
+    assert "exchanged" in said(scan)
+
+
 def test_a_person_who_stepped_aside(images):
     """Twelve millimetres between one pole's turn and the next."""
     away = {
