@@ -162,12 +162,12 @@ def results_of(stage: str) -> Callable[[Job], dict[str, Path]]:
 
 KINDS: Kinds = {
     "fuse": (
-        Stage("scan", 2, ("alignment", "fusion", "mesh"), scan_inputs, run_scan),
+        Stage("scan", 3, ("alignment", "fusion", "mesh"), scan_inputs, run_scan),
         Stage("export", 2, ("export",), results_of("scan"), run_export),
         Stage("report", 1, (), results_of("scan"), run_report),
     ),
     "calibrate": (
-        Stage("calibration", 2, (), rig_inputs, run_calibrate),
+        Stage("calibration", 3, (), rig_inputs, run_calibrate),
         Stage("rig", 1, ("rig_export",), results_of("calibration"), run_rig_export),
         Stage("report", 1, (), results_of("calibration"), run_report),
     ),
