@@ -108,7 +108,7 @@ def main(step: str, workspace: Path, folder: Path) -> None:
     """One step; the last line it prints are its figures as JSON."""
     work, finish = _STEPS[step](workspace, folder)
     result, times, yardstick = None, [], []
-    paths = _images_of(workspace)
+    paths = _images_of(workspace) if step == "ours" else []
     for _ in range(RUNS if step in OURS else 1):
         result = None  # the last run's memory is free for this one
         if step == "ours":

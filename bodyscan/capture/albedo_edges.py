@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bodyscan.capture.stripe_images import ScanLines
 from bodyscan.compiled import compiled
-from bodyscan.geometry.crop import crop_of
+from bodyscan.geometry.crop import crop_of, ends_of
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -121,9 +121,7 @@ def gentle_gradient(image: Image, usable: Mask) -> tuple[Image, Image]:
     along, across = np.zeros((2, *image.shape), np.float32)
     shown = crop_of(usable)
     if shown is not None:
-        lines, places = shown
-        box = (lines.start, lines.stop, places.start, places.stop)
-        _gentle(image, usable, box, along, across)
+        _gentle(image, usable, ends_of(shown), along, across)
     return along, across
 
 

@@ -1,6 +1,6 @@
-"""Grey PNG files, which is what cameras of a scanner write, in a quarter of OpenCV's time.
+"""Grey PNG files, which is what cameras of a scanner write, in a third of OpenCV's time.
 
-Reading is a third of the work of a scan. ISA-L inflates; the rows are put together here. Only
+Reading is a large part of a scan's work. ISA-L inflates; the rows are put together here. Only
 8-bit grey that is not interlaced: all else is left to OpenCV. Source: PNG, ISO/IEC 15948:2004.
 """
 

@@ -16,7 +16,7 @@ from bodyscan.compiled import compiled
 from bodyscan.fusion.grid import Doubles, Floats, lens_of
 from bodyscan.fusion.quadratics import Fit, Mask, fit_quadratics
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.crop import crop_of
+from bodyscan.geometry.crop import crop_of, ends_of
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -63,7 +63,7 @@ def smooth(
     box = crop_of(image.valid)
     if box is None:
         return None
-    inverse, noise = _inverse_depths(image.points, image.sigma_mm, _ends(box))
+    inverse, noise = _inverse_depths(image.points, image.sigma_mm, ends_of(box))
     some = inverse[::EVERY]
     pixel_mm = float(np.median(1.0 / some[some > 0])) / image.camera.alpha
     reach = int(np.clip(round(0.5 * window_mm / pixel_mm), 2, 6))
@@ -85,7 +85,7 @@ def _surface(
     sigma = np.empty(most, np.float32)
     count = _lay_out(
         image.points,
-        _ends(box),
+        ends_of(box),
         (fit.value, fit.slope_u, fit.slope_v, fit.sigma),
         fitted,
         lens_of(image.camera),
@@ -117,12 +117,6 @@ def _distance_to_rim(depth: Floats, jump: float) -> Floats:
     inner = cv2.dilate(depth, np.ones((3, 3), np.uint8)) < np.float32(1.0 + jump) * depth
     padded = np.pad(inner.astype(np.uint8), 1)
     return cv2.distanceTransform(padded, cv2.DIST_L2, 3)[1:-1, 1:-1] + np.float32(1.0)
-
-
-def _ends(box: tuple[slice, slice]) -> tuple[int, int, int, int]:
-    """Top, bottom, left, right."""
-    rows, columns = box
-    return rows.start, rows.stop, columns.start, columns.stop
 
 
 @compiled

@@ -12,3 +12,9 @@ def crop_of(shown: NDArray[np.bool_]) -> tuple[slice, slice] | None:
     if not rows.size:
         return None
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def ends_of(crop: tuple[slice, slice]) -> tuple[int, int, int, int]:
+    """Top, bottom, left and right of a crop, for compiled functions."""
+    rows, columns = crop
+    return rows.start, rows.stop, columns.start, columns.stop

@@ -9,7 +9,7 @@ from bodyscan.calibration.pair import PairCalibration
 from bodyscan.capture.views import StripeMap
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
-from bodyscan.geometry.crop import crop_of
+from bodyscan.geometry.crop import crop_of, ends_of
 from bodyscan.geometry.measuring import measure_image
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -52,9 +52,7 @@ def grid_normals(points: Floats, measured: NDArray[np.bool_] | None = None) -> F
     normals = np.full(points.shape, np.nan, np.float32)
     shown = crop_of(np.isfinite(points[..., 2]) if measured is None else measured)
     if shown is not None:
-        rows, columns = shown
-        box = (rows.start, rows.stop, columns.start, columns.stop)
-        _grid_normals(np.ascontiguousarray(points, np.float32), box, normals)
+        _grid_normals(np.ascontiguousarray(points, np.float32), ends_of(shown), normals)
     return normals
 
 
