@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks import charuco_ring, codes, full_size, fusion, lens, png, procam, rig
-from bodyscan.files import write_text
+from bodyscan.files.atomic import write_text
 
 PROJECT = Path(__file__).parents[1]
 RESULTS = PROJECT / "docs" / "results.md"

@@ -15,10 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.detection import find_boards
-from bodyscan.capture.rig import Board, Rig
-from bodyscan.capture.views import BoardView
+from bodyscan.boards.detection import find_boards
+from bodyscan.boards.view import BoardView
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.rig.board import Board
+from bodyscan.rig.rig import Rig
 from bodyscan.simulation.board import board_print
 from bodyscan.simulation.layout import TruePair, build_pairs
 from bodyscan.simulation.lens import sampled_directions

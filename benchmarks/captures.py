@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from bodyscan.capture.folder import Captures, open_captures
-from bodyscan.capture.rig import Rig
-from bodyscan.capture.rig_file import load_rig
+from bodyscan.captures.folder import Captures, open_captures
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig
 
 PROJECT = Path(__file__).parents[1]
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyscan.capture.codes import read_code
-from bodyscan.capture.rig import Board, FrameNames, ProjectorSpec
-from bodyscan.capture.rig_file import load_rig
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.rig.board import Board
+from bodyscan.rig.frame_names import FrameNames
+from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation.board import make_board
 from bodyscan.simulation.files import scaled_rig
 from bodyscan.simulation.instrument import handed_out
@@ -20,6 +20,8 @@ from bodyscan.simulation.render import PixelTruth, View, pixel_truth, render_pai
 from bodyscan.simulation.scene import Scene, grid_surface
 from bodyscan.simulation.sensor import expose, exposure
 from bodyscan.simulation.settings import InterReflection, SimulationSettings
+from bodyscan.stripes.codes import read_code
+from bodyscan.stripes.projector_spec import ProjectorSpec
 
 RIG = Path(__file__).parents[1] / "rigs" / "one-pair.yaml"
 SEED = 7

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks import full_size
-from bodyscan.fusion.body import BodyCloud
 from bodyscan.memory import keep_freed_memory
+from bodyscan.mesh.body import BodyCloud
 
 Figures = dict[str, Any]
 POINTS = 1_000_000
@@ -137,7 +137,7 @@ Step = tuple[Callable[[], Any], Callable[[Any], Figures]]
 
 
 def _read(workspace: Path, folder: Path) -> Step:
-    from bodyscan.capture.images import read_sequence
+    from bodyscan.captures.images import read_sequence
     from bodyscan.progress import threaded
 
     calibration, captures = _scan_of(workspace)
@@ -167,11 +167,11 @@ def _read_with_opencv(paths: list[list[str]]) -> None:
 
 
 def _ours(workspace: Path, folder: Path) -> Step:
+    from bodyscan.alignment.align import align
     from bodyscan.fusion.cleaning import clean
     from bodyscan.fusion.error_bar import with_placing
     from bodyscan.fusion.merging import merge
-    from bodyscan.reconstruction.pairs import range_images
-    from bodyscan.registration.alignment import align
+    from bodyscan.workflows.range_images import range_images
 
     calibration, captures = _scan_of(workspace)
     stages: dict[str, float] = {}
@@ -227,9 +227,9 @@ def versions(full: Any) -> Figures:
 
     Distances, mm, are those of random spots of the light mesh and of all vertices of the full one.
     """
-    from bodyscan.evaluation.self_intersections import self_intersections
     from bodyscan.evaluation.surface import sample_surface, signed_distances
-    from bodyscan.fusion.versions import light
+    from bodyscan.mesh.self_intersections import self_intersections
+    from bodyscan.mesh.versions import light
 
     lean = light(full)
     spots = sample_surface(lean.vertices, lean.faces, 500_000)[0]
@@ -353,8 +353,8 @@ _STEPS: dict[str, Callable[[Path, Path], Step]] = {
 
 
 def _scan_of(workspace: Path) -> tuple[Any, Any]:
-    from bodyscan.calibration.storage import load_calibration
-    from bodyscan.capture.folder import open_scan
+    from bodyscan.captures.folder import open_scan
+    from bodyscan.registration.storage import load_calibration
 
     calibration = load_calibration(workspace / "calibration")
     return calibration, open_scan(calibration.rig, workspace / "captures" / "person")
@@ -378,7 +378,7 @@ def _deviation(workspace: Path, points: Any) -> Figures:
     from dataclasses import asdict
 
     from bodyscan.evaluation.surface import deviation, signed_distances
-    from bodyscan.evaluation.workspace import load_truth
+    from bodyscan.workflows.evaluate import load_truth
 
     truth = load_truth(workspace / "truth")
     assert truth.vertices is not None

@@ -12,19 +12,19 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
+from bodyscan.boards.board import corner_points
 from bodyscan.calibration.pair import PairCalibration
-from bodyscan.calibration.storage import load_calibration
-from bodyscan.capture.boards import corner_points
-from bodyscan.capture.decoding import decode_sequence
-from bodyscan.capture.folder import open_captures, open_scan
-from bodyscan.capture.rig import Rig
-from bodyscan.capture.rig_file import load_rig
-from bodyscan.evaluation.workspace import load_truth
+from bodyscan.captures.folder import open_captures, open_scan
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.storage import load_calibration
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation import SimulationSettings, simulate
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import PinholeProjector
 from bodyscan.simulation.settings import Projection
+from bodyscan.workflows.decoding import decode_sequence
+from bodyscan.workflows.evaluate import load_truth
 
 Array = NDArray[np.float64]
 

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 
 from benchmarks import full_size
-from bodyscan.calibration.storage import load_calibration
-from bodyscan.capture.folder import open_scan
-from bodyscan.capture.grey_png import decode_grey_png
-from bodyscan.capture.image_header import png_damage
+from bodyscan.captures.folder import open_scan
+from bodyscan.captures.grey_png import decode_grey_png
+from bodyscan.captures.image_header import png_damage
+from bodyscan.registration.storage import load_calibration
 
 RUNS, THREADS = 7, 2
 

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from benchmarks.board_images import SeenRig, see_boards
 from benchmarks.rivals import RIVALS, run_rival
-from bodyscan.calibration.rig import calibrate_cameras, locate_views
-from bodyscan.capture.rig import Board, Rig
-from bodyscan.capture.rig_file import load_rig
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.placing_covariance import position_sigma
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
 from bodyscan.registration.rig_solve import PlacedRig, place_rig
-from bodyscan.registration.uncertainty import position_sigma
+from bodyscan.rig.board import Board
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation.layout import TruePair
+from bodyscan.workflows.calibrate_rig import calibrate_cameras, locate_views
 
 Array = NDArray[np.float64]
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.boards import corner_points
-from bodyscan.capture.rig import Board
+from bodyscan.boards.board import corner_points
+from bodyscan.calibration.located_view import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.located_view import LocatedView
+from bodyscan.rig.board import Board
 
 Array = NDArray[np.float64]
 

@@ -1,3 +1,3 @@
-from bodyscan.cli import main
+from bodyscan.cli.main import main
 
 main()

@@ -11,6 +11,13 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from ray_cast_scan import Scan, cast_scan, load_body, load_rig
+
+from bodyscan.fusion.cleaning import clean
+from bodyscan.fusion.merging import merge
+from bodyscan.fusion.meshing import mesh
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.reconstruction.range_image import RangeImage
 
 # What is compiled is compiled at its first call, and machines may be loaded.
 settings.register_profile("bodyscan", deadline=None)
@@ -26,3 +33,23 @@ def captures() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real captures not found at {folder} (set BODYSCAN_CAPTURES)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def scan() -> Scan:
+    return cast_scan(load_body(), load_rig(), scale=0.5)
+
+
+@pytest.fixture(scope="session")
+def cleaned(scan: Scan) -> list[RangeImage]:
+    return clean(scan.range_images, scan.rig_from_camera, load_rig().volume)
+
+
+@pytest.fixture(scope="session")
+def cloud(scan: Scan, cleaned: list[RangeImage]) -> BodyCloud:
+    return merge(cleaned, scan.rig_from_camera, points=250_000)
+
+
+@pytest.fixture(scope="session")
+def body(scan: Scan, cloud: BodyCloud) -> BodyMesh:
+    return mesh(cloud, scan.range_images, scan.rig_from_camera, depth=8)

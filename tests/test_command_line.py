@@ -42,7 +42,7 @@ def test_check_and_help_import_nothing_heavy():
     for arguments in (["--help"], ["check", str(RIGS / "three-pole-12.yaml")]):
         program = (
             f"import sys; sys.argv = ['bodyscan', *{arguments!r}]\n"
-            "from bodyscan.cli import main\n"
+            "from bodyscan.cli.main import main\n"
             "try:\n    main()\nexcept SystemExit:\n    pass\n"
             f"print('heavy:', [m for m in {HEAVY!r} if m in sys.modules])"
         )

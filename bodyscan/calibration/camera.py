@@ -16,7 +16,7 @@ from bodyscan.calibration.zhang import (
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import minimize
-from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 Array = NDArray[np.float64]
 
@@ -128,17 +128,6 @@ def projection_jacobians(camera: Camera, points: Array) -> tuple[Array, Array]:
     perspective[:, 0, 0] = perspective[:, 1, 1] = 1.0 / z
     perspective[:, 0, 2], perspective[:, 1, 2] = -x / z, -y / z
     return intrinsics, a @ distortion @ perspective
-
-
-def twist_jacobian(points: Array) -> Array:
-    """d(point)/d(twist) (N, 3, 6) when a small motion acts on points (N, 3) in their own frame."""
-    jacobian = np.zeros((len(points), 3, 6))
-    x, y, z = points.T
-    jacobian[:, 0, 1], jacobian[:, 0, 2] = z, -y
-    jacobian[:, 1, 0], jacobian[:, 1, 2] = -z, x
-    jacobian[:, 2, 0], jacobian[:, 2, 1] = y, -x
-    jacobian[:, [0, 1, 2], [3, 4, 5]] = 1.0
-    return jacobian
 
 
 def _camera(matrix: Array, width: int, height: int) -> Camera:

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.rig import Rig
-from bodyscan.capture.views import BoardView
+from bodyscan.boards.view import BoardView
+from bodyscan.rig.rig import Rig
 
 Array = NDArray[np.float64]
 

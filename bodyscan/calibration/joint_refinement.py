@@ -15,16 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.boundary_points import BoundaryPoints, points_on_board
-from bodyscan.calibration.camera import (
-    INTRINSICS,
-    PlanarView,
-    projection_jacobians,
-    twist_jacobian,
-)
+from bodyscan.calibration.camera import INTRINSICS, PlanarView, projection_jacobians
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import cauchy_weights, spread
 from bodyscan.geometry.smooth_sheets import SmoothSheets
-from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 Array = NDArray[np.float64]
 Sheets = TypeVar("Sheets", bound=SmoothSheets)

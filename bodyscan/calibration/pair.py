@@ -8,17 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.boards.board import corner_points, corners_per_face
+from bodyscan.boards.view import BoardView
 from bodyscan.calibration.boundary_points import BoundaryPoints
 from bodyscan.calibration.camera import PlanarView
 from bodyscan.calibration.light_choice import HeldOutModel
 from bodyscan.calibration.light_planes import boundary_points, join
-from bodyscan.capture.boards import corner_points, corners_per_face
-from bodyscan.capture.rig import Board, ProjectorSpec
-from bodyscan.capture.views import BoardView, StripeMap
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.rig.board import Board
+from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.stripe_map import StripeMap
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from bodyscan.capture.model import Model, Problem
-from bodyscan.capture.model_file import load_model, revised
 from bodyscan.errors import BadInput
+from bodyscan.files.model import Model, Problem
+from bodyscan.files.model_file import load_model, revised
 
 _REMEDY = "Mend the acceptance file; docs/report.md explains every key."
 MOST_SPHERES = 6

@@ -11,10 +11,10 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from bodyscan.evaluation.surface import covered, sample_surface
-from bodyscan.fusion.body import BodyMesh
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
 from bodyscan.measurement.measuring import Slice, measure
+from bodyscan.mesh.body import BodyMesh
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -10,7 +10,7 @@ import open3d as o3d
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bodyscan.fusion.topology import directed_edges
+from bodyscan.mesh.topology import directed_edges
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

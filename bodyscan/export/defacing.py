@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from bodyscan.errors import FailedWork
 from bodyscan.export.neck import REACH_MM, Neck
-from bodyscan.fusion.body import BodyMesh
-from bodyscan.fusion.topology import (
+from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.topology import (
     directed_edges,
     face_components,
     vertex_normals,

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyscan import __version__
 from bodyscan.errors import BadInput
-from bodyscan.files import replacing, write_json
+from bodyscan.files.atomic import replacing, write_json
 from bodyscan.fusion.scan import Scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage

@@ -13,12 +13,12 @@ from bodyscan import __version__
 from bodyscan.errors import BadInput
 from bodyscan.export.glb import write_glb
 from bodyscan.export.obj import write_obj
-from bodyscan.export.ply import write_ply
 from bodyscan.export.stl import write_stl
-from bodyscan.files import write_json
-from bodyscan.fusion.body import BodyCloud, BodyMesh
-from bodyscan.fusion.topology import face_areas
+from bodyscan.files.atomic import write_json
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.ply import write_ply
+from bodyscan.mesh.topology import face_areas
 
 CLOUD_FORMATS = (".ply", ".glb")
 MESH_FORMATS = (".ply", ".obj", ".stl", ".glb")

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.files import replacing
-from bodyscan.fusion.body import BodyCloud, BodyMesh
+from bodyscan.files.atomic import replacing
+from bodyscan.mesh.body import BodyCloud, BodyMesh
 
 FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from bodyscan.errors import FailedWork
-from bodyscan.fusion.topology import directed_edges
+from bodyscan.mesh.topology import directed_edges
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

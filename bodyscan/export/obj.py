@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from bodyscan.export.text import fixed, lines, whole
-from bodyscan.files import replacing
-from bodyscan.fusion.body import BodyMesh
+from bodyscan.files.atomic import replacing
+from bodyscan.mesh.body import BodyMesh
 
 ROWS = 200_000  # written at a time
 

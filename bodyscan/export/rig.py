@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 import pycolmap
 
-from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.errors import BadInput
-from bodyscan.files import write_bytes, write_json, write_text
+from bodyscan.files.atomic import write_bytes, write_json, write_text
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.joint_solve import COLMAP_PIXEL_CENTRE
+from bodyscan.registration.rig_calibration import RigCalibration
 
 PlacedCameras: TypeAlias = dict[str, tuple[Camera, RigidTransform]]
 """Camera and `rig_from_camera` by the pair's name."""

@@ -13,11 +13,11 @@ from bodyscan.errors import BadInput
 from bodyscan.export.defacing import deface as without_face
 from bodyscan.export.exporting import MESH_FORMATS, Origin, export
 from bodyscan.export.neck import find_neck
-from bodyscan.fusion.body import BodyMesh
 from bodyscan.fusion.storage import StoredScan
-from bodyscan.fusion.versions import light, measured_only
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
+from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.versions import light, measured_only
 
 FRAMES = ("rig", "body")
 

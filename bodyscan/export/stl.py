@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyscan.files import replacing
-from bodyscan.fusion.body import BodyMesh
+from bodyscan.files.atomic import replacing
+from bodyscan.mesh.body import BodyMesh
 
 TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 HEADER = b"bodyscan: mm, x the way the subject faces, z up, floor at z = 0"

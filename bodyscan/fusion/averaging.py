@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.compiled import compiled
-from bodyscan.fusion.body import BodyCloud
 from bodyscan.fusion.comparing import Evidence, Samples
 from bodyscan.fusion.grid import Doubles, Floats
 from bodyscan.fusion.quadratics import NORMAL_MEDIAN
 from bodyscan.fusion.smoothing import Surface
+from bodyscan.mesh.body import BodyCloud
 
 AT_A_TIME = 1 << 16  # samples whose sums fit into a processor's cache
 EVERY = 8  # spot of an overlap that is looked at to learn how far two surfaces are apart

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.rig import Volume
 from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.dark_gaps import dark_gaps
@@ -21,6 +20,7 @@ from bodyscan.fusion.grid import Floats
 from bodyscan.geometry.crop import crop_of
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.rig.rig import Volume
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

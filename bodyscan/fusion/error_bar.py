@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.compiled import compiled
-from bodyscan.fusion.body import BodyCloud
+from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.uncertainty import PlacingCovariance
+from bodyscan.mesh.body import BodyCloud
 
 Array = NDArray[np.float64]
 

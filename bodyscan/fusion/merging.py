@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.averaging import averaged
-from bodyscan.fusion.body import BodyCloud
 from bodyscan.fusion.brightness import gains, log_ratio
 from bodyscan.fusion.comparing import Evidence, Samples, compare
 from bodyscan.fusion.grid import Floats
 from bodyscan.fusion.smoothing import Surface, smooth
 from bodyscan.fusion.thinning import one_per_voxel, voxel_size_for
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyCloud
 from bodyscan.reconstruction.range_image import RangeImage
 
 FEWEST_POINTS = 1000

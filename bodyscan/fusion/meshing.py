@@ -10,18 +10,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bodyscan.errors import ScanFailed
-from bodyscan.fusion.body import BodyCloud, BodyMesh
 from bodyscan.fusion.carving import hints
-from bodyscan.fusion.repair import closed
 from bodyscan.fusion.support import settled, support
-from bodyscan.fusion.topology import (
-    face_components,
-    signed_volume,
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.repair import largest_piece
+from bodyscan.mesh.topology import (
     topology,
     vertex_normals,
-    without_unused,
 )
-from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
 Array = NDArray[np.float64]
@@ -82,14 +79,6 @@ def poisson(
         cloud, depth=depth, linear_fit=linear, n_threads=1
     )
     return np.asarray(surface.vertices), np.asarray(surface.triangles).astype(np.int64)
-
-
-def largest_piece(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
-    """The connected piece with the most faces, closed and turned to look outwards."""
-    vertices, faces = closed(vertices, faces)
-    labels = face_components(faces, len(vertices))
-    vertices, faces, _ = without_unused(vertices, faces[labels == np.argmax(np.bincount(labels))])
-    return vertices, faces if signed_volume(vertices, faces) > 0 else faces[:, ::-1].copy()
 
 
 def dressed(

@@ -1,24 +1,22 @@
-"""One person: range images, aligned, merged to a body cloud, meshed."""
+"""One person: range images aligned, merged to a body cloud, meshed and judged."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from bodyscan.calibration.rig_calibration import RigCalibration
-from bodyscan.capture.folder import Captures
+from bodyscan.alignment.align import Alignment, AlignmentSettings, align
 from bodyscan.errors import BadInput
-from bodyscan.fusion.body import BodyCloud, BodyMesh
 from bodyscan.fusion.cleaning import clean, with_subject
 from bodyscan.fusion.error_bar import with_placing
 from bodyscan.fusion.merging import merged
 from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.verdict import Verdict, judge
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.progress import Progress, silent
-from bodyscan.reconstruction.pairs import range_images
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.registration.alignment import Alignment, AlignmentSettings, align
+from bodyscan.registration.rig_calibration import RigCalibration
 
 
 @dataclass(frozen=True)
@@ -66,24 +64,6 @@ def alignment_settings(matching: str) -> AlignmentSettings | None:
             f"there is no alignment {matching!r}", remedy="choose projected, nearest or none"
         )
     return AlignmentSettings(matching="projected" if matching == "projected" else "nearest")
-
-
-def scan(
-    calibration: RigCalibration,
-    captures: Captures,
-    settings: ScanSettings = ScanSettings(),
-    progress: Progress = silent,
-    *,
-    empty: Captures | None = None,
-) -> Scan:
-    """Person images in, body model and mesh out.
-
-    empty: captures of the rig without anybody in it, whose surfaces are no part of the subject.
-    Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left.
-    """
-    images, failed = range_images(calibration, captures, progress)
-    background = range_images(calibration, empty, progress)[0] if empty else ()
-    return fuse(calibration, images, failed, settings, progress, empty=background)
 
 
 def fuse(

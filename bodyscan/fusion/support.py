@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bodyscan.compiled import compiled
-from bodyscan.fusion.body import BodyCloud
+from bodyscan.mesh.body import BodyCloud
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from bodyscan.capture.rig import Volume
-from bodyscan.fusion.body import BodyCloud, BodyMesh
-from bodyscan.fusion.rings import rings
-from bodyscan.fusion.topology import face_areas
-from bodyscan.registration.alignment import Alignment
+from bodyscan.alignment.align import Alignment
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.rings import rings
+from bodyscan.mesh.topology import face_areas
+from bodyscan.rig.rig import Volume
 
 Array = NDArray[np.float64]
 Grade = Literal["good", "usable", "repeat"]

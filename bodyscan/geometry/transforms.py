@@ -105,6 +105,17 @@ def adjoint(a_from_b: RigidTransform) -> Array:
     return matrix
 
 
+def twist_jacobian(points: Array) -> Array:
+    """d(point)/d(twist) (N, 3, 6) when a small motion acts on points (N, 3) in their own frame."""
+    jacobian = np.zeros((len(points), 3, 6))
+    x, y, z = points.T
+    jacobian[:, 0, 1], jacobian[:, 0, 2] = z, -y
+    jacobian[:, 1, 0], jacobian[:, 1, 2] = -z, x
+    jacobian[:, 2, 0], jacobian[:, 2, 1] = y, -x
+    jacobian[:, [0, 1, 2], [3, 4, 5]] = 1.0
+    return jacobian
+
+
 def rigid_fit(source: Array, target: Array) -> RigidTransform:
     """`target_from_source` that best carries points (N, 3) onto (N, 3), least squares.
 

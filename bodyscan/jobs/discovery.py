@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-from bodyscan.capture.captures_file import FILE_NAME as CAPTURES
-from bodyscan.capture.yaml_file import YamlError, read_yaml
+from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput
+from bodyscan.files.yaml_file import YamlError, read_yaml
 from bodyscan.jobs.job import Job, job_name
 from bodyscan.jobs.pipeline import Pipeline
 

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bodyscan.capture.captures_file import FILE_NAME as CAPTURES
-from bodyscan.capture.yaml_file import YamlError, read_yaml
+from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput
-from bodyscan.files import write_text
+from bodyscan.files.atomic import write_text
+from bodyscan.files.yaml_file import YamlError, read_yaml
 from bodyscan.jobs.job import BATCH_LOCK, JOB, MANIFEST, SUMMARY
 from bodyscan.jobs.locking import for_owner_only, locked
 from bodyscan.jobs.summary import write_out_manifest

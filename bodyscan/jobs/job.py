@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bodyscan.errors import BadInput, ResultError
-from bodyscan.files import write_json
+from bodyscan.files.atomic import write_json
 from bodyscan.jobs.pipeline import Pipeline
 
 SCHEMA, VERSION = "bodyscan-job", 1

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from bodyscan.capture.captures_file import FILE_NAME as CAPTURES
+from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput
 from bodyscan.jobs.discovery import find_jobs
 from bodyscan.jobs.hashing import files_below

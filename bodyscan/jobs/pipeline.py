@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from bodyscan.capture.model import Model, Name, Problem
-from bodyscan.capture.model_file import load_model, revised
 from bodyscan.errors import BadInput
+from bodyscan.files.model import Model, Name, Problem
+from bodyscan.files.model_file import load_model, revised
 
 _REMEDY = "Mend the pipeline file; docs/formats.md explains every key."
 
@@ -32,7 +32,7 @@ class Resources(Model):
 
 
 class Alignment(Model):
-    """See bodyscan.registration.alignment.AlignmentSettings; matching none: boards alone."""
+    """See bodyscan.alignment.align.AlignmentSettings; matching none: boards alone."""
 
     matching: Literal["projected", "nearest", "none"] = "projected"
     spacing_mm: Millimetres = 3.0

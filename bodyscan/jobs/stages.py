@@ -8,15 +8,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from bodyscan.capture.captures_file import FILE_NAME as CAPTURES
-from bodyscan.capture.folder import Captures, open_captures, open_scan
-from bodyscan.capture.rig import Rig
-from bodyscan.capture.rig_file import load_rig
+from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
+from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import BadInput, CalibrationFileError, CaptureError
 from bodyscan.jobs.discovery import CALIBRATION, RIG_FILE
 from bodyscan.jobs.hashing import files_below
 from bodyscan.jobs.job import STAGE, Job
 from bodyscan.progress import Progress
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,12 @@ def scan_inputs(job: Job) -> dict[str, Path]:
 
 def run_scan(job: Job, out: Path, progress: Progress) -> None:
     """As `bodyscan scan` does: cloud, mesh, what they are, pictures."""
-    from bodyscan.calibration.storage import calibration_id, load_calibration
-    from bodyscan.fusion.scan import ScanSettings, scan
+    from bodyscan.alignment.align import AlignmentSettings
+    from bodyscan.fusion.scan import ScanSettings
     from bodyscan.fusion.storage import save_scan
-    from bodyscan.registration.alignment import AlignmentSettings
+    from bodyscan.registration.storage import calibration_id, load_calibration
     from bodyscan.report.scan_pictures import draw_scan
+    from bodyscan.workflows.scan_person import scan
 
     align = job.pipeline.section("alignment")
     fusion, mesh = job.pipeline.fusion, job.pipeline.mesh
@@ -111,7 +112,7 @@ def run_export(job: Job, out: Path, progress: Progress) -> None:
 
 def run_report(job: Job, out: Path, progress: Progress) -> None:
     """As `bodyscan report` does."""
-    from bodyscan.files import write_text
+    from bodyscan.files.atomic import write_text
     from bodyscan.report.page import render
     from bodyscan.report.result import page_of
 
@@ -130,8 +131,8 @@ def rig_inputs(job: Job) -> dict[str, Path]:
 
 def run_calibrate(job: Job, out: Path, progress: Progress) -> None:
     """As `bodyscan calibrate-rig` does."""
-    from bodyscan.calibration.rig import calibrate_rig
-    from bodyscan.calibration.storage import save_calibration
+    from bodyscan.registration.storage import save_calibration
+    from bodyscan.workflows.calibrate_rig import calibrate_rig
 
     rig_file = job.source / RIG_FILE
     rig = load_rig(rig_file)
@@ -140,8 +141,8 @@ def run_calibrate(job: Job, out: Path, progress: Progress) -> None:
 
 def run_rig_export(job: Job, out: Path, progress: Progress) -> None:
     """As `bodyscan export-rig` does."""
-    from bodyscan.calibration.storage import load_calibration
     from bodyscan.export.rig import export_rig
+    from bodyscan.registration.storage import load_calibration
 
     progress("exporting", 0, 1)
     formats = job.pipeline.rig_export.formats

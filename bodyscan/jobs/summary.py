@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.files import write_json, write_text
+from bodyscan.files.atomic import write_json, write_text
 from bodyscan.jobs.hashing import file_hash
 from bodyscan.jobs.job import MANIFEST, SUMMARY, Job
 from bodyscan.jobs.supervision import Outcome

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bodyscan.files import write_json
+from bodyscan.files.atomic import write_json
 from bodyscan.jobs.job import LOG, STATE, printable
 
 Listen = Callable[[dict[str, Any]], None]

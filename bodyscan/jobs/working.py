@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from bodyscan.errors import BodyscanError, CaptureError
-from bodyscan.files import json_text, write_json
+from bodyscan.files.atomic import json_text, write_json
 from bodyscan.jobs.hashing import content_hash, file_hash, file_hashes, files_below
 from bodyscan.jobs.job import LOCK, MANIFEST, STAGE, Job, read_job
 from bodyscan.jobs.locking import for_owner_only, locked

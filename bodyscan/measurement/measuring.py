@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.errors import BadInput
-from bodyscan.fusion.body import BodyMesh
-from bodyscan.fusion.topology import face_areas, signed_volume
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
 from bodyscan.measurement.slices import Loop, loops_at
+from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.topology import face_areas, signed_volume
 
 Array = NDArray[np.float64]
 

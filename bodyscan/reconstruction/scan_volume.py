@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.pair import PairCalibration
-from bodyscan.capture.rig import Volume
-from bodyscan.capture.wanted_stripes import WantedStripes
 from bodyscan.compiled import compiled
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.measuring import measure
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.rig.rig import Volume
+from bodyscan.stripes.wanted_stripes import WantedStripes
 
 Array = NDArray[np.float64]
 

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.pair import PairCalibration
-from bodyscan.capture.views import StripeMap
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
 from bodyscan.geometry.crop import crop_of, ends_of
 from bodyscan.geometry.measuring import measure_image
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.stripes.stripe_map import StripeMap
 
 Floats = NDArray[np.float32]
 

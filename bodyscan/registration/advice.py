@@ -10,7 +10,7 @@ from itertools import combinations
 import networkx as nx
 import numpy as np
 
-from bodyscan.capture.rig import Board, Rig
+from bodyscan.geometry.placing_covariance import point_covariance, position_sigma
 from bodyscan.registration.more_shots import (
     MOST_SHOTS,
     BoardPlace,
@@ -21,8 +21,9 @@ from bodyscan.registration.more_shots import (
 from bodyscan.registration.normal_equations import normal_equations
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import PlacedRig
-from bodyscan.registration.uncertainty import point_covariance, position_sigma
 from bodyscan.registration.view_graph import Target, view_graph
+from bodyscan.rig.board import Board
+from bodyscan.rig.rig import Rig
 
 WORTH = 0.8
 """Further shots that leave more than this share of a sigma are not worth taking."""

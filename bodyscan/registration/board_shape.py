@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.camera import projection_jacobians
+from bodyscan.calibration.located_view import LocatedView
 from bodyscan.geometry.least_squares import cauchy_weights, spread
 from bodyscan.geometry.transforms import rigid_fit
 from bodyscan.registration.disagreement import fit_board
 from bodyscan.registration.full_solve import solve_fully
 from bodyscan.registration.joint_solve import JointSolution
-from bodyscan.registration.located_view import LocatedView
 
 Array = NDArray[np.float64]
 

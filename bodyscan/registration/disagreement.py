@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.camera import projection_jacobians, twist_jacobian
+from bodyscan.calibration.camera import projection_jacobians
+from bodyscan.calibration.located_view import LocatedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.located_view import LocatedView
+from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.view_graph import Target
 
 Array = NDArray[np.float64]

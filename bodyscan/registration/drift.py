@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.camera import projection_jacobians, twist_jacobian
+from bodyscan.calibration.camera import projection_jacobians
+from bodyscan.calibration.located_view import LocatedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.transforms import RigidTransform, adjoint
-from bodyscan.registration.located_view import LocatedView
-from bodyscan.registration.uncertainty import PlacingCovariance, point_covariance
+from bodyscan.geometry.placing_covariance import PlacingCovariance, point_covariance
+from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
 from bodyscan.registration.view_graph import Target
 
 Array = NDArray[np.float64]

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.camera import INTRINSICS
+from bodyscan.calibration.located_view import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.registration.joint_solve import JointSolution
-from bodyscan.registration.located_view import LocatedView
 from bodyscan.registration.normal_equations import LENS, NormalEquations, normal_equations
 
 Array = NDArray[np.float64]

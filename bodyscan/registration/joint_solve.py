@@ -10,10 +10,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from bodyscan.calibration.located_view import LocatedView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.located_view import LocatedView
 from bodyscan.registration.view_graph import Target
 
 Array = NDArray[np.float64]

@@ -10,18 +10,18 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.camera import twist_jacobian
-from bodyscan.capture.boards import corner_points, corners_per_face
-from bodyscan.capture.rig import Board, Volume
+from bodyscan.boards.board import corner_points, corners_per_face
+from bodyscan.calibration.located_view import LocatedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.visibility import in_image
-from bodyscan.registration.located_view import LocatedView
 from bodyscan.registration.normal_equations import (
     NormalEquations,
     normal_equations,
     scaled_inverse,
 )
+from bodyscan.rig.board import Board
+from bodyscan.rig.rig import Volume
 
 Array = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.camera import INTRINSICS, projection_jacobians, twist_jacobian
+from bodyscan.calibration.camera import INTRINSICS, projection_jacobians
+from bodyscan.calibration.located_view import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import cauchy_weights, spread
-from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.located_view import LocatedView
-from bodyscan.registration.uncertainty import PlacingCovariance
+from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.view_graph import Target
 
 Array = NDArray[np.float64]

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bodyscan.capture.rig import Placing, Rig
+from bodyscan.calibration.located_view import board_symmetries
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.located_view import board_symmetries
 from bodyscan.registration.view_graph import Target
+from bodyscan.rig.pair import Placing
+from bodyscan.rig.rig import Rig
 
 
 def nominal_placing(placing: Placing) -> RigidTransform:

@@ -9,19 +9,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.rig import Rig
+from bodyscan.calibration.located_view import LocatedView
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import cauchy_weights, spread
+from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.board_shape import BoardShape, ShapedSolution, with_board_shapes
 from bodyscan.registration.disagreement import error_limit, judge, own_errors
 from bodyscan.registration.full_solve import solve_fully
 from bodyscan.registration.joint_solve import JointSolution, solve_jointly
-from bodyscan.registration.located_view import LocatedView
 from bodyscan.registration.normal_equations import normal_equations
 from bodyscan.registration.rig_frame import frame_board_turn, frame_target, rig_from_root
-from bodyscan.registration.uncertainty import PlacingCovariance
 from bodyscan.registration.view_graph import (
     Target,
     not_together,
@@ -29,6 +28,7 @@ from bodyscan.registration.view_graph import (
     placings,
     view_graph,
 )
+from bodyscan.rig.rig import Rig
 
 LOSS_PX = 0.3
 COARSE_PX = 30.0

@@ -11,9 +11,9 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.calibration.located_view import LocatedView, apart
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.located_view import LocatedView, apart
 
 AGREEMENT_MM = 40.0
 REACH_MM = 1000.0

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from rich.table import Table as ScreenTable
 
-from bodyscan.evaluation.acceptance_run import ALL, Figure, Readings
+from bodyscan.evaluation.acceptance_readings import ALL, Figure, Readings
 from bodyscan.report.page import Column, Lines, Number, Numbers, Page, Section, Table, shown
 
 NO_STANDARD = (

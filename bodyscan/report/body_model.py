@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bodyscan.errors import ScanFailed
-from bodyscan.fusion.body import BodyCloud, BodyMesh
-from bodyscan.fusion.versions import light
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.versions import light
 from bodyscan.report.comparison import Comparison
 from bodyscan.report.model import Layer, Shape, css, ramp_legend
 from bodyscan.report.pictures import FILLED_TINT, _blue_white_red, _turbo

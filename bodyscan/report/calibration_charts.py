@@ -11,11 +11,11 @@ from matplotlib.collections import PolyCollection
 from numpy.typing import NDArray
 
 from bodyscan.calibration.pair import PairCalibration
-from bodyscan.calibration.rig_calibration import RigCalibration
-from bodyscan.calibration.seen_corners import SeenCorners
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
 from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.registration.seen_corners import SeenCorners
 from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, plt, style, svg
 
 Array = NDArray[np.float64]

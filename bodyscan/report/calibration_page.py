@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyscan.calibration.rig_calibration import RigCalibration
-from bodyscan.calibration.storage import FILE_NAME, calibration_id, load_calibration
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.registration.storage import FILE_NAME, calibration_id, load_calibration
 from bodyscan.report import calibration_charts as draw
 from bodyscan.report import calibration_verdict as limits
 from bodyscan.report import charts

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.calibration.coverage import covered
-from bodyscan.calibration.rig_calibration import RigCalibration
-from bodyscan.registration.uncertainty import position_sigma
+from bodyscan.geometry.placing_covariance import position_sigma
+from bodyscan.registration.rig_calibration import RigCalibration
 
 CORNERS_RMS_PX = 0.3
 """Corners are found to less than a tenth of a pixel in sharp, well lit pictures."""

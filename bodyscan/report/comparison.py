@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from bodyscan.errors import BadInput
 from bodyscan.evaluation.surface import Deviation, deviation, signed_distances
-from bodyscan.fusion.body import BodyMesh
 from bodyscan.fusion.storage import FILE_NAME, load_scan
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyMesh
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

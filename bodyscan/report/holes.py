@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.fusion.body import BodyMesh
-from bodyscan.fusion.topology import face_areas, face_components
+from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.topology import face_areas, face_components
 
 WAYS = {
     "front": (1.0, 0.0, 0.0),

@@ -15,8 +15,8 @@ import open3d as o3d
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bodyscan.files import write_bytes
-from bodyscan.fusion.body import BodyCloud, BodyMesh
+from bodyscan.files.atomic import write_bytes
+from bodyscan.mesh.body import BodyCloud, BodyMesh
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bodyscan.calibration import storage as calibrations
 from bodyscan.errors import BadInput
 from bodyscan.fusion import storage as scans
+from bodyscan.registration import storage as calibrations
 from bodyscan.report.page import Page
 
 REMEDY = "give the folder that `bodyscan calibrate-rig` or `bodyscan scan` wrote"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.rig_calibration import RigCalibration
-from bodyscan.registration.uncertainty import point_covariance
+from bodyscan.geometry.placing_covariance import point_covariance
+from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.calibration_charts import line_styles
 from bodyscan.report.model import Layer, Shape, Standpoint, Strokes, pack
 

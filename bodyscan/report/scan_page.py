@@ -14,7 +14,7 @@ from bodyscan.errors import ResultError
 from bodyscan.evaluation.surface import Deviation
 from bodyscan.fusion import verdict as limits
 from bodyscan.fusion.storage import FILE_NAME, SCHEMA, StoredScan, load_scan
-from bodyscan.fusion.topology import topology
+from bodyscan.mesh.topology import topology
 from bodyscan.report import charts
 from bodyscan.report.body_model import layers, light_mesh, shape_of
 from bodyscan.report.comparison import Comparison, compare

@@ -9,13 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.camera import twist_jacobian
-from bodyscan.capture.rig import Volume
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.visibility import in_image
-from bodyscan.registration.uncertainty import PlacingCovariance
 from bodyscan.report.pictures import BACKGROUND, INK, Image, Scale, _bar, _save, _turbo
+from bodyscan.rig.rig import Volume
 
 Array = NDArray[np.float64]
 

@@ -12,11 +12,11 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from bodyscan.capture.rig import Rig
-from bodyscan.capture.rig_file import load_rig
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, silent, threaded
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation import files
 from bodyscan.simulation.layout import TruePair
 from bodyscan.simulation.render import View

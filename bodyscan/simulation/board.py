@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from bodyscan.capture.rig import Board
 from bodyscan.errors import BadInput
+from bodyscan.rig.board import Board
 from bodyscan.simulation.scene import Floats, Surface, grid_surface, grid_triangles
 from bodyscan.simulation.settings import BoardMaking
 

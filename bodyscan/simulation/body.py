@@ -9,7 +9,7 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from bodyscan.errors import BadInput
-from bodyscan.files import replacing
+from bodyscan.files.atomic import replacing
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.simulation.scene import Surface
 from bodyscan.simulation.settings import Person

@@ -12,8 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.captures_file import CapturesFile, ShotEntry, write_captures_file
-from bodyscan.capture.rig import CaptureFolder, Pair, Rig
+from bodyscan.captures.captures_file import CapturesFile, ShotEntry, write_captures_file
+from bodyscan.rig.capture_folder import CaptureFolder
+from bodyscan.rig.pair import Pair
+from bodyscan.rig.rig import Rig
 
 WHEN = datetime(2026, 11, 21, 10, 0, 0)
 """The date written into captures.yaml: always the same, so that the bytes are too."""

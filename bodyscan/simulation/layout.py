@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.rig import Pair, Placing, Rig
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.rig.pair import Pair, Placing
+from bodyscan.rig.rig import Rig
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
 from bodyscan.simulation.settings import Optics, Projection, SimulationSettings

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.rig import FrameNames, ProjectorSpec
+from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.gray import bit_count, code_bits
+from bodyscan.stripes.projector_spec import ProjectorSpec
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bodyscan.capture.rig import Board, Rig
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.rig.board import Board
+from bodyscan.rig.rig import Rig
 from bodyscan.simulation.layout import TruePair
 
 Array = NDArray[np.float64]

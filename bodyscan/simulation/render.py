@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.capture.rig import FrameNames, ProjectorSpec
+from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.gray import LightTable, light_table, table_index
 from bodyscan.simulation.inter_reflection import LitFacets, lit_facets
 from bodyscan.simulation.lamps import Lamps, laser_light
@@ -19,6 +19,7 @@ from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene
 from bodyscan.simulation.sensor import blurred, off_focus, shade, speckled
 from bodyscan.simulation.settings import InterReflection, Optics, Projection
+from bodyscan.stripes.projector_spec import ProjectorSpec
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

@@ -10,12 +10,12 @@ from threading import Lock
 
 import numpy as np
 
-from bodyscan.capture.rig import Rig
-from bodyscan.capture.rig_file import load_rig, write_rig
-from bodyscan.capture.templates import fill
-from bodyscan.files import write_json
+from bodyscan.files.atomic import write_json
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, silent
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig, write_rig
+from bodyscan.rig.templates import fill
 from bodyscan.simulation import body, files
 from bodyscan.simulation.board import make_board
 from bodyscan.simulation.instrument import handed_out

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from bodyscan.boards.view import BoardView
 from bodyscan.calibration.coverage import coverage_notes, covered
-from bodyscan.capture.rig_file import load_rig
-from bodyscan.capture.views import BoardView
+from bodyscan.rig.rig_file import load_rig
 
 
 def corners(left: float, top: float, width: float, height: float) -> np.ndarray:

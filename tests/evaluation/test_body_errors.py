@@ -9,10 +9,10 @@ import open3d as o3d
 import pytest
 
 from bodyscan.evaluation.body import coverage_of_seen, girth_errors, settled
-from bodyscan.fusion.body import BodyMesh
-from bodyscan.fusion.topology import vertex_normals
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.topology import vertex_normals
 
 CAMERA = Camera(300.0, 300.0, 0.0, 160.0, 128.0, 0.0, 0.0, 320, 256)
 

@@ -12,12 +12,12 @@ import pytest
 from bodyscan.errors import FailedWork
 from bodyscan.export.defacing import GREY, deface
 from bodyscan.export.neck import Neck, find_neck
-from bodyscan.export.ply import read_ply_mesh
 from bodyscan.export.scan import export_scan
-from bodyscan.fusion.body import BodyCloud, BodyMesh
 from bodyscan.fusion.storage import StoredScan
-from bodyscan.fusion.topology import topology, vertex_normals
-from bodyscan.fusion.versions import measured_only
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.ply import read_ply_mesh
+from bodyscan.mesh.topology import topology, vertex_normals
+from bodyscan.mesh.versions import measured_only
 
 SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
 

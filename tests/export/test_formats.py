@@ -19,12 +19,12 @@ from bodyscan.errors import BadInput
 from bodyscan.export.exporting import CLOUD_FORMATS, MESH_FORMATS, Origin, export
 from bodyscan.export.glb import write_glb
 from bodyscan.export.obj import write_obj
-from bodyscan.export.ply import read_ply_mesh
 from bodyscan.export.scan import export_scan
 from bodyscan.export.stl import write_stl
 from bodyscan.export.text import fixed, lines, whole
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.ply import read_ply_mesh
 
 ORIGIN = Origin("S-0042", "3f2a")
 

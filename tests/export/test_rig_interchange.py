@@ -7,7 +7,6 @@ import pytest
 from ring import ring_of_cameras, ring_rig
 
 from bodyscan.calibration.pair import PairCalibration, PairQuality
-from bodyscan.calibration.rig_calibration import RigCalibration
 from bodyscan.errors import BadInput
 from bodyscan.export.rig import (
     export_rig,
@@ -16,7 +15,8 @@ from bodyscan.export.rig import (
     write_colmap_rig,
     write_opencv_rig,
 )
-from bodyscan.registration.uncertainty import PlacingCovariance
+from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.registration.rig_calibration import RigCalibration
 
 WRITTEN = {
     "colmap": (write_colmap_rig, read_colmap_rig, "model"),

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from bodyscan.fusion.body import BodyCloud
 from bodyscan.fusion.error_bar import with_placing
+from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.uncertainty import PlacingCovariance
+from bodyscan.mesh.body import BodyCloud
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ import numpy as np
 import open3d as o3d
 from ray_cast_scan import looking, nominal_camera
 
-from bodyscan.capture.rig import Placing
 from bodyscan.fusion.free_space import Guess, seen_through
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.rig.pair import Placing
 
 PLACING = Placing(position_mm=(1500.0, 0.0, 900.0), look_at_mm=(0.0, 0.0, 900.0))
 CAMERA = nominal_camera(320, 256)

@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 
 from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.surface import coverage, deviation, sample_surface, signed_distances
-from bodyscan.fusion.body import BodyCloud
 from bodyscan.fusion.merging import merge
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyCloud
 from bodyscan.reconstruction.range_image import RangeImage
 
 

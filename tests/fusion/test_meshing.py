@@ -10,11 +10,11 @@ import pytest
 from ray_cast_scan import Scan
 
 from bodyscan.errors import ScanFailed
-from bodyscan.evaluation.self_intersections import self_intersections
 from bodyscan.evaluation.surface import deviation, signed_distances
-from bodyscan.fusion.body import BodyCloud, BodyMesh
 from bodyscan.fusion.meshing import mesh, poisson
-from bodyscan.fusion.topology import signed_volume, topology
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.self_intersections import self_intersections
+from bodyscan.mesh.topology import signed_volume, topology
 
 
 def crossings(body: BodyMesh, start: np.ndarray, way: np.ndarray) -> np.ndarray:

@@ -7,9 +7,9 @@ import open3d as o3d
 import pytest
 from scipy.spatial import cKDTree
 
-from bodyscan.fusion.body import BodyCloud
 from bodyscan.fusion.support import Support, settled, support
-from bodyscan.fusion.topology import vertex_normals
+from bodyscan.mesh.body import BodyCloud
+from bodyscan.mesh.topology import vertex_normals
 
 REACH_MM = 4.0
 UP = np.array([0.0, 0.0, 1.0])

@@ -9,14 +9,14 @@ import open3d as o3d
 import pytest
 from ray_cast_scan import Truth, cast_scan, load_body, load_rig, looking, without
 
-from bodyscan.calibration.rig_calibration import RigCalibration
-from bodyscan.capture.rig import Volume
+from bodyscan.alignment.align import AlignmentSettings
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.scan import Scan, ScanSettings, fuse
+from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.registration.alignment import AlignmentSettings
-from bodyscan.registration.uncertainty import PlacingCovariance
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.rig.rig import Volume
 
 RIG = load_rig()
 SETTINGS = ScanSettings(

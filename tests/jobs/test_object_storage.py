@@ -11,7 +11,7 @@ import pytest
 from cheap_batch import results, run_cheap
 from typer.testing import CliRunner
 
-from bodyscan.cli import app
+from bodyscan.cli.main import app
 from bodyscan.errors import BadInput
 from bodyscan.jobs.batch import finish, here, run_batch
 from bodyscan.jobs.object_storage import (

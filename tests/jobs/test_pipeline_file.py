@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from bodyscan.alignment.align import AlignmentSettings
 from bodyscan.fusion.scan import ScanSettings
 from bodyscan.jobs.pipeline import (
     SECTIONS,
@@ -18,7 +19,6 @@ from bodyscan.jobs.pipeline import (
     PipelineError,
     load_pipeline,
 )
-from bodyscan.registration.alignment import AlignmentSettings
 
 PIPELINES = sorted((Path(__file__).parents[2] / "pipelines").glob("*.yaml"))
 FUSE = next(path for path in PIPELINES if path.stem == "fuse")

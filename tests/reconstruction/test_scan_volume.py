@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_range_images import CAMERA, STRIPES, pair, planes, stripe_map
+from test_triangulation import CAMERA, STRIPES, pair, planes, stripe_map
 
-from bodyscan.capture.rig import Volume
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.measuring import measure_image
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.scan_volume import LAYER_MM, MARGIN_MM, passage, stripes_in_volume
+from bodyscan.rig.rig import Volume
 
 VOLUME = Volume(radius_mm=120.0, bottom_mm=-100.0, top_mm=150.0)
 

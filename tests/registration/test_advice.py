@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
-from bodyscan.capture.boards import corner_points, corners_per_face
+from bodyscan.boards.board import corner_points, corners_per_face
+from bodyscan.calibration.located_view import LocatedView
+from bodyscan.geometry.placing_covariance import position_sigma
 from bodyscan.registration.advice import advise, crucial_shots
-from bodyscan.registration.located_view import LocatedView
 from bodyscan.registration.normal_equations import normal_equations, scaled_inverse
 from bodyscan.registration.rig_solve import place_rig
-from bodyscan.registration.uncertainty import position_sigma
 
 NOISE_PX = 0.03
 

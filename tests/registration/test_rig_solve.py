@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
-from bodyscan.capture.rig import Board, Placing, RigFrame
 from bodyscan.errors import RigDisconnected
+from bodyscan.geometry.placing_covariance import position_sigma
 from bodyscan.registration.rig_solve import place_rig
-from bodyscan.registration.uncertainty import position_sigma
+from bodyscan.rig.board import Board
+from bodyscan.rig.pair import Placing
+from bodyscan.rig.rig_frame import RigFrame
 
 
 def centre_errors(placed, placings):

@@ -11,11 +11,11 @@ import pytest
 from ring import ring_of_cameras, ring_rig
 
 from bodyscan.calibration.pair import PairCalibration, PairQuality
-from bodyscan.calibration.rig_calibration import RigCalibration
-from bodyscan.calibration.seen_corners import SeenCorners
-from bodyscan.calibration.storage import load_calibration, save_calibration
+from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.uncertainty import PlacingCovariance
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.registration.seen_corners import SeenCorners
+from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.report.calibration_charts import shared_boards
 from bodyscan.report.calibration_page import calibration_page
 from bodyscan.report.calibration_verdict import judge

@@ -10,8 +10,8 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from bodyscan.fusion.body import BodyCloud, BodyMesh
-from bodyscan.fusion.topology import vertex_normals
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.topology import vertex_normals
 from bodyscan.report.pictures import View, draw_cloud, draw_deviation, draw_mesh, round_ticks
 
 RADIUS = 100.0

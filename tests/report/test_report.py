@@ -16,9 +16,9 @@ from browser import browser_page, find_browser
 from made_scan import MIDDLE_MM, SEMI_AXES_MM, MadeScan, egg, make_scan
 from typer.testing import CliRunner
 
-from bodyscan.cli import app
+from bodyscan.cli.main import app
 from bodyscan.errors import BadInput, ResultError
-from bodyscan.files import write_json
+from bodyscan.files.atomic import write_json
 from bodyscan.jobs.forgetting import find
 from bodyscan.report.comparison import compare
 from bodyscan.report.holes import holes

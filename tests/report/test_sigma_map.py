@@ -3,11 +3,11 @@ import numpy as np
 import pytest
 from ring import ring_of_cameras
 
-from bodyscan.capture.rig import Volume
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.visibility import in_image
-from bodyscan.registration.uncertainty import PlacingCovariance
 from bodyscan.report.sigma_map import draw_sigma_map, sigma_at
+from bodyscan.rig.rig import Volume
 
 MIDDLE = np.array([[0.0, 0.0, 1000.0]])
 

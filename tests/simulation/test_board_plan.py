@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyscan.capture.rig import Rig
-from bodyscan.capture.rig_file import load_rig
 from bodyscan.errors import BadInput
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation.layout import TruePair, build_pairs
 from bodyscan.simulation.plan import BoardShot, default_shots, plan_boards
 from bodyscan.simulation.settings import SimulationSettings

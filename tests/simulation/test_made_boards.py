@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from bodyscan.capture.rig import Board
 from bodyscan.errors import BadInput
+from bodyscan.rig.board import Board
 from bodyscan.simulation.board import board_print, make_board
 from bodyscan.simulation.settings import BoardMaking
 

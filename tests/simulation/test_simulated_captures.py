@@ -13,8 +13,8 @@ import open3d as o3d
 import pytest
 import yaml
 
-from bodyscan.capture.rig_file import load_rig
 from bodyscan.errors import BadInput
+from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation import SimulationSettings, settings_for, simulate
 from bodyscan.simulation.body import draw_sways, load_subject
 from bodyscan.simulation.settings import Person

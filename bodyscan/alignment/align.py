@@ -1,0 +1,238 @@
+"""Range images brought together where they overlap, the boards' solution and covariance as prior.
+
+A multiway ICP: matches between all pairs, then one solve for the small motions of all of them
+together with the prior, so the ring closes and only what the boards leave open is improved.  Pairs
+without overlap stay where the boards put them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from itertools import permutations
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.alignment.matching import (
+    Matches,
+    Patch,
+    match_nearest,
+    match_projected,
+    patch,
+)
+from bodyscan.alignment.pull import Pull
+from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.transforms import RigidTransform, adjoint
+from bodyscan.reconstruction.range_image import RangeImage
+
+Array = NDArray[np.float64]
+Result = TypeVar("Result")
+
+BODY_CENTRE_MM = np.array([0.0, 0.0, 900.0])
+COARSE = 4  # only one in so many points takes part
+FINE_ROUNDS = 2  # at the end, with all of them
+UNKNOWN = 0, float("nan")
+SWAY_ROOM = 1.5  # standard deviations are believed this much larger than what was found
+
+
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """matching: `projected` (into the other camera's pixel grid) or `nearest` (Open3D's ICP).
+
+    spacing_mm: of the points that take part.  reach_mm: farthest match, halved each round down to
+    `least_reach_mm`.  fewest: matches below which two pairs do not count as overlapping.
+    sway_mm, sway_deg: how far a subject is believed to move between pairs (standard deviations; a
+    rotation about the body's centre); 0 for a rigid object.  Each round believes what the last one
+    found, from `least_sway` to `most_sway` times that.  limit_sigmas: a pair that wants to move
+    farther than this many standard deviations, most_sway taken, stays where it was.
+    correlated: neighbouring points share their errors, so many count as one.
+    """
+
+    matching: Literal["projected", "nearest"] = "projected"
+    spacing_mm: float = 3.0
+    reach_mm: float = 12.0
+    least_reach_mm: float = 3.0
+    rounds: int = 5
+    fewest: int = 30
+    sway_mm: float = 1.0
+    sway_deg: float = 0.05
+    least_sway: float = 0.3
+    most_sway: float = 4.0
+    limit_sigmas: float = 5.0
+    correlated: float = 5.0
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """source and target pairs, about how many points they share, and how far apart those lie before
+    and after, mm.
+    """
+
+    source: str
+    target: str
+    points: int
+    rms_before_mm: float
+    rms_after_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """rig_from_camera after alignment; motion_mm of each pair at the body's centre; pairs refused
+    because they wanted to move farther than the prior allows, in sigmas; overlaps.
+    """
+
+    rig_from_camera: dict[str, RigidTransform]
+    motion_mm: dict[str, float]
+    refused: dict[str, float]
+    overlaps: tuple[Overlap, ...]
+
+    @property
+    def rms_before_mm(self) -> float:
+        return _pooled([(o.points, o.rms_before_mm) for o in self.overlaps])
+
+    @property
+    def rms_after_mm(self) -> float:
+        return _pooled([(o.points, o.rms_after_mm) for o in self.overlaps])
+
+
+def align(
+    images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    prior: PlacingCovariance,
+    settings: AlignmentSettings = AlignmentSettings(),
+    *,
+    workers: int = 2,
+) -> Alignment:
+    """Small motions of all range images that bring their overlaps together."""
+    names = [image.pair for image in images]
+    start = [rig_from_camera[name] for name in names]
+    motion = np.zeros((len(names), 6))
+    reach, sway = settings.reach_mm, 1.0
+    pull = partial(Pull.of, correlated=settings.correlated)
+    with ThreadPoolExecutor(workers) as pool:
+        patches = list(pool.map(lambda image: patch(image, settings.spacing_mm), images))
+        coarse = [p.thinned(COARSE) for p in patches]
+        for left in range(settings.rounds, 0, -1):
+            moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
+            taken = patches if left <= FINE_ROUNDS else coarse
+            pulls = _of_overlaps(pull, pool, taken, moved, reach, settings)
+            motion = _solve(pulls, motion, _prior(names, prior, settings, sway))
+            reach, sway = max(reach / 2.0, settings.least_reach_mm), _sway_of(motion, settings)
+        widest = _prior(names, prior, settings, settings.most_sway)
+        motion, refused = _bounded(names, motion, widest, settings.limit_sigmas)
+        moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
+        # Both with the same reach, so that they can be compared.
+        was, now = (
+            _of_overlaps(_gap, pool, coarse, placings, settings.least_reach_mm, settings)
+            for placings in (start, moved)
+        )
+    shift = np.linalg.norm(_shifts(motion), axis=1)
+    return Alignment(
+        dict(zip(names, moved, strict=True)),
+        dict(zip(names, shift.tolist(), strict=True)),
+        refused,
+        tuple(
+            Overlap(names[i], names[j], COARSE * count, was.get((i, j), UNKNOWN)[1], rms_mm)
+            for (i, j), (count, rms_mm) in now.items()
+        ),
+    )
+
+
+def _of_overlaps(
+    measure: Callable[[Matches], Result],
+    pool: ThreadPoolExecutor,
+    patches: Sequence[Patch],
+    placings: Sequence[RigidTransform],
+    reach_mm: float,
+    settings: AlignmentSettings,
+) -> dict[tuple[int, int], Result]:
+    """What the matches of every two pairs say, if they are enough; both ways, so that what one way
+    gets wrong on curves cancels."""
+    match = match_projected if settings.matching == "projected" else match_nearest
+
+    def of_two(both: tuple[int, int]) -> Result | None:
+        i, j = both
+        matches = match(patches[i], patches[j], placings[i], placings[j], reach_mm)
+        return measure(matches) if len(matches.distances) >= settings.fewest else None
+
+    every_two = list(permutations(range(len(patches)), 2))
+    found = zip(every_two, pool.map(of_two, every_two), strict=True)
+    return {both: said for both, said in found if said is not None}
+
+
+def _gap(matches: Matches) -> tuple[int, float]:
+    """How many matches, and their RMS distance, mm."""
+    return len(matches.distances), float(np.sqrt(np.mean(matches.distances**2)))
+
+
+def _solve(pulls: Mapping[tuple[int, int], Pull], motion: Array, covariance: Array) -> Array:
+    """Motions (P, 6), one Gauss-Newton step: matches pull together, the prior holds near zero."""
+    normal = np.linalg.inv(covariance)
+    right = np.zeros(motion.size)
+    for (a, b), pull in pulls.items():
+        i, j = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
+        # The distance left after the step: d + J (x_i - m_i) - J (x_j - m_j).
+        wanted = pull.information @ (motion[a] - motion[b]) - pull.gradient
+        normal[i, i] += pull.information
+        normal[j, j] += pull.information
+        normal[i, j] -= pull.information
+        normal[j, i] -= pull.information
+        right[i] += wanted
+        right[j] -= wanted
+    return np.linalg.solve(normal, right).reshape(-1, 6)
+
+
+def _shifts(motion: Array) -> Array:
+    """(P, 3) mm: how far motions (P, 6) carry the body's centre."""
+    return motion[:, 3:] + np.cross(motion[:, :3], BODY_CENTRE_MM)
+
+
+def _sway_of(motion: Array, settings: AlignmentSettings) -> float:
+    """How much the subject moved, in multiples of settings.sway_mm, within its bounds.
+
+    A prior too tight would leave a part of the sway in; too wide it would let noise in.
+    """
+    if not settings.sway_mm:
+        return 1.0
+    found = float(np.sqrt(np.mean(_shifts(motion) ** 2))) / settings.sway_mm
+    return float(np.clip(SWAY_ROOM * found, settings.least_sway, settings.most_sway))
+
+
+def _prior(
+    names: Sequence[str], prior: PlacingCovariance, settings: AlignmentSettings, sway: float
+) -> Array:
+    """(6P, 6P): the calibration's covariance, plus for each pair a sway about the body's centre of
+    `sway` times what the settings say.
+    """
+    order = np.concatenate([6 * prior.names.index(name) + np.arange(6) for name in names])
+    rotation, translation = sway * np.radians(settings.sway_deg), sway * settings.sway_mm
+    own = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
+    carry = adjoint(RigidTransform(np.eye(3), BODY_CENTRE_MM))
+    each = np.kron(np.eye(len(names)), carry @ own @ carry.T)
+    return prior.matrix[np.ix_(order, order)] + each
+
+
+def _bounded(
+    names: Sequence[str], motion: Array, covariance: Array, limit: float
+) -> tuple[Array, dict[str, float]]:
+    """Put pairs back that moved more than `limit` sigmas of their own prior (six freedoms)."""
+    kept, refused = motion.copy(), {}
+    for k, name in enumerate(names):
+        block = covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
+        sigmas = float(np.sqrt(motion[k] @ np.linalg.solve(block, motion[k]) / 6.0))
+        if sigmas > limit:
+            refused[name] = sigmas
+            kept[k] = 0.0
+    return kept, refused
+
+
+def _pooled(parts: Sequence[tuple[int, float]]) -> float:
+    known = [(points, rms) for points, rms in parts if np.isfinite(rms)]
+    total = sum(points for points, _ in known)
+    if not total:
+        return float("nan")
+    return float(np.sqrt(sum(points * rms**2 for points, rms in known) / total))

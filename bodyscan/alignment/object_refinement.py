@@ -1,0 +1,64 @@
+"""The rig's placing refined on a rigid object that its pairs scanned: ICP with the boards as prior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from bodyscan.alignment.align import Alignment, AlignmentSettings, align
+from bodyscan.errors import FailedWork
+from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.reconstruction.range_image import RangeImage
+
+STILL = AlignmentSettings(sway_mm=0.0, sway_deg=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectRefinement:
+    """alignment: what the object's overlaps asked for.  rig_from_camera: of all pairs; those that
+    saw nothing of it, or wanted to move farther than the boards allow, stay where they were."""
+
+    alignment: Alignment
+    rig_from_camera: dict[str, RigidTransform]
+
+    @property
+    def better(self) -> bool:
+        """Whether the overlaps lie closer together than before."""
+        return self.alignment.rms_after_mm < self.alignment.rms_before_mm
+
+    @property
+    def lines(self) -> list[str]:
+        """Before and after, and who moved."""
+        found = self.alignment
+        said = [
+            f"{len(found.overlaps)} overlaps: {found.rms_before_mm:.3f} mm RMS before, "
+            f"{found.rms_after_mm:.3f} after"
+        ]
+        if found.motion_mm:
+            farthest = max(sorted(found.motion_mm), key=lambda name: found.motion_mm[name])
+            said.append(f"farthest moved: {farthest}, {found.motion_mm[farthest]:.3f} mm")
+        said += [
+            f"{name} wanted to move by {sigmas:.1f} sigmas of what the boards allow: left where it is"
+            for name, sigmas in sorted(found.refused.items())
+        ]
+        return said
+
+
+def refine_on_object(
+    images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    prior: PlacingCovariance,
+    settings: AlignmentSettings = STILL,
+) -> ObjectRefinement:
+    """images: one object that stood still while all pairs scanned it, its background cut away.
+
+    Raises FailedWork if no two pairs saw the same part of it.
+    """
+    found = align(images, rig_from_camera, prior, replace(settings, sway_mm=0.0, sway_deg=0.0))
+    if not found.overlaps:
+        raise FailedWork(
+            "no two pairs see the same part of the object",
+            remedy="take a larger object, or put it where the pairs look",
+        )
+    return ObjectRefinement(found, dict(rig_from_camera) | found.rig_from_camera)

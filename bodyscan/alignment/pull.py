@@ -1,0 +1,60 @@
+"""How hard, and where to, the matches of one overlap pull two pairs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.alignment.matching import Matches
+from bodyscan.compiled import compiled
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Pull:
+    """information (6, 6) = J^T W J and gradient (6,) = J^T W d, d the distances of matches and J
+    their Jacobian by the source's motion; the target's motion has the opposite effect."""
+
+    information: Array
+    gradient: Array
+
+    @staticmethod
+    def of(matches: Matches, correlated: float) -> Pull:
+        """Distances far beyond their own spread count for little (Cauchy); `correlated` of them
+        count as one."""
+        information, gradient = np.zeros((6, 6)), np.zeros(6)
+        distances = matches.distances
+        spread = max(1.4826 * float(np.median(np.abs(distances))), 0.01)
+        spots = (matches.points, matches.normals, distances, matches.sigma_mm)
+        _accumulate(*spots, spread, information, gradient)
+        return Pull(information / correlated, gradient / correlated)
+
+
+@compiled
+def _accumulate(
+    points: Array,
+    normals: Array,
+    distances: Array,
+    sigma_mm: Array,
+    spread_mm: float,
+    information: Array,
+    gradient: Array,
+) -> None:
+    """Adds M distances (M,) along normals (M, 3) at points (M, 3) to the normal equations."""
+    jacobian = np.empty(6)
+    for n in range(len(distances)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        a, b, c = normals[n, 0], normals[n, 1], normals[n, 2]
+        jacobian[0], jacobian[1], jacobian[2] = y * c - z * b, z * a - x * c, x * b - y * a
+        jacobian[3], jacobian[4], jacobian[5] = a, b, c
+        variance = sigma_mm[n] ** 2 + spread_mm**2
+        # Cauchy's weight, 1 / (1 + (d / 2 sigma)^2), over sigma^2.
+        weight = 1.0 / (variance + 0.25 * distances[n] ** 2)
+        for i in range(6):
+            weighted = weight * jacobian[i]
+            gradient[i] += weighted * distances[n]
+            for j in range(6):
+                information[i, j] += weighted * jacobian[j]

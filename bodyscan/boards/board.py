@@ -1,0 +1,111 @@
+"""What a calibration board looks like: where its corners and its markers lie.
+
+Board frame (mm): origin at the outer corner of the checkered area's first square, x along the
+columns, y along the rows (down, as printed), z away from whoever looks at the front.
+
+A back is a print of its own, turned over about the board's vertical axis: whoever walks round
+the board sees it upright. A point (xb, yb) of the back print lies at
+(columns * square - xb, yb, thickness) in the board frame.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.errors import BadInput
+from bodyscan.rig.board import Board
+
+Array = NDArray[np.float64]
+
+
+def corners_per_face(board: Board) -> int:
+    """Number of inner corners of one face."""
+    return (board.columns - 1) * (board.rows - 1)
+
+
+def corner_points(board: Board) -> Array:
+    """Inner corners in the board frame, (N, 3) mm, or (2N, 3) for a board with two faces.
+
+    Corner id r * (columns - 1) + c is the crossing of column line c + 1 and row line r + 1; the
+    back's corners, numbered likewise on its own print, follow the front's.
+    """
+    column, row = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
+    printed = board.square_mm * np.stack([column.ravel(), row.ravel()], axis=-1).astype(float)
+    return np.concatenate([points_from_print(board, printed, face) for face in range(board.faces)])
+
+
+def points_from_print(board: Board, printed: Array, face: int) -> Array:
+    """Points (..., 2) mm of a face's print (0 front, 1 back) in the board frame, (..., 3) mm."""
+    x, y = printed[..., 0], printed[..., 1]
+    if face == 0:
+        return np.stack([x, y, np.zeros_like(x)], axis=-1)
+    return np.stack(
+        [board.columns * board.square_mm - x, y, np.full_like(x, board.thickness_mm)], axis=-1
+    )
+
+
+def outline(board: Board, face: int = 0) -> Array:
+    """The face's rim, margin included, (4, 3) mm in the board frame.
+
+    Clockwise for whoever looks at that face, from its first square on.
+    """
+    low = -board.margin_mm
+    right = board.columns * board.square_mm + board.margin_mm
+    bottom = board.rows * board.square_mm + board.margin_mm
+    printed = np.array([[low, low], [right, low], [right, bottom], [low, bottom]])
+    return points_from_print(board, printed, face)
+
+
+def marker_dictionary(board: Board) -> cv2.aruco.Dictionary:
+    """The ArUco dictionary of a ChArUco board. Raises BadInput for an unknown name."""
+    number = getattr(cv2.aruco, board.dictionary, None)
+    if not board.dictionary.startswith("DICT_") or not isinstance(number, int):
+        raise BadInput(
+            f"unknown marker dictionary {board.dictionary!r}",
+            where=f"board {board.name}",
+            remedy="use one of OpenCV's names, such as DICT_4X4_1000",
+        )
+    return cv2.aruco.getPredefinedDictionary(number)
+
+
+def charuco_face(board: Board, face: int = 0) -> cv2.aruco.CharucoBoard:
+    """OpenCV's description of one face. The back's marker ids follow the front's.
+
+    Raises BadInput if marker_mm is missing or too large, or the dictionary has too few markers.
+    """
+    where = f"board {board.name}"
+    if board.marker_mm is None or not board.marker_mm < board.square_mm:
+        raise BadInput("a charuco board needs marker_mm, smaller than square_mm", where=where)
+    dictionary = marker_dictionary(board)
+    count = markers_per_face(board)
+    first = board.first_marker + face * count
+    if first + count > len(dictionary.bytesList):
+        raise BadInput(
+            f"{board.dictionary} has {len(dictionary.bytesList)} markers, too few for ids "
+            f"{first} to {first + count - 1}",
+            where=where,
+            remedy="choose a larger dictionary or a smaller first_marker",
+        )
+    size = (board.columns, board.rows)
+    ids = np.arange(first, first + count)
+    charuco = cv2.aruco.CharucoBoard(size, board.square_mm, board.marker_mm, dictionary, ids)
+    charuco.setLegacyPattern(board.legacy_layout)
+    return charuco
+
+
+def markers_per_face(board: Board) -> int:
+    """Number of markers of one face of a ChArUco board: one in each white square."""
+    squares = board.columns * board.rows
+    return squares // 2
+
+
+def marker_corners(board: Board, face: int = 0) -> tuple[NDArray[np.int64], Array]:
+    """Marker ids (M,) and their four corners on the face's print, (M, 4, 2) mm.
+
+    Corners clockwise as printed, from the marker's own top left, as OpenCV's detector gives them.
+    """
+    charuco = charuco_face(board, face)
+    corners = np.asarray(charuco.getObjPoints(), float).reshape(-1, 4, 3)[..., :2]
+    return np.asarray(charuco.getIds(), np.int64).ravel(), corners

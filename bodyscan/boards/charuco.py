@@ -1,0 +1,133 @@
+"""ChArUco boards: their markers say roughly where corners are, the corners' saddles say exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.boards import board as boards
+from bodyscan.boards.board_map import BoardMap, fit_board_map
+from bodyscan.boards.corners import SightedCorners, refine_corners
+from bodyscan.rig.board import Board
+
+Array = NDArray[np.float64]
+
+MIN_CORNERS = 4
+MIN_CORNERS_FOR_LENS = 12
+RANSAC_SHARE_OF_SQUARE = 0.15
+ROUNDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Markers:
+    """ids: (M,) int64.  corners: (M, 4, 2) float64 px, from each marker's top left, clockwise."""
+
+    ids: NDArray[np.int64]
+    corners: Array
+
+
+def detect_markers(image: NDArray[np.uint8], board: Board) -> Markers:
+    """All markers of the board's dictionary in the image (H, W)."""
+    detector = cv2.aruco.ArucoDetector(boards.marker_dictionary(board), _parameters())
+    corners, ids, _ = detector.detectMarkers(image)
+    if ids is None or len(ids) == 0:
+        return Markers(np.empty(0, np.int64), np.empty((0, 4, 2)))
+    corners = np.asarray([np.reshape(corner, (4, 2)) for corner in corners], float)
+    return Markers(np.asarray(ids, np.int64).ravel(), corners)
+
+
+def _parameters() -> cv2.aruco.DetectorParameters:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerPerimeterRate = 0.01
+    return parameters
+
+
+def locate_charuco(
+    image: NDArray[np.uint8], board: Board, markers: Markers
+) -> SightedCorners | None:
+    """The board's corners beside the markers seen, of the face that shows more of them."""
+    found = [_locate_face(image, board, face, markers) for face in range(board.faces)]
+    seen = [corners for corners in found if corners is not None]
+    return max(seen, key=lambda corners: len(corners.ids), default=None)
+
+
+def _locate_face(
+    image: NDArray[np.uint8], board: Board, face: int, markers: Markers
+) -> SightedCorners | None:
+    face_ids, printed = boards.marker_corners(board, face)
+    _, seen, of_face = np.intersect1d(markers.ids, face_ids, return_indices=True)
+    if len(seen) < 2:
+        return None
+    fit = _fit_markers(printed[of_face], markers.corners[seen], board)
+    if fit is None:
+        return None
+    board_map, inliers = fit
+    nearby = _corners_beside(board, printed[of_face[inliers]].mean(axis=1))
+    if len(nearby) < MIN_CORNERS:
+        return None
+    pixels, good = _refine(image, board, board_map, nearby, printed)
+    ids = nearby[good] + face * boards.corners_per_face(board)
+    return SightedCorners(ids, pixels[good], boards.corners_per_face(board))
+
+
+def _refine(
+    image: NDArray[np.uint8],
+    board: Board,
+    board_map: BoardMap,
+    corner_ids: NDArray[np.int64],
+    markers: Array,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Corners fitted where the markers say they are; then, as corners say it better than
+    markers, once more where the corners found say that those not found must be."""
+    points = boards.corner_points(board.model_copy(update={"faces": 1}))[corner_ids, :2]
+    gap = (1.0 - (board.marker_mm or 0.0) / board.square_mm) / 2.0
+    marked = np.floor(markers[0].mean(axis=0) / board.square_mm).astype(int).sum()
+    row, column = np.divmod(corner_ids, board.columns - 1)
+    bright_diagonal = (row + column + marked) % 2 == 0
+
+    def refine(at: BoardMap) -> tuple[Array, NDArray[np.bool_]]:
+        along = board.square_mm * at.jacobian(points)
+        return refine_corners(image, at.apply(points), along, bright_diagonal, marker_gap=gap)
+
+    pixels, good = refine(board_map)
+    if good.sum() >= MIN_CORNERS_FOR_LENS:
+        again, good_again = refine(fit_board_map(points[good], pixels[good]))
+        pixels = np.where(good[:, None], pixels, again)
+        good = good | good_again
+    return pixels, good
+
+
+def _fit_markers(
+    printed: Array, corners: Array, board: Board
+) -> tuple[BoardMap, NDArray[np.bool_]] | None:
+    """Where the print appears, and which markers (M,) agree on it; None if no two do.
+
+    A homography picks those that agree; a lens that bends the board's far parts away from it is
+    followed in a few rounds.
+    """
+    size = np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
+    tolerance = max(2.0, RANSAC_SHARE_OF_SQUARE * size * board.square_mm / (board.marker_mm or 1))
+    points, pixels = printed.reshape(-1, 2), corners.reshape(-1, 2)
+    _, mask = cv2.findHomography(points, pixels, cv2.RANSAC, tolerance)
+    if mask is None:
+        return None
+    agree = mask.reshape(-1, 4).all(axis=1)
+    for _ in range(ROUNDS):
+        if agree.sum() < 2:
+            return None
+        board_map = fit_board_map(printed[agree].reshape(-1, 2), corners[agree].reshape(-1, 2))
+        error = np.linalg.norm(board_map.apply(printed) - corners, axis=-1)
+        agree = (error < tolerance).all(axis=1)
+    return (board_map, agree) if agree.sum() >= 2 else None
+
+
+def _corners_beside(board: Board, centres: Array) -> NDArray[np.int64]:
+    """Ids, on one face, of the inner corners that touch squares with these centres (M, 2) mm."""
+    square = np.floor(centres / board.square_mm).astype(int)
+    column = (square[:, 0, None] + np.array([-1, 0, -1, 0])).ravel()
+    row = (square[:, 1, None] + np.array([-1, -1, 0, 0])).ravel()
+    inside = (column >= 0) & (column < board.columns - 1) & (row >= 0) & (row < board.rows - 1)
+    return np.unique(row[inside] * (board.columns - 1) + column[inside]).astype(np.int64)

@@ -1,0 +1,27 @@
+"""A board as one camera saw it: which of its corners lie where in the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """A board as one camera saw it in one shot.
+
+    corner_ids: (N,) int, index into `boards.corner_points(board)` (front face first, then back).
+    pixels: (N, 2) float64, real image coordinates, px.
+    turnable: the detector may have numbered this board from its other end.
+    """
+
+    pair: str
+    shot: str
+    board: str
+    corner_ids: NDArray[np.int64]
+    pixels: Array
+    turnable: bool = False

@@ -1,0 +1,71 @@
+"""A board seen by one calibrated camera: what registration works on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.rig.board import Board
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedView:
+    """points (N, 3) of the board's frame seen at pixels (N, 2) by `pair`, with the pose they give.
+
+    alternatives: every `board_from_seen` under which the board looks the same to the detector
+    (identity first): a plain board may be numbered from its other end, or seen from its back.
+    """
+
+    pair: str
+    shot: str
+    board: str
+    points: Array
+    pixels: Array
+    camera_from_board: RigidTransform
+    alternatives: tuple[RigidTransform, ...] = (RigidTransform.identity(),)
+
+    @property
+    def target(self) -> tuple[str, str]:
+        """(shot, board): what several cameras may see at once."""
+        return self.shot, self.board
+
+    @property
+    def ambiguous(self) -> bool:
+        return len(self.alternatives) > 1
+
+    def resolved(self, board_from_seen: RigidTransform) -> LocatedView:
+        """The same view with one of its alternatives taken for true."""
+        return replace(
+            self,
+            points=board_from_seen.apply(self.points),
+            camera_from_board=self.camera_from_board @ board_from_seen.inverse(),
+            alternatives=(RigidTransform.identity(),),
+        )
+
+
+def apart(a: RigidTransform, b: RigidTransform, reach_mm: float) -> float:
+    """How far two transforms differ, mm: translation, plus rotation acting at `reach_mm`."""
+    difference = a.inverse() @ b
+    return float(np.linalg.norm(difference.translation) + difference.angle * reach_mm)
+
+
+def board_symmetries(board: Board) -> tuple[RigidTransform, ...]:
+    """Every `board_from_seen` under which a plain board looks the same to the detector.
+
+    From its other end (unless the colour of its first square tells), and from its back.
+    """
+    width, height = board.columns * board.square_mm, board.rows * board.square_mm
+    found = [RigidTransform.identity()]
+    if (board.columns + board.rows) % 2 == 0:
+        found.append(RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.array([width, height, 0.0])))
+    if board.faces == 2:
+        turned_over = RigidTransform(
+            np.diag([-1.0, 1.0, -1.0]), np.array([width, 0.0, board.thickness_mm])
+        )
+        found += [turned_over @ symmetry for symmetry in found]
+    return tuple(found)

@@ -1,0 +1,229 @@
+"""Look a rig file and its captures over in a moment: nothing is decoded, nothing heavy imported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+from bodyscan.captures.folder import Captures, Sequence, join, open_folder, open_scan
+from bodyscan.captures.image_faults import header_fault
+from bodyscan.captures.strangers import strange_images
+from bodyscan.errors import CaptureError
+from bodyscan.files.model import did_you_mean
+from bodyscan.rig.pair import Pair
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig
+
+FEWEST_SHOTS = 3
+ENOUGH_SHOTS = 6
+MANY_SHOTS = 3
+"""Where more shots than this have the same fault, they share a line."""
+_READERS = 8  # waiting for a disk or a server, not computing
+
+
+@dataclass(frozen=True)
+class BadImage:
+    """An image that is missing or cannot be used, and why."""
+
+    path: Path
+    pair: str
+    shot: str
+    what: str
+
+
+@dataclass(frozen=True)
+class PairCount:
+    """How many shots of the calibration captures a pair took part in, all images being right."""
+
+    pair: str
+    pole: str | None
+    stripe_shots: int
+    lit_shots: int
+    images: int
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What `check` found. `errors`: what must be mended besides images; `warnings`: what may be.
+
+    bad_images: missing or unusable, by pair, then shot. images: how many were looked at.
+    """
+
+    rig_path: Path
+    rig: Rig
+    folders: tuple[Path, ...]
+    shots: tuple[str, ...]
+    images: int
+    pairs: tuple[PairCount, ...]
+    bad_images: tuple[BadImage, ...]
+    errors: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether calibration can start."""
+        return not (self.bad_images or self.errors)
+
+
+def check(rig_path: Path, scans: Iterable[Path] = ()) -> CheckReport:
+    """Check a rig file, the calibration captures it names, and scan folders if any are given.
+
+    Raises RigFileError when the rig file is wrong: then nothing else can be looked at.
+    """
+    rig = load_rig(rig_path)
+    errors: list[str] = []
+    parts = [_attempt(errors, open_folder, rig, rig_path, entry) for entry in rig.calibration]
+    opened = tuple(part for part in parts if part is not None)
+    calibration = _attempt(errors, join, opened) if opened else None
+    scanned = [_attempt(errors, open_scan, rig, Path(scan)) for scan in scans]
+    captures = [part for part in (calibration, *scanned) if part is not None]
+
+    sequences = [sequence for part in captures for sequence in part.sequences]
+    with ThreadPoolExecutor(_READERS) as pool:
+        bad_of = dict(pool.map(lambda s: (s, _bad_images(rig, s)), sequences))
+    good = [s for s in (calibration.sequences if calibration else ()) if not bad_of[s]]
+    counts = tuple(_count(pair, good) for pair in rig.pairs)
+    place = {pair.name: index for index, pair in enumerate(rig.pairs)}
+    bad = sorted((bad for found in bad_of.values() for bad in found), key=lambda b: place[b.pair])
+    for part in captures:
+        errors += [f"{part.folders[0]}: shot {shot}: no image" for shot in _empty_shots(part)]
+    if calibration:
+        errors += _frame_errors(calibration)
+        errors += filter(None, map(_too_few, rig.pairs, counts))
+    warnings = [] if rig.calibration else [f"{rig_path}: names no calibration captures"]
+    warnings += filter(None, map(_strangers, captures))
+    warnings += filter(None, map(_few, rig.pairs, counts)) if calibration else ()
+    return CheckReport(
+        rig_path=Path(rig_path),
+        rig=rig,
+        folders=tuple(folder for part in captures for folder in part.folders),
+        shots=calibration.shots if calibration else (),
+        images=sum(len(sequence.paths) for sequence in sequences),
+        pairs=counts,
+        bad_images=tuple(bad),
+        errors=tuple(errors),
+        warnings=tuple(warnings),
+    )
+
+
+def report_lines(report: CheckReport) -> list[str]:
+    """The report as lines of text; bad images grouped by pair, shot and what is wrong."""
+    rig = report.rig
+    lines = [
+        f"{report.rig_path}: rig {rig.name}: {_several(len(rig.pairs), 'pair')},"
+        f" {_several(len(rig.boards), 'board')}"
+    ]
+    shots = _several(len(report.shots), "calibration shot")
+    lines += [f"{folder}" for folder in report.folders]
+    lines.append(f"{shots}, {_several(report.images, 'image')}")
+    width = max(len(pair.pair) for pair in report.pairs)
+    for count in report.pairs if report.folders else ():
+        stripes = (
+            f"{count.stripe_shots:4d} with stripes, " if rig.pair(count.pair).projector else ""
+        )
+        lines.append(f"  {count.pair:{width}}  {stripes}{count.lit_shots:4d} lit only")
+    lines += _bad_lines(report.bad_images)
+    lines += [f"error: {text}" for text in report.errors]
+    lines += [f"warning: {text}" for text in report.warnings]
+    faults = len(report.errors) + len(report.bad_images)
+    lines.append("good" if report.ok else f"{_several(faults, 'fault')} to mend")
+    return lines
+
+
+def _attempt(errors: list[str], work: Callable[..., Captures], *args: object) -> Captures | None:
+    """What `work` returns; if the captures cannot be opened the reason goes to `errors`."""
+    try:
+        return work(*args)
+    except CaptureError as error:
+        errors.append(str(error))
+        return None
+
+
+def _bad_images(rig: Rig, sequence: Sequence) -> tuple[BadImage, ...]:
+    camera = rig.pair(sequence.pair).camera
+    missing = set(sequence.missing)
+    faults = (
+        (path, "is missing" if path in missing else header_fault(path, camera.width, camera.height))
+        for path in sequence.paths
+    )
+    return tuple(
+        BadImage(path, sequence.pair, sequence.shot, fault) for path, fault in faults if fault
+    )
+
+
+def _count(pair: Pair, good: list[Sequence]) -> PairCount:
+    own = [sequence for sequence in good if sequence.pair == pair.name]
+    stripes = sum(sequence.has_stripes for sequence in own)
+    images = sum(len(sequence.paths) for sequence in own)
+    return PairCount(pair.name, pair.pole, stripes, len(own) - stripes, images)
+
+
+def _too_few(pair: Pair, count: PairCount) -> str | None:
+    """A pair needs three board poses with stripes, a camera alone three lit ones (Zhang 2000)."""
+    have = count.stripe_shots + (0 if pair.projector else count.lit_shots)
+    if have >= FEWEST_SHOTS:
+        return None
+    kind = "whole stripe sequence" if pair.projector else "lit image"
+    return (
+        f"pair {pair.name}: has {_several(have, kind)}; calibration needs {FEWEST_SHOTS} or more,"
+        " with the board tilted differently in each"
+    )
+
+
+def _few(pair: Pair, count: PairCount) -> str | None:
+    """Enough to calibrate, hardly enough to trust it."""
+    have = count.stripe_shots + (0 if pair.projector else count.lit_shots)
+    if not FEWEST_SHOTS <= have < ENOUGH_SHOTS:
+        return None
+    return f"pair {pair.name}: {have} board poses will do, {ENOUGH_SHOTS} or more are better"
+
+
+def _empty_shots(captures: Captures) -> list[str]:
+    taken = {sequence.shot for sequence in captures.sequences}
+    return [shot for shot in captures.shots if shot not in taken]
+
+
+def _strangers(captures: Captures) -> str | None:
+    found = strange_images(captures)
+    if not found:
+        return None
+    belong = "belongs" if len(found) == 1 else "belong"
+    return (
+        f"{_several(len(found), 'image')} {belong} to no pair and frame of the rig file, such as "
+        f"{found[0]}; is a name spelt differently?"
+    )
+
+
+def _frame_errors(calibration: Captures) -> list[str]:
+    shot = calibration.rig.rig_frame.shot
+    if shot is None or shot in calibration.shots:
+        return []
+    hint = did_you_mean(shot, calibration.shots)
+    return [f"rig_frame.shot: there is no shot '{shot}'{hint} in the calibration captures"]
+
+
+def _bad_lines(bad: tuple[BadImage, ...]) -> list[str]:
+    """One line a pair, shot and fault, with the first file of each; one a pair and fault where many
+    shots have it."""
+    shots_of: dict[tuple[str, str], set[str]] = {}
+    for image in bad:
+        shots_of.setdefault((image.pair, image.what), set()).add(image.shot)
+
+    def key(image: BadImage) -> tuple[str, str, str]:
+        shots = shots_of[image.pair, image.what]
+        where = f"{len(shots)} shots" if len(shots) > MANY_SHOTS else f"shot {image.shot}"
+        return image.pair, where, image.what
+
+    lines = []
+    for (pair, where, what), group in groupby(sorted(bad, key=key), key=key):
+        files = [image.path for image in group]
+        rest = f" and {len(files) - 1} more" if len(files) > 1 else ""
+        lines.append(f"error: pair {pair}, {where}: {files[0]}{rest}: {what}")
+    return lines
+
+
+def _several(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -1,0 +1,301 @@
+"""Capture folders: which image of which pair in which shot lies where, and what is missing."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+from bodyscan.captures.captures_file import FILE_NAME, ShotEntry, load_captures_file
+from bodyscan.captures.listing import Listing
+from bodyscan.errors import CaptureError
+from bodyscan.rig.capture_folder import CaptureFolder
+from bodyscan.rig.pair import Pair
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.templates import SHOT, fill, has_field, shot_pattern
+
+Kind = Literal["calibration", "scan"]
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """The images that one pair took, or should have taken, in one shot.
+
+    coded: the images of the stripe code, in the order of `FrameNames.of_code`; () where only the
+    lit image was taken. dark: None where there is no such image. missing: those of the paths that
+    are not there.
+    """
+
+    pair: str
+    shot: str
+    lit: Path
+    dark: Path | None
+    coded: tuple[Path, ...]
+    missing: tuple[Path, ...]
+
+    @property
+    def has_stripes(self) -> bool:
+        """Whether this is a stripe sequence rather than a lit image alone."""
+        return bool(self.coded)
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Lit, dark, then those of the code."""
+        dark = () if self.dark is None else (self.dark,)
+        return (self.lit, *dark, *self.coded)
+
+
+@dataclass(frozen=True)
+class MissingImage:
+    """An image that should be there."""
+
+    path: Path
+    pair: str
+    shot: str
+
+    def __str__(self) -> str:
+        return f"{self.path} (pair {self.pair}, shot {self.shot})"
+
+
+@dataclass(frozen=True)
+class Captures:
+    """What one or more capture folders hold. `shots` in order; `sequences` by shot, then by pair.
+
+    when, subject: of a scan, as its captures.yaml says.
+    """
+
+    rig: Rig
+    folders: tuple[Path, ...]
+    shots: tuple[str, ...]
+    sequences: tuple[Sequence, ...]
+    when: datetime | None = None
+    subject: str | None = None
+
+    @cached_property
+    def _by_pair_and_shot(self) -> dict[tuple[str, str], Sequence]:
+        return {(sequence.pair, sequence.shot): sequence for sequence in self.sequences}
+
+    def sequence(self, pair: str, shot: str) -> Sequence | None:
+        """What that pair took in that shot, None if it took no part."""
+        return self._by_pair_and_shot.get((pair, shot))
+
+    def of_pair(self, pair: str) -> tuple[Sequence, ...]:
+        """That pair's sequences in the order of the shots."""
+        return tuple(sequence for sequence in self.sequences if sequence.pair == pair)
+
+    def of_shot(self, shot: str) -> tuple[Sequence, ...]:
+        """What was taken in that shot, in the order of the rig's pairs."""
+        return tuple(sequence for sequence in self.sequences if sequence.shot == shot)
+
+    def missing(self) -> tuple[MissingImage, ...]:
+        """Every image that should be there and is not."""
+        return tuple(
+            MissingImage(path, sequence.pair, sequence.shot)
+            for sequence in self.sequences
+            for path in sequence.missing
+        )
+
+
+def open_captures(rig: Rig, rig_path: Path) -> Captures:
+    """The calibration captures that a rig file names, its folders joined.
+
+    Raises CaptureError when it names none, and as `open_folder` and `join` do.
+    """
+    if not rig.calibration:
+        raise CaptureError(
+            "the rig file names no calibration captures",
+            where=str(rig_path),
+            remedy="Add `calibration:` with a folder; docs/formats.md shows how.",
+        )
+    return join(tuple(open_folder(rig, rig_path, entry) for entry in rig.calibration))
+
+
+def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
+    """The captures of one folder of the rig file's `calibration` list. Raises as `open_scan`."""
+    folder = capture_path(rig_path, entry)
+    return _open(rig, folder, "calibration", entry.files or rig.files, entry.shots)
+
+
+def capture_path(rig_path: Path, entry: CaptureFolder) -> Path:
+    """Where a folder of the rig file lies, without .. in its middle where that is the same."""
+    path = Path(rig_path).parent / entry.folder
+    short = os.path.normpath(path)  # not the same where a symbolic link comes before ..
+    return Path(short) if os.path.realpath(short) == os.path.realpath(path) else path
+
+
+def open_scan(rig: Rig, folder: Path) -> Captures:
+    """The captures of one scan.
+
+    Raises CaptureError when the folder is not there, its captures.yaml is wrong or says that it is
+    no scan, no image of this rig lies in it, or a symbolic link leads out of it.
+    """
+    return _open(rig, Path(folder), "scan", rig.files, None)
+
+
+def open_check(rig: Rig, folder: Path) -> tuple[Kind, Captures]:
+    """Captures of either kind, for a check: what its captures.yaml says; without one a scan, unless
+    more than one shot lies in it. Raises as `open_scan`."""
+    listing = Listing(Path(folder))
+    file = load_captures_file(Path(folder), rig) if listing.has(FILE_NAME) else None
+    kind: Kind = file.kind if file is not None else "scan"
+    captures = _open(rig, Path(folder), kind, rig.files, None)
+    if file is None and len(captures.shots) > 1:
+        kind = "calibration"
+    return kind, captures
+
+
+def join(parts: tuple[Captures, ...]) -> Captures:
+    """Captures of several folders as one; a shot of the same name in two is the same moment.
+
+    Raises CaptureError when two folders hold the same shot of the same pair.
+    """
+    seen: dict[tuple[str, str], Path] = {}
+    for part in parts:
+        for sequence in part.sequences:
+            key = (sequence.pair, sequence.shot)
+            if key in seen:
+                raise CaptureError(
+                    f"shot {sequence.shot} of pair {sequence.pair} lies in {seen[key]} as well",
+                    where=str(part.folders[0]),
+                    remedy="Rename one of the shots, or leave it out with `shots:` in rig.yaml.",
+                )
+            seen[key] = part.folders[0]
+    shots = tuple(dict.fromkeys(shot for part in parts for shot in part.shots))
+    order = {pair.name: place for place, pair in enumerate(parts[0].rig.pairs)}
+    sequences = [sequence for part in parts for sequence in part.sequences]
+    sequences.sort(key=lambda sequence: (shots.index(sequence.shot), order[sequence.pair]))
+    folders = tuple(folder for part in parts for folder in part.folders)
+    return replace(parts[0], folders=folders, shots=shots, sequences=tuple(sequences))
+
+
+def _open(
+    rig: Rig, folder: Path, kind: Kind, template: str, wanted: tuple[str, ...] | None
+) -> Captures:
+    listing = Listing(folder)
+    file = load_captures_file(folder, rig) if listing.has(FILE_NAME) else None
+    if file is not None and file.kind != kind:
+        raise CaptureError(
+            f"is of kind {file.kind}, but {kind} captures are wanted here",
+            where=str(folder / FILE_NAME),
+            remedy="Name the right folder, or mend `kind` in its captures.yaml.",
+        )
+    entries = {shot.name: shot for shot in (file.shots if file else None) or ()}
+    names = wanted or tuple(entries) or _discover(rig, listing, template)
+    if not has_field(template, "shot") and len(names) > 1:
+        raise CaptureError(
+            f"holds one shot by the template {template}, but {len(names)} are listed",
+            where=str(folder),
+            remedy="Put {shot} into the template, or list one shot.",
+        )
+    shots = [entries.get(name, ShotEntry(name=name)) for name in names]
+    sequences = tuple(
+        sequence for shot in shots for sequence in _sequences(rig, listing, template, shot)
+    )
+    if not sequences:
+        example = fill(template, shot="SHOT", pair=rig.pairs[0].name, frame=rig.frames.lit)
+        raise CaptureError(
+            f"holds no image of rig {rig.name} by the template {template}",
+            where=str(folder),
+            remedy=f"An image should be named such as {example}; mend `files` in the rig file.",
+        )
+    when, subject = (file.when, file.subject) if file else (None, None)
+    return Captures(rig, (folder,), names, sequences, when, subject)
+
+
+def _discover(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
+    """Shots told from the names of the files: those with a lit image or the first of a code."""
+    if not has_field(template, "shot"):
+        name = listing.root.resolve().name
+        if re.fullmatch(SHOT, name) and len(name) <= 64:
+            return (name,)
+        raise CaptureError(
+            "cannot give its shot its own name, which is no valid name of a shot",
+            where=str(listing.root),
+            remedy="Rename the folder (letters, digits, '_', '-', '.'), or list its shot.",
+        )
+    found: set[str] = set()
+    for pair in rig.pairs:
+        frames = [rig.frames.lit]
+        if pair.projector:
+            frames += rig.frames.of_code(pair.projector)[:1]
+        for frame in frames:
+            found |= _shots_matching(listing, shot_pattern(template, pair.name, frame), "", None)
+    return tuple(sorted((name for name in found if len(name) <= 64), key=_natural))
+
+
+def _shots_matching(
+    listing: Listing, parts: tuple[re.Pattern[str], ...], folder: str, shot: str | None
+) -> set[str]:
+    """Names of shots for which a path below `folder` matches the patterns, part by part."""
+    found: set[str] = set()
+    for name in listing.names(folder):
+        match = parts[0].fullmatch(name)
+        if match is None:
+            continue
+        told = match.groupdict().get("shot", shot)
+        if shot is not None and told != shot:
+            continue
+        if len(parts) > 1:
+            found |= _shots_matching(listing, parts[1:], f"{folder}/{name}".lstrip("/"), told)
+        elif told is not None:
+            found.add(told)
+    return found
+
+
+def _natural(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sorts b2 before b10."""
+    pieces = re.findall(r"\d+|\D+", name)
+    return tuple((0, int(p), p) if p.isdecimal() else (1, 0, p) for p in pieces)
+
+
+def _sequences(rig: Rig, listing: Listing, template: str, shot: ShotEntry) -> Iterator[Sequence]:
+    look = shot.stripes is None and shot.lit is None
+    for pair in rig.pairs:
+        whole = _sequence(rig, listing, template, shot.name, pair, stripes=True)
+        alone = _sequence(rig, listing, template, shot.name, pair, stripes=False)
+        if look:
+            if set(whole.coded) - set(whole.missing):
+                yield whole
+            elif not alone.missing:
+                yield alone
+        elif pair.name in (shot.stripes or ()):
+            if not has_field(template, "frame"):
+                raise CaptureError(
+                    f"says that pair {pair.name} took stripes in shot {shot.name}, but the"
+                    f" template {template} has no {{frame}}",
+                    where=str(listing.root / FILE_NAME),
+                    remedy="List the pair in `lit`, or put {frame} into the template.",
+                )
+            yield whole
+        elif pair.name in (shot.lit or ()):
+            yield alone
+
+
+def _sequence(
+    rig: Rig, listing: Listing, template: str, shot: str, pair: Pair, *, stripes: bool
+) -> Sequence:
+    frames = rig.frames
+    projector = pair.projector if stripes and has_field(template, "frame") else None
+
+    def files(*names: str) -> tuple[str, ...]:
+        return tuple(fill(template, shot=shot, pair=pair.name, frame=name) for name in names)
+
+    lit = files(frames.lit)
+    takes_dark = projector is not None and projector.takes_dark and frames.dark is not None
+    dark = files(frames.dark or "") if takes_dark else ()
+    coded = files(*frames.of_code(projector)) if projector else ()
+    missing = [name for name in (*lit, *dark, *coded) if not listing.has(name)]
+    root = listing.root
+    return Sequence(
+        pair=pair.name,
+        shot=shot,
+        lit=root / lit[0],
+        dark=root / dark[0] if dark else None,
+        coded=tuple(root / name for name in coded),
+        missing=tuple(root / name for name in missing),
+    )

@@ -1,0 +1,43 @@
+"""What is wrong with an image file as far as its header tells, in words, without decoding it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bodyscan.captures.image_header import NoImage, read_header
+from bodyscan.errors import ImageError
+
+
+def header_fault(path: Path, width: int, height: int) -> str | None:
+    """Why the file cannot be an 8-bit image of that size, or None."""
+    try:
+        header = read_header(path)
+    except FileNotFoundError:
+        return "is missing"
+    except NoImage as error:
+        return str(error)
+    except OSError as error:
+        return f"cannot be read: {error.strerror or error}"
+    if (header.width, header.height) != (width, height):
+        size = f"{header.width} x {header.height}"
+        return f"is {size} pixels, but the rig file says {width} x {height}"
+    if header.bits > 8:
+        return f"has {header.bits} bits a sample; only 8-bit images are read"
+    return None if header.complete else "is cut short"
+
+
+def image_error(what: str, path: Path, pair: str, shot: str, *, remedy: str = "") -> ImageError:
+    """An ImageError that names file, pair and shot, and what to do."""
+    taken = ", ".join(f"{kind} {name}" for kind, name in (("pair", pair), ("shot", shot)) if name)
+    where = f"{path} ({taken})" if taken else str(path)
+    return ImageError(what, where=where, remedy=remedy or _remedy(what))
+
+
+def _remedy(what: str) -> str:
+    if what == "is missing":
+        return "Copy it here, take the shot again, or leave it out of captures.yaml."
+    if "the rig file says" in what:
+        return "Check the camera's width and height in the rig file, and which camera took this."
+    if "bits a sample" in what:
+        return "Save 8 bits a pixel; the camera's software can choose them."
+    return "Copy it again from where it was taken, or take the shot again."

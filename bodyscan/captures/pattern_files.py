@@ -1,0 +1,111 @@
+"""The images a rig's projectors show, as PNG files with a list of their order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.errors import BadInput
+from bodyscan.files.atomic import write_bytes, write_json
+from bodyscan.rig.frame_names import FrameNames
+from bodyscan.rig.pair import Pair
+from bodyscan.rig.rig import Rig
+from bodyscan.stripes.codes import pattern_frames
+from bodyscan.stripes.projector_spec import ProjectorSpec
+
+LIST_NAME = "patterns.json"
+
+
+def uneven_stripes(rig: Rig, width: int, height: int) -> tuple[str, ...]:
+    """A note on each kind of projector whose stripes cannot all be equally wide.
+
+    Their boundaries lie up to half a projector pixel from where even stripes would have them: free
+    planes take that as it is, models that are smooth in s do not. Waves of light need no whole
+    pixels.
+    """
+    kinds = {pair.projector for pair in rig.pairs if pair.projector}
+    counts = {
+        (kind.stripes, height if kind.direction == "horizontal" else width)
+        for kind in kinds
+        if kind.code not in ("stripe-index", "phase-shift")
+    }
+    return tuple(
+        f"{stripes} stripes cannot be equally wide on {across} px: choose a number that divides it"
+        for stripes, across in sorted(counts)
+        if across % stripes
+    )
+
+
+def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, ...]:
+    """A folder of images for each kind of projector in the rig; its list is written last.
+
+    width, height: of the projector's image, px. Returns the lists. Raises BadInput for a rig whose
+    projectors show no images, and as `pattern_frames`.
+    """
+    kinds: dict[ProjectorSpec, list[Pair]] = {}
+    for pair in rig.pairs:
+        if pair.projector and pair.projector.code != "stripe-index":
+            kinds.setdefault(pair.projector, []).append(pair)
+    if not kinds:
+        raise BadInput(
+            "none of its projectors shows images",
+            where=f"rig {rig.name}",
+            remedy="an instrument with code: stripe-index projects stripes of its own",
+        )
+    names = _folder_names(tuple(kinds))
+    # Every kind is made before the first is written: one that does not fit writes nothing.
+    made = {kind: pattern_frames(kind, width, height) for kind in kinds}
+    return tuple(
+        _write_kind(Path(out) / names[kind], rig.frames, kind, pairs, made[kind])
+        for kind, pairs in kinds.items()
+    )
+
+
+def _folder_names(kinds: tuple[ProjectorSpec, ...]) -> dict[ProjectorSpec, str]:
+    """Such as gray-640-horizontal, with a number where that is not enough."""
+    names: dict[ProjectorSpec, str] = {}
+    for kind in kinds:
+        name = f"{kind.code}-{kind.stripes}-{kind.direction}"
+        again = sum(taken.startswith(name) for taken in names.values())
+        names[kind] = f"{name}-{again + 1}" if again else name
+    return names
+
+
+def _write_kind(
+    folder: Path,
+    frames: FrameNames,
+    kind: ProjectorSpec,
+    pairs: list[Pair],
+    coded: NDArray[np.uint8],
+) -> Path:
+    height, width = coded.shape[1:]
+    order = []
+    for name, image in _in_order(frames, kind, coded):
+        packed = cv2.imencode(".png", image)[1]
+        write_bytes(folder / f"{name}.png", packed.tobytes())
+        order.append({"file": f"{name}.png", "frame": name})
+    content = {
+        "version": 1,
+        "code": kind.model_dump(mode="json", exclude_none=True),
+        "width": width,
+        "height": height,
+        "pairs": [pair.name for pair in pairs],
+        "show": order,
+    }
+    write_json(folder / LIST_NAME, content)
+    return folder / LIST_NAME
+
+
+def _in_order(
+    frames: FrameNames, kind: ProjectorSpec, coded: NDArray[np.uint8]
+) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    """Name and image (H, W): lit, dark if it is taken, then those of the code."""
+    blank = np.zeros(coded.shape[1:], np.uint8)
+    yield frames.lit, blank + 255
+    if frames.dark is not None and kind.takes_dark:
+        yield frames.dark, blank
+    yield from zip(frames.of_code(kind), coded, strict=True)

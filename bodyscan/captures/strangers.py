@@ -1,0 +1,37 @@
+"""Images in a capture folder that the rig file names nowhere: often a folder that was renamed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from bodyscan.captures.folder import Captures
+
+SUFFIXES = {".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
+
+
+def strange_images(captures: Captures) -> list[Path]:
+    """Images beside those of the captures' shots that belong to no pair and frame of the rig file.
+
+    Shots that are not wanted are left alone.
+    """
+    wanted = {path for sequence in captures.sequences for path in sequence.paths}
+    beside = {path.parent.parent for path in wanted} | {path.parent for path in wanted}
+    return sorted(
+        path
+        for folder in captures.folders
+        for path in _images(folder)
+        if path not in wanted
+        and _belongs(path.relative_to(folder), captures, path.parent in beside)
+    )
+
+
+def _images(folder: Path) -> Iterator[Path]:
+    for place, _, names in os.walk(folder):
+        yield from (Path(place) / n for n in names if Path(n).suffix.lower() in SUFFIXES)
+
+
+def _belongs(relative: Path, captures: Captures, beside: bool) -> bool:
+    """Whether a file lies where images of a wanted shot lie."""
+    return beside or any(part in captures.shots for part in relative.parts[:-1])

@@ -1,0 +1,159 @@
+"""What an acceptance test read, and the figures that follow from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from bodyscan.evaluation.acceptance_file import AcceptanceFile
+
+ALL = "all pairs"
+
+
+@dataclass(frozen=True)
+class SphereRow:
+    """One sphere in one shot, by all pairs together or by one; see `SphereReading`."""
+
+    place: str
+    shot: str
+    view: str
+    sphere: int
+    points: int
+    form_mm: float
+    shell_mm: float
+    size_mm: float
+
+
+@dataclass(frozen=True)
+class SpacingRow:
+    """Distance of two spheres' centres less the calibrated one, by all pairs together."""
+
+    place: str
+    shot: str
+    between: str
+    error_mm: float
+
+
+@dataclass(frozen=True)
+class PlateRow:
+    """The plate in one shot; see `PlateReading`."""
+
+    place: str
+    shot: str
+    view: str
+    points: int
+    flatness_mm: float
+    rms_mm: float
+    measured_percent: float
+
+
+@dataclass(frozen=True)
+class Readings:
+    """All that was read.  problems: places where an artefact was not found, or not by all."""
+
+    spheres: tuple[SphereRow, ...] = ()
+    spacings: tuple[SpacingRow, ...] = ()
+    plates: tuple[PlateRow, ...] = ()
+    problems: tuple[str, ...] = ()
+
+    def __add__(self, other: Readings) -> Readings:
+        return Readings(
+            self.spheres + other.spheres,
+            self.spacings + other.spacings,
+            self.plates + other.plates,
+            self.problems + other.problems,
+        )
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of the test: its largest value, where that was, and the limit if one was given."""
+
+    name: str
+    value_mm: float | None
+    where: str
+    limit_mm: float | None
+    meaning: str
+
+    @property
+    def exceeded(self) -> bool:
+        """A limit on what was not measured is not kept either."""
+        return self.limit_mm is not None and (
+            self.value_mm is None or abs(self.value_mm) > self.limit_mm
+        )
+
+
+def figures(readings: Readings, file: AcceptanceFile) -> list[Figure]:
+    """The test's figures, the worst of all places and shots, with their limits."""
+    merged = [row for row in readings.spheres if row.view == ALL]
+    single = [row for row in readings.spheres if row.view != ALL]
+    plates = [row for row in readings.plates if row.view == ALL]
+    alone = [row for row in readings.plates if row.view != ALL]
+    found = (
+        ("probing_form_mm", _worst(merged, "form_mm"),
+         "range of the points' distances from the best sphere, all pairs merged, 3 in 1000 points "
+         "left out"),
+        ("probing_size_mm", _worst(merged, "size_mm"),
+         "diameter of the best sphere less the calibrated diameter"),
+        ("sphere_spacing_mm", _worst(readings.spacings, "error_mm"),
+         "distance of two spheres' centres less the calibrated distance"),
+        ("flatness_mm", _worst(plates, "flatness_mm"),
+         "range of the points' distances from the best plane, all pairs merged, 3 in 1000 points "
+         "left out"),
+        ("repeatability_mm", _repeatability(readings.spacings),
+         "range of one distance between spheres over repeated shots at one place"),
+        ("single_probing_form_mm", _worst(single, "form_mm"),
+         "probing form of one pair by itself, not merged"),
+        ("single_flatness_mm", _worst(alone, "flatness_mm"),
+         "flatness by one pair by itself, not merged"),
+    )  # fmt: skip
+    return [
+        Figure(name, value, where, getattr(file.limits, name), meaning)
+        for name, (value, where), meaning in found
+    ]
+
+
+def document(
+    readings: Readings, found: Sequence[Figure], file: AcceptanceFile, **origin: Any
+) -> dict[str, Any]:
+    """What acceptance.json holds."""
+    return origin | {
+        "schema": "bodyscan-acceptance",
+        "version": 1,
+        "units": "mm",
+        "artefacts": file.model_dump(mode="json"),
+        "figures": {
+            one.name: {
+                "value": one.value_mm,
+                "where": one.where,
+                "limit": one.limit_mm,
+                "exceeded": one.exceeded,
+                "meaning": one.meaning,
+            }
+            for one in found
+        },
+        "spheres": [asdict(row) for row in readings.spheres],
+        "spacings": [asdict(row) for row in readings.spacings],
+        "plates": [asdict(row) for row in readings.plates],
+        "problems": readings.problems,
+    }
+
+
+def _worst(rows: Sequence[Any], name: str) -> tuple[float | None, str]:
+    if not rows:
+        return None, "not measured"
+    row = max(rows, key=lambda one: abs(getattr(one, name)))
+    view = getattr(row, "view", ALL)
+    return getattr(row, name), ", ".join([row.place, row.shot, *([view] if view != ALL else [])])
+
+
+def _repeatability(rows: Sequence[SpacingRow]) -> tuple[float | None, str]:
+    groups: dict[tuple[str, str], list[float]] = {}
+    for row in rows:
+        groups.setdefault((row.place, row.between), []).append(row.error_mm)
+    ranges = {key: max(own) - min(own) for key, own in groups.items() if len(own) > 1}
+    if not ranges:
+        return None, "not repeated"
+    (place, between), value = max(ranges.items(), key=lambda item: item[1])
+    return value, f"{place}, spheres {between}"

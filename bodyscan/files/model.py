@@ -1,0 +1,55 @@
+"""The base of everything read from a YAML file: frozen, strict, and able to say what is wrong."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator
+from typing import Annotated, Self, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+Name = Annotated[str, Field(pattern=r"^[\w][\w.-]*$", max_length=64)]
+
+Problem: TypeAlias = tuple[tuple[str | int, ...], str]
+"""Where in the model (keys and indices from its root) and what, in words that follow the path."""
+
+
+class Model(BaseModel):
+    """Frozen, and strangers to it are refused; `problems` says what single fields cannot say."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    def problems(self) -> Iterator[Problem]:
+        """What is wrong with this model as a whole, though each field by itself is right."""
+        return iter(())
+
+    @model_validator(mode="after")
+    def _refuse_problems(self) -> Self:
+        details = [
+            InitErrorDetails(
+                type=PydanticCustomError("problem", "{text}", {"text": text}),
+                loc=where,
+                input=None,
+            )
+            for where, text in self.problems()
+        ]
+        if details:
+            raise ValidationError.from_exception_data(type(self).__name__, details)
+        return self
+
+
+def duplicates(names: list[str | None] | tuple[str | None, ...]) -> Iterator[tuple[int, str]]:
+    """Index and name of each name that stood earlier in the list already (None never does)."""
+    seen: set[str] = set()
+    for index, name in enumerate(names):
+        if name is not None and name in seen:
+            yield index, name
+        elif name is not None:
+            seen.add(name)
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """` (did you mean 'x'?)` for the nearest of the known words, or nothing."""
+    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f" (did you mean '{near[0]}'?)" if near else ""

@@ -1,0 +1,239 @@
+"""A YAML file read into a model; all that is wrong said at once, by line and in plain words."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from bodyscan.errors import BadInput
+from bodyscan.files.model import Model, Problem, did_you_mean
+from bodyscan.files.yaml_file import (
+    Document,
+    Where,
+    YamlError,
+    YamlProblem,
+    dotted,
+    read_yaml,
+)
+
+M = TypeVar("M", bound=Model)
+
+_MOST_SHOWN = 30
+
+_MUST_BE = {
+    "string_type": "text",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "bool_type": "true or false",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "model_type": "a mapping (key: value)",
+    "model_attributes_type": "a mapping (key: value)",
+    "dict_type": "a mapping (key: value)",
+    "greater_than": "greater than {gt}",
+    "greater_than_equal": "{ge} or more",
+    "less_than": "less than {lt}",
+    "less_than_equal": "{le} or less",
+    "literal_error": "{expected}",
+    "string_pattern_mismatch": "a name of letters, digits, '_', '-' and '.', no spaces",
+    "string_too_short": "{min_length} characters or longer",
+    "string_too_long": "{max_length} characters or shorter",
+    "too_short": "a list of {min_length} or more",
+    "too_long": "a list of {max_length} or less",
+    "datetime_type": "a date and time such as 2026-11-21T10:00:00",
+    "datetime_parsing": "a date and time such as 2026-11-21T10:00:00",
+    "datetime_from_date_parsing": "a date and time such as 2026-11-21T10:00:00",
+}
+
+
+def load_model(
+    path: Path,
+    model: type[M],
+    error: type[BadInput],
+    *,
+    remedy: str,
+    also: Callable[[M], Iterable[Problem]] = lambda _: (),
+    salvage: Callable[[Any], Iterable[Problem]] = lambda _: (),
+) -> M:
+    """Read `path` as `model`; raise `error` with every problem of the file, one a line.
+
+    also: checks of a model that is right in itself, against something outside the file.
+    salvage: checks across the plain data of a file that is not right, so that all is said at once.
+    """
+    try:
+        document = read_yaml(path)
+    except YamlError as unreadable:
+        raise report(path, [unreadable.problem], error, remedy) from None
+    except FileNotFoundError:
+        raise error("there is no such file", where=str(path), remedy="check the path") from None
+    except OSError as fault:
+        what = f"cannot be read: {fault.strerror or fault}"
+        raise error(what, where=str(path), remedy=remedy) from None
+    problems = list(document.problems)
+    try:
+        loaded = model.model_validate_json(json.dumps(document.data), strict=True)
+        found: Iterable[Problem] = also(loaded)
+    except ValidationError as refused:
+        problems += _translated(refused, document, model)
+        found = salvage(document.data)
+    problems += [_placed(problem, document) for problem in found]
+    if problems:
+        raise report(path, problems, error, remedy)
+    return loaded
+
+
+def revised(model: M, changes: Mapping[Where, Any], error: type[BadInput]) -> M:
+    """`model` with the values at some paths replaced, checked anew.
+
+    Raises `error` that names every change that is wrong by its path.
+    """
+    data: dict[Any, Any] = model.model_dump(mode="json", exclude_unset=True)
+    for where, value in changes.items():
+        inside = data
+        for part in where[:-1]:
+            deeper = inside.setdefault(part, {})
+            if not isinstance(deeper, dict):
+                raise error(f"--set {dotted(where)}: {part} has nothing inside")
+            inside = deeper
+        inside[where[-1]] = value
+    try:
+        return type(model).model_validate_json(json.dumps(data), strict=True)
+    except ValidationError as refused:
+        problems = _translated(refused, Document(data), type(model))
+        told = "\n".join(f"--set {problem.path}: {problem.text}" for problem in problems)
+        raise error(told, remedy="docs/formats.md explains every key") from None
+
+
+def report(
+    path: Path, problems: Iterable[YamlProblem], error: type[BadInput], remedy: str
+) -> BadInput:
+    """All problems as one error, in the order of the file; one behind an alias is told once."""
+    paths: dict[tuple[int, int, str], set[str]] = {}
+    for problem in problems:
+        place = problem.place
+        paths.setdefault((place.line, place.column, problem.text), set()).add(problem.path)
+    lines = []
+    for (line, column, text), sharing in sorted(paths.items()):
+        first = min(sharing, key=lambda path: (len(path), path))
+        more = f" (and so in {len(sharing) - 1} more places by alias)" if len(sharing) > 1 else ""
+        lines.append((f"{path}:{line}:{column}", f"{first}: {text}{more}" if first else text))
+    told = [f"{place}: {text}" for place, text in lines[1:_MOST_SHOWN]]
+    if len(lines) > _MOST_SHOWN:
+        told.append(f"... and {len(lines) - _MOST_SHOWN} more")
+    return error("\n".join([lines[0][1], *told]), where=lines[0][0], remedy=remedy)
+
+
+def validated(model: type[M], data: Any) -> M | None:
+    """`data` as a model if it is right, else None."""
+    try:
+        return model.model_validate_json(json.dumps(data), strict=True)
+    except ValidationError:
+        return None
+
+
+def _placed(problem: Problem, document: Document) -> YamlProblem:
+    where, text = problem
+    return YamlProblem(document.place(where), dotted(where), text)
+
+
+def _translated(
+    refused: ValidationError, document: Document, model: type[BaseModel]
+) -> list[YamlProblem]:
+    """pydantic's errors in plain words, those of one value joined, at their places in the file."""
+    wrong: dict[Where, list[str]] = {}
+    other: list[YamlProblem] = []
+    guessed: set[Where] = set()
+    missing: list[Where] = []
+    for where, e in _located(refused, document):
+        if e["type"] == "missing":
+            missing.append(where)
+        elif e["type"] == "extra_forbidden":
+            known = _keys_at(model, where[:-1])
+            hint = did_you_mean(str(where[-1]), known)
+            guessed |= {(*where[:-1], key) for key in known if f"'{key}'" in hint}
+            place = document.place(where, of_key=True)
+            other.append(YamlProblem(place, dotted(where), f"is no key known here{hint}"))
+        elif e["type"] in _MUST_BE:
+            limits = {key: _plain(value) for key, value in e.get("ctx", {}).items()}
+            wrong.setdefault(where, []).append(_MUST_BE[e["type"]].format(**limits))
+        else:
+            other.append(_placed((where, e["msg"]), document))
+    for where, wanted in wrong.items():
+        text = f"must be {' or '.join(dict.fromkeys(wanted))} ({_got(where, wanted, document)})"
+        other.append(_placed((where, text), document))
+    other += [_placed((w, "is missing"), document) for w in missing if w not in guessed]
+    return other
+
+
+def _located(refused: ValidationError, document: Document) -> Iterator[tuple[Where, ErrorDetails]]:
+    """Errors with their true locations, less those that follow from others.
+
+    For a value that may be text or a list pydantic reports both ways in which it is wrong, with
+    the way's name in the location; a wrong item of a list says more than "is not text".
+    """
+    errors = []
+    for e in refused.errors(include_url=False):
+        where = _true_location(e["loc"], document)
+        counted = e.get("ctx", {}).get("min_length", 0)
+        value = document.at(where)
+        if e["type"] == "too_short" and isinstance(value, list) and len(value) >= counted:
+            continue  # pydantic counts only the items that are right
+        errors.append((where, where != e["loc"], e))
+    unions = [where for where, of_union, _ in errors if of_union]
+    for where, of_union, e in errors:
+        deeper = [w for w in unions if w != where and w[: len(where)] == where]
+        if not (of_union and deeper):
+            yield where, e
+
+
+def _true_location(loc: Where, document: Document) -> Where:
+    """pydantic's location without the names it gives to the members of a union."""
+    where: Where = ()
+    for part in loc:
+        inside = document.at(where)
+        of_list = isinstance(inside, list) and isinstance(part, int)
+        if of_list or (isinstance(inside, dict) and not str(part).startswith("tuple[")):
+            where = (*where, part)
+    return where
+
+
+def _keys_at(model: type[BaseModel], where: Where) -> list[str]:
+    """The keys that the model knows at a path."""
+    here: type[BaseModel] | None = model
+    for part in where:
+        if isinstance(part, str) and here is not None:
+            field = here.model_fields.get(part)
+            here = _model_in(field.annotation) if field else None
+    return list(here.model_fields) if here else []
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    found = (_model_in(argument) for argument in get_args(annotation))
+    return next((model for model in found if model), None)
+
+
+def _plain(limit: Any) -> Any:
+    return f"{limit:g}" if isinstance(limit, float) else limit
+
+
+def _got(where: Where, wanted: list[str], document: Document) -> str:
+    value = document.at(where)
+    if isinstance(value, dict):
+        return "got a mapping"
+    if isinstance(value, list):
+        return f"got a list of {len(value)}"
+    if value is None:
+        return "got nothing"
+    written = document.raw.get(where, json.dumps(value, ensure_ascii=False))
+    shown = written if len(written) <= 60 else written[:57] + "..."
+    quotes = f': write "{shown}"' if "text" in wanted and not isinstance(value, str) else ""
+    return f"got {shown}{quotes}"

@@ -1,0 +1,47 @@
+"""How well the joint solve knows each placing: the covariance of all pairs in the rig frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.geometry.transforms import twist_jacobian
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PlacingCovariance:
+    """Joint covariance (6P, 6P) of small motions of the pairs `names`, rig frame.
+
+    A motion is a rotation vector (radians) about the rig's origin, then a translation (mm).
+    """
+
+    names: tuple[str, ...]
+    matrix: Array
+
+    def of(self, name: str) -> Array:
+        """(6, 6) of one pair's motion."""
+        k = 6 * self.names.index(name)
+        return self.matrix[k : k + 6, k : k + 6]
+
+    def between(self, a: str, b: str) -> Array:
+        """(6, 6) of the motion of b relative to a."""
+        i, j = 6 * self.names.index(a), 6 * self.names.index(b)
+        m = self.matrix
+        rows_i, rows_j = slice(i, i + 6), slice(j, j + 6)
+        cross = m[rows_i, rows_j]
+        return m[rows_i, rows_i] + m[rows_j, rows_j] - cross - cross.T
+
+
+def point_covariance(motion_covariance: Array, point: Array) -> Array:
+    """(3, 3) mm2: how a rig point (3,) carried by such a motion (6, 6) is spread."""
+    jacobian = twist_jacobian(point[None])[0]
+    return jacobian @ motion_covariance @ jacobian.T
+
+
+def position_sigma(covariance: PlacingCovariance, name: str, position: Array) -> Array:
+    """(3,) mm: standard deviation of a pair's camera centre (3,) along the rig's axes."""
+    return np.sqrt(np.diag(point_covariance(covariance.of(name), position)))

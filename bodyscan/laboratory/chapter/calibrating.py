@@ -1,0 +1,140 @@
+"""The approaches of 4.2 and ours from the same images; and how honest Table 1's sigmas are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.boards.board import corner_points
+from bodyscan.calibration.boundary_points import binned
+from bodyscan.calibration.camera import (
+    INTRINSICS,
+    CameraCalibration,
+    PlanarView,
+    calibrate_camera,
+)
+from bodyscan.calibration.joint_refinement import striped_board
+from bodyscan.calibration.light import fit_light
+from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
+from bodyscan.calibration.pair import planar_view
+from bodyscan.calibration.refinement_choice import refine_where_better
+from bodyscan.laboratory.chapter.captures import TARGET, ChapterCaptures
+from bodyscan.laboratory.chapter.setup import CAMERA, board_places
+from bodyscan.laboratory.rivals.approaches import (
+    Approach,
+    mended_pinhole_by_stage,
+    pinhole_by_stage,
+    planes_by_stage_camera,
+    rivals,
+)
+from bodyscan.laboratory.rivals.targets import Located, by_reference_plane, by_slide_stage
+
+Array = NDArray[np.float64]
+
+CORNER_NOISE_PX = 0.012
+"""What corners found in the rendered images are off, each way."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """reference: Zhang's camera.  planes: the chapter's fit of its free planes.
+
+    camera, camera_covariance: ours, after the joint solve if held-out boards took it.
+    model, refinement: what ours chose.  approaches: (i), (i) mended, (ii), (iii), ours.
+    by_stage, by_reference: every model of the projector, calibrated either way.
+    """
+
+    reference: CameraCalibration
+    planes: PlaneFit
+    ours: Approach
+    camera_covariance: Array
+    model: str
+    refinement: str
+    approaches: tuple[Approach, ...]
+    by_stage: tuple[Approach, ...]
+    by_reference: tuple[Approach, ...]
+
+
+def calibrate_all(captures: ChapterCaptures) -> Calibrated:
+    """Everything that is to be compared, from the same shots."""
+    reference, located = by_reference_plane(TARGET, captures.boards)
+    _, stage = by_slide_stage(TARGET, captures.stage, captures.readings)
+    projector = TARGET.projector
+    planes = fit_light_planes(located.points, projector.stripes, projector.direction)
+    ours, covariance, model, refinement = _ours(captures, reference, located)
+    approaches = (
+        pinhole_by_stage(TARGET, captures.stage, captures.readings),
+        mended_pinhole_by_stage(TARGET, stage),
+        planes_by_stage_camera(TARGET, stage, captures.boards),
+        Approach("(iii)", located.camera, planes.planes),
+        ours,
+    )
+    return Calibrated(
+        reference,
+        planes,
+        ours,
+        covariance,
+        model,
+        refinement,
+        approaches,
+        tuple(rivals(TARGET, stage)),
+        tuple(rivals(TARGET, located)),
+    )
+
+
+def _ours(
+    captures: ChapterCaptures, reference: CameraCalibration, located: Located
+) -> tuple[Approach, Array, str, str]:
+    """As `bodyscan calibrate-rig` does a pair by itself: the model of the light that held-out boards
+    choose, and one solve for all where they gain by it."""
+    projector = TARGET.projector
+    data = binned(located.points, located.camera, projector.direction)
+    fit = fit_light(located.points, projector.stripes, projector.direction, located.camera)
+    boards = [
+        striped_board(planar_view(shot.view, TARGET.board), located.camera, data, number)
+        for number, shot in enumerate(captures.boards)
+    ]
+    refined = refine_where_better(reference, fit.sheets, boards, data)
+    if refined.joint is None:
+        approach = Approach("ours", located.camera, fit.sheets)
+        return approach, reference.covariance, fit.model, refined.reason
+    approach = Approach("ours", refined.joint.camera, refined.joint.sheets)
+    return approach, refined.joint.camera_covariance, fit.model, refined.reason
+
+
+@dataclass(frozen=True, eq=False)
+class SigmaTrial:
+    """Many calibrations from noisy corners: errors over sigmas, (seeds, 7) over INTRINSICS."""
+
+    errors: Array
+
+    @property
+    def spread(self) -> Array:
+        """(7,) root mean square; 1 if the sigmas are honest."""
+        return np.sqrt(np.mean(self.errors**2, axis=0))
+
+    @property
+    def beyond_three(self) -> int:
+        """How many of all parameters were off by more than three sigmas."""
+        return int(np.count_nonzero(np.abs(self.errors) > 3.0))
+
+
+def sigma_trial(seeds: int, seed: int = 0) -> SigmaTrial:
+    """Table 1's camera from the three poses, with `seeds` draws of corner noise."""
+    corners = corner_points(TARGET.board)
+    places = board_places()
+    seen = [CAMERA.image(place.apply(corners)) for place in places]
+    errors = []
+    for number in range(seeds):
+        rng = np.random.default_rng([seed, number])
+        views = [
+            PlanarView(f"s{k}", corners, pixels + rng.normal(0.0, CORNER_NOISE_PX, pixels.shape))
+            for k, pixels in enumerate(seen)
+        ]
+        found = calibrate_camera(views, CAMERA.width, CAMERA.height)
+        sigmas = np.sqrt(np.diag(found.covariance))
+        off = [getattr(found.camera, name) - getattr(CAMERA, name) for name in INTRINSICS]
+        errors.append(np.array(off) / sigmas)
+    return SigmaTrial(np.stack(errors))

@@ -1,0 +1,132 @@
+"""Everything the simulated camera takes for the experiments: boards, slide stage, spheres, plate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.boards.detection import find_boards
+from bodyscan.errors import BoardNotFound
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.laboratory.chapter.setup import (
+    BOARD,
+    CENTRES,
+    PROJECTOR,
+    RADIUS_MM,
+    ChapterSetup,
+    board_places,
+    board_surfaces,
+    expose_scene,
+    expose_twice,
+    plane_surfaces,
+    scene_truth,
+    sphere_surfaces,
+    stage_places,
+    stage_readings,
+)
+from bodyscan.laboratory.rivals.targets import StripedShot, Target
+from bodyscan.progress import Progress, silent
+from bodyscan.simulation.render import PixelTruth
+from bodyscan.simulation.scene import Surface
+from bodyscan.stripes.stripe_map import StripeMap
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TARGET = Target(BOARD, PROJECTOR)
+ON_SPHERE_MM = 0.02
+RIM_PX = 4
+WALL_MM = 600.0
+_BOARDS, _STAGE, _SPHERES, _PLATE = 0, 100, 200, 300
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One scene: the lit image, its stripes, the same light exposed once more, and the truth."""
+
+    lit: NDArray[np.uint8]
+    stripes: StripeMap
+    again: StripeMap
+    truth: PixelTruth
+
+
+@dataclass(frozen=True, eq=False)
+class ChapterCaptures:
+    """boards: the three poses.  stage, readings: a board on a slide stage, and its readings (mm).
+
+    owner: (H, W) number of the sphere that a pixel's centre sees and the projector lights, or -1.
+    on_plate: (H, W) pixels on the plate, clear of its rim.
+    """
+
+    setup: ChapterSetup
+    boards: tuple[StripedShot, ...]
+    stage: tuple[StripedShot, ...]
+    readings: Array
+    spheres: Seen
+    plate: Seen
+    owner: NDArray[np.int64]
+    on_plate: Mask
+
+
+def take_captures(
+    setup: ChapterSetup, *, stage_stops: int = 7, progress: Progress = silent
+) -> ChapterCaptures:
+    """Render, expose and decode all of it. Raises BoardNotFound if a board is not found."""
+    readings = stage_readings(stage_stops)
+    boards, stage = board_places(), stage_places(readings, setup.seed)
+    total = len(boards) + len(stage) + 2
+    progress("rendering", 0, total)
+    shots = []
+    for number, place in enumerate([*boards, *stage]):
+        of_stage = number - len(boards)
+        stream = _STAGE + of_stage if of_stage >= 0 else _BOARDS + number
+        name = f"stage{of_stage + 1}" if of_stage >= 0 else f"board{number + 1}"
+        shots.append(_board_shot(setup, place, name, stream))
+        progress("rendering", number + 1, total)
+    spheres = _seen(setup, sphere_surfaces(), _SPHERES)
+    progress("rendering", total - 1, total)
+    plate = _seen(setup, plane_surfaces(), _PLATE)
+    progress("rendering", total, total)
+    return ChapterCaptures(
+        setup,
+        tuple(shots[: len(boards)]),
+        tuple(shots[len(boards) :]),
+        readings,
+        spheres,
+        plate,
+        _owners(setup, spheres.truth),
+        _on_plate(plate.truth),
+    )
+
+
+def _board_shot(setup: ChapterSetup, place: RigidTransform, shot: str, number: int) -> StripedShot:
+    taken = expose_scene(setup, board_surfaces(setup, place), number)
+    views = find_boards(taken.lit, [BOARD], pair="chapter", shot=shot)
+    if not views:
+        raise BoardNotFound("the simulated board was not found", where=f"shot {shot}")
+    return StripedShot(views[0], taken.stripes)
+
+
+def _seen(setup: ChapterSetup, surfaces: Sequence[Surface], number: int) -> Seen:
+    first, second = expose_twice(setup, surfaces, number)
+    return Seen(first.lit, first.stripes, second.stripes, scene_truth(setup, surfaces))
+
+
+def _owners(setup: ChapterSetup, truth: PixelTruth) -> NDArray[np.int64]:
+    camera = setup.view.camera
+    points = camera.directions(camera.grid()) * truth.depth[..., None]
+    off = np.abs(np.linalg.norm(points[..., None, :] - CENTRES, axis=-1) - RADIUS_MM)
+    off = np.nan_to_num(off, nan=np.inf)
+    nearest = np.argmin(off, axis=-1)
+    on = (off.min(axis=-1) < ON_SPHERE_MM) & np.isfinite(truth.s)
+    return np.where(on, nearest, -1).astype(np.int64)
+
+
+def _on_plate(truth: PixelTruth) -> Mask:
+    near = (np.nan_to_num(truth.depth, nan=np.inf) < WALL_MM) & np.isfinite(truth.s)
+    window = np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)
+    return cv2.erode(near.astype(np.uint8), window, borderValue=0) > 0

@@ -1,0 +1,147 @@
+"""What one approach makes of the spheres and of the flat plate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.evaluation.planes import Flatness, flatness
+from bodyscan.evaluation.spheres import (
+    CentreDistances,
+    SphereAccuracy,
+    centre_distances,
+    measure_sphere,
+)
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.light_planes import LightPlanes
+from bodyscan.laboratory.chapter.captures import ChapterCaptures
+from bodyscan.laboratory.chapter.setup import (
+    CAMERA,
+    CENTRES,
+    PROJECTOR,
+    RADIUS_MM,
+    ChapterSetup,
+    true_planes,
+)
+from bodyscan.laboratory.rivals.approaches import Approach
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Stripes = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """One approach on the same images.
+
+    spheres: No. 1 to 5, from every measured pixel that a sphere covers and the projector lights.
+    covered: share of those pixels that were measured, for each sphere.
+    distances: between the spheres' centres (radius held), and what their scale is off.
+    plate: of the flat plate as decoded.  plate_systematic_mm: RMS from flat of the same plate, every
+    pixel's stripe coordinate known exactly: nothing but the calibration is left.
+    """
+
+    name: str
+    spheres: tuple[SphereAccuracy, ...]
+    covered: tuple[float, ...]
+    distances: CentreDistances
+    plate: Flatness
+    plate_systematic_mm: float
+
+    @property
+    def mean_e(self) -> float:
+        """Mean of E over the spheres, given radius, mm^2."""
+        return float(np.mean([sphere.e_given for sphere in self.spheres]))
+
+
+def points_of(approach: Approach, s: Stripes, where: Mask | None = None) -> Array:
+    """(N, 3) mm, camera frame, of the pixels `where` (H, W) is true (all by default), row by row,
+    from the stripe coordinate s (H, W) of every pixel; NaN where nothing is measured."""
+    rows, columns = np.nonzero(np.ones(s.shape, bool) if where is None else where)
+    rays = approach.camera.rays(np.column_stack([columns, rows]).astype(float))
+    wanted = s[rows, columns].astype(float)
+    known = np.isfinite(wanted)
+    points = np.full(rays.shape, np.nan)
+    depth = approach.sheets.depth(rays[known], wanted[known])
+    points[known] = rays[known] * depth[:, None]
+    return points
+
+
+def whole_stripes(s: Stripes) -> Stripes:
+    """One whole stripe a pixel, as the chapter's instrument gives it: the middle of the stripe."""
+    return np.floor(s) + 0.5
+
+
+def measure(
+    approach: Approach, captures: ChapterCaptures, *, whole: bool = False, name: str | None = None
+) -> Measured:
+    """whole: the stripe number of each pixel only, no fraction."""
+    maps = [captures.spheres.stripes.s, captures.plate.stripes.s]
+    spheres_s, plate_s = (whole_stripes(s) if whole else s for s in maps)
+    on_spheres = captures.owner >= 0
+    points, owner = points_of(approach, spheres_s, on_spheres), captures.owner[on_spheres]
+    found, covered = [], []
+    for number in range(len(CENTRES)):
+        own = owner == number
+        measured = _known(points[own])
+        found.append(measure_sphere(measured, RADIUS_MM))
+        covered.append(len(measured) / int(own.sum()))
+    centres = np.stack([sphere.given.centre for sphere in found])
+    return Measured(
+        name or approach.name,
+        tuple(found),
+        tuple(covered),
+        centre_distances(centres, CENTRES),
+        flatness(_known(points_of(approach, plate_s, captures.on_plate))),
+        flatness(_known(points_of(approach, captures.plate.truth.s, captures.on_plate))).rms_mm,
+    )
+
+
+def true_approach(setup: ChapterSetup, name: str = "true calibration") -> Approach:
+    """What nothing can calibrate better: the simulator's own camera and planes."""
+    camera = Camera(
+        **{field: getattr(CAMERA, field) for field in ("alpha", "beta", "gamma", "u0", "v0")},
+        k1=CAMERA.k1,
+        k2=CAMERA.k2,
+        width=CAMERA.width,
+        height=CAMERA.height,
+    )
+    planes = true_planes(setup)
+    unknown = np.zeros((len(planes), 4, 4))
+    return Approach(name, camera, LightPlanes(planes, unknown, PROJECTOR.direction))
+
+
+@dataclass(frozen=True)
+class NoiseBound:
+    """What the sensor's noise alone does to E, mm^2, for each sphere: true calibration, the same
+    light exposed twice, half the mean square of the difference.
+
+    everything: over all measured pixels.  best_share: over the 90 % of the lit pixels where the
+    decoder itself expects the least.
+    """
+
+    everything: tuple[float, ...]
+    best_share: tuple[float, ...]
+
+
+def noise_bound(captures: ChapterCaptures, share: float = 0.9) -> NoiseBound:
+    truth = true_approach(captures.setup)
+    seen = captures.spheres
+    everything, best = [], []
+    for number, centre in enumerate(CENTRES):
+        own = captures.owner == number
+        both = (points_of(truth, stripes.s, own) for stripes in (seen.stripes, seen.again))
+        distance = [np.linalg.norm(points - centre, axis=1) for points in both]
+        half = 0.5 * (distance[0] - distance[1]) ** 2
+        sigma = seen.stripes.sigma[own]
+        order = np.argsort(np.where(np.isfinite(half), sigma, np.inf))[: int(share * own.sum())]
+        everything.append(float(np.nanmean(half)))
+        best.append(float(np.nanmean(half[order])))
+    return NoiseBound(tuple(everything), tuple(best))
+
+
+def _known(points: Array) -> Array:
+    return points[np.isfinite(points[..., 2])]

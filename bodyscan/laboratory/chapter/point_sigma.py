@@ -1,0 +1,59 @@
+"""Whether a point's own sigma says how far off it is: errors of depth over sigma, on known surfaces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.geometry.measuring import measure
+from bodyscan.laboratory.chapter.captures import ChapterCaptures, Seen
+from bodyscan.laboratory.rivals.approaches import Approach
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class PointSigma:
+    """Errors of depth over their sigma: root mean square on the spheres and on the plate (1 if the
+    sigmas are honest), and the share of all that lies beyond three sigmas (0.0027 if Gaussian).
+
+    median_mm: of the sigmas themselves.
+    """
+
+    name: str
+    spheres: float
+    plate: float
+    beyond_three: float
+    median_mm: float
+
+
+def point_sigma(approach: Approach, captures: ChapterCaptures) -> PointSigma:
+    """From decoding noise and the sheets' covariance, against the simulator's true depth."""
+    parts = (
+        _errors(approach, captures.spheres, captures.owner >= 0),
+        _errors(approach, captures.plate, captures.on_plate),
+    )
+    spheres, plate = (error / sigma for error, sigma in parts)
+    every = np.concatenate([spheres, plate])
+    return PointSigma(
+        approach.name,
+        float(np.sqrt(np.mean(spheres**2))),
+        float(np.sqrt(np.mean(plate**2))),
+        float(np.mean(np.abs(every) > 3.0)),
+        float(np.median(np.concatenate([sigma for _, sigma in parts]))),
+    )
+
+
+def _errors(approach: Approach, seen: Seen, where: Mask) -> tuple[Array, Array]:
+    """Error of depth and its sigma, mm, of the measured pixels among `where` (H, W)."""
+    rows, columns = np.nonzero(where & np.isfinite(seen.stripes.s))
+    rays = approach.camera.rays(np.column_stack([columns, rows]).astype(float))
+    measured = measure(approach.sheets, rays, seen.stripes.s[rows, columns].astype(float))
+    decoding = measured.per_stripe * seen.stripes.sigma[rows, columns]
+    sigma = np.sqrt(decoding**2 + measured.variance_mm2)
+    error = measured.depth - seen.truth.depth[rows, columns]
+    known = np.isfinite(error) & np.isfinite(sigma)
+    return error[known], sigma[known]

@@ -1,0 +1,133 @@
+"""The chapter's figures 6 and 7 drawn from what was found. Matplotlib is imported here alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.files.atomic import replacing
+from bodyscan.geometry.light_planes import Axis, baseline_angle_tilt
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+
+Array = NDArray[np.float64]
+
+INK, GREY = "#333333", "#999999"
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
+"""Okabe and Ito's, told apart by the colour-blind too."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneCurve:
+    """A model's planes (N, 4) of Eq. 6 at stripe coordinates s (N,)."""
+
+    name: str
+    s: Array
+    planes: Array
+
+
+def draw_projector(
+    curves: Sequence[PlaneCurve], true: PlaneCurve, residuals_mm: Array, direction: Axis, path: Path
+) -> Path:
+    """Fig. 6: baselines, projection angles and tilts against the stripe's number, each model and the
+    truth; and how the boundary points' distances from their planes are distributed."""
+    figure, axes = plt.subplots(2, 2, figsize=(10.0, 7.5), constrained_layout=True)
+    baseline, angle, tilt, spread = axes.ravel()
+    for axis, part, label in (
+        (baseline, 0, "baseline, mm"),
+        (angle, 1, "projection angle, degrees"),
+        (tilt, 2, "tilt angle, degrees"),
+    ):
+        values = _explicit(true, direction)[part]
+        axis.plot(true.s, values, color=INK, linewidth=3.0, alpha=0.35, label=true.name)
+        for colour, curve in zip(COLOURS, curves, strict=False):
+            own = _explicit(curve, direction)[part]
+            axis.plot(curve.s, own, ".", color=colour, markersize=2.5, label=curve.name)
+        room = 0.6 * float(np.ptp(values)) + 1e-3
+        if part != 1:
+            axis.set_ylim(values.min() - room, values.max() + room)
+        axis.set_xlabel("light stripe number")
+        axis.set_ylabel(label)
+    baseline.legend(frameon=False, markerscale=4.0)
+    _distribution(spread, residuals_mm)
+    for axis in axes.ravel():
+        _plain(axis)
+    return _save(figure, path)
+
+
+@dataclass(frozen=True, eq=False)
+class RangeData:
+    """points: (H, W, 3) mm, normals likewise; off_mm: (H, W), how far they are from the truth."""
+
+    name: str
+    normals: Array
+    off_mm: Array
+
+
+def draw_range_data(data: Sequence[RangeData], path: Path) -> Path:
+    """Fig. 7: the five spheres as each approach measures them, and how far that is from the truth
+    along the viewing ray, the whole picture laid on the truth by a rigid motion first."""
+    figure, axes = plt.subplots(
+        2, len(data), figsize=(4.2 * len(data), 6.6), constrained_layout=True, squeeze=False
+    )
+    for shown, below, one in zip(axes[0], axes[1], data, strict=True):
+        light = np.array([-0.4, -0.4, -0.83])
+        grey = np.clip(np.nan_to_num(one.normals @ light, nan=0.0), 0.0, 1.0)
+        shown.imshow(grey, cmap="gray", vmin=0.0, vmax=1.0)
+        shown.set_title(one.name)
+        limit = _round_up(float(np.nanpercentile(np.abs(one.off_mm), 95)))
+        colours = matplotlib.colormaps["RdBu_r"].with_extremes(bad="#dddddd")
+        picture = below.imshow(one.off_mm, cmap=colours, vmin=-limit, vmax=limit)
+        figure.colorbar(picture, ax=below, shrink=0.8, label="off by, mm")
+        for axis in (shown, below):
+            axis.set_xticks([])
+            axis.set_yticks([])
+    return _save(figure, path)
+
+
+def _explicit(curve: PlaneCurve, direction: Axis) -> tuple[Array, Array, Array]:
+    length, angle, tilt = baseline_angle_tilt(curve.planes, direction)
+    return length, np.degrees(angle), np.degrees(tilt)
+
+
+def _distribution(axis: Axes, residuals_mm: Array) -> None:
+    """Of what noise leaves, against a normal curve of the same middle half."""
+    spread = 1.4826 * float(np.median(np.abs(residuals_mm))) + 1e-12
+    edges = np.linspace(-8.0 * spread, 8.0 * spread, 161)
+    density, _ = np.histogram(residuals_mm, edges)
+    density = density / (len(residuals_mm) * np.diff(edges))
+    axis.stairs(density, edges, fill=True, color=COLOURS[0], alpha=0.6)
+    normal = np.exp(-0.5 * (edges / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
+    axis.plot(edges, normal, color=INK, linewidth=1.0, label=f"normal, sigma {spread:.4f} mm")
+    axis.set_yscale("log")
+    axis.set_ylim(normal.max() * 1e-4, normal.max() * 3.0)
+    axis.set_xlabel("distance of a boundary point from its plane, mm")
+    axis.set_ylabel("density, 1/mm")
+    axis.legend(frameon=False, loc="upper right")
+
+
+def _plain(axis: Axes) -> None:
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)
+    axis.grid(color=GREY, alpha=0.25, linewidth=0.6)
+
+
+def _round_up(value: float) -> float:
+    """To 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(max(value, 1e-6)))
+    return float(next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value))
+
+
+def _save(figure: matplotlib.figure.Figure, path: Path) -> Path:
+    # Without a date and a version in it the same figure gives the same bytes.
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+    return path

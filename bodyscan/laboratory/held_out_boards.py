@@ -1,0 +1,151 @@
+"""How well a pair measures a board it was not calibrated on: planes against rival projectors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.boards.board import corner_points
+from bodyscan.boards.view import BoardView
+from bodyscan.calibration.boundary_points import BoundaryPoints, binned
+from bodyscan.calibration.camera import CameraCalibration
+from bodyscan.calibration.light import fit_light, smooth_models
+from bodyscan.calibration.light_planes import fit_light_planes, join
+from bodyscan.calibration.pair import BoardBoundaries, on_board
+from bodyscan.calibration.pinhole_projector import fit_pinhole, fit_pinhole_opencv
+from bodyscan.captures.folder import Captures
+from bodyscan.errors import PairFailed
+from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.rig.rig import Rig
+from bodyscan.stripes.stripe_map import StripeMap
+from bodyscan.workflows.calibrate_rig import calibrate_cameras, find_all_boards
+from bodyscan.workflows.decoding import decode_sequence
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """One model on one held-out board: median absolute distance of measured points to the board's
+    plane, RMS of the points about their own best plane (flatness), share of points measured.
+    """
+
+    model: str
+    shot: str
+    median_mm: float
+    flatness_rms_mm: float
+    measured: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    view: BoardView
+    camera_from_board: RigidTransform
+    points: BoundaryPoints
+    stripes: StripeMap
+
+
+def hold_out_boards(rig: Rig, captures: Captures, pair: str) -> list[HeldOut]:
+    """Hold each shot out in turn, fit every model on the others, measure the held-out board.
+
+    Boards are placed by their corners and a camera calibrated on all of them; the stripes of the
+    held-out board take no part in any fit.  Raises PairFailed with fewer than three boards.
+    """
+    camera, shots = _shots(rig, captures, pair)
+    results = []
+    for held in shots:
+        others = [shot for shot in shots if shot is not held]
+        for name, sheets in _models(rig, pair, camera, others).items():
+            results.append(_measure(name, sheets, held))
+    return results
+
+
+def _models(
+    rig: Rig, pair: str, camera: CameraCalibration, shots: Sequence[_Shot]
+) -> dict[str, LightSheets]:
+    projector = rig.pair(pair).projector
+    assert projector is not None
+    points = join([shot.points for shot in shots])
+    stripes, direction = projector.stripes, projector.direction
+    pinhole = fit_pinhole(points.points, points.index.astype(float))
+    corners = [_corners_with_stripe(rig, shot) for shot in shots]
+    opencv = fit_pinhole_opencv(
+        camera.camera,
+        [c[0] for c in corners],
+        [c[1] for c in corners],
+        [c[2] for c in corners],
+        pinhole,
+    )
+    smooth = dict(smooth_models(binned(points, camera.camera, direction), stripes, direction))
+    return {
+        "smooth planes": smooth["smooth planes"],
+        "free planes": fit_light_planes(points, stripes, direction).planes,
+        "chosen by held-out boards": fit_light(points, stripes, direction, camera.camera).sheets,
+        "pinhole (2 x 4, stripes)": pinhole.planes(stripes, direction),
+        "pinhole (OpenCV, corners)": opencv.planes(stripes, direction),
+    }
+
+
+def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, list[_Shot]]:
+    notes: list[str] = []
+    boards = {board.name: board for board in rig.boards}
+    views = [view for view in find_all_boards(rig, captures, notes) if view.pair == pair]
+    cameras, failed = calibrate_cameras(rig, views, boards)
+    if pair not in cameras:
+        raise PairFailed(failed.get(pair, "no boards"), where=f"pair {pair}")
+    camera = cameras[pair]
+    spec = rig.pair(pair)
+    assert spec.projector is not None
+    shots = []
+    for number, view in enumerate(views):
+        sequence = captures.sequence(pair, view.shot)
+        if sequence is None or not sequence.has_stripes:
+            continue
+        stripes = decode_sequence(sequence, spec, workers=2)
+        face_z = float(corner_points(boards[view.board])[view.corner_ids[0], 2])
+        pose = camera.camera_from_board[view.shot]
+        boundaries = BoardBoundaries(
+            stripes.boundary_index,
+            stripes.boundary_pixels,
+            stripes.boundary_sigma_px.astype(np.float64),
+        )
+        points = on_board(
+            camera.camera, spec.projector, boards[view.board], pose, face_z, boundaries, number
+        )
+        shots.append(_Shot(view, pose, points, stripes))
+    if len(shots) < 3:
+        raise PairFailed(
+            f"{len(shots)} boards with stripes, holding one out needs three",
+            where=f"pair {pair}",
+        )
+    return camera, shots
+
+
+def _corners_with_stripe(rig: Rig, shot: _Shot) -> tuple[Array, Array, Array]:
+    """Corners (N, 3), their pixels (N, 2) and stripe coordinates (N,), where all three are known."""
+    u, v = np.split(shot.view.pixels.astype(np.float32), 2, axis=1)
+    s = cv2.remap(
+        shot.stripes.s, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
+    ).ravel()
+    known = np.isfinite(s)
+    corners = corner_points(rig.board(shot.view.board))[shot.view.corner_ids]
+    return corners[known], shot.view.pixels[known], s[known].astype(float)
+
+
+def _measure(model: str, sheets: LightSheets, held: _Shot) -> HeldOut:
+    rays = held.points.points / held.points.points[:, 2:]
+    depth = sheets.depth(rays, held.points.index.astype(float))
+    known = np.isfinite(depth)
+    measured = rays[known] * depth[known, None]
+    centre = held.points.points.mean(axis=0)
+    distance = (measured - centre) @ held.camera_from_board.rotation[:, 2]
+    typical = float(np.median(np.abs(distance)))
+    near = np.abs(distance - np.median(distance)) < 10.0 * max(typical, 1e-6)
+    centred = measured[near] - measured[near].mean(axis=0)
+    flatness = float(np.sqrt(max(np.linalg.eigvalsh(centred.T @ centred)[0], 0.0) / len(centred)))
+    return HeldOut(model, held.view.shot, typical, flatness, float(known.mean()))

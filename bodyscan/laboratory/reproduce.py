@@ -1,0 +1,160 @@
+"""`bodyscan reproduce`: the chapter's own set-up simulated, its Tables 1 and 2, its Fig. 6 and 7."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.files.atomic import write_text
+from bodyscan.geometry.light_planes import LightPlanes
+from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.transforms import rigid_fit
+from bodyscan.laboratory.chapter.calibrating import Calibrated, calibrate_all, sigma_trial
+from bodyscan.laboratory.chapter.captures import ChapterCaptures, take_captures
+from bodyscan.laboratory.chapter.measuring import (
+    Measured,
+    measure,
+    noise_bound,
+    points_of,
+    true_approach,
+)
+from bodyscan.laboratory.chapter.point_sigma import point_sigma
+from bodyscan.laboratory.chapter.setup import (
+    CAMERA,
+    PROJECTOR,
+    chapter_setup,
+    ideal_settings,
+    real_settings,
+    true_planes,
+)
+from bodyscan.laboratory.chapter.text import Reproduction, report
+from bodyscan.laboratory.rivals.approaches import Approach
+from bodyscan.progress import Progress, silent
+from bodyscan.reconstruction.triangulation import grid_normals
+
+if TYPE_CHECKING:
+    from bodyscan.laboratory.figures import RangeData
+
+Array = NDArray[np.float64]
+
+SEEDS, STAGE_STOPS, SAMPLES = 250, 7, 5
+QUICK_SEEDS, QUICK_STAGE_STOPS, QUICK_SAMPLES = 5, 3, 3
+FIGURES = ("fig6-projector.png", "fig7-range-data.png")
+TEXT = "reproduction.md"
+
+
+def reproduce(
+    out: Path,
+    *,
+    seed: int = 0,
+    quick: bool = False,
+    real_light: bool = False,
+    progress: Progress = silent,
+) -> str:
+    """Simulate, calibrate every approach, measure; the text that is also written into `out`,
+    beside the figures.
+
+    seed: of all noise.  quick: coarser rendering and fewer shots, to try it out.  real_light: a
+    bowed board, speckle and all else that an ideal simulation leaves out.
+    """
+    settings = (real_settings if real_light else ideal_settings)(
+        QUICK_SAMPLES if quick else SAMPLES
+    )
+    setup = chapter_setup(settings, seed)
+    stops = QUICK_STAGE_STOPS if quick else STAGE_STOPS
+    captures = take_captures(setup, stage_stops=stops, progress=progress)
+    calibrated = calibrate_all(captures)
+    found = _measure_all(captures, calibrated, seed, quick, real_light, progress)
+    text = report(found)
+    draw(captures, calibrated, Path(out))
+    write_text(Path(out) / TEXT, text)
+    return text
+
+
+def _measure_all(
+    captures: ChapterCaptures,
+    calibrated: Calibrated,
+    seed: int,
+    quick: bool,
+    real_light: bool,
+    progress: Progress,
+) -> Reproduction:
+    shown = [*calibrated.approaches, true_approach(captures.setup)]
+    groups: list[tuple[Sequence[Approach], bool]] = [
+        (shown, True),
+        (shown, False),
+        (calibrated.by_stage, False),
+        (calibrated.by_reference, False),
+    ]
+    total = sum(len(approaches) for approaches, _ in groups)
+    results: list[tuple[Measured, ...]] = []
+    for approaches, whole in groups:
+        done = sum(map(len, results))
+        progress("measuring", done, total)
+        results.append(tuple(measure(approach, captures, whole=whole) for approach in approaches))
+    progress("measuring", total, total)
+    return Reproduction(
+        seed=seed,
+        real_light=real_light,
+        calibrated=calibrated,
+        trial=sigma_trial(QUICK_SEEDS if quick else SEEDS, seed),
+        whole=results[0],
+        fine=results[1],
+        by_stage=results[2],
+        by_reference=results[3],
+        noise=noise_bound(captures),
+        sigmas=tuple(point_sigma(approach, captures) for approach in _with_sigmas(shown)),
+    )
+
+
+def _with_sigmas(approaches: Sequence[Approach]) -> list[Approach]:
+    """Those whose sheets know their covariance."""
+    return [approach for approach in approaches if approach.name in ("(iii)", "ours")]
+
+
+def draw(captures: ChapterCaptures, calibrated: Calibrated, out: Path) -> None:
+    """Fig. 6 and Fig. 7 into the folder `out`."""
+    # Matplotlib takes a second to import: only whoever draws waits for it.
+    from bodyscan.laboratory.figures import PlaneCurve, draw_projector, draw_range_data
+
+    by_name = {approach.name: approach for approach in calibrated.approaches}
+    s = np.arange(PROJECTOR.stripes + 1.0)
+    curves = [PlaneCurve(name, s, _planes(by_name[name], s)) for name in ("(iii)", "ours", "(i)")]
+    true = PlaneCurve("true", s, true_planes(captures.setup))
+    distances = calibrated.planes.distances_mm
+    draw_projector(
+        curves,
+        true,
+        distances[np.isfinite(distances)],
+        PROJECTOR.direction,
+        out / FIGURES[0],
+    )
+    wanted = [by_name[name] for name in ("(i)", "(ii)", "(iii)", "ours")]
+    draw_range_data([_range_data(approach, captures) for approach in wanted], out / FIGURES[1])
+
+
+def _planes(approach: Approach, s: Array) -> Array:
+    """(N, 4) at stripe coordinates s; for bent sheets the planes that touch them."""
+    sheets = approach.sheets
+    if isinstance(sheets, LightPlanes):
+        return sheets.at(s)
+    if isinstance(sheets, SmoothSheets):
+        return sheets.tangent_planes(s)
+    raise TypeError(f"no planes of {type(sheets).__name__}")
+
+
+def _range_data(approach: Approach, captures: ChapterCaptures) -> RangeData:
+    from bodyscan.laboratory.figures import RangeData
+
+    s = captures.spheres.stripes.s
+    points = points_of(approach, s).reshape(*s.shape, 3)
+    true = CAMERA.directions(CAMERA.grid()) * captures.spheres.truth.depth[..., None]
+    both = np.isfinite(points[..., 2]) & np.isfinite(captures.spheres.truth.s)
+    laid = np.full(points.shape, np.nan)
+    laid[both] = rigid_fit(points[both], true[both]).apply(points[both])
+    normals = grid_normals(laid.astype(np.float32)).astype(float)
+    return RangeData(approach.name, normals, laid[..., 2] - true[..., 2])

@@ -1,0 +1,122 @@
+"""The approaches of 4.2, and every rival projector at the same points, all as camera and sheets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.calibration.boundary_points import BoundaryPoints, thinned
+from bodyscan.calibration.light_planes import fit_light_planes
+from bodyscan.calibration.pinhole_projector import fit_pinhole
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
+from bodyscan.laboratory.rivals.baseline_models import (
+    fit_invariable_baseline,
+    fit_variable_baseline,
+)
+from bodyscan.laboratory.rivals.remapped_pinhole import fit_remapped_pinhole
+from bodyscan.laboratory.rivals.targets import (
+    Located,
+    StripedShot,
+    Target,
+    by_matrix,
+    relocated,
+)
+
+Array = NDArray[np.float64]
+
+MATRIX_POINTS = 20000
+"""So many points fix the few numbers of a matrix far better than the model fits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Approach:
+    """A calibrated pair as triangulation needs it, whatever the models."""
+
+    name: str
+    camera: Camera
+    sheets: LightSheets
+
+
+def pinhole_by_stage(
+    target: Target, shots: Sequence[StripedShot], readings: Array, name: str = "(i)"
+) -> Approach:
+    """Approach (i) as the chapter has it: a 3 x 4 and a 2 x 4 matrix from a slide stage, no lens,
+    and the index taken for a place on the projector's slide."""
+    return _fitted(name, by_matrix(target, shots, readings), target, pinhole_planes)
+
+
+def mended_pinhole_by_stage(target: Target, stage: Located, name: str = "(i) mended") -> Approach:
+    """Approach (i) with what it lacks: Tsai's camera with its lens, and a re-mapped index."""
+    return _fitted(name, stage, target, remapped_planes)
+
+
+def planes_by_stage_camera(
+    target: Target, stage: Located, shots: Sequence[StripedShot], name: str = "(ii)"
+) -> Approach:
+    """Approach (ii): Tsai's camera from the slide stage, planes from the reference plane.
+
+    So the chapter's text has it, though it is headed `calibrated by slide stage`.
+    """
+    return _fitted(name, relocated(target, shots, stage.camera), target, free_planes)
+
+
+def planes_by_reference(target: Target, reference: Located, name: str = "(iii)") -> Approach:
+    """Approach (iii), the chapter's own: all from the reference plane, one plane a boundary."""
+    return _fitted(name, reference, target, free_planes)
+
+
+Model = Callable[[BoundaryPoints, int, Axis], LightPlanes]
+
+
+def free_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
+    """One plane a stripe (Eq. 6)."""
+    return fit_light_planes(points, stripes, direction).planes
+
+
+def pinhole_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
+    """The 2 x 4 matrix of Bolles et al. 1981."""
+    few = thinned(points, MATRIX_POINTS)
+    fitted = fit_pinhole(few.points, few.index.astype(float))
+    return fitted.planes(stripes, direction)
+
+
+def remapped_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
+    """The 2 x 4 matrix with a re-mapped index."""
+    few = thinned(points, MATRIX_POINTS)
+    return fit_remapped_pinhole(few.points, few.index.astype(float), stripes, direction)
+
+
+def _invariable(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
+    return fit_invariable_baseline(points, stripes, direction, fit_tilt=False)
+
+
+def _variable(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
+    return fit_variable_baseline(points, stripes, direction, fit_tilt=False)
+
+
+PROJECTORS: dict[str, Model] = {
+    "2 x 4 matrix": pinhole_planes,
+    "2 x 4 matrix, index re-mapped": remapped_planes,
+    "invariable baseline": _invariable,
+    "invariable baseline, tilted": fit_invariable_baseline,
+    "variable baseline": _variable,
+    "variable baseline, tilted": fit_variable_baseline,
+    "free planes": free_planes,
+}
+"""Every model of the projector that the chapter names; `tilted`: the baseline's direction in the
+image is found too, not taken for the camera's x axis."""
+
+
+def rivals(target: Target, where: Located) -> list[Approach]:
+    """Each model fitted to the same boundaries."""
+    return [_fitted(name, where, target, model) for name, model in PROJECTORS.items()]
+
+
+def _fitted(name: str, where: Located, target: Target, model: Model) -> Approach:
+    projector = target.projector
+    sheets = model(where.points, projector.stripes, projector.direction)
+    return Approach(name, where.camera, sheets)

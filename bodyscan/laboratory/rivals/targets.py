@@ -1,0 +1,182 @@
+"""What a pair is calibrated with: a reference plane held anywhere, or one on a slide stage (4.2).
+
+Both give the same: a camera, and stripe boundaries at known places in its frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.boards.view import BoardView
+from bodyscan.calibration.boundary_points import BoundaryPoints, join
+from bodyscan.calibration.camera import (
+    CameraCalibration,
+    PlanarView,
+    calibrate_camera,
+    locate_board,
+)
+from bodyscan.calibration.pair import boundaries_near, on_board, planar_view
+from bodyscan.calibration.zhang import homography
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.laboratory.rivals.projection_matrix import (
+    projection_matrix,
+    split_projection_matrix,
+)
+from bodyscan.laboratory.rivals.tsai import TsaiCamera, calibrate_tsai
+from bodyscan.rig.board import Board
+from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.stripe_map import StripeMap
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class StripedShot:
+    """One board in one shot: its corners, and the stripes that fell on it."""
+
+    view: BoardView
+    stripes: StripeMap
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What the shots have in common."""
+
+    board: Board
+    projector: ProjectorSpec
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """camera, camera_from_board by shot, and the boundaries on the boards, camera frame."""
+
+    camera: Camera
+    camera_from_board: dict[str, RigidTransform]
+    points: BoundaryPoints
+
+
+def by_reference_plane(
+    target: Target, shots: Sequence[StripedShot]
+) -> tuple[CameraCalibration, Located]:
+    """The chapter's way (3): Zhang's camera, which also says where the boards are."""
+    height, width = shots[0].stripes.s.shape
+    views = [planar_view(shot.view, target.board) for shot in shots]
+    found = calibrate_camera(views, width, height)
+    return found, located(target, shots, found.camera, found.camera_from_board)
+
+
+def by_slide_stage(
+    target: Target, shots: Sequence[StripedShot], readings: Array
+) -> tuple[TsaiCamera, Located]:
+    """Tsai's camera from a board that slid along its normal to `readings` (shots,) mm."""
+    height, width = shots[0].stripes.s.shape
+    points, pixels = stage_points(target.board, shots, readings)
+    middle = np.array([(width - 1) / 2.0, (height - 1) / 2.0])
+    tsai = calibrate_tsai(points, pixels, middle)
+    poses = {
+        shot.view.shot: tsai.camera_from_points @ _slid(float(reading))
+        for shot, reading in zip(shots, readings, strict=True)
+    }
+    return tsai, located(target, shots, tsai.camera(width, height), poses)
+
+
+def by_matrix(target: Target, shots: Sequence[StripedShot], readings: Array) -> Located:
+    """A 3 x 4 camera from the same stage, without a lens (Bolles et al. 1981).
+
+    Where the stripes fall is read off each board by its own homography, which knows no lens either.
+    """
+    height, width = shots[0].stripes.s.shape
+    points, pixels = stage_points(target.board, shots, readings)
+    matrix = projection_matrix(points, pixels)
+    camera, camera_from_stage = split_projection_matrix(matrix, width, height)
+    poses, parts = {}, []
+    for number, (shot, reading) in enumerate(zip(shots, readings, strict=True)):
+        pose = camera_from_stage @ _slid(float(reading))
+        poses[shot.view.shot] = pose
+        view = planar_view(shot.view, target.board)
+        parts.append(_by_homography(target, shot, view, camera, pose, number))
+    return Located(camera, poses, join(parts))
+
+
+def relocated(target: Target, shots: Sequence[StripedShot], camera: Camera) -> Located:
+    """Boards anywhere, seen by a camera that is known already."""
+    poses = {
+        shot.view.shot: locate_board(camera, planar_view(shot.view, target.board))[0]
+        for shot in shots
+    }
+    return located(target, shots, camera, poses)
+
+
+def located(
+    target: Target,
+    shots: Sequence[StripedShot],
+    camera: Camera,
+    camera_from_board: dict[str, RigidTransform],
+) -> Located:
+    """Carry the boundaries onto boards of known place (Eq. 18)."""
+    parts = [
+        on_board(
+            camera,
+            target.projector,
+            target.board,
+            camera_from_board[shot.view.shot],
+            0.0,
+            boundaries_near(shot.stripes, shot.view),
+            number,
+        )
+        for number, shot in enumerate(shots)
+    ]
+    return Located(camera, camera_from_board, join(parts))
+
+
+def stage_points(
+    board: Board, shots: Sequence[StripedShot], readings: Array
+) -> tuple[Array, Array]:
+    """All corners in the stage's frame (N, 3) mm: the board's at reading 0; and pixels (N, 2)."""
+    views = [planar_view(shot.view, board) for shot in shots]
+    points = [
+        view.points + [0.0, 0.0, reading] for view, reading in zip(views, readings, strict=True)
+    ]
+    return np.concatenate(points), np.concatenate([view.pixels for view in views])
+
+
+def _slid(reading: float) -> RigidTransform:
+    return RigidTransform(np.eye(3), np.array([0.0, 0.0, reading]))
+
+
+def _by_homography(
+    target: Target,
+    shot: StripedShot,
+    view: PlanarView,
+    camera: Camera,
+    camera_from_board: RigidTransform,
+    number: int,
+) -> BoundaryPoints:
+    """A board's boundaries, placed on it by the corners around them alone."""
+    near = boundaries_near(shot.stripes, shot.view)
+    onto_board = np.linalg.inv(homography(view.points[:, :2], view.pixels))
+
+    def carried(pixels: Array) -> Array:
+        image = np.column_stack([pixels, np.ones(len(pixels))]) @ onto_board.T
+        flat = np.column_stack([image[:, :2] / image[:, 2:], np.zeros(len(image))])
+        return camera_from_board.apply(flat)
+
+    # What lies on the checkered area is judged as for every other model.
+    everything = on_board(
+        camera, target.projector, target.board, camera_from_board, 0.0, near, number
+    )
+    pixels = camera.project(everything.points)
+    horizontal = target.projector.direction == "horizontal"
+    across = np.array([0.0, 0.5]) if horizontal else np.array([0.5, 0.0])
+    return BoundaryPoints(
+        everything.index,
+        everything.board,
+        carried(pixels),
+        carried(pixels + across) - carried(pixels - across),
+        everything.sigma_px,
+    )

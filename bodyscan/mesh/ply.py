@@ -1,0 +1,151 @@
+"""PLY, binary little endian: our own clouds and meshes, exact on reading back."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.errors import ResultError
+from bodyscan.files.atomic import replacing
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+
+Records = NDArray[np.void]
+
+END = b"end_header\n"
+HEADER_LIMIT = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Element:
+    """One kind of record in a PLY file: its name, its fields (numpy) and its properties (PLY)."""
+
+    name: str
+    fields: np.dtype[Any]
+    properties: tuple[str, ...]
+
+    def header(self, count: int) -> list[str]:
+        properties = [f"property {text}" for text in self.properties]
+        return [f"element {self.name} {count}", *properties]
+
+
+def _vertex(*extra: tuple[str, str, str]) -> Element:
+    """Position, normal, colour, sigma, and what is extra: (name, numpy type, PLY type)."""
+    fields = [(axis, "<f8", "double") for axis in ("x", "y", "z")]
+    fields += [(axis, "<f4", "float") for axis in ("nx", "ny", "nz")]
+    fields += [(colour, "u1", "uchar") for colour in ("red", "green", "blue")]
+    fields += [("sigma_mm", "<f4", "float"), *extra]
+    return Element(
+        "vertex",
+        np.dtype([(name, kind) for name, kind, _ in fields]),
+        tuple(f"{kind} {name}" for name, _, kind in fields),
+    )
+
+
+CLOUD: tuple[Element, ...] = (_vertex(("pairs_seen", "u1", "uchar")),)
+MESH: tuple[Element, ...] = (
+    _vertex(),
+    Element(
+        "face",
+        np.dtype([("count", "u1"), ("corners", "<i4", 3), ("filled", "u1")]),
+        ("list uchar int vertex_indices", "uchar filled"),
+    ),
+)
+
+
+def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
+    """Write a cloud or a mesh in mm, rig frame. A mesh's faces carry a uchar `filled` (0 or 1)."""
+    if isinstance(body, BodyCloud):
+        elements, records = CLOUD, [_vertex_records(CLOUD[0], body, body.points)]
+        records[0]["pairs_seen"] = body.pairs_seen
+    else:
+        elements = MESH
+        faces = np.empty(len(body.faces), MESH[1].fields)
+        faces["count"], faces["corners"], faces["filled"] = 3, body.faces, body.filled
+        records = [_vertex_records(MESH[0], body, body.vertices), faces]
+    with replacing(Path(path)) as temporary, temporary.open("wb") as stream:
+        stream.write(_header(elements, [len(some) for some in records]))
+        for some in records:
+            stream.write(some.data)
+
+
+def read_ply_cloud(path: Path) -> BodyCloud:
+    """A cloud that `write_ply` wrote. Raises ResultError if the file is not one."""
+    (vertices,) = _read(Path(path), CLOUD, "cloud")
+    return BodyCloud(*_vertex_arrays(vertices), vertices["pairs_seen"].copy())
+
+
+def read_ply_mesh(path: Path) -> BodyMesh:
+    """A mesh that `write_ply` wrote. Raises ResultError if the file is not one."""
+    vertices, faces = _read(Path(path), MESH, "mesh")
+    points, normals, sigma_mm, colours = _vertex_arrays(vertices)
+    corners = faces["corners"].astype(np.int64)
+    if corners.size and (corners.min() < 0 or corners.max() >= len(points)):
+        raise ResultError("a face names a vertex that is not there", where=str(path))
+    return BodyMesh(points, corners, normals, colours, sigma_mm, faces["filled"] != 0)
+
+
+def _vertex_records(
+    element: Element, body: BodyCloud | BodyMesh, positions: NDArray[np.float64]
+) -> Records:
+    records = np.empty(len(positions), element.fields)
+    for k, (axis, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
+        records[axis] = positions[:, k]
+        records[f"n{axis}"] = body.normals[:, k]
+        records[colour] = body.colours[:, k]
+    records["sigma_mm"] = body.sigma_mm
+    return records
+
+
+def _vertex_arrays(
+    records: Records,
+) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """Positions, normals, sigmas and colours."""
+
+    def columns(*names: str) -> NDArray[Any]:
+        return np.stack([records[name] for name in names], axis=-1)
+
+    colours = columns("red", "green", "blue")
+    return columns("x", "y", "z"), columns("nx", "ny", "nz"), records["sigma_mm"].copy(), colours
+
+
+def _header(elements: Sequence[Element], counts: Sequence[int]) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += ["comment bodyscan: mm, x the way the subject faces, z up, floor at z = 0"]
+    for element, count in zip(elements, counts, strict=True):
+        lines += element.header(count)
+    return "\n".join([*lines, ""]).encode("ascii") + END
+
+
+def _read(path: Path, elements: Sequence[Element], what: str) -> list[Records]:
+    """The records of a file that `write_ply` wrote with these elements."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ResultError(f"cannot be read ({error.strerror})", where=str(path)) from error
+    end = data[:HEADER_LIMIT].find(END) + len(END)
+    lines = _meaning(data[:end])
+    counts = [int(line.split()[-1]) for line in lines if re.fullmatch(rb"element \w+ \d+", line)]
+    sizes = [n * element.fields.itemsize for n, element in zip(counts, elements, strict=False)]
+    ours = len(counts) == len(elements) and lines == _meaning(_header(elements, counts))
+    if not ours or len(data) != end + sum(sizes):
+        raise ResultError(
+            f"is not a {what} that bodyscan wrote, or is cut short",
+            where=str(path),
+            remedy="Export it again; PLY files of other programs are not read.",
+        )
+    records, start = [], end
+    for element, count, size in zip(elements, counts, sizes, strict=True):
+        records.append(np.frombuffer(data, element.fields, count, start))
+        start += size
+    return records
+
+
+def _meaning(header: bytes) -> list[bytes]:
+    """A header's lines without its comments."""
+    return [line for line in header.splitlines() if not line.startswith(b"comment")]

@@ -1,0 +1,60 @@
+"""A nearly closed triangle mesh made a closed manifold one."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from bodyscan.mesh.half_edges import RIM, UNSOUND, corner_fans, twins
+from bodyscan.mesh.topology import face_components, signed_volume, without_unused
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+def closed(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
+    """Vertices (V, 3) and faces (F, 3) of a closed manifold surface made from nearly one.
+
+    Faces at edges that more than two share go, surfaces that touch in a vertex are parted, holes
+    are closed with fans of triangles. An octree's surface has a few such places; a closed
+    manifold stays as it is, but for the numbers of its vertices.
+    """
+    twin = twins(faces, len(vertices))
+    sound = (twin != UNSOUND).all(axis=1)
+    if not sound.all():
+        faces = faces[sound]
+        twin = twins(faces, len(vertices))
+    parted, count = corner_fans(twin)
+    places = np.empty((count, 3))
+    places[parted] = vertices[faces]
+    following = np.roll(parted, -1, axis=1)
+    return _holes_filled(
+        places, parted, np.stack([parted[twin == RIM], following[twin == RIM]], axis=-1)
+    )
+
+
+def _holes_filled(vertices: Array, faces: Indices, rim: Indices) -> tuple[Array, Indices]:
+    """Every rim, of edges (N, 2), gets a vertex at its middle and a triangle for each of them."""
+    if not len(rim):
+        return vertices, faces
+    corners, ends = np.unique(rim, return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    graph = coo_array((np.ones(len(rim), np.int8), tuple(ends.T)), shape=(len(corners),) * 2)
+    _, piece = connected_components(graph, directed=False)
+    hole = piece[ends[:, 0]]
+    size = np.bincount(hole)
+    middles = np.stack(
+        [np.bincount(hole, vertices[rim[:, 0], axis]) / size for axis in range(3)], axis=-1
+    )
+    fans = np.stack([rim[:, 1], rim[:, 0], len(vertices) + hole], axis=-1)
+    return np.concatenate([vertices, middles]), np.concatenate([faces, fans])
+
+
+def largest_piece(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
+    """The connected piece with the most faces, closed and turned to look outwards."""
+    vertices, faces = closed(vertices, faces)
+    labels = face_components(faces, len(vertices))
+    vertices, faces, _ = without_unused(vertices, faces[labels == np.argmax(np.bincount(labels))])
+    return vertices, faces if signed_volume(vertices, faces) > 0 else faces[:, ::-1].copy()

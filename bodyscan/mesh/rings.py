@@ -1,0 +1,62 @@
+"""Rings that a body closes where its parts touch: a hand on the hip, one knee against the other.
+
+The mesh is cut into layers. The pieces of all layers, joined where they meet, make a graph; on a
+surface without handles that graph is a tree whatever the shape (it is the nerve of the height's
+level sets, see Reeb 1946), and each ring of it is a handle of the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from bodyscan.mesh.topology import directed_edges
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+LAYER_MM = 20.0
+
+
+@dataclass(frozen=True)
+class Ring:
+    """A closed ring of body parts: its lowest and highest place, its middle's y, rig frame, mm."""
+
+    low_mm: float
+    high_mm: float
+    y_mm: float
+
+
+def rings(vertices: Array, faces: Indices, *, smallest_mm: float = 80.0) -> list[Ring]:
+    """Rings at least `smallest_mm` high of a closed mesh, from the lowest up."""
+    edges = directed_edges(faces)
+    edges = edges[edges[:, 0] < edges[:, 1]]
+    # An edge that skipped a layer would make a ring where there is none.
+    layer_mm = max(LAYER_MM, float(np.abs(np.diff(vertices[edges, 2], axis=1)).max()))
+    layer = np.floor(vertices[:, 2] / layer_mm).astype(np.int64)
+    within = layer[edges[:, 0]] == layer[edges[:, 1]]
+    size = len(vertices)
+    graph = coo_array(
+        (np.ones(np.count_nonzero(within), np.int8), tuple(edges[within].T)), shape=(size, size)
+    )
+    count, piece = connected_components(graph, directed=False)
+    height = np.zeros(count)
+    height[piece] = layer_mm * (layer + 0.5)
+    y = np.bincount(piece, vertices[:, 1], count) / np.bincount(piece, minlength=count)
+    pieces = nx.Graph(np.unique(piece[edges[~within]], axis=0).tolist())
+    found = []
+    for cycle in nx.minimum_cycle_basis(_stripped(pieces)):
+        heights = height[cycle]
+        if np.ptp(heights) >= smallest_mm:
+            found.append(Ring(float(heights.min()), float(heights.max()), float(y[cycle].mean())))
+    return sorted(found, key=lambda ring: (ring.low_mm, ring.y_mm))
+
+
+def _stripped(graph: nx.Graph) -> nx.Graph:
+    """Without the branches that are in no ring."""
+    return nx.k_core(graph, 2)

@@ -1,0 +1,111 @@
+"""Is a triangle mesh a closed, oriented, manifold surface, and of how many pieces?
+
+Linear in the number of faces (Open3D's is_watertight looks for self-intersections too
+and is quadratic).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from bodyscan.mesh.half_edges import corner_fans, twins
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Topology:
+    """What a mesh is, as a surface."""
+
+    closed: bool  # every edge lies in exactly two faces, which run along it in opposite directions
+    manifold: bool  # closed, and the faces around every vertex form a single fan
+    components: int
+    euler: int  # 2 for a sphere, less 2 for each handle
+    volume_mm3: float  # signed; positive if the faces look outwards
+
+
+def topology(vertices: Array, faces: Indices) -> Topology:
+    """Of a mesh with vertices (V, 3) and faces (F, 3); unused vertices do not count."""
+    used = used_vertices(faces, len(vertices))
+    count = len(vertices)
+    twin = twins(faces, count)
+    closed = bool(faces.size) and bool((twin >= 0).all())
+    edge_count = 3 * len(faces) // 2 if closed else len(np.unique(_edge_keys(faces, count)))
+    labels = face_components(faces, count)
+    return Topology(
+        closed,
+        closed and corner_fans(twin)[1] == used.size,
+        int(labels.max() + 1) if labels.size else 0,
+        int(used.size - edge_count + len(faces)),
+        signed_volume(vertices, faces),
+    )
+
+
+def _edge_keys(faces: Indices, vertex_count: int) -> Indices:
+    """(3 F,) a number for each edge, whichever way it runs."""
+    low, high = np.sort(directed_edges(faces), axis=1).T
+    return low * vertex_count + high
+
+
+def directed_edges(faces: Indices) -> Indices:
+    """(3 F, 2): edge k of face f, at k * F + f, runs from its corner k to the next."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def face_components(faces: Indices, vertex_count: int) -> NDArray[np.int32]:
+    """(F,) number of the connected piece that each face belongs to."""
+    edges = directed_edges(faces)
+    graph = coo_array(
+        (np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])),
+        shape=(vertex_count, vertex_count),
+    )
+    _, labels = connected_components(graph, directed=False)
+    return np.unique(labels[faces[:, 0]], return_inverse=True)[1].astype(np.int32)
+
+
+def signed_volume(vertices: Array, faces: Indices) -> float:
+    """Volume inside a closed mesh; negative if its faces look inwards."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return float(np.einsum("fc,fc->", a, np.cross(b, c)) / 6.0)
+
+
+def face_areas(vertices: Array, faces: Indices) -> Array:
+    """(F,) mm2."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def vertex_normals(vertices: Array, faces: Indices) -> NDArray[np.float32]:
+    """(V, 3) unit normals, the mean of the faces around weighted by area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    total = np.stack(
+        [
+            np.bincount(faces.ravel(), np.repeat(cross[:, k], 3), minlength=len(vertices))
+            for k in range(3)
+        ],
+        axis=-1,
+    )
+    length = np.linalg.norm(total, axis=-1, keepdims=True)
+    return (total / np.where(length > 0, length, 1.0)).astype(np.float32)
+
+
+def without_unused(vertices: Array, faces: Indices) -> tuple[Array, Indices, Indices]:
+    """Vertices that faces use, the faces renumbered, and which old vertices stayed."""
+    used = used_vertices(faces, len(vertices))
+    number = np.full(len(vertices), -1, np.int64)
+    number[used] = np.arange(used.size)
+    return vertices[used], number[faces], used
+
+
+def used_vertices(faces: Indices, count: int) -> Indices:
+    """Numbers of the vertices (of `count`) that faces use, rising."""
+    used = np.zeros(count, bool)
+    used[faces] = True
+    return np.flatnonzero(used)

@@ -1,0 +1,64 @@
+"""A calibration board as the rig file describes it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import Field, PositiveFloat
+
+from bodyscan.files.model import Model, Name, Problem, did_you_mean
+from bodyscan.rig.dictionaries import MARKERS_IN
+
+
+class Board(Model):
+    """A flat checkered board. `columns` x `rows` counts squares, not corners.
+
+    Board frame: origin at the first square's outer corner (of the checkered area), x along the
+    columns, y along the rows (down, as printed), z away from whoever looks at the front.
+    """
+
+    name: Name
+    kind: Literal["checkerboard", "charuco"] = "checkerboard"
+    columns: Annotated[int, Field(ge=3, le=200)]
+    rows: Annotated[int, Field(ge=3, le=200)]
+    square_mm: PositiveFloat
+    marker_mm: PositiveFloat | None = None
+    dictionary: str = "DICT_4X4_1000"
+    legacy_layout: bool = False
+    first_marker: Annotated[int, Field(ge=0)] = 0
+    margin_mm: Annotated[float, Field(ge=0)] = 0.0
+    faces: Literal[1, 2] = 1
+    thickness_mm: Annotated[float, Field(ge=0)] = 0.0
+
+    @property
+    def marker_count(self) -> int:
+        """Markers on all faces of a charuco board: every second square of a face carries one."""
+        return self.faces * (self.columns * self.rows // 2) if self.kind == "charuco" else 0
+
+    def problems(self) -> Iterator[Problem]:
+        return _problems(self)
+
+
+def _problems(board: Board) -> Iterator[Problem]:
+    if board.faces == 1 and board.thickness_mm > 0:
+        yield ("thickness_mm",), "is for a board with faces: 2 (it is between the two prints)"
+    if board.kind == "checkerboard":
+        if board.marker_mm is not None:
+            yield ("marker_mm",), "is for kind: charuco; a checkerboard has no markers"
+        return
+    if board.marker_mm is None:
+        yield ("marker_mm",), "is missing: a charuco board needs the side of its markers"
+    elif board.marker_mm >= board.square_mm:
+        wrong = f"must be less than square_mm ({board.square_mm:g}) (got {board.marker_mm:g})"
+        yield ("marker_mm",), wrong
+    if board.dictionary not in MARKERS_IN:
+        hint = did_you_mean(board.dictionary, MARKERS_IN)
+        yield ("dictionary",), f"is no dictionary of OpenCV{hint} (got {board.dictionary!r})"
+    elif board.first_marker + board.marker_count > MARKERS_IN[board.dictionary]:
+        end = board.first_marker + board.marker_count - 1
+        held = MARKERS_IN[board.dictionary]
+        yield (
+            ("dictionary",),
+            f"holds markers 0 to {held - 1}, but this board needs {board.first_marker} to {end}",
+        )

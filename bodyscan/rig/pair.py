@@ -1,0 +1,47 @@
+"""One pair: its camera, its projector, and where both are meant to stand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated
+
+from pydantic import Field
+
+from bodyscan.files.model import Model, Name, Problem
+from bodyscan.rig.rig_frame import Vector
+from bodyscan.stripes.projector_spec import ProjectorSpec
+
+Pixels = Annotated[int, Field(gt=0, le=32767)]
+
+
+class CameraSpec(Model):
+    """Image size in pixels."""
+
+    width: Pixels
+    height: Pixels
+
+
+class Placing(Model):
+    """Where something is meant to stand, rig frame: looks from `position_mm` at `look_at_mm`."""
+
+    position_mm: Vector
+    look_at_mm: Vector
+
+    def problems(self) -> Iterator[Problem]:
+        if self.position_mm == self.look_at_mm:
+            yield ("look_at_mm",), "must differ from position_mm, or it looks nowhere"
+
+
+class Pair(Model):
+    """One camera and one projector (or a camera alone)."""
+
+    name: Name
+    pole: Name | None = None
+    camera: CameraSpec
+    projector: ProjectorSpec | None = None
+    nominal: Placing | None = None
+    projector_nominal: Placing | None = None
+
+    def problems(self) -> Iterator[Problem]:
+        if self.projector_nominal and not self.projector:
+            yield ("projector_nominal",), "needs a projector: this pair is a camera alone"

@@ -1,0 +1,86 @@
+"""The whole rig file: boards, poles, pairs, where captures lie and how files are named."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+from pydantic import Field, PositiveFloat
+
+from bodyscan.files.model import Model, Name, Problem
+from bodyscan.rig.board import Board
+from bodyscan.rig.capture_folder import CaptureFolder
+from bodyscan.rig.consistency import RigParts, rig_problems
+from bodyscan.rig.frame_names import FrameNames
+from bodyscan.rig.pair import Pair
+from bodyscan.rig.rig_frame import RigFrame
+
+
+class Volume(Model):
+    """The scan volume: an upright cylinder on the floor around the rig's centre."""
+
+    radius_mm: PositiveFloat = 700.0
+    bottom_mm: float = 5.0
+    top_mm: PositiveFloat = 2200.0
+
+    def problems(self) -> Iterator[Problem]:
+        if self.bottom_mm >= self.top_mm:
+            yield (
+                ("bottom_mm",),
+                f"must lie below top_mm ({self.top_mm:g}) (got {self.bottom_mm:g})",
+            )
+
+
+class Rig(Model):
+    """The whole rig file."""
+
+    version: Literal[1] = 1
+    name: Name
+    boards: tuple[Board, ...] = Field(min_length=1)
+    pairs: tuple[Pair, ...] = Field(min_length=1)
+    calibration: tuple[CaptureFolder, ...] = ()
+    files: str = "{shot}/{pair}/{frame}.png"
+    frames: FrameNames = FrameNames()
+    rig_frame: RigFrame = RigFrame()
+    volume: Volume = Volume()
+
+    def pair(self, name: str) -> Pair:
+        """The pair of that name; KeyError if there is none."""
+        return {pair.name: pair for pair in self.pairs}[name]
+
+    def board(self, name: str) -> Board:
+        """The board of that name; KeyError if there is none."""
+        return {board.name: board for board in self.boards}[name]
+
+    @property
+    def poles(self) -> dict[str, str]:
+        """The pole of each pair that stands on one."""
+        return {pair.name: pair.pole for pair in self.pairs if pair.pole}
+
+    @property
+    def frame_pair(self) -> Pair | None:
+        """The pair that fixes the rig frame, or None where a board in a shot does."""
+        if self.rig_frame.shot is not None:
+            return None
+        return self.pair(self.rig_frame.pair) if self.rig_frame.pair else self.pairs[0]
+
+    @property
+    def frame_board(self) -> Board | None:
+        """The board that fixes the rig frame, or None where a pair does."""
+        if self.rig_frame.shot is None:
+            return None
+        return self.board(self.rig_frame.board) if self.rig_frame.board else self.boards[0]
+
+    def problems(self) -> Iterator[Problem]:
+        return rig_problems(
+            RigParts(
+                board_names=tuple(board.name for board in self.boards),
+                boards=self.boards,
+                pair_names=tuple(pair.name for pair in self.pairs),
+                pairs=self.pairs,
+                folders=self.calibration,
+                files=self.files,
+                frames=self.frames,
+                rig_frame=self.rig_frame,
+            )
+        )

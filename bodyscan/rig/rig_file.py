@@ -1,0 +1,63 @@
+"""The rig file, read and checked; see docs/formats.md."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from bodyscan.errors import RigFileError
+from bodyscan.files.atomic import write_text
+from bodyscan.files.model import Problem
+from bodyscan.files.model_file import load_model, validated
+from bodyscan.files.yaml_file import dump_yaml
+from bodyscan.rig.board import Board
+from bodyscan.rig.capture_folder import CaptureFolder
+from bodyscan.rig.consistency import RigParts, rig_problems
+from bodyscan.rig.frame_names import FrameNames
+from bodyscan.rig.pair import Pair
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_frame import RigFrame
+
+_REMEDY = "Mend the rig file; docs/formats.md explains every key."
+
+
+def load_rig(path: Path) -> Rig:
+    """Read and check a rig file. Raises RigFileError that lists every problem by line."""
+    return load_model(Path(path), Rig, RigFileError, remedy=_REMEDY, salvage=_problems_of_parts)
+
+
+def write_rig(path: Path, rig: Rig) -> None:
+    """Write a rig file that `load_rig` reads as the same rig (comments are not kept)."""
+    data = rig.model_dump(mode="json", exclude_defaults=True)
+    write_text(path, dump_yaml({"version": rig.version, **data}))
+
+
+def _problems_of_parts(data: Any) -> Iterator[Problem]:
+    """What does not fit together in a file that cannot be read as a rig, as far as can be told."""
+    if not isinstance(data, dict):
+        return iter(())
+    boards, pairs, folders = (_items(data, key) for key in ("boards", "pairs", "calibration"))
+    files = data.get("files", Rig.model_fields["files"].default)
+    return rig_problems(
+        RigParts(
+            board_names=tuple(map(_name, boards)),
+            boards=tuple(validated(Board, item) for item in boards),
+            pair_names=tuple(map(_name, pairs)),
+            pairs=tuple(validated(Pair, item) for item in pairs),
+            folders=tuple(validated(CaptureFolder, item) for item in folders),
+            files=files if isinstance(files, str) else None,
+            frames=validated(FrameNames, data.get("frames", {})),
+            rig_frame=validated(RigFrame, data.get("rig_frame", {})),
+        )
+    )
+
+
+def _items(data: dict[str, Any], key: str) -> list[Any]:
+    items = data.get(key)
+    return items if isinstance(items, list) else []
+
+
+def _name(item: Any) -> str | None:
+    name = item.get("name") if isinstance(item, dict) else None
+    return name if isinstance(name, str) else None

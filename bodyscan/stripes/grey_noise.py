@@ -1,0 +1,79 @@
+"""How noisy grey levels are, measured from the stripe sequence itself."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.compiled import compiled
+from bodyscan.stripes.scan_lines import ScanLines
+
+Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Sums = NDArray[np.int64]
+
+LEVELS = 16
+ENOUGH_PIXELS = 500
+LARGEST_DIFFERENCE = 24
+BRIGHTEST = 250
+LEAST_VARIANCE = 0.15
+"""Rounding to whole grey levels (1/12), and a little."""
+
+
+def noise_variance(images: ScanLines) -> NDArray[np.float32]:
+    """(256,) variance of one frame's grey level, for each grey level.
+
+    Away from the few edges of the coarsest pattern, the brighter of it and its inverse shows what
+    the lit frame shows, and the other one what the dark frame shows (without inverses the pattern
+    shows one of the two): what differs is noise. It is
+    measured for each band of grey levels, because light itself is noisy (and a laser's speckle
+    more so), and smoothed by a line a + b grey that is nowhere falling.
+    """
+    nothing = np.empty((0, 0), np.uint8)
+    inverse = nothing if images.inverses is None else images.inverses[0]
+    bright = images.bright(0) if images.inverses is None else nothing.astype(bool)
+    count, total, square = _sums(images.lit, images.dark, images.patterns[0], inverse, bright)
+    mean = total / np.maximum(count, 1)
+    variance = (square / np.maximum(count, 1) - mean**2) / 2.0
+    known = count >= ENOUGH_PIXELS
+    grey = LEVELS * (np.arange(LEVELS) + 0.5)
+    if not known.any():
+        return np.ones(256, np.float32)
+    rise, base = 0.0, float(np.average(variance[known], weights=count[known]))
+    if known.sum() >= 3:
+        # Each band's variance is known to the same relative precision for the same count.
+        weight = np.sqrt(count[known]) / np.maximum(variance[known], LEAST_VARIANCE)
+        slope, start = np.polyfit(grey[known], variance[known], 1, w=weight)
+        if slope > 0:
+            rise, base = float(slope), float(start)
+    return np.maximum(base + rise * np.arange(256), LEAST_VARIANCE).astype(np.float32)
+
+
+@compiled
+def _sums(lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, bright: Mask) -> Sums:
+    """How many, sum and sum of squares (LEVELS,) of what differs between two frames that show the
+    same, by bands of grey levels; of every other pixel of every other line.
+
+    Without an inverse (0, 0), `bright` (L, P) says where the pattern shows what the lit frame does.
+    """
+    sums = np.zeros((3, LEVELS), np.int64)
+    for line in range(0, lit.shape[0], 2):
+        for place in range(0, lit.shape[1], 2):
+            seen, light, black = pattern[line, place], lit[line, place], dark[line, place]
+            if inverse.size:
+                other = inverse[line, place]
+                _add(sums, light, max(seen, other))
+                _add(sums, black, min(seen, other))
+            else:
+                _add(sums, light if bright[line, place] else black, seen)
+    return sums
+
+
+@compiled
+def _add(sums: Sums, once: int, again: int) -> None:
+    difference = np.int64(again) - np.int64(once)
+    if abs(difference) <= LARGEST_DIFFERENCE and once < BRIGHTEST:
+        band = once // LEVELS
+        sums[0, band] += 1
+        sums[1, band] += difference
+        sums[2, band] += difference * difference

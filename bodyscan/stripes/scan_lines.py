@@ -1,0 +1,159 @@
+"""The frames of a stripe sequence, laid out so that every image row crosses the stripes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.compiled import compiled
+
+Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+Image = NDArray[np.float32]
+Words = NDArray[np.uint16]
+
+WHOLE_SHARE = 128
+"""All of the light, as images of its shares have it."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScanLines:
+    """Frames as scan lines: L lines, each of P positions across the stripes.
+
+    lit, dark: (L, P) uint8.  patterns: (F, L, P) uint8, the images of the code.
+    inverses: (F, L, P) uint8, None where none are thrown.
+    turned: the lines are the camera image's columns (its stripes are horizontal).
+    """
+
+    lit: Bytes
+    dark: Bytes
+    patterns: Bytes
+    inverses: Bytes | None
+    turned: bool
+
+    @staticmethod
+    def along_lines(
+        lit: Bytes, dark: Bytes, patterns: Bytes, inverses: Bytes | None, direction: str
+    ) -> ScanLines:
+        """From images (H, W) and stacks (F, H, W)."""
+        if direction != "horizontal":
+            return ScanLines(lit, dark, patterns, inverses, False)
+        lit, dark = cv2.transpose(lit), cv2.transpose(dark)
+        turned = None if inverses is None else transposed(inverses)
+        return ScanLines(lit, dark, transposed(patterns), turned, True)
+
+    @property
+    def contrast(self) -> NDArray[np.float32]:
+        """Lit minus dark, (L, P), grey levels."""
+        return cv2.subtract(self.lit, self.dark, dtype=cv2.CV_32F)
+
+    def words(self) -> NDArray[np.uint16]:
+        """(L, P) code words, the first pattern the most significant bit."""
+        words = np.zeros(self.lit.shape, np.uint16)
+        for bit in range(len(self.patterns)):
+            if self.inverses is None:
+                words <<= 1
+                words |= self.bright(bit)
+            else:
+                _append_bit(words.ravel(), self.patterns[bit].ravel(), self.inverses[bit].ravel())
+        return words
+
+    def bright(self, bit: int) -> Mask:
+        """(L, P): where a pattern is brighter than its inverse, or than the middle between lit and
+        dark if there is no inverse."""
+        if self.inverses is not None:
+            return np.asarray(self.patterns[bit] > self.inverses[bit])
+        middle = cv2.add(self.lit, self.dark, dtype=cv2.CV_16S)
+        return np.asarray(2 * self.patterns[bit].astype(np.int16) > middle)
+
+    def difference(
+        self, bit: NDArray[np.int64], at: NDArray[np.int64], variance: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Pattern minus inverse of bits (N,) at flat pixels (N, K), and its noise, grey levels.
+
+        Pixels below 0 get 0. Without inverses, twice what the pattern is above the middle of lit
+        and dark.
+        """
+        patterns, inverses = self.patterns.reshape(-1), self._inverses.reshape(-1)
+        return _differences(
+            self.lit.ravel(), self.dark.ravel(), patterns, inverses, bit, at, variance
+        )
+
+    def direct_share(self, bit: int, variance: NDArray[np.float32]) -> Bytes:
+        """(L, P): what part of lit minus dark shows in `difference` of one bit, or as much as its
+        noise allows, in 1/WHOLE_SHARE; at most 255."""
+        share = np.empty(self.lit.size, np.uint8)
+        inverse = self._inverses[bit : bit + 1].reshape(-1)
+        frames = (self.lit.ravel(), self.dark.ravel(), self.patterns[bit].ravel(), inverse)
+        _share(*frames, variance, share)
+        return share.reshape(self.lit.shape)
+
+    @property
+    def _inverses(self) -> Bytes:
+        """(F, L, P), or (0, L, P) where none are thrown."""
+        return self.patterns[:0] if self.inverses is None else self.inverses
+
+
+def transposed(images: Bytes) -> Bytes:
+    """Each image of a stack (F, H, W) transposed."""
+    turned = np.empty((len(images), *images.shape[:0:-1]), np.uint8)
+    for image, target in zip(images, turned, strict=True):
+        cv2.transpose(image, dst=target)
+    return turned
+
+
+@compiled
+def _append_bit(words: Words, pattern: Bytes, inverse: Bytes) -> None:
+    """Makes room for one bit in code words (N,) and sets it where the pattern is brighter."""
+    for at in range(words.size):
+        words[at] = (words[at] << 1) | (pattern[at] > inverse[at])
+
+
+@compiled
+def _difference(
+    pattern: int, inverse: int, lit: int, dark: int, inverted: bool, variance: Image
+) -> tuple[np.float32, np.float32]:
+    """See `ScanLines.difference`; of one pixel."""
+    seen = np.float32(pattern)
+    if inverted:
+        return seen - np.float32(inverse), np.sqrt(variance[pattern] + variance[inverse])
+    above = (seen - np.float32(lit)) + (seen - np.float32(dark))
+    twice = variance[pattern] + variance[pattern]
+    return above, np.sqrt(twice + twice + variance[lit] + variance[dark])
+
+
+@compiled
+def _differences(
+    lit: Bytes, dark: Bytes, patterns: Bytes, inverses: Bytes, bit: Ints, at: Ints, variance: Image
+) -> tuple[Image, Image]:
+    difference, noise = np.zeros(at.shape, np.float32), np.zeros(at.shape, np.float32)
+    inverted = inverses.size > 0
+    for k in range(at.shape[0]):
+        for n in range(at.shape[1]):
+            pixel = at[k, n]
+            if pixel < 0:
+                continue
+            place = bit[k] * lit.size + pixel
+            inverse = inverses[place] if inverted else patterns[place]
+            difference[k, n], noise[k, n] = _difference(
+                patterns[place], inverse, lit[pixel], dark[pixel], inverted, variance
+            )
+    return difference, noise
+
+
+@compiled
+def _share(
+    lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, variance: Image, share: Bytes
+) -> None:
+    inverted = inverse.size > 0
+    other = inverse if inverted else pattern
+    most = np.float32(255.0)
+    for at in range(lit.size):
+        light, black = lit[at], dark[at]
+        difference, noise = _difference(pattern[at], other[at], light, black, inverted, variance)
+        contrast = max(np.float32(light) - np.float32(black), np.float32(1.0))
+        share[at] = min(np.float32(WHOLE_SHARE) * (abs(difference) + noise) / contrast, most)

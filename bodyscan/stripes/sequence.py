@@ -1,0 +1,300 @@
+"""Whether the frames of a stripe sequence add up, and if not, which frame is to blame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import combinations
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.compiled import compiled
+from bodyscan.errors import DecodingFailed
+from bodyscan.stripes.gray_code import WordCode
+from bodyscan.stripes.scan_lines import ScanLines
+from bodyscan.stripes.usable_pixels import SATURATED
+
+Codes = NDArray[np.uint16]
+Greys = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+SAMPLES = 50_000
+"""About so many pixels are looked at where the whole picture is meant."""
+
+MIN_CONTRAST = 4
+MIN_SHARE_LIT = 1e-3
+MAX_SHARE_SATURATED = 0.5
+MIN_DIFFERENCE = 0.06
+MOST_ALIKE = 0.75
+"""Of the pixels: a dark frame in place of a pattern looks like the inverse in half of them."""
+
+NOISE_GREY = 4
+MAX_SUM_ERROR = 0.15
+MAX_SHARE_BEYOND = 0.05
+MIN_FLIPS = 50
+WRONG_WAY = 2.0
+MIN_SHARE_IN_STEP = 0.6
+MIN_SHARE_WITHOUT_INVERSES = 0.75
+MAX_SHARE_FOLDED = 0.3
+CONVINCING = 0.8
+ENOUGH = 200_000
+"""Of the pixels lines are taken until there are so many, to look at neighbours along them."""
+
+
+def check_sizes(
+    lit: NDArray[np.uint8], dark: NDArray[np.uint8] | None, coded: NDArray[np.uint8], count: int
+) -> None:
+    """Raises DecodingFailed if there are too few or too many frames, or of different sizes.
+
+    lit, dark: (H, W).  coded: (F, H, W).  count: how many the code has.
+    """
+    if len(coded) != count:
+        raise DecodingFailed(
+            f"{len(coded)} images of the code, but it has {count}",
+            remedy="give every image of the code, or correct `code` and `stripes`",
+        )
+    if coded.shape[1:] != lit.shape:
+        raise DecodingFailed(f"images of {coded.shape[1:]} px, lit frame of {lit.shape} px")
+    if dark is not None and dark.shape != lit.shape:
+        raise DecodingFailed(f"dark frame of {dark.shape} px, lit frame of {lit.shape} px")
+
+
+def check_exposure(images: ScanLines) -> None:
+    """Raises DecodingFailed for frames that are black, overexposed, or do not add up in light.
+
+    Each pattern and its inverse together are as bright as the lit and the dark frame together,
+    and most pixels are lit in only one of them. Without an inverse, a pattern is at least nowhere
+    brighter than lit or darker than dark.
+    """
+    step = _step(images)
+    lit, dark = (frame[::step, ::step].astype(np.int16) for frame in (images.lit, images.dark))
+    contrast = lit - dark
+    seen = contrast >= MIN_CONTRAST
+    if np.mean(contrast <= -MIN_CONTRAST) > max(float(np.mean(seen)), MIN_SHARE_LIT):
+        raise DecodingFailed(
+            "the dark frame is brighter than the lit frame",
+            remedy="see whether the names of the two are exchanged in the rig file",
+        )
+    check_light(seen, lit)
+    bright = seen & (lit < SATURATED)
+    bright &= contrast >= np.median(contrast[bright])
+    line, place = np.nonzero(bright)
+    at = step * (line * images.lit.shape[1] + place)
+    frames = (images.lit.ravel(), images.dark.ravel())
+    for bit in range(len(images.patterns)):
+        pattern = images.patterns[bit].ravel()
+        if images.inverses is None:
+            _check_range(bit, _out_of_range(*frames, pattern, at))
+        else:
+            _check_sum(bit, *_in_sum(*frames, pattern, images.inverses[bit].ravel(), at))
+
+
+def _step(images: ScanLines) -> int:
+    """From one line or place that is looked at to the next."""
+    return max(1, round(math.sqrt(images.lit.size / SAMPLES)))
+
+
+def check_light(seen: Mask, lit: NDArray[Any]) -> None:
+    """Raises DecodingFailed where the projector lights next to nothing, or most of it too bright.
+
+    seen: pixels that are lit.  lit: how bright they are then, grey levels.
+    """
+    if np.mean(seen) < MIN_SHARE_LIT:
+        raise DecodingFailed(
+            f"the projector lights only {np.mean(seen):.2%} of the picture",
+            remedy="see whether the projector is on, and whether lit and dark frames differ",
+        )
+    saturated = np.mean(lit[seen] >= SATURATED)
+    if saturated > MAX_SHARE_SATURATED:
+        raise DecodingFailed(
+            f"{saturated:.0%} of the lit pixels are saturated", remedy="expose for a shorter time"
+        )
+
+
+def _check_sum(bit: int, alike: float, error: float) -> None:
+    """alike, error: see `_in_sum`."""
+    if alike > MOST_ALIKE:
+        raise DecodingFailed(
+            f"pattern and inverse of bit {bit} look alike",
+            remedy="see whether one of the two frames is missing or was taken twice",
+        )
+    if error > MAX_SUM_ERROR:
+        raise DecodingFailed(
+            f"pattern and inverse of bit {bit} do not add up to the lit frame "
+            f"(off by {error:.0%} of its contrast)",
+            remedy="see whether one of the two frames is missing, belongs to another bit or "
+            "was exposed differently",
+        )
+
+
+def _check_range(bit: int, error: float) -> None:
+    """error: see `_out_of_range`."""
+    if error > MAX_SUM_ERROR:
+        raise DecodingFailed(
+            f"the pattern of bit {bit} is brighter than the lit frame or darker than the dark one "
+            f"(by {error:.0%} of their contrast)",
+            remedy="see whether it was exposed as they were",
+        )
+
+
+@compiled
+def _in_sum(
+    lit: Greys, dark: Greys, pattern: Greys, inverse: Greys, at: NDArray[np.int64]
+) -> tuple[float, float]:
+    """At flat pixels (N,): the share at which pattern and inverse look alike, and by how much of its
+    contrast their sum differs from the lit frame's and the dark one's."""
+    alike, error = 0, 0.0
+    for pixel in at:
+        light, black = float(lit[pixel]), float(dark[pixel])
+        seen, other = float(pattern[pixel]), float(inverse[pixel])
+        contrast = light - black
+        alike += abs(seen - other) < MIN_DIFFERENCE * contrast
+        excess = max(abs(seen + other - light - black) - NOISE_GREY, 0.0)
+        error += min(excess / contrast, 1.0)
+    return alike / at.size, error / at.size
+
+
+@compiled
+def _out_of_range(lit: Greys, dark: Greys, pattern: Greys, at: NDArray[np.int64]) -> float:
+    """At flat pixels (N,): by how much of its contrast a pattern is brighter than the lit frame or
+    darker than the dark one."""
+    error = 0.0
+    for pixel in at:
+        light, black, seen = float(lit[pixel]), float(dark[pixel]), float(pattern[pixel])
+        excess = max(max(seen - light, black - seen) - NOISE_GREY, 0.0)
+        error += min(excess / (light - black), 1.0)
+    return error / at.size
+
+
+def check_codes(images: ScanLines, words: Codes, code: WordCode, stripes: int) -> None:
+    """Raises DecodingFailed if neighbouring pixels do not lie in neighbouring stripes.
+
+    words: (L, P) code words as read. Where just one bit of a Gray code differs between two pixels,
+    their stripes must be neighbours, whichever bit it is. Without inverses a pattern may be missing
+    unnoticed; then stripes count up and down along a line, which they must not. An exchange of the
+    coarsest pattern and its inverse turns the whole order round; it shows only in codes beyond the
+    last stripe, and not at all if the stripes are a power of two.
+    """
+    bits = len(images.patterns)
+    contrast = cv2.subtract(images.lit, images.dark)
+    some = slice(None, None, _step(images))
+    sampled = contrast[some, some]
+    # Darker pixels are misread too often by themselves to tell anything.
+    good = contrast >= np.median(sampled[sampled >= MIN_CONTRAST])
+    check_direction(words, good, images.turned)
+    lines = slice(None, None, max(1, words.size // ENOUGH))
+    one, other = _changes(words[lines], good[lines], code)
+    least = MIN_SHARE_IN_STEP
+    if images.inverses is None:
+        _check_folds(one, other, code)
+        least = MIN_SHARE_WITHOUT_INVERSES
+    seen = words[some, some][good[some, some]]
+    in_step, beyond = _in_step(one, other, code, bits), _beyond(seen, code, stripes)
+    failing = [bit for bit, share in in_step.items() if share < least]
+    if not failing and beyond <= MAX_SHARE_BEYOND:
+        return
+    found = [f"{beyond:.0%} of the codes lie beyond the last stripe"] if beyond > 0.01 else []
+    if failing:
+        names = ", ".join(str(bit) for bit in failing)
+        found.append(f"where bit {names} flips, stripes do not follow each other")
+    cause = next(_causes(one, other, seen, code, bits, stripes), None)
+    raise DecodingFailed(
+        "the patterns do not make a stripe code: " + "; ".join(found or ["no order in them"]),
+        remedy=f"it would fit if {cause}" if cause else "see whether frames are in their order",
+    )
+
+
+def _check_folds(one: Codes, other: Codes, code: WordCode) -> None:
+    """Raises DecodingFailed if stripes count up and down: a pattern shows no stripes then."""
+    step = code.stripes(other) - code.stripes(one)
+    up, down = np.count_nonzero(step == 1), np.count_nonzero(step == -1)
+    if min(up, down) > max(MAX_SHARE_FOLDED * (up + down), MIN_FLIPS):
+        raise DecodingFailed(
+            "the patterns do not make a stripe code: stripes count up and down in turn",
+            remedy="see whether the pattern of bit 0 is missing or another one's stands in for it",
+        )
+
+
+def check_direction(numbers: NDArray[Any], good: Mask, turned: bool) -> None:
+    """Raises DecodingFailed if stripes change from line to line rather than along lines.
+
+    numbers: (L, P) code words or stripes.  turned: see `ScanLines`.
+    """
+    flips = [
+        np.count_nonzero((np.diff(numbers, axis=axis) != 0) & _both(good, axis)) for axis in (0, 1)
+    ]
+    if flips[0] > WRONG_WAY * flips[1]:
+        seen, said = ("vertical", "horizontal") if turned else ("horizontal", "vertical")
+        raise DecodingFailed(
+            f"the stripes run {seen}ly in the picture, not {said}ly",
+            remedy=f"write `direction: {seen}` in the rig file if this camera stands so",
+        )
+
+
+def _both(good: Mask, axis: int) -> Mask:
+    """Whether neighbours along the axis are both good."""
+    return good[1:] & good[:-1] if axis == 0 else good[:, 1:] & good[:, :-1]
+
+
+def _changes(words: Codes, good: Mask, code: WordCode) -> tuple[Codes, Codes]:
+    """Code words (N,) of neighbours along lines that differ: of a Gray code in just one bit."""
+    difference = words[:, 1:] ^ words[:, :-1]
+    changes = (difference != 0) & _both(good, 1)
+    if code.single:
+        changes &= difference & (difference - 1) == 0
+    line, place = np.nonzero(changes)
+    return words[line, place], words[line, place + 1]
+
+
+def _in_step(one: Codes, other: Codes, code: WordCode, bits: int) -> dict[int, float]:
+    """For each bit that flips often enough (the coarsest, where several do): how often the stripes
+    then are neighbours."""
+    step = np.abs(code.stripes(one) - code.stripes(other))
+    bit = bits - np.frexp((one ^ other).astype(np.float64))[1]
+    flips = np.bincount(bit, minlength=bits)
+    neighbours = np.bincount(bit, step == 1, minlength=bits)
+    return {k: neighbours[k] / flips[k] for k in range(bits) if flips[k] >= MIN_FLIPS}
+
+
+def _beyond(words: Codes, code: WordCode, stripes: int) -> float:
+    """Share of code words that no stripe has."""
+    return float(np.mean(code.stripes(words) >= stripes)) if words.size else 0.0
+
+
+def _causes(
+    one: Codes, other: Codes, words: Codes, code: WordCode, bits: int, stripes: int
+) -> Iterator[str]:
+    """What, undone, would make the code whole; the simplest first."""
+    for cause, undo in _mistakes(bits):
+        in_step = _in_step(undo(one), undo(other), code, bits)
+        whole = bool(in_step) and min(in_step.values()) > CONVINCING
+        if whole and _beyond(undo(words), code, stripes) <= MAX_SHARE_BEYOND:
+            yield cause
+
+
+def _mistakes(bits: int) -> Iterator[tuple[str, Callable[[Codes], Codes]]]:
+    """Common mistakes with the frames, and how code words are changed to undo them."""
+    for bit in range(bits):
+        mask = np.uint16(1 << (bits - 1 - bit))
+        yield f"pattern and inverse of bit {bit} were exchanged", partial(np.bitwise_xor, mask)
+    everything = np.uint16((1 << bits) - 1)
+    yield "all patterns and inverses were exchanged", partial(np.bitwise_xor, everything)
+    in_order = list(range(bits))
+    yield "the bits came in reverse order", partial(_reordered, in_order[::-1])
+    for first, second in combinations(range(bits), 2):
+        order = in_order.copy()
+        order[first], order[second] = second, first
+        yield f"bits {first} and {second} were exchanged", partial(_reordered, order)
+
+
+def _reordered(order: list[int], words: Codes) -> Codes:
+    """Words whose bit k is bit order[k] of the given ones; 0 the most significant."""
+    bits = len(order)
+    result = np.zeros_like(words)
+    for target, source in enumerate(order):
+        result |= ((words >> (bits - 1 - source)) & 1) << (bits - 1 - target)
+    return result

@@ -1,0 +1,226 @@
+"""The stripe coordinate s of every pixel, from the boundaries on either side of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.compiled import compiled
+from bodyscan.stripes.boundaries import MIN_STRIPE_PX, Boundaries
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+SMOOTHERS = (
+    np.array([-3.0, 12.0, 17.0, 12.0, -3.0]) / 35.0,
+    np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0,
+)
+"""Local quadratic fits to 5 and to 7 equally spaced values (Savitzky and Golay 1964)."""
+
+REACH_PX = 6.0
+MAX_STRAY = 4.0
+SLACK = 0.15
+BEYOND = 0.4
+"""How far s is continued past the last boundary of a run, stripes."""
+BEYOND_DOUBT = 3.0
+"""How much less is known of s there."""
+MAX_PULL = 0.05
+"""More than blur does to s on any smooth surface."""
+
+
+def interpolate_stripes(
+    boundaries: Boundaries, codes: NDArray[np.int32], usable: Mask
+) -> tuple[Image, Image]:
+    """s and its standard deviation, (L, P) each, NaN where there is none.
+
+    Between two boundaries s is a cubic with the slopes that the boundaries around them tell
+    (Hermite's). Past the last boundary of a run it goes on with the slope there, a little way.
+    """
+    s = np.full(codes.shape, np.nan, np.float32)
+    sigma = s.copy()
+    if boundaries.joined.any():
+        found = _Segments.of(boundaries)
+        segments = (found.start, found.width, found.index, found.rise, found.sigma)
+        bends = (found.slope_in, found.slope_out, found.pull)
+        _fill(s, sigma, codes, usable, boundaries.line, boundaries.before, segments, bends)
+    return s, sigma
+
+
+@dataclass(frozen=True, eq=False)
+class _Segments:
+    """s on a scan line between boundaries j and j + 1: NaN if they are not joined.
+
+    start: place of boundary j, px.  width: to the next, px.  index: s at boundary j.  rise: what s
+    gains to the next.  slope_in, slope_out: ds per px at both ends.  pull: what blur adds to s
+    where s bends, blur^2 / 2 times its second derivative.  sigma: of s.
+    """
+
+    start: Floats
+    width: Floats
+    index: Floats
+    rise: Floats
+    slope_in: Floats
+    slope_out: Floats
+    pull: Floats
+    sigma: Floats
+
+    @staticmethod
+    def of(boundaries: Boundaries) -> _Segments:
+        position, sigma_px = smoothed(boundaries, boundaries.joined)
+        width = np.where(boundaries.joined, np.diff(position), np.nan)
+        width[width < MIN_STRIPE_PX] = np.nan
+        rise = np.diff(boundaries.index).astype(float)
+        secant = rise / width
+        slope_in, slope_out = end_slopes(secant, width)
+        pull = np.clip(0.5 * boundaries.blur2 * (slope_out - slope_in) / width, -MAX_PULL, MAX_PULL)
+        variance = sigma_px * sigma_px
+        sigma = np.abs(secant) * np.sqrt((variance[1:] + variance[:-1]) / 2)
+        start, index = position[:-1], boundaries.index[:-1].astype(float)
+        return _Segments(start, width, index, rise, slope_in, slope_out, pull, sigma)
+
+
+@compiled
+def _fill(
+    s: Image,
+    sigma: Image,
+    codes: NDArray[np.int32],
+    usable: Mask,
+    line: Ints,
+    before: Ints,
+    segments: tuple[Floats, ...],
+    bends: tuple[Floats, ...],
+) -> None:
+    """Writes s and sigma (L, P) of usable pixels from the segments they lie in; beyond a run's
+    ends from the run's last one, the one before the pixel rather than the one behind.
+
+    line, before: (N,) of the boundaries. segments, bends: (N - 1,) each, see `_Segments`.
+    """
+    last, count = -1, line.size
+    for row in range(codes.shape[0]):
+        for place in range(codes.shape[1]):
+            while last + 1 < count and (
+                line[last + 1] < row or (line[last + 1] == row and before[last + 1] < place)
+            ):
+                last += 1
+            if not usable[row, place]:
+                continue
+            code, passed = codes[row, place], last >= 0 and line[last] == row
+            value, doubt = np.nan, np.nan
+            if passed and last + 1 < count:
+                value, doubt = _within(place, code, last, segments, bends)
+            if passed and last >= 1 and math.isnan(value):
+                value, doubt = _beside(place, code, last - 1, segments, bends)
+            if last + 2 < count and line[last + 1] == row and math.isnan(value):
+                value, doubt = _beside(place, code, last + 1, segments, bends)
+            s[row, place], sigma[row, place] = value, doubt
+
+
+@compiled
+def _within(
+    place: int, code: int, k: int, segments: tuple[Floats, ...], bends: tuple[Floats, ...]
+) -> tuple[float, float]:
+    """s and its standard deviation at a place (px) between the boundaries of segment k, or NaN."""
+    start, width, index, rise, sigma = segments
+    slope_in, slope_out, pull = bends
+    x, secant = place - start[k], rise[k] / width[k]
+    square = (3.0 * secant - 2.0 * slope_in[k] - slope_out[k]) / width[k]
+    cube = (slope_in[k] + slope_out[k] - 2.0 * secant) / (width[k] * width[k])
+    value = ((cube * x + square) * x + slope_in[k]) * x + index[k] - pull[k]
+    return _credible(value, sigma[k], code, index[k] + 0.5 * rise[k])
+
+
+@compiled
+def _beside(
+    place: int, code: int, k: int, segments: tuple[Floats, ...], bends: tuple[Floats, ...]
+) -> tuple[float, float]:
+    """s and its standard deviation at a place (px) before or behind segment k, or NaN: its bend
+    goes on, and s is doubted by as much as that adds."""
+    start, width, index, rise, sigma = segments
+    slope_in, slope_out, pull = bends
+    x, base, slope = place - start[k], index[k] - pull[k], slope_in[k]
+    if x > 0.5 * width[k]:
+        x, base, slope = x - width[k], base + rise[k], slope_out[k]
+    bending = 0.5 * x * x * (slope_out[k] - slope_in[k]) / width[k]
+    doubt = math.sqrt((BEYOND_DOUBT * sigma[k]) ** 2 + bending * bending)
+    return _credible(base + x * slope + bending, doubt, code, index[k] + 0.5 * rise[k])
+
+
+@compiled
+def _credible(value: float, doubt: float, code: int, middle: float) -> tuple[float, float]:
+    """Both, or NaN where the pixel's code says otherwise or the segment (its middle's s is given)
+    is left by more than a part of a stripe."""
+    if abs(value - code - 0.5) < 0.5 + SLACK and abs(value - middle) < 0.5 + BEYOND:
+        return value, doubt
+    return np.nan, np.nan
+
+
+@compiled
+def end_slopes(secant: Floats, width: Floats) -> tuple[Floats, Floats]:
+    """Slopes of s at both ends of every segment from the segments beside it; their own secant where
+    there are none.
+
+    Within a run the slope at a boundary is that of the parabola through it and its neighbours; at
+    a run's end the parabola of the one segment goes on. Segments in which s runs the other way
+    tell nothing of this one.
+    """
+    count = secant.size
+    slope_in, slope_out = np.full(count, np.nan), np.full(count, np.nan)
+    for k in range(1, count):
+        if secant[k - 1] * secant[k] > 0.0:
+            both = width[k - 1] * secant[k] + width[k] * secant[k - 1]
+            slope_in[k] = slope_out[k - 1] = both / (width[k - 1] + width[k])
+    for k in range(count):
+        first, last = slope_in[k], slope_out[k]
+        slope_in[k] = _completed(first, last, secant[k])
+        slope_out[k] = _completed(last, first, secant[k])
+    return slope_in, slope_out
+
+
+@compiled
+def _completed(slope: float, other: float, secant: float) -> float:
+    """The slope at one end; if unknown, of the parabola with slope `other` at the other end."""
+    if not math.isnan(slope):
+        return slope
+    return secant if math.isnan(other) else 2.0 * secant - other
+
+
+def smoothed(boundaries: Boundaries, joined: Mask) -> tuple[Floats, Floats]:
+    """Positions and their sigmas, px, after a local quadratic fit along each unbroken run.
+
+    Along a run the index counts evenly, so the fit of place against index is a fixed filter. It
+    reaches no further than about 6 px and not past the run's ends; a boundary that it would move
+    by more than noise explains stays where it was seen.
+    """
+    position, sigma = boundaries.position.copy(), boundaries.sigma_px.copy()
+    for weights in SMOOTHERS:
+        _smooth(boundaries.position, boundaries.sigma_px, joined, weights, position, sigma)
+    return position, sigma
+
+
+@compiled
+def _smooth(
+    seen: Floats,
+    sigma_px: Floats,
+    joined: Mask,
+    weights: Floats,
+    position: Floats,
+    sigma: Floats,
+) -> None:
+    """One filter of `smoothed`; overwrites position and sigma (N,) where it fits."""
+    half = weights.size // 2
+    share = math.sqrt(np.sum(weights * weights))
+    run = 0  # how many boundaries before this one belong to its run
+    for last in range(1, seen.size):
+        run = run + 1 if joined[last - 1] else 0
+        if run < 2 * half or seen[last] - seen[last - 2 * half] >= 2 * REACH_PX:
+            continue
+        middle, fitted = last - half, 0.0
+        for k in range(weights.size):
+            fitted += weights[k] * seen[last - 2 * half + k]
+        if abs(fitted - seen[middle]) < MAX_STRAY * sigma_px[middle]:
+            position[middle], sigma[middle] = fitted, sigma_px[middle] * share

@@ -1,0 +1,66 @@
+"""Which stripe is where in the images of one pair in one shot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.stripes.boundaries import Boundaries
+from bodyscan.stripes.scan_lines import ScanLines
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class StripeMap:
+    """The stripe coordinate of every lit pixel, and the stripe boundaries between them.
+
+    s: (height, width) float32, in [0, S]; NaN where there is none.
+    sigma: (height, width) float32, standard deviation of s, in stripes; NaN likewise.
+    lit: (height, width) uint8, the fully lit image (grey).
+    boundary_index: (N,) int64: boundary i lies between stripes i - 1 and i, that is s = i.
+    boundary_pixels: (N, 2) float64, where it was seen, px, sub-pixel.
+    boundary_sigma_px: (N,) float32, standard deviation across the stripe, px.
+    stripes: S, the number of stripes projected.
+    beyond: (height, width) bool, lit by a stripe that lies deeper than wanted; None where all stripes
+    were wanted. s is NaN there (see `WantedStripes`).
+    """
+
+    s: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    lit: NDArray[np.uint8]
+    boundary_index: NDArray[np.int64]
+    boundary_pixels: Array
+    boundary_sigma_px: NDArray[np.float32]
+    stripes: int
+    beyond: NDArray[np.bool_] | None = None
+
+
+def stripe_map(
+    images: ScanLines,
+    lit: NDArray[np.uint8],
+    s: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    boundaries: Boundaries,
+    stripes: int,
+    beyond: NDArray[np.bool_] | None = None,
+) -> StripeMap:
+    """What was read along scan lines, back in the camera's own layout."""
+    pixels = np.stack([boundaries.position, boundaries.line_position], axis=-1)
+    if images.turned:
+        s, sigma = cv2.transpose(s), cv2.transpose(sigma)
+        pixels = pixels[:, ::-1]
+        beyond = None if beyond is None else beyond.T
+    return StripeMap(
+        s=s,
+        sigma=sigma,
+        lit=lit,
+        boundary_index=boundaries.index,
+        boundary_pixels=np.ascontiguousarray(pixels, float),
+        boundary_sigma_px=boundaries.sigma_px.astype(np.float32),
+        stripes=stripes,
+        beyond=beyond,
+    )

@@ -1,0 +1,90 @@
+"""Which pixels of a stripe sequence show the projector's light clearly enough to be decoded."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.compiled import compiled
+from bodyscan.stripes.indirect_light import mostly_direct
+from bodyscan.stripes.scan_lines import ScanLines
+
+Mask = NDArray[np.bool_]
+
+SATURATED = 254
+MIN_CONTRAST = 4.0
+MIN_CONTRAST_TO_NOISE = 5.0
+WHOLLY_COVERED = 0.7
+
+
+def usable_pixels(
+    images: ScanLines,
+    codes: NDArray[np.int32],
+    variance: NDArray[np.float32],
+    stripes: int,
+    fine_bit: int,
+) -> Mask:
+    """(L, P): pixels whose stripes `codes` can be relied on.
+
+    Not low contrast, saturation, codes that were not projected, pixels that the surface's rim
+    covers only in part, pixels beside a jump of the code by more than one (a mixed pixel at a
+    depth jump is one), and pixels that other surfaces light more than the projector does.
+    variance: (256,) of each grey level.  fine_bit: see `mostly_direct`.
+    """
+    contrast = cv2.subtract(images.lit, images.dark)
+    least = np.maximum(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * np.sqrt(variance))
+    least = np.minimum(np.ceil(least), 255).astype(np.uint8)
+    bright = contrast >= cv2.LUT(cv2.max(images.lit, images.dark), least)
+    bright &= ~half_covered(contrast, bright)
+    usable = bright & (images.lit < SATURATED) & (codes < stripes)
+    usable &= ~beside_jumps(codes, usable)
+    return usable & mostly_direct(images, usable, fine_bit, variance)
+
+
+def half_covered(contrast: NDArray[Any], lit: Mask) -> Mask:
+    """(L, P): pixels beside one that is not lit and much darker than their brightest neighbour.
+
+    They straddle the rim of the surface, and tell s of its part of them, not of their middle.
+    """
+    around = np.ones((3, 3), np.uint8)
+    at_rim = cv2.erode(lit.view(np.uint8), around, borderValue=1) == 0
+    return at_rim & (contrast < np.float32(WHOLLY_COVERED) * cv2.dilate(contrast, around))
+
+
+def beside_jumps(codes: NDArray[np.int32], usable: Mask) -> Mask:
+    """(L, P): pixels whose code differs from a usable neighbour's by more than one."""
+    jumps = np.zeros(codes.shape, bool)
+    _mark_jumps(codes, usable, jumps)
+    return jumps
+
+
+@compiled
+def _mark_jumps(codes: NDArray[np.int32], usable: Mask, jumps: Mask) -> None:
+    # Without a branch inside: on a noisy image a processor guesses wrong every other time.
+    lines, places = codes.shape
+    for line in range(lines):
+        jump = _leaps(codes[line, 1:], codes[line, :-1], usable[line, 1:], usable[line, :-1])
+        for place in range(places - 1):
+            jumps[line, place] |= jump[place]
+        for place in range(places - 1):
+            jumps[line, place + 1] |= jump[place]
+        if line + 1 == lines:
+            break
+        jump = _leaps(codes[line + 1], codes[line], usable[line + 1], usable[line])
+        for place in range(places):
+            jumps[line, place] |= jump[place]
+            jumps[line + 1, place] |= jump[place]
+
+
+@compiled
+def _leaps(
+    one: NDArray[np.int32], other: NDArray[np.int32], usable: Mask, usable_too: Mask
+) -> Mask:
+    """(P,) whether two rows' codes, both usable, differ by more than one."""
+    leap = np.empty(one.size, np.bool_)
+    for place in range(one.size):
+        leap[place] = (abs(one[place] - other[place]) > 1) & usable[place] & usable_too[place]
+    return leap

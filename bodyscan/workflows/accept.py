@@ -1,0 +1,154 @@
+"""Artefacts measured as a person is: captures decoded, placed by the calibration, merged, judged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.captures.folder import Captures
+from bodyscan.errors import BodyscanError
+from bodyscan.evaluation import acceptance
+from bodyscan.evaluation.acceptance_file import AcceptanceFile
+from bodyscan.evaluation.acceptance_readings import (
+    ALL,
+    PlateRow,
+    Readings,
+    SpacingRow,
+    SphereRow,
+)
+from bodyscan.fusion.cleaning import clean
+from bodyscan.fusion.merging import merge
+from bodyscan.progress import Progress, silent
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.workflows.range_images import range_images
+
+Array = NDArray[np.float64]
+
+POINTS = 200_000
+FEWEST_OF_ONE = 400
+"""A single pair's sphere or plate is judged from so many points on."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Cloud:
+    view: str
+    points: Array
+    normals: Array
+
+
+def read_spheres(
+    calibration: RigCalibration,
+    captures: Captures,
+    place: str,
+    file: AcceptanceFile,
+    progress: Progress = silent,
+) -> Readings:
+    """Every shot of a folder of the spheres at one place."""
+    centres, radius = np.array(file.spheres.centres_mm), file.spheres.radius_mm
+    total = Readings()
+    for shot in captures.shots:
+        try:
+            merged, *single = _clouds(calibration, captures, shot, progress)
+            near = acceptance.locate_spheres(merged.points, merged.normals, radius, centres)
+            read = [acceptance.read_sphere(merged.points, merged.normals, s, radius) for s in near]
+        except BodyscanError as error:
+            total += Readings(problems=(f"{place}, {shot}: {error.what}",))
+            continue
+        rows = [_row(place, shot, ALL, k, one) for k, one in enumerate(read, start=1)]
+        for cloud in single:
+            rows += _of_one(cloud, place, shot, read, radius)
+        pairs = combinations(range(1, len(centres) + 1), 2)
+        errors = acceptance.spacing_errors(read, centres)
+        spacings = tuple(
+            SpacingRow(place, shot, f"{a}-{b}", float(error))
+            for (a, b), error in zip(pairs, errors, strict=True)
+        )
+        total += Readings(tuple(rows), spacings)
+    return total
+
+
+def read_plates(
+    calibration: RigCalibration,
+    captures: Captures,
+    place: str,
+    file: AcceptanceFile,
+    progress: Progress = silent,
+) -> Readings:
+    """Every shot of a folder of the plate at one place."""
+    width, height = file.plate.size_mm
+    total = Readings()
+    for shot in captures.shots:
+        try:
+            clouds = _clouds(calibration, captures, shot, progress)
+            read = [(clouds[0].view, acceptance.read_plate(clouds[0].points, clouds[0].normals))]
+        except BodyscanError as error:
+            total += Readings(problems=(f"{place}, {shot}: {error.what}",))
+            continue
+        for cloud in clouds[1:]:
+            if len(cloud.points) >= FEWEST_OF_ONE:
+                try:
+                    read.append((cloud.view, acceptance.read_plate(cloud.points, cloud.normals)))
+                except BodyscanError:
+                    continue  # it sees an edge of it alone
+        rows = tuple(
+            PlateRow(
+                place,
+                shot,
+                view,
+                one.points,
+                one.flatness_mm,
+                one.rms_mm,
+                100.0 * one.area_mm2 / (width * height),
+            )
+            for view, one in read
+        )
+        total += Readings(plates=rows)
+    return total
+
+
+def _clouds(
+    calibration: RigCalibration, captures: Captures, shot: str, progress: Progress
+) -> list[_Cloud]:
+    """All pairs' points merged as a scan's are (without alignment), then each pair's own, rig
+    frame. Raises ScanFailed."""
+    one = replace(captures, shots=(shot,), sequences=captures.of_shot(shot))
+    images, _ = range_images(calibration, one, progress)
+    cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
+    seen = [image for image in cleaned if image.valid.any()]
+    cloud = merge(seen, calibration.rig_from_camera, points=POINTS)
+    found = [_Cloud(ALL, cloud.points, cloud.normals.astype(np.float64))]
+    for image in seen:
+        valid = image.valid & np.isfinite(image.normals).all(axis=-1)
+        placing = calibration.rig_from_camera[image.pair]
+        found.append(
+            _Cloud(
+                image.pair,
+                placing.apply(image.points[valid].astype(np.float64)),
+                placing.rotate(image.normals[valid].astype(np.float64)),
+            )
+        )
+    return found
+
+
+def _of_one(
+    cloud: _Cloud,
+    place: str,
+    shot: str,
+    merged: Sequence[acceptance.SphereReading],
+    radius_mm: float,
+) -> Iterator[SphereRow]:
+    for k, sphere in enumerate(merged, start=1):
+        try:
+            one = acceptance.read_sphere(cloud.points, cloud.normals, sphere.fitted, radius_mm)
+        except BodyscanError:
+            continue  # this pair does not see it
+        if one.points >= FEWEST_OF_ONE:
+            yield _row(place, shot, cloud.view, k, one)
+
+
+def _row(place: str, shot: str, view: str, sphere: int, one: acceptance.SphereReading) -> SphereRow:
+    return SphereRow(place, shot, view, sphere, one.points, one.form_mm, one.shell_mm, one.size_mm)

@@ -1,0 +1,223 @@
+"""Whether a calibrated rig still is what it was, told from a shot of a board; and its repair."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.boards.view import BoardView
+from bodyscan.calibration.camera import CameraCalibration
+from bodyscan.calibration.located_view import LocatedView
+from bodyscan.calibration.pair import BoardBoundaries, boundaries_near, on_board
+from bodyscan.captures.folder import Captures
+from bodyscan.captures.folder import Sequence as ImageSequence
+from bodyscan.errors import BoardNotFound, BodyscanError
+from bodyscan.geometry.measuring import measure
+from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.progress import Progress, silent, threaded
+from bodyscan.registration.drift import Drift, Move, find_drift, seen_pose
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.workflows.calibrate_rig import find_all_boards, locate_views
+from bodyscan.workflows.decoding import decode_sequence
+
+Array = NDArray[np.float64]
+
+LEAST_NOISE_PX = 0.02
+STRIPE_SIGMAS, STRIPE_MM = 5.0, 0.25
+"""Stripes are off a board by so many sigmas, and by so much, before a projector is blamed."""
+
+
+@dataclass(frozen=True)
+class StripeOffset:
+    """How far the surface that a pair's stripes measure lies from the board that its corners show.
+
+    offset_mm: median over all boards, positive away from the camera.  sigma_mm: what the
+    calibration expects.  turned_mm: half the difference between the board's ends, of its tilt.
+    """
+
+    pair: str
+    offset_mm: float
+    turned_mm: float
+    sigma_mm: float
+
+    @property
+    def moved(self) -> bool:
+        """Whether the projector no longer stands to its camera as it did."""
+        off = max(abs(self.offset_mm), abs(self.turned_mm))
+        return off > max(STRIPE_SIGMAS * self.sigma_mm, STRIPE_MM)
+
+
+@dataclass(frozen=True, eq=False)
+class BoardCheck:
+    """drift: of the cameras.  stripes: of the projectors whose stripes were taken on a board.
+
+    seen: pairs that saw a board.  unseen: calibrated pairs that did not.  notes: what was dropped.
+    """
+
+    drift: Drift
+    stripes: tuple[StripeOffset, ...]
+    seen: tuple[str, ...]
+    unseen: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def valid(self) -> bool:
+        return not self.drift.moves and not any(offset.moved for offset in self.stripes)
+
+
+def check_boards(
+    calibration: RigCalibration, captures: Captures, progress: Progress = silent
+) -> BoardCheck:
+    """One or more shots of the calibration's boards, as the calibrated rig sees them.
+
+    Raises BoardNotFound if no board is seen by two pairs.
+    """
+    notes: list[str] = []
+    views = find_all_boards(calibration.rig, captures, notes, progress)
+    cameras = _cameras(calibration)
+    boards = {board.name: board for board in calibration.rig.boards}
+    located = [view for view in locate_views(views, cameras, boards, notes) if not view.ambiguous]
+    poses = [
+        seen_pose(view, calibration.pairs[view.pair].camera, _noise_px(calibration, view.pair))
+        for view in located
+    ]
+    drift = find_drift(
+        poses, calibration.rig_from_camera, calibration.covariance, calibration.rig.poles
+    )
+    if not drift.rig_from_board:
+        raise BoardNotFound(
+            "no board is seen by two calibrated pairs at once",
+            where=", ".join(str(folder) for folder in captures.folders),
+            remedy="show a board whose corners are numbered (ChArUco) to as many cameras as can see "
+            "it together",
+        )
+    stripes = _stripe_offsets(calibration, captures, views, located, notes, progress)
+    seen = tuple(sorted({view.pair for view in located}))
+    unseen = tuple(sorted(set(calibration.pairs) - set(seen)))
+    return BoardCheck(drift, stripes, seen, unseen, tuple(notes))
+
+
+def repaired(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibration:
+    """The calibration with the pairs that moved where they are now, everything else as it was.
+
+    Of a moved pair the covariance is that of its move; what tied it to the others is gone.
+    """
+    placing = dict(calibration.rig_from_camera)
+    names = calibration.covariance.names
+    matrix = calibration.covariance.matrix.copy()
+    for move in moves:
+        for pair in move.pairs:
+            placing[pair] = move.motion @ placing[pair]
+            own = 6 * names.index(pair)
+            matrix[own : own + 6, own : own + 6] += move.covariance
+    said = tuple(f"repaired: {move_line(move)}" for move in moves)
+    return replace(
+        calibration,
+        rig_from_camera=placing,
+        covariance=PlacingCovariance(names, matrix),
+        notes=(*calibration.notes, *said),
+    )
+
+
+def move_line(move: Move) -> str:
+    return (
+        f"{move.name} moved by {move.shift_mm:.2f} mm (sigma {move.sigma_mm:.2f}) and "
+        f"{move.turn_deg:.3f} degrees"
+    )
+
+
+def _noise_px(calibration: RigCalibration, pair: str) -> float:
+    """Of one coordinate of a corner, as the calibration saw it."""
+    both = calibration.pairs[pair].quality.corners_rms_px
+    return max(both / np.sqrt(2.0), LEAST_NOISE_PX)
+
+
+def _cameras(calibration: RigCalibration) -> Mapping[str, CameraCalibration]:
+    return {
+        name: CameraCalibration(
+            pair.camera, pair.camera_covariance, {}, {}, pair.quality.corners_rms_px
+        )
+        for name, pair in calibration.pairs.items()
+    }
+
+
+def _stripe_offsets(
+    calibration: RigCalibration,
+    captures: Captures,
+    views: Sequence[BoardView],
+    located: Sequence[LocatedView],
+    notes: list[str],
+    progress: Progress,
+) -> tuple[StripeOffset, ...]:
+    """Of every pair that took stripes on a board it saw."""
+    seen = {(view.pair, view.shot): view for view in views}
+    wanted: dict[tuple[str, str], list[LocatedView]] = defaultdict(list)
+    for one in located:
+        wanted[one.pair, one.shot].append(one)
+    sequences = [
+        s
+        for s in captures.sequences
+        if s.has_stripes
+        and (s.pair, s.shot) in wanted
+        and calibration.pairs[s.pair].light is not None
+    ]
+
+    def read(sequence: ImageSequence) -> BoardBoundaries | str:
+        try:
+            stripes = decode_sequence(sequence, calibration.rig.pair(sequence.pair))
+        except BodyscanError as error:
+            return str(error)
+        return boundaries_near(stripes, seen[sequence.pair, sequence.shot])
+
+    results = threaded(read, sequences, stage="decoding stripes", progress=progress)
+    parts: dict[str, list[Array]] = defaultdict(list)
+    for sequence, found in zip(sequences, results, strict=True):
+        if isinstance(found, str):
+            notes.append(found)
+            continue
+        for view in wanted[sequence.pair, sequence.shot]:
+            parts[sequence.pair].append(_off_board(calibration, view, found))
+    return tuple(
+        offset
+        for pair, own in sorted(parts.items())
+        if (offset := _offset(pair, np.concatenate(own))) is not None
+    )
+
+
+def _off_board(
+    calibration: RigCalibration, view: LocatedView, boundaries: BoardBoundaries
+) -> Array:
+    """(N, 3): distance from the board along its normal (mm), place on it (-1 to 1), its sigma."""
+    rig, pair = calibration.rig, calibration.pairs[view.pair]
+    projector = rig.pair(view.pair).projector
+    assert projector is not None
+    assert pair.light is not None
+    face = float(view.points[0, 2])
+    board = rig.board(view.board)
+    points = on_board(
+        pair.camera, projector, board, view.camera_from_board, face, boundaries, number=0
+    )
+    rays = points.points / points.points[:, 2:]
+    measured = measure(pair.light, rays, points.index.astype(float))
+    facing = np.abs(rays @ view.camera_from_board.rotation[:, 2])
+    away = (measured.depth - points.points[:, 2]) * facing
+    axis = 1 if projector.direction == "horizontal" else 0
+    place = points.points[:, axis] - np.mean(points.points[:, axis])
+    place = place / max(float(np.abs(place).max(initial=0.0)), 1e-9)
+    rows = np.stack([away, place, np.sqrt(measured.variance_mm2) * facing], axis=1)
+    return rows[np.all(np.isfinite(rows), axis=1)]
+
+
+def _offset(pair: str, rows: Array) -> StripeOffset | None:
+    if len(rows) < 100:
+        return None
+    away, place, sigma = rows.T
+    low, high = place < -0.4, place > 0.4
+    turned = 0.0
+    if min(low.sum(), high.sum()) > 20:
+        turned = 0.5 * float(np.median(away[high]) - np.median(away[low]))
+    return StripeOffset(pair, float(np.median(away)), turned, float(np.median(sigma)))

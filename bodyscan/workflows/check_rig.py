@@ -1,0 +1,147 @@
+"""`bodyscan check-calibration`: which check a folder of captures allows, and what it says in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from bodyscan.captures.folder import Captures, join, open_check
+from bodyscan.errors import BadInput, FailedWork
+from bodyscan.progress import Progress, silent
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.workflows.check_boards import BoardCheck, check_boards, move_line, repaired
+from bodyscan.workflows.check_scans import ScanCheck, check_scans
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """Either of the checks, in words; `lines` begins with the verdict."""
+
+    check: BoardCheck | ScanCheck
+    lines: tuple[str, ...]
+
+    @property
+    def valid(self) -> bool:
+        """Whether the rig is known to be what it was; False where a check cannot tell."""
+        if isinstance(self.check, ScanCheck) and not self.check.decided:
+            return self.check.quiet
+        return self.check.valid
+
+    def repaired(self, calibration: RigCalibration) -> RigCalibration:
+        """Raises FailedWork where the check cannot tell where things are now."""
+        if isinstance(self.check, ScanCheck):
+            raise FailedWork(
+                "people's scans tell that something moved, not exactly where it is now",
+                remedy="show the board in a few shots and repair from those",
+            )
+        projectors = [offset.pair for offset in self.check.stripes if offset.moved]
+        if projectors:
+            raise FailedWork(
+                f"the projector of {', '.join(projectors)} moved against its camera",
+                remedy="only a new calibration of that pair mends this: capture the stripes on the "
+                "board again and run calibrate-rig",
+            )
+        if not self.check.drift.moves:
+            raise FailedWork("nothing moved: there is nothing to repair")
+        return repaired(calibration, self.check.drift.moves)
+
+
+def look_at(
+    calibration: RigCalibration, folders: Sequence[Path], progress: Progress = silent
+) -> Findings:
+    """Folders of one kind: shots of the board, or scans of people.
+
+    Raises CaptureError for folders without captures, BadInput for a mixture, BoardNotFound,
+    ScanFailed if there is nobody in a scan.
+    """
+    captures = [open_check(calibration.rig, folder) for folder in folders]
+    kinds = {kind for kind, _ in captures}
+    if len(kinds) > 1:
+        raise BadInput(
+            "shots of boards and scans of people cannot be checked together",
+            where=", ".join(map(str, folders)),
+            remedy="check one kind at a time",
+        )
+    if kinds == {"scan"}:
+        return _of_scans(check_scans(calibration, [one for _, one in captures], progress))
+    shots = join(tuple(_named_apart([one for _, one in captures])))
+    return _of_boards(check_boards(calibration, shots, progress))
+
+
+def _named_apart(parts: Sequence[Captures]) -> list[Captures]:
+    """Shots of several folders, each with its folder's number before its name."""
+    if len(parts) == 1:
+        return list(parts)
+    return [
+        replace(
+            part,
+            shots=tuple(f"{number}/{shot}" for shot in part.shots),
+            sequences=tuple(replace(s, shot=f"{number}/{s.shot}") for s in part.sequences),
+        )
+        for number, part in enumerate(parts, start=1)
+    ]
+
+
+def _of_boards(check: BoardCheck) -> Findings:
+    drift = check.drift
+    said = [
+        "valid: all that see the board agree"
+        if check.valid
+        else "NOT valid: something moved; --repair writes a calibration with that put right"
+    ]
+    said += [move_line(move) for move in drift.moves]
+    said += [
+        f"projector of {offset.pair} moved against its camera: the board's surface is measured "
+        f"{offset.offset_mm:+.2f} mm off, tilted by {offset.turned_mm:+.2f} mm at its ends"
+        for offset in check.stripes
+        if offset.moved
+    ]
+    said.append(
+        f"{len(check.seen)} pairs saw a board; their views are {drift.misfit_before:.1f} sigmas off "
+        f"(root mean square)" + (f", {drift.misfit:.1f} after the moves" if drift.moves else "")
+    )
+    if check.stripes:
+        worst = max(check.stripes, key=lambda offset: abs(offset.offset_mm))
+        said.append(
+            f"stripes of {len(check.stripes)} pairs lie on the board to {abs(worst.offset_mm):.2f} mm "
+            f"(farthest: {worst.pair})"
+        )
+    if check.unseen:
+        said.append(f"not checked, for they saw no board: {', '.join(check.unseen)}")
+    if drift.lonely:
+        said.append(f"not checked, for nobody shares their board: {', '.join(drift.lonely)}")
+    return Findings(check, (*said, *(f"note: {note}" for note in check.notes)))
+
+
+def _of_scans(check: ScanCheck) -> Findings:
+    moved = [drift for drift in (*check.poles, *check.pairs) if drift.moved]
+    if moved:
+        said = ["NOT valid: the same motion in every scan, which no sway explains"]
+    elif check.apart:
+        groups = "; ".join(", ".join(group) for group in check.apart)
+        said = [
+            f"undecided: no surface is seen by more than one of these groups of pairs: {groups}. How "
+            "they stand to each other a scan does not tell; give shots of the board that they share"
+        ]
+    elif check.decided:
+        said = ["valid: no pair moves the same way in all scans"]
+    else:
+        said = [
+            f"undecided: from {_scans(check)} a moved pair cannot be told from a person's sway; give "
+            "three scans or more, or a shot of the board"
+        ]
+        if check.quiet:
+            said = ["valid: all pairs see the same surface, and alignment moves none of them"]
+    for drift in moved:
+        said.append(f"{drift.pair}: {drift.shift_mm:.2f} mm (sigma {drift.sigma_mm:.2f})")
+    before, after = max(check.before_mm), max(check.after_mm)
+    said.append(f"overlaps in {_scans(check)}: {before:.2f} mm RMS at most, {after:.2f} aligned")
+    farthest = max(check.pairs, key=lambda drift: drift.shift_mm)
+    said.append(f"most moved on average: {farthest.pair}, {farthest.shift_mm:.2f} mm")
+    return Findings(check, tuple(said))
+
+
+def _scans(check: ScanCheck) -> str:
+    count = len(check.before_mm)
+    return "1 scan" if count == 1 else f"{count} scans"

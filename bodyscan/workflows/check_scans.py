@@ -1,0 +1,138 @@
+"""What ordinary scans of people say of a rig: a pair that always has to be moved the same way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.alignment.align import BODY_CENTRE_MM, Alignment, align
+from bodyscan.captures.folder import Captures
+from bodyscan.fusion.cleaning import clean, with_subject
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import Progress, silent
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.workflows.range_images import range_images
+
+Array = NDArray[np.float64]
+
+FEWEST_SCANS = 3
+"""A person sways by as much as a pair may have moved: from so many scans on the two are told apart."""
+SIGMAS, LEAST_MM = 4.0, 0.3
+LEAST_SIGMA_MM = 0.05
+OVERLAP_MM = 0.5
+
+
+@dataclass(frozen=True)
+class PairDrift:
+    """shift: mean motion (3,) mm at the body's centre that its overlaps asked for, rig axes; sigma_mm
+    of it, from how much it varies from scan to scan; None with fewer than three scans."""
+
+    pair: str
+    shift: tuple[float, float, float]
+    sigma_mm: float | None
+
+    @property
+    def shift_mm(self) -> float:
+        return float(np.linalg.norm(self.shift))
+
+    @property
+    def moved(self) -> bool:
+        """The same motion in every scan, which no sway explains."""
+        return self.sigma_mm is not None and self.shift_mm > max(SIGMAS * self.sigma_mm, LEAST_MM)
+
+
+@dataclass(frozen=True, eq=False)
+class ScanCheck:
+    """before_mm, after_mm: of each scan, RMS of its overlaps, before and after the pairs were moved.
+
+    pairs: what the overlaps asked of each.  poles: likewise, of poles whose pairs moved alike.
+    apart: groups of pairs between which no scan has an overlap, the largest first; empty if there is
+    one group. How groups stand to each other is not seen: moved far enough, they share nothing.
+    """
+
+    before_mm: tuple[float, ...]
+    after_mm: tuple[float, ...]
+    pairs: tuple[PairDrift, ...]
+    poles: tuple[PairDrift, ...]
+    apart: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def decided(self) -> bool:
+        """Whether there are scans enough to tell a move from sway, and all pairs are joined."""
+        return len(self.before_mm) >= FEWEST_SCANS and not self.apart
+
+    @property
+    def quiet(self) -> bool:
+        """Whether nothing calls for an explanation, neither sway nor a move."""
+        still = all(drift.shift_mm < LEAST_MM for drift in self.pairs)
+        return still and max(self.before_mm) < OVERLAP_MM and not self.apart
+
+    @property
+    def valid(self) -> bool:
+        return not any(drift.moved for drift in (*self.pairs, *self.poles))
+
+
+def check_scans(
+    calibration: RigCalibration, scans: Sequence[Captures], progress: Progress = silent
+) -> ScanCheck:
+    """Raises ScanFailed if a scan shows nobody."""
+    alignments = []
+    for captures in scans:
+        images, _ = range_images(calibration, captures, progress)
+        cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
+        seen = with_subject(cleaned)
+        alignments.append(align(seen, calibration.rig_from_camera, calibration.covariance))
+    return judge_scans(alignments, calibration.rig_from_camera, calibration.rig.poles)
+
+
+def judge_scans(
+    alignments: Sequence[Alignment],
+    rig_from_camera: Mapping[str, RigidTransform],
+    poles: Mapping[str, str],
+) -> ScanCheck:
+    """poles: of each pair that stands on one."""
+    shifts = {
+        name: np.array(
+            [
+                (found.rig_from_camera[name] @ at.inverse()).apply(BODY_CENTRE_MM) - BODY_CENTRE_MM
+                for found in alignments
+                if name in found.rig_from_camera
+            ]
+        ).reshape(-1, 3)
+        for name, at in rig_from_camera.items()
+    }
+    pairs = [_drift(name, own) for name, own in sorted(shifts.items()) if len(own)]
+    together = []
+    for pole in sorted(set(poles.values())):
+        own = [shifts[n] for n in sorted(shifts) if poles.get(n) == pole and len(shifts[n])]
+        if len(own) > 1 and len({len(one) for one in own}) == 1:
+            together.append(_drift(f"pole {pole}", np.mean(own, axis=0)))
+    return ScanCheck(
+        tuple(found.rms_before_mm for found in alignments),
+        tuple(found.rms_after_mm for found in alignments),
+        tuple(pairs),
+        tuple(together),
+        _apart(alignments),
+    )
+
+
+def _apart(alignments: Sequence[Alignment]) -> tuple[tuple[str, ...], ...]:
+    graph = nx.Graph()
+    for found in alignments:
+        graph.add_nodes_from(found.rig_from_camera)
+        graph.add_edges_from((overlap.source, overlap.target) for overlap in found.overlaps)
+    groups = sorted((tuple(sorted(group)) for group in nx.connected_components(graph)), key=len)
+    return tuple(groups[::-1]) if len(groups) > 1 else ()
+
+
+def _drift(name: str, shifts: Array) -> PairDrift:
+    """shifts: (scans, 3) mm."""
+    x, y, z = (float(value) for value in shifts.mean(axis=0))
+    if len(shifts) < FEWEST_SCANS:
+        return PairDrift(name, (x, y, z), None)
+    varies = float(np.sqrt(shifts.var(axis=0, ddof=1).sum() / len(shifts)))
+    return PairDrift(name, (x, y, z), max(varies, LEAST_SIGMA_MM))

@@ -1,0 +1,165 @@
+"""A simulated workspace held against the truth beside it: calibration, cloud and mesh."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from bodyscan.errors import BadInput
+from bodyscan.evaluation.body import coverage_of_seen, girth_errors, settled
+from bodyscan.evaluation.surface import Deviation, deviation, honesty, signed_distances
+from bodyscan.export.scan import carried
+from bodyscan.fusion.storage import StoredScan, load_scan
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.topology import topology
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.registration.storage import load_calibration
+from bodyscan.report.pictures import draw_deviation
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RigDeviation:
+    """Errors of each pair against truth in the rig frame as defined, nothing else aligned.
+
+    centres_mm: (P, 3).  rotations_deg: (P,).  sigmas: (P, 3) of the centres, as reported.
+    """
+
+    names: tuple[str, ...]
+    centres_mm: Array
+    rotations_deg: Array
+    sigmas_mm: Array
+
+    @property
+    def centres_rms_mm(self) -> float:
+        return float(np.sqrt(np.mean(np.sum(self.centres_mm**2, axis=1))))
+
+    @property
+    def rotations_rms_deg(self) -> float:
+        return float(np.sqrt(np.mean(self.rotations_deg**2)))
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The simulator's truth: facts is truth.json; the subject's surface in mm, rig frame."""
+
+    facts: dict[str, Any]
+    vertices: Array | None
+    faces: NDArray[np.int64] | None
+
+
+def load_truth(folder: Path) -> Truth:
+    """Read `truth/`. Raises BadInput if there is none: real captures have no truth."""
+    try:
+        facts = json.loads((folder / "truth.json").read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise BadInput(
+            "has no truth.json"
+            if isinstance(error, FileNotFoundError)
+            else "has a truth.json that cannot be read",
+            where=str(folder),
+            remedy="only workspaces made by `bodyscan simulate` can be held against the truth",
+        ) from error
+    surface = folder / "subject.ply"
+    if not surface.exists():
+        return Truth(facts, None, None)
+    mesh = o3d.io.read_triangle_mesh(str(surface))
+    return Truth(facts, np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int64))
+
+
+def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
+    """Camera centres and rotations against the truth."""
+    from bodyscan.geometry.placing_covariance import position_sigma
+
+    names = tuple(sorted(calibration.rig_from_camera))
+    centres, rotations, sigmas = [], [], []
+    for name in names:
+        found = calibration.rig_from_camera[name]
+        true = RigidTransform.from_matrix(truth.facts["pairs"][name]["rig_from_camera"])
+        centres.append(found.translation - true.translation)
+        rotations.append(np.degrees((found.inverse() @ true).angle))
+        sigmas.append(position_sigma(calibration.covariance, name, found.translation))
+    return RigDeviation(names, np.array(centres), np.array(rotations), np.array(sigmas))
+
+
+def evaluate_workspace(workspace: Path) -> str:
+    """A text with every figure, and deviation pictures beside the scan."""
+    truth = load_truth(workspace / "truth")
+    calibration = load_calibration(workspace / "calibration")
+    rig = compare_rig(calibration, truth)
+    lines = [
+        "against the truth (synthetic):",
+        f"  camera centres          {rig.centres_rms_mm:.3f} mm RMS, rotations "
+        f"{rig.rotations_rms_deg:.4f} degrees RMS, {len(rig.names)} pairs",
+    ]
+    folder = workspace / "scan"
+    if not (folder / "scan.json").exists() or truth.vertices is None or truth.faces is None:
+        return "\n".join([*lines, "  no scan to compare yet"])
+    stored = load_scan(folder)
+    pairs = truth.facts["pairs"]
+    place = settled(_placings(stored, calibration), pairs, truth.vertices)
+    still_from_rig = RigidTransform.identity()
+    if truth.facts["settings"]["person"]["sway_mm"]:
+        still_from_rig = place.rig_from_still.inverse()  # who sways stands nowhere in particular
+    body = carried(stored.mesh, still_from_rig)
+    points = still_from_rig.apply(stored.cloud.points)
+    cloud = signed_distances(points, truth.vertices, truth.faces)
+    measured = np.unique(body.faces[~body.filled])
+    mesh = signed_distances(body.vertices[measured], truth.vertices, truth.faces)
+    girths = girth_errors(body, truth.vertices, truth.faces)
+    seen, covered = coverage_of_seen(points, truth.vertices, truth.faces, pairs)
+    spread, beyond = honesty(cloud, stored.cloud.sigma_mm)
+    shape = topology(stored.mesh.vertices, stored.mesh.faces)
+    pictures = [folder / "cloud-deviation.png", folder / "mesh-deviation.png"]
+    draw_deviation(stored.cloud.points, cloud, pictures[0], normals=stored.cloud.normals)
+    draw_deviation(
+        stored.mesh.vertices[measured], mesh, pictures[1], normals=stored.mesh.normals[measured]
+    )
+    lines += [
+        f"  cloud, {len(stored.cloud.points):,} points   {_figures(deviation(cloud))}",
+        f"  error over sigma        {spread:.2f} (robust; 1 is honest), {100.0 * beyond:.2f} % of the "
+        "points beyond three sigmas",
+        f"  mesh, measured vertices {_figures(deviation(mesh))}",
+        f"  mesh: {'closed' if shape.closed else 'open'}, "
+        f"{'manifold' if shape.manifold else 'not manifold'}, {shape.components} piece(s), "
+        f"{'outward' if shape.volume_mm3 > 0 else 'inward'} faces, "
+        f"{shape.volume_mm3 / 1e6:.2f} litres",
+        f"  torso girths (tape)     RMS {girths.rms_mm:.2f}, worst {girths.worst_mm:.2f} mm at "
+        f"{girths.worst_at_mm:.0f} mm, {girths.heights} heights; stature "
+        f"{girths.stature_mm:+.2f} mm",
+        f"  covered within 1 mm     {100.0 * covered:.1f} % of the {100.0 * seen:.1f} % of the "
+        "surface that a camera and its projector see",
+        f"  pairs to each other     {place.apart_mm:.3f} mm RMS over the body, along and across",
+        "results:",
+        f"  calibration {workspace / 'calibration' / 'calibration.json'}",
+        f"  cloud       {folder / 'cloud.ply'}",
+        f"  mesh        {folder / 'mesh.ply'}",
+        f"  exports     {workspace / 'export'}",
+        f"  pictures    {', '.join(str(path) for path in sorted(folder.glob('*.png')))}",
+    ]
+    return "\n".join(lines)
+
+
+def _placings(stored: StoredScan, calibration: RigCalibration) -> dict[str, RigidTransform]:
+    """rig_from_camera of the pairs in the scan, aligned where they were."""
+    measured = [name for name, points in stored.facts["measured"].items() if points]
+    alignment = stored.facts["alignment"]
+    if alignment is None:
+        return {name: calibration.rig_from_camera[name] for name in measured}
+    return {
+        name: RigidTransform.from_matrix(alignment["rig_from_camera"][name]) for name in measured
+    }
+
+
+def _figures(d: Deviation) -> str:
+    return (
+        f"bias {d.bias_mm:+.3f}, median {d.median_mm:.3f}, RMS {d.rms_mm:.3f}, "
+        f"95 % {d.p95_mm:.3f}, worst {d.worst_mm:.2f} mm"
+    )

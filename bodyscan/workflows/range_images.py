@@ -1,0 +1,51 @@
+"""All pairs of a scan: images to range images. A pair that fails is named and left out."""
+
+from __future__ import annotations
+
+from bodyscan.captures.folder import Captures, Sequence
+from bodyscan.errors import BodyscanError, ScanFailed
+from bodyscan.progress import Progress, silent, threaded
+from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.reconstruction.scan_volume import stripes_in_volume
+from bodyscan.reconstruction.triangulation import range_image
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.workflows.decoding import decode_sequence
+
+
+def range_images(
+    calibration: RigCalibration, captures: Captures, progress: Progress = silent
+) -> tuple[list[RangeImage], dict[str, str]]:
+    """The range image of every calibrated pair, and the pairs that gave none, with the reason.
+
+    They show the scan volume and a little around it. Raises ScanFailed if no pair gives one.
+    """
+    failed = {
+        pair.name: calibration.failed.get(pair.name, "is not calibrated")
+        for pair in calibration.rig.pairs
+        if pair.projector and pair.name not in calibration.pairs
+    }
+    failed |= {
+        pair.name: "took no stripe sequence in this scan"
+        for pair in calibration.rig.pairs
+        if pair.projector
+        and pair.name not in failed
+        and not any(s.has_stripes for s in captures.of_pair(pair.name))
+    }
+    sequences = [s for s in captures.sequences if s.has_stripes and s.pair not in failed]
+
+    def reconstruct(sequence: Sequence) -> RangeImage | tuple[str, str]:
+        try:
+            pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
+            wanted = stripes_in_volume(pair, at, calibration.rig.volume)
+            spec = calibration.rig.pair(sequence.pair)
+            return range_image(pair, decode_sequence(sequence, spec, wanted=wanted))
+        except BodyscanError as error:
+            return sequence.pair, str(error)
+
+    results = threaded(reconstruct, sequences, stage="range images", progress=progress)
+    failed |= dict(result for result in results if not isinstance(result, RangeImage))
+    images = [result for result in results if isinstance(result, RangeImage)]
+    if not images:
+        reasons = "\n".join(f"  {name}: {reason}" for name, reason in failed.items())
+        raise ScanFailed(f"no pair gave a range image:\n{reasons}")
+    return images, failed

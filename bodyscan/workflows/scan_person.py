@@ -1,0 +1,27 @@
+"""One person: images to range images, and these to a body cloud and a closed mesh."""
+
+from __future__ import annotations
+
+from bodyscan.captures.folder import Captures
+from bodyscan.fusion.scan import Scan, ScanSettings, fuse
+from bodyscan.progress import Progress, silent
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.workflows.range_images import range_images
+
+
+def scan(
+    calibration: RigCalibration,
+    captures: Captures,
+    settings: ScanSettings = ScanSettings(),
+    progress: Progress = silent,
+    *,
+    empty: Captures | None = None,
+) -> Scan:
+    """Person images in, body model and mesh out.
+
+    empty: captures of the rig without anybody in it, whose surfaces are no part of the subject.
+    Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left.
+    """
+    images, failed = range_images(calibration, captures, progress)
+    background = range_images(calibration, empty, progress)[0] if empty else ()
+    return fuse(calibration, images, failed, settings, progress, empty=background)

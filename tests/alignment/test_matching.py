@@ -1,0 +1,117 @@
+"""Spots that two cameras see of one wavy surface, whose shape and place are known."""
+
+import numpy as np
+import pytest
+from ring import looking_at
+
+from bodyscan.alignment.matching import Patch, match_nearest, match_projected, patch
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.reconstruction.range_image import RangeImage
+
+CAMERA = Camera(400.0, 404.0, -1.0, 158.0, 130.0, -0.12, 0.03, 320, 256)
+CENTRE, RADIUS = np.array([0.0, 0.0, 900.0]), 250.0
+SIGMA_MM = 0.2
+HOLE = np.s_[100:130, 150:190]
+
+
+def seen(name: str, rig_from_camera: RigidTransform) -> RangeImage:
+    """A ball of 250 mm radius, its points and normals exact; a hole in what the camera saw."""
+    rays = CAMERA.pixel_rays()
+    centre = rig_from_camera.inverse().apply(CENTRE)
+    square = np.sum(rays**2, axis=-1)
+    along = rays @ centre / square
+    gap = along**2 - (centre @ centre - RADIUS**2) / square
+    points = rays * (along - np.sqrt(np.where(gap > 0, gap, np.nan)))[..., None]
+    points[HOLE] = np.nan
+    sigma = np.where(np.isfinite(points[..., 2]), SIGMA_MM, np.nan)
+    return RangeImage(
+        name,
+        CAMERA,
+        points.astype(np.float32),
+        ((points - centre) / RADIUS).astype(np.float32),
+        sigma.astype(np.float32),
+        np.full(sigma.shape, 150, np.uint8),
+    )
+
+
+@pytest.fixture(scope="module")
+def two() -> list[tuple[Patch, RigidTransform]]:
+    places = [
+        looking_at([1300.0 * np.cos(a), 1300.0 * np.sin(a), 950.0], CENTRE) for a in (0.2, 0.9)
+    ]
+    return [(patch(seen(f"p{k}", t), 5.0), t) for k, t in enumerate(places)]
+
+
+def test_a_patch_is_about_evenly_spread(two):
+    for part, _ in two:
+        # 1050 mm away a pixel is 2.6 mm: every second one is the nearest to 5 mm.
+        gaps = np.linalg.norm(np.diff(part.points, axis=0), axis=1)
+        assert np.percentile(gaps, 10) > 4.9
+        assert np.median(gaps) < 7.5
+        facing = -np.sum(part.points * part.normals, axis=1) / np.linalg.norm(part.points, axis=1)
+        assert facing.min() > 0.3
+        np.testing.assert_allclose(part.sigma_mm, SIGMA_MM * facing, rtol=1e-6)
+        assert 0.0 < part.rim.mean() < 0.3
+
+
+@pytest.mark.parametrize("match", [match_projected, match_nearest])
+def test_matches_lie_on_the_surface(two, match):
+    (a, rig_from_a), (b, rig_from_b) = two
+    found = match(a, b, rig_from_a, rig_from_b, 6.0)
+    assert len(found.distances) > 500
+    outward = found.points - CENTRE
+    np.testing.assert_allclose(np.linalg.norm(outward, axis=1), RADIUS, atol=1e-3)
+    # The mean of two normals of a ball less than 6 mm apart.
+    assert np.sum(found.normals * outward, axis=1).min() > 0.999 * RADIUS
+    # Along the mean of both normals a ball's points agree to float32, wherever on it they lie.
+    assert np.abs(found.distances).max() < 2e-3
+    assert np.all((found.sigma_mm > 0.3 * SIGMA_MM) & (found.sigma_mm < 1.5 * SIGMA_MM))
+
+
+def test_projected_points_are_those_that_the_camera_saw(two):
+    """Each matched point lands, lens and all, on a pixel away from rims and the hole."""
+    (a, rig_from_a), (b, rig_from_b) = two
+    found = match_projected(a, b, rig_from_a, rig_from_b, 6.0)
+    pixels = np.rint(CAMERA.project(rig_from_b.inverse().apply(found.points))).astype(int)
+    assert np.all(b.inner[pixels[:, 1], pixels[:, 0]])
+    grown = np.zeros_like(b.inner)
+    grown[96:134, 146:194] = True
+    assert not np.any(grown[pixels[:, 1], pixels[:, 0]])
+    # And none is left out without a reason: all that face both cameras and are inside are there.
+    rig = rig_from_a.apply(a.points[~a.rim])
+    local, normals = rig_from_b.inverse().apply(rig), (rig - CENTRE) / RADIUS
+    facing = -np.sum(rig_from_b.inverse().rotate(normals) * local, axis=1)
+    facing /= np.linalg.norm(local, axis=1)
+    columns, rows = np.rint(CAMERA.project(local)).astype(int).T
+    inside = (columns >= 0) & (columns < 320) & (rows >= 0) & (rows < 256)
+    expected = np.zeros(len(rig), bool)
+    expected[inside] = b.inner[rows[inside], columns[inside]] & (facing[inside] > 0.3)
+    np.testing.assert_allclose(found.points, rig[expected], atol=1e-9)
+
+
+def test_a_shift_is_measured_along_the_normals(two):
+    (a, rig_from_a), (b, rig_from_b) = two
+    shift = np.array([0.4, -0.3, 0.5])
+    away = RigidTransform(rig_from_a.rotation, rig_from_a.translation + shift)
+    found = match_projected(a, b, away, rig_from_b, 6.0)
+    assert len(found.distances) > 500
+    # Of two balls 0.7 mm apart: second order is 0.7^2 / 250 mm.
+    np.testing.assert_allclose(found.distances, found.normals @ shift, atol=5e-3)
+
+
+def test_nothing_farther_than_the_reach(two):
+    (a, rig_from_a), (b, rig_from_b) = two
+    inward = 8.0 * rig_from_a.rotation[:, 2]
+    away = RigidTransform(rig_from_a.rotation, rig_from_a.translation + inward)
+    near, far = (match_projected(a, b, away, rig_from_b, reach) for reach in (5.0, 12.0))
+    assert np.abs(near.distances).max(initial=0.0) < 5.0
+    assert np.abs(far.distances).max() > 6.0
+    assert len(near.distances) < len(far.distances)
+
+
+def test_cameras_on_opposite_sides_share_nothing(two):
+    (a, rig_from_a), _ = two
+    opposite = looking_at(2.0 * CENTRE - rig_from_a.translation, CENTRE)
+    other = patch(seen("p2", opposite), 5.0)
+    assert len(match_projected(a, other, rig_from_a, opposite, 6.0).distances) == 0

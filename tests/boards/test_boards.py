@@ -1,0 +1,86 @@
+"""Where a board's corners, rim and markers lie."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bodyscan.boards.board import corner_points, corners_per_face, marker_corners, outline
+from bodyscan.errors import BadInput
+from bodyscan.rig.board import Board
+
+sizes = st.integers(3, 30)
+
+
+@given(sizes, sizes, st.floats(1, 200), st.floats(0, 20))
+def test_corner_ids_count_along_columns_and_back_follows_front(columns, rows, square, thickness):
+    board = Board(
+        name="b", columns=columns, rows=rows, square_mm=square, faces=2, thickness_mm=thickness
+    )
+    points, count = corner_points(board), corners_per_face(board)
+    assert points.shape == (2 * count, 3)
+    for column, row in ((0, 0), (columns - 2, 0), (0, rows - 2), (columns - 2, rows - 2)):
+        corner = row * (columns - 1) + column
+        front = [(column + 1) * square, (row + 1) * square, 0.0]
+        back = [(columns - column - 1) * square, (row + 1) * square, thickness]
+        np.testing.assert_allclose(points[corner], front, rtol=1e-12)
+        np.testing.assert_allclose(points[count + corner], back, rtol=1e-12, atol=1e-9)
+
+
+@given(sizes, sizes, st.floats(0, 50))
+def test_rim_runs_clockwise_for_whoever_looks_at_that_face(columns, rows, margin):
+    board = Board(
+        name="b",
+        columns=columns,
+        rows=rows,
+        square_mm=10,
+        margin_mm=margin,
+        faces=2,
+        thickness_mm=4,
+    )
+    for face, towards_viewer in ((0, -1.0), (1, 1.0)):
+        rim = outline(board, face)
+        # Clockwise with y down means that x cross y points away from the viewer.
+        turn = np.cross(rim[1] - rim[0], rim[2] - rim[1])
+        assert turn[2] * towards_viewer < 0
+        width, height = 10 * columns + 2 * margin, 10 * rows + 2 * margin
+        assert abs(turn[2]) == pytest.approx(width * height)
+        assert np.all(rim[:, 2] == 4 * face)
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize("size", [(9, 7), (8, 10), (8, 11), (9, 8)])
+def test_markers_stand_in_the_white_squares(size, legacy):
+    columns, rows = size
+    board = Board(
+        name="b", kind="charuco", columns=columns, rows=rows, square_mm=10, marker_mm=8,
+        legacy_layout=legacy, faces=2, first_marker=5,
+    )  # fmt: skip
+    ids, corners = marker_corners(board)
+    back_ids, back_corners = marker_corners(board, 1)
+    np.testing.assert_array_equal(ids, 5 + np.arange(columns * rows // 2))
+    np.testing.assert_array_equal(back_ids, ids[-1] + 1 + np.arange(len(ids)))
+    np.testing.assert_array_equal(corners, back_corners)
+    square = np.floor(corners.mean(axis=1) / 10).astype(int)
+    # OpenCV's old layout begins with white when there is an even number of rows.
+    white = 0 if legacy and rows % 2 == 0 else 1
+    assert np.all(square.sum(axis=1) % 2 == white)
+    np.testing.assert_allclose(corners[:, 2] - corners[:, 0], 8.0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"dictionary": "DICT_9X9"}, "unknown marker dictionary"),
+        ({"dictionary": "DICT_4X4_50", "faces": 2}, "too few"),
+        ({"marker_mm": None}, "marker_mm"),
+    ],
+)
+def test_boards_that_cannot_be_printed_are_refused(changes, said):
+    board = Board(name="b", kind="charuco", columns=9, rows=7, square_mm=10, marker_mm=8)
+    with pytest.raises(BadInput, match=said):
+        marker_corners(
+            board.model_copy(update=changes), face=board.model_copy(update=changes).faces - 1
+        )

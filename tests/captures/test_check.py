@@ -1,0 +1,215 @@
+"""`bodyscan check`: every fault of a rig's captures found and told, without decoding an image."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from small_captures import FRAMES, RIG, encoded, picture, write, write_small_captures
+
+from bodyscan.captures.check import check, report_lines
+from bodyscan.errors import RigFileError
+
+
+@pytest.fixture
+def rig_path(tmp_path: Path) -> Path:
+    return write_small_captures(tmp_path)
+
+
+def image(rig_path: Path, shot: str, pair: str, frame: str) -> Path:
+    return rig_path.parent / "captures" / shot / pair / f"{frame}.png"
+
+
+def lines_with(rig_path: Path, word: str) -> list[str]:
+    return [line for line in report_lines(check(rig_path)) if word in line]
+
+
+def test_good_captures_are_good(rig_path: Path) -> None:
+    report = check(rig_path)
+    assert report.ok
+    assert report.images == 3 * (2 * len(FRAMES) + 1)
+    assert [(p.pair, p.stripe_shots, p.lit_shots) for p in report.pairs] == [
+        ("p1", 3, 0),
+        ("p2", 3, 0),
+        ("cam", 0, 3),
+    ]
+    assert report_lines(report)[-1] == "good"
+
+
+def test_missing_images_are_grouped_by_pair_and_shot(rig_path: Path) -> None:
+    for frame in ("bit00", "bit01", "dark"):
+        image(rig_path, "b2", "p1", frame).unlink()
+    report = check(rig_path)
+    assert not report.ok
+    assert {(bad.pair, bad.shot, bad.what) for bad in report.bad_images} == {
+        ("p1", "b2", "is missing")
+    }
+    assert len(report.bad_images) == 3
+    (line,) = lines_with(rig_path, "is missing")
+    first = image(rig_path, "b2", "p1", "dark")
+    assert line == f"error: pair p1, shot b2: {first} and 2 more: is missing"
+    assert report.pairs[0].stripe_shots == 2  # that sequence cannot be used
+    (few,) = lines_with(rig_path, "calibration needs 3")
+    assert few.startswith("error: pair p1: has 2 whole stripe sequences")
+
+
+@pytest.mark.parametrize(
+    ("code", "frames"),
+    [
+        ("code: gray, inverses: false", ["dark", "bit00", "bit01", "bit02", "bit03"]),
+        ("code: light-section", [f"stripe{stripe:03d}" for stripe in range(12)]),
+        ("code: stripe-index", ["index"]),
+        ("code: phase-shift, steps: 3, period: 6",
+         ["dark", *(f"bit0{b}{kind}" for kind in ("", "-inverse") for b in range(2)),
+          "phase00", "phase01", "phase02"]),
+    ],
+)  # fmt: skip
+def test_the_images_that_a_code_takes_are_known(
+    tmp_path: Path, code: str, frames: list[str]
+) -> None:
+    rig_path = write(tmp_path / "rig.yaml", RIG.replace("code: gray", code))
+    for shot in ("b1", "b2", "b3"):
+        write(image(rig_path, shot, "cam", "lit"), picture("lit"))
+        for pair, taken in (("p1", ["lit", *frames]), ("p2", FRAMES)):
+            for frame in taken:
+                write(image(rig_path, shot, pair, frame), picture("lit"))
+    assert check(rig_path).ok
+    image(rig_path, "b2", "p1", frames[-1]).rename(image(rig_path, "b2", "p1", "other"))
+    report = check(rig_path)
+    if len(frames) == 1:  # nothing of the code is left: then the lit image was taken alone
+        assert (report.pairs[0].stripe_shots, report.pairs[0].lit_shots) == (2, 1)
+        return
+    (bad,) = report.bad_images
+    assert (bad.pair, bad.shot, bad.path.stem, bad.what) == ("p1", "b2", frames[-1], "is missing")
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        (b"", "is an empty file"),
+        (b"text", "is neither a PNG nor a JPEG image"),
+        (encoded(picture("lit"))[:-12], "is cut short"),
+        (encoded(picture("lit")[:-1]), "is 40 x 29 pixels, but the rig file says 40 x 30"),
+        (encoded(picture("lit").astype("uint16")), "has 16 bits a sample"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_bad_files_are_found_by_their_headers(rig_path: Path, content: bytes, what: str) -> None:
+    write(image(rig_path, "b1", "p2", "bit03"), content)
+    (bad,) = check(rig_path).bad_images
+    assert (bad.pair, bad.shot, bad.path.name) == ("p2", "b1", "bit03.png")
+    assert what in bad.what
+
+
+def test_too_few_shots(tmp_path: Path) -> None:
+    report = check(write_small_captures(tmp_path, shots=2))
+    assert [error.split(";")[0] for error in report.errors] == [
+        "pair p1: has 2 whole stripe sequences",
+        "pair p2: has 2 whole stripe sequences",
+        "pair cam: has 2 lit images",
+    ]
+
+
+def test_unknown_pairs_and_shots_that_are_not_there(rig_path: Path) -> None:
+    file = rig_path.parent / "captures" / "captures.yaml"
+    write(file, "kind: calibration\nshots: [{name: b1, stripes: [p7]}]")
+    (line,) = lines_with(rig_path, "names no pair of rig small")
+    assert line.startswith(f"error: {file}:2:30: shots[0].stripes[0]")
+    write(file, "kind: calibration\nshots: [{name: b1}, {name: b2}, {name: b3}, {name: b4}]")
+    assert lines_with(rig_path, "shot b4: no image")
+
+
+def test_the_shot_that_fixes_the_rig_frame_must_be_there(rig_path: Path) -> None:
+    write(rig_path, RIG + "rig_frame: {shot: b22}\n")
+    (line,) = lines_with(rig_path, "rig_frame.shot")
+    assert "no shot 'b22' (did you mean 'b2'?)" in line
+
+
+def test_one_bad_folder_does_not_hide_the_others(rig_path: Path) -> None:
+    write(rig_path, RIG + "  - folder: gone\n")
+    report = check(rig_path)
+    assert len(report.errors) == 1
+    assert "gone: the capture folder does not exist" in report.errors[0]
+    assert report.shots == ("b1", "b2", "b3")
+
+
+def test_no_captures_at_all(rig_path: Path) -> None:
+    write(rig_path, RIG.replace("calibration:\n  - folder: captures\n", ""))
+    report = check(rig_path)
+    assert report.ok
+    assert "names no calibration captures" in report.warnings[0]
+    shutil.rmtree(rig_path.parent / "captures")
+    write(rig_path, RIG)
+    assert "does not exist" in check(rig_path).errors[0]
+
+
+def test_scans_are_checked_with_the_rig(rig_path: Path, tmp_path: Path) -> None:
+    scan = tmp_path / "scan"
+    shutil.copytree(rig_path.parent / "captures" / "b1", scan / "standing")
+    assert check(rig_path, [scan]).ok
+    write(scan / "captures.yaml", "kind: calibration")
+    assert "scan captures are wanted" in check(rig_path, [scan]).errors[0]
+    (scan / "captures.yaml").unlink()
+    (scan / "standing" / "p1" / "lit.png").unlink()
+    report = check(rig_path, [scan])
+    assert [bad.path for bad in report.bad_images] == [scan / "standing" / "p1" / "lit.png"]
+    assert report.pairs[0].stripe_shots == 3  # a scan calibrates nothing
+
+
+def test_a_wrong_rig_file_is_told_by_line(rig_path: Path) -> None:
+    write(rig_path, RIG.replace("width: 40", "width: 0"))
+    with pytest.raises(RigFileError, match=r":7:29: pairs\[0\]\.camera\.width: must be greater"):
+        check(rig_path)
+
+
+def test_checking_decodes_nothing_and_imports_nothing_heavy(rig_path: Path) -> None:
+    code = (
+        "import sys; from bodyscan.captures.check import check\n"
+        f"assert check({str(rig_path)!r}).ok\n"
+        "print([m for m in ('numpy', 'cv2', 'open3d', 'scipy', 'pycolmap') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(("rig", "images"), [("procam-board", 88), ("charuco-ring", 48)])
+def test_real_captures_are_read_where_they_lie(rig: str, images: int) -> None:
+    path = Path(__file__).parents[2] / "rigs" / f"{rig}.yaml"
+    if not (path.parent / "../../shared/captures" / rig).is_dir():
+        pytest.skip("the shared captures are not on this machine")
+    report = check(path)
+    assert report.ok, report_lines(report)
+    assert report.images == images
+
+
+def test_a_renamed_folder_is_not_passed_over_in_silence(rig_path: Path) -> None:
+    folder = image(rig_path, "b2", "p1", "lit").parent
+    folder.rename(folder.with_name("P1"))
+    (warning,) = lines_with(rig_path, "spelt differently")
+    assert f"{len(FRAMES)} images belong to no pair" in warning
+    assert str(folder.with_name("P1")) in warning
+
+
+def test_images_of_shots_that_are_not_wanted_are_left_alone(rig_path: Path) -> None:
+    folder = rig_path.parent / "captures"
+    shutil.copytree(folder / "b2", rig_path.parent / "captures" / "elsewhere" / "b9")
+    assert lines_with(rig_path, "spelt differently") == []
+
+
+def test_few_poses_are_warned_of(rig_path: Path) -> None:
+    warnings = lines_with(rig_path, "or more are better")
+    assert len(warnings) == 3
+    assert "pair p1: 3 board poses" in warnings[0]
+
+
+def test_the_same_fault_in_many_shots_is_one_line(rig_path: Path) -> None:
+    captures = rig_path.parent / "captures"
+    for shot in ("b4", "b5"):
+        shutil.copytree(captures / "b2", captures / shot)
+    shots = [path.unlink() for path in captures.glob("b*/p1/lit.png")]
+    (line,) = lines_with(rig_path, "error: pair p1, ")
+    assert f"{len(shots)} shots: " in line
+    assert f"and {len(shots) - 1} more" in line

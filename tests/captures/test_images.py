@@ -1,0 +1,215 @@
+"""Images: read exactly, and refused before they do harm."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from small_captures import BITS, HEIGHT, STRIPES, WIDTH, encoded, picture, write
+from small_captures import write_small_captures as small
+
+from bodyscan.captures.folder import Sequence, open_captures
+from bodyscan.captures.image_header import NoImage, png_damage, read_header
+from bodyscan.captures.images import read_image, read_lit, read_sequence
+from bodyscan.errors import ImageError
+from bodyscan.rig.pair import CameraSpec
+from bodyscan.rig.rig_file import load_rig
+
+CAMERA = CameraSpec(width=WIDTH, height=HEIGHT)
+NOISE = np.random.default_rng(5).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
+
+
+def first_sequence(folder: Path) -> Sequence:
+    rig_path = small(folder, shots=1)
+    sequence = open_captures(load_rig(rig_path), rig_path).sequence("p1", "b1")
+    assert sequence is not None
+    return sequence
+
+
+def read(path: Path, **options: bool) -> np.ndarray:
+    return read_image(path, WIDTH, HEIGHT, pair="p1", shot="b1", **options)
+
+
+def png(width: int, height: int, bits: int = 8) -> bytes:
+    """A PNG of a header, one empty data chunk and an end, all checksums right."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        checksum = zlib.crc32(kind + content)
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
+
+    header = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)
+    data = zlib.compress(b"")
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    )
+
+
+def test_a_png_is_read_to_the_last_bit(tmp_path: Path) -> None:
+    image = read(write(tmp_path / "x.png", NOISE))
+    assert image.dtype == np.uint8
+    np.testing.assert_array_equal(image, NOISE)
+
+
+def test_colour_becomes_grey_and_exif_turns_are_not_applied(tmp_path: Path) -> None:
+    colour = np.dstack([NOISE // 4, NOISE // 2, NOISE])
+    expected = NOISE / 4 * 0.114 + NOISE / 2 * 0.587 + NOISE * 0.299  # luma, blue first
+    image = read(write(tmp_path / "x.png", colour))
+    assert np.abs(image - expected).max() <= 1.5  # whole grey levels, and // above
+    exif = (
+        b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"  # turned by 90
+    )
+    jpeg = encoded(picture("bit02"), ".jpg")
+    turned = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
+    plain = read(write(tmp_path / "x.jpg", jpeg))
+    np.testing.assert_array_equal(read(write(tmp_path / "y.jpg", turned)), plain)
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        (None, "is missing"),
+        (b"", "is an empty file"),
+        (b"this is text", "is neither a PNG nor a JPEG image"),
+        (encoded(NOISE, ".bmp"), "is neither a PNG nor a JPEG image"),
+        (encoded(NOISE.T), "is 30 x 40 pixels, but the rig file says 40 x 30"),
+        (encoded(NOISE.T.copy(), ".jpg"), "is 30 x 40 pixels, but the rig file says 40 x 30"),
+        (encoded(NOISE.astype(np.uint16) * 16), "has 16 bits a sample; only 8-bit images"),
+        (encoded(NOISE)[:-20], "is cut short"),
+        (encoded(NOISE)[:600], "is cut short"),
+        (encoded(NOISE)[:20], "is cut short"),
+        (encoded(NOISE, ".jpg")[:-20], "is cut short"),
+        (encoded(NOISE, ".jpg")[:30], "is cut short"),
+        (png(WIDTH, HEIGHT), "cannot be decoded"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(50), "is damaged (its PNG header is wrong)"),
+        (b"\xff\xd8\xff\xe0\x00\x01" + bytes(50), "is damaged (its JPEG header is wrong)"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_bad_images_are_refused(tmp_path: Path, content: bytes | None, what: str) -> None:
+    path = tmp_path / "x.png"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ImageError) as caught:
+        read(path)
+    assert what in caught.value.what
+    assert caught.value.where == f"{path} (pair p1, shot b1)"
+    assert caught.value.remedy
+
+
+def test_a_folder_is_no_image(tmp_path: Path) -> None:
+    with pytest.raises(ImageError, match="cannot be read: Is a directory"):
+        read(tmp_path)
+
+
+def test_a_huge_image_is_refused_by_its_header(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "x.png", png(60_000, 60_000))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(ImageError, match="is 60000 x 60000 pixels, but the rig file says"):
+        read(path)
+
+
+@given(st.integers(33, len(encoded(NOISE)) - 13), st.integers(1, 255))
+def test_every_changed_byte_of_a_png_is_noticed(place: int, change: int) -> None:
+    data = bytearray(encoded(NOISE))
+    data[place] ^= change
+    assert png_damage(bytes(data)) is not None
+    assert png_damage(encoded(NOISE)) is None
+
+
+def test_a_damaged_png_is_refused_and_opencv_prints_nothing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    data = bytearray(encoded(NOISE))
+    data[500] ^= 1
+    with pytest.raises(ImageError, match="damaged"):
+        read(write(tmp_path / "x.png", bytes(data)))
+    with pytest.raises(ImageError, match="cut short"):
+        read(write(tmp_path / "y.png", encoded(NOISE)[:600]))
+    assert capfd.readouterr().err == ""
+
+
+@given(st.binary(max_size=200), st.sampled_from([b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"]))
+def test_any_bytes_give_a_header_or_a_reason(
+    tmp_path_factory: pytest.TempPathFactory, tail: bytes, start: bytes
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.png"
+    path.write_bytes(start + tail)
+    with suppress(NoImage):  # anything else that is raised would reach the user as a traceback
+        assert read_header(path).width >= 0
+
+
+def test_a_jpeg_header_is_found_behind_long_segments(tmp_path: Path) -> None:
+    jpeg = encoded(NOISE, ".jpg")
+    thumbnail = b"\xff\xe2" + struct.pack(">H", 60_002) + b"\xff\xd9" * 30_000
+    for content, complete in ((jpeg, True), (jpeg + bytes(300), True), (jpeg[:-9], False)):
+        path = write(tmp_path / "x.jpg", content[:2] + thumbnail * 3 + content[2:])
+        header = read_header(path)
+        assert (header.width, header.height, header.bits) == (WIDTH, HEIGHT, 8)
+        assert header.complete is complete
+
+
+@pytest.mark.parametrize(("level", "good"), [(0, False), (8, False), (9, True)])
+def test_a_black_lit_image_is_refused(tmp_path: Path, level: int, good: bool) -> None:
+    image = np.zeros((HEIGHT, WIDTH), np.uint8)
+    image[3, 4] = level
+    path = write(tmp_path / "lit.png", image)
+    assert read(path).max() == level  # any other image may be black
+    if good:
+        assert read(path, lit=True).max() == level
+    else:
+        with pytest.raises(ImageError, match=rf"shows nothing: .* is {level} of 255"):
+            read(path, lit=True)
+
+
+def test_a_sequence_comes_in_order(tmp_path: Path) -> None:
+    images = read_sequence(first_sequence(tmp_path), CAMERA)
+    assert (images.pair, images.shot) == ("p1", "b1")
+    patterns, inverses = np.split(images.coded, 2)
+    assert patterns.shape == inverses.shape == (BITS, HEIGHT, WIDTH)
+    assert images.lit.min() == 200
+    assert images.dark.max() == 5
+    gray = sum(
+        (patterns[bit] > inverses[bit]).astype(int) << (BITS - 1 - bit) for bit in range(BITS)
+    )
+    stripe = np.arange(HEIGHT) * STRIPES // HEIGHT
+    np.testing.assert_array_equal(gray, np.repeat((stripe ^ stripe >> 1)[:, None], WIDTH, axis=1))
+
+
+def test_a_dark_image_need_not_be_taken(tmp_path: Path) -> None:
+    rig_path = small(tmp_path, shots=1)
+    rig_path.write_text(rig_path.read_text() + "frames: {dark: null}\n")
+    sequence = open_captures(load_rig(rig_path), rig_path).sequence("p1", "b1")
+    assert sequence is not None
+    assert sequence.dark is None
+    assert read_sequence(sequence, CAMERA).dark is None
+
+
+@pytest.mark.parametrize("frame", ["lit", "dark", "bit02", "bit03-inverse"])
+def test_a_bad_image_of_a_sequence_is_named(tmp_path: Path, frame: str) -> None:
+    sequence = first_sequence(tmp_path)
+    path = sequence.lit.with_name(f"{frame}.png")
+    path.unlink()
+    with pytest.raises(ImageError, match="is missing") as caught:
+        read_sequence(sequence, CAMERA)
+    assert caught.value.where == f"{path} (pair p1, shot b1)"
+
+
+def test_a_black_sequence_is_refused_and_a_lit_image_is_no_sequence(tmp_path: Path) -> None:
+    sequence = first_sequence(tmp_path)
+    np.testing.assert_array_equal(read_lit(sequence, CAMERA), picture("lit"))
+    write(sequence.lit, picture("dark"))
+    for work in (read_sequence, read_lit):
+        with pytest.raises(ImageError, match="shows nothing"):
+            work(sequence, CAMERA)
+    alone = Sequence("p1", "b1", sequence.lit, None, (), ())
+    with pytest.raises(ImageError, match="there is no stripe sequence"):
+        read_sequence(alone, CAMERA)

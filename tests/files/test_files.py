@@ -1,0 +1,99 @@
+"""Atomic, exact and repeatable files."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bodyscan.files.atomic import json_text, replacing, write_bytes, write_json, write_npz
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
+    path = tmp_path / "mesh.ply"
+    write_bytes(path, b"old")
+
+    def fail() -> None:
+        with replacing(path) as temporary:
+            assert temporary.suffix == ".ply"
+            assert temporary.parent == path.parent
+            temporary.write_bytes(b"half of the new")
+            raise RuntimeError("power cut")
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["mesh.ply"]
+
+
+def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), replacing(tmp_path / "x.bin"):
+        pass
+    assert os.listdir(tmp_path) == []
+
+
+def test_folders_are_made_and_the_umask_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "a" / "b" / "c.bin"
+    before = os.umask(0o027)
+    try:
+        write_bytes(path, b"x")
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == 0o640
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False)))
+def test_json_keeps_every_bit_of_a_float(values: list[float]) -> None:
+    back = json.loads(json_text({"values": np.array(values, dtype=np.float64)}))["values"]
+    assert [v.hex() for v in back] == [v.hex() for v in values]
+
+
+def test_json_is_sorted_indented_and_a_matrix_takes_a_line_a_row() -> None:
+    content = {"b": np.eye(2), "a": [{"n": np.int64(3)}], "c": {}, "d": [], "e": None, "f": "é"}
+    text = json_text(content)
+    assert json.loads(text) == {
+        "a": [{"n": 3}],
+        "b": [[1, 0], [0, 1]],
+        "c": {},
+        "d": [],
+        "e": None,
+        "f": "é",
+    }
+    assert text.startswith(
+        '{\n  "a": [\n    {\n      "n": 3\n    }\n  ],\n  "b": [\n    [1.0, 0.0],\n'
+    )
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, np.array([1.0, math.nan])])
+def test_json_refuses_what_json_does_not_have(tmp_path: Path, value: object) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "x.json", {"value": value})
+    assert os.listdir(tmp_path) == []
+
+
+def test_npz_is_exact_and_its_bytes_do_not_depend_on_time_or_order(tmp_path: Path) -> None:
+    points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
+    names = np.array(["p1-1", "p1-2"])
+    write_npz(tmp_path / "a.npz", points=points, names=names, path=np.float64(np.nan))
+    write_npz(tmp_path / "b.npz", path=np.float64(np.nan), names=names, points=points)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as back:
+        np.testing.assert_array_equal(back["points"], points)
+        assert back["points"].dtype == np.float32
+        assert back["names"].tolist() == names.tolist()
+        assert np.isnan(back["path"])
+
+
+def test_npz_never_pickles(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="allow_pickle"):
+        write_npz(tmp_path / "x.npz", things=np.array([{}], dtype=object))
+    assert os.listdir(tmp_path) == []

@@ -1,0 +1,203 @@
+"""The chapter's experiments once, coarsely: images rendered, decoded, every approach calibrated."""
+
+import numpy as np
+import pytest
+
+from bodyscan.boards.detection import find_boards
+from bodyscan.calibration.camera import INTRINSICS
+from bodyscan.evaluation.spheres import find_spheres
+from bodyscan.geometry.light_planes import baseline_angle_tilt
+from bodyscan.laboratory.chapter.calibrating import calibrate_all, sigma_trial
+from bodyscan.laboratory.chapter.captures import take_captures
+from bodyscan.laboratory.chapter.measuring import (
+    measure,
+    noise_bound,
+    points_of,
+    true_approach,
+    whole_stripes,
+)
+from bodyscan.laboratory.chapter.point_sigma import point_sigma
+from bodyscan.laboratory.chapter.setup import (
+    BOARD,
+    CAMERA,
+    CENTRES,
+    board_places,
+    chapter_setup,
+    ideal_settings,
+    stage_places,
+    stage_readings,
+    true_planes,
+)
+from bodyscan.laboratory.chapter.text import Reproduction, report
+from bodyscan.laboratory.reproduce import FIGURES, draw
+from bodyscan.reconstruction.triangulation import grid_normals
+
+
+@pytest.fixture(scope="module")
+def captures():
+    # Two rays a pixel each way: boundaries are then some 0.02 px worse than in the real run.
+    return take_captures(chapter_setup(ideal_settings(2)), stage_stops=3)
+
+
+@pytest.fixture(scope="module")
+def calibrated(captures):
+    return calibrate_all(captures)
+
+
+@pytest.fixture(scope="module")
+def measured(captures, calibrated):
+    approaches = [*calibrated.approaches, true_approach(captures.setup)]
+    return {
+        whole: {m.name: m for m in (measure(a, captures, whole=whole) for a in approaches)}
+        for whole in (True, False)
+    }
+
+
+def test_baselines_reduce_angles_grow_tilts_stay():
+    # Fig. 6, in words.
+    baseline, angle, tilt = baseline_angle_tilt(
+        true_planes(chapter_setup(ideal_settings(1))), "vertical"
+    )
+    assert (np.diff(baseline) < 0).all()
+    assert (np.diff(angle) > 0).all()
+    assert np.degrees(np.ptp(tilt)) < 0.5 < np.degrees(np.ptp(angle))
+
+
+def test_boards_and_stage_are_wholly_in_the_picture(captures):
+    assert len(captures.boards) == 3
+    assert len(captures.stage) == 3
+    for shot in (*captures.boards, *captures.stage):
+        assert len(shot.view.corner_ids) == 48
+
+
+def test_corners_are_the_simulated_boards(captures):
+    camera = captures.setup.view.camera
+    places = [*board_places(), *stage_places(stage_readings(3), 0)]
+    for shot, place in zip((*captures.boards, *captures.stage), places, strict=True):
+        true = camera.image(place.apply(captures.setup.board.corners))[shot.view.corner_ids]
+        # Two rays a pixel move an edge by up to 0.1 px in one pixel; a corner has thirty of them.
+        assert np.sqrt(np.mean((shot.view.pixels - true) ** 2)) < 0.04
+
+
+def test_true_stripes_and_true_calibration_leave_nothing(captures):
+    truth = true_approach(captures.setup)
+    for number, centre in enumerate(CENTRES):
+        own = captures.owner == number
+        points = points_of(truth, captures.spheres.truth.s, own)
+        # 0.0005 mm of facets, and float32 in the ray caster.
+        assert np.abs(np.linalg.norm(points - centre, axis=1) - 25.0).max() < 0.003
+    assert measure(truth, captures).plate_systematic_mm < 1e-3
+
+
+def test_whole_stripes_hide_the_calibration(measured):
+    third = measured[True]["(iii)"]
+    for name, one in measured[True].items():
+        # The issue's trial: 0.31 to 0.52 with whole stripes, chapter's Table 2: 0.13 to 0.41.
+        assert all(0.1 < sphere.e_given < 0.6 for sphere in one.spheres), name
+        # Whole stripes of 2.8 px leave 0.5 mm whatever the model: within a tenth of one another.
+        assert one.mean_e == pytest.approx(third.mean_e, rel=0.1), name
+
+
+def test_sub_pixel_boundaries_do_not(measured):
+    fine = measured[False]
+    assert fine["(iii)"].mean_e < 0.02 * measured[True]["(iii)"].mean_e
+    assert fine["(i)"].mean_e > 1.3 * fine["(iii)"].mean_e
+    for name in ("(i) mended", "ours", "true calibration"):
+        assert fine[name].mean_e == pytest.approx(fine["(iii)"].mean_e, rel=0.3), name
+    # Tsai's single coefficient is off by some hundredths of a pixel: a few 0.0001 mm^2.
+    assert fine["(ii)"].mean_e < fine["(iii)"].mean_e + 0.001
+    for one in fine.values():
+        # The issue: at least 90 percent of the pixels that a sphere covers and the light reaches.
+        assert min(one.covered) > 0.9
+
+
+def test_the_plate_and_the_centres_tell_calibrations_apart(measured):
+    fine = measured[False]
+    # Corners found to 0.03 px in rendering this coarse: a few um, and 0.2 um for all in one solve.
+    assert fine["(iii)"].plate_systematic_mm < 0.02
+    assert fine["ours"].plate_systematic_mm < 0.004
+    assert fine["(i)"].plate_systematic_mm > 0.15
+    assert fine["(i) mended"].plate_systematic_mm < 0.2 * fine["(i)"].plate_systematic_mm
+    assert fine["ours"].distances.rms_mm < 0.02
+    assert fine["(i)"].distances.rms_mm > 0.05
+    for name in ("(iii)", "ours"):
+        for sphere, true in zip(fine[name].spheres, CENTRES, strict=True):
+            # An error of 1e-3 in the focal length is 0.4 mm of depth at 400 mm.
+            assert np.linalg.norm(sphere.given.centre - true) < 0.8
+
+
+def test_table_1_is_recovered(calibrated):
+    found, sigmas = calibrated.reference.camera, np.sqrt(np.diag(calibrated.reference.covariance))
+    errors = [getattr(found, name) - getattr(CAMERA, name) for name in INTRINSICS]
+    # Three sigmas is the issue's bound; a fixed seed makes it no matter of chance.
+    assert np.all(np.abs(errors) < 3.0 * sigmas), np.array(errors) / sigmas
+
+
+def test_sigmas_are_honest_over_many_seeds():
+    trial = sigma_trial(50)
+    # RMS of 50 normal draws is 1 +- 0.1.
+    assert np.all(np.abs(trial.spread - 1.0) < 0.3), trial.spread
+    # 350 draws: 0.95 beyond three sigmas expected, 5 or more once in three hundred times.
+    assert trial.beyond_three < 5
+
+
+def test_the_spheres_are_found_without_knowing_where_they_are(captures, calibrated):
+    s = captures.spheres.stripes.s
+    points = points_of(calibrated.ours, s).reshape(*s.shape, 3).astype(np.float32)
+    found = find_spheres(points.astype(float), grid_normals(points).astype(float), 25.0, 5)
+    places = np.stack([sphere.centre for sphere in found])
+    assert np.allclose(places, CENTRES, atol=0.8)
+
+
+def test_noise_is_less_than_everything(captures, measured):
+    noise = noise_bound(captures)
+    assert max(noise.best_share) < 0.001
+    for alone, sphere in zip(
+        noise.everything, measured[False]["true calibration"].spheres, strict=True
+    ):
+        assert 0 < alone < sphere.e_given
+
+
+def test_points_are_as_far_off_as_they_say(captures, calibrated):
+    found = point_sigma(calibrated.ours, captures)
+    # 0.9 to 1.0 in docs/reproduction.md; so coarsely rendered, boards seem worse placed than they are.
+    assert 0.25 < found.spheres < 1.7
+    assert 0.25 < found.plate < 1.7
+    assert found.beyond_three < 0.02
+
+
+def test_whole_stripes_are_middles():
+    assert whole_stripes(np.array([0.0, 3.2, 3.99])) == pytest.approx([0.5, 3.5, 3.5])
+    assert np.isnan(whole_stripes(np.array([np.nan]))[0])
+
+
+def test_the_report_says_all_of_it(tmp_path, captures, calibrated, measured):
+    fine, whole = tuple(measured[False].values()), tuple(measured[True].values())
+    found = Reproduction(
+        seed=0,
+        real_light=False,
+        calibrated=calibrated,
+        trial=sigma_trial(3),
+        whole=whole,
+        fine=fine,
+        by_stage=fine[:1],
+        by_reference=fine[-1:],
+        noise=noise_bound(captures),
+        sigmas=(point_sigma(calibrated.ours, captures),),
+    )
+    text = report(found)
+    for wanted in ("Table 1", "Table 2", "mean square", "contradicts", "scale ppm", "noise alone"):
+        assert wanted in text
+    assert f"{fine[3].spheres[2].e_given:.5f}" in text
+    assert f"{whole[0].spheres[4].e_given:.3f}" in text
+    for line in text.splitlines():
+        if line.startswith("|"):
+            assert line.endswith("|")
+    draw(captures, calibrated, tmp_path)
+    for name in FIGURES:
+        assert (tmp_path / name).stat().st_size > 10_000
+    assert not list(tmp_path.glob("*.tmp*"))
+
+
+def test_no_board_is_seen_among_the_spheres(captures):
+    assert find_boards(captures.spheres.lit, [BOARD], pair="p", shot="s") == []

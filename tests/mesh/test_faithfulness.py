@@ -1,0 +1,71 @@
+"""A coarse ball brought nearer to a fine one."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+
+from bodyscan.mesh.faithfulness import Surface, brought_within
+from bodyscan.mesh.topology import topology
+
+
+def ball(resolution: int) -> tuple[np.ndarray, np.ndarray]:
+    mesh = o3d.geometry.TriangleMesh.create_sphere(100.0, resolution)
+    return np.asarray(mesh.vertices) + [900.0, 0.0, 1500.0], np.asarray(mesh.triangles).astype(int)
+
+
+def farthest(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float:
+    vertices, faces = one
+    a, b = np.random.default_rng(0).random((2, len(faces), 1))
+    a, b = np.where(a + b > 1, 1 - a, a), np.where(a + b > 1, 1 - b, b)
+    corners = vertices[faces]
+    inside = (
+        corners[:, 0] + a * (corners[:, 1] - corners[:, 0]) + b * (corners[:, 2] - corners[:, 0])
+    )
+    return float(Surface(*other).nearest(np.concatenate([vertices, inside]))[1].max())
+
+
+def test_a_coarse_ball_comes_within_the_limit():
+    fine, coarse = ball(100), ball(10)
+    assert farthest(coarse, fine) > 2.0
+    found = brought_within(*coarse, *fine, 0.5)
+    assert farthest(found, fine) < 0.55
+    assert farthest(fine, found) < 0.55
+    check = topology(*found)
+    assert check.manifold
+    assert check.euler == 2
+    # Flat faces within half a millimetre of a ball of 100 mm have edges of about 17 mm.
+    assert len(found[1]) < 4000
+
+
+def test_what_is_near_enough_stays():
+    fine, coarse = ball(60), ball(40)
+    vertices, faces = brought_within(*coarse, *fine, 1.0)
+    np.testing.assert_array_equal(faces, coarse[1])
+    np.testing.assert_array_equal(vertices, coarse[0])
+
+
+def test_one_bad_place_costs_a_few_faces_only():
+    fine, coarse = ball(60), ball(60)
+    dented = coarse[0].copy()
+    dent = int(np.argmax(dented[:, 0]))
+    dented[dent, 0] -= 5.0
+    vertices, faces = brought_within(dented, coarse[1], *fine, 0.3)
+    assert farthest((vertices, faces), fine) < 0.3
+    assert len(faces) <= len(coarse[1]) + 20
+
+
+def test_the_same_input_gives_the_same_bytes():
+    one, other = (brought_within(*ball(10), *ball(60), 0.5) for _ in range(2))
+    assert one[0].tobytes() == other[0].tobytes()
+    assert one[1].tobytes() == other[1].tobytes()
+
+
+def test_a_spike_that_was_lost_comes_back():
+    fine, coarse = ball(60), ball(20)
+    spiked = fine[0].copy()
+    tip = int(np.argmax(spiked[:, 1]))
+    spiked[tip, 1] += 3.0
+    found = brought_within(*coarse, spiked, fine[1], 0.5)
+    assert farthest((spiked, fine[1]), found) < 0.55
+    assert topology(*found).manifold

@@ -1,0 +1,119 @@
+"""Our PLY files: exact on reading back, readable by others, refused when damaged."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from small_bodies import ball, points
+
+from bodyscan.errors import ResultError
+from bodyscan.mesh.body import BodyCloud
+from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
+
+
+def assert_same(one: object, other: object) -> None:
+    for field in fields(one):
+        mine, theirs = getattr(one, field.name), getattr(other, field.name)
+        assert mine.dtype == theirs.dtype, field.name
+        assert mine.tobytes() == theirs.tobytes(), field.name
+
+
+def test_a_cloud_is_read_back_to_the_last_bit(tmp_path: Path):
+    cloud = points()
+    write_ply(tmp_path / "cloud.ply", cloud)
+    assert_same(read_ply_cloud(tmp_path / "cloud.ply"), cloud)
+
+
+def test_a_mesh_is_read_back_to_the_last_bit(tmp_path: Path):
+    mesh = ball()
+    assert mesh.filled.any()
+    assert not mesh.filled.all()
+    write_ply(tmp_path / "mesh.ply", mesh)
+    assert_same(read_ply_mesh(tmp_path / "mesh.ply"), mesh)
+
+
+def test_an_empty_cloud_can_be_stored(tmp_path: Path):
+    cloud = BodyCloud(*(getattr(points(), field.name)[:0] for field in fields(BodyCloud)))
+    write_ply(tmp_path / "empty.ply", cloud)
+    assert len(read_ply_cloud(tmp_path / "empty.ply").points) == 0
+
+
+def test_others_can_read_it(tmp_path: Path):
+    mesh, cloud = ball(), points()
+    write_ply(tmp_path / "mesh.ply", mesh)
+    write_ply(tmp_path / "cloud.ply", cloud)
+    seen = o3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply"))
+    np.testing.assert_allclose(np.asarray(seen.vertices), mesh.vertices, atol=1e-9)
+    np.testing.assert_array_equal(np.asarray(seen.triangles), mesh.faces)
+    np.testing.assert_allclose(np.asarray(seen.vertex_normals), mesh.normals, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(seen.vertex_colors) * 255.0, mesh.colours, atol=1e-6)
+    dots = o3d.t.io.read_point_cloud(str(tmp_path / "cloud.ply"))
+    np.testing.assert_array_equal(dots.point.positions.numpy(), cloud.points)
+    np.testing.assert_array_equal(dots.point.sigma_mm.numpy()[:, 0], cloud.sigma_mm)
+    np.testing.assert_array_equal(dots.point.pairs_seen.numpy()[:, 0], cloud.pairs_seen)
+
+
+def test_other_comments_do_not_matter(tmp_path: Path):
+    path, cloud = tmp_path / "cloud.ply", points()
+    write_ply(path, cloud)
+    head, comment, rest = path.read_bytes().partition(b"comment bodyscan")
+    path.write_bytes(head + b"comment by hand\n" + comment + rest)
+    assert_same(read_ply_cloud(path), cloud)
+
+
+def _cut(data: bytes) -> bytes:
+    return data[:-1]
+
+
+def _lengthened(data: bytes) -> bytes:
+    return data + b"\0"
+
+
+def _other_property(data: bytes) -> bytes:
+    return data.replace(b"property float sigma_mm", b"property float quality", 1)
+
+
+def _other_count(data: bytes) -> bytes:
+    return data.replace(b"element vertex 500", b"element vertex 499", 1)
+
+
+def _no_ply(data: bytes) -> bytes:
+    return b"solid " + data
+
+
+def _header_only(data: bytes) -> bytes:
+    return data[:40]
+
+
+@pytest.mark.parametrize(
+    "damage", [_cut, _lengthened, _other_property, _other_count, _no_ply, _header_only]
+)
+def test_a_damaged_file_is_refused(tmp_path: Path, damage):
+    path = tmp_path / "cloud.ply"
+    write_ply(path, points())
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(ResultError, match=r"cloud\.ply"):
+        read_ply_cloud(path)
+
+
+def test_a_mesh_is_no_cloud_and_nothing_is_neither(tmp_path: Path):
+    write_ply(tmp_path / "mesh.ply", ball())
+    with pytest.raises(ResultError, match="not a cloud"):
+        read_ply_cloud(tmp_path / "mesh.ply")
+    write_ply(tmp_path / "cloud.ply", points())
+    with pytest.raises(ResultError, match="not a mesh"):
+        read_ply_mesh(tmp_path / "cloud.ply")
+    with pytest.raises(ResultError, match="cannot be read"):
+        read_ply_mesh(tmp_path / "nowhere.ply")
+
+
+def test_a_face_without_its_vertex_is_refused(tmp_path: Path):
+    mesh = ball()
+    mesh.faces[7, 1] = len(mesh.vertices)
+    write_ply(tmp_path / "mesh.ply", mesh)
+    with pytest.raises(ResultError, match="vertex that is not there"):
+        read_ply_mesh(tmp_path / "mesh.ply")

@@ -1,0 +1,130 @@
+import numpy as np
+import pytest
+
+from bodyscan.calibration.pair import PairCalibration, PairQuality
+from bodyscan.errors import BadInput
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.light_planes import LightPlanes
+from bodyscan.reconstruction.triangulation import grid_normals, range_image
+from bodyscan.stripes.stripe_map import StripeMap
+
+CAMERA = Camera(400.0, 402.0, -0.5, 80.0, 60.0, -0.1, 0.02, 160, 120)
+STRIPES = 64
+
+
+def planes() -> LightPlanes:
+    """Horizontal stripes from 200 mm above the camera, fanning down."""
+    angle = np.radians(np.linspace(2.0, 40.0, STRIPES + 1))
+    normals = np.stack([np.zeros_like(angle), np.cos(angle), np.sin(angle)], axis=1)
+    normals[:, 2] *= -1.0
+    coefficients = np.column_stack([normals, 200.0 * normals[:, 1]])
+    return LightPlanes(coefficients, np.zeros((STRIPES + 1, 4, 4)), "horizontal")
+
+
+def pair() -> PairCalibration:
+    return PairCalibration("p", CAMERA, np.zeros((7, 7)), planes(), PairQuality(0.02, 3))
+
+
+def stripe_map(depth: np.ndarray) -> StripeMap:
+    """What a surface of known depth would decode to, found by bisection on the planes."""
+    rays = CAMERA.pixel_rays()
+    low, high = np.zeros_like(depth), np.full_like(depth, float(STRIPES))
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        with np.errstate(invalid="ignore"):
+            # The light comes down steeper with growing s: nearer along the ray.
+            far = planes().depth(rays, middle) > depth
+        low, high = np.where(far, middle, low), np.where(far, high, middle)
+    s = 0.5 * (low + high)
+    s = np.where((s > 0.5) & (s < STRIPES - 0.5), s, np.nan).astype(np.float32)
+    empty = np.empty(0)
+    return StripeMap(
+        s,
+        np.where(np.isfinite(s), 0.01, np.nan).astype(np.float32),
+        np.full(s.shape, 150, np.uint8),
+        empty.astype(np.int64),
+        empty.reshape(0, 2),
+        empty.astype(np.float32),
+        STRIPES,
+    )
+
+
+def test_a_slanted_plane_is_measured_where_it_is():
+    normal = np.array([0.2, 0.1, -1.0]) / np.linalg.norm([0.2, 0.1, -1.0])
+    rays = CAMERA.pixel_rays()
+    depth = -500.0 / (rays @ normal)
+    image = range_image(pair(), stripe_map(depth))
+    known = image.valid
+    assert known.mean() > 0.5
+    # s is stored as float32: 64 stripes to 4e-6, worth 4e-5 mm here.
+    assert np.allclose(image.points[known], (rays * depth[..., None])[known], atol=2e-3)
+    inner = image.normals[5:-5, 5:-5][known[5:-5, 5:-5]]
+    inner = inner[np.isfinite(inner[:, 0])]
+    assert np.allclose(inner, normal, atol=1e-3)
+
+
+def test_sigma_follows_from_the_decoding():
+    rays = CAMERA.pixel_rays()
+    depth = np.full(rays.shape[:2], 480.0)
+    stripes = stripe_map(depth)
+    image = range_image(pair(), stripes)
+    shifted = range_image(
+        pair(), StripeMap(**{**vars(stripes), "s": (stripes.s + 0.01).astype(np.float32)})
+    )
+    known = image.valid & shifted.valid
+    moved = np.linalg.norm(shifted.points[known] - image.points[known], axis=1)
+    # One sigma of s moves a point by its sigma, along its ray; crossing into the next plane's
+    # interval changes the slope a little.
+    assert np.allclose(moved, image.sigma_mm[known], rtol=0.1)
+
+
+def test_normals_of_a_sphere_point_to_the_camera():
+    rays = CAMERA.pixel_rays()
+    centre, radius = np.array([0.0, 0.0, 600.0]), 80.0
+    along = rays @ centre / np.sum(rays**2, axis=-1)
+    gap = along**2 - (centre @ centre - radius**2) / np.sum(rays**2, axis=-1)
+    depth = along - np.sqrt(np.where(gap > 0, gap, np.nan))
+    points = (rays * depth[..., None]).astype(np.float32)
+    normals = grid_normals(points)
+    true = (points - centre) / radius
+    facing = -np.sum(true * rays, axis=-1) / np.linalg.norm(rays, axis=-1)
+    middle = np.isfinite(normals[..., 0]) & (facing > 0.5)
+    assert middle.sum() > 1000
+    # A window of 5 px (7 mm) on a sphere of 80 mm: second-order terms of a few thousandths.
+    assert np.min(np.sum(normals[middle] * true[middle], axis=1)) > 0.999
+
+
+def test_a_normal_needs_its_whole_window():
+    rays = CAMERA.pixel_rays()
+    points = (rays * 500.0).astype(np.float32)
+    points[40, 70] = np.nan
+    unknown = np.isnan(grid_normals(points)).any(axis=-1)
+    expected = np.ones_like(unknown)
+    expected[2:-2, 2:-2] = False
+    expected[38:43, 68:73] = True
+    np.testing.assert_array_equal(unknown, expected)
+
+
+def test_normals_are_those_of_planes_fitted_to_the_windows():
+    """Against a least-squares fit of 1/z by column and row, window by window, on a rough surface."""
+    rng = np.random.default_rng(6)
+    camera = Camera(400.0, 400.0, 0.0, 15.0, 10.0, 0.0, 0.0, 30, 20)
+    rays = camera.pixel_rays()
+    points = rays * rng.uniform(480.0, 520.0, rays.shape[:2])[..., None]
+    normals = grid_normals(points.astype(np.float32))
+    for v, u in rng.integers([2, 2], [18, 28], (30, 2)):
+        window = np.s_[v - 2 : v + 3, u - 2 : u + 3]
+        ones = np.ones((25, 1))
+        unknowns = np.hstack([rays[window].reshape(25, 3)[:, :2], ones])
+        slope = np.linalg.lstsq(unknowns, 1.0 / points[window][..., 2].ravel(), rcond=None)[0]
+        rest = 1.0 / points[v, u, 2] - slope[:2] @ rays[v, u, :2]
+        normal = -np.append(slope[:2], rest)
+        # float32 sums of 25 numbers near 1, of which differences of 1e-2 are taken.
+        assert np.allclose(normals[v, u], normal / np.linalg.norm(normal), atol=1e-4)
+
+
+def test_another_image_size_is_refused():
+    stripes = stripe_map(np.full((CAMERA.height, CAMERA.width), 480.0))
+    small = StripeMap(**{**vars(stripes), "s": stripes.s[:100]})
+    with pytest.raises(BadInput, match="160 x 100"):
+        range_image(pair(), small)

@@ -1,0 +1,54 @@
+"""A board that is not what the rig file says is named, and what to look at."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodyscan.boards.view import BoardView
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.board_doubts import boards_not_found, size_doubt, what_was_found
+from bodyscan.rig.board import Board
+from bodyscan.rig.rig import Rig
+
+PLACES = {"a": (1000.0, 0.0, 500.0), "b": (0.0, 1000.0, 500.0), "c": (-1000.0, 0.0, 900.0)}
+RIG = Rig(
+    name="three",
+    boards=(
+        Board(name="seen", columns=9, rows=7, square_mm=50),
+        Board(name="unseen", columns=10, rows=7, square_mm=20),
+    ),
+    pairs=tuple(
+        {
+            "name": name,
+            "camera": {"width": 640, "height": 480},
+            "nominal": {"position_mm": place, "look_at_mm": (0, 0, 500)},
+        }
+        for name, place in PLACES.items()
+    ),
+)
+
+
+def view(count):
+    return BoardView("a", "s1", "seen", np.arange(count), np.zeros((count, 2)))
+
+
+def test_a_board_never_found_is_named_with_what_the_rig_file_says():
+    (note,) = boards_not_found(RIG, [view(48)], 30)
+    assert "board unseen" in note
+    assert "10 columns x 7 rows" in note
+    assert "none of 30 images" in note
+
+
+def test_a_board_of_which_little_is_found_is_doubted():
+    assert "may not be those" in what_was_found(RIG, [view(10)], 30)
+    assert "may not be those" not in what_was_found(RIG, [view(45)], 30)
+
+
+def test_squares_of_another_size_show_in_the_size_of_the_rig():
+    def placed(factor):
+        return {n: RigidTransform(np.eye(3), factor * np.array(p)) for n, p in PLACES.items()}
+
+    (note,) = size_doubt(RIG, placed(1.25))
+    assert "1.250 times" in note
+    assert "40.00 would fit" in note
+    assert not size_doubt(RIG, placed(1.01))

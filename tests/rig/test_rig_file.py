@@ -1,0 +1,329 @@
+"""Rig files: read as meant, and every mistake reported by line, column and path."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from small_captures import RIG, write
+
+from bodyscan.errors import RigFileError
+from bodyscan.files.yaml_file import dump_yaml, read_yaml
+from bodyscan.rig.board import Board
+from bodyscan.rig.dictionaries import MARKERS_IN
+from bodyscan.rig.frame_names import FrameNames
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig, write_rig
+from bodyscan.stripes.projector_spec import ProjectorSpec
+
+RIGS = Path(__file__).parents[2] / "rigs"
+
+
+def refused(tmp_path: Path, text: str | bytes) -> list[str]:
+    """The lines of the error, less the remedy, with `rig.yaml` for the whole path."""
+    path = write(tmp_path / "rig.yaml", text)
+    with pytest.raises(RigFileError) as caught:
+        load_rig(path)
+    assert caught.value.exit_code == 2
+    assert "docs/formats.md" in caught.value.remedy
+    lines = str(caught.value).replace(str(path), "rig.yaml").splitlines()
+    return lines[:-1]
+
+
+def changed(old: str, new: str) -> str:
+    assert old in RIG
+    return RIG.replace(old, new, 1)
+
+
+@pytest.mark.parametrize("path", sorted(RIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_rig_files_of_the_project_load_and_survive_writing(path: Path, tmp_path: Path) -> None:
+    rig = load_rig(path)
+    write_rig(tmp_path / "again.yaml", rig)
+    assert load_rig(tmp_path / "again.yaml") == rig
+
+
+def test_a_rig_file_is_read_as_meant(tmp_path: Path) -> None:
+    rig = load_rig(write(tmp_path / "rig.yaml", RIG))
+    assert [pair.name for pair in rig.pairs] == ["p1", "p2", "cam"]
+    assert rig.pair("p2").camera.width == 40
+    assert rig.pair("cam").projector is None
+    assert rig.board("board").square_mm == 30
+    assert rig.files == "{shot}/{pair}/{frame}.png"
+    assert rig.frame_pair is rig.pairs[0]
+    assert rig.frame_board is None
+
+
+def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
+    text = changed(
+        "  - name: p2\n    camera: *camera\n    projector: {stripes: 12, direction: horizontal}",
+        "  - &p2\n    name: p2\n    camera: {<<: *camera, width: 50}\n  - {<<: *p2, name: p3}",
+    )
+    rig = load_rig(write(tmp_path / "rig.yaml", text))
+    assert (rig.pair("p2").camera.width, rig.pair("p2").camera.height) == (50, 30)
+    assert rig.pair("p3").camera == rig.pair("p2").camera
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("width: 40", "width: -5", "7:29: pairs[0].camera.width: must be greater than 0 (got -5)"),
+        ("width: 40", "width: 40.5", "pairs[0].camera.width: must be a whole number (got 40.5)"),
+        ("width: 40", 'width: "40"', 'pairs[0].camera.width: must be a whole number (got "40")'),
+        ("width: 40", "width: true", "pairs[0].camera.width: must be a whole number (got true)"),
+        ("width: 40", "widht: 40", "pairs[0].camera.widht: is no key known here (did you mean"),
+        ("{width: 40, height: 30}", "big", "must be a mapping (key: value) (got big)"),
+        ("square_mm: 30", "square_mm: 0", "4:51: boards[0].square_mm: must be greater than 0"),
+        ("square_mm: 30", "square_mm: .nan", "boards[0].square_mm: must be a finite number"),
+        ("square_mm: 30", "square_mm: 1e9999", "boards[0].square_mm: must be a finite number"),
+        ("square_mm: 30", "square_mm: ", "boards[0].square_mm: must be a number (got nothing)"),
+        (", square_mm: 30", "", "4:5: boards[0].square_mm: is missing"),
+        ("square_mm: 30", "square_mm: 30, marker_mm: 9", "a checkerboard has no markers"),
+        ("square_mm: 30", "square_mm: 30, thickness_mm: 6", "is for a board with faces: 2"),
+        ("square_mm: 30", "square_mm: 30, faces: 3", "boards[0].faces: must be 1 or 2 (got 3)"),
+        ("columns: 5", "columns: 2", "boards[0].columns: must be 3 or more (got 2)"),
+        ("columns: 5", "columns: 5, columns: 6", "4:31: boards[0].columns: is given twice"),
+        ("name: p2", "name: p1", "9:11: pairs[1].name: is given to two pairs: every name once"),
+        ("name: p2", "name: 2", 'pairs[1].name: must be text (got 2: write "2")'),
+        ("name: p2", "name: ../up", "pairs[1].name: must be a name of letters, digits"),
+        ("name: p2", "name: p2\n    nominal: {position_mm: [1, 2, 3], look_at_mm: [1, 2, 3]}",
+         "pairs[1].nominal.look_at_mm: must differ from position_mm"),
+        ("name: p2", "name: p2\n    nominal: {position_mm: [1, 2], look_at_mm: [1, 2, 3]}",
+         "pairs[1].nominal.position_mm[2]: is missing"),
+        ("name: cam", "name: cam\n    projector_nominal: {position_mm: [1, 2, 4], look_at_mm: "
+         "[1, 2, 3]}", "pairs[2].projector_nominal: needs a projector"),
+        ("direction: h", "direction: diagonal-h", "must be 'horizontal' or 'vertical' (got diag"),
+        ("stripes: 12", "stripes: 1", "pairs[0].projector.stripes: must be 2 or more (got 1)"),
+        ("code: gray", "code: grey", "8:23: pairs[0].projector.code: must be 'gray', 'binary', 'li"),
+        ("code: gray", "code: light-section, inverses: true", "inverses: is for codes with bits"),
+        ("code: gray", "code: gray, steps: 4", "projector.steps: is for code: phase-shift"),
+        ("code: gray", "code: phase-shift, steps: 2", "projector.steps: must be 3 or more (got 2)"),
+        ("code: gray", "code: phase-shift, period: 20", "period: must be 12 (stripes) or less (got"),
+        ("code: gray, stripes: 12", "code: stripe-index, stripes: 255", "must be 254 or less for s"),
+        ("version: 1", "version: 1\nframes: {stripe: line}", "frames.stripe: needs {stripe}, or"),
+        ("version: 1", "version: 1\nframes: {phase: '{bit}'}", "phase: may only hold {step}"),
+        ("version: 1", "version: 2", "1:10: version: must be 1 (got 2)"),
+        ("  - folder: captures", "  - folder: a\n  - folder: a/", "folder: is listed twice"),
+        ("  - folder: captures", "  folder: captures", "calibration: must be a list (got a map"),
+        ("version: 1", "version: 1\nrig_frame: {pair: p9}", "rig_frame.pair: names no pair"),
+        ("version: 1", "version: 1\nrig_frame: {pair: p1, shot: b}", "together with shot"),
+        ("version: 1", "version: 1\nrig_frame: {shot: b, board: bord}", "(did you mean 'board'?)"),
+        ("version: 1", "version: 1\nrig_frame: {board: board}", "rig_frame.board: needs shot"),
+        ("version: 1", "version: 1\nrig_frame: {shot: b, x_axis: [0, 0, 0]}", "not be zero"),
+        ("version: 1", "version: 1\nrig_frame: {shot: b, x_axis: [1, 1, 0]}", "perpendicular"),
+        ("version: 1", "version: 1\nvolume: {top_mm: 100, bottom_mm: 200}", "must lie below top"),
+        ("version: 1", "version: 1\nframes: {pattern: bit}", "frames.pattern: needs {bit}, or"),
+        ("version: 1", "version: 1\nframes: {pattern: '{bit.real}'}", "may only hold {bit}"),
+        ("version: 1", "version: 1\nframes: {pattern: '{bit:999999999d}'}", "may only hold {bit}"),
+        ("version: 1", "version: 1\nframes: {pattern: 5}", "frames.pattern: must be text or a li"),
+        ("version: 1", "version: 1\nframes: {pattern: [a, 5]}", "frames.pattern[1]: must be text"),
+        ("version: 1", "version: 1\nframes: {pattern: [a, b, c]}",
+         "2:19: frames.pattern: has 3 names, but the 12 stripes of pair p1 take 4 bits"),
+        ("version: 1", "version: 1\nframes: {lit: same, dark: same}", "two images the same name"),
+        ("version: 1", "version: 1\nframes: {lit: ../../x}", "frames.lit: must not climb out"),
+        ("version: 1", "version: 1\nfiles: '{shot}/{frame}.png'", "files: needs {pair}, since"),
+        ("version: 1", "version: 1\nfiles: '{shot}/{pair}.png'", "files: needs {frame}, since"),
+        ("version: 1", "version: 1\nfiles: '{shot}/{pair}/{frame}.tif'", "must end in .png"),
+        ("version: 1", "version: 1\nfiles: '../{shot}/{pair}/{frame}.png'", "must not climb out"),
+        ("version: 1", "version: 1\nfiles: '/{shot}/{pair}/{frame}.png'", "must be relative"),
+        ("version: 1", "version: 1\nfiles: 'C:/{shot}/{pair}/{frame}.png'", "nor a drive letter"),
+        ("version: 1", "version: 1\nfiles: '{shot}/{pole}/{frame}.png'", "not {pole}"),
+        ("version: 1", "version: 1\nfiles: '{shot.__class__}{pair}{frame}.png'", "no file-name te"),
+        ("version: 1", "version: 1\nfiles: '{shot'", "files: is no file-name template"),
+    ],
+)  # fmt: skip
+def test_one_mistake_is_one_line(tmp_path: Path, old: str, new: str, line: str) -> None:
+    lines = refused(tmp_path, changed(old, new))
+    assert len(lines) == 1
+    assert lines[0].startswith("rig.yaml:")
+    assert line in lines[0]
+
+
+CHARUCO = "square_mm: 30, kind: charuco"
+
+
+@pytest.mark.parametrize(
+    ("board", "line"),
+    [
+        (CHARUCO, "boards[0].marker_mm: is missing"),
+        (CHARUCO + ", marker_mm: 30", "boards[0].marker_mm: must be less than square_mm (30)"),
+        (CHARUCO + ", marker_mm: 20, dictionary: DICT_4x4_50", "(did you mean 'DICT_4X4_50'?)"),
+        (CHARUCO + ", marker_mm: 20, dictionary: DICT_4X4_50, first_marker: 45",
+         "boards[0].dictionary: holds markers 0 to 49, but this board needs 45 to 54"),
+    ],
+)  # fmt: skip
+def test_charuco_boards_are_checked(tmp_path: Path, board: str, line: str) -> None:
+    lines = refused(tmp_path, changed("square_mm: 30", board))
+    assert len(lines) == 1
+    assert line in lines[0]
+
+
+def test_markers_of_two_boards_must_differ(tmp_path: Path) -> None:
+    def two(second: str) -> str:
+        board = f"  - {{name: board, columns: 5, rows: 4, {CHARUCO}, marker_mm: 20, faces: 2}}\n"
+        other = f"  - {{name: other, columns: 4, rows: 4, {CHARUCO}, marker_mm: 20, {second}}}\n"
+        return changed("  - {name: board, columns: 5, rows: 4, square_mm: 30}\n", board + other)
+
+    # 2 faces of 5 x 4 squares take markers 0 to 19; DICT_4X4_50 begins DICT_4X4_1000.
+    for second in ("first_marker: 19", "first_marker: 19, dictionary: DICT_4X4_50"):
+        lines = refused(tmp_path, two(second))
+        assert len(lines) == 1
+        assert "boards[1].first_marker: gives board other markers 19 to 26" in lines[0]
+        assert "first_marker 20 or more" in lines[0]
+    for second in ("first_marker: 20", "dictionary: DICT_5X5_50"):
+        load_rig(write(tmp_path / "rig.yaml", two(second)))
+
+
+def test_all_mistakes_are_reported_at_once_in_order(tmp_path: Path) -> None:
+    text = changed("square_mm: 30", "square_mm: 0, colour: red").replace("name: p2", "name: p1")
+    text = text.replace("height: 30", 'height: "30"') + "rig_frame: {pair: p7}\nfiles: nothing\n"
+    lines = refused(tmp_path, text)
+    places = [int(line.split(":")[1]) for line in lines]
+    assert places == sorted(places)
+    told = "\n".join(lines)
+    for part in ("square_mm: must be", "colour: is no", "height: must", "given to two pairs",
+                 "names no pair", "needs {pair}", "must end in"):  # fmt: skip
+        assert part in told
+    # p2's and cam's camera are aliases of p1's: one mistake, told once, where it is written.
+    (height,) = (line for line in lines if "camera.height" in line)
+    assert height.startswith("rig.yaml:7:")
+    assert height.endswith("(and so in 2 more places by alias)")
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        ("name: [1, 2", "is not YAML"),
+        ("name:\n\tpairs: []", "indent with spaces, never with tabs"),
+        ("a: *nobody", "1:4: is not YAML: found undefined alias"),
+        ("name: x\n---\nname: y", "found another document"),
+        (b"name: \xff\xfe", "1:7: is not UTF-8 text"),
+        (b"name: \x00", "is not YAML"),
+        ("", "1:1: must be a mapping"),
+        ("- 1", "1:1: must be a mapping"),
+        ("[" * 100_000, "is nested more than 40 deep"),
+        ("&a [*a]", "is nested more than 40 deep"),
+        ("&a {<<: *a}", "merges (<<) too much"),
+        ("name: !!python/object/apply:os.getcwd []", "write the value without a tag"),
+        ("? [a]\n: 1", "has a key that is not text"),
+        ("x" * 1_000_001, "is longer than 1,000,000 bytes"),
+    ],
+)
+def test_files_that_are_no_rig_files(tmp_path: Path, content: str | bytes, line: str) -> None:
+    assert any(line in text for text in refused(tmp_path, content))
+
+
+def test_alias_bombs_are_refused_before_they_go_off(tmp_path: Path) -> None:
+    levels = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    levels += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)]
+    lines = refused(tmp_path, "\n".join(levels))  # 9^12 values: weeks, if they were followed
+    assert "values once aliases are followed" in lines[0]
+    merges = ["a0: &a0 {x: 1}"]
+    merges += [f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}" for i in range(1, 12)]
+    assert "too much" in refused(tmp_path, "\n".join(merges))[0]
+
+
+def test_a_missing_rig_file(tmp_path: Path) -> None:
+    with pytest.raises(RigFileError, match=r"nowhere\.yaml: there is no such file"):
+        load_rig(tmp_path / "nowhere.yaml")
+    with pytest.raises(RigFileError, match="cannot be read: Is a directory"):
+        load_rig(tmp_path)
+
+
+def test_long_lists_of_mistakes_are_cut(tmp_path: Path) -> None:
+    lines = refused(tmp_path, RIG + "".join(f"key{i}: 1\n" for i in range(50)))
+    assert len(lines) == 31
+    assert lines[-1] == "... and 20 more"
+
+
+def test_dictionaries_are_those_of_opencv() -> None:
+    for name, count in MARKERS_IN.items():
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+        assert len(dictionary.bytesList) == count
+    names = {name.lower() for name in dir(cv2.aruco) if name.startswith("DICT_")}
+    assert names == {name.lower() for name in MARKERS_IN}
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(9, 7), (8, 11), (8, 6), (5, 4)])
+def test_marker_count_is_that_of_opencv(columns: int, rows: int) -> None:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    opencv = cv2.aruco.CharucoBoard((columns, rows), 1.0, 0.7, dictionary)
+    board = Board(name="b", kind="charuco", columns=columns, rows=rows, square_mm=1, marker_mm=0.7)
+    assert board.marker_count == len(opencv.getIds())
+
+
+@given(st.integers(2, 65535))
+def test_bits_are_enough_for_the_stripes_and_not_one_too_many(stripes: int) -> None:
+    bits = ProjectorSpec(stripes=stripes, direction="vertical").bits
+    assert 2 ** (bits - 1) < stripes <= 2**bits
+
+
+def test_a_code_without_inverses_needs_a_dark_image(tmp_path: Path) -> None:
+    text = changed("code: gray", "code: gray, inverses: false") + "frames: {dark: null}\n"
+    (line,) = refused(tmp_path, text)
+    assert "frames.dark: is needed: pair p1 takes no inverses" in line
+
+
+@pytest.mark.parametrize(
+    ("code", "names"),
+    [
+        ({}, "bit00 bit01 bit02 bit00-inverse bit01-inverse bit02-inverse"),
+        ({"inverses": False}, "bit00 bit01 bit02"),
+        ({"code": "binary", "inverses": False}, "bit00 bit01 bit02"),
+        ({"code": "light-section"}, "stripe000 stripe001 stripe002 stripe003 stripe004"),
+        ({"code": "stripe-index"}, "index"),
+        # 5 stripes are 2.5 periods of 2, and so 5 half periods.
+        ({"code": "phase-shift", "steps": 3, "period": 2, "inverses": False},
+         "bit00 bit01 bit02 phase00 phase01 phase02"),
+    ],
+)  # fmt: skip
+def test_each_code_has_its_images(code: dict, names: str) -> None:
+    spec = ProjectorSpec.model_validate({**code, "stripes": 5, "direction": "vertical"})
+    assert FrameNames().of_code(spec) == tuple(names.split())
+
+
+def test_frame_names() -> None:
+    names = FrameNames(inverse=("a", "b", "c"))
+    assert names.of_kind("pattern", 3) == ("bit00", "bit01", "bit02")
+    assert names.of_kind("inverse", 3) == ("a", "b", "c")
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
+        lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+        max_leaves=20,
+    )
+)
+def test_written_yaml_reads_back_as_it_was(tmp_path_factory: pytest.TempPathFactory, data) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    path.write_text(dump_yaml(data), encoding="utf-8", newline="")
+    document = read_yaml(path)
+    assert document.problems == []
+    assert document.data == data
+
+
+def test_words_that_old_yaml_misreads_stay_words(tmp_path: Path) -> None:
+    path = write(tmp_path / "x.yaml", "[no, on, 1:30, 010, 2026-11-21, 1_000, 1e3, 0o10, '5']")
+    assert read_yaml(path).data == [
+        "no", "on", "1:30", 10, "2026-11-21", "1_000", 1000.0, 8, "5",
+    ]  # fmt: skip
+
+
+def test_reading_rig_files_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, bodyscan.rig.rig_file, bodyscan.captures.check\n"
+        "print([m for m in ('numpy', 'cv2', 'open3d', 'scipy', 'pycolmap') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_rig_made_in_python_is_checked_too(tmp_path: Path) -> None:
+    rig = load_rig(write(tmp_path / "rig.yaml", RIG))
+    with pytest.raises(ValueError, match="names no pair"):
+        Rig.model_validate({**rig.model_dump(), "rig_frame": {"pair": "p9"}})

@@ -1,0 +1,199 @@
+"""Sequences of every code that do not add up are refused, and the image to blame is named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stripe_rendering import code_light, render
+
+from bodyscan.errors import DecodingFailed
+from bodyscan.stripes.codes import read_code
+from bodyscan.stripes.projector_spec import ProjectorSpec
+
+STRIPES = 60
+
+
+def rendered(**code):
+    """A function that reads a good sequence after `change` has been at its images."""
+    spec = ProjectorSpec.model_validate({**code, "stripes": STRIPES, "direction": "horizontal"})
+    lights = code_light(stripes=STRIPES, **code)
+    lit, dark, coded, _ = render(
+        lambda u, v: 1.2 + (v + 0.1 * u + 2 * np.sin(u / 20)) / 2.3,
+        lights,
+        stripes=STRIPES,
+        shape=(130, 130),
+    )
+
+    def read(change=lambda images: None, *, spec=spec, lit=lit):
+        images = {"coded": coded.copy(), "dark": dark, "lit": lit}
+        change(images)
+        return read_code(spec, images["lit"], images["dark"], images["coded"], where="pair a")
+
+    assert np.isfinite(read().s).mean() > 0.8
+    return read
+
+
+def exchanged(first, second):
+    def change(images):
+        images["coded"][[first, second]] = images["coded"][[second, first]]
+
+    return change
+
+
+def replaced(place, by):
+    def change(images):
+        images["coded"][place] = images[by] if isinstance(by, str) else images["coded"][by]
+
+    return change
+
+
+@pytest.fixture(scope="module")
+def plain_gray():
+    return rendered(code="gray", inverses=False)
+
+
+@pytest.fixture(scope="module")
+def binary():
+    return rendered(code="binary")
+
+
+@pytest.fixture(scope="module")
+def section():
+    return rendered(code="light-section")
+
+
+@pytest.fixture(scope="module")
+def phase():
+    return rendered(code="phase-shift", steps=4, period=8)
+
+
+def test_exchanged_bits_without_inverses_are_named(plain_gray):
+    with pytest.raises(DecodingFailed, match="bits 1 and 3 were exchanged") as caught:
+        plain_gray(exchanged(1, 3))
+    assert caught.value.where == "pair a"
+
+
+@pytest.mark.parametrize("bit", range(6))
+def test_a_missing_pattern_without_inverse_is_noticed(plain_gray, bit):
+    with pytest.raises(DecodingFailed, match="do not make a stripe code"):
+        plain_gray(replaced(bit, "dark"))
+
+
+def test_a_pattern_exposed_otherwise_is_named(plain_gray):
+    def brighter(images):
+        images["coded"][2] = np.minimum(images["coded"][2].astype(int) * 2, 255)
+
+    with pytest.raises(DecodingFailed, match="the pattern of bit 2 is brighter than the lit frame"):
+        plain_gray(brighter)
+
+
+@pytest.mark.parametrize(("one", "other"), [(0, 1), (2, 5)])
+def test_exchanged_bits_of_the_plain_code_are_named(binary, one, other):
+    def change(images):
+        exchanged(one, other)(images)
+        exchanged(6 + one, 6 + other)(images)
+
+    with pytest.raises(DecodingFailed, match=f"bits {one} and {other} were exchanged"):
+        binary(change)
+
+
+@pytest.mark.parametrize(("one", "other"), [(10, 30), (20, 21), (14, 16)])
+def test_exchanged_images_of_a_sweep_are_named(section, one, other):
+    with pytest.raises(DecodingFailed, match=f"stripes {one} and {other} were exchanged"):
+        section(exchanged(one, other))
+
+
+def test_images_of_a_sweep_that_are_missing_or_double_are_named(section):
+    with pytest.raises(DecodingFailed, match="stripe 25 shows no line of its own"):
+        section(replaced(25, "dark"))
+    with pytest.raises(DecodingFailed, match="stripe 26 shows no line of its own"):
+        section(replaced(26, 25))
+
+
+def test_a_sweep_in_no_order_is_noticed(section):
+    def shuffled(images):
+        images["coded"] = np.random.default_rng(0).permutation(images["coded"])
+
+    with pytest.raises(DecodingFailed, match="see whether the images are in their order"):
+        section(shuffled)
+
+
+def test_a_sweep_that_is_dark_or_too_bright_is_refused(section):
+    def dark(images):
+        images["coded"][:] = images["dark"]
+
+    def bright(images):
+        images["coded"] = np.minimum(images["coded"].astype(int) * 3, 255).astype(np.uint8)
+
+    with pytest.raises(DecodingFailed, match="lights only"):
+        section(dark)
+    with pytest.raises(DecodingFailed, match="saturated"):
+        section(bright)
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (exchanged(-4, -2), "phase images 0 and 2 were exchanged"),
+        (exchanged(-3, -2), "phase images 1 and 2 were exchanged"),
+        (lambda images: images.update(coded=np.r_[images["coded"][:-4], images["coded"][:-5:-1]]),
+         "the phase images came in reverse order"),
+        (lambda images: images.update(coded=np.r_[images["coded"][:-4], images["coded"][-3:],
+                                                  images["coded"][-4:-3]]),
+         "the phase images began with number 1"),
+    ],
+)  # fmt: skip
+def test_phase_images_in_another_order_are_named(phase, change, cause):
+    with pytest.raises(DecodingFailed, match=cause):
+        phase(change)
+
+
+def test_phase_images_that_are_missing_or_double_are_named(phase):
+    with pytest.raises(DecodingFailed, match="phase images 1 and 2 look alike"):
+        phase(replaced(-2, -3))
+    with pytest.raises(DecodingFailed, match="phase image 3 is 0% as bright as lit"):
+        phase(replaced(-1, "dark"))
+
+
+def test_a_wrong_period_is_noticed(phase):
+    spec = ProjectorSpec(
+        code="phase-shift", stripes=STRIPES, direction="horizontal", steps=4, period=6
+    )
+    with pytest.raises(DecodingFailed):
+        phase(spec=spec)
+
+
+def index_image(s):
+    return np.where((s >= 0) & (s < STRIPES), np.clip(s, 0, 254).astype(int) + 1, 0)
+
+
+def read_index(image, stripes=STRIPES, direction="horizontal"):
+    spec = ProjectorSpec(code="stripe-index", stripes=stripes, direction=direction)
+    lit = np.full(image.shape, 200, np.uint8)
+    return read_code(spec, lit, None, image.astype(np.uint8)[None])
+
+
+def test_a_stripe_index_image_is_read_or_refused():
+    v, u = np.mgrid[:130, :130]
+    image = index_image(1.2 + (v + 0.1 * u) / 2.3)
+    image[:5], image[5:9] = 0, 255  # both are no stripe
+    seen = read_index(image)
+    assert np.isnan(seen.s[:9]).all()
+    assert np.isfinite(seen.s[10:]).mean() > 0.98
+    assert np.nanmax(np.abs(seen.s - (image - 0.5))[10:]) <= 0.7  # number n is stripe n - 1
+    with pytest.raises(DecodingFailed, match="have a stripe number above 30"):
+        read_index(image, stripes=30)
+    with pytest.raises(DecodingFailed, match="the stripes run horizontally"):
+        read_index(image, direction="vertical")
+    with pytest.raises(DecodingFailed, match="lights only"):
+        read_index(np.zeros_like(image))
+    with pytest.raises(DecodingFailed, match="neighbouring stripes in"):
+        read_index(np.where(image > 0, (image * 37) % 60 + 1, 0))
+
+
+def test_too_few_images_are_refused(section):
+    def fewer(images):
+        images["coded"] = images["coded"][1:]
+
+    with pytest.raises(DecodingFailed, match="59 images of the code, but it has 60"):
+        section(fewer)

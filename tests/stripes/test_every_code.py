@@ -1,0 +1,245 @@
+"""Stripe coordinates by every code on rendered surfaces whose stripe coordinate is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stripe_rendering import checkered, code_light, render, white
+
+from bodyscan.errors import BadInput, DecodingFailed
+from bodyscan.stripes.codes import pattern_frames, read_code
+from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.stripe_map import StripeMap
+from bodyscan.stripes.wanted_stripes import WantedStripes
+
+PLAIN_GRAY = {"code": "gray", "inverses": False}
+BINARY = {"code": "binary"}
+PLAIN_BINARY = {"code": "binary", "inverses": False}
+SECTION = {"code": "light-section"}
+INDEX = {"code": "stripe-index"}
+PHASE = {"code": "phase-shift", "steps": 4, "period": 8}
+THREE_PHASES = {"code": "phase-shift", "steps": 3, "period": 16, "inverses": False}
+ALL = [PLAIN_GRAY, BINARY, PLAIN_BINARY, SECTION, INDEX, PHASE, THREE_PHASES]
+
+
+def name(value):
+    if not isinstance(value, dict):
+        return None
+    return "-".join(str(part) for part in value.values())
+
+
+def spec_of(code: dict, stripes: int, direction: str = "horizontal") -> ProjectorSpec:
+    return ProjectorSpec.model_validate({**code, "stripes": stripes, "direction": direction})
+
+
+def wavy(stripe_px):
+    def s_at(u, v):
+        return 3.3 + (v + 0.1 * u + 2.5 * np.sin(u / 23) + 1.5 * np.sin(v / 31)) / stripe_px
+
+    return s_at
+
+
+def captured(code: dict, s_at, stripes: int, **scene):
+    """Lit, dark, coded images and the true s at pixel centres."""
+    scene = {"shape": (110, 140), **scene}
+    if code["code"] != "stripe-index":
+        return render(s_at, code_light(stripes=stripes, **code), stripes=stripes, **scene)
+    lit, dark, _, s = render(s_at, np.zeros((1, stripes)), stripes=stripes, **scene)
+    number = np.where(np.isfinite(s), np.nan_to_num(s).astype(int) + 1, 0)
+    return lit, dark, number.astype(np.uint8)[None], s
+
+
+def read(code: dict, images, stripes: int) -> StripeMap:
+    lit, dark, coded, _ = images
+    return read_code(spec_of(code, stripes), lit, dark, coded)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def robust(errors):
+    return np.median(np.abs(errors)) / 0.6745
+
+
+def boundary_errors(seen, s_at):
+    """How far boundaries lie from where they should be, across the stripes, px."""
+    u, v = seen.boundary_pixels.T
+    slope = s_at(u, v + 0.5) - s_at(u, v - 0.5)
+    return (s_at(u, v) - seen.boundary_index) / slope
+
+
+# Noise of 1 in 180 grey levels, stripes of 2.2 px blurred by 0.25 stripes and 0.6 px. Tolerances
+# are about 1.4 times what was measured. For comparison, Gray code with inverses: 0.005 and 0.012.
+@pytest.mark.parametrize(
+    ("code", "s_rms", "boundary_px", "share"),
+    [
+        (PLAIN_GRAY, 0.008, 0.024, 0.97),
+        (BINARY, 0.008, 0.024, 0.94),
+        (PLAIN_BINARY, 0.01, 0.03, 0.92),
+        (SECTION, 0.018, 0.036, 0.99),
+        # A place known to a pixel only: uniform within 1 px, 0.29.
+        (INDEX, 0.14, 0.3, 0.99),
+        (PHASE, 0.021, 0.032, 0.99),
+        # Noise of sqrt(2 / 3) / 90 of a radian, period / 2 pi of it: 0.023.
+        (THREE_PHASES, 0.035, 0.065, 0.99),
+    ],
+    ids=name,
+)
+def test_s_and_boundaries_are_where_they_should_be(code, s_rms, boundary_px, share):
+    s_at = wavy(2.2)
+    images = captured(code, s_at, 60)
+    seen = read(code, images, 60)
+    error = (seen.s - images[3])[np.isfinite(images[3]) & np.isfinite(seen.s)]
+    assert len(error) > share * np.isfinite(images[3]).sum()
+    assert rms(error) < s_rms
+    assert abs(error.mean()) < 0.1 * s_rms + 0.001
+    assert rms(boundary_errors(seen, s_at)) < boundary_px
+    assert len(seen.boundary_index) > share * 140 * 49  # 49 boundaries on each of 140 lines
+    np.testing.assert_array_equal(np.isnan(seen.s), np.isnan(seen.sigma))
+    assert seen.stripes == 60
+
+
+@pytest.mark.parametrize("stripe_px", [1.5, 10.0])
+@pytest.mark.parametrize(
+    ("code", "s_rms"), [(SECTION, (0.024, 0.018)), (PHASE, (0.027, 0.016))], ids=name
+)
+def test_narrow_and_wide_stripes_are_read_too(code, s_rms, stripe_px):
+    stripes = int(140 / stripe_px)
+    images = captured(code, wavy(stripe_px), stripes)
+    seen = read(code, images, stripes)
+    error = (seen.s - images[3])[np.isfinite(images[3]) & np.isfinite(seen.s)]
+    # The last stripe of a light section has no image behind it to tell s by.
+    assert len(error) > (0.98 - stripe_px / 110) * np.isfinite(images[3]).sum()
+    assert rms(error) < s_rms[stripe_px > 5]
+
+
+@pytest.mark.parametrize("code", [PLAIN_GRAY, SECTION, PHASE, THREE_PHASES], ids=name)
+def test_sigmas_say_how_far_off_values_are_in_dim_light(code):
+    s_at, light = wavy(3.0), 40.0
+    images = captured(code, s_at, 50, light=light)
+    seen = read(code, images, 50)
+    known = np.isfinite(images[3]) & np.isfinite(seen.s)
+    assert known.sum() > 0.98 * np.isfinite(images[3]).sum()
+    # 1 would be perfect; the variance of grey levels is found a little too large.
+    assert 0.5 < robust((seen.s - images[3])[known] / seen.sigma[known]) < 1.4
+    assert 0.55 < robust(boundary_errors(seen, s_at) / seen.boundary_sigma_px) < 1.4
+
+
+@pytest.mark.parametrize(
+    ("code", "untouched", "corrected"), [(SECTION, 0.16, 0.12), (PHASE, 0.13, 0.1)], ids=name
+)
+def test_black_and_white_pulls_pixels_less(code, untouched, corrected):
+    images = captured(code, wavy(2.2), 60, albedo=checkered(24))
+    seen = read(code, images, 60)
+    error = (seen.s - images[3])[np.isfinite(images[3]) & np.isfinite(seen.s)]
+    assert rms(error) < corrected < untouched
+    assert len(error) > 0.97 * np.isfinite(images[3]).sum()
+
+
+@pytest.mark.parametrize("code", ALL, ids=name)
+def test_vertical_stripes_are_horizontal_ones_transposed(code):
+    images = captured(code, wavy(3.0), 64, shape=(120, 140))
+    seen = read(code, images, 64)
+    lit, dark, coded = images[0].T, images[1].T, images[2].transpose(0, 2, 1)
+    turned = read_code(
+        spec_of(code, 64, "vertical"), *map(np.ascontiguousarray, (lit, dark, coded))
+    )
+    np.testing.assert_array_equal(turned.s.T, seen.s)
+    np.testing.assert_array_equal(turned.boundary_pixels[:, ::-1], seen.boundary_pixels)
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+@pytest.mark.parametrize("code", [each for each in ALL if each is not INDEX], ids=name)
+def test_what_is_projected_is_read_as_it_is(code, direction):
+    spec = spec_of(code, 40, direction)
+    coded = pattern_frames(spec, 120, 160) // 2 + 20
+    assert len(coded) == sum(spec.frame_counts.values())
+    lit = np.full((160, 120), 147, np.uint8)
+    seen = read_code(spec, lit, np.full_like(lit, 20), np.ascontiguousarray(coded))
+    pixel = np.arange(160 if direction == "horizontal" else 120)
+    true = (pixel + 0.5) / (len(pixel) / 40)
+    true = np.broadcast_to(true[:, None] if direction == "horizontal" else true, lit.shape)
+    known = np.isfinite(seen.s)
+    assert known.mean() > 0.92
+    # Light that is not blurred at all says at which pixels a boundary lies between, and no more:
+    # s is right to half a pixel of 3 or 4 a stripe.
+    # A pixel that lies between no two boundaries says so by its sigma.
+    assert np.all(np.abs(seen.s - true)[known] < np.maximum(0.17, 2.0 * seen.sigma[known]))
+
+
+@pytest.mark.parametrize("code", [SECTION, PHASE, INDEX], ids=name)
+def test_a_depth_jump_gives_no_values_in_between(code):
+    near, far = wavy(2.2), lambda u, v: wavy(2.2)(u, v) + 17.3
+
+    def s_at(u, v):
+        return np.where((u - 70) ** 2 + (v - 55) ** 2 < 35**2, near(u, v), far(u, v))
+
+    seen = read(code, captured(code, s_at, 80), 80)
+    v, u = np.nonzero(np.isfinite(seen.s))
+    nearest = np.minimum(np.abs(seen.s[v, u] - near(u, v)), np.abs(seen.s[v, u] - far(u, v)))
+    assert (
+        len(nearest) > 0.9 * np.isfinite(s_at(*np.meshgrid(np.arange(140), np.arange(110)))).sum()
+    )
+    # A mixed pixel would lie anywhere between surfaces 17.3 stripes apart.
+    assert (nearest > 1.0).sum() == 0
+
+
+def test_too_bright_and_doubly_lit_pixels_have_no_value_in_a_light_section():
+    def bright_spot(u, v):
+        return np.where((u - 60) ** 2 + (v - 60) ** 2 < 20**2, 1.5, 1.0)
+
+    lit, dark, coded, s = captured(SECTION, wavy(3.0), 50, albedo=bright_spot)
+    coded = coded.copy()
+    twice = np.s_[80:100, 100:130]
+    coded[5][twice] = coded[45][twice] = 150  # light by way of another surface
+    seen = read_code(spec_of(SECTION, 50), lit, dark, coded)
+    v, u = np.mgrid[: lit.shape[0], : lit.shape[1]]
+    spot = (u - 60) ** 2 + (v - 60) ** 2 < 17**2
+    assert np.isnan(seen.s[spot & (coded.max(axis=0) >= 254)]).all()
+    # What is left of the spot lies between two stripes, each half as bright.
+    assert np.nanmax(np.abs(seen.s - s)[spot]) < 0.1
+    assert np.isnan(seen.s[twice]).all()
+
+
+@pytest.mark.parametrize("code", [SECTION, PHASE], ids=name)
+def test_the_same_images_give_the_same_bytes(code):
+    images = captured(code, wavy(3.0), 64, shape=(100, 120), albedo=white)
+    one, other = read(code, images, 64), read(code, images, 64)
+    assert one.s.tobytes() == other.s.tobytes()
+    assert one.boundary_pixels.tobytes() == other.boundary_pixels.tobytes()
+
+
+def test_an_instrument_projects_stripes_of_its_own():
+    with pytest.raises(BadInput, match="projects stripes of its own"):
+        pattern_frames(spec_of(INDEX, 100), 640, 480)
+
+
+def test_black_must_be_known():
+    lit, _, coded, _ = captured(PLAIN_GRAY, wavy(3.0), 64, shape=(60, 80))
+    with pytest.raises(DecodingFailed, match="show what black is"):
+        read_code(spec_of(PLAIN_GRAY, 64), lit, None, coded)
+
+
+@pytest.mark.parametrize("code", [{"code": "gray"}, *ALL], ids=name)
+@pytest.mark.parametrize("rising", [True, False])
+def test_wanted_stripes_are_decoded_as_if_all_were(code, rising):
+    stripes = 60
+    images = captured(code, wavy(2.2), stripes)
+    whole = read(code, images, stripes)
+    low, high = (20.0, 35.0) if rising else (-35.0, -20.0)
+    corners = np.ones((3, 4), np.float32)
+    wanted = WantedStripes(low * corners, high * corners, high * corners, rising, 64, 5.0)
+    lit, dark, coded, _ = images
+    part = read_code(spec_of(code, stripes), lit, dark, coded, wanted=wanted)
+    # Within two stripes of the ends a run, and what is smoothed along it, ends earlier.
+    inside = np.isfinite(whole.s) & (whole.s > 22.0) & (whole.s < 33.0)
+    assert inside.sum() > 1000
+    np.testing.assert_allclose(part.s[inside], whole.s[inside], atol=0.02)
+    shown = part.s[np.isfinite(part.s)]
+    assert shown.min() > 19.0
+    assert shown.max() < 36.0
+    deep = whole.s > 36.0 if rising else whole.s < 19.0
+    assert part.beyond[deep].mean() > 0.99
+    assert not part.beyond[whole.s < 34.0 if rising else whole.s > 21.0].any()
+    assert whole.beyond is None

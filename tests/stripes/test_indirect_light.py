@@ -1,0 +1,93 @@
+"""Stripes where other surfaces throw light too: dropped where it is most, put right where not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stripe_rendering import Sequence, gray_bits, render_sequence
+
+from bodyscan.stripes.codes import read_stripes
+from bodyscan.stripes.stripe_map import StripeMap
+
+STRIPES, PX = 50, 4.0
+THERE = slice(12, 31)
+"""Stripes on the surface that throws light back: its share of a bit is that of these."""
+DIRECT = 180.0
+
+
+def slanted(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return 2.0 + u / PX * 0.7 + 0.02 * v
+
+
+def shadowed(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return np.where((u > 100) & (u < 160), np.nan, slanted(u, v))
+
+
+def with_indirect(sequence: Sequence, grey: float) -> Sequence:
+    """Light of the other surface added everywhere, `grey` when all of it is lit."""
+    share = gray_bits(np.arange(STRIPES))[:, THERE].mean(axis=1)
+
+    def more(image: np.ndarray, light: np.ndarray | float) -> np.ndarray:
+        added = image + np.asarray(grey * light)[..., None, None]
+        return np.clip(np.rint(added), 0, 255).astype(np.uint8).reshape(image.shape)
+
+    return Sequence(
+        more(sequence.lit, 1.0),
+        sequence.dark,
+        more(sequence.patterns, share),
+        more(sequence.inverses, 1.0 - share),
+        sequence.s,
+    )
+
+
+def read(sequence: Sequence) -> StripeMap:
+    frames = (sequence.lit, sequence.dark, sequence.patterns, sequence.inverses)
+    return read_stripes(*frames, stripes=STRIPES, direction="vertical")
+
+
+def rms(found: StripeMap, s: np.ndarray) -> float:
+    known = np.isfinite(found.s) & np.isfinite(s)
+    assert known.sum() > 0.9 * np.isfinite(s).sum()
+    return float(np.sqrt(np.mean((found.s - s)[known] ** 2)))
+
+
+def test_boundaries_lie_in_the_middle_of_what_both_sides_show() -> None:
+    """A fifth of the light comes by another way. Where the coarsest bits flip, their differences
+    are J, up to a fifth of D, in the middle: taken for 0, their boundaries would be off by a quarter
+    of the blur and more, up to 0.1 stripes."""
+    plain = render_sequence(slanted, stripes=STRIPES, light=DIRECT, noise=0.7)
+    mixed = read(with_indirect(plain, 50.0))
+    # 0.0020 without the other surface's light, 0.0047 with it, 0.020 if J is taken for 0. The finest
+    # bit's boundaries are left as they are: its J is a nineteenth of I, which moves them by 0.004.
+    assert rms(mixed, plain.s) < 0.006
+    u, v = mixed.boundary_pixels.T
+    off = slanted(u, v) - mixed.boundary_index
+    # Each is seen on 200 lines, to 0.003 stripes; taken for 0, J would move the worst by 0.10.
+    for index in range(6, 46):
+        assert abs(np.median(off[mixed.boundary_index == index])) < 0.006, index
+
+
+def test_a_shadow_that_other_surfaces_light_shows_no_stripes() -> None:
+    plain = render_sequence(shadowed, stripes=STRIPES, light=DIRECT, ambient=15.0, noise=0.7)
+    shade = np.zeros(plain.s.shape, bool)
+    shade[:, 104:157] = True  # clear of the rims, which are partly lit
+    mixed = read(with_indirect(plain, 30.0))
+    assert np.isfinite(mixed.s[shade]).mean() == 0.0
+    rest = ~np.isin(np.arange(plain.s.shape[1]), range(96, 165))
+    assert np.isfinite(mixed.s[:, rest]).mean() == pytest.approx(
+        np.isfinite(read(plain).s[:, rest]).mean(), abs=0.002
+    )
+
+
+@pytest.mark.parametrize("pixels", [1.3, 2.0, 6.0])
+def test_direct_light_is_never_taken_for_indirect(pixels: float, monkeypatch) -> None:
+    """Whatever the stripes' width: all pixels that were read without asking are read."""
+    plain = render_sequence(
+        lambda u, v: 0.5 + u / pixels, stripes=int(250 / pixels), light=60.0, noise=1.0
+    )
+    frames = (plain.lit, plain.dark, plain.patterns, plain.inverses)
+    found = read_stripes(*frames, stripes=int(250 / pixels), direction="vertical")
+    monkeypatch.setattr("bodyscan.stripes.indirect_light.LEAST_DIRECT", -1.0)
+    everything = read_stripes(*frames, stripes=int(250 / pixels), direction="vertical")
+    assert np.isfinite(everything.s).mean() > 0.8
+    assert np.isfinite(found.s).sum() >= 0.999 * np.isfinite(everything.s).sum()

@@ -1,0 +1,114 @@
+"""Stripe sequences that do not add up are refused, and the frame to blame is named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stripe_rendering import Sequence, render_sequence
+
+from bodyscan.errors import DecodingFailed
+from bodyscan.stripes.codes import read_stripes
+
+STRIPES = 100
+BITS = 7
+
+
+@pytest.fixture(scope="module")
+def good() -> Sequence:
+    return render_sequence(
+        lambda u, v: 1.2 + (v + 0.1 * u + 2 * np.sin(u / 20)) / 2.3, stripes=STRIPES
+    )
+
+
+def read(sequence, direction="horizontal"):
+    return read_stripes(
+        sequence.lit, sequence.dark, sequence.patterns, sequence.inverses,
+        stripes=STRIPES, direction=direction,
+    )  # fmt: skip
+
+
+def reordered(sequence, order):
+    return replace(sequence, patterns=sequence.patterns[order], inverses=sequence.inverses[order])
+
+
+def with_frame(sequence, name, bit, frame):
+    frames = getattr(sequence, name).copy()
+    frames[bit] = frame
+    return replace(sequence, **{name: frames})
+
+
+def test_a_good_sequence_is_read(good):
+    assert np.isfinite(read(good).s).mean() > 0.9
+
+
+@pytest.mark.parametrize("bit", range(BITS))
+def test_an_exchanged_pattern_and_inverse_are_named(good, bit):
+    bad = with_frame(good, "patterns", bit, good.inverses[bit])
+    bad = with_frame(bad, "inverses", bit, good.patterns[bit])
+    with pytest.raises(DecodingFailed, match=f"pattern and inverse of bit {bit} were exchanged"):
+        read(bad)
+
+
+@pytest.mark.parametrize(("one", "other"), [(0, 1), (2, 3), (5, 6), (1, 5)])
+def test_exchanged_bits_are_named(good, one, other):
+    order = list(range(BITS))
+    order[one], order[other] = other, one
+    with pytest.raises(DecodingFailed, match=f"bits {one} and {other} were exchanged"):
+        read(reordered(good, order))
+
+
+def test_reversed_bits_and_exchanged_lists_are_named(good):
+    with pytest.raises(DecodingFailed, match="reverse order"):
+        read(reordered(good, list(range(BITS))[::-1]))
+    with pytest.raises(DecodingFailed, match="all patterns and inverses were exchanged"):
+        read(replace(good, patterns=good.inverses, inverses=good.patterns))
+
+
+@pytest.mark.parametrize("bit", [0, 3, 6])
+def test_a_frame_taken_twice_or_missing_is_named(good, bit):
+    with pytest.raises(DecodingFailed, match=f"bit {bit} look alike"):
+        read(with_frame(good, "inverses", bit, good.patterns[bit]))
+    with pytest.raises(DecodingFailed, match=f"bit {bit} do not add up"):
+        read(with_frame(good, "patterns", bit, good.dark))
+    with pytest.raises(DecodingFailed, match=f"bit {bit} (look alike|do not add up)"):
+        read(with_frame(good, "inverses", bit, good.patterns[(bit + 1) % BITS]))
+
+
+def test_a_bit_in_place_of_another_is_noticed(good):
+    order = [0, 1, 2, 4, 4, 5, 6]
+    with pytest.raises(DecodingFailed, match="do not make a stripe code"):
+        read(reordered(good, order))
+
+
+def test_a_sequence_of_the_wrong_length_or_size_is_refused(good):
+    with pytest.raises(DecodingFailed, match="6 patterns, but the code has 7 bits"):
+        read(replace(good, patterns=good.patterns[1:]))
+    with pytest.raises(DecodingFailed, match="inverses of"):
+        read(replace(good, inverses=good.inverses[:, :-1]))
+    with pytest.raises(DecodingFailed, match="dark frame of"):
+        read(replace(good, dark=good.dark[:-1]))
+
+
+def test_exposures_that_cannot_be_read_are_refused(good):
+    def brighter(factor):
+        return Sequence(
+            *(
+                np.clip(frames.astype(float) * factor, 0, 255).astype(np.uint8)
+                for frames in (good.lit, good.dark, good.patterns, good.inverses)
+            ),
+            s=good.s,
+        )
+
+    with pytest.raises(DecodingFailed, match="saturated"):
+        read(brighter(3.0))
+    with pytest.raises(DecodingFailed, match="lights only"):
+        read(brighter(0.01))
+    with pytest.raises(DecodingFailed, match="dark frame is brighter"):
+        read(replace(good, lit=good.dark, dark=good.lit))
+
+
+def test_stripes_that_run_the_other_way_are_noticed(good):
+    with pytest.raises(DecodingFailed, match="direction: horizontal"):
+        read(good, direction="vertical")

@@ -1,0 +1,259 @@
+"""Stripe coordinates on rendered surfaces whose stripe coordinate is known, and on real ones."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from stripe_rendering import checkered, render_sequence, white
+
+from bodyscan.boards.detection import find_boards
+from bodyscan.rig.board import Board
+from bodyscan.stripes.codes import read_stripes
+
+
+def wavy(stripe_px, *, slant=0.1, first=3.3):
+    """A smooth, uneven field of s with stripes about `stripe_px` wide."""
+
+    def s_at(u, v):
+        return first + (v + slant * u + 2.5 * np.sin(u / 23) + 1.5 * np.sin(v / 31)) / stripe_px
+
+    return s_at
+
+
+def read(sequence, stripes, direction="horizontal"):
+    return read_stripes(
+        sequence.lit, sequence.dark, sequence.patterns, sequence.inverses,
+        stripes=stripes, direction=direction,
+    )  # fmt: skip
+
+
+def contrast(sequence):
+    return cv2.subtract(sequence.lit, sequence.dark)
+
+
+def boundary_errors(seen, s_at):
+    """How far boundaries lie from where they should be, across the stripes, px."""
+    u, v = seen.boundary_pixels.T
+    slope = s_at(u, v + 0.5) - s_at(u, v - 0.5)
+    return (s_at(u, v) - seen.boundary_index) / slope
+
+
+def robust(errors):
+    return np.median(np.abs(errors)) / 0.6745
+
+
+# Tolerances are about 1.5 times what was measured, with noise of 1 in 180 grey levels.
+@pytest.mark.parametrize(
+    ("stripe_px", "stripes", "boundary_px", "s_rms"),
+    [(1.5, 160, 0.012, 0.009), (2.2, 100, 0.013, 0.007), (10.0, 30, 0.033, 0.004)],
+)
+def test_boundaries_and_s_on_a_plain_surface(stripe_px, stripes, boundary_px, s_rms):
+    s_at = wavy(stripe_px)
+    sequence = render_sequence(s_at, stripes=stripes)
+    seen = read(sequence, stripes)
+    lit = np.isfinite(sequence.s) & (contrast(sequence) > 20)
+    # Past the last boundary of a line s goes on for 0.4 stripes, of up to one.
+    assert np.isfinite(seen.s[lit]).mean() > 0.995 - 2 * 0.35 * stripe_px / seen.s.shape[1]
+    error = (seen.s - sequence.s)[lit & np.isfinite(seen.s)]
+    assert np.sqrt(np.mean(error**2)) < s_rms
+    assert robust(boundary_errors(seen, s_at)) < boundary_px
+    np.testing.assert_array_equal(np.isnan(seen.s), np.isnan(seen.sigma))
+
+
+def test_black_and_white_does_not_move_boundaries():
+    s_at = wavy(2.2)
+    sequence = render_sequence(s_at, stripes=100, albedo=checkered(24))
+    seen = read(sequence, 100)
+    error = boundary_errors(seen, s_at)
+    # Without the correction 0.15 px, at edges up to 0.6 px; measured 0.073, largest 0.53.
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    lit = np.isfinite(sequence.s) & np.isfinite(seen.s)
+    assert np.sqrt(np.mean((seen.s - sequence.s)[lit] ** 2)) < 0.03
+    assert lit.mean() > 0.97
+
+
+@pytest.mark.parametrize("light", [12.0, 40.0])
+@pytest.mark.parametrize("stripe_px", [1.5, 4.0])
+def test_sigmas_say_how_far_off_values_are_in_dim_light(stripe_px, light):
+    s_at, stripes = wavy(stripe_px), int(240 / stripe_px)
+    sequence = render_sequence(s_at, stripes=stripes, light=light)
+    seen = read(sequence, stripes)
+    lit = np.isfinite(sequence.s) & np.isfinite(seen.s)
+    assert lit.sum() > 0.985 * np.isfinite(sequence.s).sum()
+    # Noise rules here: ratios of 1 would be perfect; a floor of 0.015 px lowers those of the brighter.
+    ratio = robust((seen.s - sequence.s)[lit] / seen.sigma[lit])
+    assert 0.5 < ratio < 1.2
+    ratio = robust(boundary_errors(seen, s_at) / seen.boundary_sigma_px)
+    assert 0.6 < ratio < 1.2
+
+
+def test_vertical_stripes_are_horizontal_ones_transposed():
+    s_at = wavy(3.0)
+    sequence = render_sequence(s_at, stripes=80, shape=(120, 140))
+    seen = read(sequence, 80)
+    turned = read_stripes(
+        np.ascontiguousarray(sequence.lit.T),
+        np.ascontiguousarray(sequence.dark.T),
+        np.ascontiguousarray(sequence.patterns.transpose(0, 2, 1)),
+        np.ascontiguousarray(sequence.inverses.transpose(0, 2, 1)),
+        stripes=80,
+        direction="vertical",
+    )
+    np.testing.assert_array_equal(turned.s.T, seen.s)
+    np.testing.assert_array_equal(turned.sigma.T, seen.sigma)
+    np.testing.assert_array_equal(turned.boundary_pixels[:, ::-1], seen.boundary_pixels)
+
+
+def test_stripes_may_count_upwards():
+    sequence = render_sequence(lambda u, v: 70 - wavy(3.0)(u, v), stripes=70, shape=(120, 140))
+    seen = read(sequence, 70)
+    lit = np.isfinite(sequence.s) & np.isfinite(seen.s)
+    assert lit.sum() > 0.98 * np.isfinite(sequence.s).sum()
+    assert np.sqrt(np.mean((seen.s - sequence.s)[lit] ** 2)) < 0.008
+
+
+def test_a_depth_jump_gives_no_values_in_between():
+    near, far = wavy(2.2), wavy(2.2, first=20.6)
+
+    def s_at(u, v):
+        disc = (u - 130) ** 2 + (v - 100) ** 2 < 55**2
+        return np.where(disc, near(u, v), far(u, v))
+
+    seen = read(render_sequence(s_at, stripes=130), 130)
+    v, u = np.nonzero(np.isfinite(seen.s))
+    nearest = np.minimum(np.abs(seen.s[v, u] - near(u, v)), np.abs(seen.s[v, u] - far(u, v)))
+    # 17 stripes apart: a mixed pixel would lie anywhere between.
+    assert (nearest > 0.5).sum() == 0
+    assert (nearest > 0.2).mean() < 1e-3
+    rim = np.abs(np.hypot(u - 130, v - 100) - 55) < 0.5
+    assert rim.sum() < 0.2 * 2 * np.pi * 55
+
+
+def test_pixels_half_off_the_surface_have_no_value():
+    def s_at(u, v):
+        return np.where(np.abs(u - 130.3) < 60, 3 + (v + 0.7 * u) / 2.2, np.nan)
+
+    sequence = render_sequence(s_at, stripes=200)
+    seen = read(sequence, 200)
+    on, has = np.isfinite(sequence.s), np.isfinite(seen.s)
+    # 200 lines, each with two rims that cut a pixel: at most the better half of one is kept.
+    assert (has & ~on).sum() < 20
+    assert (on & has).sum() > 0.97 * on.sum()
+    # At a rim across which s changes, a pixel's light comes from beside its middle: without
+    # regard to that 82 pixels are off by more than a tenth of a stripe.
+    error = np.abs(seen.s - sequence.s)[on & has]
+    assert (error > 0.1).sum() < 10
+
+
+def test_black_and_white_edges_along_the_scan_lines_do_not_move_slanted_stripes():
+    s_at = wavy(2.2, slant=0.6)
+    sequence = render_sequence(s_at, stripes=170, albedo=checkered(24, turned_deg=8))
+    seen = read(sequence, 170)
+    # Measured 0.084 px and 0.027 stripes; 0.107 and 0.039 if only edges across lines counted.
+    assert np.sqrt(np.mean(boundary_errors(seen, s_at) ** 2)) < 0.095
+    both = np.isfinite(sequence.s) & np.isfinite(seen.s)
+    assert np.sqrt(np.mean((seen.s - sequence.s)[both] ** 2)) < 0.033
+
+
+def test_boundaries_near_by_on_the_line_steady_each_other():
+    sequence = render_sequence(wavy(1.5), stripes=160, light=20.0)
+    seen = read(sequence, 160)
+    both = np.isfinite(sequence.s) & np.isfinite(seen.s)
+    # Measured 0.0266; 0.038 with each boundary by itself.
+    assert np.sqrt(np.mean((seen.s - sequence.s)[both] ** 2)) < 0.032
+
+
+def test_saturated_and_unlit_pixels_have_no_value():
+    def bright_spot(u, v):
+        return np.where((u - 60) ** 2 + (v - 60) ** 2 < 20**2, 1.5, 1.0)
+
+    def s_at(u, v):
+        return np.where(u > 200, np.nan, wavy(3.0)(u, v))
+
+    seen = read(render_sequence(s_at, stripes=90, albedo=bright_spot), 90)
+    v, u = np.mgrid[: seen.s.shape[0], : seen.s.shape[1]]
+    spot = (u - 60) ** 2 + (v - 60) ** 2
+    assert np.isnan(seen.s[spot < 18**2]).all()
+    assert np.isnan(seen.s[u > 202]).all()
+    assert np.isfinite(seen.s[(u < 197) & (spot > 24**2)]).mean() > 0.99
+    inside = (seen.boundary_pixels[:, 0] - 60) ** 2 + (seen.boundary_pixels[:, 1] - 60) ** 2 < 18**2
+    assert not inside.any()
+
+
+def test_the_same_frames_give_the_same_bytes():
+    sequence = render_sequence(wavy(3.0), stripes=80, shape=(100, 120), albedo=white)
+    one, other = read(sequence, 80), read(sequence, 80)
+    assert one.s.tobytes() == other.s.tobytes()
+    assert one.boundary_pixels.tobytes() == other.boundary_pixels.tobytes()
+
+
+@pytest.mark.parametrize("pose", [0, 1, 2, 4])
+def test_real_stripes_on_a_real_board_are_smooth(captures, pose):
+    folder = captures / "procam-board" / f"capture_{pose}"
+    frame = {k: cv2.imread(str(folder / f"graycode_{k}.png"), 0) for k in range(20, 42)}
+    seen = read_stripes(
+        frame[40], frame[41],
+        np.stack([frame[k] for k in range(20, 40, 2)]),
+        np.stack([frame[k] for k in range(21, 40, 2)]),
+        stripes=768, direction="horizontal",
+    )  # fmt: skip
+    board = Board(name="procam", columns=10, rows=8, square_mm=75)
+    (view,) = find_boards(frame[40], [board], pair="a", shot="b")
+    inside = np.zeros(frame[40].shape, np.uint8)
+    hull = cv2.convexHull(view.pixels.astype(np.float32)).reshape(-1, 2)
+    cv2.fillConvexPoly(inside, np.rint(hull).astype(np.int32), 1)
+    u, v = np.rint(seen.boundary_pixels).astype(int).T
+    bright = (inside[v, u] > 0) & (cv2.subtract(frame[40], frame[41])[v, u] > 40)
+    assert bright.sum() > 30_000
+    place = (seen.boundary_pixels[bright] - hull.mean(axis=0)) / 500
+    powers = [(i, j) for i in range(6) for j in range(6 - i)]
+    design = np.stack([place[:, 0] ** i * place[:, 1] ** j for i, j in powers], axis=-1)
+    index, sigma = seen.boundary_index[bright], seen.boundary_sigma_px[bright]
+    fitted = np.linalg.lstsq(design / sigma[:, None], index / sigma, rcond=None)[0]
+    stray_px = (index - design @ fitted) * 1.78
+    # A plane lit by a projector: stripes 1.78 px wide. Measured 0.04 to 0.1 px, which is what the
+    # sigmas say, in images whose finest stripes have only a fifth to a third of the full contrast.
+    assert robust(stray_px) < 0.13
+    assert 0.7 < robust(stray_px / sigma) < 1.4
+
+
+def test_stripes_that_end_and_begin_again_are_not_joined():
+    """Behind a narrow dark gap another surface happens to show the very next stripe."""
+
+    def s_at(u, v):
+        behind = 17.4 + (v - 113) / 9.0
+        return np.where(v < 108, 3 + v / 7.5, np.where(v < 113, np.nan, behind))
+
+    sequence = render_sequence(s_at, stripes=40)
+    seen = read(sequence, 40)
+    both = np.isfinite(seen.s) & np.isfinite(sequence.s)
+    # 0.2 stripes when the two were joined.
+    assert np.abs(seen.s - sequence.s)[both].max() < 0.08
+
+
+def test_between_boundaries_s_bends_as_it_does_around_them():
+    sequence = render_sequence(lambda u, v: 3 + v / 9.0 + (v / 60.0) ** 2, stripes=60, noise=0.3)
+    seen = read(sequence, 60)
+    both = np.isfinite(seen.s) & np.isfinite(sequence.s)
+    error = (seen.s - sequence.s)[both]
+    # Straight lines between boundaries would be off by up to s'' w^2 / 8 = 0.005, all to one side.
+    assert np.sqrt(np.mean(error**2)) < 0.0045
+    assert abs(error.mean()) < 0.0004
+
+
+def test_shading_that_fades_gently_does_not_move_stripes():
+    def mean_error(fade):
+        scene = render_sequence(
+            lambda u, v: 3 + v / 4.0,
+            stripes=90,
+            albedo=lambda u, v: np.exp(fade * (v - 100)),
+            light=80.0,
+            noise=0.3,
+        )
+        seen = read(scene, 90)
+        both = np.isfinite(seen.s) & np.isfinite(scene.s) & (contrast(scene) > 40)
+        return (seen.s - scene.s)[both].mean()
+
+    # A pixel's light comes from the bright side by blur^2 / 80 = 0.0055 px, 0.0014 stripes.
+    assert abs(mean_error(1 / 80) - mean_error(-1 / 80)) < 0.0007

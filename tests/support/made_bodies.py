@@ -1,0 +1,46 @@
+"""Meshes whose girths, volumes and areas are known from formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+
+from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.topology import vertex_normals
+
+
+def mesh_of(vertices: np.ndarray, faces: np.ndarray, filled: np.ndarray | None = None) -> BodyMesh:
+    """Grey, measured everywhere unless said otherwise."""
+    count = len(vertices)
+    return BodyMesh(
+        np.asarray(vertices, float),
+        np.asarray(faces, np.int64),
+        vertex_normals(vertices, faces),
+        np.full((count, 3), 128, np.uint8),
+        np.full(count, 0.1, np.float32),
+        np.zeros(len(faces), bool) if filled is None else filled,
+    )
+
+
+def arrays(made: o3d.geometry.TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(made.vertices), np.asarray(made.triangles).astype(np.int64)
+
+
+def ellipsoid(axes, centre=(0.0, 0.0, 0.0), resolution: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    vertices, faces = arrays(o3d.geometry.TriangleMesh.create_sphere(1.0, resolution=resolution))
+    return vertices * np.asarray(axes) + np.asarray(centre), faces
+
+
+def cylinder(radius: float, low: float, high: float, x: float = 0.0, y: float = 0.0):
+    made = o3d.geometry.TriangleMesh.create_cylinder(radius, high - low, resolution=400, split=50)
+    vertices, faces = arrays(made)
+    return vertices + [x, y, 0.5 * (low + high)], faces
+
+
+def together(*bodies: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Several closed surfaces in one mesh."""
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in bodies)])
+    return (
+        np.concatenate([vertices for vertices, _ in bodies]),
+        np.concatenate([faces + start for (_, faces), start in zip(bodies, starts, strict=False)]),
+    )

@@ -1,0 +1,163 @@
+"""Range images of a body with known truth, by ray casting: what the fusion tests work on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import open3d as o3d
+import yaml
+
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.rig.pair import Placing
+from bodyscan.rig.rig import Rig
+
+ROOT = Path(__file__).parents[2]
+BODY = ROOT / "data" / "subjects" / "woman_average.ply"
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The surface that was scanned: vertices (V, 3) mm, rig frame, and faces (F, 3)."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Range images with noise, where their cameras stand, and the truth."""
+
+    range_images: list[RangeImage]
+    rig_from_camera: dict[str, RigidTransform]
+    truth: Truth
+
+
+def load_rig(name: str = "three-pole-12") -> Rig:
+    return Rig.model_validate(yaml.safe_load((ROOT / "rigs" / f"{name}.yaml").read_text()))
+
+
+def load_body(path: Path = BODY, subdivisions: int = 2) -> Truth:
+    """A subject's file (metres, facing -y), Loop-subdivided, facing x in mm."""
+    mesh = o3d.io.read_triangle_mesh(str(path)).subdivide_loop(subdivisions)
+    x, y, z = 1000.0 * np.asarray(mesh.vertices).T
+    return Truth(np.stack([-y, x, z], axis=-1), np.asarray(mesh.triangles).astype(np.int64))
+
+
+def scene_of(truth: Truth) -> o3d.t.geometry.RaycastingScene:
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(truth.vertices.astype(np.float32), truth.faces.astype(np.uint32))
+    return scene
+
+
+def looking(placing: Placing) -> RigidTransform:
+    """rig_from_camera of a camera that stands upright at a placing."""
+    position = np.array(placing.position_mm)
+    forward = np.array(placing.look_at_mm) - position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return RigidTransform(np.stack([right, np.cross(forward, right), forward], axis=-1), position)
+
+
+def nominal_camera(width: int, height: int) -> Camera:
+    """Sees about 1 m x 0.8 m at 1.3 m, with a little barrel distortion."""
+    focal = 1.33 * width
+    return Camera(
+        focal, 1.002 * focal, 0.4, width / 2 + 3.3, height / 2 - 2.1, -0.09, 0.06, width, height
+    )
+
+
+def cast_scan(
+    truth: Truth,
+    rig: Rig,
+    *,
+    scale: float = 1.0,
+    noise_mm: float = 0.3,
+    flying: float = 0.01,
+    seed: int = 1,
+    floor: bool = True,
+) -> Scan:
+    """What the rig's pairs would measure from their nominal placings.
+
+    A pixel counts only if its point is also lit from the projector's placing. `flying` is the
+    fraction of pixels that silhouettes turn into points somewhere between front and back.
+    """
+    scene = scene_of(truth)
+    if floor:
+        square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32) * 2500
+        scene.add_triangles(square, np.array([[0, 1, 2], [0, 2, 3]], np.uint32))
+    rng = np.random.default_rng(seed)
+    poses = {pair.name: looking(pair.nominal) for pair in rig.pairs}
+    images = []
+    for pair in rig.pairs:
+        camera = nominal_camera(round(scale * pair.camera.width), round(scale * pair.camera.height))
+        images.append(_cast(scene, pair, camera, poses[pair.name], noise_mm, flying, rng))
+    return Scan(images, poses, truth)
+
+
+def _cast(scene, pair, camera, pose, noise_mm, flying, rng) -> RangeImage:
+    rays = camera.pixel_rays()
+    directions = pose.rotate(rays)
+    origins = np.broadcast_to(pose.translation, directions.shape)
+    cast = scene.cast_rays(np.concatenate([origins, directions], axis=-1).astype(np.float32))
+    depth = cast["t_hit"].numpy().astype(float)
+    normals = cast["primitive_normals"].numpy() @ pose.rotation
+    seen = np.isfinite(depth)
+    depth[~seen] = 0.0
+    hit = pose.apply(rays * depth[..., None])
+    from_projector = hit - np.array(pair.projector_nominal.position_mm)
+    lit = scene.cast_rays(
+        np.concatenate(
+            [np.broadcast_to(pair.projector_nominal.position_mm, hit.shape), from_projector],
+            axis=-1,
+        ).astype(np.float32)
+    )["t_hit"].numpy()
+    facing = np.sum(normals * rays, axis=-1) < 0
+    valid = seen & facing & (lit > 1.0 - 1e-3)
+    length = np.linalg.norm(rays, axis=-1)
+    depth = depth + rng.normal(0.0, noise_mm, depth.shape) / length
+    depth = _mix_silhouettes(depth, valid, flying, rng)
+    shade = -np.sum(normals * rays, axis=-1) / length
+    points = np.where(valid[..., None], rays * depth[..., None], np.nan).astype(np.float32)
+    return RangeImage(
+        pair.name,
+        camera,
+        points,
+        np.where(valid[..., None], normals, np.nan).astype(np.float32),
+        np.where(valid, noise_mm, np.nan).astype(np.float32),
+        np.where(valid, 40 + 200 * np.clip(shade, 0, 1), 0).astype(np.uint8),
+    )
+
+
+def _mix_silhouettes(depth, valid, flying, rng):
+    """Pixels next to a jump in depth land anywhere between the two sides."""
+    near = np.where(valid, depth, 1e9).astype(np.float32)
+    far = np.where(valid, depth, -1e9).astype(np.float32)
+    kernel = np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(near, kernel), cv2.dilate(far, kernel)
+    rim = valid & ((high - low > 15.0) | (cv2.erode(valid.astype(np.uint8), kernel) == 0))
+    chosen = rim & (rng.random(depth.shape) < flying * valid.sum() / max(rim.sum(), 1))
+    reach = np.where(high - low > 15.0, np.minimum(high - low, 300.0), 60.0)
+    return np.where(chosen, low + reach * rng.random(depth.shape), depth)
+
+
+def without(
+    image: RangeImage, rig_from_camera: RigidTransform, low_mm: float, high_mm: float
+) -> RangeImage:
+    """The range image with nothing measured between two heights: black cloth, hair."""
+    height = rig_from_camera.apply(image.points.astype(float))[..., 2]
+    gone = (height > low_mm) & (height < high_mm)
+    nan = np.float32(np.nan)
+    return RangeImage(
+        image.pair,
+        image.camera,
+        np.where(gone[..., None], nan, image.points),
+        np.where(gone[..., None], nan, image.normals),
+        np.where(gone, nan, image.sigma_mm),
+        image.colours,
+    )

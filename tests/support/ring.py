@@ -1,0 +1,104 @@
+"""A ring of cameras around a board, corners with noise: no images, exact truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodyscan.boards.board import corner_points
+from bodyscan.calibration.camera import PlanarView, locate_board
+from bodyscan.calibration.located_view import LocatedView, board_symmetries
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.rig.board import Board
+from bodyscan.rig.rig import Rig
+
+CHARUCO = Board(
+    name="board", kind="charuco", columns=9, rows=7, square_mm=70, marker_mm=52, faces=2,
+    thickness_mm=6,
+)  # fmt: skip
+
+
+def looking_at(position, target) -> RigidTransform:
+    forward = np.asarray(target, float) - position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return RigidTransform(
+        np.column_stack([right, np.cross(forward, right), forward]), np.asarray(position, float)
+    )
+
+
+def ring_of_cameras(poles=3, heights=(400, 850, 1300, 1750)):
+    """`rig_from_camera` and cameras by name, at 1.3 m around the centre."""
+    placings, cameras = {}, {}
+    rng = np.random.default_rng(7)
+    for pole in range(poles):
+        angle = np.radians(60.0 + 360.0 * pole / poles)
+        for k, height in enumerate(heights):
+            name = f"p{pole + 1}-{k + 1}"
+            position = [1300.0 * np.cos(angle), 1300.0 * np.sin(angle), height]
+            placings[name] = looking_at(position, [0.0, 0.0, height - 50.0])
+            focal = 1510.0 + rng.normal(0.0, 5.0)
+            cameras[name] = Camera(focal, focal + 2.0, -0.5, 645.0, 508.0, -0.1, 0.05, 1280, 1024)
+    return placings, cameras
+
+
+def ring_rig(placings, fixed="p1-1") -> Rig:
+    position = placings[fixed].translation
+    target = position + 1000.0 * placings[fixed].rotation[:, 2]
+    pairs = [{"name": name, "camera": {"width": 1280, "height": 1024}} for name in sorted(placings)]
+    for pair in pairs:
+        if pair["name"] == fixed:
+            pair["nominal"] = {
+                "position_mm": tuple(position), "look_at_mm": tuple(target)
+            }  # fmt: skip
+    return Rig(name="ring", boards=(CHARUCO,), pairs=tuple(pairs), rig_frame={"pair": fixed})
+
+
+def board_poses(count, rng):
+    """`rig_from_board`: upright boards near the centre at all heights, turned and tilted."""
+    upright = np.column_stack([[0, 1, 0], [0, 0, -1], [-1, 0, 0]]).astype(float)
+    for _ in range(count):
+        turn = RigidTransform.from_rotation_vector([0, 0, rng.uniform(0, 2 * np.pi)], [0, 0, 0])
+        tilt = RigidTransform.from_rotation_vector(rng.normal(0, 0.3, 3), [0, 0, 0])
+        rotation = turn.rotation @ upright @ tilt.rotation
+        centre = [*rng.uniform(-200, 200, 2), rng.uniform(300, 1800)]
+        yield RigidTransform(rotation, centre - rotation @ [315.0, 245.0, 0.0])
+
+
+def ring_views(
+    placings, cameras, *, shots=40, noise_px=0.03, seed=0, board=CHARUCO, least_facing=0.4
+):
+    """What each camera sees of each shot, located with the true camera."""
+    rng = np.random.default_rng(seed)
+    points = corner_points(board)
+    per_face = len(points) // board.faces
+    views, truth = [], {}
+    for number, rig_from_board in enumerate(board_poses(shots, rng)):
+        shot = f"s{number:02d}"
+        truth[shot, board.name] = rig_from_board
+        for name, camera in cameras.items():
+            camera_from_board = placings[name].inverse() @ rig_from_board
+            middle = camera_from_board.apply(points.mean(axis=0))
+            facing = camera_from_board.rotation[:, 2] @ middle / np.linalg.norm(middle)
+            if abs(facing) < least_facing or (facing < 0 and board.faces == 1):
+                continue
+            face = points[:per_face] if facing > 0 else points[-per_face:]
+            pixels = camera.project(camera_from_board.apply(face))
+            inside = np.all((pixels > 5) & (pixels < [1275, 1019]), axis=1)
+            if inside.sum() < 12:
+                continue
+            noisy = pixels[inside] + rng.normal(0.0, noise_px, (inside.sum(), 2))
+            seen = face[inside]
+            view = PlanarView(shot, seen, noisy)
+            symmetries = (RigidTransform.identity(),)
+            if board.kind == "checkerboard":
+                # As a detector would: whichever end, and always as if it were the front.
+                symmetries = board_symmetries(board)
+                label = symmetries[rng.integers(len(symmetries))]
+                if abs(label.inverse().apply(seen)[0, 2]) > 1e-9:
+                    label = next(s for s in symmetries if abs(s.inverse().apply(seen)[0, 2]) < 1e-9)
+                view = PlanarView(shot, label.inverse().apply(seen), noisy)
+            pose, _ = locate_board(camera, view)
+            views.append(LocatedView(name, shot, board.name, view.points, noisy, pose, symmetries))
+    return views, truth

@@ -1,0 +1,39 @@
+"""A small mesh and a small cloud with every field filled, to write and read back."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.topology import vertex_normals
+
+
+def ball(resolution: int = 20, radius_mm: float = 120.0) -> BodyMesh:
+    """A ball that stands on the floor off the middle; its lowest part was measured by nobody."""
+    sphere = o3d.geometry.TriangleMesh.create_sphere(radius_mm, resolution)
+    vertices = np.asarray(sphere.vertices) + np.array([30.0, -40.0, radius_mm])
+    faces = np.asarray(sphere.triangles).astype(np.int64)
+    rng = np.random.default_rng(1)
+    sigma_mm = rng.uniform(0.01, 0.3, len(vertices)).astype(np.float32)
+    sigma_mm[vertices[:, 2] < 40.0] = np.nan
+    return BodyMesh(
+        vertices + rng.normal(0.0, 1e-3, vertices.shape),
+        faces,
+        vertex_normals(vertices, faces),
+        rng.integers(0, 256, vertices.shape).astype(np.uint8),
+        sigma_mm,
+        np.isnan(sigma_mm)[faces].any(axis=1),
+    )
+
+
+def points(count: int = 500) -> BodyCloud:
+    rng = np.random.default_rng(2)
+    normals = rng.normal(size=(count, 3))
+    return BodyCloud(
+        rng.uniform(-900.0, 1900.0, (count, 3)),
+        (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
+        rng.uniform(0.01, 1.0, count).astype(np.float32),
+        rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        rng.integers(1, 13, count).astype(np.uint8),
+    )

@@ -1,0 +1,207 @@
+"""Artefacts of known size among points of known error: every figure against what was put in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bodyscan.cli.main import app
+from bodyscan.errors import FailedWork
+from bodyscan.evaluation.acceptance import (
+    RIM_MM,
+    locate_spheres,
+    read_plate,
+    read_sphere,
+    spacing_errors,
+)
+from bodyscan.evaluation.acceptance_file import AcceptanceError, load_acceptance
+from bodyscan.evaluation.acceptance_readings import (
+    ALL,
+    PlateRow,
+    Readings,
+    SpacingRow,
+    SphereRow,
+    figures,
+)
+from bodyscan.evaluation.spheres import Sphere
+from bodyscan.rig.rig import Volume
+from bodyscan.simulation.acceptance_places import plates_at, spheres_at
+
+RADIUS = 60.0
+CENTRES = np.array([[0.0, 0.0, 0.0], [400.0, 0.0, 0.0], [0.0, 250.0, 150.0]])
+AT = np.array([-120.0, 80.0, 1100.0])
+
+
+def ball(centre, radius: float, count: int = 20_000, wave_mm: float = 0.0, seed: int = 0):
+    """Points all over a ball, waved by so much to either side, and outward normals."""
+    normals = np.random.default_rng(seed).normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    wave = wave_mm * np.sin(12.0 * np.arctan2(normals[:, 1], normals[:, 0]))
+    return np.asarray(centre) + (radius + wave)[:, None] * normals, normals
+
+
+def test_form_and_size_are_what_was_put_in():
+    points, normals = ball(AT, RADIUS + 0.2, wave_mm=0.1)
+    read = read_sphere(points, normals, Sphere(AT + 0.5, RADIUS), RADIUS)
+    assert read.size_mm == pytest.approx(0.4, abs=0.005)
+    # Waves of 0.1 mm to either side: all of their range, but for the 3 in 1000 farthest off.
+    assert read.form_mm == pytest.approx(0.2, abs=0.005)
+    # The narrowest shell leaves out one crest or half of each: sin is beyond x in arccos(x)/pi.
+    assert read.shell_mm == pytest.approx(0.1 * (1.0 + np.cos(0.1 * np.pi)), abs=0.004)
+    assert np.linalg.norm(read.fitted.centre - AT) < 0.01
+
+
+def test_three_in_a_thousand_may_be_left_out_but_no_more():
+    points, normals = ball(AT, RADIUS)
+    few, many = points.copy(), points.copy()
+    few[:50] += 3.0 * normals[:50]
+    many[:100] += 3.0 * normals[:100]
+    near = Sphere(AT, RADIUS)
+    assert read_sphere(few, normals, near, RADIUS).form_mm < 0.02
+    assert read_sphere(many, normals, near, RADIUS).form_mm == pytest.approx(3.0, abs=0.05)
+
+
+def test_a_stand_is_no_part_of_its_sphere():
+    points, normals = ball(AT, RADIUS)
+    angle = np.linspace(0.0, 2.0 * np.pi, 4000)
+    down = np.linspace(RADIUS - 3.0, RADIUS + 40.0, 4000)
+    stand = AT + np.stack([12 * np.cos(angle * 50), 12 * np.sin(angle * 50), -down], axis=1)
+    outward = np.stack([np.cos(angle * 50), np.sin(angle * 50), 0.0 * angle], axis=1)
+    read = read_sphere(
+        np.concatenate([points, stand]),
+        np.concatenate([normals, outward]),
+        Sphere(AT, RADIUS),
+        RADIUS,
+    )
+    assert read.points == len(points)
+    assert read.form_mm < 0.01
+
+
+def test_spheres_are_told_apart_whatever_their_order():
+    turn = np.array([[0.0, -1, 0], [0.6, 0, -0.8], [0.8, 0, 0.6]])
+    places = (1.001 * CENTRES) @ turn.T + AT
+    parts = [ball(places[k], RADIUS, seed=k) for k in (2, 0, 1)]
+    points = np.concatenate([part[0] for part in parts])
+    normals = np.concatenate([part[1] for part in parts])
+    found = locate_spheres(points, normals, RADIUS, CENTRES)
+    assert np.stack([one.centre for one in found]) == pytest.approx(places, abs=0.05)
+    read = [read_sphere(points, normals, one, RADIUS) for one in found]
+    errors = spacing_errors(read, CENTRES)
+    # A scale of 1.001 makes every distance longer by a thousandth.
+    pairs = ((0, 1), (0, 2), (1, 2))
+    expected = [0.001 * np.linalg.norm(CENTRES[a] - CENTRES[b]) for a, b in pairs]
+    assert errors == pytest.approx(expected, abs=0.02)
+
+
+def test_a_missing_sphere_is_said():
+    points, normals = ball(AT, RADIUS)
+    with pytest.raises(FailedWork, match="1 spheres of radius 60 mm found, 3 were expected"):
+        locate_spheres(points, normals, RADIUS, CENTRES)
+
+
+def plate(wave_mm: float = 0.0):
+    """400 x 300 mm, tilted, with a rim that curls up by 3 mm, and clutter beside it."""
+    rng = np.random.default_rng(3)
+    u, v = rng.uniform(-200.0, 200.0, 40_000), rng.uniform(-150.0, 150.0, 40_000)
+    off = wave_mm * np.cos(u / 15.0)  # even: no plane tilts to meet it
+    at_rim = np.minimum(200.0 - np.abs(u), 150.0 - np.abs(v)) < RIM_MM - 4.0
+    off[at_rim] += 3.0
+    along, up = np.array([0.8, 0.6, 0.0]), np.array([0.0, 0.28, 0.96])
+    up = up - (up @ along) * along
+    up /= np.linalg.norm(up)
+    surface = u[:, None] * along + v[:, None] * up + off[:, None] * np.cross(along, up)
+    clutter, outward = ball([300.0, 0.0, 900.0], 80.0, 8000)
+    normals = np.broadcast_to(np.cross(along, up), surface.shape)
+    return np.concatenate([surface + AT, clutter]), np.concatenate([normals, outward])
+
+
+def test_flatness_is_what_was_put_in_and_the_rim_is_left_out():
+    read = read_plate(*plate(wave_mm=0.15))
+    assert read.flatness_mm == pytest.approx(0.3, abs=0.02)
+    assert read.rms_mm == pytest.approx(0.15 / np.sqrt(2.0), abs=0.01)
+    assert read.area_mm2 == pytest.approx(400.0 * 300.0, rel=0.02)
+
+
+def test_no_plate_is_said():
+    with pytest.raises(FailedWork, match="too few"):
+        read_plate(*(part[:100] for part in plate()))
+    with pytest.raises(FailedWork, match="no plate"):
+        read_plate(*ball(AT, 30.0, 200_000))
+
+
+def test_artefacts_stand_inside_the_volume_as_they_are_described():
+    volume = Volume()
+    for _, at in spheres_at(volume, CENTRES[:2]):
+        placed = at.apply(CENTRES[:2])
+        assert np.linalg.norm(placed[1] - placed[0]) == pytest.approx(400.0)
+        assert np.hypot(*placed[:, :2].T).max() + RADIUS < volume.radius_mm
+        assert volume.bottom_mm < placed[:, 2].min() - RADIUS
+        assert placed[:, 2].max() + RADIUS < volume.top_mm
+    faces = [at.rotate(np.array([[1.0, 0, 0]]))[0] for _, at in plates_at(volume)]
+    assert faces[0] == pytest.approx([1.0, 0.0, 0.0])
+
+
+def sphere_row(**more) -> SphereRow:
+    row = SphereRow("a", "s01", ALL, 1, 5000, 0.3, 0.2, 0.1)
+    return replace(row, **more)
+
+
+def test_the_worst_of_all_places_is_judged():
+    readings = Readings(
+        (sphere_row(), sphere_row(place="b", size_mm=-0.4), sphere_row(view="p1", form_mm=2.0)),
+        (
+            SpacingRow("a", "s01", "1-2", 0.1),
+            SpacingRow("a", "s02", "1-2", 0.25),
+            SpacingRow("b", "s01", "1-2", -0.2),
+        ),
+        (PlateRow("a", "s01", "p1", 900, 0.9, 0.1, 80.0),),
+    )
+    file = load_acceptance(
+        None, {"probing_size_mm": 0.4, "sphere_spacing_mm": 0.2, "flatness_mm": 1.0}
+    )
+    found = {one.name: one for one in figures(readings, file)}
+    assert (found["probing_size_mm"].value_mm, found["probing_size_mm"].where) == (-0.4, "b, s01")
+    assert not found["probing_size_mm"].exceeded
+    assert found["sphere_spacing_mm"].value_mm == 0.25
+    assert found["sphere_spacing_mm"].exceeded
+    assert found["repeatability_mm"].value_mm == pytest.approx(0.15)
+    assert found["probing_form_mm"].value_mm == 0.3  # by all pairs, not by one
+    assert found["single_probing_form_mm"].value_mm == 2.0
+    # Nothing measured the plate by all pairs: a limit on it is not kept.
+    assert found["flatness_mm"].value_mm is None
+    assert found["flatness_mm"].exceeded
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("spheres: {radius_mm: -1}", "spheres.radius_mm"),
+        ("limits: {flatness: 1}", "limits.flatness"),
+        ("spheres: {centres_mm: [[0, 0, 0], [50, 0, 0]]}", "lies inside sphere 1"),
+    ],
+)
+def test_a_wrong_file_is_explained(tmp_path, text: str, said: str):
+    path = tmp_path / "acceptance.yaml"
+    path.write_text(text)
+    with pytest.raises(AcceptanceError, match=said):
+        load_acceptance(path)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["--spheres", "a"],
+        ["--spheres", "a", "--simulate", "b"],
+        ["--simulate", "nowhere"],
+        ["--spheres", "a", "--calibration", "c", "--limit", "flatness_mm=flat"],
+    ],
+)
+def test_what_cannot_be_measured_is_bad_input(tmp_path, monkeypatch, arguments):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["accept", *arguments])
+    assert result.exception is not None
+    assert getattr(result.exception, "exit_code", None) == 2

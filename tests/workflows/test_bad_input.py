@@ -1,0 +1,165 @@
+"""What goes wrong costs that image or that pair, is named, and never the whole run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from small_workspace import run
+
+from bodyscan.captures.folder import open_captures
+from bodyscan.errors import ResultError
+from bodyscan.fusion.storage import load_scan
+from bodyscan.registration.storage import load_calibration
+from bodyscan.rig.rig_file import load_rig
+from bodyscan.workflows.calibrate_rig import calibrate_cameras, find_all_boards
+
+
+@pytest.fixture
+def copy(workspace, tmp_path):
+    """A copy of the captures and the rig file, to be damaged."""
+    folder = tmp_path / "copy"
+    folder.mkdir()
+    shutil.copy(workspace.folder / "rig.yaml", folder)
+    shutil.copytree(workspace.folder / "captures", folder / "captures")
+    return folder
+
+
+def image(folder, shot, pair, frame):
+    return folder / "captures" / "calibration" / shot / pair / f"{frame}.png"
+
+
+def test_bad_images_cost_only_themselves(copy):
+    shots = sorted(p.name for p in (copy / "captures" / "calibration").glob("b*"))
+    with_pair = [s for s in shots if image(copy, s, "p1-2", "bit00").exists()]
+    missing = image(copy, with_pair[0], "p1-2", "bit03")
+    missing.unlink()
+    unreadable = image(copy, with_pair[1], "p1-2", "bit01")
+    unreadable.write_bytes(unreadable.read_bytes()[:2000])
+    resized = image(copy, with_pair[2], "p1-2", "lit")
+    cv2.imwrite(str(resized), np.full((100, 100), 128, np.uint8))
+    black = image(copy, with_pair[3], "p1-2", "lit")
+    cv2.imwrite(str(black), np.zeros((512, 640), np.uint8))
+    result = run("calibrate-rig", copy / "rig.yaml")
+    assert result.exit_code == 0, result.output
+    said = " ".join(result.output.split())
+    for path in (missing, unreadable, resized, black):
+        assert path.name in said
+        assert path.parent.parent.name in said
+    assert "100 x 100" in said
+    assert "shows nothing" in said
+    assert sorted(load_calibration(copy / "calibration").pairs) == ["p1-2", "p1-3", "p2-2", "p2-3"]
+
+
+def test_a_pair_with_too_few_poses_is_named_and_left_out(workspace):
+    rig = load_rig(workspace.folder / "rig.yaml")
+    captures = open_captures(rig, workspace.folder / "rig.yaml")
+    boards = {board.name: board for board in rig.boards}
+    views = find_all_boards(rig, captures, [])
+    few = [v for v in views if v.pair != "p2-3"] + [v for v in views if v.pair == "p2-3"][:2]
+    done, failed = calibrate_cameras(rig, few, boards)
+    assert sorted(done) == ["p1-2", "p1-3", "p2-2"]
+    assert "at least 3" in failed["p2-3"]
+
+
+def test_an_image_without_a_board_is_named(copy):
+    shots = sorted(p.name for p in (copy / "captures" / "calibration").glob("b*"))
+    path = next(
+        image(copy, s, "p1-3", "lit") for s in shots if image(copy, s, "p1-3", "lit").exists()
+    )
+    cv2.imwrite(str(path), np.full((512, 640), 90, np.uint8))
+    rig = load_rig(copy / "rig.yaml")
+    notes: list[str] = []
+    find_all_boards(rig, open_captures(rig, copy / "rig.yaml"), notes)
+    assert any(str(path) in note and "no board found" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("square_mm: 70", "square_mm: 0", "square_mm"),
+        ("name: small", "name: small\ncolour: red", "colour"),
+    ],
+)
+def test_a_wrong_rig_file_is_bad_input(copy, old, new, said):
+    path = copy / "rig.yaml"
+    text = path.read_text()
+    changed = text.replace(old, new).replace(old.replace("70", "70.0"), new)
+    assert changed != text
+    path.write_text(changed)
+    result = run("check", path)
+    assert result.exit_code != 0
+    assert said in str(result.exception) + result.output
+
+
+def test_a_scan_of_another_image_size_is_refused(workspace, copy):
+    for path in (copy / "captures" / "person").rglob("*.png"):
+        path.write_bytes(path.read_bytes())
+        small = cv2.resize(cv2.imread(str(path), 0), (320, 256))
+        cv2.imwrite(str(path), small)
+    result = run(
+        "scan", copy / "captures" / "person", "--calibration", workspace.folder / "calibration"
+    )
+    assert result.exit_code != 0
+    assert "320 x 256" in str(result.exception)
+
+
+def test_a_scan_with_one_pair_missing_goes_on_and_says_so(workspace, copy):
+    shutil.rmtree(copy / "captures" / "person" / "s01" / "p2-3")
+    result = run(
+        "scan",
+        copy / "captures" / "person",
+        "--calibration",
+        workspace.folder / "calibration",
+        "--out",
+        copy / "scan",
+        "--points",
+        50_000,
+    )
+    assert result.exit_code == 0, result.output
+    assert "left out: p2-3" in result.output
+    verdict = json.loads((copy / "scan" / "scan.json").read_text())["verdict"]
+    assert verdict["grade"] == "usable"
+    assert any("p2-3" in reason for reason in verdict["reasons"])
+
+
+def test_a_scan_of_nobody_ends_in_a_verdict(workspace, copy):
+    """All images black but for the lit ones' noise: no pair can be read, and the JSON says so."""
+    for path in (copy / "captures" / "person").rglob("*.png"):
+        cv2.imwrite(str(path), np.full((512, 640), 12, np.uint8))
+    arguments = (copy / "captures" / "person", "--calibration", workspace.folder / "calibration")
+    result = run("scan", *arguments, "--out", copy / "scan")
+    assert result.exit_code == 1
+    verdict = json.loads((copy / "scan" / "scan.json").read_text())["verdict"]
+    assert verdict["grade"] == "repeat"
+    assert any("p1-2" in reason for reason in verdict["reasons"])
+    with pytest.raises(ResultError, match="gave no model"):
+        load_scan(copy / "scan")
+
+
+def test_a_scan_with_one_frame_missing_names_it(workspace, copy):
+    (copy / "captures" / "person" / "s01" / "p1-3" / "bit04-inverse.png").unlink()
+    arguments = (copy / "captures" / "person", "--calibration", workspace.folder / "calibration")
+    result = run("scan", *arguments, "--out", copy / "scan", "--points", 50_000)
+    assert result.exit_code == 0, result.output
+    assert "verdict: usable" in result.output
+    said = " ".join(result.output.split())
+    assert "left out: p1-3" in said
+    assert "bit04-inverse.png" in said
+
+
+def test_a_damaged_calibration_is_refused(workspace, tmp_path):
+    shutil.copytree(workspace.folder / "calibration", tmp_path / "calibration")
+    arrays = tmp_path / "calibration" / "calibration.npz"
+    arrays.write_bytes(arrays.read_bytes()[:-100])
+    result = run(
+        "scan",
+        workspace.folder / "captures" / "person",
+        "--calibration",
+        tmp_path / "calibration",
+    )
+    assert result.exit_code != 0
+    assert "does not belong" in str(result.exception)

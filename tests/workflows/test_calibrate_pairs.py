@@ -1,0 +1,33 @@
+"""What a pair's calibration does with shots whose stripes disagree."""
+
+import numpy as np
+import pytest
+
+from bodyscan.calibration.located_view import LocatedView
+from bodyscan.calibration.stripe_agreement import Disagreement
+from bodyscan.errors import PairFailed
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.workflows.calibrate_pairs import agreeing
+
+NOTHING = np.zeros((0, 3))
+VIEWS = [
+    LocatedView("p1-1", shot, "board", NOTHING, NOTHING, RigidTransform.identity(), ())
+    for shot in ("a", "b", "c", "d", "e")
+]
+
+
+def test_one_shot_that_fits_no_other_is_left_out_and_named():
+    notes: list[str] = []
+    found = Disagreement(np.array([0, 1, 3, 4]), np.array([2]), 2.5, 0.1)
+    kept = agreeing("p1-1", VIEWS, found, notes)
+    assert [view.shot for view in kept] == ["a", "b", "d", "e"]
+    (note,) = notes
+    assert note.startswith("p1-1: the stripes of shot c ")
+    assert "2.5 px" in note
+
+
+def test_a_projector_that_moved_costs_the_pair_and_the_shots_are_named():
+    found = Disagreement(np.array([0, 1, 2]), np.array([3, 4]), 2.5, 0.1)
+    with pytest.raises(PairFailed, match="moved between shots c and d") as error:
+        agreeing("p1-1", VIEWS, found, [])
+    assert error.value.where == "pair p1-1"

@@ -1,0 +1,118 @@
+"""Reports of a real calibration and scan, and an acceptance test, on the small simulated rig."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_workspace import run
+
+from bodyscan.evaluation.acceptance_file import load_acceptance
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.storage import load_calibration, save_calibration
+from bodyscan.simulation.acceptance_places import spheres_at
+from bodyscan.simulation.artefact import capture_artefact, open_workspace, sphere_surfaces
+
+
+def report(workspace, *arguments: object) -> str:
+    result = run("report", *arguments)
+    assert result.exit_code == 0, f"{result.output}\n{result.exception!r}"
+    return Path(str(arguments[2])).read_text("utf-8")
+
+
+def test_corners_are_kept_with_their_residuals(workspace):
+    calibration = load_calibration(workspace.folder / "calibration")
+    assert set(calibration.seen) == set(calibration.pairs)
+    for name, seen in calibration.seen.items():
+        quality, camera = calibration.pairs[name].quality, calibration.pairs[name].camera
+        assert len(np.unique(seen.target)) == quality.poses
+        assert seen.target.max() < len(calibration.rig_from_board)
+        assert np.all((seen.pixels > -0.5) & (seen.pixels < [camera.width, camera.height]))
+        # The robust RMS of the quality leaves outliers out; the median of a Rayleigh distribution
+        # is 1.18 sigma, its RMS 1.41.
+        median = float(np.median(np.linalg.norm(seen.residuals_px, axis=1)))
+        assert 0.4 < median / quality.corners_rms_px < 1.2
+
+
+def test_the_calibration_has_a_report(workspace, tmp_path: Path):
+    text = report(workspace, workspace.folder / "calibration", "--out", tmp_path / "c.html")
+    assert len(text) < 8_000_000
+    for part in ("synthetic", "Verdict:", "Coverage of each camera", "View graph", "Residuals",
+                 "Baseline, projection angle", "held-out boards", "Sigma over the scan volume",
+                 "times too large"):  # fmt: skip
+        assert part in text
+    for name in ("p1-2", "p1-3", "p2-2", "p2-3"):
+        assert f"<th>{name}</th>" in text
+
+
+def test_the_scan_has_a_report_held_against_the_truth(workspace, tmp_path: Path):
+    truth = workspace.folder / "truth" / "subject.ply"
+    text = report(
+        workspace, workspace.folder / "scan", "--out", tmp_path / "s.html", "--compare", truth
+    )
+    assert len(text) < 8_000_000
+    for part in ("synthetic", "Deviation map", "Residuals of the overlaps", "Sway", "Holes"):
+        assert part in text
+
+
+def test_a_calibration_is_not_compared(workspace):
+    result = run("report", workspace.folder / "calibration", "--compare", workspace.folder / "scan")
+    assert getattr(result.exception, "exit_code", None) == 2
+
+
+@pytest.fixture(scope="module")
+def spheres(workspace) -> Path:
+    """A scan of two spheres in the middle of the volume."""
+    world, file = open_workspace(workspace.folder), load_acceptance(None)
+    centres = np.array(file.spheres.centres_mm)
+    _, place = spheres_at(world.rig.volume, centres)[0]
+    balls = sphere_surfaces(centres, file.spheres.radius_mm)
+    return capture_artefact(world, balls, place, workspace.folder / "captures" / "spheres")
+
+
+def accept(folder: Path, calibration: Path, out: Path, *more: object):
+    result = run("accept", "--spheres", folder, "--calibration", calibration, "--out", out, *more)
+    return result, json.loads((out / "acceptance.json").read_text("utf-8"))
+
+
+def test_spheres_are_accepted_from_captures(workspace, spheres: Path, tmp_path: Path):
+    # Half the pixels, two of three poles and ten boards: cameras stand within 0.6 mm (see
+    # test_whole_way), so 500 mm between centres are known to about that.
+    limits = ("--limit", "sphere_spacing_mm=0.6", "--limit", "probing_size_mm=0.6")
+    result, found = accept(spheres, workspace.folder / "calibration", tmp_path, *limits)
+    assert result.exit_code == 0, result.output
+    assert found["synthetic"]
+    assert "synthetic" in result.output
+    assert found["figures"]["flatness_mm"]["value"] is None
+    text = (tmp_path / "acceptance.html").read_text("utf-8")
+    assert "Verdict: accepted" in text
+    assert "is no test by these standards" in text
+
+
+def test_a_calibration_of_the_wrong_size_is_not_accepted(workspace, spheres: Path, tmp_path: Path):
+    right = load_calibration(workspace.folder / "calibration")
+    shifted = {
+        name: RigidTransform(t.rotation, 1.003 * t.translation) if name.startswith("p2") else t
+        for name, t in right.rig_from_camera.items()
+    }
+    right.rig_from_camera.update(shifted)
+    save_calibration(right, tmp_path / "wrong")
+    limits = ("--limit", "probing_form_mm=1.5")
+    result, found = accept(spheres, tmp_path / "wrong", tmp_path / "out", *limits)
+    assert result.exit_code == 1
+    assert found["figures"]["probing_form_mm"]["exceeded"]
+
+
+def test_artefacts_are_simulated_measured_and_judged(workspace, tmp_path: Path):
+    limit = ("--limit", "flatness_mm=0.001")
+    result = run("accept", "--simulate", workspace.folder, "--places", 1, "--repeats", 2,
+                 "--out", tmp_path, *limit)  # fmt: skip
+    assert result.exit_code == 1, result.output
+    found = json.loads((tmp_path / "acceptance.json").read_text("utf-8"))
+    assert found["problems"] == []
+    assert found["figures"]["flatness_mm"]["exceeded"]
+    assert 0.0 < found["figures"]["repeatability_mm"]["value"] < 0.1  # noise alone: 20,000 points
+    assert abs(found["figures"]["sphere_spacing_mm"]["value"]) < 0.6
+    assert "Verdict: not accepted" in (tmp_path / "acceptance.html").read_text("utf-8")
