@@ -15,7 +15,6 @@ from itertools import permutations
 from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bodyscan.alignment.matching import (
     Matches,
@@ -25,11 +24,11 @@ from bodyscan.alignment.matching import (
     patch,
 )
 from bodyscan.alignment.pull import Pull
+from bodyscan.arrays import Array
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.reconstruction.range_image import RangeImage
 
-Array = NDArray[np.float64]
 Result = TypeVar("Result")
 
 BODY_CENTRE_MM = np.array([0.0, 0.0, 900.0])

@@ -11,15 +11,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Vector = tuple[float, float, float]
 
 FACING = 0.7  # least cosine between the normals of what may be one spot

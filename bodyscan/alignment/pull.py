@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bodyscan.alignment.matching import Matches
+from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

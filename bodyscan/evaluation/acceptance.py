@@ -10,15 +10,13 @@ from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
+from bodyscan.arrays import Array, Mask
 from bodyscan.errors import FailedWork
 from bodyscan.evaluation.planes import best_plane
 from bodyscan.evaluation.spheres import Sphere, find_spheres, fit_sphere
-
-Array = NDArray[np.float64]
 
 REJECTED = 0.003
 """So many of the points may be left out, the farthest off, as VDI/VDE 2634 allows."""
@@ -166,7 +164,7 @@ def _in_plane(normal: Array) -> Array:
     return np.stack([right, np.cross(normal, right)], axis=1)
 
 
-def _largest_piece(flat: Array) -> NDArray[np.bool_]:
+def _largest_piece(flat: Array) -> Mask:
     """(N,) which of flat points (N, 2) belong to the piece with most of them; cells of it touch."""
     cells = np.floor((flat - flat.min(axis=0)) / CELL_MM).astype(np.int64)
     taken = np.zeros(cells.max(axis=0) + 1, bool)
@@ -175,7 +173,7 @@ def _largest_piece(flat: Array) -> NDArray[np.bool_]:
     return np.asarray(piece == np.argmax(np.bincount(piece)))
 
 
-def _within_rim(flat: Array) -> tuple[NDArray[np.bool_], float]:
+def _within_rim(flat: Array) -> tuple[Mask, float]:
     """(N,) which of flat points (N, 2) lie farther than the rim's width inside their hull, and the
     hull's area."""
     hull = ConvexHull(flat)

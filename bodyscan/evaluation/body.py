@@ -8,16 +8,13 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.evaluation.surface import covered, sample_surface
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
 from bodyscan.measurement.measuring import Slice, measure
 from bodyscan.mesh.body import BodyMesh
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 STEP_MM = 20.0
 TORSO = (0.46, 0.86)  # of the stature: crotch to shoulders
@@ -133,7 +130,7 @@ def coverage_of_seen(
     return float(seen.mean()), float(covered(points, spots[seen], normals[seen]).mean())
 
 
-def _open(scene: Any, spots: Array, normals: Array, eye: Array) -> NDArray[np.bool_]:
+def _open(scene: Any, spots: Array, normals: Array, eye: Array) -> Mask:
     """(N,) which spots face the eye, with nothing between."""
     way = eye - spots
     distance = np.linalg.norm(way, axis=1)

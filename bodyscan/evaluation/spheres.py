@@ -11,14 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.errors import FailedWork
 from bodyscan.evaluation.planes import best_plane
 from bodyscan.geometry.least_squares import spread
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 FEWEST_POINTS = 50
 ROUNDS = 30
@@ -125,7 +122,7 @@ def find_spheres(points: Array, normals: Array, radius: float, count: int) -> li
     return _in_reading_order(found)
 
 
-def nearest_sphere(points: Array, spheres: Sequence[Sphere]) -> NDArray[np.int64]:
+def nearest_sphere(points: Array, spheres: Sequence[Sphere]) -> Indices:
     """(N,) number of the sphere whose surface each point (N, 3) belongs to, -1 for none."""
     off = np.stack([np.abs(sphere.distances(points)) for sphere in spheres], axis=-1)
     nearest = np.argmin(np.nan_to_num(off, nan=np.inf), axis=-1)

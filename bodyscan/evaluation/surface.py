@@ -10,10 +10,8 @@ import open3d as o3d
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.mesh.topology import directed_edges
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 ON_EDGE = 1e-5  # of a barycentric coordinate, in float32
 
@@ -130,7 +128,7 @@ def coverage(
 
 def covered(
     points: Array, spots: Array, normals: Array, within_mm: float = 1.0, spacing_mm: float = 2.0
-) -> NDArray[np.bool_]:
+) -> Mask:
     """(N,) which spots (N, 3) of a surface with normals (N, 3) points (M, 3) cover: see `coverage`."""
     distance, index = cKDTree(points).query(spots, k=4, distance_upper_bound=spacing_mm + within_mm)
     found = np.isfinite(distance)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.compiled import compiled
 from bodyscan.fusion.comparing import Evidence, Samples
-from bodyscan.fusion.grid import Doubles, Floats
 from bodyscan.fusion.quadratics import NORMAL_MEDIAN
 from bodyscan.fusion.smoothing import Surface
 from bodyscan.mesh.body import BodyCloud
@@ -71,8 +71,8 @@ def disagreement(
 
 @compiled
 def _begun(
-    normals: Floats, sigma_mm: Floats, weights: Floats, colours: NDArray[np.uint8], gain: Floats
-) -> tuple[Doubles, NDArray[np.uint8]]:
+    normals: Floats, sigma_mm: Floats, weights: Floats, colours: Bytes, gain: Floats
+) -> tuple[Array, Bytes]:
     """Sums (N, 9) over the samples' own surfaces alone, and by how many each was seen."""
     sums = np.zeros((len(weights), SUMS))
     for n in range(len(weights)):
@@ -86,13 +86,13 @@ def _begun(
 
 @compiled
 def _add(
-    surface: tuple[Floats, Floats, Floats, NDArray[np.uint8]],
+    surface: tuple[Floats, Floats, Floats, Bytes],
     gain: float,
     index: NDArray[np.int32],
     at: NDArray[np.int32],
     shifts: Floats,
-    sums: Doubles,
-    seen: NDArray[np.uint8],
+    sums: Array,
+    seen: Bytes,
 ) -> None:
     """Points `at` of a surface (normals, sigma, weight, grey levels) to the sums at `index`."""
     normals, sigma_mm, weights, colours = surface
@@ -111,8 +111,8 @@ def _add(
 
 @compiled
 def _means(
-    points: Floats, normals: Floats, sums: Doubles, seen: NDArray[np.uint8], general: float
-) -> tuple[Doubles, Floats, Floats, NDArray[np.uint8], NDArray[np.uint8]]:
+    points: Floats, normals: Floats, sums: Array, seen: Bytes, general: float
+) -> tuple[Array, Floats, Floats, Bytes, Bytes]:
     """The cloud's points, normals, sigmas, colours and how many saw them, of what is not outvoted.
 
     Pairs that disagree by more than their sigmas say (`general`, in variances) make everything that

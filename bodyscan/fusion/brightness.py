@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bodyscan.fusion.grid import Floats
+from bodyscan.arrays import Bytes, Floats
 
 DARKEST = 8.0  # grey levels that say nothing of the exposure
 FEWEST = 200
@@ -31,9 +30,7 @@ def gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Floats:
     return np.exp(logarithms - logarithms.mean()).astype(np.float32)
 
 
-def log_ratio(
-    ours: NDArray[np.uint8] | Floats, theirs: NDArray[np.uint8] | Floats
-) -> tuple[float, int]:
+def log_ratio(ours: Bytes | Floats, theirs: Bytes | Floats) -> tuple[float, int]:
     """Median log of `theirs` over `ours` (N,) grey levels, and of how many; 0 of too few."""
     bright = (ours > DARKEST) & (theirs > DARKEST)
     spots = int(np.count_nonzero(bright))

@@ -13,18 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.fusion.free_space import Guess, seen_through
-from bodyscan.fusion.grid import Floats
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 VOXEL_MM = 5.0
 SMOOTHING_VOXELS = 1.0

@@ -11,19 +11,15 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.dark_gaps import dark_gaps
-from bodyscan.fusion.grid import Floats
 from bodyscan.geometry.crop import crop_of
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.rig import Volume
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 STEEPEST = 5.0  # depth per sideways step on a surface still worth having: tan 79 degrees
 DISTANCES_PX = np.hypot(*np.mgrid[-2:3, -2:3])  # of a pixel's neighbours

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.compiled import compiled
-from bodyscan.fusion.grid import Doubles, Floats, lens_of
+from bodyscan.fusion.grid import lens_of
 from bodyscan.fusion.smoothing import Surface
 
 Numbers = NDArray[np.int32]
@@ -31,7 +32,7 @@ class Samples:
     normals: Floats
     sigma_mm: Floats
     weight: Floats
-    colours: NDArray[np.uint8]
+    colours: Bytes
     starts: NDArray[np.intp]
 
 
@@ -89,8 +90,8 @@ def _compare(
     own: tuple[int, int],
     surface: tuple[Floats, Floats, Numbers],
     corner: tuple[int, int],
-    lens: Doubles,
-    camera_from_rig: tuple[Doubles, Doubles],
+    lens: Array,
+    camera_from_rig: tuple[Array, Array],
     limits_mm: tuple[float, float],
     evidence: tuple[Numbers, Numbers, Floats, Numbers, Numbers],
 ) -> tuple[int, int]:
@@ -134,7 +135,7 @@ def _compare(
 
 
 @compiled
-def _faces(point: Floats, normal: Floats, centre: Doubles) -> bool:
+def _faces(point: Floats, normal: Floats, centre: Array) -> bool:
     """Whether a point looks towards a camera's centre: n.(centre - point) > EDGE_ON * distance."""
     towards = distance2 = 0.0
     for k in range(3):
@@ -145,9 +146,7 @@ def _faces(point: Floats, normal: Floats, centre: Doubles) -> bool:
 
 
 @compiled
-def _pixel_of(
-    point: Floats, camera_from_rig: tuple[Doubles, Doubles], lens: Doubles
-) -> tuple[int, int]:
+def _pixel_of(point: Floats, camera_from_rig: tuple[Array, Array], lens: Array) -> tuple[int, int]:
     """(column, row) of the pixel that shows a point (Eq. 1, 3-5), (-1, -1) if it is behind."""
     r, t = camera_from_rig
     x = r[0, 0] * point[0] + r[0, 1] * point[1] + r[0, 2] * point[2] + t[0]

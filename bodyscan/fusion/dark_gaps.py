@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from bodyscan.arrays import Bytes, Mask
 
 WIDEST_PX = 7  # of the gap and half of its slopes: several times the blur
 DARKER = 2.0  # times, than the surfaces around
@@ -17,7 +18,7 @@ MARGIN_PX = 1  # beside what is so dark, where the two mix
 LEAST_STEP = 30  # grey levels; less may be noise on something dark
 
 
-def dark_gaps(grey: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def dark_gaps(grey: Bytes) -> Mask:
     """(height, width) pixels of an image (height, width) that lie in a narrow dark gap or at its rim.
 
     A morphological closing fills what is narrower than its window and has brighter surfaces on both

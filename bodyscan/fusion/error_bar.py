@@ -8,14 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
-
-Array = NDArray[np.float64]
 
 FACING = 0.2
 """Cosine below which a pair sees a surface too flat to have measured it."""
@@ -50,7 +48,7 @@ def with_placing(
 @compiled
 def _placing(
     points: Array,
-    normals: NDArray[np.float32],
+    normals: Floats,
     centres: Array,
     covariances: Array,
     placing_mm: Array,

@@ -9,13 +9,11 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from bodyscan.fusion.grid import Floats, carried, rotated
+from bodyscan.arrays import Array, Floats, Indices, Mask
+from bodyscan.fusion.grid import carried, rotated
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
-
-Mask = NDArray[np.bool_]
-Indices = NDArray[np.int64]
 
 RAY_SPACING_MM = 3.0  # on a subject in the middle of the rig
 WIDEST_GAP_MM = 200.0
@@ -29,7 +27,7 @@ class Guess:
     filled: Mask
 
     @staticmethod
-    def of(vertices: NDArray[np.float64], faces: Indices, filled: Mask) -> Guess:
+    def of(vertices: Array, faces: Indices, filled: Mask) -> Guess:
         scene = o3d.t.geometry.RaycastingScene()
         scene.add_triangles(
             o3d.core.Tensor(vertices.astype(np.float32)),

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Floats
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
-
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
 
 
 def carried(points: Floats, a_from_b: RigidTransform) -> Floats:
@@ -24,7 +21,7 @@ def rotated(directions: Floats, a_from_b: RigidTransform) -> Floats:
     return cv2.transform(directions.reshape(1, -1, 3), a_from_b.rotation).reshape(directions.shape)
 
 
-def lens_of(camera: Camera) -> Doubles:
+def lens_of(camera: Camera) -> Array:
     """(7,) for compiled functions: alpha, beta, gamma, u0, v0 (Eq. 1), k1, k2 (Eq. 3-5)."""
     sizes = (camera.alpha, camera.beta, camera.gamma, camera.u0, camera.v0)
     return np.array([*sizes, camera.k1, camera.k2])

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Floats
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.averaging import averaged
 from bodyscan.fusion.brightness import gains, log_ratio
 from bodyscan.fusion.comparing import Evidence, Samples, compare
-from bodyscan.fusion.grid import Floats
 from bodyscan.fusion.smoothing import Surface, smooth
 from bodyscan.fusion.thinning import one_per_voxel, voxel_size_for
 from bodyscan.geometry.transforms import RigidTransform

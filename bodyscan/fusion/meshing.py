@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.carving import hints
 from bodyscan.fusion.support import settled, support
@@ -20,9 +20,6 @@ from bodyscan.mesh.topology import (
     vertex_normals,
 )
 from bodyscan.reconstruction.range_image import RangeImage
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 FEWEST_POINTS = 1000
 ROUGH_POINTS = 100_000
@@ -103,7 +100,7 @@ def dressed(
     )
 
 
-def _made_up(vertices: Array, faces: Indices, tree: cKDTree, reach_mm: float) -> NDArray[np.bool_]:
+def _made_up(vertices: Array, faces: Indices, tree: cKDTree, reach_mm: float) -> Mask:
     """(F,) faces with a corner that no point lies near."""
     distance = np.asarray(tree.query(vertices, distance_upper_bound=reach_mm, workers=2)[0])
     return np.any(np.isinf(distance)[faces], axis=1)

@@ -11,13 +11,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Floats, Mask
 from bodyscan.compiled import compiled
-from bodyscan.fusion.grid import Floats
 from bodyscan.fusion.robust_windows import fit_windows
-
-Mask = NDArray[np.bool_]
 
 OUTLIER_SIGMAS = 5.0
 WORST_MISFIT = 4.0  # mean square residual over 5 x 5 pixels, in variances
@@ -85,7 +82,7 @@ def _judge(
     value: Floats,
     fitted: Mask,
     squares: Floats,
-    calm: NDArray[np.uint8],
+    calm: Bytes,
 ) -> None:
     """Squared residuals over variances, 0 where nothing was measured; calm: 0
     at outliers and pixels that have no fit, else 1.
@@ -132,7 +129,7 @@ def convolved_fit(inverse: Floats, noise: Floats, reach: int) -> Fit:
     normal = np.linalg.inv(basis.T @ basis)
     one, slope, square = np.ones_like(offsets), offsets, offsets**2
 
-    def filtered(rows: NDArray[np.float64], columns: NDArray[np.float64]) -> Floats:
+    def filtered(rows: Array, columns: Array) -> Floats:
         return cv2.sepFilter2D(inverse, cv2.CV_32F, columns, rows, borderType=cv2.BORDER_CONSTANT)
 
     constant, along_u2, along_v2 = normal[0, 0], normal[0, 3], normal[0, 5]
@@ -142,7 +139,7 @@ def convolved_fit(inverse: Floats, noise: Floats, reach: int) -> Fit:
     return Fit(value, slope_u, slope_v, noise * np.float32(np.sqrt(constant)))
 
 
-def window_basis(reach: int) -> NDArray[np.float64]:
+def window_basis(reach: int) -> Array:
     """(samples, 6): 1, du, dv, du^2, du dv, dv^2 over a square window, row by row."""
     dv, du = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).astype(float)
     return np.stack([np.ones_like(du), du, dv, du * du, du * dv, dv * dv], axis=-1)

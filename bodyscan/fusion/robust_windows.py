@@ -9,11 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
-
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 LANES = 128  # windows fitted side by side: what fits into a processor's cache
 ROUNDS_SIGMAS = (8.0, 3.0)  # how close samples have to be to the fits before
@@ -121,7 +118,7 @@ def _weigh_first(
 
 
 @compiled
-def _sum(samples: Floats, weights: Floats, reach: int, moments: Doubles) -> None:
+def _sum(samples: Floats, weights: Floats, reach: int, moments: Array) -> None:
     """Moments (21, LANES) of the windows, row by row of the window."""
     rows, product = np.empty((8, LANES), np.float32), np.empty(LANES, np.float32)
     moments[:] = 0.0
@@ -146,7 +143,7 @@ def _sum(samples: Floats, weights: Floats, reach: int, moments: Doubles) -> None
 
 
 @compiled
-def _solve(moments: Doubles, prior: Doubles, solution: Doubles, variance: Doubles) -> None:
+def _solve(moments: Array, prior: Array, solution: Array, variance: Array) -> None:
     """The six coefficients and the variance of the first.  prior: ridge on the last three.
 
     Gauss's elimination from the last unknown to the second; the first one's pivot is then its
@@ -172,7 +169,7 @@ def _solve(moments: Doubles, prior: Doubles, solution: Doubles, variance: Double
 
 
 @compiled
-def _reweigh(samples: Floats, solution: Doubles, reach: int, width: float, weights: Floats) -> None:
+def _reweigh(samples: Floats, solution: Array, reach: int, width: float, weights: Floats) -> None:
     """1 for the samples within `width` of the fits, 0 for the others."""
     a, b, c, d, e, f = [solution[k].astype(np.float32) for k in range(6)]
     n = 0
@@ -201,13 +198,13 @@ def _weigh(
 
 
 @compiled
-def _add(total: Floats | Doubles, factor: float | np.float32, part: Floats) -> None:
+def _add(total: Floats | Array, factor: float | np.float32, part: Floats) -> None:
     for b in range(len(total)):
         total[b] += factor * part[b]
 
 
 @compiled
-def _subtract(total: Doubles, factor: Doubles, part: Doubles) -> None:
+def _subtract(total: Array, factor: Array, part: Array) -> None:
     for b in range(len(total)):
         total[b] -= factor[b] * part[b]
 
@@ -219,6 +216,6 @@ def _multiply(one: Floats, other: Floats, product: Floats) -> None:
 
 
 @compiled
-def _divide(one: Doubles, other: Doubles, quotient: Doubles) -> None:
+def _divide(one: Array, other: Array, quotient: Array) -> None:
     for b in range(len(quotient)):
         quotient[b] = one[b] / other[b]

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Floats, Mask
 from bodyscan.compiled import compiled
-from bodyscan.fusion.grid import Doubles, Floats, lens_of
-from bodyscan.fusion.quadratics import Fit, Mask, fit_quadratics
+from bodyscan.fusion.grid import lens_of
+from bodyscan.fusion.quadratics import Fit, fit_quadratics
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.crop import crop_of, ends_of
 from bodyscan.geometry.transforms import RigidTransform
@@ -50,7 +51,7 @@ class Surface:
     sigma_mm: Floats
     rim: Floats
     weight: Floats
-    colours: NDArray[np.uint8]
+    colours: Bytes
 
 
 def smooth(
@@ -145,8 +146,8 @@ def _lay_out(
     ends: tuple[int, int, int, int],
     fit: tuple[Floats, Floats, Floats, Floats],
     fitted: Mask,
-    lens: Doubles,
-    rig_from_camera: tuple[Doubles, Doubles],
+    lens: Array,
+    rig_from_camera: tuple[Array, Array],
     images: tuple[Floats, Numbers],
     surface: tuple[Floats, Floats, Floats],
 ) -> int:
@@ -185,7 +186,7 @@ def _lay_out(
 
 @compiled
 def _normal(
-    x: float, y: float, inverse: float, slopes: tuple[float, float], lens: Doubles
+    x: float, y: float, inverse: float, slopes: tuple[float, float], lens: Array
 ) -> tuple[float, float, float]:
     """Unit normal towards the camera, camera frame, from the slopes of 1/z per pixel.
 

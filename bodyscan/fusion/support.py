@@ -9,14 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.mesh.body import BodyCloud
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 NEIGHBOURS = 8
 # Shares of the reach: 2, 1 and 0.5 mm of 4.
@@ -39,14 +36,14 @@ class Support:
     """
 
     nearest: Indices
-    sigma_mm: NDArray[np.float32]
+    sigma_mm: Floats
     weight: Array
     shift_mm: Array
     spread_mm: Array
     reach_mm: float
 
     @property
-    def measured(self) -> NDArray[np.bool_]:
+    def measured(self) -> Mask:
         """(V,) whether a vertex lies where the points say, and these agree.
 
         Not beyond the rim of what was seen (too little weight), not where Poisson's smoothness
@@ -59,7 +56,7 @@ class Support:
 
 
 def support(
-    vertices: Array, normals: NDArray[np.float32], cloud: BodyCloud, tree: cKDTree, reach_mm: float
+    vertices: Array, normals: Floats, cloud: BodyCloud, tree: cKDTree, reach_mm: float
 ) -> Support:
     """Of vertices (V, 3) with unit normals (V, 3) by a cloud, whose points the tree holds."""
     found = tree.query(vertices, NEIGHBOURS, distance_upper_bound=reach_mm, workers=2)
@@ -77,9 +74,7 @@ def support(
     return Support(nearest, cloud.sigma_mm[nearest], weight, shift, spread, reach_mm)
 
 
-def settled(
-    vertices: Array, faces: Indices, normals: NDArray[np.float32], around: Support
-) -> Array:
+def settled(vertices: Array, faces: Indices, normals: Floats, around: Support) -> Array:
     """The vertices (V, 3), moved along their normals to where the points around say.
 
     The less the less weight these have: where the points end, the surface has no step. Where a face
@@ -110,11 +105,11 @@ def _normals(vertices: Array, faces: Indices) -> Array:
 @compiled
 def _asked(
     vertices: Array,
-    normals: NDArray[np.float32],
+    normals: Floats,
     distance: Array,
     near: Indices,
     points: Array,
-    point_normals: NDArray[np.float32],
+    point_normals: Floats,
     scale_mm: float,
 ) -> tuple[Array, Array, Array]:
     """Weight, shift and spread as in `Support`, from the nearest points (V, k), as scipy gives them:

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Floats, Mask
 from bodyscan.compiled import compiled
 
-Floats = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Numbers = NDArray[np.uint32]
 
 FIRST_GUESS_MM = 1.2

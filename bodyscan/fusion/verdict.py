@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -17,7 +16,6 @@ from bodyscan.mesh.rings import rings
 from bodyscan.mesh.topology import face_areas
 from bodyscan.rig.rig import Volume
 
-Array = NDArray[np.float64]
 Grade = Literal["good", "usable", "repeat"]
 Finding = tuple[Grade, str]
 GRADES: tuple[Grade, ...] = ("good", "usable", "repeat")

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.files.atomic import write_json, write_text
 from bodyscan.jobs.hashing import file_hash
 from bodyscan.jobs.job import MANIFEST, SUMMARY, Job
@@ -41,7 +41,7 @@ COLUMNS = {
 }
 _FIRST = ("job", "subject", "when", "state", "attempts", "seconds", "stages")
 
-Motions = dict[str, NDArray[np.float64]]
+Motions = dict[str, Array]
 
 
 def write_summary(jobs: Sequence[Job], outcomes: Sequence[Outcome], out: Path) -> Path:
@@ -165,7 +165,7 @@ def _motions(job: Job) -> Motions:
     }
 
 
-def _moved(now: Any, calibrated: Any) -> NDArray[np.float64]:
+def _moved(now: Any, calibrated: Any) -> Array:
     change = np.asarray(now, float) @ np.linalg.inv(np.asarray(calibrated, float))
     return np.asarray(change[:3, :3] @ BODY_CENTRE_MM + change[:3, 3] - BODY_CENTRE_MM)
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
-
-Array = NDArray[np.float64]
 
 UPPER_BODY = 0.45  # of the stature: hips, trunk and arms, which are wider than they are deep
 

@@ -6,16 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Mask
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
 from bodyscan.measurement.slices import Loop, loops_at
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import face_areas, signed_volume
-
-Array = NDArray[np.float64]
 
 STEP_MM = 100.0
 SPECK_MM2 = 50.0  # less than a fingertip
@@ -102,7 +100,7 @@ def heights_from(text: str) -> list[float]:
         ) from error
 
 
-def _share(areas: Array, which: NDArray[np.bool_], among: NDArray[np.bool_]) -> float:
+def _share(areas: Array, which: Mask, among: Mask) -> float:
     return float(areas[which & among].sum() / max(areas[among].sum(), 1e-12))
 
 

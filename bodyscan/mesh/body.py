@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
 from bodyscan.mesh.topology import face_areas
 
 
@@ -19,11 +17,11 @@ class BodyCloud:
     colours: (N, 3) uint8, red, green, blue.  pairs_seen: (N,) uint8, how many pairs measured it.
     """
 
-    points: NDArray[np.float64]
-    normals: NDArray[np.float32]
-    sigma_mm: NDArray[np.float32]
-    colours: NDArray[np.uint8]
-    pairs_seen: NDArray[np.uint8]
+    points: Array
+    normals: Floats
+    sigma_mm: Floats
+    colours: Bytes
+    pairs_seen: Bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +33,12 @@ class BodyMesh:
     filled: (F,) bool, faces that no pair measured and that were made up to close the mesh.
     """
 
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    normals: NDArray[np.float32]
-    colours: NDArray[np.uint8]
-    sigma_mm: NDArray[np.float32]
-    filled: NDArray[np.bool_]
+    vertices: Array
+    faces: Indices
+    normals: Floats
+    colours: Bytes
+    sigma_mm: Floats
+    filled: Mask
 
     @property
     def filled_share(self) -> float:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.mesh.half_edges import twins
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 ROUNDS = 12
 
@@ -75,8 +72,8 @@ def brought_within(
 
 
 def _strays(
-    vertices: Array, faces: Indices, concerned: NDArray[np.bool_], full: Surface, limit_mm: float
-) -> NDArray[np.bool_]:
+    vertices: Array, faces: Indices, concerned: Mask, full: Surface, limit_mm: float
+) -> Mask:
     """(F,) those of some faces whose middle, or an edge's, lies too far from the full mesh."""
     corners = vertices[faces[concerned]]
     middles = [corners.mean(axis=1), *(0.5 * (corners[:, k] + corners[:, k - 1]) for k in range(3))]
@@ -85,9 +82,7 @@ def _strays(
     return stray
 
 
-def _longest_edges(
-    vertices: Array, faces: Indices, stray: NDArray[np.bool_]
-) -> tuple[Indices, Indices]:
+def _longest_edges(vertices: Array, faces: Indices, stray: Mask) -> tuple[Indices, Indices]:
     """Half-edges (N,) and their twins: the longest of stray faces, at most one edge to a face."""
     corners = vertices[faces]
     length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)

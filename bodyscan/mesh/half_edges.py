@@ -6,11 +6,9 @@ Half-edge 3 f + k runs from corner k of face f to the next one.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Indices
 from bodyscan.compiled import compiled
-
-Indices = NDArray[np.int64]
 
 RIM = -1  # nobody lies across
 UNSOUND = -2  # several faces run along the edge the same way, or it has no length

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.errors import ResultError
 from bodyscan.files.atomic import replacing
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -90,9 +91,7 @@ def read_ply_mesh(path: Path) -> BodyMesh:
     return BodyMesh(points, corners, normals, colours, sigma_mm, faces["filled"] != 0)
 
 
-def _vertex_records(
-    element: Element, body: BodyCloud | BodyMesh, positions: NDArray[np.float64]
-) -> Records:
+def _vertex_records(element: Element, body: BodyCloud | BodyMesh, positions: Array) -> Records:
     records = np.empty(len(positions), element.fields)
     for k, (axis, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
         records[axis] = positions[:, k]
@@ -104,7 +103,7 @@ def _vertex_records(
 
 def _vertex_arrays(
     records: Records,
-) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+) -> tuple[Array, Floats, Floats, Bytes]:
     """Positions, normals, sigmas and colours."""
 
     def columns(*names: str) -> NDArray[Any]:

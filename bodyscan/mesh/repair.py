@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.mesh.half_edges import RIM, UNSOUND, corner_fans, twins
 from bodyscan.mesh.topology import face_components, signed_volume, without_unused
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 def closed(vertices: Array, faces: Indices) -> tuple[Array, Indices]:

@@ -11,14 +11,11 @@ from dataclasses import dataclass
 
 import networkx as nx
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.mesh.topology import directed_edges
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 LAYER_MM = 20.0
 

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.mesh.topology import directed_edges
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 def self_intersections(vertices: Array, faces: Indices) -> Indices:

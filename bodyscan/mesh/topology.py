@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from bodyscan.arrays import Array, Floats, Indices
 from bodyscan.mesh.half_edges import corner_fans, twins
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -81,7 +79,7 @@ def face_areas(vertices: Array, faces: Indices) -> Array:
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
-def vertex_normals(vertices: Array, faces: Indices) -> NDArray[np.float32]:
+def vertex_normals(vertices: Array, faces: Indices) -> Floats:
     """(V, 3) unit normals, the mean of the faces around weighted by area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes, Floats, Mask
 from bodyscan.geometry.camera import Camera
 
 
@@ -25,19 +25,19 @@ class RangeImage:
 
     pair: str
     camera: Camera
-    points: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    sigma_mm: NDArray[np.float32]
-    colours: NDArray[np.uint8]
-    beyond: NDArray[np.bool_] | None = None
+    points: Floats
+    normals: Floats
+    sigma_mm: Floats
+    colours: Bytes
+    beyond: Mask | None = None
 
     @property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> Mask:
         """(height, width): where a point was measured."""
         return np.isfinite(self.sigma_mm)
 
     @property
-    def open_depth(self) -> NDArray[np.float32]:
+    def open_depth(self) -> Floats:
         """(height, width): how deep the camera saw, z, mm; inf behind the scan volume, 0 if unknown."""
         depth = np.where(self.valid, self.points[..., 2], np.float32(0.0))
         return depth if self.beyond is None else np.where(self.beyond, np.float32(np.inf), depth)

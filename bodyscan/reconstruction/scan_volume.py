@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.compiled import compiled
 from bodyscan.geometry.camera import Camera
@@ -12,8 +12,6 @@ from bodyscan.geometry.measuring import measure
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Volume
 from bodyscan.stripes.wanted_stripes import WantedStripes
-
-Array = NDArray[np.float64]
 
 BLOCKS_ACROSS = 40
 STEP_STRIPES = 8

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Floats, Mask
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
@@ -12,8 +12,6 @@ from bodyscan.geometry.crop import crop_of, ends_of
 from bodyscan.geometry.measuring import measure_image
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.stripes.stripe_map import StripeMap
-
-Floats = NDArray[np.float32]
 
 NORMAL_WINDOW_PX = 5
 REACH = NORMAL_WINDOW_PX // 2
@@ -41,7 +39,7 @@ def range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
     return RangeImage(pair.name, camera, points, normals, sigma_mm, stripes.lit, stripes.beyond)
 
 
-def grid_normals(points: Floats, measured: NDArray[np.bool_] | None = None) -> Floats:
+def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:
     """Unit normals (H, W, 3) towards the camera, from the points (H, W, 3) of a small window.
 
     measured: (H, W), where there are points, if that is known.

@@ -6,14 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bodyscan.arrays import Bytes, Mask
 from bodyscan.errors import ScanFailed
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.versions import light
 from bodyscan.report.comparison import Comparison
 from bodyscan.report.model import Layer, Shape, css, ramp_legend
 from bodyscan.report.pictures import FILLED_TINT, _blue_white_red, _turbo
-
-Colours = NDArray[np.uint8]
 
 FACES = (50_000, 44_000, 38_000)
 """Tried in turn: reduced to one number of faces a mesh may fold, and not to another."""
@@ -85,7 +84,7 @@ def _deviation(
     small: BodyMesh,
     mesh: BodyMesh,
     comparison: Comparison,
-    made_up: NDArray[np.bool_],
+    made_up: Mask,
     limit_mm: float,
 ) -> Layer:
     """Of the nearest vertex of the full mesh: the light one is a few tenths of a mm off itself."""
@@ -105,11 +104,11 @@ def _deviation(
     )
 
 
-def _ramp(share: NDArray[np.floating], table: Colours) -> Colours:
+def _ramp(share: NDArray[np.floating], table: Bytes) -> Bytes:
     return table[np.clip(np.rint(255 * share), 0, 255).astype(np.int64)]
 
 
-def _without(colours: Colours, unknown: NDArray[np.bool_]) -> Colours:
+def _without(colours: Bytes, unknown: Mask) -> Bytes:
     return np.where(unknown[:, None], UNKNOWN, colours).astype(np.uint8)
 
 

@@ -8,8 +8,8 @@ import cv2
 import matplotlib
 import numpy as np
 from matplotlib.collections import PolyCollection
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
@@ -17,8 +17,6 @@ from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.seen_corners import SeenCorners
 from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, plt, style, svg
-
-Array = NDArray[np.float64]
 
 COLUMNS = 4
 CELLS = (10, 8)

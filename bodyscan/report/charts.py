@@ -9,14 +9,13 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from numpy.typing import NDArray
+
+from bodyscan.arrays import Array
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 INK, GREY, BLUE, RED = "#1d2430", "#8a93a0", "#0072b2", "#d55e00"
 STYLE: Any = {

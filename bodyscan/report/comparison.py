@@ -8,16 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
 from bodyscan.evaluation.surface import Deviation, deviation, signed_distances
 from bodyscan.fusion.storage import FILE_NAME, load_scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 SAMPLE = 30_000
 REACHES_MM = (40.0, 10.0, 3.0)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import face_areas, face_components
 
@@ -25,7 +26,7 @@ class Hole:
     """area_mm2: of the faces that fill it.  middle: (3,) mm, rig frame.  faces: which way."""
 
     area_mm2: float
-    middle: NDArray[np.float64]
+    middle: Array
     faces: str
 
 
@@ -48,6 +49,6 @@ def holes(mesh: BodyMesh) -> list[Hole]:
     ]
 
 
-def _sums(group: NDArray[np.intp], values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def _sums(group: NDArray[np.intp], values: Array, count: int) -> Array:
     """(count, 3) sums of values (N, 3) by group."""
     return np.stack([np.bincount(group, values[:, k], count) for k in range(3)], axis=1)

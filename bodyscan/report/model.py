@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Colours = NDArray[np.uint8]
+from bodyscan.arrays import Array, Bytes, Indices
+
 Legend = dict[str, Any]
 
 MOST_VERTICES = 65_536
@@ -24,7 +24,7 @@ class Layer:
     """One way to colour a mesh: colours (V, 3) red, green, blue, and what they mean."""
 
     name: str
-    colours: Colours
+    colours: Bytes
     legend: Legend | None = None
     unlit: bool = False
 
@@ -34,7 +34,7 @@ class Shape:
     """vertices (V, 3) mm, faces (F, 3), normals (V, 3)."""
 
     vertices: Array
-    faces: NDArray[np.int64]
+    faces: Indices
     normals: NDArray[np.floating[Any]]
 
 
@@ -43,7 +43,7 @@ class Strokes:
     """Straight lines: ends (L, 2, 3) mm, colours (L, 3) red, green, blue."""
 
     ends: Array
-    colours: Colours
+    colours: Bytes
 
 
 @dataclass(frozen=True)
@@ -118,11 +118,11 @@ def encoded(array: NDArray[Any]) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
 
 
-def ramp_legend(caption: str, table: Colours, ends: tuple[str, str]) -> Legend:
+def ramp_legend(caption: str, table: Bytes, ends: tuple[str, str]) -> Legend:
     """A colour bar; table (256, 3) red, green, blue."""
     some = table[np.linspace(0, 255, 12).astype(int)]
     return {"caption": caption, "gradient": [css(c) for c in some], "ends": list(ends)}
 
 
-def css(colour: Sequence[int] | Colours) -> str:
+def css(colour: Sequence[int] | Bytes) -> str:
     return "#{:02x}{:02x}{:02x}".format(*(int(part) for part in colour))

@@ -15,11 +15,9 @@ import open3d as o3d
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bodyscan.arrays import Array, Bytes
 from bodyscan.files.atomic import write_bytes
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 BACKGROUND = (250, 250, 250)
 INK = (40, 40, 40)
@@ -67,9 +65,9 @@ class Scale:
     low: float
     high: float
     caption: str
-    table: Image  # (256, 3) blue, green, red
+    table: Bytes  # (256, 3) blue, green, red
 
-    def colours(self, values: NDArray[np.floating]) -> Image:
+    def colours(self, values: NDArray[np.floating]) -> Bytes:
         """(N,) -> (N, 3); beyond the ends the end's colour, not a number: grey."""
         share = (np.nan_to_num(values) - self.low) / (self.high - self.low)
         colours = self.table[np.clip(np.rint(255 * share), 0, 255).astype(np.uint8)]
@@ -157,7 +155,7 @@ def draw_deviation(
 def draw_points(
     points: Array,
     normals: NDArray[np.floating] | None,
-    colours: Image,
+    colours: Bytes,
     path: Path,
     views: Sequence[str | View],
     height_px: int,
@@ -206,7 +204,7 @@ def _view(view: str | View) -> View:
     return VIEWS[view] if isinstance(view, str) else view
 
 
-def _named(panel: Image, view: str | View) -> Image:
+def _named(panel: Bytes, view: str | View) -> Bytes:
     """The panel with the name of its view, if it has one, in its upper left corner."""
     if isinstance(view, str):
         _write(panel, view, (6, 16))
@@ -214,8 +212,8 @@ def _named(panel: Image, view: str | View) -> Image:
 
 
 def _cast_view(
-    scene: o3d.t.geometry.RaycastingScene, centre: Array, base: Image, frame: _Frame
-) -> Image:
+    scene: o3d.t.geometry.RaycastingScene, centre: Array, base: Bytes, frame: _Frame
+) -> Bytes:
     right, up, towards = frame.axes
     columns = frame.left + frame.step_mm * (np.arange(frame.width) + 0.5)
     rows = frame.top - frame.step_mm * (np.arange(frame.height) + 0.5)
@@ -235,11 +233,11 @@ def _cast_view(
 def _splat_view(
     points: Array,
     normals: NDArray[np.floating] | None,
-    colours: Image,
+    colours: Bytes,
     frame: _Frame,
     dot_mm: float,
     shaded: bool,
-) -> Image:
+) -> Bytes:
     right, up, towards = frame.axes
     facing = np.ones(len(points)) if normals is None else normals @ towards
     front = facing > 0
@@ -270,7 +268,7 @@ def _dot_size(points: Array) -> float:
     return 4.0 * float(np.median(gaps))
 
 
-def _bar(scale: Scale, height_px: int) -> Image:
+def _bar(scale: Scale, height_px: int) -> Bytes:
     """A colour bar with round numbers beside it, and its caption."""
     panel = np.full((height_px, 130, 3), BACKGROUND, np.uint8)
     top, bottom = height_px // 6, height_px - height_px // 6
@@ -294,23 +292,23 @@ def round_ticks(low: float, high: float) -> list[float]:
     return [float(np.round(k * step, 10)) + 0.0 for k in np.arange(first, last + 1)]
 
 
-def _write(panel: Image, text: str, corner: tuple[int, int]) -> None:
+def _write(panel: Bytes, text: str, corner: tuple[int, int]) -> None:
     cv2.putText(panel, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
 
 
-def _turbo() -> Image:
+def _turbo() -> Bytes:
     ramp = np.arange(256, dtype=np.uint8)[:, None]
     return np.asarray(cv2.applyColorMap(ramp, cv2.COLORMAP_TURBO)).reshape(256, 3)
 
 
-def _blue_white_red() -> Image:
+def _blue_white_red() -> Bytes:
     share = np.linspace(-1.0, 1.0, 256)[:, None]
     blue, white, red = np.array([[180, 60, 20], [245, 245, 245], [30, 20, 180]], float)
     ends = np.where(share < 0, blue, red)
     return np.rint(white + np.abs(share) ** 0.8 * (ends - white)).astype(np.uint8)
 
 
-def _save(path: Path, panels: Sequence[Image]) -> None:
+def _save(path: Path, panels: Sequence[Bytes]) -> None:
     ok, data = cv2.imencode(".png", np.concatenate(panels, axis=1))
     if not ok:
         raise ValueError(f"no PNG could be made for {path}")

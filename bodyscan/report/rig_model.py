@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes
 from bodyscan.geometry.placing_covariance import point_covariance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.calibration_charts import line_styles
 from bodyscan.report.model import Layer, Shape, Standpoint, Strokes, pack
-
-Array = NDArray[np.float64]
 
 SHOWN_MM = 140.0
 """The largest ellipsoid's longest half axis as it is drawn."""
@@ -77,9 +75,7 @@ def _ellipsoid(middle: Array, covariance: Array) -> Shape:
     )
 
 
-def _joined(
-    shapes: dict[str, Shape], tints: dict[str, NDArray[np.uint8]]
-) -> tuple[Shape, NDArray[np.uint8]]:
+def _joined(shapes: dict[str, Shape], tints: dict[str, Bytes]) -> tuple[Shape, Bytes]:
     counts = [len(shape.vertices) for shape in shapes.values()]
     starts = np.cumsum([0, *counts[:-1]])
     every = list(shapes.values())
@@ -94,7 +90,7 @@ def _joined(
 def _strokes(calibration: RigCalibration) -> Strokes:
     """Cameras' fields of view, boards' outlines, the scan volume, and the rig's axes."""
     colours, _ = line_styles(calibration)
-    parts: list[tuple[Array, NDArray[np.uint8]]] = []
+    parts: list[tuple[Array, Bytes]] = []
     for name, placing in calibration.rig_from_camera.items():
         camera = calibration.pairs[name].camera
         right, bottom = camera.width - 0.5, camera.height - 0.5
@@ -126,7 +122,7 @@ def _closed(corners: Array) -> Array:
     return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
 
 
-def _rgb(colour: str) -> NDArray[np.uint8]:
+def _rgb(colour: str) -> Bytes:
     return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], np.uint8)
 
 

@@ -7,16 +7,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.visibility import in_image
-from bodyscan.report.pictures import BACKGROUND, INK, Image, Scale, _bar, _save, _turbo
+from bodyscan.report.pictures import BACKGROUND, INK, Scale, _bar, _save, _turbo
 from bodyscan.rig.rig import Volume
-
-Array = NDArray[np.float64]
 
 STEP_MM = 20.0
 MARGIN_PX = 60
@@ -33,7 +31,7 @@ def sigma_at(
     rig_from_camera: Mapping[str, RigidTransform],
     cameras: Mapping[str, Camera],
     covariance: PlacingCovariance,
-) -> tuple[Array, NDArray[np.int64]]:
+) -> tuple[Array, Indices]:
     """Rig points (N, 3) -> sigma (N,) mm, all axes together, and how many pairs see each, (N,).
 
     A point is the mean of what the pairs that see it say, so only what they err alike, and their
@@ -97,7 +95,7 @@ def plane_points(volume: Volume, right: Array, step_mm: float) -> Array:
     return along[None, :, None] * right + height[:, None, None] * np.array([0.0, 0.0, 1.0])
 
 
-def _panel(values: Array, scale: Scale, caption: str, volume: Volume, height_px: int) -> Image:
+def _panel(values: Array, scale: Scale, caption: str, volume: Volume, height_px: int) -> Bytes:
     """One map with its caption and a height every half metre."""
     tall = height_px - 2 * MARGIN_PX
     px_per_mm = tall / (volume.top_mm - volume.bottom_mm)
@@ -116,5 +114,5 @@ def _panel(values: Array, scale: Scale, caption: str, volume: Volume, height_px:
     return panel
 
 
-def _text(panel: Image, text: str, corner: tuple[int, int]) -> None:
+def _text(panel: Bytes, text: str, corner: tuple[int, int]) -> None:
     cv2.putText(panel, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)

@@ -1,0 +1,15 @@
+"""The array types that signatures name; a docstring gives an array's shape, unit and frame."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+"""Coordinates, lengths, angles: whatever geometry is computed in."""
+
+Floats = NDArray[np.float32]
+"""What is stored for every pixel or point, at half the size."""
+
+Mask = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+"""Grey levels and colours."""
