@@ -17,13 +17,13 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from bodyscan.alignment.matching import (
+    AlignmentPoints,
     Matches,
-    Patch,
+    alignment_points,
     match_nearest,
     match_projected,
-    patch,
 )
-from bodyscan.alignment.pull import Pull
+from bodyscan.alignment.overlap_equations import OverlapEquations
 from bodyscan.arrays import Array
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint
@@ -111,15 +111,15 @@ def align(
     start = [rig_from_camera[name] for name in names]
     motion = np.zeros((len(names), 6))
     reach, sway = settings.reach_mm, 1.0
-    pull = partial(Pull.of, correlated=settings.correlated)
+    overlap_equations = partial(OverlapEquations.of, correlated=settings.correlated)
     with ThreadPoolExecutor(workers) as pool:
-        patches = list(pool.map(lambda image: patch(image, settings.spacing_mm), images))
-        coarse = [p.thinned(COARSE) for p in patches]
+        clouds = list(pool.map(lambda image: alignment_points(image, settings.spacing_mm), images))
+        coarse = [p.subsample(COARSE) for p in clouds]
         for left in range(settings.rounds, 0, -1):
             moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
-            taken = patches if left <= FINE_ROUNDS else coarse
-            pulls = _of_overlaps(pull, pool, taken, moved, reach, settings)
-            motion = _solve(pulls, motion, _prior(names, prior, settings, sway))
+            taken = clouds if left <= FINE_ROUNDS else coarse
+            equations = _of_overlaps(overlap_equations, pool, taken, moved, reach, settings)
+            motion = _solve(equations, motion, _prior(names, prior, settings, sway))
             reach, sway = max(reach / 2.0, settings.least_reach_mm), _sway_of(motion, settings)
         widest = _prior(names, prior, settings, settings.most_sway)
         motion, refused = _bounded(names, motion, widest, settings.limit_sigmas)
@@ -144,7 +144,7 @@ def align(
 def _of_overlaps(
     measure: Callable[[Matches], Result],
     pool: ThreadPoolExecutor,
-    patches: Sequence[Patch],
+    clouds: Sequence[AlignmentPoints],
     placings: Sequence[RigidTransform],
     reach_mm: float,
     settings: AlignmentSettings,
@@ -155,10 +155,10 @@ def _of_overlaps(
 
     def of_two(both: tuple[int, int]) -> Result | None:
         i, j = both
-        matches = match(patches[i], patches[j], placings[i], placings[j], reach_mm)
+        matches = match(clouds[i], clouds[j], placings[i], placings[j], reach_mm)
         return measure(matches) if len(matches.distances) >= settings.fewest else None
 
-    every_two = list(permutations(range(len(patches)), 2))
+    every_two = list(permutations(range(len(clouds)), 2))
     found = zip(every_two, pool.map(of_two, every_two), strict=True)
     return {both: said for both, said in found if said is not None}
 
@@ -168,18 +168,20 @@ def _gap(matches: Matches) -> tuple[int, float]:
     return len(matches.distances), float(np.sqrt(np.mean(matches.distances**2)))
 
 
-def _solve(pulls: Mapping[tuple[int, int], Pull], motion: Array, covariance: Array) -> Array:
+def _solve(
+    equations: Mapping[tuple[int, int], OverlapEquations], motion: Array, covariance: Array
+) -> Array:
     """Motions (P, 6), one Gauss-Newton step: matches pull together, the prior holds near zero."""
     normal = np.linalg.inv(covariance)
     right = np.zeros(motion.size)
-    for (a, b), pull in pulls.items():
+    for (a, b), overlap in equations.items():
         i, j = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
         # The distance left after the step: d + J (x_i - m_i) - J (x_j - m_j).
-        wanted = pull.information @ (motion[a] - motion[b]) - pull.gradient
-        normal[i, i] += pull.information
-        normal[j, j] += pull.information
-        normal[i, j] -= pull.information
-        normal[j, i] -= pull.information
+        wanted = overlap.information @ (motion[a] - motion[b]) - overlap.gradient
+        normal[i, i] += overlap.information
+        normal[j, j] += overlap.information
+        normal[i, j] -= overlap.information
+        normal[j, i] -= overlap.information
         right[i] += wanted
         right[j] -= wanted
     return np.linalg.solve(normal, right).reshape(-1, 6)

@@ -26,7 +26,7 @@ RIM_PX = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Patch:
+class AlignmentPoints:
     """What takes part in alignment of one range image, camera frame: N points with normals, standard
     deviations along the normal, and whether they lie at the rim of what was measured.
 
@@ -41,7 +41,7 @@ class Patch:
     sigma_mm: Array
     rim: Mask
 
-    def thinned(self, step: int) -> Patch:
+    def subsample(self, step: int) -> AlignmentPoints:
         """Every `step`th point."""
         some = slice(None, None, step)
         return replace(
@@ -65,7 +65,7 @@ class Matches:
     sigma_mm: Array
 
 
-def patch(image: RangeImage, spacing_mm: float) -> Patch:
+def alignment_points(image: RangeImage, spacing_mm: float) -> AlignmentPoints:
     """Points of every so many rows and columns, about `spacing_mm` apart where a surface faces the
     camera; what is seen edge-on takes no part."""
     window = np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)
@@ -79,7 +79,7 @@ def patch(image: RangeImage, spacing_mm: float) -> Patch:
     points, normals = (a[some][seen].astype(np.float64) for a in (image.points, image.normals))
     facing = -np.einsum("nc,nc->n", points, normals) / np.linalg.norm(points, axis=-1)
     chosen = facing > EDGE_ON  # a normal of NaN is not more
-    return Patch(
+    return AlignmentPoints(
         image,
         inner,
         points[chosen],
@@ -90,8 +90,8 @@ def patch(image: RangeImage, spacing_mm: float) -> Patch:
 
 
 def match_projected(
-    source: Patch,
-    target: Patch,
+    source: AlignmentPoints,
+    target: AlignmentPoints,
     rig_from_source: RigidTransform,
     rig_from_target: RigidTransform,
     reach_mm: float,
@@ -206,8 +206,8 @@ def _dot(one: Vector, other: Vector) -> float:
 
 
 def match_nearest(
-    source: Patch,
-    target: Patch,
+    source: AlignmentPoints,
+    target: AlignmentPoints,
     rig_from_source: RigidTransform,
     rig_from_target: RigidTransform,
     reach_mm: float,

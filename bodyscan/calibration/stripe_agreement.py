@@ -20,7 +20,7 @@ from bodyscan.calibration.sheet_fit import fit_sheets
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import Axis, LightSheets
-from bodyscan.geometry.measuring import measure
+from bodyscan.geometry.ray_depths import intersect_rays
 
 Array = NDArray[np.float64]
 Boards = NDArray[np.int64]
@@ -78,7 +78,7 @@ def boards_off(data: BoundaryPoints, sheets: LightSheets) -> Array:
     """(B,) mm: how far from its place, by the corners of all cameras, each board is measured by the
     stripes: median along its normal, positive away from the camera."""
     rays = data.points / data.points[:, 2:]
-    depth = measure(sheets, rays, data.index.astype(float)).depth
+    depth = intersect_rays(sheets, rays, data.index.astype(float)).depth
     off = (depth - data.points[:, 2]) * board_errors(data).facing
     medians = [np.nanmedian(own) for own in _by_board(off, data.board) if np.isfinite(own).any()]
     return np.array(medians, np.float64)

@@ -61,7 +61,11 @@ def load_captures_file(folder: Path, rig: Rig) -> CapturesFile:
     """
     path = folder / FILE_NAME
     return load_model(
-        path, CapturesFile, CaptureError, remedy=_REMEDY, also=lambda file: _strangers(file, rig)
+        path,
+        CapturesFile,
+        CaptureError,
+        remedy=_REMEDY,
+        also=lambda file: _unknown_names(file, rig),
     )
 
 
@@ -71,7 +75,7 @@ def write_captures_file(folder: Path, captures: CapturesFile) -> None:
     write_text(folder / FILE_NAME, dump_yaml(data))
 
 
-def _strangers(captures: CapturesFile, rig: Rig) -> Iterator[Problem]:
+def _unknown_names(captures: CapturesFile, rig: Rig) -> Iterator[Problem]:
     pairs = {pair.name: pair for pair in rig.pairs}
     for index, shot in enumerate(captures.shots or ()):
         for key in ("stripes", "lit"):

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from bodyscan.captures.folder import Captures, Sequence, join, open_folder, open_scan
+from bodyscan.captures.folder import Captures, ImageSequence, join, open_folder, open_scan
 from bodyscan.captures.image_faults import header_fault
-from bodyscan.captures.strangers import strange_images
+from bodyscan.captures.unlisted_images import find_unlisted_images
 from bodyscan.errors import CaptureError
 from bodyscan.files.model import did_you_mean
 from bodyscan.rig.pair import Pair
@@ -94,7 +94,7 @@ def check(rig_path: Path, scans: Iterable[Path] = ()) -> CheckReport:
         errors += _frame_errors(calibration)
         errors += filter(None, map(_too_few, rig.pairs, counts))
     warnings = [] if rig.calibration else [f"{rig_path}: names no calibration captures"]
-    warnings += filter(None, map(_strangers, captures))
+    warnings += filter(None, map(_unlisted_images, captures))
     warnings += filter(None, map(_few, rig.pairs, counts)) if calibration else ()
     return CheckReport(
         rig_path=Path(rig_path),
@@ -142,7 +142,7 @@ def _attempt(errors: list[str], work: Callable[..., Captures], *args: object) ->
         return None
 
 
-def _bad_images(rig: Rig, sequence: Sequence) -> tuple[BadImage, ...]:
+def _bad_images(rig: Rig, sequence: ImageSequence) -> tuple[BadImage, ...]:
     camera = rig.pair(sequence.pair).camera
     missing = set(sequence.missing)
     faults = (
@@ -154,7 +154,7 @@ def _bad_images(rig: Rig, sequence: Sequence) -> tuple[BadImage, ...]:
     )
 
 
-def _count(pair: Pair, good: list[Sequence]) -> PairCount:
+def _count(pair: Pair, good: list[ImageSequence]) -> PairCount:
     own = [sequence for sequence in good if sequence.pair == pair.name]
     stripes = sum(sequence.has_stripes for sequence in own)
     images = sum(len(sequence.paths) for sequence in own)
@@ -186,8 +186,8 @@ def _empty_shots(captures: Captures) -> list[str]:
     return [shot for shot in captures.shots if shot not in taken]
 
 
-def _strangers(captures: Captures) -> str | None:
-    found = strange_images(captures)
+def _unlisted_images(captures: Captures) -> str | None:
+    found = find_unlisted_images(captures)
     if not found:
         return None
     belong = "belongs" if len(found) == 1 else "belong"

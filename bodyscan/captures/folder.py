@@ -23,7 +23,7 @@ Kind = Literal["calibration", "scan"]
 
 
 @dataclass(frozen=True)
-class Sequence:
+class ImageSequence:
     """The images that one pair took, or should have taken, in one shot.
 
     coded: the images of the stripe code, in the order of `FrameNames.of_code`; () where only the
@@ -72,23 +72,23 @@ class Captures:
     rig: Rig
     folders: tuple[Path, ...]
     shots: tuple[str, ...]
-    sequences: tuple[Sequence, ...]
+    sequences: tuple[ImageSequence, ...]
     when: datetime | None = None
     subject: str | None = None
 
     @cached_property
-    def _by_pair_and_shot(self) -> dict[tuple[str, str], Sequence]:
+    def _by_pair_and_shot(self) -> dict[tuple[str, str], ImageSequence]:
         return {(sequence.pair, sequence.shot): sequence for sequence in self.sequences}
 
-    def sequence(self, pair: str, shot: str) -> Sequence | None:
+    def sequence(self, pair: str, shot: str) -> ImageSequence | None:
         """What that pair took in that shot, None if it took no part."""
         return self._by_pair_and_shot.get((pair, shot))
 
-    def of_pair(self, pair: str) -> tuple[Sequence, ...]:
+    def of_pair(self, pair: str) -> tuple[ImageSequence, ...]:
         """That pair's sequences in the order of the shots."""
         return tuple(sequence for sequence in self.sequences if sequence.pair == pair)
 
-    def of_shot(self, shot: str) -> tuple[Sequence, ...]:
+    def of_shot(self, shot: str) -> tuple[ImageSequence, ...]:
         """What was taken in that shot, in the order of the rig's pairs."""
         return tuple(sequence for sequence in self.sequences if sequence.shot == shot)
 
@@ -253,7 +253,9 @@ def _natural(name: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(p), p) if p.isdecimal() else (1, 0, p) for p in pieces)
 
 
-def _sequences(rig: Rig, listing: Listing, template: str, shot: ShotEntry) -> Iterator[Sequence]:
+def _sequences(
+    rig: Rig, listing: Listing, template: str, shot: ShotEntry
+) -> Iterator[ImageSequence]:
     look = shot.stripes is None and shot.lit is None
     for pair in rig.pairs:
         whole = _sequence(rig, listing, template, shot.name, pair, stripes=True)
@@ -278,7 +280,7 @@ def _sequences(rig: Rig, listing: Listing, template: str, shot: ShotEntry) -> It
 
 def _sequence(
     rig: Rig, listing: Listing, template: str, shot: str, pair: Pair, *, stripes: bool
-) -> Sequence:
+) -> ImageSequence:
     frames = rig.frames
     projector = pair.projector if stripes and has_field(template, "frame") else None
 
@@ -291,7 +293,7 @@ def _sequence(
     coded = files(*frames.of_code(projector)) if projector else ()
     missing = [name for name in (*lit, *dark, *coded) if not listing.has(name)]
     root = listing.root
-    return Sequence(
+    return ImageSequence(
         pair=pair.name,
         shot=shot,
         lit=root / lit[0],

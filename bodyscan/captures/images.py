@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.captures.folder import Sequence
+from bodyscan.captures.folder import ImageSequence
 from bodyscan.captures.grey_png import decode_grey_png
 from bodyscan.captures.image_faults import header_fault, image_error
 from bodyscan.captures.image_header import png_damage
@@ -75,14 +75,14 @@ def read_image(
     return image
 
 
-def read_lit(sequence: Sequence, camera: CameraSpec) -> Grey:
+def read_lit(sequence: ImageSequence, camera: CameraSpec) -> Grey:
     """The lit image of a sequence, (H, W) uint8. Raises ImageError as `read_image`."""
     return read_image(
         sequence.lit, camera.width, camera.height, pair=sequence.pair, shot=sequence.shot, lit=True
     )
 
 
-def read_sequence(sequence: Sequence, camera: CameraSpec, *, workers: int = 2) -> StripeImages:
+def read_sequence(sequence: ImageSequence, camera: CameraSpec, *, workers: int = 2) -> StripeImages:
     """All images of a stripe sequence.
 
     Raises ImageError as `read_image`, and where the sequence is a lit image alone.

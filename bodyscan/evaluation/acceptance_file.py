@@ -11,7 +11,7 @@ from pydantic import Field
 
 from bodyscan.errors import BadInput
 from bodyscan.files.model import Model, Problem
-from bodyscan.files.model_file import load_model, revised
+from bodyscan.files.model_file import apply_changes, load_model
 
 _REMEDY = "Mend the acceptance file; docs/report.md explains every key."
 MOST_SPHERES = 6
@@ -79,7 +79,7 @@ def load_acceptance(path: Path | None, changes: Mapping[str, float] = {}) -> Acc
     )
     if not changes:
         return file
-    return revised(
+    return apply_changes(
         file, {("limits", name): value for name, value in changes.items()}, AcceptanceError
     )
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyscan import __version__
 from bodyscan.errors import BadInput
-from bodyscan.files.atomic import replacing, write_json
+from bodyscan.files.atomic import atomic_replacement, write_json
 from bodyscan.fusion.scan import Scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -36,7 +36,7 @@ def write_e57(
             remedy="pip install 'bodyscan[e57]'",
         ) from error
     counts = {}
-    with replacing(Path(path)) as temporary:
+    with atomic_replacement(Path(path)) as temporary:
         file = pye57.E57(str(temporary), mode="w")
         for image in images:
             rows, columns = np.nonzero(image.valid)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.files.atomic import replacing
+from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 
 FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125
@@ -34,7 +34,7 @@ def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     text += b" " * (-len(text) % 4)
     size = sum(len(chunk) for chunk in chunks)
-    with replacing(Path(path)) as temporary, temporary.open("wb") as stream:
+    with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
         stream.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + size))
         stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
         stream.write(struct.pack("<I4s", size, b"BIN\0"))

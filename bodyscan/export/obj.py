@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyscan.export.text import fixed, lines, whole
-from bodyscan.files.atomic import replacing
+from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyMesh
 
 ROWS = 200_000  # written at a time
@@ -16,7 +16,7 @@ ROWS = 200_000  # written at a time
 
 def write_obj(path: Path, mesh: BodyMesh) -> None:
     """Write a mesh in mm, rig frame: positions to 0.1 um, normals and colours to four places."""
-    with replacing(Path(path)) as temporary, temporary.open("wb") as stream:
+    with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
         stream.write(b"# bodyscan: mm, x the way the subject faces, z up, floor at z = 0\n")
         stream.write(b"o body\n")
         for rows in _blocks(len(mesh.vertices)):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyscan.files.atomic import replacing
+from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyMesh
 
 TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -21,7 +21,7 @@ def write_stl(path: Path, mesh: BodyMesh) -> None:
     triangles = np.zeros(len(mesh.faces), TRIANGLE)
     triangles["normal"] = cross / np.where(length > 0, length, 1.0)
     triangles["corners"] = corners
-    with replacing(Path(path)) as temporary, temporary.open("wb") as stream:
+    with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
         stream.write(HEADER.ljust(80, b"\0"))
         stream.write(np.uint32(len(triangles)).astype("<u4").tobytes())
         stream.write(triangles.data)

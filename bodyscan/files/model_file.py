@@ -17,7 +17,7 @@ from bodyscan.files.yaml_file import (
     Where,
     YamlError,
     YamlProblem,
-    dotted,
+    dotted_path,
     read_yaml,
 )
 
@@ -89,7 +89,7 @@ def load_model(
     return loaded
 
 
-def revised(model: M, changes: Mapping[Where, Any], error: type[BadInput]) -> M:
+def apply_changes(model: M, changes: Mapping[Where, Any], error: type[BadInput]) -> M:
     """`model` with the values at some paths replaced, checked anew.
 
     Raises `error` that names every change that is wrong by its path.
@@ -100,7 +100,7 @@ def revised(model: M, changes: Mapping[Where, Any], error: type[BadInput]) -> M:
         for part in where[:-1]:
             deeper = inside.setdefault(part, {})
             if not isinstance(deeper, dict):
-                raise error(f"--set {dotted(where)}: {part} has nothing inside")
+                raise error(f"--set {dotted_path(where)}: {part} has nothing inside")
             inside = deeper
         inside[where[-1]] = value
     try:
@@ -130,7 +130,7 @@ def report(
     return error("\n".join([lines[0][1], *told]), where=lines[0][0], remedy=remedy)
 
 
-def validated(model: type[M], data: Any) -> M | None:
+def validate(model: type[M], data: Any) -> M | None:
     """`data` as a model if it is right, else None."""
     try:
         return model.model_validate_json(json.dumps(data), strict=True)
@@ -140,7 +140,7 @@ def validated(model: type[M], data: Any) -> M | None:
 
 def _placed(problem: Problem, document: Document) -> YamlProblem:
     where, text = problem
-    return YamlProblem(document.place(where), dotted(where), text)
+    return YamlProblem(document.place(where), dotted_path(where), text)
 
 
 def _translated(
@@ -159,7 +159,7 @@ def _translated(
             hint = did_you_mean(str(where[-1]), known)
             guessed |= {(*where[:-1], key) for key in known if f"'{key}'" in hint}
             place = document.place(where, of_key=True)
-            other.append(YamlProblem(place, dotted(where), f"is no key known here{hint}"))
+            other.append(YamlProblem(place, dotted_path(where), f"is no key known here{hint}"))
         elif e["type"] in _MUST_BE:
             limits = {key: _plain(value) for key, value in e.get("ctx", {}).items()}
             wrong.setdefault(where, []).append(_MUST_BE[e["type"]].format(**limits))

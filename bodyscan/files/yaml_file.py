@@ -120,7 +120,7 @@ def read_yaml(path: Path) -> Document:
     return document
 
 
-def dotted(where: Where) -> str:
+def dotted_path(where: Where) -> str:
     """`('pairs', 2, 'camera')` as `pairs[2].camera`."""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where)
     return text.removeprefix(".")
@@ -217,7 +217,7 @@ class _Builder:
         return own
 
     def _problem(self, place: Place, where: Where, text: str) -> None:
-        self.document.problems.append(YamlProblem(place, dotted(where), text))
+        self.document.problems.append(YamlProblem(place, dotted_path(where), text))
 
 
 def _is_text(node: yaml.Node) -> bool:

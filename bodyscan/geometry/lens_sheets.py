@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from bodyscan.geometry.lens_points import measure_rays, stripes_of_points
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
-from bodyscan.geometry.transforms import RigidTransform, skew
+from bodyscan.geometry.transforms import RigidTransform, cross_matrix
 
 Array = NDArray[np.float64]
 
@@ -80,7 +80,7 @@ class LensSheets(SmoothSheets):
         """The step is taken in the 2 x 4 matrix of the projector without its lens: there the
         valley in which frame, f and c make up for one another is straight."""
         rows = self.projector_from_camera.matrix[:3]
-        turn = skew(step[:3]) @ rows
+        turn = cross_matrix(step[:3]) @ rows
         turn[:, 3] += step[3:FRAME]
         (focal, centre), (more_focal, more_centre) = self.parameters[:SCALE], step[FRAME:][:SCALE]
         above = (focal + more_focal) * rows[1] + (centre + more_centre) * rows[2]

@@ -88,7 +88,7 @@ class RigidTransform:
         return RigidTransform.from_rotation_vector(twist[:3], twist[3:]) @ self
 
 
-def skew(vectors: Array) -> Array:
+def cross_matrix(vectors: Array) -> Array:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3): skew(a) @ b = a x b."""
     zero = np.zeros(vectors.shape[:-1])
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
@@ -101,7 +101,7 @@ def adjoint(a_from_b: RigidTransform) -> Array:
     rotation = a_from_b.rotation
     matrix = np.zeros((6, 6))
     matrix[:3, :3] = matrix[3:, 3:] = rotation
-    matrix[3:, :3] = skew(a_from_b.translation) @ rotation
+    matrix[3:, :3] = cross_matrix(a_from_b.translation) @ rotation
     return matrix
 
 

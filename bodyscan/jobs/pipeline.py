@@ -11,7 +11,7 @@ from pydantic import Field
 
 from bodyscan.errors import BadInput
 from bodyscan.files.model import Model, Name, Problem
-from bodyscan.files.model_file import load_model, revised
+from bodyscan.files.model_file import apply_changes, load_model
 
 _REMEDY = "Mend the pipeline file; docs/formats.md explains every key."
 
@@ -118,7 +118,9 @@ def load_pipeline(path: Path, changes: Sequence[str] = ()) -> Pipeline:
     Raises PipelineError that lists every problem: those of the file by line and column.
     """
     pipeline = load_model(Path(path), Pipeline, PipelineError, remedy=_REMEDY)
-    return revised(pipeline, dict(map(_change, changes)), PipelineError) if changes else pipeline
+    return (
+        apply_changes(pipeline, dict(map(_change, changes)), PipelineError) if changes else pipeline
+    )
 
 
 def _change(text: str) -> tuple[tuple[str, ...], Any]:

@@ -10,7 +10,7 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.files.atomic import replacing
+from bodyscan.files.atomic import atomic_replacement
 from bodyscan.geometry.light_planes import Axis, baseline_angle_tilt
 
 matplotlib.use("Agg")
@@ -127,7 +127,7 @@ def _round_up(value: float) -> float:
 
 def _save(figure: matplotlib.figure.Figure, path: Path) -> Path:
     # Without a date and a version in it the same figure gives the same bytes.
-    with replacing(path) as temporary:
+    with atomic_replacement(path) as temporary:
         figure.savefig(temporary, dpi=110, metadata={"Software": None})
     plt.close(figure)
     return path

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.errors import ResultError
-from bodyscan.files.atomic import replacing
+from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 
 Records = NDArray[np.void]
@@ -69,7 +69,7 @@ def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
         faces = np.empty(len(body.faces), MESH[1].fields)
         faces["count"], faces["corners"], faces["filled"] = 3, body.faces, body.filled
         records = [_vertex_records(MESH[0], body, body.vertices), faces]
-    with replacing(Path(path)) as temporary, temporary.open("wb") as stream:
+    with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
         stream.write(_header(elements, [len(some) for some in records]))
         for some in records:
             stream.write(some.data)

@@ -8,7 +8,7 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.compiled import compiled
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.measuring import measure
+from bodyscan.geometry.ray_depths import intersect_rays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Volume
 from bodyscan.stripes.wanted_stripes import WantedStripes
@@ -34,13 +34,13 @@ def stripes_in_volume(
         return None
     block_px = max(1, round(pair.camera.width / BLOCKS_ACROSS))
     rays = _corner_rays(pair.camera, block_px)
-    near, far = passage(rays, rig_from_camera, volume, raised_mm=0.0)
-    standing = passage(rays, rig_from_camera, volume, raised_mm=LAYER_MM)[1]
+    near, far = volume_interval(rays, rig_from_camera, volume, raised_mm=0.0)
+    standing = volume_interval(rays, rig_from_camera, volume, raised_mm=LAYER_MM)[1]
     standing = np.maximum(np.minimum(standing, far), near)
     count = round(pair.light.stripes / STEP_STRIPES) + 1
     s = np.linspace(0.0, pair.light.stripes, count)
     along = np.broadcast_to(rays[:, :, None], (*rays.shape[:2], count, 3))
-    found = measure(pair.light, along, np.broadcast_to(s, along.shape[:-1]))
+    found = intersect_rays(pair.light, along, np.broadcast_to(s, along.shape[:-1]))
     within = (found.depth > near[..., None]) & (found.depth < far[..., None])
     growing = found.per_stripe[within if within.any() else np.isfinite(found.per_stripe)] > 0
     if growing.any() != growing.all():
@@ -61,7 +61,7 @@ def stripes_in_volume(
     )
 
 
-def passage(
+def volume_interval(
     rays: Array, rig_from_camera: RigidTransform, volume: Volume, *, raised_mm: float
 ) -> tuple[Array, Array]:
     """Depths z (...) mm at which rays (..., 3), camera frame, z = 1, enter and leave the scan volume.

@@ -9,7 +9,7 @@ from bodyscan.calibration.pair import PairCalibration
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
 from bodyscan.geometry.crop import crop_of, ends_of
-from bodyscan.geometry.measuring import measure_image
+from bodyscan.geometry.ray_depths import triangulate_image
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.stripes.stripe_map import StripeMap
 
@@ -18,7 +18,7 @@ REACH = NORMAL_WINDOW_PX // 2
 ZERO, ONE = np.float32(0.0), np.float32(1.0)  # a float64 among them would make all of it float64
 
 
-def range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
+def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
     """Points, normals and sigma on the camera's pixel grid, camera frame, mm.
 
     Raises BadInput if the pair has no projector or the image size is another.
@@ -34,7 +34,7 @@ def range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
             where=f"pair {pair.name}",
             remedy="scan with the camera settings of the calibration, or calibrate again",
         )
-    points, sigma_mm = measure_image(pair.light, camera, stripes.s, stripes.sigma)
+    points, sigma_mm = triangulate_image(pair.light, camera, stripes.s, stripes.sigma)
     normals = grid_normals(points, np.isfinite(sigma_mm))
     return RangeImage(pair.name, camera, points, normals, sigma_mm, stripes.lit, stripes.beyond)
 

@@ -9,7 +9,7 @@ from typing import Any
 from bodyscan.errors import RigFileError
 from bodyscan.files.atomic import write_text
 from bodyscan.files.model import Problem
-from bodyscan.files.model_file import load_model, validated
+from bodyscan.files.model_file import load_model, validate
 from bodyscan.files.yaml_file import dump_yaml
 from bodyscan.rig.board import Board
 from bodyscan.rig.capture_folder import CaptureFolder
@@ -42,13 +42,13 @@ def _problems_of_parts(data: Any) -> Iterator[Problem]:
     return rig_problems(
         RigParts(
             board_names=tuple(map(_name, boards)),
-            boards=tuple(validated(Board, item) for item in boards),
+            boards=tuple(validate(Board, item) for item in boards),
             pair_names=tuple(map(_name, pairs)),
-            pairs=tuple(validated(Pair, item) for item in pairs),
-            folders=tuple(validated(CaptureFolder, item) for item in folders),
+            pairs=tuple(validate(Pair, item) for item in pairs),
+            folders=tuple(validate(CaptureFolder, item) for item in folders),
             files=files if isinstance(files, str) else None,
-            frames=validated(FrameNames, data.get("frames", {})),
-            rig_frame=validated(RigFrame, data.get("rig_frame", {})),
+            frames=validate(FrameNames, data.get("frames", {})),
+            rig_frame=validate(RigFrame, data.get("rig_frame", {})),
         )
     )
 

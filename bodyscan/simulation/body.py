@@ -9,7 +9,7 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from bodyscan.errors import BadInput
-from bodyscan.files.atomic import replacing
+from bodyscan.files.atomic import atomic_replacement
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.simulation.scene import Surface
 from bodyscan.simulation.settings import Person
@@ -88,5 +88,5 @@ def save_truth(surface: Surface, path: Path) -> None:
     )
     if surface.normals is not None:
         mesh.vertex_normals = o3d.utility.Vector3dVector(surface.normals)
-    with replacing(path) as temporary:
+    with atomic_replacement(path) as temporary:
         o3d.io.write_triangle_mesh(str(temporary), mesh, write_ascii=False)

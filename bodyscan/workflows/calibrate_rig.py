@@ -21,8 +21,7 @@ from bodyscan.calibration.pair import (
     planar_view,
     usable,
 )
-from bodyscan.captures.folder import Captures
-from bodyscan.captures.folder import Sequence as ImageSequence
+from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_lit
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
 from bodyscan.progress import Progress, silent, threaded

@@ -13,11 +13,10 @@ from bodyscan.boards.view import BoardView
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.located_view import LocatedView
 from bodyscan.calibration.pair import BoardBoundaries, boundaries_near, on_board
-from bodyscan.captures.folder import Captures
-from bodyscan.captures.folder import Sequence as ImageSequence
+from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.errors import BoardNotFound, BodyscanError
-from bodyscan.geometry.measuring import measure
 from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.ray_depths import intersect_rays
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.registration.drift import Drift, Move, find_drift, seen_pose
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -202,7 +201,7 @@ def _off_board(
         pair.camera, projector, board, view.camera_from_board, face, boundaries, number=0
     )
     rays = points.points / points.points[:, 2:]
-    measured = measure(pair.light, rays, points.index.astype(float))
+    measured = intersect_rays(pair.light, rays, points.index.astype(float))
     facing = np.abs(rays @ view.camera_from_board.rotation[:, 2])
     away = (measured.depth - points.points[:, 2]) * facing
     axis = 1 if projector.direction == "horizontal" else 0

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.pair import BoardBoundaries, boundaries_near
-from bodyscan.captures.folder import Captures
-from bodyscan.captures.folder import Sequence as ImageSequence
+from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.errors import BodyscanError, plainly
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.registration.rig_solve import PlacedRig

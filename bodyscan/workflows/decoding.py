@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bodyscan.captures.folder import Sequence
+from bodyscan.captures.folder import ImageSequence
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import DecodingFailed
 from bodyscan.rig.pair import Pair
@@ -12,7 +12,7 @@ from bodyscan.stripes.wanted_stripes import WantedStripes
 
 
 def decode_sequence(
-    sequence: Sequence, pair: Pair, *, wanted: WantedStripes | None = None, workers: int = 1
+    sequence: ImageSequence, pair: Pair, *, wanted: WantedStripes | None = None, workers: int = 1
 ) -> StripeMap:
     """Read and decode what `pair` took in one shot; wanted: see `read_code`.
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from bodyscan.captures.folder import Captures, Sequence
+from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.errors import BodyscanError, ScanFailed
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.scan_volume import stripes_in_volume
-from bodyscan.reconstruction.triangulation import range_image
+from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.workflows.decoding import decode_sequence
 
@@ -33,12 +33,12 @@ def range_images(
     }
     sequences = [s for s in captures.sequences if s.has_stripes and s.pair not in failed]
 
-    def reconstruct(sequence: Sequence) -> RangeImage | tuple[str, str]:
+    def reconstruct(sequence: ImageSequence) -> RangeImage | tuple[str, str]:
         try:
             pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
             wanted = stripes_in_volume(pair, at, calibration.rig.volume)
             spec = calibration.rig.pair(sequence.pair)
-            return range_image(pair, decode_sequence(sequence, spec, wanted=wanted))
+            return reconstruct_range_image(pair, decode_sequence(sequence, spec, wanted=wanted))
         except BodyscanError as error:
             return sequence.pair, str(error)
 

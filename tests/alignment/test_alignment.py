@@ -8,7 +8,7 @@ from ring import looking_at
 from bodyscan.alignment.align import AlignmentSettings, align
 from bodyscan.alignment.matching import Matches
 from bodyscan.alignment.object_refinement import refine_on_object
-from bodyscan.alignment.pull import Pull
+from bodyscan.alignment.overlap_equations import OverlapEquations
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.placing_covariance import PlacingCovariance
@@ -172,7 +172,7 @@ def test_the_normal_equations_are_those_of_the_distances_jacobian():
     spread = 1.4826 * np.median(np.abs(matches.distances))
     sigma = np.hypot(matches.sigma_mm, spread)
     weights = 1.0 / (1.0 + (matches.distances / (2.0 * sigma)) ** 2) / (sigma**2 * 5.0)
-    found = Pull.of(matches, correlated=5.0)
+    found = OverlapEquations.of(matches, correlated=5.0)
     scale = np.sqrt(np.diag(found.information))  # rotations of 300 mm arms beside millimetres
     information = jacobian.T @ (weights[:, None] * jacobian)
     np.testing.assert_allclose(

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from ring import looking_at
 
-from bodyscan.alignment.matching import Patch, match_nearest, match_projected, patch
+from bodyscan.alignment.matching import (
+    AlignmentPoints,
+    alignment_points,
+    match_nearest,
+    match_projected,
+)
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -36,11 +41,11 @@ def seen(name: str, rig_from_camera: RigidTransform) -> RangeImage:
 
 
 @pytest.fixture(scope="module")
-def two() -> list[tuple[Patch, RigidTransform]]:
+def two() -> list[tuple[AlignmentPoints, RigidTransform]]:
     places = [
         looking_at([1300.0 * np.cos(a), 1300.0 * np.sin(a), 950.0], CENTRE) for a in (0.2, 0.9)
     ]
-    return [(patch(seen(f"p{k}", t), 5.0), t) for k, t in enumerate(places)]
+    return [(alignment_points(seen(f"p{k}", t), 5.0), t) for k, t in enumerate(places)]
 
 
 def test_a_patch_is_about_evenly_spread(two):
@@ -113,5 +118,5 @@ def test_nothing_farther_than_the_reach(two):
 def test_cameras_on_opposite_sides_share_nothing(two):
     (a, rig_from_a), _ = two
     opposite = looking_at(2.0 * CENTRE - rig_from_a.translation, CENTRE)
-    other = patch(seen("p2", opposite), 5.0)
+    other = alignment_points(seen("p2", opposite), 5.0)
     assert len(match_projected(a, other, rig_from_a, opposite, 6.0).distances) == 0

@@ -18,7 +18,7 @@ from bodyscan.calibration.boundary_points import BoundaryPoints, join, part
 from bodyscan.calibration.light import LightFit, fit_light
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.light_planes import LightPlanes
-from bodyscan.geometry.measuring import measure
+from bodyscan.geometry.ray_depths import intersect_rays
 
 
 def boards(scene: Scene, poses, corner_px: float = 0.03, seed: int = 1) -> BoundaryPoints:
@@ -39,7 +39,7 @@ def flatness(scene: Scene, fit: LightFit, distance: float) -> float:
     pose = scene.looking_at([0.0, 0.0, distance], [0.05, -0.1, 0.0])
     index, pixels = scene.crossings(pose)
     rays = scene.camera.rays(pixels)
-    depth = measure(fit.sheets, rays, index.astype(float)).depth
+    depth = intersect_rays(fit.sheets, rays, index.astype(float)).depth
     assert np.isfinite(depth).mean() > 0.95
     points = (rays * depth[:, None])[np.isfinite(depth)]
     points -= points.mean(axis=0)
@@ -122,7 +122,7 @@ def errors_on_body(scene: Scene, fit: LightFit) -> tuple[np.ndarray, np.ndarray,
     """Distances from the body as calibrated and as with perfect sheets, and boards at each s."""
     rays, points, s, normals = body(scene, 0.03)
     perfect = scene.true_depth(rays, s, points[:, 2])
-    depth = measure(fit.sheets, rays, s).depth
+    depth = intersect_rays(fit.sheets, rays, s).depth
     true = np.sum((rays * perfect[:, None] - points) * normals, axis=1)
     got = np.sum((rays * depth[:, None] - points) * normals, axis=1)
     return got, true, fit.boards_seen[np.rint(s).astype(int)]
@@ -168,7 +168,7 @@ def test_sigma_tells_how_far_off_the_sheets_are():
         pose = scene.looking_at([0.0, 0.0, 400.0], [0.05, -0.1, 0.0])
         index, pixels = scene.crossings(pose, every_px=40)
         rays = scene.camera.rays(pixels)
-        measured = measure(fit.sheets, rays, index.astype(float))
+        measured = intersect_rays(fit.sheets, rays, index.astype(float))
         off = measured.depth - scene.on_plane(pixels, pose)[:, 2]
         pulls.append(np.sqrt(np.nanmean(off**2 / measured.variance_mm2)))
     # Three boards tell their own error badly: within a factor of two, over four calibrations.

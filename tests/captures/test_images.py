@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from small_captures import BITS, HEIGHT, STRIPES, WIDTH, encoded, picture, write
 from small_captures import write_small_captures as small
 
-from bodyscan.captures.folder import Sequence, open_captures
+from bodyscan.captures.folder import ImageSequence, open_captures
 from bodyscan.captures.image_header import NoImage, png_damage, read_header
 from bodyscan.captures.images import read_image, read_lit, read_sequence
 from bodyscan.errors import ImageError
@@ -26,7 +26,7 @@ CAMERA = CameraSpec(width=WIDTH, height=HEIGHT)
 NOISE = np.random.default_rng(5).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
 
 
-def first_sequence(folder: Path) -> Sequence:
+def first_sequence(folder: Path) -> ImageSequence:
     rig_path = small(folder, shots=1)
     sequence = open_captures(load_rig(rig_path), rig_path).sequence("p1", "b1")
     assert sequence is not None
@@ -210,6 +210,6 @@ def test_a_black_sequence_is_refused_and_a_lit_image_is_no_sequence(tmp_path: Pa
     for work in (read_sequence, read_lit):
         with pytest.raises(ImageError, match="shows nothing"):
             work(sequence, CAMERA)
-    alone = Sequence("p1", "b1", sequence.lit, None, (), ())
+    alone = ImageSequence("p1", "b1", sequence.lit, None, (), ())
     with pytest.raises(ImageError, match="there is no stripe sequence"):
         read_sequence(alone, CAMERA)

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyscan.files.atomic import json_text, replacing, write_bytes, write_json, write_npz
+from bodyscan.files.atomic import atomic_replacement, json_text, write_bytes, write_json, write_npz
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
@@ -21,7 +21,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> Non
     write_bytes(path, b"old")
 
     def fail() -> None:
-        with replacing(path) as temporary:
+        with atomic_replacement(path) as temporary:
             assert temporary.suffix == ".ply"
             assert temporary.parent == path.parent
             temporary.write_bytes(b"half of the new")
@@ -34,7 +34,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> Non
 
 
 def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), replacing(tmp_path / "x.bin"):
+    with pytest.raises(FileNotFoundError), atomic_replacement(tmp_path / "x.bin"):
         pass
     assert os.listdir(tmp_path) == []
 

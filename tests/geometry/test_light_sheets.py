@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightPlanes
-from bodyscan.geometry.measuring import measure
+from bodyscan.geometry.ray_depths import intersect_rays
 from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 
@@ -212,11 +212,11 @@ def test_what_is_too_uncertain_is_not_measured():
     rays = points / points[:, 2:]
     s = model.stripe(points)
     inside = (s > 0) & (s < STRIPES)
-    good = measure(model, rays, s)
+    good = intersect_rays(model, rays, s)
     assert np.array_equal(np.isfinite(good.depth), inside)
     sigma = float(np.sqrt(np.nanmedian(good.variance_mm2)))
     worse = model.with_covariance(model.covariance * (1e-3 * 1300.0 / sigma) ** 2)
-    kept = np.isfinite(measure(worse, rays, s).depth)
+    kept = np.isfinite(intersect_rays(worse, rays, s).depth)
     # Sigma is now about one thousandth of the distance: some are below, some above.
     assert 0 < kept.sum() < inside.sum()
 

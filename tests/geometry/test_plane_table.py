@@ -7,8 +7,8 @@ import pytest
 from test_light_sheets import MIDDLE, STRIPES, models
 
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.measuring import MOST_SIGMA, measure, measure_image
 from bodyscan.geometry.plane_table import PlaneTable
+from bodyscan.geometry.ray_depths import MOST_SIGMA, intersect_rays, triangulate_image
 
 
 @pytest.fixture(params=[3, 4, 5])
@@ -54,7 +54,7 @@ def test_nothing_outside_the_stripes_or_behind(planes):
 
 def test_measuring_takes_the_table(planes):
     rays, s = some_rays(500)
-    found = measure(planes, rays.reshape(20, 25, 3), s.reshape(20, 25))
+    found = intersect_rays(planes, rays.reshape(20, 25, 3), s.reshape(20, 25))
     assert found.depth.shape == (20, 25)
     expected = PlaneTable.of(planes).measure(rays, s)[0]
     known = np.isfinite(found.depth.ravel())
@@ -69,7 +69,7 @@ def test_an_image_is_measured_as_its_rays_are(planes):
     s[rng.random(shape) < 0.1] = np.nan
     sigma = rng.uniform(0.01, 0.03, shape).astype(np.float32)
     sigma[rng.random(shape) < 0.05] = np.nan
-    points, sigma_mm = measure_image(planes, CAMERA, s, sigma)
+    points, sigma_mm = triangulate_image(planes, CAMERA, s, sigma)
     assert points.dtype == sigma_mm.dtype == np.float32
 
     rays, wide = CAMERA.pixel_rays(), s.astype(float)

@@ -12,9 +12,14 @@ from hypothesis import strategies as st
 from test_triangulation import CAMERA, STRIPES, pair, planes, stripe_map
 
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.measuring import measure_image
+from bodyscan.geometry.ray_depths import triangulate_image
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.reconstruction.scan_volume import LAYER_MM, MARGIN_MM, passage, stripes_in_volume
+from bodyscan.reconstruction.scan_volume import (
+    LAYER_MM,
+    MARGIN_MM,
+    stripes_in_volume,
+    volume_interval,
+)
 from bodyscan.rig.rig import Volume
 
 VOLUME = Volume(radius_mm=120.0, bottom_mm=-100.0, top_mm=150.0)
@@ -61,7 +66,7 @@ def test_all_that_lies_in_the_volume_is_wanted(distance_mm, turn, tilt, rising, 
     one, at = calibrated(rising), looking_at_the_middle(distance_mm, turn, tilt)
     wanted = stripes_in_volume(one, at, VOLUME)
     s = some_s(seed, rising)
-    points, _ = measure_image(one.light, one.camera, s, np.full_like(s, 0.01))
+    points, _ = triangulate_image(one.light, one.camera, s, np.full_like(s, 0.01))
     x, y, z = np.moveaxis(at.apply(points.astype(np.float64)), -1, 0)
     there = (np.hypot(x, y) < VOLUME.radius_mm) & (z > VOLUME.bottom_mm) & (z < VOLUME.top_mm)
     standing = there & (z > VOLUME.bottom_mm + LAYER_MM)
@@ -129,7 +134,7 @@ def test_a_ray_is_in_the_volume_between_where_it_enters_and_leaves(distance_mm, 
     at = looking_at_the_middle(distance_mm, turn, tilt)
     rng = np.random.default_rng(seed)
     rays = np.concatenate([rng.uniform(-0.6, 0.6, (200, 2)), np.ones((200, 1))], axis=1)
-    enter, leave = passage(rays, at, VOLUME, raised_mm=20.0)
+    enter, leave = volume_interval(rays, at, VOLUME, raised_mm=20.0)
     depth = rng.uniform(60.0, 3000.0, 200)
     x, y, z = at.apply(rays * depth[:, None]).T
     within = np.hypot(x, y) < VOLUME.radius_mm + MARGIN_MM

@@ -5,7 +5,7 @@ from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightPlanes
-from bodyscan.reconstruction.triangulation import grid_normals, range_image
+from bodyscan.reconstruction.triangulation import grid_normals, reconstruct_range_image
 from bodyscan.stripes.stripe_map import StripeMap
 
 CAMERA = Camera(400.0, 402.0, -0.5, 80.0, 60.0, -0.1, 0.02, 160, 120)
@@ -53,7 +53,7 @@ def test_a_slanted_plane_is_measured_where_it_is():
     normal = np.array([0.2, 0.1, -1.0]) / np.linalg.norm([0.2, 0.1, -1.0])
     rays = CAMERA.pixel_rays()
     depth = -500.0 / (rays @ normal)
-    image = range_image(pair(), stripe_map(depth))
+    image = reconstruct_range_image(pair(), stripe_map(depth))
     known = image.valid
     assert known.mean() > 0.5
     # s is stored as float32: 64 stripes to 4e-6, worth 4e-5 mm here.
@@ -67,8 +67,8 @@ def test_sigma_follows_from_the_decoding():
     rays = CAMERA.pixel_rays()
     depth = np.full(rays.shape[:2], 480.0)
     stripes = stripe_map(depth)
-    image = range_image(pair(), stripes)
-    shifted = range_image(
+    image = reconstruct_range_image(pair(), stripes)
+    shifted = reconstruct_range_image(
         pair(), StripeMap(**{**vars(stripes), "s": (stripes.s + 0.01).astype(np.float32)})
     )
     known = image.valid & shifted.valid
@@ -127,4 +127,4 @@ def test_another_image_size_is_refused():
     stripes = stripe_map(np.full((CAMERA.height, CAMERA.width), 480.0))
     small = StripeMap(**{**vars(stripes), "s": stripes.s[:100]})
     with pytest.raises(BadInput, match="160 x 100"):
-        range_image(pair(), small)
+        reconstruct_range_image(pair(), small)

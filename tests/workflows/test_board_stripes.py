@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from bodyscan.captures.folder import Sequence
+from bodyscan.captures.folder import ImageSequence
 from bodyscan.errors import DecodingFailed
 from bodyscan.workflows.decode_boards import failure_notes, hopeless
 
@@ -10,7 +10,7 @@ from bodyscan.workflows.decode_boards import failure_notes, hopeless
 def failures(pair: str, what: str, *shots: str):
     return [
         (
-            Sequence(pair, shot, Path("lit.png"), None, (), ()),
+            ImageSequence(pair, shot, Path("lit.png"), None, (), ()),
             DecodingFailed(what, where=f"pair {pair}, shot {shot}", remedy="do something"),
         )
         for shot in shots

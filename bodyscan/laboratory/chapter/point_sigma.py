@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.geometry.measuring import measure
+from bodyscan.geometry.ray_depths import intersect_rays
 from bodyscan.laboratory.chapter.captures import ChapterCaptures, Seen
 from bodyscan.laboratory.rivals.approaches import Approach
 
@@ -51,7 +51,7 @@ def _errors(approach: Approach, seen: Seen, where: Mask) -> tuple[Array, Array]:
     """Error of depth and its sigma, mm, of the measured pixels among `where` (H, W)."""
     rows, columns = np.nonzero(where & np.isfinite(seen.stripes.s))
     rays = approach.camera.rays(np.column_stack([columns, rows]).astype(float))
-    measured = measure(approach.sheets, rays, seen.stripes.s[rows, columns].astype(float))
+    measured = intersect_rays(approach.sheets, rays, seen.stripes.s[rows, columns].astype(float))
     decoding = measured.per_stripe * seen.stripes.sigma[rows, columns]
     sigma = np.sqrt(decoding**2 + measured.variance_mm2)
     error = measured.depth - seen.truth.depth[rows, columns]

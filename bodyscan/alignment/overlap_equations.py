@@ -1,4 +1,4 @@
-"""How hard, and where to, the matches of one overlap pull two pairs."""
+"""The normal equations that the matches of one overlap add to the motions of its two pairs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bodyscan.compiled import compiled
 
 
 @dataclass(frozen=True, eq=False)
-class Pull:
+class OverlapEquations:
     """information (6, 6) = J^T W J and gradient (6,) = J^T W d, d the distances of matches and J
     their Jacobian by the source's motion; the target's motion has the opposite effect."""
 
@@ -20,7 +20,7 @@ class Pull:
     gradient: Array
 
     @staticmethod
-    def of(matches: Matches, correlated: float) -> Pull:
+    def of(matches: Matches, correlated: float) -> OverlapEquations:
         """Distances far beyond their own spread count for little (Cauchy); `correlated` of them
         count as one."""
         information, gradient = np.zeros((6, 6)), np.zeros(6)
@@ -28,7 +28,7 @@ class Pull:
         spread = max(1.4826 * float(np.median(np.abs(distances))), 0.01)
         spots = (matches.points, matches.normals, distances, matches.sigma_mm)
         _accumulate(*spots, spread, information, gradient)
-        return Pull(information / correlated, gradient / correlated)
+        return OverlapEquations(information / correlated, gradient / correlated)
 
 
 @compiled

@@ -28,7 +28,7 @@ BAND = 16  # rows at a time: what fits into a processor's cache
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class RayDepths:
     """depth: z (...) mm.  per_stripe: dz/ds (...), mm.  variance_mm2: of the depth, from the sheets
     alone.  All NaN where there is no depth that can be trusted."""
 
@@ -37,14 +37,14 @@ class Measured:
     variance_mm2: Array
 
 
-def measure(sheets: LightSheets, rays: Array, s: Array) -> Measured:
+def intersect_rays(sheets: LightSheets, rays: Array, s: Array) -> RayDepths:
     """Rays (..., 3) with z = 1, camera frame, at real stripe coordinates s (...)."""
     found = _way_to_measure(sheets)(rays.reshape(-1, 3), np.ravel(s))
     unsure = found[2] > (MOST_SIGMA * found[0]) ** 2
-    return Measured(*(np.where(unsure, np.nan, some).reshape(np.shape(s)) for some in found))
+    return RayDepths(*(np.where(unsure, np.nan, some).reshape(np.shape(s)) for some in found))
 
 
-def measure_image(
+def triangulate_image(
     sheets: LightSheets, camera: Camera, s: Floats, sigma: Floats
 ) -> tuple[Floats, Floats]:
     """Points (height, width, 3), camera frame, mm, and sigma_mm (height, width) along the viewing

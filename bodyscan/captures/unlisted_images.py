@@ -11,7 +11,7 @@ from bodyscan.captures.folder import Captures
 SUFFIXES = {".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
 
 
-def strange_images(captures: Captures) -> list[Path]:
+def find_unlisted_images(captures: Captures) -> list[Path]:
     """Images beside those of the captures' shots that belong to no pair and frame of the rig file.
 
     Shots that are not wanted are left alone.
