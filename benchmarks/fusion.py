@@ -167,7 +167,7 @@ def _read_with_opencv(paths: list[list[str]]) -> None:
 
 
 def _ours(workspace: Path, folder: Path) -> Step:
-    from bodyscan.alignment.align import align
+    from bodyscan.alignment.icp import align
     from bodyscan.fusion.cleaning import clean
     from bodyscan.fusion.error_bar import with_placing
     from bodyscan.fusion.merging import merge

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from bodyscan.alignment.align import Alignment, AlignmentSettings, align
+from bodyscan.alignment.icp import Alignment, AlignmentSettings, align
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform

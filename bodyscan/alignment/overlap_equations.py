@@ -1,7 +1,8 @@
-"""The normal equations that the matches of one overlap add to the motions of its two pairs."""
+"""Normal equations of the overlaps, and the step that solves those of all pairs together."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,25 @@ class OverlapEquations:
         spots = (matches.points, matches.normals, distances, matches.sigma_mm)
         _accumulate(*spots, spread, information, gradient)
         return OverlapEquations(information / correlated, gradient / correlated)
+
+
+def solve_motions(
+    overlaps: Mapping[tuple[int, int], OverlapEquations], motion: Array, covariance: Array
+) -> Array:
+    """Motions (P, 6), one Gauss-Newton step: matches pull together, the prior holds near zero."""
+    normal = np.linalg.inv(covariance)
+    right = np.zeros(motion.size)
+    for (a, b), overlap in overlaps.items():
+        i, j = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
+        # The distance left after the step: d + J (x_i - m_i) - J (x_j - m_j).
+        wanted = overlap.information @ (motion[a] - motion[b]) - overlap.gradient
+        normal[i, i] += overlap.information
+        normal[j, j] += overlap.information
+        normal[i, j] -= overlap.information
+        normal[j, i] -= overlap.information
+        right[i] += wanted
+        right[j] -= wanted
+    return np.linalg.solve(normal, right).reshape(-1, 6)
 
 
 @compiled

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from bodyscan.alignment.align import Alignment, AlignmentSettings, align
+from bodyscan.alignment.icp import Alignment, AlignmentSettings, align
 from bodyscan.errors import BadInput
 from bodyscan.fusion.cleaning import clean, with_subject
 from bodyscan.fusion.error_bar import with_placing

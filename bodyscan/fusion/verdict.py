@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from bodyscan.alignment.align import Alignment
+from bodyscan.alignment.icp import Alignment
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.rings import rings
 from bodyscan.mesh.topology import face_areas

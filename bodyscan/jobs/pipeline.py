@@ -32,7 +32,7 @@ class Resources(Model):
 
 
 class Alignment(Model):
-    """See bodyscan.alignment.align.AlignmentSettings; matching none: boards alone."""
+    """See bodyscan.alignment.icp.AlignmentSettings; matching none: boards alone."""
 
     matching: Literal["projected", "nearest", "none"] = "projected"
     spacing_mm: Millimetres = 3.0

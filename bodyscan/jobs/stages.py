@@ -65,7 +65,7 @@ def scan_inputs(job: Job) -> dict[str, Path]:
 
 def run_scan(job: Job, out: Path, progress: Progress) -> None:
     """As `bodyscan scan` does: cloud, mesh, what they are, pictures."""
-    from bodyscan.alignment.align import AlignmentSettings
+    from bodyscan.alignment.icp import AlignmentSettings
     from bodyscan.fusion.scan import ScanSettings
     from bodyscan.fusion.storage import save_scan
     from bodyscan.registration.storage import calibration_id, load_calibration

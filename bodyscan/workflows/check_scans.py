@@ -9,7 +9,8 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.alignment.align import BODY_CENTRE_MM, Alignment, align
+from bodyscan.alignment.icp import Alignment, align
+from bodyscan.alignment.sway import BODY_CENTRE_MM
 from bodyscan.captures.folder import Captures
 from bodyscan.fusion.cleaning import clean, with_subject
 from bodyscan.geometry.transforms import RigidTransform

@@ -5,7 +5,7 @@ import open3d as o3d
 import pytest
 from ring import looking_at
 
-from bodyscan.alignment.align import AlignmentSettings, align
+from bodyscan.alignment.icp import AlignmentSettings, align
 from bodyscan.alignment.matching import Matches
 from bodyscan.alignment.object_refinement import refine_on_object
 from bodyscan.alignment.overlap_equations import OverlapEquations

@@ -9,7 +9,7 @@ import open3d as o3d
 import pytest
 from ray_cast_scan import Truth, cast_scan, load_body, load_rig, looking, without
 
-from bodyscan.alignment.align import AlignmentSettings
+from bodyscan.alignment.icp import AlignmentSettings
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.scan import Scan, ScanSettings, fuse
 from bodyscan.geometry.placing_covariance import PlacingCovariance

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from bodyscan.alignment.align import AlignmentSettings
+from bodyscan.alignment.icp import AlignmentSettings
 from bodyscan.fusion.scan import ScanSettings
 from bodyscan.jobs.pipeline import (
     SECTIONS,

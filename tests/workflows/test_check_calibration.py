@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_workspace import run
 
-from bodyscan.alignment.align import Alignment, Overlap
+from bodyscan.alignment.icp import Alignment, Overlap
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.workflows.check_rig import _of_scans

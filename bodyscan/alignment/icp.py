@@ -23,19 +23,17 @@ from bodyscan.alignment.matching import (
     match_nearest,
     match_projected,
 )
-from bodyscan.alignment.overlap_equations import OverlapEquations
-from bodyscan.arrays import Array
+from bodyscan.alignment.overlap_equations import OverlapEquations, solve_motions
+from bodyscan.alignment.sway import SwayPrior, bound_motions, centre_shifts
 from bodyscan.geometry.placing_covariance import PlacingCovariance
-from bodyscan.geometry.transforms import RigidTransform, adjoint
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
 Result = TypeVar("Result")
 
-BODY_CENTRE_MM = np.array([0.0, 0.0, 900.0])
 COARSE = 4  # only one in so many points takes part
 FINE_ROUNDS = 2  # at the end, with all of them
 UNKNOWN = 0, float("nan")
-SWAY_ROOM = 1.5  # standard deviations are believed this much larger than what was found
 
 
 @dataclass(frozen=True)
@@ -91,11 +89,11 @@ class Alignment:
 
     @property
     def rms_before_mm(self) -> float:
-        return _pooled([(o.points, o.rms_before_mm) for o in self.overlaps])
+        return _pool_rms([(o.points, o.rms_before_mm) for o in self.overlaps])
 
     @property
     def rms_after_mm(self) -> float:
-        return _pooled([(o.points, o.rms_after_mm) for o in self.overlaps])
+        return _pool_rms([(o.points, o.rms_after_mm) for o in self.overlaps])
 
 
 def align(
@@ -110,26 +108,27 @@ def align(
     names = [image.pair for image in images]
     start = [rig_from_camera[name] for name in names]
     motion = np.zeros((len(names), 6))
-    reach, sway = settings.reach_mm, 1.0
-    overlap_equations = partial(OverlapEquations.of, correlated=settings.correlated)
+    reach, scale = settings.reach_mm, 1.0
+    sway = SwayPrior(settings.sway_mm, settings.sway_deg, settings.least_sway, settings.most_sway)
+    equations = partial(OverlapEquations.of, correlated=settings.correlated)
     with ThreadPoolExecutor(workers) as pool:
         clouds = list(pool.map(lambda image: alignment_points(image, settings.spacing_mm), images))
         coarse = [p.subsample(COARSE) for p in clouds]
         for left in range(settings.rounds, 0, -1):
             moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
             taken = clouds if left <= FINE_ROUNDS else coarse
-            equations = _of_overlaps(overlap_equations, pool, taken, moved, reach, settings)
-            motion = _solve(equations, motion, _prior(names, prior, settings, sway))
-            reach, sway = max(reach / 2.0, settings.least_reach_mm), _sway_of(motion, settings)
-        widest = _prior(names, prior, settings, settings.most_sway)
-        motion, refused = _bounded(names, motion, widest, settings.limit_sigmas)
+            overlaps = _each_overlap(equations, pool, taken, moved, reach, settings)
+            motion = solve_motions(overlaps, motion, sway.covariance(names, prior, scale))
+            reach, scale = max(reach / 2.0, settings.least_reach_mm), sway.scale(motion)
+        widest = sway.covariance(names, prior, sway.most)
+        motion, refused = bound_motions(names, motion, widest, settings.limit_sigmas)
         moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
         # Both with the same reach, so that they can be compared.
         was, now = (
-            _of_overlaps(_gap, pool, coarse, placings, settings.least_reach_mm, settings)
+            _each_overlap(_gap, pool, coarse, placings, settings.least_reach_mm, settings)
             for placings in (start, moved)
         )
-    shift = np.linalg.norm(_shifts(motion), axis=1)
+    shift = np.linalg.norm(centre_shifts(motion), axis=1)
     return Alignment(
         dict(zip(names, moved, strict=True)),
         dict(zip(names, shift.tolist(), strict=True)),
@@ -141,7 +140,7 @@ def align(
     )
 
 
-def _of_overlaps(
+def _each_overlap(
     measure: Callable[[Matches], Result],
     pool: ThreadPoolExecutor,
     clouds: Sequence[AlignmentPoints],
@@ -168,70 +167,7 @@ def _gap(matches: Matches) -> tuple[int, float]:
     return len(matches.distances), float(np.sqrt(np.mean(matches.distances**2)))
 
 
-def _solve(
-    equations: Mapping[tuple[int, int], OverlapEquations], motion: Array, covariance: Array
-) -> Array:
-    """Motions (P, 6), one Gauss-Newton step: matches pull together, the prior holds near zero."""
-    normal = np.linalg.inv(covariance)
-    right = np.zeros(motion.size)
-    for (a, b), overlap in equations.items():
-        i, j = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
-        # The distance left after the step: d + J (x_i - m_i) - J (x_j - m_j).
-        wanted = overlap.information @ (motion[a] - motion[b]) - overlap.gradient
-        normal[i, i] += overlap.information
-        normal[j, j] += overlap.information
-        normal[i, j] -= overlap.information
-        normal[j, i] -= overlap.information
-        right[i] += wanted
-        right[j] -= wanted
-    return np.linalg.solve(normal, right).reshape(-1, 6)
-
-
-def _shifts(motion: Array) -> Array:
-    """(P, 3) mm: how far motions (P, 6) carry the body's centre."""
-    return motion[:, 3:] + np.cross(motion[:, :3], BODY_CENTRE_MM)
-
-
-def _sway_of(motion: Array, settings: AlignmentSettings) -> float:
-    """How much the subject moved, in multiples of settings.sway_mm, within its bounds.
-
-    A prior too tight would leave a part of the sway in; too wide it would let noise in.
-    """
-    if not settings.sway_mm:
-        return 1.0
-    found = float(np.sqrt(np.mean(_shifts(motion) ** 2))) / settings.sway_mm
-    return float(np.clip(SWAY_ROOM * found, settings.least_sway, settings.most_sway))
-
-
-def _prior(
-    names: Sequence[str], prior: PlacingCovariance, settings: AlignmentSettings, sway: float
-) -> Array:
-    """(6P, 6P): the calibration's covariance, plus for each pair a sway about the body's centre of
-    `sway` times what the settings say.
-    """
-    order = np.concatenate([6 * prior.names.index(name) + np.arange(6) for name in names])
-    rotation, translation = sway * np.radians(settings.sway_deg), sway * settings.sway_mm
-    own = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
-    carry = adjoint(RigidTransform(np.eye(3), BODY_CENTRE_MM))
-    each = np.kron(np.eye(len(names)), carry @ own @ carry.T)
-    return prior.matrix[np.ix_(order, order)] + each
-
-
-def _bounded(
-    names: Sequence[str], motion: Array, covariance: Array, limit: float
-) -> tuple[Array, dict[str, float]]:
-    """Put pairs back that moved more than `limit` sigmas of their own prior (six freedoms)."""
-    kept, refused = motion.copy(), {}
-    for k, name in enumerate(names):
-        block = covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
-        sigmas = float(np.sqrt(motion[k] @ np.linalg.solve(block, motion[k]) / 6.0))
-        if sigmas > limit:
-            refused[name] = sigmas
-            kept[k] = 0.0
-    return kept, refused
-
-
-def _pooled(parts: Sequence[tuple[int, float]]) -> float:
+def _pool_rms(parts: Sequence[tuple[int, float]]) -> float:
     known = [(points, rms) for points, rms in parts if np.isfinite(rms)]
     total = sum(points for points, _ in known)
     if not total:

@@ -1,0 +1,72 @@
+"""A subject's sway: how far people move between the pairs' shots, believed, found and bounded.
+
+Alignment takes it out (see `icp`): each pair's pose may move about the body's centre as far as this
+prior lets it, besides what the boards left open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.arrays import Array
+from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.transforms import RigidTransform, adjoint
+
+BODY_CENTRE_MM = np.array([0.0, 0.0, 900.0])
+SWAY_ROOM = 1.5  # standard deviations are believed this much larger than what was found
+
+
+@dataclass(frozen=True)
+class SwayPrior:
+    """Standard deviations of a subject's motion between pairs: of a shift, and of a rotation about
+    the body's centre; 0 for a rigid object. What is found scales both, from `least` to `most`.
+    """
+
+    shift_mm: float
+    rotation_deg: float
+    least: float
+    most: float
+
+    def scale(self, motion: Array) -> float:
+        """How much the subject moved by motions (P, 6), in multiples of `shift_mm`.
+
+        A prior too tight would leave a part of the sway in; too wide it would let noise in.
+        """
+        if not self.shift_mm:
+            return 1.0
+        found = float(np.sqrt(np.mean(centre_shifts(motion) ** 2))) / self.shift_mm
+        return float(np.clip(SWAY_ROOM * found, self.least, self.most))
+
+    def covariance(
+        self, names: Sequence[str], boards: PlacingCovariance, scale: float = 1.0
+    ) -> Array:
+        """(6P, 6P): the calibration's covariance, plus for each pair a sway `scale` times the usual."""
+        order = np.concatenate([6 * boards.names.index(name) + np.arange(6) for name in names])
+        rotation, translation = scale * np.radians(self.rotation_deg), scale * self.shift_mm
+        own = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
+        carry = adjoint(RigidTransform(np.eye(3), BODY_CENTRE_MM))
+        each = np.kron(np.eye(len(names)), carry @ own @ carry.T)
+        return boards.matrix[np.ix_(order, order)] + each
+
+
+def centre_shifts(motion: Array) -> Array:
+    """(P, 3) mm: how far motions (P, 6) carry the body's centre."""
+    return motion[:, 3:] + np.cross(motion[:, :3], BODY_CENTRE_MM)
+
+
+def bound_motions(
+    names: Sequence[str], motion: Array, covariance: Array, limit_sigmas: float
+) -> tuple[Array, dict[str, float]]:
+    """Motions (P, 6), 0 for pairs that moved more than `limit_sigmas` of their own prior (six
+    freedoms); and by how many sigmas these did."""
+    kept, refused = motion.copy(), {}
+    for k, name in enumerate(names):
+        block = covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
+        sigmas = float(np.sqrt(motion[k] @ np.linalg.solve(block, motion[k]) / 6.0))
+        if sigmas > limit_sigmas:
+            refused[name] = sigmas
+            kept[k] = 0.0
+    return kept, refused
