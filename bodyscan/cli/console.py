@@ -15,8 +15,8 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from bodyscan.fusion.scan import Scan
-from bodyscan.fusion.verdict import Verdict
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.verdict import Verdict
 
 # Tables keep their lines whole when the output goes into a file.
 console = Console() if sys.stdout.isatty() else Console(width=120)

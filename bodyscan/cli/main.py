@@ -219,7 +219,7 @@ def scan(
     from bodyscan.fusion.scan import ScanSettings, alignment_settings
     from bodyscan.fusion.storage import clear, make_room, save_failure, save_scan
     from bodyscan.registration.storage import calibration_id, load_calibration
-    from bodyscan.report.scan_pictures import draw_scan
+    from bodyscan.report.pictures import draw_scan
     from bodyscan.workflows.scan_person import scan as fuse
 
     _refuse_file(out)
@@ -245,7 +245,7 @@ def scan(
 
         export_raw_clouds(out / "raw.e57", result, subject=subject, calibration_id=origin)
     with console.errors.status("drawing"):
-        pictures = draw_scan(result, out)
+        pictures = draw_scan(result.cloud, result.mesh, out)
     console.console.print(console.scan_table(result))
     console.console.print(console.times_table(clock.seconds))
     console.console.print(f"result: {saved}\npictures: {', '.join(map(str, pictures))}")

@@ -39,19 +39,19 @@ def report(
     from bodyscan.cli import console
     from bodyscan.files.atomic import write_json, write_text
     from bodyscan.report.page import render
-    from bodyscan.report.result import page_of
+    from bodyscan.report.result_page import build_page
 
     folder = result if result.is_dir() else result.parent
     path = out or folder / "report.html"
     if path.is_dir():
         raise BadInput("is a folder", where=str(path), remedy="give --out the name of a file")
     with console.errors.status("writing the report"):
-        page = page_of(result, compare)
+        page = build_page(result, compare)
         write_text(path, render(page))
         if page.subject is not None and path.parent.resolve() != folder.resolve():
             # As beside an export: so that `bodyscan forget` knows whose it is.
             write_json(path.with_name(f"{path.name}.json"), {"subject": page.subject})
-    console.console.print(f"verdict: {page.grade}", highlight=False)
+    console.console.print(f"verdict: {page.verdict.grade}", highlight=False)
     console.console.print(f"report: {path}", soft_wrap=True, highlight=False)
 
 
@@ -90,7 +90,7 @@ def accept(
     from bodyscan.cli import console
     from bodyscan.evaluation.acceptance_file import limit_from, load_acceptance
     from bodyscan.registration.storage import calibration_id, load_calibration
-    from bodyscan.report.origin import is_synthetic
+    from bodyscan.report.page import is_synthetic
 
     captured = [*(spheres or ()), *(plate or ())]
     if bool(captured) == (simulate is not None):

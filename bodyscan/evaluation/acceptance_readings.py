@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from bodyscan.evaluation.acceptance_file import AcceptanceFile
+from bodyscan.verdict import Verdict
 
 ALL = "all pairs"
 
@@ -112,6 +113,23 @@ def figures(readings: Readings, file: AcceptanceFile) -> list[Figure]:
         Figure(name, value, where, getattr(file.limits, name), meaning)
         for name, (value, where), meaning in found
     ]
+
+
+def grade_acceptance(found: Sequence[Figure], readings: Readings) -> Verdict:
+    """Not accepted where a limit is exceeded or an artefact was not read."""
+    reasons = [
+        f"{one.name}: {one.value_mm:.3f} mm ({one.where}), limit {one.limit_mm:g} mm"
+        if one.value_mm is not None
+        else f"{one.name}: not measured, though it has a limit"
+        for one in found
+        if one.exceeded
+    ]
+    reasons += readings.problems
+    if reasons:
+        return Verdict("not accepted", tuple(reasons))
+    if all(one.limit_mm is None for one in found):
+        return Verdict("not judged", ("no limits were given",))
+    return Verdict("accepted")
 
 
 def document(

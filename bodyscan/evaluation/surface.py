@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.mesh.scene import centred_scene
 from bodyscan.mesh.topology import directed_edges
 
 ON_EDGE = 1e-5  # of a barycentric coordinate, in float32
@@ -31,15 +32,10 @@ class Deviation:
 def signed_distances(points: Array, vertices: Array, faces: Indices) -> Array:
     """(N,) mm from points (N, 3) to a closed triangle mesh, positive outside it.
 
-    The ray-casting scene computes in float32: coordinates are centred first. The sign is that of
-    the angle-weighted pseudo-normal at the nearest spot (Baerentzen and Aanaes 2005).
+    The sign is that of the angle-weighted pseudo-normal at the nearest spot (Baerentzen and Aanaes
+    2005).
     """
-    centre = vertices.mean(axis=0)
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor((vertices - centre).astype(np.float32)),
-        o3d.core.Tensor(faces.astype(np.uint32)),
-    )
+    scene, centre = centred_scene(vertices, faces)
     centred = (points - centre).astype(np.float32)
     nearest = scene.compute_closest_points(o3d.core.Tensor(centred))
     offset = centred.astype(np.float64) - nearest["points"].numpy()

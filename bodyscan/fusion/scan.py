@@ -11,12 +11,13 @@ from bodyscan.fusion.cleaning import clean, with_subject
 from bodyscan.fusion.error_bar import with_placing
 from bodyscan.fusion.merging import merged
 from bodyscan.fusion.meshing import mesh
-from bodyscan.fusion.verdict import Verdict, judge
+from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.progress import Progress, silent
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -109,5 +110,7 @@ def fuse(
     )
     progress("meshing", 1, 1)
     measured = {image.pair: int(image.valid.sum()) for image in cleaned}
-    verdict = judge(cloud, surface, alignment, failed, calibration.rig.volume, fused.contradicted)
+    verdict = grade_scan(
+        cloud, surface, alignment, failed, calibration.rig.volume, fused.contradicted
+    )
     return Scan(cloud, surface, alignment, measured, failed, verdict, tuple(seen), placing)

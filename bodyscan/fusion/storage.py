@@ -16,9 +16,9 @@ from bodyscan import __version__
 from bodyscan.errors import ResultError, ScanFailed
 from bodyscan.files.atomic import write_json
 from bodyscan.fusion.scan import Scan
-from bodyscan.fusion.verdict import Verdict
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
+from bodyscan.verdict import Verdict
 
 SCHEMA = "bodyscan-scan"
 VERSION = 1

@@ -69,7 +69,7 @@ def run_scan(job: Job, out: Path, progress: Progress) -> None:
     from bodyscan.fusion.scan import ScanSettings
     from bodyscan.fusion.storage import save_scan
     from bodyscan.registration.storage import calibration_id, load_calibration
-    from bodyscan.report.scan_pictures import draw_scan
+    from bodyscan.report.pictures import draw_scan
     from bodyscan.workflows.scan_person import scan
 
     align = job.pipeline.section("alignment")
@@ -94,7 +94,7 @@ def run_scan(job: Job, out: Path, progress: Progress) -> None:
         when=captures.when,
     )
     progress("drawing", 0, 1)
-    draw_scan(result, out)
+    draw_scan(result.cloud, result.mesh, out)
     progress("drawing", 1, 1)
 
 
@@ -114,11 +114,11 @@ def run_report(job: Job, out: Path, progress: Progress) -> None:
     """As `bodyscan report` does."""
     from bodyscan.files.atomic import write_text
     from bodyscan.report.page import render
-    from bodyscan.report.result import page_of
+    from bodyscan.report.result_page import build_page
 
     progress("reporting", 0, 1)
     folder = job.folder / ("scan" if job.pipeline.kind == "fuse" else "calibration")
-    write_text(out / "report.html", render(page_of(folder)))
+    write_text(out / "report.html", render(build_page(folder)))
     progress("reporting", 1, 1)
 
 

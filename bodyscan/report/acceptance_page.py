@@ -6,30 +6,13 @@ from collections.abc import Sequence
 
 from rich.table import Table as ScreenTable
 
-from bodyscan.evaluation.acceptance_readings import ALL, Figure, Readings
+from bodyscan.evaluation.acceptance_readings import ALL, Figure, Readings, grade_acceptance
 from bodyscan.report.page import Column, Lines, Number, Numbers, Page, Section, Table, shown
 
 NO_STANDARD = (
     "Modelled on VDI/VDE 2634 parts 2 and 3 and ISO 20685-2; it is no test by these standards, "
     "which ask for more artefacts and places, and for calibrated ones."
 )
-
-
-def verdict_of(found: Sequence[Figure], readings: Readings) -> tuple[str, tuple[str, ...]]:
-    """accepted, not accepted, or not judged where no limit was given; and the reasons."""
-    reasons = [
-        f"{one.name}: {_signed(one.value_mm)} mm ({one.where}), limit {one.limit_mm:g} mm"
-        if one.value_mm is not None
-        else f"{one.name}: not measured, though it has a limit"
-        for one in found
-        if one.exceeded
-    ]
-    reasons += readings.problems
-    if reasons:
-        return "not accepted", tuple(reasons)
-    if all(one.limit_mm is None for one in found):
-        return "not judged", ("no limits were given",)
-    return "accepted", ()
 
 
 def screen_table(found: Sequence[Figure], synthetic: bool) -> ScreenTable:
@@ -50,7 +33,6 @@ def screen_table(found: Sequence[Figure], synthetic: bool) -> ScreenTable:
 def acceptance_page(
     found: Sequence[Figure], readings: Readings, rig: str, calibration_id: str, synthetic: bool
 ) -> Page:
-    grade, reasons = verdict_of(found, readings)
     numbers = Numbers(
         tuple(
             Number(
@@ -98,8 +80,7 @@ def acceptance_page(
     )
     return Page(
         f"Acceptance of rig {rig}",
-        grade,
-        reasons,
+        grade_acceptance(found, readings),
         synthetic,
         (("calibration", calibration_id[:12]),),
         [

@@ -8,11 +8,12 @@ from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Bytes, Mask
 from bodyscan.errors import ScanFailed
+from bodyscan.evaluation.comparison import Comparison
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.versions import light
-from bodyscan.report.comparison import Comparison
+from bodyscan.report.canvas import blue_white_red, turbo
 from bodyscan.report.model import Layer, Shape, css, ramp_legend
-from bodyscan.report.pictures import FILLED_TINT, _blue_white_red, _turbo
+from bodyscan.report.pictures import FILLED_TINT
 
 FACES = (50_000, 44_000, 38_000)
 """Tried in turn: reduced to one number of faces a mesh may fold, and not to another."""
@@ -50,7 +51,7 @@ def layers(
     made_up = np.zeros(len(small.vertices), bool)
     made_up[small.faces[small.filled]] = True
     top = _round_up(float(np.nanpercentile(cloud.sigma_mm, 98)))
-    sigma = _ramp(np.nan_to_num(small.sigma_mm / top), _turbo()[:, ::-1])
+    sigma = _ramp(np.nan_to_num(small.sigma_mm / top), turbo()[:, ::-1])
     nearest = np.asarray(cKDTree(cloud.points).query(small.vertices, workers=2)[1])
     pairs = np.array(PAIRS, np.uint8)[np.clip(cloud.pairs_seen[nearest], 1, len(PAIRS)) - 1]
     tint = FILLED_TINT[::-1]
@@ -64,7 +65,7 @@ def layers(
             grey,
         ]}),
         Layer("sigma", _without(sigma, made_up), {
-            **ramp_legend("sigma along the normal, mm", _turbo()[:, ::-1], ("0", f"{top:g}")),
+            **ramp_legend("sigma along the normal, mm", turbo()[:, ::-1], ("0", f"{top:g}")),
             "swatches": [grey],
         }),
         Layer("filled", np.where(made_up[:, None], tint, SKIN).astype(np.uint8), {
@@ -90,7 +91,7 @@ def _deviation(
     """Of the nearest vertex of the full mesh: the light one is a few tenths of a mm off itself."""
     tree = cKDTree(mesh.vertices[comparison.vertices])
     signed = comparison.signed_mm[np.asarray(tree.query(small.vertices, workers=2)[1])]
-    table = _blue_white_red()[:, ::-1]
+    table = blue_white_red()[:, ::-1]
     legend = ramp_legend(
         f"from {comparison.name}, mm (red: outside it)",
         table,

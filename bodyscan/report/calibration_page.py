@@ -12,11 +12,20 @@ from bodyscan.registration.storage import FILE_NAME, calibration_id, load_calibr
 from bodyscan.report import calibration_charts as draw
 from bodyscan.report import calibration_verdict as limits
 from bodyscan.report import charts
-from bodyscan.report.calibration_verdict import PairFigures, figures_of, judge
-from bodyscan.report.origin import is_synthetic
-from bodyscan.report.page import Block, Column, Lines, Page, Picture, Section, Table, Viewer
+from bodyscan.report.calibration_verdict import PairFigures, figures_of, grade_calibration
+from bodyscan.report.canvas import png_of
+from bodyscan.report.page import (
+    Block,
+    Column,
+    Lines,
+    Page,
+    Picture,
+    Section,
+    Table,
+    Viewer,
+    is_synthetic,
+)
 from bodyscan.report.rig_model import rig_model
-from bodyscan.report.scan_page import drawn
 from bodyscan.report.sigma_map import draw_sigma_map
 
 SVG = "image/svg+xml"
@@ -29,12 +38,10 @@ NOT_STORED = (
 def calibration_page(folder: Path) -> Page:
     """The report of the calibration in `folder`. Raises CalibrationFileError."""
     calibration = load_calibration(folder)
-    grade, reasons = judge(calibration)
     shots = len({shot for shot, _ in calibration.rig_from_board})
     return Page(
         f"Calibration of rig {calibration.rig.name}",
-        grade,
-        reasons,
+        grade_calibration(calibration),
         is_synthetic(folder),
         (
             ("pairs", f"{len(calibration.pairs)} of {len(calibration.rig.pairs)}"),
@@ -240,7 +247,7 @@ def _sigma(calibration: RigCalibration) -> Section:
         "How far the rig's placing alone may put a point wrong (one sigma, all axes together, mm), in "
         "two upright planes through the rig's axis. No noise of stripes and no swaying subject is "
         "in it. Light grey: no camera sees anything.",
-        drawn(
+        png_of(
             lambda path: draw_sigma_map(
                 calibration.rig.volume,
                 calibration.rig_from_camera,

@@ -1,4 +1,4 @@
-"""Whether a calibration is good, usable, or to be done again, and why."""
+"""What makes a calibration good, usable, or to be done again."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import numpy as np
 from bodyscan.calibration.coverage import covered
 from bodyscan.geometry.placing_covariance import position_sigma
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.verdict import Grade, Verdict
 
 CORNERS_RMS_PX = 0.3
 """Corners are found to less than a tenth of a pixel in sharp, well lit pictures."""
 SHEETS_RMS_MM, HELD_OUT_MM = 0.3, 0.5
-"""A scan's overlaps are called in doubt from 0.4 mm on (fusion/verdict.py)."""
+"""A scan's overlaps are called in doubt from 0.4 mm on (fusion/scan_verdict.py)."""
 COVERED_PERCENT = 40.0
 """Of the picture: a lens is only known where boards were."""
 POSES, STRIPE_SHOTS = 6, 4
@@ -67,8 +68,8 @@ def figures_of(calibration: RigCalibration) -> list[PairFigures]:
     ]
 
 
-def judge(calibration: RigCalibration) -> tuple[str, tuple[str, ...]]:
-    """good, usable or recalibrate, and the reasons, worst first."""
+def grade_calibration(calibration: RigCalibration) -> Verdict:
+    """By how far its pairs are beyond their limits."""
     findings = [
         (np.inf, f"recalibrate: pair {name} failed: {reason}")
         for name, reason in calibration.failed.items()
@@ -79,8 +80,8 @@ def judge(calibration: RigCalibration) -> tuple[str, tuple[str, ...]]:
             findings.append((times, f"{'recalibrate: ' if far else ''}pair {pair.name}: {words}"))
     findings.sort(key=lambda finding: -finding[0])
     worst = findings[0][0] if findings else 0.0
-    grade = "recalibrate" if worst > FAR_BEYOND else "usable" if findings else "good"
-    return grade, tuple(words for _, words in findings)
+    grade: Grade = "recalibrate" if worst > FAR_BEYOND else "usable" if findings else "good"
+    return Verdict(grade, tuple(words for _, words in findings))
 
 
 def _figures(calibration: RigCalibration, name: str) -> PairFigures:

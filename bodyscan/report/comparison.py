@@ -1,118 +1,79 @@
-"""A scan held against another scan or a known surface: signed distances, as they stand or laid on
-each other."""
+"""What a scan's report says of a comparison with another surface."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
 import numpy as np
-import open3d as o3d
 
-from bodyscan.arrays import Array, Indices
-from bodyscan.errors import BadInput
-from bodyscan.evaluation.surface import Deviation, deviation, signed_distances
-from bodyscan.fusion.storage import FILE_NAME, load_scan
-from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.evaluation.comparison import Comparison
+from bodyscan.evaluation.surface import Deviation
 from bodyscan.mesh.body import BodyMesh
-
-SAMPLE = 30_000
-REACHES_MM = (40.0, 10.0, 3.0)
-"""A point's partner may be so far away, round after round."""
-LIKE_A_BODY = (0.2, 5.0)
-"""Sizes that differ by more than this are not of one subject, or not both in mm."""
+from bodyscan.report import charts
+from bodyscan.report.canvas import PICTURE_PX, png_of
+from bodyscan.report.page import Column, Picture, Section, Table
+from bodyscan.report.pictures import draw_deviation
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """vertices: numbers (N,) of the mesh's measured vertices.  signed_mm: (N,) their distances from
-    the other surface, positive outside it.  figures: of all of them.
-
-    is_scan: whether the other is a scan, not a surface of its own.  fitted: whether the scan was laid
-    on it first, by `other_from_scan`.
-    """
-
-    name: str
-    is_scan: bool
-    vertices: Indices
-    signed_mm: Array
-    figures: Deviation
-    fitted: bool
-    other_from_scan: RigidTransform
-
-
-def compare(mesh: BodyMesh, other: Path) -> list[Comparison]:
-    """The mesh's measured part against `other`: a scan's folder or a PLY in mm, rig frame.
-
-    First as they stand, then with the scan laid on the other as a whole.  Raises ResultError or
-    BadInput where `other` cannot be read, or cannot be the same subject.
-    """
-    vertices, faces = _surface(other)
-    share = np.ptp(mesh.vertices, axis=0).max() / max(float(np.ptp(vertices, axis=0).max()), 1e-9)
-    if not LIKE_A_BODY[0] < share < LIKE_A_BODY[1]:
-        raise BadInput(
-            f"is {1.0 / share:.3g} times as large as the scan",
-            where=str(other),
-            remedy="give a surface of the same subject, in millimetres",
-        )
-    measured = np.unique(mesh.faces[~mesh.filled])
-    points = mesh.vertices[measured]
-    laid = laid_on(points, vertices, faces)
-    return [
-        Comparison(
-            _name(other), _is_scan(other), measured, signed, deviation(signed), fitted, place
-        )
-        for place, fitted in ((RigidTransform.identity(), False), (laid, True))
-        for signed in (signed_distances(place.apply(points), vertices, faces),)
-    ]
-
-
-def laid_on(points: Array, vertices: Array, faces: Indices) -> RigidTransform:
-    """`other_from_scan`: the rigid motion that brings points (N, 3) nearest to a mesh.
-
-    Point to plane (Chen and Medioni 1992) with Tukey's weights, in Open3D.
-    """
-    middle = vertices.mean(axis=0)
-    target = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(vertices - middle),
-        o3d.utility.Vector3iVector(faces.astype(np.int32)),
+def comparison_section(
+    mesh: BodyMesh, found: list[Comparison], shown: Comparison, limit: float
+) -> Section:
+    """The comparisons' figures, and a map of the one `shown`; limit: of the map's scale, mm."""
+    columns = (
+        Column("the scan"),
+        Column("bias", "mm", "mean signed distance, outside is positive."),
+        Column("median", "mm", "of the absolute distances."),
+        Column("RMS", "mm", "root of the mean squared distance."),
+        Column("95 %", "mm", "of the absolute distances are less."),
+        Column("worst", "mm", "the largest of the absolute distances.", digits=2),
     )
-    target.compute_vertex_normals()
-    known = o3d.geometry.PointCloud(target.vertices)
-    known.normals = target.vertex_normals
-    some = points[:: max(1, len(points) // SAMPLE)] - middle
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(some))
-    icp = o3d.pipelines.registration
-    motion = np.eye(4)
-    for reach in REACHES_MM:
-        loss = icp.TransformationEstimationPointToPlane(icp.TukeyLoss(0.5 * reach))
-        motion = icp.registration_icp(cloud, known, reach, motion, loss).transformation
-    found = RigidTransform.from_matrix(motion)
-    return RigidTransform(found.rotation, found.translation + middle - found.rotation @ middle)
+    rows: tuple[tuple[float | str | None, ...], ...] = tuple(
+        (_standing(one), *_row(one.figures)) for one in found
+    )
+    points = mesh.vertices[shown.vertices]
+    normals = mesh.normals[shown.vertices]
+    laid = found[-1].other_from_scan
+    moved = float(np.linalg.norm(laid.apply(points.mean(axis=0)) - points.mean(axis=0)))
+    return Section(
+        f"Compared with {shown.name}",
+        f"Distances of the {len(points):,} measured vertices of this scan's mesh from the surface of "
+        f"{shown.name}; what was made up is left out. To lay one on the other the scan was moved "
+        f"by {moved:.2f} mm and turned by {np.degrees(laid.angle):.3f} degrees as a whole.",
+        [
+            Table(columns, rows),
+            Picture(
+                "Deviation map",
+                f"Front, left side, back; the scan {_standing(shown)}. Red: outside of {shown.name}, "
+                "blue: inside. Beyond the ends of the scale the colour is that of the end.",
+                png_of(
+                    lambda path: draw_deviation(
+                        points,
+                        shown.signed_mm,
+                        path,
+                        limit,
+                        normals=normals,
+                        height_px=PICTURE_PX,
+                        caption="deviation, mm",
+                    )
+                ),
+            ),
+            Picture(
+                "How the deviations are distributed",
+                "The line stands at their mean; the outermost bars hold all that lies beyond.",
+                charts.histogram(shown.signed_mm, limit, "signed distance, mm"),
+                "image/svg+xml",
+            ),
+        ],
+    )
 
 
-def _is_scan(path: Path) -> bool:
-    return path.is_dir() or path.name == FILE_NAME
+def _row(figures: Deviation) -> tuple[float, ...]:
+    return figures.bias_mm, figures.median_mm, figures.rms_mm, figures.p95_mm, figures.worst_mm
 
 
-def _name(path: Path) -> str:
-    """`truth/subject.ply`, but `scan` of a scan's folder."""
-    whole = path.resolve()
-    if path.name == FILE_NAME:
-        return whole.parent.name
-    return whole.name if path.is_dir() else f"{whole.parent.name}/{whole.name}"
+def _standing(one: Comparison) -> str:
+    return "laid on the other as a whole" if one.fitted else "as it stands in its rig frame"
 
 
-def _surface(path: Path) -> tuple[Array, Indices]:
-    """vertices (V, 3) mm, faces (F, 3)."""
-    if _is_scan(path):
-        mesh = load_scan(path if path.is_dir() else path.parent).mesh
-        return mesh.vertices, mesh.faces
-    read = o3d.io.read_triangle_mesh(str(path)) if path.is_file() else o3d.geometry.TriangleMesh()
-    if not read.has_triangles():
-        raise BadInput(
-            "no surface can be read here",
-            where=str(path),
-            remedy="give a scan's folder, or a PLY with faces, in mm",
-        )
-    return np.asarray(read.vertices), np.asarray(read.triangles).astype(np.int64)
+def map_limit(one: Comparison) -> float:
+    """The map's end, mm: a round number that most deviations stay below."""
+    power = 10.0 ** np.floor(np.log10(max(one.figures.p95_mm, 1e-3)))
+    return float(next(s * power for s in (1.0, 2.0, 5.0, 10.0) if s * power >= one.figures.p95_mm))

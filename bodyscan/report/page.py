@@ -7,15 +7,14 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from pathlib import Path
 from typing import Any, Literal
 
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from bodyscan import __version__
-
-Mark = Literal["", "good", "usable", "bad"]
-GOOD, CAREFUL = ("good", "accepted"), ("usable", "not judged")
+from bodyscan.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -38,8 +37,8 @@ class Number:
         return self.value >= self.limit if self.at_least else self.value <= self.limit
 
     @property
-    def mark(self) -> Mark:
-        return {None: "", True: "good", False: "bad"}[self.kept]  # type: ignore[return-value]
+    def mark(self) -> str:
+        return {None: "", True: "good", False: "bad"}[self.kept]
 
     @property
     def text(self) -> str:
@@ -143,23 +142,30 @@ class Section:
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """grade: one of GOOD or CAREFUL, or a word for bad (repeat, recalibrate), with its reasons.
-
-    synthetic: whether what is reported was simulated.  facts: what it is, as (name, value).
+    """synthetic: whether what is reported was simulated.  facts: what it is, as (name, value).
     subject: pseudonym of the person it shows.
     """
 
     title: str
-    grade: str
-    reasons: tuple[str, ...]
+    verdict: Verdict
     synthetic: bool
     facts: tuple[tuple[str, str], ...]
     sections: Sequence[Section] = ()
     subject: str | None = None
 
-    @property
-    def mark(self) -> Mark:
-        return "good" if self.grade in GOOD else "usable" if self.grade in CAREFUL else "bad"
+
+SIMULATED_SUBJECT = "sim-"
+"""What the simulator's pseudonyms begin with."""
+LEVELS = 3
+"""So many folders above a result are looked at: a batch's lie deeper than a single scan's."""
+
+
+def is_synthetic(folder: Path, subject: str | None = None) -> bool:
+    """Whether the simulator's truth lies beside a result, or its subject is the simulator's."""
+    above = (folder.resolve(), *folder.resolve().parents[:LEVELS])
+    return (subject or "").startswith(SIMULATED_SUBJECT) or any(
+        (place / "truth" / "truth.json").is_file() for place in above
+    )
 
 
 def render(page: Page) -> str:

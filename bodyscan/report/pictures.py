@@ -9,18 +9,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Bytes
-from bodyscan.files.atomic import write_bytes
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.scene import centred_scene
+from bodyscan.report.canvas import (
+    BACKGROUND,
+    Scale,
+    blue_white_red,
+    colour_bar,
+    save_panels,
+    turbo,
+    write_text,
+)
 
-BACKGROUND = (250, 250, 250)
-INK = (40, 40, 40)
 FILLED_TINT = (60, 160, 255)  # blue, green, red: orange
 WRONG_SIDE = (200, 40, 200)
 
@@ -58,20 +64,15 @@ VIEWS = {
 }
 
 
-@dataclass(frozen=True)
-class Scale:
-    """A colour for every number between two ends, with a caption for its bar."""
-
-    low: float
-    high: float
-    caption: str
-    table: Bytes  # (256, 3) blue, green, red
-
-    def colours(self, values: NDArray[np.floating]) -> Bytes:
-        """(N,) -> (N, 3); beyond the ends the end's colour, not a number: grey."""
-        share = (np.nan_to_num(values) - self.low) / (self.high - self.low)
-        colours = self.table[np.clip(np.rint(255 * share), 0, 255).astype(np.uint8)]
-        return np.where(np.isfinite(values)[:, None], colours, 128).astype(np.uint8)
+def draw_scan(cloud: BodyCloud, mesh: BodyMesh, folder: Path) -> list[Path]:
+    """The pictures that a scan leaves beside its result: the cloud by photo, sigma and number of
+    pairs, and the mesh with its filled faces marked."""
+    paths = [folder / f"{name}.png" for name in ("cloud", "sigma", "pairs", "mesh")]
+    draw_cloud(cloud, paths[0], colour="photo")
+    draw_cloud(cloud, paths[1], colour="sigma")
+    draw_cloud(cloud, paths[2], colour="pairs_seen")
+    draw_mesh(mesh, paths[3], colour="filled")
+    return paths
 
 
 def draw_mesh(
@@ -93,19 +94,14 @@ def draw_mesh(
         base = mesh.colours[mesh.faces[:, 0], ::-1]
     elif colour != "plain":
         raise ValueError(f"colour is filled, photo or plain, not {colour!r}")
-    centre = mesh.vertices.mean(axis=0)
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor((mesh.vertices - centre).astype(np.float32)),
-        o3d.core.Tensor(mesh.faces.astype(np.uint32)),
-    )
+    scene, centre = centred_scene(mesh.vertices, mesh.faces)
     panels = [
         _named(
             _cast_view(scene, centre, base, _Frame.of(mesh.vertices, _view(view), height_px)), view
         )
         for view in views
     ]
-    _save(path, panels)
+    save_panels(path, panels)
 
 
 def draw_cloud(
@@ -126,9 +122,9 @@ def draw_cloud(
         return
     if colour == "sigma":
         top = float(np.percentile(cloud.sigma_mm, 98))
-        scale, values = Scale(0.0, top, "sigma, mm", _turbo()), cloud.sigma_mm
+        scale, values = Scale(0.0, top, "sigma, mm", turbo()), cloud.sigma_mm
     elif colour == "pairs_seen":
-        scale, values = Scale(0.0, 6.0, "pairs", _turbo()), cloud.pairs_seen.astype(np.float32)
+        scale, values = Scale(0.0, 6.0, "pairs", turbo()), cloud.pairs_seen.astype(np.float32)
     else:
         raise ValueError(f"colour is photo, plain, sigma or pairs_seen, not {colour!r}")
     colours = scale.colours(values)
@@ -147,7 +143,7 @@ def draw_deviation(
     caption: str = "from truth, mm",
 ) -> None:
     """Points coloured by signed distance to a known surface: blue inside, red outside."""
-    scale = Scale(-limit_mm, limit_mm, caption, _blue_white_red())
+    scale = Scale(-limit_mm, limit_mm, caption, blue_white_red())
     colours = scale.colours(signed_mm)
     draw_points(points, normals, colours, path, views, height_px, scale=scale)
 
@@ -169,7 +165,7 @@ def draw_points(
     for view in views:
         frame = _Frame.of(points, _view(view), height_px)
         panels.append(_named(_splat_view(points, normals, colours, frame, dot_mm, shaded), view))
-    _save(path, panels if scale is None else [*panels, _bar(scale, height_px)])
+    save_panels(path, panels if scale is None else [*panels, colour_bar(scale, height_px)])
 
 
 @dataclass(frozen=True)
@@ -207,7 +203,7 @@ def _view(view: str | View) -> View:
 def _named(panel: Bytes, view: str | View) -> Bytes:
     """The panel with the name of its view, if it has one, in its upper left corner."""
     if isinstance(view, str):
-        _write(panel, view, (6, 16))
+        write_text(panel, view, (6, 16))
     return panel
 
 
@@ -266,50 +262,3 @@ def _dot_size(points: Array) -> float:
     some = points[:: max(1, len(points) // 2000)]
     gaps = np.asarray(cKDTree(points).query(some, k=2)[0])[:, 1]
     return 4.0 * float(np.median(gaps))
-
-
-def _bar(scale: Scale, height_px: int) -> Bytes:
-    """A colour bar with round numbers beside it, and its caption."""
-    panel = np.full((height_px, 130, 3), BACKGROUND, np.uint8)
-    top, bottom = height_px // 6, height_px - height_px // 6
-    ramp = scale.table[np.linspace(255, 0, bottom - top).astype(np.uint8)]
-    panel[top:bottom, 20:50] = ramp[:, None]
-    for value in round_ticks(scale.low, scale.high):
-        share = (value - scale.low) / (scale.high - scale.low)
-        row = round(bottom - share * (bottom - top))
-        panel[row, 50:54] = INK
-        _write(panel, f"{value:g}", (58, row + 5))
-    _write(panel, scale.caption, (8, top - 20))
-    return panel
-
-
-def round_ticks(low: float, high: float) -> list[float]:
-    """Three to six round numbers from low to high; whole ones where they reach far enough."""
-    rough = (high - low) / 5.0
-    unit = 10.0 ** np.floor(np.log10(rough))
-    step = next(unit * times for times in (1.0, 2.0, 5.0, 10.0) if unit * times >= rough * 0.999)
-    first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
-    return [float(np.round(k * step, 10)) + 0.0 for k in np.arange(first, last + 1)]
-
-
-def _write(panel: Bytes, text: str, corner: tuple[int, int]) -> None:
-    cv2.putText(panel, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
-
-
-def _turbo() -> Bytes:
-    ramp = np.arange(256, dtype=np.uint8)[:, None]
-    return np.asarray(cv2.applyColorMap(ramp, cv2.COLORMAP_TURBO)).reshape(256, 3)
-
-
-def _blue_white_red() -> Bytes:
-    share = np.linspace(-1.0, 1.0, 256)[:, None]
-    blue, white, red = np.array([[180, 60, 20], [245, 245, 245], [30, 20, 180]], float)
-    ends = np.where(share < 0, blue, red)
-    return np.rint(white + np.abs(share) ** 0.8 * (ends - white)).astype(np.uint8)
-
-
-def _save(path: Path, panels: Sequence[Bytes]) -> None:
-    ok, data = cv2.imencode(".png", np.concatenate(panels, axis=1))
-    if not ok:
-        raise ValueError(f"no PNG could be made for {path}")
-    write_bytes(Path(path), data.tobytes())

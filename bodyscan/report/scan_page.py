@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from bodyscan.errors import ResultError
-from bodyscan.evaluation.surface import Deviation
-from bodyscan.fusion import verdict as limits
+from bodyscan.evaluation.comparison import Comparison, compare
+from bodyscan.fusion import scan_verdict as limits
 from bodyscan.fusion.storage import FILE_NAME, SCHEMA, StoredScan, load_scan
+from bodyscan.mesh.holes import holes
 from bodyscan.mesh.topology import topology
 from bodyscan.report import charts
 from bodyscan.report.body_model import layers, light_mesh, shape_of
-from bodyscan.report.comparison import Comparison, compare
-from bodyscan.report.holes import holes
+from bodyscan.report.canvas import PICTURE_PX, png_of
+from bodyscan.report.comparison import comparison_section, map_limit
 from bodyscan.report.model import pack
-from bodyscan.report.origin import is_synthetic
 from bodyscan.report.page import (
     Column,
     Lines,
@@ -31,10 +30,11 @@ from bodyscan.report.page import (
     Section,
     Table,
     Viewer,
+    is_synthetic,
 )
-from bodyscan.report.pictures import draw_cloud, draw_deviation, draw_mesh
+from bodyscan.report.pictures import draw_cloud, draw_mesh
+from bodyscan.verdict import Verdict
 
-HEIGHT_PX = 760
 MOST_HOLES = 8
 SMALL_HOLE_MM2 = 100.0
 NO_VERDICT = (
@@ -49,7 +49,7 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
     """
     facts = _facts(folder)
     subject = facts.get("subject")
-    verdict = facts.get("verdict") or {"grade": "usable", "reasons": [NO_VERDICT]}
+    told = facts.get("verdict") or {"grade": "usable", "reasons": [NO_VERDICT]}
     sections: list[Section] = []
     if "sha256" in facts:
         scan = load_scan(folder)
@@ -57,8 +57,7 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
         sections = _sections(scan, found)
     return Page(
         f"Scan of {subject}" if subject else f"Scan {folder.resolve().name}",
-        verdict["grade"],
-        tuple(verdict["reasons"]),
+        Verdict(told["grade"], tuple(told["reasons"])),
         is_synthetic(folder, subject),
         (
             ("taken", str(facts.get("when") or "not known")),
@@ -91,13 +90,13 @@ def _facts(folder: Path) -> dict[str, Any]:
 def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
     # A person stands elsewhere in each scan, but a truth stands where it is true.
     shown = next((one for one in found if one.fitted == one.is_scan), None)
-    limit = _limit(shown) if shown else 1.0
+    limit = map_limit(shown) if shown else 1.0
     sections = [
         Section("The body", "", [_viewer(scan, shown, limit)]),
         Section("Figures", "", [_numbers(scan)]),
     ]
     if shown:
-        sections.append(_comparison(scan, found, shown, limit))
+        sections.append(comparison_section(scan.mesh, found, shown, limit))
     sections += [_pictures(scan), _pairs(scan.facts), _holes(scan)]
     return sections
 
@@ -197,34 +196,27 @@ def _pictures(scan: StoredScan) -> Section:
             Picture(
                 "Measured points, as photographed",
                 views + "White: nothing was measured there.",
-                drawn(lambda path: draw_cloud(cloud, path, height_px=HEIGHT_PX)),
+                png_of(lambda path: draw_cloud(cloud, path, height_px=PICTURE_PX)),
             ),
             Picture(
                 "Mesh",
                 views + "Orange: made up to close the mesh.",
-                drawn(lambda path: draw_mesh(mesh, path, height_px=HEIGHT_PX)),
+                png_of(lambda path: draw_mesh(mesh, path, height_px=PICTURE_PX)),
             ),
             Picture(
                 "Sigma of the points",
                 views + "Standard deviation of each point along its normal, mm.",
-                drawn(lambda path: draw_cloud(cloud, path, colour="sigma", height_px=HEIGHT_PX)),
+                png_of(lambda path: draw_cloud(cloud, path, colour="sigma", height_px=PICTURE_PX)),
             ),
             Picture(
                 "Pairs",
                 views + "How many pairs measured each place.",
-                drawn(
-                    lambda path: draw_cloud(cloud, path, colour="pairs_seen", height_px=HEIGHT_PX)
+                png_of(
+                    lambda path: draw_cloud(cloud, path, colour="pairs_seen", height_px=PICTURE_PX)
                 ),
             ),
         ],
     )
-
-
-def drawn(draw: Callable[[Path], object]) -> bytes:
-    """What a function that draws into a file draws."""
-    with TemporaryDirectory(prefix="bodyscan-") as folder:
-        draw(Path(folder) / "picture.png")
-        return (Path(folder) / "picture.png").read_bytes()
 
 
 def _pairs(facts: Mapping[str, Any]) -> Section:
@@ -317,68 +309,3 @@ def _holes(scan: StoredScan) -> Section:
         + ". Height and place are of the patch's middle."
     )
     return Section("Holes", intro, [Table(columns, rows)] if rows else [])
-
-
-def _comparison(
-    scan: StoredScan, found: list[Comparison], shown: Comparison, limit: float
-) -> Section:
-    columns = (
-        Column("the scan"),
-        Column("bias", "mm", "mean signed distance, outside is positive."),
-        Column("median", "mm", "of the absolute distances."),
-        Column("RMS", "mm", "root of the mean squared distance."),
-        Column("95 %", "mm", "of the absolute distances are less."),
-        Column("worst", "mm", "the largest of the absolute distances.", digits=2),
-    )
-    rows: tuple[tuple[float | str | None, ...], ...] = tuple(
-        (_standing(one), *_row(one.figures)) for one in found
-    )
-    points = scan.mesh.vertices[shown.vertices]
-    normals = scan.mesh.normals[shown.vertices]
-    laid = found[-1].other_from_scan
-    moved = float(np.linalg.norm(laid.apply(points.mean(axis=0)) - points.mean(axis=0)))
-    return Section(
-        f"Compared with {shown.name}",
-        f"Distances of the {len(points):,} measured vertices of this scan's mesh from the surface of "
-        f"{shown.name}; what was made up is left out. To lay one on the other the scan was moved "
-        f"by {moved:.2f} mm and turned by {np.degrees(laid.angle):.3f} degrees as a whole.",
-        [
-            Table(columns, rows),
-            Picture(
-                "Deviation map",
-                f"Front, left side, back; the scan {_standing(shown)}. Red: outside of {shown.name}, "
-                "blue: inside. Beyond the ends of the scale the colour is that of the end.",
-                drawn(
-                    lambda path: draw_deviation(
-                        points,
-                        shown.signed_mm,
-                        path,
-                        limit,
-                        normals=normals,
-                        height_px=HEIGHT_PX,
-                        caption="deviation, mm",
-                    )
-                ),
-            ),
-            Picture(
-                "How the deviations are distributed",
-                "The line stands at their mean; the outermost bars hold all that lies beyond.",
-                charts.histogram(shown.signed_mm, limit, "signed distance, mm"),
-                "image/svg+xml",
-            ),
-        ],
-    )
-
-
-def _row(figures: Deviation) -> tuple[float, ...]:
-    return figures.bias_mm, figures.median_mm, figures.rms_mm, figures.p95_mm, figures.worst_mm
-
-
-def _standing(one: Comparison) -> str:
-    return "laid on the other as a whole" if one.fitted else "as it stands in its rig frame"
-
-
-def _limit(one: Comparison) -> float:
-    """The map's end, mm: a round number that most deviations stay below."""
-    power = 10.0 ** np.floor(np.log10(max(one.figures.p95_mm, 1e-3)))
-    return float(next(s * power for s in (1.0, 2.0, 5.0, 10.0) if s * power >= one.figures.p95_mm))

@@ -13,7 +13,15 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.visibility import in_image
-from bodyscan.report.pictures import BACKGROUND, INK, Scale, _bar, _save, _turbo
+from bodyscan.report.canvas import (
+    BACKGROUND,
+    INK,
+    Scale,
+    colour_bar,
+    save_panels,
+    turbo,
+    write_text,
+)
 from bodyscan.rig.rig import Volume
 
 STEP_MM = 20.0
@@ -79,9 +87,9 @@ def draw_sigma_map(
         maps[caption] = sigma.reshape(points.shape[:2])
     known = np.concatenate([values[np.isfinite(values)] for values in maps.values()])
     top = float(np.percentile(known, 98)) if known.size else 1.0
-    scale = Scale(0.0, max(top, 1e-6), "sigma, mm", _turbo())
+    scale = Scale(0.0, max(top, 1e-6), "sigma, mm", turbo())
     panels = [_panel(values, scale, caption, volume, height_px) for caption, values in maps.items()]
-    _save(path, [*panels, _bar(scale, height_px)])
+    save_panels(path, [*panels, colour_bar(scale, height_px)])
 
 
 def plane_points(volume: Volume, right: Array, step_mm: float) -> Array:
@@ -108,11 +116,7 @@ def _panel(values: Array, scale: Scale, caption: str, volume: Volume, height_px:
     for height in np.arange(0.0, volume.top_mm, 500.0):
         row = round(MARGIN_PX + (volume.top_mm - height) * px_per_mm)
         if row <= MARGIN_PX + tall + 5:
-            _text(panel, f"{height:.0f}", (8, row))
+            write_text(panel, f"{height:.0f}", (8, row))
             cv2.line(panel, (MARGIN_PX - 8, row), (MARGIN_PX - 2, row), INK, 1)
-    _text(panel, f"{caption}, mm", (MARGIN_PX, MARGIN_PX - 20))
+    write_text(panel, f"{caption}, mm", (MARGIN_PX, MARGIN_PX - 20))
     return panel
-
-
-def _text(panel: Bytes, text: str, corner: tuple[int, int]) -> None:
-    cv2.putText(panel, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)

@@ -18,9 +18,10 @@ from bodyscan.registration.seen_corners import SeenCorners
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.report.calibration_charts import shared_boards
 from bodyscan.report.calibration_page import calibration_page
-from bodyscan.report.calibration_verdict import judge
+from bodyscan.report.calibration_verdict import grade_calibration
 from bodyscan.report.page import render
 from bodyscan.report.rig_model import RINGS, SECTORS, rig_model
+from bodyscan.verdict import Verdict
 
 SIGMA_MM = np.array([0.01, 0.02, 0.05])
 SHOTS = {("b1", "board"): 0, ("b2", "board"): 1, ("b3", "board"): 2}
@@ -65,33 +66,33 @@ def worse(calibration: RigCalibration, name: str, **changes) -> RigCalibration:
 
 
 def test_a_calibration_within_all_limits_is_good(calibration):
-    assert judge(calibration) == ("good", ())
+    assert grade_calibration(calibration) == Verdict("good")
 
 
 def test_what_exceeds_a_limit_is_named_with_pair_value_and_limit(calibration):
     name = min(calibration.pairs)
-    grade, reasons = judge(worse(calibration, name, corners_rms_px=0.4))
-    assert grade == "usable"
-    assert reasons == (f"pair {name}: corners are off by 0.4 px RMS (at most 0.3 is good)",)
-    grade, reasons = judge(worse(calibration, name, corners_rms_px=0.7, poses=5))
-    assert grade == "recalibrate"
-    assert reasons[0].startswith(f"recalibrate: pair {name}: corners are off by 0.7 px")
-    assert "5 board poses (at least 6 is good)" in reasons[1]
+    verdict = grade_calibration(worse(calibration, name, corners_rms_px=0.4))
+    assert verdict.grade == "usable"
+    assert verdict.reasons == (f"pair {name}: corners are off by 0.4 px RMS (at most 0.3 is good)",)
+    verdict = grade_calibration(worse(calibration, name, corners_rms_px=0.7, poses=5))
+    assert verdict.grade == "recalibrate"
+    assert verdict.reasons[0].startswith(f"recalibrate: pair {name}: corners are off by 0.7 px")
+    assert "5 board poses (at least 6 is good)" in verdict.reasons[1]
 
 
 def test_a_failed_pair_asks_for_a_new_calibration(calibration):
-    grade, reasons = judge(replace(calibration, failed={"c9": "saw nothing"}))
-    assert grade == "recalibrate"
-    assert reasons == ("recalibrate: pair c9 failed: saw nothing",)
+    verdict = grade_calibration(replace(calibration, failed={"c9": "saw nothing"}))
+    assert verdict.grade == "recalibrate"
+    assert verdict.reasons == ("recalibrate: pair c9 failed: saw nothing",)
 
 
 def test_a_picture_that_boards_hardly_cover_is_named(calibration):
     name = min(calibration.pairs)
     narrow = corners(calibration.pairs[name].camera, [0, 1], share=0.3)
-    grade, reasons = judge(replace(calibration, seen=calibration.seen | {name: narrow}))
-    assert grade == "usable"
+    verdict = grade_calibration(replace(calibration, seen=calibration.seen | {name: narrow}))
+    assert verdict.grade == "usable"
     # 30 % of the width and 80 % of the height.
-    assert f"pair {name}: boards covered 2" in reasons[0]
+    assert f"pair {name}: boards covered 2" in verdict.reasons[0]
 
 
 def test_boards_in_common_are_counted_shot_by_shot(calibration):

@@ -18,13 +18,13 @@ from typer.testing import CliRunner
 
 from bodyscan.cli.main import app
 from bodyscan.errors import BadInput, ResultError
+from bodyscan.evaluation.comparison import compare
 from bodyscan.files.atomic import write_json
 from bodyscan.jobs.forgetting import find
-from bodyscan.report.comparison import compare
-from bodyscan.report.holes import holes
+from bodyscan.mesh.holes import holes
 from bodyscan.report.model import Layer, Shape, pack
 from bodyscan.report.page import Number, render
-from bodyscan.report.result import page_of
+from bodyscan.report.result_page import build_page
 
 
 @pytest.fixture(scope="module")
@@ -64,15 +64,15 @@ def test_nothing_lies_outside_of_the_file(html: str):
 
 
 def test_the_same_result_gives_the_same_bytes(scan: MadeScan, html: str):
-    assert render(page_of(scan.folder)) == html
+    assert render(build_page(scan.folder)) == html
 
 
 def test_simulated_is_said_and_only_where_it_is_known(tmp_path: Path, html: str):
     assert "synthetic" not in html[html.index("<body>") :]
     beside = make_scan(tmp_path / "w" / "scan")
     write_json(tmp_path / "w" / "truth" / "truth.json", {})
-    assert page_of(beside.folder).synthetic
-    assert page_of(make_scan(tmp_path / "x" / "scan", subject="sim-woman").folder).synthetic
+    assert build_page(beside.folder).synthetic
+    assert build_page(make_scan(tmp_path / "x" / "scan", subject="sim-woman").folder).synthetic
 
 
 def test_the_body_is_packed_to_a_fraction_of_a_millimetre(html: str, scan: MadeScan):
@@ -123,7 +123,7 @@ def test_a_larger_body_lies_outside_of_a_smaller_one(tmp_path: Path):
     expected = 0.5 * np.sum(place * normal, axis=1)
     # Facets lie up to 0.03 mm inside of the egg whose vertices they join, where it is bent most.
     assert standing.signed_mm == pytest.approx(expected, abs=0.03)
-    page = render(page_of(large.folder, small.folder))
+    page = render(build_page(large.folder, small.folder))
     assert "Deviation map" in page
     assert "Compared with small" in page
 
@@ -155,7 +155,7 @@ def test_a_scan_without_a_model_has_a_report_of_why(tmp_path: Path):
         "verdict": {"grade": "repeat", "reasons": ["nobody stands in the scan volume"]},
     }
     write_json(tmp_path / "scan.json", facts)
-    text = render(page_of(tmp_path))
+    text = render(build_page(tmp_path))
     assert "Verdict: repeat" in text
     assert "nobody stands" in text
 
@@ -163,18 +163,18 @@ def test_a_scan_without_a_model_has_a_report_of_why(tmp_path: Path):
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"schema": "bodyscan-scan"}'])
 def test_what_is_no_result_is_said(tmp_path: Path, content: str):
     with pytest.raises(BadInput, match="neither"):
-        page_of(tmp_path)
+        build_page(tmp_path)
     (tmp_path / "scan.json").write_text(content)
     with pytest.raises(ResultError, match="no readable scan"):
-        page_of(tmp_path)
+        build_page(tmp_path)
 
 
 def test_a_slip_of_the_pen_is_not_taken_for_the_folder_above(scan: MadeScan):
     with pytest.raises(BadInput, match="no such file"):
-        page_of(scan.folder / "scam.json")
+        build_page(scan.folder / "scam.json")
     with pytest.raises(BadInput, match="neither"):
-        page_of(scan.folder / "mesh.ply")
-    assert page_of(scan.folder / "scan.json").title == "Scan of s-17"
+        build_page(scan.folder / "mesh.ply")
+    assert build_page(scan.folder / "scan.json").title == "Scan of s-17"
 
 
 def test_limits_are_kept_or_not():

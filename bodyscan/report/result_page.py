@@ -12,7 +12,7 @@ from bodyscan.report.page import Page
 REMEDY = "give the folder that `bodyscan calibrate-rig` or `bodyscan scan` wrote"
 
 
-def page_of(result: Path, other: Path | None = None) -> Page:
+def build_page(result: Path, other: Path | None = None) -> Page:
     """The page for a calibration or scan, given as its folder or as the JSON in it.
 
     Raises BadInput if it is neither, or if a calibration is to be compared.

@@ -1,10 +1,8 @@
-"""Whether a scan is good, usable for some purposes, or to be taken again, and why."""
+"""What makes a scan good, usable for some purposes, or to be taken again."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy import ndimage
@@ -15,8 +13,8 @@ from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.rings import rings
 from bodyscan.mesh.topology import face_areas
 from bodyscan.rig.rig import Volume
+from bodyscan.verdict import Grade, Verdict
 
-Grade = Literal["good", "usable", "repeat"]
 Finding = tuple[Grade, str]
 GRADES: tuple[Grade, ...] = ("good", "usable", "repeat")
 
@@ -35,18 +33,7 @@ SOLES_MM = 50.0
 UNKNOWN_BAND = 0.5
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """good; usable, with the reasons for care; or repeat: not to be measured, take it again."""
-
-    grade: Grade
-    reasons: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return "\n  ".join([f"verdict: {self.grade}", *self.reasons])
-
-
-def judge(
+def grade_scan(
     cloud: BodyCloud,
     mesh: BodyMesh,
     alignment: Alignment | None,
@@ -54,7 +41,7 @@ def judge(
     volume: Volume,
     contradicted: float = 0.0,
 ) -> Verdict:
-    """The worst of all findings decides; the reasons come worst first. contradicted: see `merged`."""
+    """The worst of all findings decides; the reasons come worst first. contradicted: see `merge`."""
     findings = [
         *_pairs(failed, alignment),
         *_motion(alignment),
