@@ -227,11 +227,11 @@ def versions(full: Any) -> Figures:
 
     Distances, mm, are those of random spots of the light mesh and of all vertices of the full one.
     """
+    from benchmarks.self_intersections import self_intersections
     from bodyscan.evaluation.surface import sample_surface, signed_distances
-    from bodyscan.mesh.self_intersections import self_intersections
-    from bodyscan.mesh.versions import light
+    from bodyscan.mesh.decimation import decimate
 
-    lean = light(full)
+    lean = decimate(full)
     spots = sample_surface(lean.vertices, lean.faces, 500_000)[0]
     distances = np.abs(
         np.concatenate(

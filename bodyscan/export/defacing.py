@@ -17,9 +17,9 @@ from bodyscan.export.neck import REACH_MM, Neck
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import (
     directed_edges,
+    drop_unused_vertices,
     face_components,
     vertex_normals,
-    without_unused,
 )
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
         head = _with_simple_rim(mesh.faces, head)
     crown_mm = float(mesh.vertices[mesh.faces[head]][..., 2].max())
     crown_mm = neck.height_mm + ROUNDED_MM * round((crown_mm - neck.height_mm) / ROUNDED_MM)
-    vertices, faces, used = without_unused(mesh.vertices, mesh.faces[~head])
+    vertices, faces, used = drop_unused_vertices(mesh.vertices, mesh.faces[~head])
     number_of = np.full(len(mesh.vertices), -1, np.int64)
     number_of[used] = np.arange(len(used))
     # What is free in the head runs the other way along what was kept.

@@ -17,14 +17,14 @@ from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.versions import light, measured_only
+from bodyscan.mesh.decimation import decimate
 
 FRAMES = ("rig", "body")
 
 VERSIONS = {
     "full": ("body", lambda mesh: mesh),
-    "light": ("body-light", light),
-    "open": ("body-open", measured_only),
+    "light": ("body-light", decimate),
+    "open": ("body-open", BodyMesh.measured_part),
 }
 
 

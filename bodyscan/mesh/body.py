@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
-from bodyscan.mesh.topology import face_areas
+from bodyscan.mesh.topology import drop_unused_vertices, face_areas
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,3 +47,15 @@ class BodyMesh:
         """Share of the surface's area that was made up."""
         area = face_areas(self.vertices, self.faces)
         return float(area[self.filled].sum() / area.sum()) if area.any() else 0.0
+
+    def measured_part(self) -> BodyMesh:
+        """The open surface that is left without the filled faces."""
+        vertices, faces, used = drop_unused_vertices(self.vertices, self.faces[~self.filled])
+        return BodyMesh(
+            vertices,
+            faces,
+            self.normals[used],
+            self.colours[used],
+            self.sigma_mm[used],
+            np.zeros(len(faces), bool),
+        )

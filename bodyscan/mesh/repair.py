@@ -8,10 +8,10 @@ from scipy.sparse.csgraph import connected_components
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.mesh.half_edges import RIM, UNSOUND, corner_fans, twins
-from bodyscan.mesh.topology import face_components, signed_volume, without_unused
+from bodyscan.mesh.topology import drop_unused_vertices, face_components, signed_volume
 
 
-def closed(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
+def close_mesh(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
     """Vertices (V, 3) and faces (F, 3) of a closed manifold surface made from nearly one.
 
     Faces at edges that more than two share go, surfaces that touch in a vertex are parted, holes
@@ -27,12 +27,12 @@ def closed(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
     places = np.empty((count, 3))
     places[parted] = vertices[faces]
     following = np.roll(parted, -1, axis=1)
-    return _holes_filled(
+    return _fill_holes(
         places, parted, np.stack([parted[twin == RIM], following[twin == RIM]], axis=-1)
     )
 
 
-def _holes_filled(vertices: Array, faces: Indices, rim: Indices) -> tuple[Array, Indices]:
+def _fill_holes(vertices: Array, faces: Indices, rim: Indices) -> tuple[Array, Indices]:
     """Every rim, of edges (N, 2), gets a vertex at its middle and a triangle for each of them."""
     if not len(rim):
         return vertices, faces
@@ -51,7 +51,9 @@ def _holes_filled(vertices: Array, faces: Indices, rim: Indices) -> tuple[Array,
 
 def largest_piece(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
     """The connected piece with the most faces, closed and turned to look outwards."""
-    vertices, faces = closed(vertices, faces)
+    vertices, faces = close_mesh(vertices, faces)
     labels = face_components(faces, len(vertices))
-    vertices, faces, _ = without_unused(vertices, faces[labels == np.argmax(np.bincount(labels))])
+    vertices, faces, _ = drop_unused_vertices(
+        vertices, faces[labels == np.argmax(np.bincount(labels))]
+    )
     return vertices, faces if signed_volume(vertices, faces) > 0 else faces[:, ::-1].copy()

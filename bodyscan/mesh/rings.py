@@ -47,13 +47,13 @@ def rings(vertices: Array, faces: Indices, *, smallest_mm: float = 80.0) -> list
     y = np.bincount(piece, vertices[:, 1], count) / np.bincount(piece, minlength=count)
     pieces = nx.Graph(np.unique(piece[edges[~within]], axis=0).tolist())
     found = []
-    for cycle in nx.minimum_cycle_basis(_stripped(pieces)):
+    for cycle in nx.minimum_cycle_basis(_prune_branches(pieces)):
         heights = height[cycle]
         if np.ptp(heights) >= smallest_mm:
             found.append(Ring(float(heights.min()), float(heights.max()), float(y[cycle].mean())))
     return sorted(found, key=lambda ring: (ring.low_mm, ring.y_mm))
 
 
-def _stripped(graph: nx.Graph) -> nx.Graph:
+def _prune_branches(graph: nx.Graph) -> nx.Graph:
     """Without the branches that are in no ring."""
     return nx.k_core(graph, 2)

@@ -94,7 +94,7 @@ def vertex_normals(vertices: Array, faces: Indices) -> Floats:
     return (total / np.where(length > 0, length, 1.0)).astype(np.float32)
 
 
-def without_unused(vertices: Array, faces: Indices) -> tuple[Array, Indices, Indices]:
+def drop_unused_vertices(vertices: Array, faces: Indices) -> tuple[Array, Indices, Indices]:
     """Vertices that faces use, the faces renumbered, and which old vertices stayed."""
     used = used_vertices(faces, len(vertices))
     number = np.full(len(vertices), -1, np.int64)

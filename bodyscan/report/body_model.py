@@ -10,7 +10,7 @@ from bodyscan.arrays import Bytes, Mask
 from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.comparison import Comparison
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.versions import light
+from bodyscan.mesh.decimation import decimate
 from bodyscan.report.canvas import blue_white_red, turbo
 from bodyscan.report.model import Layer, Shape, css, ramp_legend
 from bodyscan.report.pictures import FILLED_TINT
@@ -34,7 +34,7 @@ def light_mesh(mesh: BodyMesh) -> BodyMesh | None:
     """The mesh with about 50,000 faces; None if it closes with none of the numbers tried."""
     for faces in FACES:
         try:
-            return light(mesh, faces=faces)
+            return decimate(mesh, faces=faces)
         except ScanFailed:
             continue
     return None

@@ -17,7 +17,6 @@ from bodyscan.fusion.storage import StoredScan
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_mesh
 from bodyscan.mesh.topology import topology, vertex_normals
-from bodyscan.mesh.versions import measured_only
 
 SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
 
@@ -120,9 +119,9 @@ def test_raised_hands_stay(body, neck):
 
 
 def test_an_open_mesh_ends_at_the_neck(body, neck):
-    shared = deface(measured_only(body), neck)
+    shared = deface(body.measured_part(), neck)
     assert shared.vertices[:, 2].max() <= neck.height_mm
-    assert below(shared, neck.height_mm) == below(measured_only(body), neck.height_mm)
+    assert below(shared, neck.height_mm) == below(body.measured_part(), neck.height_mm)
 
 
 def test_arms_overhead_are_refused_and_not_taken_for_a_neck(body):

@@ -9,11 +9,11 @@ import open3d as o3d
 import pytest
 from ray_cast_scan import Scan
 
+from benchmarks.self_intersections import self_intersections
 from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.fusion.meshing import mesh, poisson
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.self_intersections import self_intersections
 from bodyscan.mesh.topology import signed_volume, topology
 
 

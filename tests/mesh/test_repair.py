@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bodyscan.mesh.repair import closed
+from bodyscan.mesh.repair import close_mesh
 from bodyscan.mesh.topology import topology
 
 SPHERE = o3d.geometry.TriangleMesh.create_sphere(100.0, 12)
@@ -18,7 +18,7 @@ VOLUME = topology(VERTICES, FACES).volume_mm3
 
 
 def test_a_sound_surface_stays_as_it_is():
-    vertices, faces = closed(VERTICES, FACES)
+    vertices, faces = close_mesh(VERTICES, FACES)
     assert len(vertices) == len(VERTICES)
     assert len(faces) == len(FACES)
     np.testing.assert_array_equal(vertices[faces], VERTICES[FACES])
@@ -28,14 +28,14 @@ def test_a_sound_surface_stays_as_it_is():
 @given(seed=st.integers(0, 10_000), share=st.floats(0.0, 0.4))
 def test_holes_are_closed(seed: int, share: float):
     kept = np.random.default_rng(seed).random(len(FACES)) >= share
-    vertices, faces = closed(VERTICES, FACES[kept])
+    vertices, faces = close_mesh(VERTICES, FACES[kept])
     found = topology(vertices, faces)
     assert found.manifold
     assert found.volume_mm3 > 0
 
 
 def test_a_hole_of_one_face_costs_next_to_no_volume():
-    found = topology(*closed(VERTICES, FACES[1:]))
+    found = topology(*close_mesh(VERTICES, FACES[1:]))
     assert found.euler == 2
     assert found.components == 1
     assert found.volume_mm3 == pytest.approx(VOLUME, rel=1e-6)
@@ -45,7 +45,7 @@ def test_a_fin_on_an_edge_goes():
     vertices = np.concatenate([VERTICES, [[0.0, 0.0, 200.0]]])
     fin = [FACES[50, 0], FACES[50, 1], len(VERTICES)]
     assert not topology(vertices, np.concatenate([FACES, [fin]])).closed
-    found = topology(*closed(vertices, np.concatenate([FACES, [fin]])))
+    found = topology(*close_mesh(vertices, np.concatenate([FACES, [fin]])))
     assert found.manifold
     assert found.euler == 2
     # The two faces at the edge go with the fin, and a flat patch takes their place.
@@ -55,7 +55,7 @@ def test_a_fin_on_an_edge_goes():
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_doubled_face_goes(turned: bool):
     again = FACES[30:31, ::-1] if turned else FACES[30:31]
-    found = topology(*closed(VERTICES, np.concatenate([FACES, again])))
+    found = topology(*close_mesh(VERTICES, np.concatenate([FACES, again])))
     assert found.manifold
     assert found.volume_mm3 == pytest.approx(VOLUME, rel=0.01)
 
@@ -68,11 +68,11 @@ def test_surfaces_that_touch_in_a_vertex_are_parted():
     before = topology(vertices, faces)
     assert before.closed
     assert not before.manifold
-    found = topology(*closed(vertices, faces))
+    found = topology(*close_mesh(vertices, faces))
     assert found.manifold
     assert (found.components, found.euler) == (2, 4)
 
 
 def test_a_face_with_a_repeated_corner_goes():
-    found = topology(*closed(VERTICES, np.concatenate([FACES, [[5, 5, 6]]])))
+    found = topology(*close_mesh(VERTICES, np.concatenate([FACES, [[5, 5, 6]]])))
     assert found.manifold

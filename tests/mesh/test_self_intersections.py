@@ -6,7 +6,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from bodyscan.mesh.self_intersections import self_intersections
+from benchmarks.self_intersections import self_intersections
 
 
 def ball(centre: tuple[float, float, float], radius: float) -> tuple[np.ndarray, np.ndarray]:

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyscan.mesh.topology import (
+    drop_unused_vertices,
     face_components,
     signed_volume,
     topology,
     vertex_normals,
-    without_unused,
 )
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
@@ -106,7 +106,7 @@ def test_normals_of_a_sphere_point_outward():
 
 def test_unused_vertices_are_dropped():
     vertices = np.concatenate([[[9.0, 9.0, 9.0]], CORNERS, [[8.0, 8.0, 8.0]]])
-    kept, faces, used = without_unused(vertices, TETRAHEDRON + 1)
+    kept, faces, used = drop_unused_vertices(vertices, TETRAHEDRON + 1)
     np.testing.assert_array_equal(kept, CORNERS)
     np.testing.assert_array_equal(faces, TETRAHEDRON)
     np.testing.assert_array_equal(used, [1, 2, 3, 4])

@@ -6,11 +6,11 @@ import numpy as np
 import open3d as o3d
 import pytest
 
+from benchmarks.self_intersections import self_intersections
 from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.self_intersections import self_intersections
+from bodyscan.mesh.decimation import decimate
 from bodyscan.mesh.topology import face_areas, topology, vertex_normals
-from bodyscan.mesh.versions import light, measured_only
 
 
 def filled_share(mesh: BodyMesh) -> float:
@@ -19,7 +19,7 @@ def filled_share(mesh: BodyMesh) -> float:
 
 
 def test_the_light_version_is_close_and_closed(body: BodyMesh):
-    lean = light(body, faces=20_000, within_mm=0.5)
+    lean = decimate(body, faces=20_000, within_mm=0.5)
     # What the spare faces were not needed for, or more than them.
     assert abs(len(lean.faces) - 20_000) <= 600
     found = topology(lean.vertices, lean.faces)
@@ -43,11 +43,11 @@ def test_the_light_version_is_close_and_closed(body: BodyMesh):
 
 
 def test_a_small_mesh_stays_as_it_is(body: BodyMesh):
-    assert light(body, faces=len(body.faces)) is body
+    assert decimate(body, faces=len(body.faces)) is body
 
 
 def test_the_open_version_is_what_was_measured(body: BodyMesh):
-    measured = measured_only(body)
+    measured = body.measured_part()
     assert len(measured.faces) == np.count_nonzero(~body.filled)
     assert not measured.filled.any()
     assert np.isfinite(measured.sigma_mm).all()
@@ -75,7 +75,7 @@ def test_a_reduction_that_folds_is_mended():
         np.zeros(count, np.float32),
         np.zeros(len(faces), bool),
     )
-    reduced = light(sheet, faces=1000)
+    reduced = decimate(sheet, faces=1000)
     found = topology(reduced.vertices, reduced.faces)
     assert found.manifold
     assert found.components == 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 
-from bodyscan.mesh.faithfulness import Surface, brought_within
+from bodyscan.mesh.decimation import NearestSurface, refine_to_tolerance
 from bodyscan.mesh.topology import topology
 
 
@@ -22,13 +22,13 @@ def farthest(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.nda
     inside = (
         corners[:, 0] + a * (corners[:, 1] - corners[:, 0]) + b * (corners[:, 2] - corners[:, 0])
     )
-    return float(Surface(*other).nearest(np.concatenate([vertices, inside]))[1].max())
+    return float(NearestSurface(*other).nearest(np.concatenate([vertices, inside]))[1].max())
 
 
 def test_a_coarse_ball_comes_within_the_limit():
     fine, coarse = ball(100), ball(10)
     assert farthest(coarse, fine) > 2.0
-    found = brought_within(*coarse, *fine, 0.5)
+    found = refine_to_tolerance(*coarse, *fine, 0.5)
     assert farthest(found, fine) < 0.55
     assert farthest(fine, found) < 0.55
     check = topology(*found)
@@ -40,7 +40,7 @@ def test_a_coarse_ball_comes_within_the_limit():
 
 def test_what_is_near_enough_stays():
     fine, coarse = ball(60), ball(40)
-    vertices, faces = brought_within(*coarse, *fine, 1.0)
+    vertices, faces = refine_to_tolerance(*coarse, *fine, 1.0)
     np.testing.assert_array_equal(faces, coarse[1])
     np.testing.assert_array_equal(vertices, coarse[0])
 
@@ -50,13 +50,13 @@ def test_one_bad_place_costs_a_few_faces_only():
     dented = coarse[0].copy()
     dent = int(np.argmax(dented[:, 0]))
     dented[dent, 0] -= 5.0
-    vertices, faces = brought_within(dented, coarse[1], *fine, 0.3)
+    vertices, faces = refine_to_tolerance(dented, coarse[1], *fine, 0.3)
     assert farthest((vertices, faces), fine) < 0.3
     assert len(faces) <= len(coarse[1]) + 20
 
 
 def test_the_same_input_gives_the_same_bytes():
-    one, other = (brought_within(*ball(10), *ball(60), 0.5) for _ in range(2))
+    one, other = (refine_to_tolerance(*ball(10), *ball(60), 0.5) for _ in range(2))
     assert one[0].tobytes() == other[0].tobytes()
     assert one[1].tobytes() == other[1].tobytes()
 
@@ -66,6 +66,6 @@ def test_a_spike_that_was_lost_comes_back():
     spiked = fine[0].copy()
     tip = int(np.argmax(spiked[:, 1]))
     spiked[tip, 1] += 3.0
-    found = brought_within(*coarse, spiked, fine[1], 0.5)
+    found = refine_to_tolerance(*coarse, spiked, fine[1], 0.5)
     assert farthest((spiked, fine[1]), found) < 0.55
     assert topology(*found).manifold
