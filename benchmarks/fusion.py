@@ -169,7 +169,7 @@ def _read_with_opencv(paths: list[list[str]]) -> None:
 def _ours(workspace: Path, folder: Path) -> Step:
     from bodyscan.alignment.icp import align
     from bodyscan.fusion.cleaning import clean
-    from bodyscan.fusion.error_bar import with_placing
+    from bodyscan.fusion.error_bar import add_pose_variance
     from bodyscan.fusion.merging import merge
     from bodyscan.workflows.range_images import range_images
 
@@ -189,9 +189,9 @@ def _ours(workspace: Path, folder: Path) -> Step:
         seen = [image for image in cleaned if image.valid.any()]
         alignment = stage("aligning", lambda: align(seen, placed, calibration.covariance))
         placing = {**placed, **alignment.rig_from_camera}
-        cloud = stage("merging", lambda: merge(seen, placing, points=POINTS))
+        cloud = stage("merging", lambda: merge(seen, placing, points=POINTS).cloud)
         there = {image.pair: placing[image.pair] for image in seen}
-        cloud = stage("error bars", lambda: with_placing(cloud, there, calibration.covariance))
+        cloud = stage("error bars", lambda: add_pose_variance(cloud, there, calibration.covariance))
         return images, seen, placed, placing, cloud, alignment
 
     def finish(result: Any) -> Figures:

@@ -65,7 +65,7 @@ def refine_rig(
     from bodyscan.captures.folder import open_scan
     from bodyscan.cli import console
     from bodyscan.errors import FailedWork
-    from bodyscan.fusion.cleaning import clean, with_subject
+    from bodyscan.fusion.cleaning import clean, require_subject
     from bodyscan.registration.storage import load_calibration, save_calibration
     from bodyscan.workflows.range_images import range_images
 
@@ -74,7 +74,7 @@ def refine_rig(
         images, failed = range_images(rig, open_scan(rig.rig, folder), clock)
         clock("aligning", 0, 1)
         cleaned = clean(images, rig.rig_from_camera, rig.rig.volume)
-        found = refine_on_object(with_subject(cleaned), rig.rig_from_camera, rig.covariance)
+        found = refine_on_object(require_subject(cleaned), rig.rig_from_camera, rig.covariance)
         clock("aligning", 1, 1)
     for name, reason in failed.items():
         console.console.print(f"left out: {name}: {reason}", style="red", highlight=False)

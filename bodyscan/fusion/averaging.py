@@ -13,7 +13,7 @@ from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.compiled import compiled
 from bodyscan.fusion.comparing import Evidence, Samples
 from bodyscan.fusion.quadratics import NORMAL_MEDIAN
-from bodyscan.fusion.smoothing import Surface
+from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.mesh.body import BodyCloud
 
 AT_A_TIME = 1 << 16  # samples whose sums fit into a processor's cache
@@ -23,9 +23,9 @@ EVERY = 8  # spot of an overlap that is looked at to learn how far two surfaces 
 WEIGHT, SHIFT, SHIFT2, GREY, SPREAD, AGAINST, NORMAL, SUMS = 0, 1, 2, 3, 4, 5, 6, 9
 
 
-def averaged(
+def average(
     samples: Samples,
-    surfaces: Sequence[Surface],
+    surfaces: Sequence[SmoothSurface],
     evidence: Sequence[Evidence],
     gain: Floats,
     workers: int = 2,
@@ -35,13 +35,13 @@ def averaged(
     gain: (surfaces,) factors for their grey levels.
     """
     own_gain = np.repeat(gain, np.diff(samples.starts))
-    general = disagreement(samples, surfaces, evidence) ** 2
+    general = scatter(samples, surfaces, evidence) ** 2
 
     def part(start: int) -> tuple[NDArray[Any], ...]:
         some = slice(start, start + AT_A_TIME)
         normals, sigma_mm = samples.normals[some], samples.sigma_mm[some]
         own = normals, sigma_mm, samples.weight[some], samples.colours[some], own_gain[some]
-        sums, seen = _begun(*own)
+        sums, seen = _own_sums(*own)
         for surface, one, factor in zip(surfaces, evidence, gain, strict=True):
             facts = (surface.normals, surface.sigma_mm, surface.weight, surface.colours)
             here = slice(*np.searchsorted(one.index, (some.start, some.stop)))
@@ -57,8 +57,8 @@ def averaged(
     return BodyCloud(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
-def disagreement(
-    samples: Samples, surfaces: Sequence[Surface], evidence: Sequence[Evidence]
+def scatter(
+    samples: Samples, surfaces: Sequence[SmoothSurface], evidence: Sequence[Evidence]
 ) -> float:
     """Typical distance between pairs over its standard deviation by their sigmas; at least 1."""
     ratios = [np.empty(0)]
@@ -70,7 +70,7 @@ def disagreement(
 
 
 @compiled
-def _begun(
+def _own_sums(
     normals: Floats, sigma_mm: Floats, weights: Floats, colours: Bytes, gain: Floats
 ) -> tuple[Array, Bytes]:
     """Sums (N, 9) over the samples' own surfaces alone, and by how many each was seen."""

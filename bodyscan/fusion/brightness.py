@@ -3,14 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from bodyscan.arrays import Bytes, Floats
+from bodyscan.fusion.comparing import Evidence
+from bodyscan.fusion.smoothing import SmoothSurface
+from bodyscan.fusion.thinning import Samples
 
 DARKEST = 8.0  # grey levels that say nothing of the exposure
 FEWEST = 200
+SPOTS = 5000  # of an overlap are enough to compare exposures
 HOLD = 1e-3  # of an overlap's weight: pairs without overlap keep their own brightness
+
+
+def even_exposures(
+    samples: Samples, surfaces: Sequence[SmoothSurface], evidence: Sequence[Evidence]
+) -> Floats:
+    """(P,) factors for the surfaces' grey levels, from where two of them show one spot."""
+    ratios = []
+    for b, (surface, one) in enumerate(zip(surfaces, evidence, strict=True)):
+        starts = np.searchsorted(one.index, samples.starts)
+        for a, (start, end) in enumerate(pairwise(starts)):
+            step = 1 + (end - start) // SPOTS
+            some = slice(start, end, step)
+            ours, theirs = samples.colours[one.index[some]], surface.colours[one.at[some]]
+            ratio, spots = log_ratio(ours, theirs.astype(np.float32))
+            ratios.append((a, b, ratio, spots * step))
+    return gains([ratio for ratio in ratios if ratio[-1]], len(evidence))
 
 
 def gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Floats:

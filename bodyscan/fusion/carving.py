@@ -17,7 +17,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
-from bodyscan.fusion.free_space import Guess, seen_through
+from bodyscan.fusion.free_space import Guess, sees_through
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -39,7 +39,7 @@ class Voxels:
         return (self.origin + VOXEL_MM * index).astype(np.float32)
 
 
-def hints(
+def poisson_hints(
     vertices: Array,
     faces: Indices,
     filled: Mask,
@@ -61,7 +61,7 @@ def hints(
     centres = voxels.centres(index)
     with ThreadPoolExecutor(workers) as pool:
         votes = pool.map(
-            lambda image: seen_through(
+            lambda image: sees_through(
                 centres, guess, image, rig_from_camera[image.pair], margin_mm
             ),
             range_images,

@@ -12,10 +12,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Array, Floats, Mask
+from bodyscan.arrays import Array, Bytes, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
-from bodyscan.fusion.dark_gaps import dark_gaps
 from bodyscan.geometry.crop import crop_of
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -25,6 +24,11 @@ STEEPEST = 5.0  # depth per sideways step on a surface still worth having: tan 7
 DISTANCES_PX = np.hypot(*np.mgrid[-2:3, -2:3])  # of a pixel's neighbours
 BACKGROUND_MM = 4.0  # a subject stands out from the background by more than this
 QUANTUM_MM = 0.25  # cv2.filterSpeckles works on 16-bit integers: +-8 m in steps of this
+# Of dark gaps:
+WIDEST_GAP_PX = 7  # of the gap and half of its slopes: several times the blur
+DARKER = 2.0  # times, than the surfaces around
+GAP_MARGIN_PX = 1  # beside what is so dark, where the two mix
+LEAST_STEP = 30  # grey levels; less may be noise on something dark
 
 
 def clean(
@@ -55,17 +59,15 @@ def clean(
         if box is not None and kept.any():
             depth = np.where(kept[box], image.points[box][..., 2], np.float32(np.nan))
             pixel_mm = float(np.median(depth[kept[box]])) / image.camera.alpha
-            solid = without_flying_pixels(depth, STEEPEST * pixel_mm)
-            kept[box] = without_speckles(
-                solid, STEEPEST * pixel_mm, smallest_patch_mm2 / pixel_mm**2
-            )
-        return masked(image, kept)
+            solid = drop_flying_pixels(depth, STEEPEST * pixel_mm)
+            kept[box] = drop_speckles(solid, STEEPEST * pixel_mm, smallest_patch_mm2 / pixel_mm**2)
+        return apply_mask(image, kept)
 
     with ThreadPoolExecutor(workers) as pool:
         return list(pool.map(one, range_images))
 
 
-def with_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:
+def require_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:
     """Those that show something of the subject. Raises ScanFailed if none does."""
     seen = [image for image in cleaned if image.valid.any()]
     if not seen:
@@ -77,7 +79,7 @@ def with_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:
     return seen
 
 
-def masked(image: RangeImage, kept: Mask) -> RangeImage:
+def apply_mask(image: RangeImage, kept: Mask) -> RangeImage:
     """The range image with nothing measured where `kept` (height, width) is false."""
     return replace(image, sigma_mm=np.where(kept, image.sigma_mm, np.float32(np.nan)))
 
@@ -101,7 +103,7 @@ def in_front_of(image: RangeImage, empty: RangeImage) -> Mask:
         return image.points[..., 2] < cv2.erode(far, window) - BACKGROUND_MM
 
 
-def without_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -> Floats:
+def drop_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -> Floats:
     """Depth (h, w), NaN where there is none, of the pixels that enough neighbours agree with.
 
     A straight rim of a surface leaves a pixel 14 of its 24 neighbours; a flying pixel hangs between
@@ -111,15 +113,32 @@ def without_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13
     limits = np.where(DISTANCES_PX > 0, step_mm * DISTANCES_PX, -1.0).astype(np.float32)
     for _ in range(2):
         padded, depth = np.pad(depth, 2, constant_values=np.nan), np.empty_like(depth)
-        _supported(padded, limits, supporters, depth)
+        _keep_supported(padded, limits, supporters, depth)
     return depth
 
 
-def without_speckles(depth: Floats, step_mm: float, smallest_px: float) -> Mask:
+def drop_speckles(depth: Floats, step_mm: float, smallest_px: float) -> Mask:
     """(h, w): pixels in connected patches of at least `smallest_px`; jumps in depth cut."""
     quanta = np.clip(np.nan_to_num(depth) / QUANTUM_MM, 0, 32767).astype(np.int16)
     patches, _ = cv2.filterSpeckles(quanta, 0, int(smallest_px), step_mm / QUANTUM_MM)
     return patches > 0
+
+
+def dark_gaps(grey: Bytes) -> Mask:
+    """(height, width) pixels of an image (height, width) that lie in a narrow dark gap or at its rim.
+
+    Into the gap between two toes hardly any light falls. What a camera sees there is the blur of
+    the bright skin on both sides, with their stripes: it is measured as a bridge from one side to
+    the other, smooth, and seen alike by other cameras.
+
+    A morphological closing fills what is narrower than its window and has brighter surfaces on both
+    sides; something dark and wide (hair, cloth, the background beside a silhouette) stays.
+    """
+    window = np.ones((WIDEST_GAP_PX, WIDEST_GAP_PX), np.uint8)
+    around = cv2.morphologyEx(grey, cv2.MORPH_CLOSE, window).astype(np.float32)
+    dark = (around > DARKER * grey) & (around >= grey + np.float32(LEAST_STEP))
+    margin = np.ones((2 * GAP_MARGIN_PX + 1, 2 * GAP_MARGIN_PX + 1), np.uint8)
+    return cv2.dilate(dark.view(np.uint8), margin).view(bool)
 
 
 @compiled
@@ -147,7 +166,7 @@ def _inside(
 
 
 @compiled
-def _supported(padded: Floats, limits: Floats, supporters: int, kept: Floats) -> None:
+def _keep_supported(padded: Floats, limits: Floats, supporters: int, kept: Floats) -> None:
     """kept (h, w): the depths that at least `supporters` neighbours agree with, else NaN.
 
     padded: (h + 4, w + 4) depths, two more pixels on all sides.  limits: (5, 5) how far each

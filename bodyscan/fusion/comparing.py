@@ -10,30 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Bytes, Floats
+from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
 from bodyscan.fusion.grid import lens_of
-from bodyscan.fusion.smoothing import Surface
+from bodyscan.fusion.smoothing import SmoothSurface
+from bodyscan.fusion.thinning import Samples
 
 Numbers = NDArray[np.int32]
 
 SAME_WAY = 0.6  # cosine between the normals of what may be one surface
 EDGE_ON = 0.1  # a camera that sees a point flatter than this is not asked about it
-
-
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """N points taken from the surfaces, surface by surface, rig frame.
-
-    starts: (surfaces + 1,) where each one's points begin.  weight: as in Surface.
-    """
-
-    points: Floats
-    normals: Floats
-    sigma_mm: Floats
-    weight: Floats
-    colours: Bytes
-    starts: NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +39,7 @@ class Evidence:
 
 
 def compare(
-    samples: Samples, surface: Surface, number: int, agreement_mm: float, double_mm: float
+    samples: Samples, surface: SmoothSurface, number: int, agreement_mm: float, double_mm: float
 ) -> Evidence:
     """What `surface` (the `number`th) says about the samples that do not come from it.
 

@@ -19,7 +19,7 @@ FACING = 0.2
 """Cosine below which a pair sees a surface too flat to have measured it."""
 
 
-def with_placing(
+def add_pose_variance(
     cloud: BodyCloud,
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PlacingCovariance,

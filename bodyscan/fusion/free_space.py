@@ -36,7 +36,7 @@ class Guess:
         return Guess(scene, filled)
 
 
-def seen_through(
+def sees_through(
     points: Floats,
     guess: Guess,
     image: RangeImage,

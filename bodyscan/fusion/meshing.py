@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.errors import ScanFailed
-from bodyscan.fusion.carving import hints
-from bodyscan.fusion.support import settled, support
+from bodyscan.fusion.carving import poisson_hints
+from bodyscan.fusion.support import fit_to_points, support
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.repair import largest_piece
@@ -51,14 +51,16 @@ def mesh(
     points, normals = cloud.points, cloud.normals.astype(np.float64)
     some = slice(None, None, max(1, len(points) // ROUGH_POINTS))
     rough = largest_piece(*poisson(points[some], normals[some], depth - 1, linear=True))
-    made_up = _made_up(*rough, tree, 2.0 * reach_mm)
-    extra = hints(*rough, made_up, tree, range_images, rig_from_camera or {}, workers=workers)
+    made_up = _filled_faces(*rough, tree, 2.0 * reach_mm)
+    extra = poisson_hints(
+        *rough, made_up, tree, range_images, rig_from_camera or {}, workers=workers
+    )
     points, normals = np.concatenate([points, extra[0]]), np.concatenate([normals, extra[1]])
     vertices, faces = largest_piece(*poisson(points, normals, depth, linear=True))
     found = topology(vertices, faces)
     if not found.manifold:
         raise ScanFailed(f"no closed surface came out of the cloud ({found})")
-    return dressed(vertices, faces, cloud, tree, reach_mm)
+    return attach_attributes(vertices, faces, cloud, tree, reach_mm)
 
 
 def poisson(
@@ -78,7 +80,7 @@ def poisson(
     return np.asarray(surface.vertices), np.asarray(surface.triangles).astype(np.int64)
 
 
-def dressed(
+def attach_attributes(
     vertices: Array, faces: Indices, cloud: BodyCloud, tree: cKDTree, reach_mm: float
 ) -> BodyMesh:
     """Brought onto the points, with normals, the points' colours and sigmas, and what was made up.
@@ -88,7 +90,7 @@ def dressed(
     """
     normals = vertex_normals(vertices, faces)
     around = support(vertices, normals, cloud, tree, reach_mm)
-    vertices = settled(vertices, faces, normals, around)
+    vertices = fit_to_points(vertices, faces, normals, around)
     sigma_mm = np.where(around.measured, around.sigma_mm, np.float32(np.nan))
     return BodyMesh(
         vertices,
@@ -100,7 +102,7 @@ def dressed(
     )
 
 
-def _made_up(vertices: Array, faces: Indices, tree: cKDTree, reach_mm: float) -> Mask:
+def _filled_faces(vertices: Array, faces: Indices, tree: cKDTree, reach_mm: float) -> Mask:
     """(F,) faces with a corner that no point lies near."""
     distance = np.asarray(tree.query(vertices, distance_upper_bound=reach_mm, workers=2)[0])
     return np.any(np.isinf(distance)[faces], axis=1)

@@ -40,8 +40,8 @@ def fit_quadratics(inverse: Floats, noise: Floats, reach: int, pixel_mm: float) 
     surface.
     """
     valid = inverse > 0
-    closed, whole = with_holes_closed(inverse, valid)
-    fit = convolved_fit(closed, noise, reach)
+    closed, whole = close_holes(inverse, valid)
+    fit = fit_full_windows(closed, noise, reach)
     window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     fitted = valid & (cv2.erode(whole.astype(np.uint8), window, borderValue=0) > 0)
     size = _size_of_noise(inverse, noise, fit, fitted)
@@ -54,7 +54,7 @@ def fit_quadratics(inverse: Floats, noise: Floats, reach: int, pixel_mm: float) 
     cut = np.flatnonzero(valid & ~fitted)
     fit_windows(padded, noise, cut, reach, pixel_mm, fits, fitted)
     squares, calm = np.empty_like(inverse), np.empty(inverse.shape, np.uint8)
-    _judge(inverse, noise, fit.value, fitted, squares, calm)
+    _square_misfits(inverse, noise, fit.value, fitted, squares, calm)
     misfit = cv2.boxFilter(squares, -1, (5, 5), borderType=cv2.BORDER_CONSTANT)
     easy = (misfit < WORST_MISFIT) & (cv2.erode(calm, window, borderValue=1) > 0)
     easy.ravel()[cut] = True  # seen to
@@ -76,7 +76,7 @@ def _size_of_noise(inverse: Floats, noise: Floats, fit: Fit, full: Mask) -> np.f
 
 
 @compiled
-def _judge(
+def _square_misfits(
     inverse: Floats,
     noise: Floats,
     value: Floats,
@@ -98,7 +98,7 @@ def _judge(
                 calm[row, column] = small and fitted[row, column]
 
 
-def with_holes_closed(inverse: Floats, valid: Mask) -> tuple[Floats, Mask]:
+def close_holes(inverse: Floats, valid: Mask) -> tuple[Floats, Mask]:
     """With values in holes of a few pixels, so that they do not spoil the windows around them.
 
     The mean of opposite neighbours up to two pixels away, exact on a plane; at least four of the
@@ -122,7 +122,7 @@ def with_holes_closed(inverse: Floats, valid: Mask) -> tuple[Floats, Mask]:
     return closed, whole
 
 
-def convolved_fit(inverse: Floats, noise: Floats, reach: int) -> Fit:
+def fit_full_windows(inverse: Floats, noise: Floats, reach: int) -> Fit:
     """The quadratic fit of full windows, as separable convolutions."""
     offsets = np.arange(-reach, reach + 1, dtype=float)
     basis = window_basis(reach)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 from bodyscan.alignment.icp import Alignment, AlignmentSettings, align
 from bodyscan.errors import BadInput
-from bodyscan.fusion.cleaning import clean, with_subject
-from bodyscan.fusion.error_bar import with_placing
-from bodyscan.fusion.merging import merged
+from bodyscan.fusion.cleaning import clean, require_subject
+from bodyscan.fusion.error_bar import add_pose_variance
+from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.geometry.transforms import RigidTransform
@@ -83,7 +83,7 @@ def fuse(
     """
     progress("cleaning", 0, 1)
     cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume, empty=empty)
-    seen = with_subject(cleaned)
+    seen = require_subject(cleaned)
     progress("cleaning", 1, 1)
     placing = dict(calibration.rig_from_camera)
     alignment = None
@@ -93,7 +93,7 @@ def fuse(
         placing |= alignment.rig_from_camera
         progress("aligning", 1, 1)
     progress("merging", 0, 1)
-    fused = merged(
+    fused = merge(
         seen,
         placing,
         points=settings.points,
@@ -102,7 +102,7 @@ def fuse(
         double_mm=settings.double_mm,
     )
     there = {image.pair: placing[image.pair] for image in seen}
-    cloud = with_placing(fused.cloud, there, calibration.covariance)
+    cloud = add_pose_variance(fused.cloud, there, calibration.covariance)
     progress("merging", 1, 1)
     progress("meshing", 0, 1)
     surface = mesh(

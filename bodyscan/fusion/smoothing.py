@@ -29,7 +29,7 @@ EVERY = 4  # row that is looked at to learn how large a pixel is
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class SmoothSurface:
     """A smoothed range image, cropped to what it shows: n points, rig frame.
 
     corner: (column, row) of the crop's first pixel in the camera's image.
@@ -56,7 +56,7 @@ class Surface:
 
 def smooth(
     image: RangeImage, rig_from_camera: RigidTransform, *, window_mm: float = 7.0
-) -> Surface | None:
+) -> SmoothSurface | None:
     """Fit a quadratic in a square window of about `window_mm` around every pixel.
 
     None if the range image shows nothing.
@@ -79,7 +79,7 @@ def _surface(
     fit: Fit,
     fitted: Mask,
     reach: int,
-) -> Surface:
+) -> SmoothSurface:
     depth, number = np.zeros_like(fit.value), np.full(fitted.shape, -1, np.int32)
     most = int(np.count_nonzero(fitted))
     points, normals = np.empty((most, 3), np.float32), np.empty((most, 3), np.float32)
@@ -97,7 +97,7 @@ def _surface(
     there = number >= 0
     distance = _distance_to_rim(depth, JUMP_PX / image.camera.alpha)[there]
     rim, sigma = np.minimum(distance / np.float32(2 * reach), np.float32(1.0)), sigma[:count]
-    return Surface(
+    return SmoothSurface(
         image.pair,
         image.camera,
         rig_from_camera,

@@ -61,7 +61,7 @@ def support(
     """Of vertices (V, 3) with unit normals (V, 3) by a cloud, whose points the tree holds."""
     found = tree.query(vertices, NEIGHBOURS, distance_upper_bound=reach_mm, workers=2)
     distance, near = (np.asarray(part) for part in found)
-    weight, shift, spread = _asked(
+    weight, shift, spread = _average_planes(
         np.ascontiguousarray(vertices),
         np.ascontiguousarray(normals),
         distance,
@@ -74,7 +74,7 @@ def support(
     return Support(nearest, cloud.sigma_mm[nearest], weight, shift, spread, reach_mm)
 
 
-def settled(vertices: Array, faces: Indices, normals: Floats, around: Support) -> Array:
+def fit_to_points(vertices: Array, faces: Indices, normals: Floats, around: Support) -> Array:
     """The vertices (V, 3), moved along their normals to where the points around say.
 
     The less the less weight these have: where the points end, the surface has no step. Where a face
@@ -103,7 +103,7 @@ def _normals(vertices: Array, faces: Indices) -> Array:
 
 
 @compiled
-def _asked(
+def _average_planes(
     vertices: Array,
     normals: Floats,
     distance: Array,

@@ -1,18 +1,23 @@
-"""Many points to a given number of evenly spread ones, one for each voxel."""
+"""Many points to a given number of evenly spread samples, one for each voxel."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Floats, Mask
+from bodyscan.arrays import Bytes, Floats, Mask
 from bodyscan.compiled import compiled
+from bodyscan.errors import ScanFailed
+from bodyscan.fusion.smoothing import SmoothSurface
 
 Numbers = NDArray[np.uint32]
 
+FEWEST_POINTS = 1000
 FIRST_GUESS_MM = 1.2
 CLOSE_ENOUGH = 0.05  # to the wanted number, for the last correction to settle the rest
 ROUNDS = 4
@@ -20,6 +25,53 @@ SOME_LAYERS, MANY = 4, 300_000  # of the blocks of voxels every so many layers t
 MOST_BLOCKS = 1 << 28  # of voxels in the box around all points
 BADNESS_STEPS = np.float32(1 << 29)
 EMPTY = np.int64((1 << 63) - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """N points taken from the surfaces, surface by surface, rig frame.
+
+    starts: (surfaces + 1,) where each one's points begin.  weight: as in SmoothSurface.
+    """
+
+    points: Floats
+    normals: Floats
+    sigma_mm: Floats
+    weight: Floats
+    colours: Bytes
+    starts: NDArray[np.intp]
+
+
+def take_samples(surfaces: Sequence[SmoothSurface], points: int) -> Samples:
+    """About `points` evenly spread samples of all surfaces."""
+    ends = np.cumsum([0, *(len(surface.points) for surface in surfaces)])
+    if ends[-1] < FEWEST_POINTS:
+        raise ScanFailed(
+            f"the range images show next to nothing of a subject ({ends[-1]} points)",
+            remedy="Look at the range images; is the subject inside the scan volume?",
+        )
+
+    pixels = [np.arange(len(surface.points)) for surface in surfaces]
+    if ends[-1] > points:
+        every = np.concatenate([surface.points for surface in surfaces])
+        at_rim = np.concatenate([surface.rim < 0.5 for surface in surfaces])
+        chosen = one_per_voxel(every, at_rim, voxel_size_for(every, points))
+        parts = np.split(chosen, np.searchsorted(chosen, ends[1:-1]))
+        pixels = [part - start for part, start in zip(parts, ends, strict=False)]
+
+    def pooled(name: str) -> NDArray[Any]:
+        fields = [getattr(surface, name) for surface in surfaces]
+        taken = [field.take(some, axis=0) for field, some in zip(fields, pixels, strict=True)]
+        return np.concatenate(taken)
+
+    return Samples(
+        pooled("points"),
+        pooled("normals"),
+        pooled("sigma_mm"),
+        pooled("weight"),
+        pooled("colours"),
+        np.cumsum([0, *(some.size for some in pixels)]),
+    )
 
 
 def voxel_size_for(points: Floats, wanted: int) -> float:

@@ -119,7 +119,7 @@ def _clouds(
     images, _ = range_images(calibration, one, progress)
     cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
     seen = [image for image in cleaned if image.valid.any()]
-    cloud = merge(seen, calibration.rig_from_camera, points=POINTS)
+    cloud = merge(seen, calibration.rig_from_camera, points=POINTS).cloud
     found = [_Cloud(ALL, cloud.points, cloud.normals.astype(np.float64))]
     for image in seen:
         valid = image.valid & np.isfinite(image.normals).all(axis=-1)

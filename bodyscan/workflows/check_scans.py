@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.sway import BODY_CENTRE_MM
 from bodyscan.captures.folder import Captures
-from bodyscan.fusion.cleaning import clean, with_subject
+from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -85,7 +85,7 @@ def check_scans(
     for captures in scans:
         images, _ = range_images(calibration, captures, progress)
         cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
-        seen = with_subject(cleaned)
+        seen = require_subject(cleaned)
         alignments.append(align(seen, calibration.rig_from_camera, calibration.covariance))
     return judge_scans(alignments, calibration.rig_from_camera, calibration.rig.poles)
 

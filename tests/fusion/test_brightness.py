@@ -39,7 +39,7 @@ def test_no_seams_between_exposures(scan: Scan, cleaned: list[RangeImage]):
         replace(image, colours=np.full_like(image.colours, round(120 * factor)))
         for image, factor in zip(cleaned, factors, strict=True)
     ]
-    cloud = merge(images, scan.rig_from_camera, points=100_000)
+    cloud = merge(images, scan.rig_from_camera, points=100_000).cloud
     grey = cloud.colours[:, 0].astype(float)
     # Without gains the scatter is that of the factors, 0.25.
     assert grey.std() / grey.mean() < 0.02

@@ -9,7 +9,7 @@ import pytest
 from ray_cast_scan import Scan, load_rig
 
 from bodyscan.evaluation.surface import signed_distances
-from bodyscan.fusion.cleaning import clean, inside, without_flying_pixels
+from bodyscan.fusion.cleaning import clean, drop_flying_pixels, inside
 from bodyscan.reconstruction.range_image import RangeImage
 
 NOISE_MM = 0.3
@@ -69,7 +69,7 @@ def test_pixels_stay_that_neighbours_agree_with():
             if np.count_nonzero(off < limits) >= supporters:  # itself never: 0 < 0 is false
                 left[v, u] = expected[v, u]
         expected = left
-    found = without_flying_pixels(depth, step_mm, supporters=supporters)
+    found = drop_flying_pixels(depth, step_mm, supporters=supporters)
     assert 0.1 < np.isfinite(found).sum() / np.isfinite(depth).sum() < 0.9
     np.testing.assert_array_equal(found, expected)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.fusion.averaging import averaged
-from bodyscan.fusion.comparing import Evidence, Samples, compare
-from bodyscan.fusion.merging import thinned
-from bodyscan.fusion.smoothing import Surface, smooth
+from bodyscan.fusion.averaging import average
+from bodyscan.fusion.comparing import Evidence, compare
+from bodyscan.fusion.smoothing import SmoothSurface, smooth
+from bodyscan.fusion.thinning import Samples, take_samples
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -18,7 +18,7 @@ WALL_MM = 320.0
 ASIDE = RigidTransform(np.eye(3), np.array([40.0, 0.0, 0.0]))
 
 
-def wall(depth: float, grey: int, placing: RigidTransform) -> Surface:
+def wall(depth: float, grey: int, placing: RigidTransform) -> SmoothSurface:
     """Seen square on, without noise; sigma 0.1 mm."""
     points = (depth * CAMERA.pixel_rays()).astype(np.float32)
     sigma = np.full(points.shape[:2], 0.1, np.float32)
@@ -28,13 +28,13 @@ def wall(depth: float, grey: int, placing: RigidTransform) -> Surface:
     return surface
 
 
-def seen_beside(further_mm: float) -> tuple[Samples, list[Surface], Evidence]:
+def seen_beside(further_mm: float) -> tuple[Samples, list[SmoothSurface], Evidence]:
     """Samples of two walls, the second camera's that much further; what it says about the first's."""
     surfaces = [
         wall(WALL_MM, 100, RigidTransform.identity()),
         wall(WALL_MM + further_mm, 120, ASIDE),
     ]
-    samples = thinned(surfaces, 10**6)
+    samples = take_samples(surfaces, 10**6)
     return samples, surfaces, compare(samples, surfaces[1], 1, 1.5, 6.0)
 
 
@@ -70,7 +70,7 @@ def test_a_wall_in_front_says_nothing():
 def test_means_by_weight():
     samples, surfaces, evidence = seen_beside(0.8)
     nothing = compare(samples, surfaces[0], 0, 0.0, 0.0)
-    cloud = averaged(samples, surfaces, [nothing, evidence], np.ones(2, np.float32))
+    cloud = average(samples, surfaces, [nothing, evidence], np.ones(2, np.float32))
     assert len(cloud.points) == len(samples.points)
     inner = np.zeros(len(cloud.points), bool)
     inner[evidence.index] = True

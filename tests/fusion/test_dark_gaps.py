@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bodyscan.fusion.dark_gaps import dark_gaps
+from bodyscan.fusion.cleaning import dark_gaps
 
 SKIN, DARK = 150, 12
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bodyscan.fusion.error_bar import with_placing
+from bodyscan.fusion.error_bar import add_pose_variance
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
@@ -35,7 +35,7 @@ def placed(*places):
 def test_a_pair_that_is_shifted_along_x_errs_where_it_looks_along_x(cloud):
     covariance = np.diag([0.0, 0.0, 0.0, 0.04**2, 0.0, 0.0])
     prior = PlacingCovariance(("p0",), covariance)
-    found = with_placing(cloud, placed([1300, 0, 900]), prior)
+    found = add_pose_variance(cloud, placed([1300, 0, 900]), prior)
     front = cloud.normals[:, 0] > 0.999
     assert found.sigma_mm[front] == pytest.approx(0.05, rel=1e-3)
     assert found.sigma_mm[cloud.normals[:, 0] < 0.0] == pytest.approx(0.03)
@@ -50,7 +50,7 @@ def test_draws_of_the_placing_spread_by_the_error_bar(cloud):
     alone = BodyCloud(
         cloud.points, cloud.normals, 0 * cloud.sigma_mm, cloud.colours, cloud.pairs_seen
     )
-    sigma = with_placing(alone, place, prior).sigma_mm
+    sigma = add_pose_variance(alone, place, prior).sigma_mm
     twists = rng.normal(size=(4000, 6)) @ root.T
     moved = np.array([RigidTransform.identity().moved(t).apply(cloud.points) for t in twists])
     along = np.einsum("knc,nc->kn", moved - cloud.points, cloud.normals.astype(float))

@@ -8,7 +8,7 @@ import numpy as np
 import open3d as o3d
 from ray_cast_scan import looking, nominal_camera
 
-from bodyscan.fusion.free_space import Guess, seen_through
+from bodyscan.fusion.free_space import Guess, sees_through
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.pair import Placing
 
@@ -37,9 +37,9 @@ def test_a_wall_and_something_beyond_the_volume_are_seen_through_alike():
     guess = Guess.of(vertices, faces, np.ones(len(faces), bool))
     points = np.random.default_rng(0).uniform([-50, -400, 650], [50, 400, 1150], (5000, 3))
     points = points.astype(np.float32)
-    through = seen_through(points, guess, wall, POSE, 10.0)
+    through = sees_through(points, guess, wall, POSE, 10.0)
     assert 0.2 < through.mean() < 0.8
-    np.testing.assert_array_equal(seen_through(points, guess, far, POSE, 10.0), through)
+    np.testing.assert_array_equal(sees_through(points, guess, far, POSE, 10.0), through)
     # Without a word of what is behind, only what lies between measured parts can be open.
-    blind = seen_through(points, guess, replace(far, beyond=None), POSE, 10.0)
+    blind = sees_through(points, guess, replace(far, beyond=None), POSE, 10.0)
     assert blind.sum() < through.sum()

@@ -81,7 +81,7 @@ def test_more_pairs_are_better(scan: Scan, cloud: BodyCloud):
 def test_the_same_images_give_the_same_bytes(
     scan: Scan, cleaned: list[RangeImage], cloud: BodyCloud
 ):
-    again = merge(cleaned, scan.rig_from_camera, points=250_000, workers=3)
+    again = merge(cleaned, scan.rig_from_camera, points=250_000, workers=3).cloud
     for name in BodyCloud.__dataclass_fields__:
         assert getattr(again, name).tobytes() == getattr(cloud, name).tobytes()
 
@@ -94,7 +94,7 @@ def test_small_misalignments_are_averaged(scan: Scan, cleaned: list[RangeImage])
         @ RigidTransform.from_rotation_vector(rng.normal(0, 1e-4, 3), rng.normal(0, 0.2, 3))
         for name, placing in scan.rig_from_camera.items()
     }
-    cloud = merge(cleaned, moved, points=250_000)
+    cloud = merge(cleaned, moved, points=250_000).cloud
     off = signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
     # 0.2 mm and 0.1 mrad times 1.3 m are 0.24 mm along the normal where one pair sees alone.
     assert deviation(off).rms_mm < 0.3
@@ -107,7 +107,7 @@ def test_a_misplaced_pair_leaves_no_double_surface(scan: Scan, cleaned: list[Ran
     """One pair 3 mm too far: where others see the same, one of the surfaces has to go."""
     shift = RigidTransform(np.eye(3), np.array([0.0, 0.0, 3.0]))
     moved = {**scan.rig_from_camera, "p1-2": scan.rig_from_camera["p1-2"] @ shift}
-    cloud = merge(cleaned, moved, points=250_000)
+    cloud = merge(cleaned, moved, points=250_000).cloud
     off = signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
     assert np.mean(np.abs(off) > 1.5) > 0.02  # what only that pair saw
     assert _share_of_doubles(cloud, off, 1.5) < 0.01
@@ -133,7 +133,7 @@ def test_points_in_front_of_what_others_see_go(scan: Scan, cleaned: list[RangeIm
         image.pair, image.camera, points, image.normals, image.sigma_mm, image.colours
     )
     images = [*cleaned[:number], wrong, *cleaned[number + 1 :]]
-    cloud = merge(images, scan.rig_from_camera, points=250_000)
+    cloud = merge(images, scan.rig_from_camera, points=250_000).cloud
     floating = points[patch].reshape(-1, 3)
     floating = scan.rig_from_camera["p1-3"].apply(
         floating[np.isfinite(floating[:, 0])].astype(float)
@@ -161,7 +161,7 @@ def test_nothing_to_merge_is_an_error(scan: Scan, cleaned: list[RangeImage]):
 
 def test_few_points_are_all_kept(scan: Scan, cleaned: list[RangeImage]):
     image = cleaned[3]
-    cloud = merge([image], scan.rig_from_camera, points=10_000_000)
+    cloud = merge([image], scan.rig_from_camera, points=10_000_000).cloud
     assert 0.9 * image.valid.sum() < len(cloud.points) <= image.valid.sum()
     assert (cloud.pairs_seen == 1).all()
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bodyscan.fusion.quadratics import fit_quadratics
-from bodyscan.fusion.smoothing import Surface, smooth
+from bodyscan.fusion.smoothing import SmoothSurface, smooth
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -49,7 +49,7 @@ def sphere_depth(radius: float) -> np.ndarray:
     return np.where(inside > 0, (b - np.sqrt(np.maximum(inside, 0))) / a, np.nan)
 
 
-def smoothed(image: RangeImage) -> tuple[Surface, np.ndarray, np.ndarray]:
+def smoothed(image: RangeImage) -> tuple[SmoothSurface, np.ndarray, np.ndarray]:
     """With points and normals in the camera frame, (N, 3)."""
     surface = smooth(image, POSE)
     assert surface is not None
@@ -58,7 +58,7 @@ def smoothed(image: RangeImage) -> tuple[Surface, np.ndarray, np.ndarray]:
     return surface, points, camera_from_rig.rotate(surface.normals.astype(float))
 
 
-def on_pixels(surface: Surface, values: np.ndarray) -> np.ndarray:
+def on_pixels(surface: SmoothSurface, values: np.ndarray) -> np.ndarray:
     """(h, w) of the whole image: a value for each of the surface's points, NaN elsewhere."""
     (column, row), (height, width) = surface.corner, surface.number.shape
     image = np.full((CAMERA.height, CAMERA.width), np.nan)

@@ -7,7 +7,7 @@ import open3d as o3d
 import pytest
 from scipy.spatial import cKDTree
 
-from bodyscan.fusion.support import Support, settled, support
+from bodyscan.fusion.support import Support, fit_to_points, support
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.topology import vertex_normals
 
@@ -111,7 +111,7 @@ def test_a_surface_settles_on_its_points():
     bumpy = vertices * (1.0 + 0.01 * np.sin(vertices[:, :1] / 3.0))
     normals = vertex_normals(bumpy, faces)
     around = support(bumpy, normals, cloud, cKDTree(cloud.points), REACH_MM)
-    moved = settled(bumpy, faces, normals, around)
+    moved = fit_to_points(bumpy, faces, normals, around)
     off = np.abs(np.linalg.norm(bumpy, axis=1) - 50.0).max()
     assert off > 0.4
     # Tangent planes 1 mm away lie 1 / 100 mm over a ball of 50 mm.
@@ -134,7 +134,7 @@ def test_no_face_folds_over():
         REACH_MM,
     )
     # Near the poles faces are 0.3 mm wide.
-    moved = settled(vertices, faces, normals, everywhere)
+    moved = fit_to_points(vertices, faces, normals, everywhere)
 
     def cosines(places: np.ndarray) -> np.ndarray:
         before, after = (
