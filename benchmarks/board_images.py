@@ -22,7 +22,7 @@ from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 from bodyscan.simulation.board import board_print
 from bodyscan.simulation.layout import TruePair, build_pairs
-from bodyscan.simulation.lens import sampled_directions
+from bodyscan.simulation.lens import sample_directions
 from bodyscan.simulation.plan import BoardShot, default_shots, plan_boards
 from bodyscan.simulation.sensor import expose, exposure
 from bodyscan.simulation.settings import SimulationSettings
@@ -117,7 +117,7 @@ def _views_of(
     number: int,
 ) -> Iterator[BoardView]:
     samples = SETTINGS.optics.samples
-    rays = sampled_directions(
+    rays = sample_directions(
         pair.camera, samples, np.random.default_rng([seed, 6, number]), slice(None)
     )
     planes = np.ascontiguousarray(

@@ -12,8 +12,8 @@ from bodyscan.rig.board import Board
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation.board import make_board
-from bodyscan.simulation.files import scaled_rig
-from bodyscan.simulation.instrument import handed_out
+from bodyscan.simulation.files import scale_rig
+from bodyscan.simulation.instrument import instrument_images
 from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import TruePair, build_pairs
 from bodyscan.simulation.render import PixelTruth, View, pixel_truth, render_pair
@@ -51,7 +51,7 @@ CODES: dict[str, dict[str, object]] = {
 def report() -> str:
     """The section of docs/results.md."""
     settings = SimulationSettings()
-    rig = scaled_rig(load_rig(RIG), 0.5, "captures")
+    rig = scale_rig(load_rig(RIG), 0.5, "captures")
     (pair,) = build_pairs(rig, settings, lambda _: np.random.default_rng(SEED)).values()
     projector = rig.pairs[0].projector
     assert projector is not None
@@ -127,7 +127,7 @@ def _row(
     length = exposure(images[frames.lit], light.board_grey, light)
     seen = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}
     if spec.code == "stripe-index":
-        seen = handed_out(seen, spec, frames)
+        seen = instrument_images(seen, spec, frames)
     coded = np.stack([seen[name] for name in frames.of_code(spec)])
     found = read_code(spec, seen[frames.lit], seen.get(frames.dark or ""), coded)
     lit = np.isfinite(truth.s)

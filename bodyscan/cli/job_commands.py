@@ -53,12 +53,12 @@ def batch(
     from bodyscan.jobs.discovery import find_jobs
     from bodyscan.jobs.object_storage import Store, find_stored_jobs, is_url
     from bodyscan.jobs.pipeline import load_pipeline
-    from bodyscan.jobs.stages import KINDS, wanted
+    from bodyscan.jobs.stages import KINDS, stages_until
 
     settings = load_pipeline(pipeline, changes or ())
     every = KINDS[settings.kind]
     last = until or every[-1].name
-    stages = wanted(every, last)
+    stages = stages_until(every, last)
     if not is_url(scans) and not is_url(out):
         folder, given = Path(out), Path(calibration) if calibration else None
         jobs = find_jobs(settings, Path(scans), folder, given, last)
@@ -104,22 +104,22 @@ def _run(
     store: Store | None = None,
 ) -> int:
     """Returns the exit code: 1 if a job was set aside, or a scan has to be repeated."""
-    from bodyscan.jobs import object_storage, sharing, watching
-    from bodyscan.jobs.batch import finish, here, run_batch, supervised
-    from bodyscan.jobs.cluster import on_cluster
+    from bodyscan.jobs import allocation, display, object_storage
+    from bodyscan.jobs.batch import finish, run_batch, run_locally, supervise_job
+    from bodyscan.jobs.cluster import run_on_cluster
 
     resources = jobs[0].pipeline.resources
-    shares = sharing.share_out(
-        resources, len(jobs), workers, sharing.cores(), sharing.free_memory_mb()
+    shares = allocation.allocate(
+        resources, len(jobs), workers, allocation.cores(), allocation.free_memory_mb()
     )
-    work = partial(object_storage.work_on_stored, store=store) if store else supervised
+    work = partial(object_storage.work_on_stored, store=store) if store else supervise_job
     try:
-        with watching.json_lines() if json else watching.screen() as listen:
+        with display.json_lines() if json else display.screen() as listen:
             if cluster:
-                run = on_cluster(cluster, resources.threads, listen=listen, work=work)
+                run = run_on_cluster(cluster, resources.threads, listen=listen, work=work)
             else:
                 listen({"event": "shares", **asdict(shares)})
-                run = here(shares, listen=listen, work=work)
+                run = run_locally(shares, listen=listen, work=work)
             outcomes = run_batch(jobs, out, run, listen)
             if store:
                 object_storage.fetch_figures(jobs, store)
@@ -139,7 +139,7 @@ def verify(
 ) -> None:
     """Hold images, calibration and results against the manifest; find any byte that changed."""
     from bodyscan.jobs.job import printable
-    from bodyscan.jobs.verifying import verify as look
+    from bodyscan.jobs.verification import verify as look
 
     verified = look(folder)
     for fault in verified.faults:
@@ -165,11 +165,11 @@ def forget(
     from bodyscan.jobs import forgetting
     from bodyscan.jobs.job import printable
 
-    found = forgetting.find(subject, workspace)
+    found = forgetting.find_subject(subject, workspace)
     if not dry_run:
         if sys.stdin.isatty() and not yes and found.files:
             typer.confirm(f"remove {len(found.files)} files of {subject} for ever?", abort=True)
-        found = forgetting.forget(subject, workspace)
+        found = forgetting.forget_subject(subject, workspace)
     verb = "would remove" if dry_run else "removed"
     for path in found.files:
         typer.echo(f"{verb} {printable(str(path))}")

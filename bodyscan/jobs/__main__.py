@@ -2,6 +2,6 @@
 
 import sys
 
-from bodyscan.jobs.working import main
+from bodyscan.jobs.worker import main
 
 sys.exit(main())

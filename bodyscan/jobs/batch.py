@@ -10,24 +10,26 @@ from pathlib import Path
 from typing import Any
 
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
+from bodyscan.jobs.allocation import Allocation
 from bodyscan.jobs.job import BATCH_LOCK, STAGE, Job, write_job
-from bodyscan.jobs.locking import for_owner_only, locked
-from bodyscan.jobs.sharing import Shares
-from bodyscan.jobs.supervision import COMMAND, Listen, Outcome, deaf, supervise
+from bodyscan.jobs.locking import file_lock, for_owner_only
+from bodyscan.jobs.supervision import COMMAND, JobResult, Listen, ignore_events, supervise
 
-Run = Callable[[Sequence[Job]], Iterator[Outcome]]
+Run = Callable[[Sequence[Job]], Iterator[JobResult]]
 """Starts jobs and yields how each ended, as soon as it did."""
 
-Work = Callable[..., Outcome]
-"""What is done with a Job: `supervised`, or on its copy from elsewhere (see object_storage)."""
+Work = Callable[..., JobResult]
+"""What is done with a Job: `supervise_job`, or on its copy from elsewhere (see object_storage)."""
 
 
-def supervised(job: Job, **how: Any) -> Outcome:
+def supervise_job(job: Job, **how: Any) -> JobResult:
     """Work on a job in its folder, see `supervise`."""
     return supervise(str(job.folder), **how)
 
 
-def run_batch(jobs: Sequence[Job], out: Path, run: Run, listen: Listen = deaf) -> list[Outcome]:
+def run_batch(
+    jobs: Sequence[Job], out: Path, run: Run, listen: Listen = ignore_events
+) -> list[JobResult]:
     """Bring every job up to date; outcomes in the order of the jobs.
 
     A job that fails is set aside with its reason, the others go on.  Raises BadInput when another
@@ -38,17 +40,17 @@ def run_batch(jobs: Sequence[Job], out: Path, run: Run, listen: Listen = deaf) -
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise BadInput(f"cannot be written: {error.strerror}", where=str(out)) from error
-        with locked(out / BATCH_LOCK, wait=False):
+        with file_lock(out / BATCH_LOCK, wait=False):
             _sweep(out)
             listen({"event": "batch", "jobs": [job.name for job in jobs]})
-            outcomes: dict[str, Outcome] = {}
+            outcomes: dict[str, JobResult] = {}
             ready = []
             for job in jobs:
                 try:
                     write_job(job)
                     ready.append(job)
                 except (BodyscanError, OSError) as error:
-                    outcomes[job.name] = Outcome(job.name, "set aside", reason=str(error))
+                    outcomes[job.name] = JobResult(job.name, "set aside", reason=str(error))
             for outcome in outcomes.values():
                 _tell(outcome, listen)
             since = time.monotonic()
@@ -64,7 +66,7 @@ def run_batch(jobs: Sequence[Job], out: Path, run: Run, listen: Listen = deaf) -
 
 
 def seconds_left(
-    ended: Sequence[Outcome], waiting: Collection[str], spent_s: float
+    ended: Sequence[JobResult], waiting: Collection[str], spent_s: float
 ) -> float | None:
     """How long a batch will go on, from how long jobs took that had something to do.
 
@@ -78,15 +80,15 @@ def seconds_left(
     return round(len(waiting) * sum(took) / len(took) / at_once, 1)
 
 
-def here(
-    shares: Shares,
+def run_locally(
+    shares: Allocation,
     command: Sequence[str] = COMMAND,
-    listen: Listen = deaf,
-    work: Work = supervised,
+    listen: Listen = ignore_events,
+    work: Work = supervise_job,
 ) -> Run:
     """Runs jobs on this machine, `shares.workers` at a time."""
 
-    def run(jobs: Sequence[Job]) -> Iterator[Outcome]:
+    def run(jobs: Sequence[Job]) -> Iterator[JobResult]:
         pool = ThreadPoolExecutor(shares.workers)
         try:
             futures = [
@@ -114,11 +116,11 @@ def _sweep(out: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _tell(outcome: Outcome, listen: Listen) -> None:
+def _tell(outcome: JobResult, listen: Listen) -> None:
     listen({"event": "job", **asdict(outcome)})
 
 
-def finish(jobs: Sequence[Job], outcomes: Sequence[Outcome], out: Path) -> dict[str, object]:
+def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dict[str, object]:
     """Write the table and the manifest over all jobs; returns the event that ends a batch.
 
     Raises FailedWork when they cannot be written.

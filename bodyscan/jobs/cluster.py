@@ -11,19 +11,19 @@ import os
 from collections.abc import Iterator, Sequence
 
 from bodyscan.errors import BadInput, FailedWork
-from bodyscan.jobs.batch import Run, Work, supervised
+from bodyscan.jobs.batch import Run, Work, supervise_job
 from bodyscan.jobs.job import Job
-from bodyscan.jobs.supervision import COMMAND, Listen, Outcome, deaf
+from bodyscan.jobs.supervision import COMMAND, JobResult, Listen, ignore_events
 
 _TIMEOUT_S = 20
 
 
-def on_cluster(
+def run_on_cluster(
     address: str,
     threads: int,
     command: Sequence[str] = COMMAND,
-    listen: Listen = deaf,
-    work: Work = supervised,
+    listen: Listen = ignore_events,
+    work: Work = supervise_job,
 ) -> Run:
     """Runs jobs on the cluster whose scheduler listens at `address`, such as tcp://host:8786.
 
@@ -39,7 +39,7 @@ def on_cluster(
             remedy="pip install 'bodyscan[cluster]' here and on every worker",
         ) from None
 
-    def run(jobs: Sequence[Job]) -> Iterator[Outcome]:
+    def run(jobs: Sequence[Job]) -> Iterator[JobResult]:
         try:
             client = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
             client.wait_for_workers(1, timeout=_TIMEOUT_S)
@@ -52,7 +52,7 @@ def on_cluster(
         with client:
             futures = {
                 client.submit(
-                    run_there,
+                    run_on_worker,
                     work,
                     job,
                     threads,
@@ -69,18 +69,18 @@ def on_cluster(
                 if lost is None:
                     yield future.result()
                 else:
-                    yield Outcome(futures[future], "set aside", reason=f"on the cluster: {lost}")
+                    yield JobResult(futures[future], "set aside", reason=f"on the cluster: {lost}")
 
     return run
 
 
-def run_there(
+def run_on_worker(
     work: Work, job: Job, threads: int, limit_s: float, command: Sequence[str]
-) -> Outcome:
+) -> JobResult:
     """What a worker does with one job."""
     os.umask(0o077)
-    if work is supervised and not job.folder.is_dir():
-        return Outcome(
+    if work is supervise_job and not job.folder.is_dir():
+        return JobResult(
             job.name,
             "set aside",
             reason=f"{job.folder} is not there on this worker: share folders under one path",

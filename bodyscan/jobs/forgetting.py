@@ -22,7 +22,7 @@ from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_text
 from bodyscan.files.yaml_file import YamlError, read_yaml
 from bodyscan.jobs.job import BATCH_LOCK, JOB, MANIFEST, SUMMARY
-from bodyscan.jobs.locking import for_owner_only, locked
+from bodyscan.jobs.locking import file_lock, for_owner_only
 from bodyscan.jobs.summary import write_out_manifest
 
 # Removed in this order, so that what says whose a folder is goes last: a removal that was
@@ -31,7 +31,7 @@ _MARKERS = ("scan.json", JOB, CAPTURES)
 
 
 @dataclass(frozen=True)
-class Found:
+class SubjectFiles:
     """files: of the subject.  folders: of the subject alone.  tables: summaries and manifests of
     batches, which are written anew.  unreadable: files that should say whose a folder is, and do not.
     """
@@ -42,8 +42,8 @@ class Found:
     unreadable: tuple[Path, ...]
 
 
-def find(subject: str, workspace: Path) -> Found:
-    """What `forget` would remove. Raises BadInput when the workspace is no folder."""
+def find_subject(subject: str, workspace: Path) -> SubjectFiles:
+    """What `forget_subject` would remove. Raises BadInput when the workspace is no folder."""
     if not workspace.is_dir():
         raise BadInput("there is no such folder", where=str(workspace), remedy="check --workspace")
     files: list[Path] = []
@@ -58,19 +58,19 @@ def find(subject: str, workspace: Path) -> Found:
         if BATCH_LOCK in names and owner is None:
             tables.append(folder)
     files.sort(key=lambda path: (_rank(path.name), path))
-    return Found(tuple(files), tuple(folders), tuple(tables), tuple(unreadable))
+    return SubjectFiles(tuple(files), tuple(folders), tuple(tables), tuple(unreadable))
 
 
-def forget(subject: str, workspace: Path) -> Found:
+def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
     """Remove every file of a subject in a workspace; links are removed, never followed.
 
     Raises BadInput when there is nothing of that subject, or a batch is at work in the workspace.
     """
     with ExitStack() as locks:
         locks.enter_context(for_owner_only())
-        found = find(subject, workspace)
+        found = find_subject(subject, workspace)
         for out in found.tables:
-            locks.enter_context(locked(out / BATCH_LOCK, wait=False))
+            locks.enter_context(file_lock(out / BATCH_LOCK, wait=False))
         rows = [out for out in found.tables if _without(subject, out / SUMMARY) is not None]
         if not found.files and not rows:
             raise BadInput(

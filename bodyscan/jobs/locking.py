@@ -13,7 +13,7 @@ from bodyscan.errors import BadInput
 
 
 @contextmanager
-def locked(path: Path, *, wait: bool) -> Iterator[None]:
+def file_lock(path: Path, *, wait: bool) -> Iterator[None]:
     """Hold the lock on `path` (flock: the kernel lets it go, also after `kill -9`).
 
     wait: for whoever holds it; otherwise raises BadInput that says who does.

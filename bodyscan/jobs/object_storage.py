@@ -20,7 +20,7 @@ from bodyscan.jobs.discovery import find_jobs
 from bodyscan.jobs.hashing import files_below
 from bodyscan.jobs.job import LOCK, MANIFEST, STAGE, SUMMARY, Job, write_job
 from bodyscan.jobs.pipeline import Pipeline
-from bodyscan.jobs.supervision import COMMAND, Listen, Outcome, deaf, supervise
+from bodyscan.jobs.supervision import COMMAND, JobResult, Listen, ignore_events, supervise
 
 _FIGURES = ("scan/scan.json", "calibration/calibration.json", MANIFEST)
 
@@ -68,8 +68,8 @@ def work_on_stored(
     threads: int,
     limit_s: float,
     command: Sequence[str] = COMMAND,
-    listen: Listen = deaf,
-) -> Outcome:
+    listen: Listen = ignore_events,
+) -> JobResult:
     """Fetch a job, bring it up to date, and put back what is new. Never raises for what it does."""
     try:
         with tempfile.TemporaryDirectory(prefix="bodyscan-") as folder:
@@ -97,7 +97,7 @@ def work_on_stored(
             _put_back(local.folder, there, was, outcome.stages)
             return outcome
     except Exception as error:  # a store fails in as many ways as there are stores
-        return Outcome(job.name, "set aside", reason=f"{type(error).__name__}: {error}")
+        return JobResult(job.name, "set aside", reason=f"{type(error).__name__}: {error}")
 
 
 def fetch_figures(jobs: Sequence[Job], store: Store) -> None:

@@ -47,7 +47,7 @@ class Step:
     why: str
 
 
-def origin(job: Job, stage: Stage) -> Origin:
+def origin_of(job: Job, stage: Stage) -> Origin:
     """Of a stage if it ran now. Raises BodyscanError or OSError when its inputs cannot be read."""
     settings = {name: job.pipeline.section(name) for name in stage.sections}
     return Origin(stage.name, stage.version, settings, file_hashes(stage.inputs(job)))
@@ -61,14 +61,14 @@ def plan(job: Job, stages: Sequence[Stage]) -> list[Step]:
             steps.append(Step(stage.name, f"{steps[-1].stage} runs before it"))
             continue
         try:
-            why = why_run(job, origin(job, stage))
+            why = reason_to_run(job, origin_of(job, stage))
         except (BodyscanError, OSError) as error:
             why = f"its inputs cannot be used as they are: {error}"
         steps.append(Step(stage.name, why))
     return steps
 
 
-def why_run(job: Job, now: Origin) -> str:
+def reason_to_run(job: Job, now: Origin) -> str:
     """Why a stage has to run; "" when what lies there was made from just this, and is whole."""
     folder = job.folder / now.stage
     try:

@@ -38,7 +38,7 @@ class Stage:
 Kinds = Mapping[str, tuple[Stage, ...]]
 
 
-def wanted(stages: tuple[Stage, ...], until: str) -> tuple[Stage, ...]:
+def stages_until(stages: tuple[Stage, ...], until: str) -> tuple[Stage, ...]:
     """The stages to the one called `until`. Raises BadInput when there is none of that name."""
     names = [stage.name for stage in stages]
     if until not in names:

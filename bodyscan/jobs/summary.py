@@ -15,7 +15,7 @@ from bodyscan.arrays import Array
 from bodyscan.files.atomic import write_json, write_text
 from bodyscan.jobs.hashing import file_hash
 from bodyscan.jobs.job import MANIFEST, SUMMARY, Job
-from bodyscan.jobs.supervision import Outcome
+from bodyscan.jobs.supervision import JobResult
 
 BODY_CENTRE_MM = np.array([0.0, 0.0, 900.0])
 NEIGHBOURS = 2  # scans before and after that tell drift from the sway of one person
@@ -44,7 +44,7 @@ _FIRST = ("job", "subject", "when", "state", "attempts", "seconds", "stages")
 Motions = dict[str, Array]
 
 
-def write_summary(jobs: Sequence[Job], outcomes: Sequence[Outcome], out: Path) -> Path:
+def write_summary(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> Path:
     """Write summary.csv (one row a job, docs/formats.md says what each column is); its path."""
     kind = jobs[0].pipeline.kind
     rows = [_row(job, outcome) for job, outcome in zip(jobs, outcomes, strict=True)]
@@ -71,7 +71,7 @@ def to_repeat(jobs: Sequence[Job]) -> list[str]:
     return [name for name, verdict in verdicts.items() if verdict and verdict["grade"] == "repeat"]
 
 
-def _row(job: Job, outcome: Outcome) -> dict[str, Any]:
+def _row(job: Job, outcome: JobResult) -> dict[str, Any]:
     row: dict[str, Any] = {
         "job": outcome.job,
         "subject": job.subject,

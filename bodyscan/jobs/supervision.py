@@ -26,7 +26,7 @@ _LAST_LINES = 4000
 
 
 @dataclass(frozen=True)
-class Outcome:
+class JobResult:
     """How a job ended.  state: done or set aside.  stages: those that ran; reason: of setting aside."""
 
     job: str
@@ -37,7 +37,7 @@ class Outcome:
     reason: str = ""
 
 
-def deaf(event: dict[str, Any]) -> None:
+def ignore_events(event: dict[str, Any]) -> None:
     """Whoever does not want to know."""
 
 
@@ -47,8 +47,8 @@ def supervise(
     threads: int,
     limit_s: float,
     command: Sequence[str] = COMMAND,
-    listen: Listen = deaf,
-) -> Outcome:
+    listen: Listen = ignore_events,
+) -> JobResult:
     """Run the job in `folder` in a process of its own, twice if need be.
 
     command: what follows the name of this Python.  Never raises for what a job does.
@@ -62,7 +62,7 @@ def supervise(
         reason = _attempt(path, threads, limit_s, command, listen, stages)
         if not reason:
             break
-    outcome = Outcome(
+    outcome = JobResult(
         path.name,
         "set aside" if reason else "done",
         attempt,

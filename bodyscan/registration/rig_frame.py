@@ -10,11 +10,11 @@ from bodyscan.calibration.located_view import board_symmetries
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.view_graph import Target
-from bodyscan.rig.pair import Placing
+from bodyscan.rig.pair import NominalPose
 from bodyscan.rig.rig import Rig
 
 
-def nominal_placing(placing: Placing) -> RigidTransform:
+def nominal_pose(placing: NominalPose) -> RigidTransform:
     """`rig_from_camera` of a camera that looks from one point at another, upright."""
     position = np.array(placing.position_mm)
     forward = np.array(placing.look_at_mm) - position
@@ -90,5 +90,5 @@ def rig_from_root(
             where=f"rig {rig.name}",
             remedy="mend that pair's captures, or name another pair in rig_frame",
         )
-    placed = nominal_placing(pair.nominal) if pair.nominal else RigidTransform.identity()
+    placed = nominal_pose(pair.nominal) if pair.nominal else RigidTransform.identity()
     return placed @ root_from_camera[pair.name].inverse()

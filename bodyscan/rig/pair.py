@@ -21,7 +21,7 @@ class CameraSpec(Model):
     height: Pixels
 
 
-class Placing(Model):
+class NominalPose(Model):
     """Where something is meant to stand, rig frame: looks from `position_mm` at `look_at_mm`."""
 
     position_mm: Vector
@@ -39,8 +39,8 @@ class Pair(Model):
     pole: Name | None = None
     camera: CameraSpec
     projector: ProjectorSpec | None = None
-    nominal: Placing | None = None
-    projector_nominal: Placing | None = None
+    nominal: NominalPose | None = None
+    projector_nominal: NominalPose | None = None
 
     def problems(self) -> Iterator[Problem]:
         if self.projector_nominal and not self.projector:

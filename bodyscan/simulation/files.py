@@ -30,7 +30,7 @@ _PNG = [
 _PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
 
 
-def scaled_rig(rig: Rig, scale: float, calibration: str) -> Rig:
+def scale_rig(rig: Rig, scale: float, calibration: str) -> Rig:
     """The rig with image size and number of stripes scaled, its captures in one folder."""
 
     def scaled(value: int) -> int:

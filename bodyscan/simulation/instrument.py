@@ -15,7 +15,7 @@ _LEAST_LIGHT = 12
 _NONE, _TOO_BRIGHT = 0, 255
 
 
-def handed_out(
+def instrument_images(
     images: dict[str, Image], spec: ProjectorSpec, frames: FrameNames
 ) -> dict[str, Image]:
     """The lit image and the stripe-index image, from what its camera saw of its Gray code.

@@ -92,7 +92,7 @@ class LitFacets:
         return cosines * self.area / (np.float32(np.pi) * square + self.area)
 
 
-def lit_facets(scene: Scene, projector: Projector, lamps: Lamps, facet_mm: float) -> LitFacets:
+def light_facets(scene: Scene, projector: Projector, lamps: Lamps, facet_mm: float) -> LitFacets:
     """Facets of about facet_mm x facet_mm: the samples of a surface in one cell of a grid that face
     the light alike."""
     samples, share = _samples(scene, facet_mm)

@@ -44,7 +44,7 @@ def laser_light(
     square, height = dot(towards, towards), dot(towards, normals)
     front = height * dot(points, normals) < 0  # light and viewer are on the same side
     cosine = np.abs(height) / np.sqrt(square * dot(normals, normals))
-    shadow = scene.shadowed(points, towards, hits.surface[chosen])
+    shadow = scene.is_shadowed(points, towards, hits.surface[chosen])
     bright = np.float32(lamps.laser_grey * lamps.reach_mm**2) * cosine / square
     weight = np.zeros(len(s), np.float32)
     weight[chosen] = bright * ((front | (not seen)) & ~shadow) * hits.albedo[chosen]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.rig.pair import Pair, Placing
+from bodyscan.rig.pair import NominalPose, Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
@@ -100,7 +100,7 @@ def draw_camera(width: int, height: int, optics: Optics, rng: np.random.Generato
     return TrueCamera(alpha, beta, gamma, u0, v0, k1, k2, width, height)
 
 
-def rig_from_view(placing: Placing) -> RigidTransform:
+def rig_from_view(placing: NominalPose) -> RigidTransform:
     """From a device that looks along its z, y down, upright in the rig."""
     position, target = _ends(placing)
     forward = target - position
@@ -112,16 +112,16 @@ def rig_from_view(placing: Placing) -> RigidTransform:
     return RigidTransform(np.stack([right, np.cross(forward, right), forward], axis=1), position)
 
 
-def _ends(placing: Placing) -> tuple[Array, Array]:
+def _ends(placing: NominalPose) -> tuple[Array, Array]:
     return np.array(placing.position_mm, float), np.array(placing.look_at_mm, float)
 
 
-def _beside(nominal: RigidTransform, reach: float, horizontal: bool) -> Placing:
+def _beside(nominal: RigidTransform, reach: float, horizontal: bool) -> NominalPose:
     """Where a projector without a placing stands: above the camera, or to its right."""
     axis = -nominal.rotation[:, 1] if horizontal else nominal.rotation[:, 0]
     position = nominal.translation + 0.22 * reach * axis
     target = nominal.translation + reach * nominal.rotation[:, 2]
-    return Placing(position_mm=tuple(position.tolist()), look_at_mm=tuple(target.tolist()))
+    return NominalPose(position_mm=tuple(position.tolist()), look_at_mm=tuple(target.tolist()))
 
 
 def _perturbed(

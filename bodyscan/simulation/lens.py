@@ -78,7 +78,7 @@ def sample_offsets(count: int) -> Array:
     return np.stack([(index + 0.5) / total, (index * step % total + 0.5) / total], axis=-1)
 
 
-def sampled_directions(
+def sample_directions(
     camera: TrueCamera, count: int, rng: np.random.Generator, rows: slice
 ) -> NDArray[np.float32]:
     """Rays of some rows, (rows * width * count^2, 3) float32; each pixel shifts its samples."""

@@ -15,7 +15,7 @@ PARTS = 16
 """Values of light in a stripe, where it changes inside stripes."""
 
 
-def thrown(spec: ProjectorSpec, frames: FrameNames) -> dict[str, Array]:
+def projected_patterns(spec: ProjectorSpec, frames: FrameNames) -> dict[str, Array]:
     """By name of the image, its light (stripes * k,), 0 to 1, at evenly spaced places of the sweep.
 
     Of a stripe-index rig, what its instrument throws for itself: Gray code (see `instrument`).

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.gray import LightTable, light_table, table_index
-from bodyscan.simulation.inter_reflection import LitFacets, lit_facets
+from bodyscan.simulation.inter_reflection import LitFacets, light_facets
 from bodyscan.simulation.lamps import Lamps, laser_light
-from bodyscan.simulation.lens import TrueCamera, sampled_directions
-from bodyscan.simulation.patterns import thrown
+from bodyscan.simulation.lens import TrueCamera, sample_directions
+from bodyscan.simulation.patterns import projected_patterns
 from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene
-from bodyscan.simulation.sensor import blurred, off_focus, shade, speckled
+from bodyscan.simulation.sensor import add_speckle, blur, off_focus, shade
 from bodyscan.simulation.settings import InterReflection, Optics, Projection
 from bodyscan.stripes.projector_spec import ProjectorSpec
 
@@ -44,7 +44,7 @@ class View:
         """Rays through places inside each pixel that `rng` shifts."""
         rows = max(1, _BAND // (camera.width * optics.samples**2))
         cuts = [slice(r, min(r + rows, camera.height)) for r in range(0, camera.height, rows)]
-        bands = [(cut, sampled_directions(camera, optics.samples, rng, cut)) for cut in cuts]
+        bands = [(cut, sample_directions(camera, optics.samples, rng, cut)) for cut in cuts]
         return View(camera, optics, tuple(bands))
 
 
@@ -107,8 +107,8 @@ def render_pair(
         laser[dark] = np.zeros(shape, np.float32)
     shading, focus = shade(view.camera, view.optics), off_focus(depth, lamps.focus_mm)
     return {
-        name: blurred(
-            (speckled(light, projection.speckle, rng) + ambient) * shading, view.optics, focus
+        name: blur(
+            (add_speckle(light, projection.speckle, rng) + ambient) * shading, view.optics, focus
         )
         for name, light in laser.items()
     }
@@ -131,7 +131,7 @@ class _Between:
         tables: Mapping[str, LightTable],
         chosen: InterReflection,
     ) -> _Between:
-        facets = lit_facets(scene, projector, lamps, chosen.facet_mm)
+        facets = light_facets(scene, projector, lamps, chosen.facet_mm)
         blur = _blur_rows(facets.samples, projection, lamps)
         index = table_index(facets.s, projector.stripes, blur)
         light = np.stack([facets.radiosity(table.at(index)) for table in tables.values()])
@@ -196,7 +196,7 @@ def _steady_tables(
 
 def _lights(code: ProjectorSpec, frames: FrameNames) -> list[tuple[str, Array]]:
     """Lit and the code's images: name, and light along the sweep."""
-    return [(frames.lit, np.ones(code.stripes)), *thrown(code, frames).items()]
+    return [(frames.lit, np.ones(code.stripes)), *projected_patterns(code, frames).items()]
 
 
 def _blurs(projection: Projection) -> Array:

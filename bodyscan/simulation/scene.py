@@ -140,7 +140,7 @@ class Scene:
         )
         return np.asarray(~hidden.numpy())
 
-    def shadowed(
+    def is_shadowed(
         self, points: Floats, towards: Floats, surface: NDArray[np.uint32]
     ) -> NDArray[np.bool_]:
         """Whether something stands between points (N, 3) on surfaces and their light's source.

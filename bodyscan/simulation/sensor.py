@@ -29,7 +29,7 @@ def expose(image: Floats, noise: Noise, rng: np.random.Generator) -> Image:
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
-def speckled(image: Floats, size: float, rng: np.random.Generator) -> Floats:
+def add_speckle(image: Floats, size: float, rng: np.random.Generator) -> Floats:
     """Laser light with speckle of relative standard deviation `size` and mean 1: a gamma
     distribution, as that of speckle averaged over a pixel (Goodman, Speckle Phenomena, 2007)."""
     if size <= 0:
@@ -53,7 +53,7 @@ def off_focus(depth: Floats, focus_mm: float) -> Floats:
     return np.minimum(np.abs(np.float32(focus_mm) / depth - 1.0), 1.0)
 
 
-def blurred(image: Floats, optics: Optics, out_of_focus: Floats | None) -> Floats:
+def blur(image: Floats, optics: Optics, out_of_focus: Floats | None) -> Floats:
     """The lens's Gaussian blur; wider where the scene is out of focus (0..1), if that is given."""
     if optics.defocus_px <= 0 or out_of_focus is None:
         return _gaussian(image, optics.blur_px)

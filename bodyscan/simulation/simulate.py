@@ -18,7 +18,7 @@ from bodyscan.rig.rig_file import load_rig, write_rig
 from bodyscan.rig.templates import fill
 from bodyscan.simulation import body, files
 from bodyscan.simulation.board import make_board
-from bodyscan.simulation.instrument import handed_out
+from bodyscan.simulation.instrument import instrument_images
 from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import TruePair, build_pairs
 from bodyscan.simulation.plan import default_shots, plan_boards
@@ -73,7 +73,7 @@ def simulate(
     nominal placings or a subject that cannot be read.
     """
     settings = settings or SimulationSettings()
-    rig = files.scaled_rig(load_rig(rig_file), scale, CALIBRATION)
+    rig = files.scale_rig(load_rig(rig_file), scale, CALIBRATION)
     truth = _decide(rig, subject, settings, seed, board_shots)
     _render_all(rig, truth, Path(out), workers, progress)
     write_rig(out / "rig.yaml", rig)
@@ -215,7 +215,7 @@ def render_task(
     length = exposure(images[rig.frames.lit], task.bright_grey, light)
     exposed = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}
     if code and code.code == "stripe-index" and task.sequence:
-        exposed = handed_out(exposed, code, rig.frames)
+        exposed = instrument_images(exposed, code, rig.frames)
     for frame, image in exposed.items():
         name = fill(rig.files, shot=task.shot, pair=pair.name, frame=frame)
         files.write_image(out / task.folder / name, image)

@@ -10,9 +10,9 @@ from ray_cast_scan import looking, nominal_camera
 
 from bodyscan.fusion.free_space import Guess, sees_through
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.rig.pair import Placing
+from bodyscan.rig.pair import NominalPose
 
-PLACING = Placing(position_mm=(1500.0, 0.0, 900.0), look_at_mm=(0.0, 0.0, 900.0))
+PLACING = NominalPose(position_mm=(1500.0, 0.0, 900.0), look_at_mm=(0.0, 0.0, 900.0))
 CAMERA = nominal_camera(320, 256)
 POSE = looking(PLACING)
 

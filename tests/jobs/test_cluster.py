@@ -13,7 +13,7 @@ from cheap_batch import jobs_of, results, run_cheap
 
 from bodyscan.errors import BodyscanError
 from bodyscan.jobs.batch import run_batch
-from bodyscan.jobs.cluster import on_cluster
+from bodyscan.jobs.cluster import run_on_cluster
 
 
 def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(make_scans, tmp_path):
@@ -26,7 +26,7 @@ def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(make_scans, tmp_p
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL"
     ) as cluster:
-        run = on_cluster(cluster.scheduler_address, 1, cheap_job.COMMAND)
+        run = run_on_cluster(cluster.scheduler_address, 1, cheap_job.COMMAND)
         batch = threading.Thread(
             target=lambda: outcomes.extend(run_batch(jobs_of(scans, out), out, run))
         )
@@ -50,7 +50,7 @@ def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(make_scans, tmp_p
 def test_a_scheduler_that_is_not_there_is_named(make_scans, tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
     monkeypatch.setattr("bodyscan.jobs.cluster._TIMEOUT_S", 1)
-    run = on_cluster("tcp://127.0.0.1:9", 1)
+    run = run_on_cluster("tcp://127.0.0.1:9", 1)
     with pytest.raises(BodyscanError, match="no dask scheduler with a worker answers"):
         run_batch(jobs_of(make_scans(a="nothing"), tmp_path / "out"), tmp_path / "out", run)
 
@@ -58,7 +58,7 @@ def test_a_scheduler_that_is_not_there_is_named(make_scans, tmp_path, monkeypatc
 def test_without_dask_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(BodyscanError, match="bodyscan\\[cluster\\]"):
-        on_cluster("tcp://127.0.0.1:9", 1)
+        run_on_cluster("tcp://127.0.0.1:9", 1)
 
 
 def _a_running_job(out) -> int:

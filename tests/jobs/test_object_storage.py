@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from bodyscan.cli.main import app
 from bodyscan.errors import BadInput
-from bodyscan.jobs.batch import finish, here, run_batch
+from bodyscan.jobs.allocation import Allocation
+from bodyscan.jobs.batch import finish, run_batch, run_locally
 from bodyscan.jobs.object_storage import (
     Store,
     fetch_figures,
@@ -22,7 +23,6 @@ from bodyscan.jobs.object_storage import (
     work_on_stored,
 )
 from bodyscan.jobs.pipeline import load_pipeline
-from bodyscan.jobs.sharing import Shares
 
 fsspec = pytest.importorskip("fsspec", reason="fsspec is not installed (pip install '.[cluster]')")
 
@@ -48,7 +48,9 @@ def batch(tmp_path, name):
     work = tmp_path / name
     jobs = find_stored_jobs(STORE, load_pipeline(cheap_job.PIPELINE), "export", work)
     task = partial(work_on_stored, store=STORE)
-    outcomes = run_batch(jobs, work / "out", here(Shares(2, 1, ""), cheap_job.COMMAND, work=task))
+    outcomes = run_batch(
+        jobs, work / "out", run_locally(Allocation(2, 1, ""), cheap_job.COMMAND, work=task)
+    )
     fetch_figures(jobs, STORE)
     finish(jobs, outcomes, work / "out")
     put_summary(work / "out", STORE)

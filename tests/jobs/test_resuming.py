@@ -11,7 +11,7 @@ from pathlib import Path
 from cheap_batch import batch_command, jobs_of, results, run_cheap
 
 from bodyscan.errors import BadInput
-from bodyscan.jobs.locking import locked
+from bodyscan.jobs.locking import file_lock
 
 
 def test_ten_kills_leave_the_same_bytes_as_none(make_scans, tmp_path):
@@ -45,7 +45,7 @@ def test_the_processes_of_a_killed_batch_end_with_it(make_scans, tmp_path):
     process.kill()
     process.wait()
     _wait_for(lambda: not _is_alive(child))
-    with locked(tmp_path / "out" / "batch.lock", wait=False):  # kill let it go
+    with file_lock(tmp_path / "out" / "batch.lock", wait=False):  # kill let it go
         pass
 
 
@@ -85,7 +85,7 @@ def _is_held(lock: Path) -> bool:
     if not lock.exists():
         return False
     try:
-        with locked(lock, wait=False):
+        with file_lock(lock, wait=False):
             return False
     except BadInput:
         return True

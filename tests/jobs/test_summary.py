@@ -11,7 +11,7 @@ from cheap_batch import jobs_of
 
 from bodyscan.jobs.batch import seconds_left
 from bodyscan.jobs.summary import BODY_CENTRE_MM, to_repeat, write_summary
-from bodyscan.jobs.supervision import Outcome
+from bodyscan.jobs.supervision import JobResult
 
 NAMES = [f"s{number}" for number in range(9)]
 
@@ -57,7 +57,7 @@ def day(make_scans, tmp_path):
 
 
 def rows(jobs, out):
-    path = write_summary(jobs, [Outcome(job.name, "done", 1) for job in jobs], out)
+    path = write_summary(jobs, [JobResult(job.name, "done", 1) for job in jobs], out)
     with path.open(newline="", encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
 
@@ -86,10 +86,10 @@ def test_two_scans_tell_no_drift_from_sway(day):
 def test_the_time_left_counts_only_what_has_to_be_done():
     """Two jobs of 60 s ran side by side; one was up to date, one failed at once; four wait."""
     ended = [
-        Outcome("a", "done", 1, ("scan",), 60.0),
-        Outcome("b", "done", 1, ("scan", "export"), 60.0),
-        Outcome("c", "done", 1, (), 0.5),
-        Outcome("d", "set aside", 2, (), 1.0, "bad"),
+        JobResult("a", "done", 1, ("scan",), 60.0),
+        JobResult("b", "done", 1, ("scan", "export"), 60.0),
+        JobResult("c", "done", 1, (), 0.5),
+        JobResult("d", "set aside", 2, (), 1.0, "bad"),
     ]
     assert seconds_left(ended, {"e", "f", "g", "h"}, 60.0) == pytest.approx(120.0, rel=0.03)
     assert seconds_left(ended[2:], {"e"}, 2.0) is None

@@ -11,10 +11,10 @@ import pytest
 from cheap_batch import jobs_of, run_cheap
 
 from bodyscan.errors import BadInput
-from bodyscan.jobs.forgetting import find, forget
+from bodyscan.jobs.forgetting import find_subject, forget_subject
 from bodyscan.jobs.hashing import files_below
-from bodyscan.jobs.locking import locked
-from bodyscan.jobs.verifying import verify
+from bodyscan.jobs.locking import file_lock
+from bodyscan.jobs.verification import verify
 
 
 @pytest.fixture
@@ -72,7 +72,7 @@ def test_forget_removes_a_subject_and_nothing_else(day):
     (day / "scans" / "m1" / "link").symlink_to(day / "elder.obj")
     before = set(files_below(day))
     others = {path: path.read_bytes() for path in before if "e1" in path.parts}
-    found = forget("mallow", day)
+    found = forget_subject("mallow", day)
     after = set(files_below(day))
     assert before - after == set(found.files)
     gone = {path.relative_to(day).parts[:2] for path in found.files}
@@ -90,24 +90,27 @@ def test_forget_removes_a_subject_and_nothing_else(day):
         assert [row["job"] for row in csv.DictReader(stream)] == ["e1"]
     assert verify(day / "out", cheap_job.kinds()).faults == ()
     with pytest.raises(BadInput, match="holds nothing of subject 'mallow'"):
-        forget("mallow", day)
+        forget_subject("mallow", day)
 
 
 def test_a_forgetting_that_was_cut_short_can_be_taken_up(day):
-    files = find("mallow", day).files
+    files = find_subject("mallow", day).files
     for path in files[: len(files) // 2]:
         path.unlink()
-    rest = forget("mallow", day)
+    rest = forget_subject("mallow", day)
     assert set(rest.files) == set(files[len(files) // 2 :])
     assert not any("mallow" in path.read_text(errors="replace") for path in files_below(day))
 
 
 def test_a_batch_at_work_is_not_disturbed(day):
-    with locked(day / "out" / "batch.lock", wait=False), pytest.raises(BadInput, match="at work"):
-        forget("mallow", day)
+    with (
+        file_lock(day / "out" / "batch.lock", wait=False),
+        pytest.raises(BadInput, match="at work"),
+    ):
+        forget_subject("mallow", day)
     assert len(jobs_of(day / "scans", day / "out")) == 4
 
 
 def test_a_subject_is_never_told_from_a_name(day):
     with pytest.raises(BadInput, match="holds nothing"):
-        forget("m1", day)
+        forget_subject("m1", day)

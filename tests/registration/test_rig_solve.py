@@ -8,7 +8,7 @@ from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.placing_covariance import position_sigma
 from bodyscan.registration.rig_solve import place_rig
 from bodyscan.rig.board import Board
-from bodyscan.rig.pair import Placing
+from bodyscan.rig.pair import NominalPose
 from bodyscan.rig.rig_frame import RigFrame
 
 
@@ -172,7 +172,7 @@ def test_a_plain_board_fixes_the_frame_the_way_round_that_the_rig_is_meant():
 
 def near(placing):
     position = placing.translation + [12.0, -9.0, 15.0]
-    return Placing(
+    return NominalPose(
         position_mm=tuple(position), look_at_mm=tuple(position + 1000.0 * placing.rotation[:, 2])
     )
 

@@ -20,7 +20,7 @@ from bodyscan.cli.main import app
 from bodyscan.errors import BadInput, ResultError
 from bodyscan.evaluation.comparison import compare
 from bodyscan.files.atomic import write_json
-from bodyscan.jobs.forgetting import find
+from bodyscan.jobs.forgetting import find_subject
 from bodyscan.mesh.holes import holes
 from bodyscan.report.model import Layer, Shape, pack
 from bodyscan.report.page import Number, render
@@ -51,8 +51,8 @@ def test_a_report_elsewhere_is_found_when_its_subject_is_forgotten(scan: MadeSca
     path = tmp_path / "elsewhere" / "r.html"
     result = CliRunner().invoke(app, ["report", str(scan.folder), "--out", str(path)])
     assert result.exit_code == 0, result.output
-    assert path in find("s-17", tmp_path).files
-    assert find("s-18", tmp_path).files == ()
+    assert path in find_subject("s-17", tmp_path).files
+    assert find_subject("s-18", tmp_path).files == ()
 
 
 def test_nothing_lies_outside_of_the_file(html: str):

@@ -7,7 +7,7 @@ import open3d as o3d
 import pytest
 from test_rendering import CRISP, LAMPS, projector, view, wall
 
-from bodyscan.simulation.inter_reflection import lit_facets
+from bodyscan.simulation.inter_reflection import light_facets
 from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.projector import PinholeProjector
 from bodyscan.simulation.render import render_pair
@@ -46,7 +46,7 @@ def test_a_groove_lights_itself_as_crossed_strings_say(opening_deg: float) -> No
     """From a place at x to a plate 0..L at angle phi, Hottel: (1 + (L cos phi - x) / r) / 2, r the
     distance to its rim."""
     phi = np.radians(opening_deg)
-    facets = lit_facets(Scene(groove(phi / 2)), lamp(), PLAIN, 10.0)
+    facets = light_facets(Scene(groove(phi / 2)), lamp(), PLAIN, 10.0)
     left = (facets.middles[:, 0] < 0).astype(np.float32)
     x = np.array([20.0, 25.0, 30.0, 40.0, 55.0])
     found = facets.irradiance(on_right_plate(x, phi / 2), left[None])[0]
@@ -62,7 +62,7 @@ def test_a_hollow_ball_lights_itself_evenly() -> None:
     radius, albedo = 100.0, 0.6
     mesh = o3d.geometry.TriangleMesh.create_sphere(radius, resolution=40)
     scene = Scene([Surface(np.asarray(mesh.vertices), np.asarray(mesh.triangles), albedo)])
-    facets = lit_facets(scene, lamp(1e6), PLAIN, 15.0)
+    facets = light_facets(scene, lamp(1e6), PLAIN, 15.0)
     radiosity = facets.radiosity(np.ones(len(facets.s), np.float32))
     ways = np.random.default_rng(0).standard_normal((200, 3)).astype(np.float32)
     found = facets.irradiance(scene.cast(ways), radiosity[None])[0]
@@ -79,7 +79,7 @@ def test_what_stands_between_keeps_the_light_away() -> None:
         np.array([0.0, -LONG / 2, CREASE_Z]), np.array([0, 0, -200.0]), np.array([0, LONG, 0])
     )
     for surfaces, expected in (groove(half), None), ([*groove(half), screen], 0.0):
-        facets = lit_facets(Scene(surfaces), lamp(), PLAIN, 15.0)
+        facets = light_facets(Scene(surfaces), lamp(), PLAIN, 15.0)
         plates = np.abs(facets.middles[:, 0] / (CREASE_Z - facets.middles[:, 2]) + 1) < 1e-3
         found = facets.irradiance(on_right_plate(x, half), plates[None].astype(np.float32))[0]
         assert (found > 0.2).all() if expected is None else (found == expected).all()

@@ -17,7 +17,7 @@ from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector
 from bodyscan.simulation.render import View, pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
-from bodyscan.simulation.sensor import blurred, expose
+from bodyscan.simulation.sensor import blur, expose
 from bodyscan.simulation.settings import Noise, Optics, Projection
 
 CAMERA = TrueCamera(190.0, 190.6, -0.1, 81.0, 62.5, -0.1, 0.05, 160, 128)
@@ -226,7 +226,7 @@ def test_camera_out_of_focus_blurs_what_is_near() -> None:
     off = np.zeros_like(image)
     off[:, :40] = 1.0
     optics = Optics(blur_px=0.6, defocus_px=2.0)
-    result = blurred(image, optics, off)[20]
+    result = blur(image, optics, off)[20]
     u = np.arange(80)
     near, far = result[:40] / result[:40].sum(), result[40:] / result[40:].sum()
     # the pixel itself is not part of the blur here: the line is one sample wide

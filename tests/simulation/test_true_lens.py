@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from bodyscan.simulation.lens import TrueCamera, sample_offsets, sampled_directions
+from bodyscan.simulation.lens import TrueCamera, sample_directions, sample_offsets
 
 SKEWED = TrueCamera(1061.71, 1064.09, -0.56, 350.08, 286.5, -0.14, -0.09, 640, 480)
 
@@ -64,7 +64,7 @@ def test_samples_share_no_row_and_no_column(count: int) -> None:
 
 def test_samples_stay_inside_their_pixel_and_average_to_its_middle() -> None:
     camera = TrueCamera(755.0, 755.0, 0.0, 31.5, 23.5, 0.0, 0.0, 64, 48)
-    rays = sampled_directions(camera, 3, np.random.default_rng(0), slice(0, 48)).astype(float)
+    rays = sample_directions(camera, 3, np.random.default_rng(0), slice(0, 48)).astype(float)
     off = (camera.image(rays).reshape(48, 64, 9, 2) - camera.grid()[:, :, None]).reshape(-1, 2)
     assert np.abs(off).max() <= 0.5 + 1e-4  # float32 rays
     # uniform in a pixel: standard deviation 0.29 px, 27,648 of them, five standard errors

@@ -19,7 +19,7 @@ def slanted(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return 2.0 + u / PX * 0.7 + 0.02 * v
 
 
-def shadowed(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def is_shadowed(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.where((u > 100) & (u < 160), np.nan, slanted(u, v))
 
 
@@ -68,7 +68,7 @@ def test_boundaries_lie_in_the_middle_of_what_both_sides_show() -> None:
 
 
 def test_a_shadow_that_other_surfaces_light_shows_no_stripes() -> None:
-    plain = render_sequence(shadowed, stripes=STRIPES, light=DIRECT, ambient=15.0, noise=0.7)
+    plain = render_sequence(is_shadowed, stripes=STRIPES, light=DIRECT, ambient=15.0, noise=0.7)
     shade = np.zeros(plain.s.shape, bool)
     shade[:, 104:157] = True  # clear of the rims, which are partly lit
     mixed = read(with_indirect(plain, 30.0))

@@ -14,14 +14,14 @@ import time
 from pathlib import Path
 
 from bodyscan.errors import BodyscanError
-from bodyscan.jobs.batch import finish, here, run_batch
+from bodyscan.jobs.allocation import Allocation
+from bodyscan.jobs.batch import finish, run_batch, run_locally
 from bodyscan.jobs.discovery import find_jobs
+from bodyscan.jobs.display import json_lines
 from bodyscan.jobs.job import Job
 from bodyscan.jobs.pipeline import load_pipeline
-from bodyscan.jobs.sharing import Shares
 from bodyscan.jobs.stages import Stage, results_of
-from bodyscan.jobs.watching import json_lines
-from bodyscan.jobs.working import main
+from bodyscan.jobs.worker import main
 from bodyscan.progress import Progress
 
 COMMAND = (__file__,)
@@ -79,7 +79,7 @@ def batch(scans: Path, out: Path, workers: int) -> int:
     pipeline = load_pipeline(PIPELINE)
     jobs = find_jobs(pipeline, scans, out, scans, "export")
     with json_lines() as listen:
-        run = here(Shares(workers, 1, ""), COMMAND, listen)
+        run = run_locally(Allocation(workers, 1, ""), COMMAND, listen)
         outcomes = run_batch(jobs, out, run, listen)
         listen(finish(jobs, outcomes, out))
     return int(any(outcome.state != "done" for outcome in outcomes))

@@ -13,7 +13,7 @@ import yaml
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.rig.pair import Placing
+from bodyscan.rig.pair import NominalPose
 from bodyscan.rig.rig import Rig
 
 ROOT = Path(__file__).parents[2]
@@ -54,7 +54,7 @@ def scene_of(truth: Truth) -> o3d.t.geometry.RaycastingScene:
     return scene
 
 
-def looking(placing: Placing) -> RigidTransform:
+def looking(placing: NominalPose) -> RigidTransform:
     """rig_from_camera of a camera that stands upright at a placing."""
     position = np.array(placing.position_mm)
     forward = np.array(placing.look_at_mm) - position

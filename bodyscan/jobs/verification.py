@@ -15,14 +15,14 @@ from bodyscan.jobs.stages import KINDS, Kinds
 
 
 @dataclass(frozen=True)
-class Verified:
+class Verification:
     """files: how many were looked at.  faults: what is not as it was, one line each."""
 
     files: int
     faults: tuple[str, ...]
 
 
-def verify(folder: Path, kinds: Kinds = KINDS) -> Verified:
+def verify(folder: Path, kinds: Kinds = KINDS) -> Verification:
     """Of a batch's output folder, or of one job's folder.
 
     Raises BadInput when there is no manifest at all.
@@ -38,7 +38,7 @@ def verify(folder: Path, kinds: Kinds = KINDS) -> Verified:
         files += 1
         if fault:
             faults.append(f"{path}: {fault}")
-    return Verified(files, tuple(faults))
+    return Verification(files, tuple(faults))
 
 
 def _all(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:

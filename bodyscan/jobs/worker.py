@@ -24,9 +24,9 @@ from bodyscan.errors import BodyscanError, CaptureError
 from bodyscan.files.atomic import json_text, write_json
 from bodyscan.jobs.hashing import content_hash, file_hash, file_hashes, files_below
 from bodyscan.jobs.job import LOCK, MANIFEST, STAGE, Job, read_job
-from bodyscan.jobs.locking import for_owner_only, locked
-from bodyscan.jobs.plan import Origin, origin, result_hashes, why_run
-from bodyscan.jobs.stages import KINDS, Kinds, Stage, wanted
+from bodyscan.jobs.locking import file_lock, for_owner_only
+from bodyscan.jobs.plan import Origin, origin_of, reason_to_run, result_hashes
+from bodyscan.jobs.stages import KINDS, Kinds, Stage, stages_until
 from bodyscan.memory import keep_freed_memory
 
 Tell = Callable[..., None]
@@ -59,14 +59,14 @@ def main(kinds: Kinds = KINDS) -> int:
 
 def work(folder: Path, kinds: Kinds, tell: Tell) -> None:
     """Bring a job's results up to date. Whoever else works on it is waited for."""
-    with locked(folder / LOCK, wait=True):
+    with file_lock(folder / LOCK, wait=True):
         _tidy(folder)
         job = read_job(folder)
         every = kinds[job.pipeline.kind]
-        stages = wanted(every, job.until)
+        stages = stages_until(every, job.until)
         for stage in stages:
-            now = origin(job, stage)
-            if why := why_run(job, now):
+            now = origin_of(job, stage)
+            if why := reason_to_run(job, now):
                 tell(stage=stage.name, why=why)
                 _perform(job, stage, now, tell)
         for stage in every[len(stages) :]:
@@ -112,7 +112,7 @@ def _drop_if_stale(job: Job, stage: Stage) -> None:
     """Results of a later stage that belong to other results than now lie before it go."""
     folder = job.folder / stage.name
     with suppress(BodyscanError, OSError):
-        if folder.exists() and why_run(job, origin(job, stage)):
+        if folder.exists() and reason_to_run(job, origin_of(job, stage)):
             _remove(folder)
 
 

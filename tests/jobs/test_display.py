@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from bodyscan.jobs.watching import ending, json_lines, screen
+from bodyscan.jobs.display import ending, json_lines, screen
 
 EVENTS = [
     {"event": "shares", "workers": 2, "threads": 1, "why": "2 cores"},

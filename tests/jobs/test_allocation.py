@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from bodyscan.jobs.allocation import allocate, cores, free_memory_mb
 from bodyscan.jobs.pipeline import Resources
-from bodyscan.jobs.sharing import cores, free_memory_mb, share_out
 
 NEEDS = Resources(threads=2, memory_mb=4000)
 
@@ -23,7 +23,7 @@ NEEDS = Resources(threads=2, memory_mb=4000)
     ],
 )
 def test_shares(jobs, workers, cores_, memory_mb, wanted):
-    shares = share_out(NEEDS, jobs, workers, cores_, memory_mb)
+    shares = allocate(NEEDS, jobs, workers, cores_, memory_mb)
     assert (shares.workers, shares.threads) == wanted
 
 

@@ -11,7 +11,7 @@ from bodyscan.jobs.pipeline import Resources
 
 
 @dataclass(frozen=True)
-class Shares:
+class Allocation:
     """workers: jobs at the same time.  threads: of each.  why: what limits them, in words."""
 
     workers: int
@@ -19,9 +19,9 @@ class Shares:
     why: str
 
 
-def share_out(
+def allocate(
     resources: Resources, jobs: int, workers: int | None, cores: int, memory_mb: float
-) -> Shares:
+) -> Allocation:
     """As many jobs at once as cores and memory allow, no more than there are.
 
     workers: as asked for; they then get fewer threads each, but never more memory than there is.
@@ -33,7 +33,7 @@ def share_out(
     why = f"{cores} cores, {memory_mb / 1000.0:.1f} GB free"
     if count == by_memory < min(most, jobs):
         why += f"; memory limits them, a job takes {resources.memory_mb / 1000.0:g} GB"
-    return Shares(count, threads, why)
+    return Allocation(count, threads, why)
 
 
 def cores() -> int:
