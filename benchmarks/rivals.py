@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from bodyscan.boards.board import corner_points
 from bodyscan.calibration.located_view import LocatedView
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 
@@ -110,8 +111,7 @@ def _camera(ours: Camera, matrix: Array, lens: Array) -> Camera:
         gamma=0.0,
         u0=matrix[0, 2],
         v0=matrix[1, 2],
-        k1=lens[0],
-        k2=lens[1],
+        lens=Radial().with_coefficients(lens[:2]),
     )
 
 
@@ -136,5 +136,5 @@ def _corners(
         "grid": np.array([board.columns, board.rows, board.square_mm]),
         "size": np.array([own[0].width, own[0].height]),
         "matrices": np.array([c.matrix * [[1, 0, 1], [1, 1, 1], [1, 1, 1]] for c in own]),
-        "lenses": np.array([[c.k1, c.k2, 0.0, 0.0, 0.0] for c in own]),
+        "lenses": np.array([c.lens.opencv() for c in own]),
     }

@@ -103,8 +103,8 @@ def match_projected(
     distances, sigma_mm = np.empty(size), np.empty(size)
     found = _match_projected(
         np.ascontiguousarray(target_from_source.matrix[:3]),
-        np.array([camera.alpha, camera.beta, camera.gamma, camera.u0, camera.v0]),
-        np.array([camera.k1, camera.k2]),
+        camera.parameters[:5],
+        camera.parameters[5:],
         (source.points, source.normals, source.sigma_mm, source.rim),
         (image.points, image.normals, image.sigma_mm, target.inner),
         reach_mm,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.boundary_points import BoundaryPoints, points_on_board
-from bodyscan.calibration.camera import INTRINSICS, PlanarView, projection_jacobians
+from bodyscan.calibration.camera import PlanarView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import cauchy_weights, spread
 from bodyscan.geometry.smooth_sheets import SmoothSheets
@@ -27,8 +27,8 @@ Sheets = TypeVar("Sheets", bound=SmoothSheets)
 STEPS = 20
 CAUCHY_SIGMAS = 4.0
 FLOOR_PX = 0.02
-DIFFERENCES = (1e-2, 1e-2, 1e-2, 1e-2, 1e-2, 1e-5, 1e-5, *[1e-6] * 3, *[1e-3] * 3)
-"""Steps for derivatives of a boundary point by the intrinsics and by its board's motion."""
+TWIST_STEPS = (*[1e-6] * 3, *[1e-3] * 3)
+"""Radians and mm, for derivatives of a boundary point by its board's motion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class StripedBoard:
 
 @dataclass(frozen=True, eq=False)
 class JointFit(Generic[Sheets]):
-    """What fits corners and stripes together; covariance (7, 7) of the camera.
+    """What fits corners and stripes together; covariance (P, P) of the camera.
 
     corners_rms_px and stripes_rms_px are robustly weighted.
     """
@@ -65,15 +65,20 @@ class _State(Generic[Sheets]):
     poses: tuple[RigidTransform, ...]
     sheets: Sheets
 
+    @property
+    def first_pose(self) -> int:
+        """Where the poses begin among the unknowns; before them the camera's parameters."""
+        return len(self.camera.parameters)
+
+    @property
+    def first_sheet(self) -> int:
+        return self.first_pose + 6 * len(self.poses)
+
     def moved(self, step: Array) -> _State[Sheets]:
-        last = 7 + 6 * len(self.poses)
-        changed = {
-            name: getattr(self.camera, name) + float(change)
-            for name, change in zip(INTRINSICS, step[:7], strict=True)
-        }
-        twists = step[7:last].reshape(-1, 6)
+        twists = step[self.first_pose : self.first_sheet].reshape(-1, 6)
         poses = tuple(p.moved(twist) for p, twist in zip(self.poses, twists, strict=True))
-        return _State(replace(self.camera, **changed), poses, self.sheets.retract(step[last:]))
+        camera = self.camera.moved(step[: self.first_pose])
+        return _State(camera, poses, self.sheets.retract(step[self.first_sheet :]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,13 +135,13 @@ def refine_jointly(
             break
     normal, _ = _equations(state, boards, noise)
     covariance = _solve(normal, np.eye(len(normal)))
-    last = 7 + 6 * len(boards)
+    first, last = state.first_pose, state.first_sheet
     corners = np.concatenate([_corner_residuals(state, k, b) for k, b in enumerate(boards)])
     return JointFit(
         state.camera,
         {b.view.shot: pose for b, pose in zip(boards, state.poses, strict=True)},
         state.sheets.with_covariance(covariance[last:, last:]),
-        covariance[:7, :7],
+        covariance[:first, :first],
         _weighted_rms(corners, 2) * np.sqrt(2.0),
         _weighted_rms(np.concatenate(_stripe_residuals(state, boards, pixels=True)), 1),
     )
@@ -202,22 +207,22 @@ def _equations(
 ) -> tuple[Array, Array]:
     """Normal matrix and gradient of half the cost: camera, poses, then the sheets' parameters."""
     known, prior = state.sheets.prior()
-    last = 7 + 6 * len(boards)
+    first, last = state.first_pose, state.first_sheet
     size = last + prior.shape[1]
     normal, gradient = np.zeros((size, size)), np.zeros(size)
     normal[last:, last:] = prior.T @ prior
     gradient[last:] = prior.T @ known
     for k, board in enumerate(boards):
-        pose = np.arange(7 + 6 * k, 13 + 6 * k)
+        pose = first + 6 * k + np.arange(6)
         points = state.poses[k].apply(board.view.points)
-        intrinsics, by_point = projection_jacobians(state.camera, points)
-        jacobian = np.concatenate([intrinsics, by_point @ twist_jacobian(points)], axis=2)
+        by_parameter, by_point = state.camera.jacobians(points)
+        jacobian = np.concatenate([by_parameter, by_point @ twist_jacobian(points)], axis=2)
         residuals = _corner_residuals(state, k, board) / noise.corner_px
-        columns = np.concatenate([np.arange(7), pose])
-        rows = jacobian.reshape(-1, 13) / noise.corner_px
+        columns = np.concatenate([np.arange(first), pose])
+        rows = jacobian.reshape(-1, jacobian.shape[2]) / noise.corner_px
         _add(normal, gradient, columns, rows, residuals, 2)
         if len(board.index):
-            columns = np.concatenate([np.arange(7), pose, np.arange(last, size)])
+            columns = np.concatenate([np.arange(first), pose, np.arange(last, size)])
             residuals, rows = _stripe_equations(state, k, board, noise)
             _add(normal, gradient, columns, rows, residuals, 1)
     return normal, gradient
@@ -226,13 +231,14 @@ def _equations(
 def _stripe_equations(
     state: _State[Sheets], k: int, board: StripedBoard, noise: _Noise
 ) -> tuple[Array, Array]:
-    """Residuals (N,) and their derivatives (N, 13 + P) by camera, this board's pose, and sheets."""
+    """Residuals (N,) and their derivatives (N, ...) by camera, this board's pose, and sheets."""
     points = _points(state, k, board)
     offset = state.sheets.offset(points, state.sheets.at(board.index), parameters=True)
     assert offset.by_parameter is not None
     sigma = _sigma(state, k, board, points, offset.by_point) * noise.stripe
-    by_place = np.empty((len(points), 13))
-    for column, size in enumerate(DIFFERENCES):
+    steps = np.array([*state.camera.difference_steps, *TWIST_STEPS])
+    by_place = np.empty((len(points), len(steps)))
+    for column, size in enumerate(steps):
         ahead, behind = (_nudged(state, k, board, column, step) for step in (size, -size))
         by_place[:, column] = (ahead - behind) / (2.0 * size * noise.stripe)
     by_parameter = offset.by_parameter / sigma[:, None]
@@ -240,18 +246,17 @@ def _stripe_equations(
 
 
 def _nudged(state: _State[Sheets], k: int, board: StripedBoard, column: int, step: float) -> Array:
-    """Offsets over their sigma after a small change of an intrinsic (0-6) or the board's pose (7-12).
+    """Offsets over their sigma after a step of one of the camera's parameters, or of the board's
+    pose, whose columns follow.
 
     The sigma changes too: left out of the derivative, noise would pull the focal lengths up.
     """
-    if column < len(INTRINSICS):
-        name = INTRINSICS[column]
-        camera = replace(state.camera, **{name: getattr(state.camera, name) + step})
-        return _offsets(replace(state, camera=camera), k, board)
-    twist = np.zeros(6)
-    twist[column - len(INTRINSICS)] = step
-    poses = (*state.poses[:k], state.poses[k].moved(twist), *state.poses[k + 1 :])
-    return _offsets(replace(state, poses=poses), k, board)
+    change = np.zeros(state.first_pose + 6)
+    change[column] = step
+    camera = state.camera.moved(change[: state.first_pose])
+    pose = state.poses[k].moved(change[state.first_pose :])
+    poses = (*state.poses[:k], pose, *state.poses[k + 1 :])
+    return _offsets(replace(state, camera=camera, poses=poses), k, board)
 
 
 def _offsets(state: _State[Sheets], k: int, board: StripedBoard) -> Array:

@@ -62,7 +62,7 @@ class PairQuality:
 class PairCalibration:
     """A calibrated pair, camera frame.
 
-    camera_covariance: (7, 7) over alpha, beta, gamma, u0, v0, k1, k2.
+    camera_covariance: (P, P) of the camera's parameters.
     light: None for a camera without projector.
     """
 

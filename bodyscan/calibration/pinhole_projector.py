@@ -90,7 +90,7 @@ def fit_pinhole_opencv(
     """
     camera_matrix = camera.matrix
     camera_matrix[0, 1] = 0.0
-    lens = np.array([camera.k1, camera.k2, 0.0, 0.0, 0.0])
+    lens = camera.lens.opencv()
     seen = [camera.without_skew(p).astype(np.float32) for p in pixels]
     objects = [b.astype(np.float32) for b in boards]
     matrix, rotation, translation = _as_camera(start)

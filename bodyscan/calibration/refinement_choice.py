@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.boundary_points import BoundaryPoints, part
-from bodyscan.calibration.camera import INTRINSICS, CameraCalibration
+from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.joint_refinement import (
     JointFit,
     StripedBoard,
@@ -93,7 +93,7 @@ def _flatness(camera: Camera, sheets: LightSheets, board: StripedBoard) -> float
 
 def _drift(calibration: CameraCalibration, camera: Camera) -> float:
     """Squared distance of the refined intrinsics in the covariance that the corners gave them."""
-    change = np.array([getattr(camera, n) - getattr(calibration.camera, n) for n in INTRINSICS])
+    change = camera.parameters - calibration.camera.parameters
     size = np.sqrt(np.diag(calibration.covariance))
     correlation = calibration.covariance / np.outer(size, size)
     return float((change / size) @ np.linalg.solve(correlation, change / size))

@@ -11,7 +11,7 @@ import open3d as o3d
 
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.evaluation.surface import covered, sample_surface
-from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
 from bodyscan.measurement.measuring import Slice, measure
 from bodyscan.mesh.body import BodyMesh
@@ -118,7 +118,7 @@ def coverage_of_seen(
         still_from_camera = RigidTransform.from_matrix(
             pair["swayed_from_still"]
         ).inverse() @ RigidTransform.from_matrix(pair["rig_from_camera"])
-        camera = Camera(**pair["camera"])
+        camera = from_fields(pair["camera"])
         in_camera = still_from_camera.inverse().apply(spots)
         ahead = in_camera[:, 2] > 100.0
         u, v = camera.project(np.where(ahead[:, None], in_camera, 1.0)).T

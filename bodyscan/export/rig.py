@@ -18,6 +18,7 @@ import pycolmap
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_bytes, write_json, write_text
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.joint_solve import COLMAP_PIXEL_CENTRE
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -114,8 +115,10 @@ def read_colmap_rig(folder: Path) -> PlacedCameras:
 
 def write_opencv_rig(calibration: RigCalibration, path: Path) -> Path:
     """A sequence `pairs` as cv2.FileStorage reads it: name, image size, camera_matrix (with its
-    skew), distortion_coefficients (k1, k2, 0, 0, 0), R and T of `camera_from_rig`.  Returns
-    `path`."""
+    skew), distortion_coefficients (OpenCV's, in its order), R and T of `camera_from_rig`.
+
+    Returns `path`.  Raises BadInput for a lens that OpenCV does not have.
+    """
     memory = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
     store = cv2.FileStorage("rig.yaml", memory)
     store.writeComment(OPENCV_NOTE, False)
@@ -128,8 +131,7 @@ def write_opencv_rig(calibration: RigCalibration, path: Path) -> Path:
         store.write("image_height", camera.height)
         store.write("camera_matrix", camera.matrix)
         store.write("skew", camera.gamma)
-        lens = np.array([[camera.k1, camera.k2, 0.0, 0.0, 0.0]])
-        store.write("distortion_coefficients", lens)
+        store.write("distortion_coefficients", camera.lens.opencv()[None])
         store.write("R", camera_from_rig.rotation)
         store.write("T", camera_from_rig.translation.reshape(3, 1))
         store.endWriteStruct()
@@ -141,7 +143,7 @@ def write_opencv_rig(calibration: RigCalibration, path: Path) -> Path:
 def read_opencv_rig(path: Path) -> PlacedCameras:
     """Cameras and placings of a file that `write_opencv_rig` wrote.
 
-    Raises BadInput if it is no such file, or a lens has more than k1 and k2.
+    Raises BadInput if it is no such file, or has a lens that there is not here.
     """
     try:
         text = Path(path).read_text("utf-8")
@@ -186,37 +188,34 @@ def _colmap_model(cameras: Mapping[str, tuple[Camera, RigidTransform]]) -> pycol
 
 def _colmap_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
     centre = [camera.u0 + COLMAP_PIXEL_CENTRE, camera.v0 + COLMAP_PIXEL_CENTRE]
+    # COLMAP's OPENCV is a prefix of its FULL_OPENCV, which has OpenCV's first eight coefficients.
+    lens = np.append(camera.lens.opencv(), np.zeros(8))[:8]
+    model = "FULL_OPENCV" if lens[4:].any() else "OPENCV"
     return pycolmap.Camera(
-        model="OPENCV",
+        model=model,
         width=camera.width,
         height=camera.height,
-        params=[camera.alpha, camera.beta, *centre, camera.k1, camera.k2, 0.0, 0.0],
+        params=[camera.alpha, camera.beta, *centre, *lens[: 4 if model == "OPENCV" else 8]],
         camera_id=camera_id,
     )
 
 
 def _camera_from_colmap(camera: pycolmap.Camera, gamma: float) -> Camera:
-    if camera.model.name != "OPENCV":
-        raise ValueError(f"camera model {camera.model.name}, expected OPENCV")
-    fx, fy, cx, cy, k1, k2, *tangential = (float(value) for value in camera.params)
-    if any(tangential):
-        raise ValueError("the lens has p1 or p2, which bodyscan's camera does not have")
+    if camera.model.name not in ("OPENCV", "FULL_OPENCV"):
+        raise ValueError(f"camera model {camera.model.name}, expected OPENCV or FULL_OPENCV")
+    fx, fy, cx, cy, *coefficients = (float(value) for value in camera.params)
+    lens = lens_from_opencv(np.array(coefficients))
     u0, v0 = cx - COLMAP_PIXEL_CENTRE, cy - COLMAP_PIXEL_CENTRE
-    return Camera(fx, fy, gamma, u0, v0, k1, k2, camera.width, camera.height)
+    return Camera(fx, fy, gamma, u0, v0, lens, camera.width, camera.height)
 
 
 def _camera_from_opencv(node: Any) -> tuple[str, tuple[Camera, RigidTransform]]:
-    matrix, lens = (
-        node.getNode("camera_matrix").mat(),
-        node.getNode("distortion_coefficients").mat(),
-    )
-    k1, k2, *others = (float(value) for value in np.ravel(lens))
-    if any(others):
-        raise ValueError("the lens has more than k1 and k2")
+    matrix = node.getNode("camera_matrix").mat()
+    lens = lens_from_opencv(np.ravel(node.getNode("distortion_coefficients").mat()))
     places = ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2))
     alpha, beta, gamma, u0, v0 = (float(matrix[place]) for place in places)
     width, height = (int(node.getNode(f"image_{side}").real()) for side in ("width", "height"))
-    camera = Camera(alpha, beta, gamma, u0, v0, k1, k2, width, height)
+    camera = Camera(alpha, beta, gamma, u0, v0, lens, width, height)
     camera_from_rig = RigidTransform(node.getNode("R").mat(), np.ravel(node.getNode("T").mat()))
     return node.getNode("name").string(), (camera, camera_from_rig.inverse())
 

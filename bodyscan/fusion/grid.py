@@ -23,5 +23,4 @@ def rotated(directions: Floats, a_from_b: RigidTransform) -> Floats:
 
 def lens_of(camera: Camera) -> Array:
     """(7,) for compiled functions: alpha, beta, gamma, u0, v0 (Eq. 1), k1, k2 (Eq. 3-5)."""
-    sizes = (camera.alpha, camera.beta, camera.gamma, camera.u0, camera.v0)
-    return np.array([*sizes, camera.k1, camera.k2])
+    return camera.parameters

@@ -1,13 +1,19 @@
-"""The chapter's pinhole camera (Eq. 1) with two radial coefficients acting before A (Eq. 3-5)."""
+"""The chapter's pinhole camera (Eq. 1), its lens acting before the matrix A (Eq. 3-5)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bodyscan.arrays import Array
+from bodyscan.geometry.lenses.lens import Lens
+
+MATRIX = ("alpha", "beta", "gamma", "u0", "v0")
+MATRIX_PRIOR_PX = (50.0, 50.0, 5.0, 50.0, 50.0)
+"""Standard deviations of A's numbers before a rig's shots say more: what a pair's own few boards
+leave open at worst."""
+MATRIX_STEP_PX = 1e-2
 
 
 @dataclass(frozen=True)
@@ -22,8 +28,7 @@ class Camera:
     gamma: float
     u0: float
     v0: float
-    k1: float
-    k2: float
+    lens: Lens
     width: int
     height: int
 
@@ -34,20 +39,64 @@ class Camera:
             [[self.alpha, self.gamma, self.u0], [0.0, self.beta, self.v0], [0.0, 0.0, 1.0]]
         )
 
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Of the P unknowns of a calibration: A's five, then the lens's coefficients."""
+        return (*MATRIX, *self.lens.names)
+
+    @property
+    def parameters(self) -> Array:
+        """(P,) by `parameter_names`."""
+        return np.array([*(getattr(self, name) for name in MATRIX), *self.lens.coefficients])
+
+    @property
+    def prior_sigmas(self) -> Array:
+        """(P,) standard deviations of the parameters before any shot of the rig was seen."""
+        return np.array([*MATRIX_PRIOR_PX, *self.lens.prior_sigmas])
+
+    @property
+    def difference_steps(self) -> Array:
+        """(P,) steps of the parameters for derivatives by differences."""
+        return np.array([*[MATRIX_STEP_PX] * len(MATRIX), *self.lens.difference_steps])
+
+    def moved(self, step: Array) -> Camera:
+        """The camera with a step (P,) added to its parameters."""
+        own = {
+            name: getattr(self, name) + float(change)
+            for name, change in zip(MATRIX, step[: len(MATRIX)], strict=True)
+        }
+        lens = self.lens.with_coefficients(self.lens.coefficients + step[len(MATRIX) :])
+        return replace(self, **own, lens=lens)
+
     def project(self, points: Array) -> Array:
         """Points (..., 3) in the camera frame, z > 0 -> real image coordinates (..., 2), px."""
         normalized = points[..., :2] / points[..., 2:3]
-        return self.pixels_from_normalized(self.distort(normalized))
+        return self.pixels_from_normalized(self.lens.distort(normalized))
 
     def rays(self, pixels: Array) -> Array:
         """Real image coordinates (..., 2) -> directions (..., 3) in the camera frame with z = 1."""
-        normalized = self.undistort(self.normalized_from_pixels(pixels))
+        normalized = self.lens.undistort(self.normalized_from_pixels(pixels))
         return np.concatenate([normalized, np.ones_like(normalized[..., :1])], axis=-1)
 
     def pixel_rays(self) -> Array:
         """Rays through every pixel's centre, (height, width, 3)."""
         u, v = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))
         return self.rays(np.stack([u, v], axis=-1))
+
+    def jacobians(self, points: Array) -> tuple[Array, Array]:
+        """d(pixels)/d(parameters) (N, 2, P) and d(pixels)/d(points) (N, 2, 3), points (N, 3) mm."""
+        z = points[:, 2]
+        ideal = points[:, :2] / z[:, None]
+        real, a = self.lens.distort(ideal), self.matrix[:2, :2]
+        by_parameter = np.zeros((len(points), 2, len(self.parameter_names)))
+        by_parameter[:, 0, 0], by_parameter[:, 1, 1] = real[:, 0], real[:, 1]
+        by_parameter[:, 0, 2] = real[:, 1]
+        by_parameter[:, 0, 3] = by_parameter[:, 1, 4] = 1.0
+        by_parameter[:, :, len(MATRIX) :] = a @ self.lens.by_coefficients(ideal)
+        perspective = np.zeros((len(points), 2, 3))
+        perspective[:, 0, 0] = perspective[:, 1, 1] = 1.0 / z
+        perspective[:, :, 2] = -ideal / z[:, None]
+        return by_parameter, a @ self.lens.by_point(ideal) @ perspective
 
     def pixels_from_normalized(self, normalized: Array) -> Array:
         """Eq. 1 with A: normalized (..., 2) -> px (..., 2)."""
@@ -61,24 +110,9 @@ class Camera:
         x = (pixels[..., 0] - self.u0 - self.gamma * y) / self.alpha
         return np.stack([x, y], axis=-1)
 
-    def distort(self, normalized: Array) -> Array:
-        """Ideal to real, normalized (..., 2).
-
-        Eq. 3 and 4 scale (u - u0, v - v0); since A is linear this is the same as scaling (x, y).
-        """
-        r2 = np.sum(normalized**2, axis=-1, keepdims=True)
-        return normalized * (1.0 + r2 * (self.k1 + r2 * self.k2))
-
-    def undistort(self, normalized: Array) -> Array:
-        """Real to ideal, normalized (..., 2), by Newton's method on the radius."""
-        real = np.linalg.norm(normalized, axis=-1, keepdims=True)
-        ideal = real.copy()
-        for _ in range(8):
-            r2 = ideal**2
-            value = ideal * (1.0 + r2 * (self.k1 + r2 * self.k2)) - real
-            slope = 1.0 + r2 * (3.0 * self.k1 + 5.0 * r2 * self.k2)
-            ideal -= value / slope
-        return normalized * np.divide(ideal, real, out=np.ones_like(real), where=real > 0)
+    def without_lens(self, pixels: Array) -> Array:
+        """Real to ideal px (..., 2): where the same camera would see them without its lens."""
+        return self.pixels_from_normalized(self.rays(pixels)[..., :2])
 
     def without_skew(self, pixels: Array) -> Array:
         """Shear px (..., 2) by -gamma/beta, so that a camera without skew would have seen them."""

@@ -36,7 +36,7 @@ class PixelRays:
         corners = camera.normalized_from_pixels(np.stack([u, v], axis=-1))
         per_square = (NODES - 2.0) / float(np.max(np.sum(corners**2, axis=-1)))
         radius = np.sqrt(np.arange(NODES) / per_square)
-        ideal = camera.undistort(np.stack([radius, np.zeros(NODES)], axis=-1))[:, 0]
+        ideal = camera.lens.undistort(np.stack([radius, np.zeros(NODES)], axis=-1))[:, 0]
         stretch = np.divide(ideal, radius, out=np.ones(NODES), where=radius > 0)
         lens = np.array([camera.alpha, camera.beta, camera.gamma, camera.u0, camera.v0])
         return PixelRays(lens, stretch, per_square)

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 def in_image(camera: Camera, points: Array, margin_px: float = 0.0) -> NDArray[np.bool_]:
     """Points (..., 3), camera frame -> (...) whether they lie ahead and inside the image.
 
-    Far outside its image a lens model with k1, k2 folds back: such points project inside though
+    Far outside its image a lens model folds back: such points project inside though
     the camera cannot see them. They are ruled out by the rays of the image's own rim.
     """
     u, v = np.linspace(0.0, camera.width - 1.0, 9), np.linspace(0.0, camera.height - 1.0, 9)

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.camera import projection_jacobians
 from bodyscan.calibration.located_view import LocatedView
 from bodyscan.geometry.least_squares import cauchy_weights, spread
 from bodyscan.geometry.transforms import rigid_fit
@@ -192,7 +191,7 @@ def _corner_equations(
             solution.root_from_camera[view.pair].inverse() @ solution.root_from_board[view.target]
         )
         points = camera_from_board.apply(view.points)
-        _, by_point = projection_jacobians(camera, points)
+        _, by_point = camera.jacobians(points)
         parts.append((by_point @ camera_from_board.rotation, camera.project(points) - view.pixels))
     residuals = np.concatenate([r.ravel() for _, r in parts])
     weights = cauchy_weights(residuals, 2, 4.0 * spread(residuals))

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.camera import projection_jacobians
 from bodyscan.calibration.located_view import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
@@ -195,7 +194,7 @@ def _descend(
             camera_from_root = root_from_camera[view.pair].inverse()
             in_root = placing.apply(size * view.points)
             in_camera = camera_from_root.apply(in_root)
-            _, by_point = projection_jacobians(camera, in_camera)
+            _, by_point = camera.jacobians(in_camera)
             by_root = by_point @ camera_from_root.rotation
             by_size = by_root @ placing.rotate(view.points)[..., None]
             jacobian = np.concatenate([by_root @ twist_jacobian(in_root), by_size], axis=2)

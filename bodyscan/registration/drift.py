@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.camera import projection_jacobians
 from bodyscan.calibration.located_view import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.placing_covariance import PlacingCovariance, point_covariance
@@ -47,7 +46,7 @@ class SeenPose:
 def seen_pose(view: LocatedView, camera: Camera, sigma_px: float) -> SeenPose:
     """From a view's corners, each off by `sigma_px` and so many together (see CORRELATED)."""
     points = view.camera_from_board.apply(view.points)
-    jacobian = projection_jacobians(camera, points)[1] @ twist_jacobian(points)
+    jacobian = camera.jacobians(points)[1] @ twist_jacobian(points)
     jacobian = jacobian.reshape(-1, 6)
     information = jacobian.T @ jacobian / (CORRELATED * sigma_px**2)
     covariance = np.linalg.inv(information)

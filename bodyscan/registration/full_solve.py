@@ -1,4 +1,4 @@
-"""The joint solve's last steps, over all seven intrinsics of the chapter's camera.
+"""The joint solve's last steps, over all parameters of our own cameras.
 
 COLMAP's cameras have neither skew nor pixels that are not square; what each pair's own calibration
 got wrong of these would go into the placings, unseen by their covariance.
@@ -7,16 +7,13 @@ got wrong of these would go into the placings, unseen by their covariance.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.camera import INTRINSICS
 from bodyscan.calibration.located_view import LocatedView
-from bodyscan.geometry.camera import Camera
 from bodyscan.registration.joint_solve import JointSolution
-from bodyscan.registration.normal_equations import LENS, NormalEquations, normal_equations
+from bodyscan.registration.normal_equations import NormalEquations, normal_equations
 
 Array = NDArray[np.float64]
 
@@ -47,28 +44,15 @@ def solve_fully(
 
 
 def _moved(solution: JointSolution, equations: NormalEquations, step: Array) -> JointSolution:
-    first_board, first_lens = equations.first_board, equations.first_lens
+    first_board, first_camera = equations.first_board, equations.first_camera
     pairs = zip(equations.names, step[:first_board].reshape(-1, 6), strict=True)
-    boards = zip(equations.targets, step[first_board:first_lens].reshape(-1, 6), strict=True)
-    lenses = step[first_lens:].reshape(-1, LENS)
+    boards = zip(equations.targets, step[first_board:first_camera].reshape(-1, 6), strict=True)
     cameras = dict(solution.cameras)
     if equations.cameras_free:
-        cameras |= {
-            name: _changed(cameras[name], change)
-            for name, change in zip(equations.names, lenses, strict=True)
-        }
+        changes = zip(equations.names, equations.camera_columns, strict=True)
+        cameras |= {name: cameras[name].moved(step[columns]) for name, columns in changes}
     return JointSolution(
         {name: solution.root_from_camera[name].moved(twist) for name, twist in pairs},
         {target: solution.root_from_board[target].moved(twist) for target, twist in boards},
         cameras,
-    )
-
-
-def _changed(camera: Camera, change: Array) -> Camera:
-    return replace(
-        camera,
-        **{
-            name: getattr(camera, name) + float(value)
-            for name, value in zip(INTRINSICS, change, strict=True)
-        },
     )

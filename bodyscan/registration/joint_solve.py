@@ -19,6 +19,7 @@ from bodyscan.registration.view_graph import Target
 Array = NDArray[np.float64]
 
 COLMAP_PIXEL_CENTRE = 0.5
+WITHOUT_LENS = "SIMPLE_PINHOLE"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,34 +72,37 @@ def solve_jointly(
 
 
 def colmap_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
-    """COLMAP's RADIAL model: no skew and square pixels, see `colmap_pixels`.
+    """COLMAP's model of the lens: no skew and square pixels, see `colmap_pixels`.
 
-    Its OPENCV model would also refine p1 and p2, which the chapter's lens does not have.
+    A lens that COLMAP does not have is taken out of the pixels instead and kept as it is.
     """
+    lens = camera.lens
     return pycolmap.Camera(
-        model="RADIAL",
+        model=lens.colmap_model or WITHOUT_LENS,
         width=camera.width,
         height=camera.height,
         params=[
             camera.alpha,
             camera.u0 + COLMAP_PIXEL_CENTRE,
             camera.v0 + COLMAP_PIXEL_CENTRE,
-            camera.k1,
-            camera.k2,
+            *(lens.coefficients if lens.colmap_model else ()),
         ],
         camera_id=camera_id,
     )
 
 
 def colmap_pixels(camera: Camera, pixels: Array) -> Array:
-    """OpenCV px (N, 2) -> COLMAP px (N, 2) of the same camera without skew, beta brought to alpha."""
-    square = camera.without_skew(pixels)
+    """OpenCV px (N, 2) -> COLMAP px (N, 2) of `colmap_camera`: without skew, beta brought to alpha."""
+    square = camera.without_skew(
+        pixels if camera.lens.colmap_model else camera.without_lens(pixels)
+    )
     square[..., 1] = camera.v0 + (square[..., 1] - camera.v0) * camera.alpha / camera.beta
     return square + COLMAP_PIXEL_CENTRE
 
 
 def _refined(camera: Camera, solved: pycolmap.Camera) -> Camera:
-    focal, u0, v0, k1, k2 = (float(value) for value in solved.params)
+    focal, u0, v0, *coefficients = (float(value) for value in solved.params)
+    lens = camera.lens.with_coefficients(np.array(coefficients)) if coefficients else camera.lens
     aspect, shear = camera.beta / camera.alpha, camera.gamma / camera.beta
     v0_moved = (v0 - COLMAP_PIXEL_CENTRE - camera.v0) * aspect
     return replace(
@@ -109,8 +113,7 @@ def _refined(camera: Camera, solved: pycolmap.Camera) -> Camera:
         # The shear was undone about the old principal point.
         u0=u0 - COLMAP_PIXEL_CENTRE + shear * v0_moved,
         v0=camera.v0 + v0_moved,
-        k1=k1,
-        k2=k2,
+        lens=lens,
     )
 
 

@@ -147,7 +147,7 @@ class Knowledge:
                 fixed_pair=None,
                 fixed_target=None,
                 cameras_free=self._equations.cameras_free,
-                lens_prior=False,
+                camera_prior=False,
             )
             total += shot.without_boards()[np.ix_(self._free, self._free)]
         return total * np.outer(self._scale, self._scale) / len(place.views)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.camera import INTRINSICS, projection_jacobians
 from bodyscan.calibration.located_view import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import cauchy_weights, spread
@@ -21,10 +20,8 @@ from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.view_graph import Target
 
 Array = NDArray[np.float64]
+Columns = NDArray[np.int64]
 
-LENS = len(INTRINSICS)
-PRIOR_SIGMA = np.array([50.0, 50.0, 5.0, 50.0, 50.0, 0.5, 0.5])
-"""Cameras are known to about this much before the shots of the rig say more, by INTRINSICS."""
 ROBUST_SPREADS = 4.0
 TINY = 1e-12  # keeps a step finite where an unknown has no influence
 
@@ -34,16 +31,17 @@ class NormalEquations:
     """matrix: J^T W J, px2 per unit of either unknown.  gradient: J^T W r.
 
     Unknowns: motions of the pairs `names` (6 each), motions of the boards `targets` (6 each), then
-    INTRINSICS of each pair if `cameras_free`.  held: unknowns that the rig frame's definition
-    fixes.  variance_px2: of a corner's coordinate.
+    the parameters of each pair's camera, of which there are `parameters` (0 each if cameras are
+    held).  held: unknowns that the rig frame's definition fixes.  variance_px2: of a corner's
+    coordinate.
     """
 
     names: tuple[str, ...]
     targets: tuple[Target, ...]
-    cameras_free: bool
+    parameters: tuple[int, ...]
     matrix: Array
     gradient: Array
-    held: NDArray[np.int64]
+    held: Columns
     variance_px2: float
 
     @property
@@ -51,11 +49,20 @@ class NormalEquations:
         return 6 * len(self.names)
 
     @property
-    def first_lens(self) -> int:
+    def first_camera(self) -> int:
         return self.first_board + 6 * len(self.targets)
 
     @property
-    def free(self) -> NDArray[np.int64]:
+    def camera_columns(self) -> list[Columns]:
+        """Which unknowns are the parameters of each pair's camera."""
+        return _runs(self.first_camera, self.parameters)
+
+    @property
+    def cameras_free(self) -> bool:
+        return any(self.parameters)
+
+    @property
+    def free(self) -> Columns:
         return np.setdiff1d(np.arange(len(self.matrix)), self.held)
 
     def step(self) -> Array:
@@ -79,13 +86,13 @@ class NormalEquations:
         return PlacingCovariance(self.names, full[pairs, pairs])
 
     def without_boards(self) -> Array:
-        """(13P, 13P), or (6P, 6P): information on pairs and lenses, the boards eliminated.
+        """Information on pairs and cameras, the boards eliminated.
 
         A board that holds the rig frame is known instead. Source: Schur complement, Triggs et al.,
         Bundle Adjustment - A Modern Synthesis, 2000, 6.1.
         """
         size = len(self.matrix)
-        boards = np.arange(self.first_board, self.first_lens)
+        boards = np.arange(self.first_board, self.first_camera)
         rest = np.setdiff1d(np.arange(size), boards)
         boards = np.setdiff1d(boards, self.held)
         cross = self.matrix[np.ix_(rest, boards)]
@@ -110,19 +117,21 @@ def normal_equations(
     fixed_pair: str | None,
     fixed_target: Target | None,
     cameras_free: bool,
-    lens_prior: bool = True,
+    camera_prior: bool = True,
 ) -> NormalEquations:
     """The joint solve's normal equations where it stands; Cauchy weights, a corner at a time.
 
     A corner q of the rig frame is seen at R^T (q - t); a motion of the board and the opposite
-    motion of the camera change that alike, so both share one Jacobian.  `lens_prior` adds what is
-    known of lenses beforehand; leave it out where views are to be added to other views.
+    motion of the camera change that alike, so both share one Jacobian.  `camera_prior` adds what is
+    known of cameras beforehand; leave it out where views are to be added to other views.
     """
     names = tuple(sorted(rig_from_camera))
     targets = sorted(rig_from_board)
     first_board = 6 * len(names)
-    first_lens = first_board + 6 * len(targets)
-    size = first_lens + (LENS * len(names) if cameras_free else 0)
+    first_camera = first_board + 6 * len(targets)
+    parameters = tuple(len(cameras[n].parameters) if cameras_free else 0 for n in names)
+    camera_columns = _runs(first_camera, parameters)
+    size = first_camera + sum(parameters)
     normal, gradient = np.zeros((size, size)), np.zeros(size)
     parts = [_view_jacobian(view, cameras, rig_from_camera, rig_from_board) for view in views]
     residuals = np.concatenate([residual for _, residual in parts])
@@ -138,9 +147,9 @@ def normal_equations(
             [
                 6 * number + np.arange(6),
                 first_board + 6 * board_of[view.target] + np.arange(6),
-                first_lens + LENS * number + np.arange(LENS) if cameras_free else [],
+                camera_columns[number],
             ]
-        ).astype(int)
+        )
         block = jacobian[:, : len(columns)]
         weighted = block * weight[:, None]
         normal[np.ix_(columns, columns)] += block.T @ weighted
@@ -148,10 +157,16 @@ def normal_equations(
     held = _held(names, targets, first_board, fixed_pair, fixed_target)
     degrees = max(float(np.sum(weights)) - (size - len(held)), 1.0)
     variance = float(np.sum(weights * residuals**2)) / degrees
-    if cameras_free and lens_prior:
-        lens = np.arange(first_lens, size)
-        normal[lens, lens] += max(variance, 1e-12) * np.tile(PRIOR_SIGMA**-2, len(names))
-    return NormalEquations(names, tuple(targets), cameras_free, normal, gradient, held, variance)
+    if cameras_free and camera_prior:
+        own = np.concatenate(camera_columns)
+        known = np.concatenate([cameras[name].prior_sigmas ** -2 for name in names])
+        normal[own, own] += max(variance, 1e-12) * known
+    return NormalEquations(names, tuple(targets), parameters, normal, gradient, held, variance)
+
+
+def _runs(first: int, sizes: Sequence[int]) -> list[Columns]:
+    """Consecutive numbers from `first`, as many in each run as `sizes` says."""
+    return np.split(np.arange(first, first + sum(sizes)), np.cumsum(sizes)[:-1])
 
 
 def _held(
@@ -160,7 +175,7 @@ def _held(
     first_board: int,
     fixed_pair: str | None,
     fixed_target: Target | None,
-) -> NDArray[np.int64]:
+) -> Columns:
     if fixed_target is not None:
         start = first_board + 6 * targets.index(fixed_target)
     else:
@@ -174,13 +189,13 @@ def _view_jacobian(
     rig_from_camera: Mapping[str, RigidTransform],
     rig_from_board: Mapping[Target, RigidTransform],
 ) -> tuple[Array, Array]:
-    """d(pixels) (2N, 19) by camera motion, board motion, INTRINSICS; residuals (2N,)."""
+    """d(pixels) (2N, 12 + P) by camera motion, board motion, camera; residuals (2N,)."""
     camera = cameras[view.pair]
     in_rig = rig_from_board[view.target].apply(view.points)
     camera_from_rig = rig_from_camera[view.pair].inverse()
     points = camera_from_rig.apply(in_rig)
-    lens, by_point = projection_jacobians(camera, points)
+    by_parameter, by_point = camera.jacobians(points)
     by_motion = by_point @ camera_from_rig.rotation @ twist_jacobian(in_rig)
-    jacobian = np.concatenate([-by_motion, by_motion, lens], axis=2)
+    jacobian = np.concatenate([-by_motion, by_motion, by_parameter], axis=2)
     residuals = camera.project(points) - view.pixels
     return jacobian.reshape(-1, jacobian.shape[2]), residuals.ravel()

@@ -17,7 +17,7 @@ from bodyscan.calibration.light_choice import HeldOutModel
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import CalibrationFileError
 from bodyscan.files.atomic import write_json, write_npz
-from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.camera_fields import from_fields, to_fields
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
@@ -125,7 +125,7 @@ def calibration_id(path: Path) -> str:
 def _pair_content(calibration: RigCalibration, name: str) -> dict[str, Any]:
     pair = calibration.pairs[name]
     return {
-        "camera": asdict(pair.camera),
+        "camera": to_fields(pair.camera),
         "rig_from_camera": calibration.rig_from_camera[name].matrix,
         "light": None
         if pair.light is None
@@ -138,7 +138,7 @@ def _calibration(content: dict[str, Any], arrays: Any) -> RigCalibration:
     pairs = {
         name: PairCalibration(
             name,
-            Camera(**part["camera"]),
+            from_fields(part["camera"]),
             arrays[f"{name}/camera_covariance"],
             None if part["light"] is None else _light(part["light"], name, arrays),
             _quality(part["quality"]),

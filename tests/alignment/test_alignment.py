@@ -11,12 +11,13 @@ from bodyscan.alignment.object_refinement import refine_on_object
 from bodyscan.alignment.overlap_equations import OverlapEquations
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.triangulation import grid_normals
 
-CAMERA = Camera(380.0, 380.0, 0.0, 160.0, 128.0, 0.0, 0.0, 320, 256)
+CAMERA = Camera(380.0, 380.0, 0.0, 160.0, 128.0, Radial(), 320, 256)
 NOISE_MM = 0.2
 
 

@@ -11,10 +11,11 @@ from bodyscan.alignment.matching import (
     match_projected,
 )
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
-CAMERA = Camera(400.0, 404.0, -1.0, 158.0, 130.0, -0.12, 0.03, 320, 256)
+CAMERA = Camera(400.0, 404.0, -1.0, 158.0, 130.0, Radial(-0.12, 0.03), 320, 256)
 CENTRE, RADIUS = np.array([0.0, 0.0, 900.0]), 250.0
 SIGMA_MM = 0.2
 HOLE = np.s_[100:130, 150:190]

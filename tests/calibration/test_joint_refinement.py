@@ -8,8 +8,11 @@ from bodyscan.calibration.camera import PlanarView, calibrate_camera
 from bodyscan.calibration.joint_refinement import refine_jointly, striped_board
 from bodyscan.calibration.light import fit_light
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 
-CAMERA = Camera(1061.71, 1064.09, -0.562002, 350.08, 286.547, -0.140279, -0.0916363, 640, 480)
+CAMERA = Camera(
+    1061.71, 1064.09, -0.562002, 350.08, 286.547, Radial(-0.140279, -0.0916363), 640, 480
+)
 MIRROR = Mirror(
     254, np.array([-150.0, 0, 0]), np.array([150.0, 0, 420.0]), np.array([0, 1.0, 0])
 )  # fmt: skip

@@ -4,10 +4,13 @@ from hypothesis import strategies as st
 
 from bodyscan.calibration.light_planes import boundary_points, fit_light_planes, join
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
 from bodyscan.geometry.transforms import RigidTransform
 
-CAMERA = Camera(1061.71, 1064.09, -0.562002, 350.08, 286.547, -0.140279, -0.0916363, 640, 480)
+CAMERA = Camera(
+    1061.71, 1064.09, -0.562002, 350.08, 286.547, Radial(-0.140279, -0.0916363), 640, 480
+)
 STRIPES = 16
 POSES = [
     RigidTransform.from_rotation_vector(turn, [-90.0, -70.0, depth])

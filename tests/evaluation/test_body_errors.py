@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 import numpy as np
 import open3d as o3d
 import pytest
 
 from bodyscan.evaluation.body import coverage_of_seen, girth_errors, settled
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.camera_fields import to_fields
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import vertex_normals
 
-CAMERA = Camera(300.0, 300.0, 0.0, 160.0, 128.0, 0.0, 0.0, 320, 256)
+CAMERA = Camera(300.0, 300.0, 0.0, 160.0, 128.0, Radial(), 320, 256)
 
 
 def column(radius: float, height: float = 1700.0) -> tuple[np.ndarray, np.ndarray]:
@@ -65,7 +65,7 @@ def pairs(sways: list[RigidTransform]) -> dict[str, dict]:
     camera = RigidTransform(turn, np.array([1500.0, 0.0, 850.0]))
     return {
         f"p{k}": {
-            "camera": asdict(CAMERA),
+            "camera": to_fields(CAMERA),
             "rig_from_camera": camera.matrix,
             "projector": {"centre": [0.0, -300.0, 0.0]},
             "swayed_from_still": sway.matrix,

@@ -11,11 +11,12 @@ import pytest
 from bodyscan.errors import BadInput
 from bodyscan.export.e57 import write_e57
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.triangulation import grid_normals
 
-CAMERA = Camera(100.0, 100.0, 0.0, 20.0, 15.0, 0.0, 0.0, 40, 30)
+CAMERA = Camera(100.0, 100.0, 0.0, 20.0, 15.0, Radial(), 40, 30)
 PLACING = RigidTransform.from_rotation_vector([0.3, -1.1, 0.4], [650.0, -1120.0, 900.0])
 
 

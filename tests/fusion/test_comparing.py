@@ -10,10 +10,11 @@ from bodyscan.fusion.comparing import Evidence, compare
 from bodyscan.fusion.smoothing import SmoothSurface, smooth
 from bodyscan.fusion.thinning import Samples, take_samples
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
-CAMERA = Camera(430.0, 428.0, 0.7, 81.0, 58.0, -0.12, 0.08, 160, 120)
+CAMERA = Camera(430.0, 428.0, 0.7, 81.0, 58.0, Radial(-0.12, 0.08), 160, 120)
 WALL_MM = 320.0
 ASIDE = RigidTransform(np.eye(3), np.array([40.0, 0.0, 0.0]))
 

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from bodyscan.fusion.quadratics import fit_quadratics
 from bodyscan.fusion.smoothing import SmoothSurface, smooth
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
-CAMERA = Camera(430.0, 428.0, 0.7, 161.0, 118.0, -0.12, 0.08, 320, 240)
+CAMERA = Camera(430.0, 428.0, 0.7, 161.0, 118.0, Radial(-0.12, 0.08), 320, 240)
 DISTANCE = 320.0  # a pixel is 0.75 mm wide there, as in the real rigs
 RAYS = CAMERA.pixel_rays()
 POSE = RigidTransform.from_rotation_vector([0.3, -2.0, 0.4], [700.0, -200.0, 900.0])

@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.pixel_rays import PixelRays
 
 cameras = st.builds(
@@ -14,8 +15,7 @@ cameras = st.builds(
     gamma=st.floats(-3.0, 3.0),
     u0=st.floats(300.0, 340.0),
     v0=st.floats(220.0, 260.0),
-    k1=st.floats(-0.2, 0.2),
-    k2=st.floats(-0.1, 0.1),
+    lens=st.builds(Radial, k1=st.floats(-0.2, 0.2), k2=st.floats(-0.1, 0.1)),
     width=st.just(640),
     height=st.just(480),
 )
@@ -41,7 +41,7 @@ def test_distortion_is_that_of_equations_3_to_5(camera):
     u, v = (ideal[:, :2] / ideal[:, 2:]).T
     normalized = np.linalg.solve(camera.matrix, np.stack([u, v, np.ones_like(u)]))
     r2 = normalized[0] ** 2 + normalized[1] ** 2
-    factor = camera.k1 * r2 + camera.k2 * r2**2
+    factor = camera.lens.k1 * r2 + camera.lens.k2 * r2**2
     # Eq. 3 scales u - u0, which holds x and, through the skew, y; so does ours.
     real = np.stack([u + (u - camera.u0) * factor, v + (v - camera.v0) * factor], axis=1)
     assert np.allclose(camera.project(points), real, atol=1e-8)
@@ -52,8 +52,8 @@ def test_shearing_makes_it_opencvs_camera(camera):
     points = camera.rays(pixels_of(camera)).reshape(-1, 3) * 700.0
     matrix = camera.matrix
     matrix[0, 1] = 0.0
-    lens = np.array([camera.k1, camera.k2, 0.0, 0.0])
-    opencv = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, lens)[0].reshape(-1, 2)
+    still = np.zeros(3)
+    opencv = cv2.projectPoints(points, still, still, matrix, camera.lens.opencv())[0].reshape(-1, 2)
     assert np.allclose(camera.without_skew(camera.project(points)), opencv, atol=1e-8)
 
 

@@ -7,6 +7,7 @@ import pytest
 from test_light_sheets import MIDDLE, STRIPES, models
 
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.plane_table import PlaneTable
 from bodyscan.geometry.ray_depths import MOST_SIGMA, intersect_rays, triangulate_image
 
@@ -16,7 +17,7 @@ def planes(request):
     return next(model for model in models(request.param) if model.kind == "smooth-planes")
 
 
-CAMERA = Camera(500.0, 502.0, -0.5, 100.0, 75.0, -0.15, 0.03, 200, 150)
+CAMERA = Camera(500.0, 502.0, -0.5, 100.0, 75.0, Radial(-0.15, 0.03), 200, 150)
 
 
 def some_rays(count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.rivals.projection_matrix import (
     projection_matrix,
@@ -13,7 +14,9 @@ from bodyscan.laboratory.rivals.projection_matrix import (
 )
 from bodyscan.laboratory.rivals.tsai import calibrate_tsai
 
-TABLE_1 = Camera(1061.71, 1064.09, -0.562002, 350.08, 286.547, -0.140279, -0.0916363, 640, 480)
+TABLE_1 = Camera(
+    1061.71, 1064.09, -0.562002, 350.08, 286.547, Radial(-0.140279, -0.0916363), 640, 480
+)
 MIDDLE = np.array([319.5, 239.5])
 GRID = np.stack(np.meshgrid(np.arange(20.0, 161, 20), np.arange(20.0, 121, 20)), -1).reshape(-1, 2)
 POINTS = np.concatenate([np.column_stack([GRID, np.full(48, z)]) for z in range(-60, 61, 20)])
@@ -28,7 +31,7 @@ PLACE = RigidTransform.from_rotation_vector([0.12, -0.16, 0.02], [-98.0, -87.0, 
     turn=st.tuples(*[st.floats(-0.4, 0.4)] * 3),
 )
 def test_a_camera_without_lens_is_its_matrix(focal, aspect, skew, turn):
-    true = Camera(focal * aspect, focal, skew, 350.0, 230.0, 0.0, 0.0, 640, 480)
+    true = Camera(focal * aspect, focal, skew, 350.0, 230.0, Radial(), 640, 480)
     place = RigidTransform.from_rotation_vector(turn, [-90.0, -70.0, 450.0])
     pixels = true.project(place.apply(POINTS))
     camera, found = split_projection_matrix(projection_matrix(POINTS, pixels), 640, 480)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from test_triangulation import CAMERA, STRIPES, pair, planes, stripe_map
 
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.ray_depths import triangulate_image
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.scan_volume import (
@@ -118,7 +119,7 @@ def test_without_a_projector_or_an_order_in_depth_all_stripes_count():
 @pytest.mark.parametrize("rising", [True, False])
 def test_most_of_the_room_is_not_wanted(rising):
     at = looking_at_the_middle(700.0, 0.0, 0.0)
-    larger = Camera(1600.0, 1608.0, -2.0, 320.0, 240.0, -0.1, 0.02, 640, 480)
+    larger = Camera(1600.0, 1608.0, -2.0, 320.0, 240.0, Radial(-0.1, 0.02), 640, 480)
     one = replace(calibrated(rising), camera=larger)
     small = Volume(radius_mm=40.0, bottom_mm=-30.0, top_mm=30.0)
     s = np.repeat(np.repeat(some_s(2, rising), 4, axis=0), 4, axis=1)

@@ -4,11 +4,12 @@ import pytest
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.reconstruction.triangulation import grid_normals, reconstruct_range_image
 from bodyscan.stripes.stripe_map import StripeMap
 
-CAMERA = Camera(400.0, 402.0, -0.5, 80.0, 60.0, -0.1, 0.02, 160, 120)
+CAMERA = Camera(400.0, 402.0, -0.5, 80.0, 60.0, Radial(-0.1, 0.02), 160, 120)
 STRIPES = 64
 
 
@@ -108,7 +109,7 @@ def test_a_normal_needs_its_whole_window():
 def test_normals_are_those_of_planes_fitted_to_the_windows():
     """Against a least-squares fit of 1/z by column and row, window by window, on a rough surface."""
     rng = np.random.default_rng(6)
-    camera = Camera(400.0, 400.0, 0.0, 15.0, 10.0, 0.0, 0.0, 30, 20)
+    camera = Camera(400.0, 400.0, 0.0, 15.0, 10.0, Radial(), 30, 20)
     rays = camera.pixel_rays()
     points = rays * rng.uniform(480.0, 520.0, rays.shape[:2])[..., None]
     normals = grid_normals(points.astype(np.float32))

@@ -44,7 +44,9 @@ def calibration() -> RigCalibration:
     """A ring of cameras, each known apart from the others, without rotation, by SIGMA_MM."""
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     pairs = {
-        name: PairCalibration(name, camera, np.eye(7), None, PairQuality(0.05, 9))
+        name: PairCalibration(
+            name, camera, np.eye(len(camera.parameters)), None, PairQuality(0.05, 9)
+        )
         for name, camera in cameras.items()
     }
     one = np.diag([0.0, 0.0, 0.0, *SIGMA_MM**2])

@@ -4,6 +4,7 @@ import pytest
 from ring import ring_of_cameras
 
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.visibility import in_image
 from bodyscan.report.sigma_map import draw_sigma_map, sigma_at
@@ -79,8 +80,8 @@ def test_what_no_pair_sees_has_no_sigma(tmp_path):
 
 
 def test_points_that_the_lens_folds_back_are_not_seen():
-    """With k1 = -0.4 a point at 70 degrees projects into the image, which ends at 23 degrees."""
-    camera = Camera(1500.0, 1500.0, 0.0, 640.0, 512.0, -0.4, 0.0, 1280, 1024)
+    """With Radial(-0.4, 0) a point at 70 degrees projects into the image, which ends at 23 degrees."""
+    camera = Camera(1500.0, 1500.0, 0.0, 640.0, 512.0, Radial(-0.4, 0.0), 1280, 1024)
     angles = np.linspace(0.0, 1.4, 200)
     points = 1000.0 * np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
     pixels = camera.project(points)

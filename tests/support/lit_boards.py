@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, join
 from bodyscan.calibration.camera import PlanarView, locate_board
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 
 Array = NDArray[np.float64]
@@ -209,7 +210,9 @@ class Scene:
 
 def chapter_scene(**mirror: float) -> Scene:
     """Table 1's camera, 254 vertical stripes from a rotating mirror, a board of 48 corners."""
-    camera = Camera(1061.71, 1064.09, -0.562002, 350.08, 286.547, -0.140279, -0.0916363, 640, 480)
+    camera = Camera(
+        1061.71, 1064.09, -0.562002, 350.08, 286.547, Radial(-0.140279, -0.0916363), 640, 480
+    )
     centre, out = np.array([130.0, 5.0, 20.0]), np.array([-130.0, 0.0, 390.0])
     projector = Mirror(254, centre, out, np.array([0.0, 1.0, 0.0]), **mirror)
     return Scene(camera, projector, "vertical", 20.0, 9, 7)
@@ -226,7 +229,7 @@ def body_scene(k1: float, k2: float = 0.0, axis: float = 330.0) -> Scene:
     """A pair of a body scanner: 1280 x 1024 px, 640 horizontal stripes from above, 1.3 m away.
 
     axis: the stripe that the projector's lens looks along."""
-    camera = Camera(1510.0, 1513.0, -0.5, 645.0, 508.0, -0.1, 0.05, 1280, 1024)
+    camera = Camera(1510.0, 1513.0, -0.5, 645.0, 508.0, Radial(-0.1, 0.05), 1280, 1024)
     focal = 730.0
     # The middle of the image is to be lit by stripe 320, wherever the lens looks.
     tilt = np.arctan(280.0 / 1300.0) - np.arctan((320.0 - axis) / focal)

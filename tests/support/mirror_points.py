@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import numpy as np
 
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, join
-from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.chapter.setup import (
     BOARD,
@@ -19,7 +20,7 @@ from bodyscan.laboratory.chapter.setup import (
     true_planes,
 )
 
-LENS = Camera(**{name: getattr(CAMERA, name) for name in CAMERA.__dataclass_fields__})
+LENS = from_fields(asdict(CAMERA))
 MIRROR = chapter_setup(ideal_settings(1)).projector
 TRUE_PLANES = true_planes(chapter_setup(ideal_settings(1)))
 STRIPES = PROJECTOR.stripes

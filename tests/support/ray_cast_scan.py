@@ -11,6 +11,7 @@ import open3d as o3d
 import yaml
 
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.pair import NominalPose
@@ -68,7 +69,14 @@ def nominal_camera(width: int, height: int) -> Camera:
     """Sees about 1 m x 0.8 m at 1.3 m, with a little barrel distortion."""
     focal = 1.33 * width
     return Camera(
-        focal, 1.002 * focal, 0.4, width / 2 + 3.3, height / 2 - 2.1, -0.09, 0.06, width, height
+        focal,
+        1.002 * focal,
+        0.4,
+        width / 2 + 3.3,
+        height / 2 - 2.1,
+        Radial(-0.09, 0.06),
+        width,
+        height,
     )
 
 

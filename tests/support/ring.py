@@ -8,6 +8,7 @@ from bodyscan.boards.board import corner_points
 from bodyscan.calibration.camera import PlanarView, locate_board
 from bodyscan.calibration.located_view import LocatedView, board_symmetries
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
@@ -39,7 +40,9 @@ def ring_of_cameras(poles=3, heights=(400, 850, 1300, 1750)):
             position = [1300.0 * np.cos(angle), 1300.0 * np.sin(angle), height]
             placings[name] = looking_at(position, [0.0, 0.0, height - 50.0])
             focal = 1510.0 + rng.normal(0.0, 5.0)
-            cameras[name] = Camera(focal, focal + 2.0, -0.5, 645.0, 508.0, -0.1, 0.05, 1280, 1024)
+            cameras[name] = Camera(
+                focal, focal + 2.0, -0.5, 645.0, 508.0, Radial(-0.1, 0.05), 1280, 1024
+            )
     return placings, cameras
 
 

@@ -28,7 +28,7 @@ def test_boards_follow_the_camera(change):
     placed = place_rig(rig, views, cameras)
     camera = placed.cameras["p1-1"]
     other = replace(camera, alpha=camera.alpha + change, beta=camera.beta + change)
-    pair = PairCalibration("p1-1", other, np.eye(7), None, PairQuality(0.1, 8))
+    pair = PairCalibration("p1-1", other, np.eye(len(camera.parameters)), None, PairQuality(0.1, 8))
     again = placed_again(rig, placed, pair)
     assert (again is placed) == (change == 0.0)
     assert again.cameras["p1-1"] == other

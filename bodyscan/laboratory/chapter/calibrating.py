@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from bodyscan.boards.board import corner_points
 from bodyscan.calibration.boundary_points import binned
 from bodyscan.calibration.camera import (
-    INTRINSICS,
     CameraCalibration,
     PlanarView,
     calibrate_camera,
@@ -20,6 +19,7 @@ from bodyscan.calibration.light import fit_light
 from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
 from bodyscan.calibration.pair import planar_view
 from bodyscan.calibration.refinement_choice import refine_where_better
+from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.laboratory.chapter.captures import TARGET, ChapterCaptures
 from bodyscan.laboratory.chapter.setup import CAMERA, board_places
 from bodyscan.laboratory.rivals.approaches import (
@@ -106,13 +106,14 @@ def _ours(
 
 @dataclass(frozen=True, eq=False)
 class SigmaTrial:
-    """Many calibrations from noisy corners: errors over sigmas, (seeds, 7) over INTRINSICS."""
+    """Many calibrations from noisy corners: errors over sigmas, (seeds, P) of the `parameters`."""
 
+    parameters: tuple[str, ...]
     errors: Array
 
     @property
     def spread(self) -> Array:
-        """(7,) root mean square; 1 if the sigmas are honest."""
+        """(P,) root mean square; 1 if the sigmas are honest."""
         return np.sqrt(np.mean(self.errors**2, axis=0))
 
     @property
@@ -126,7 +127,7 @@ def sigma_trial(seeds: int, seed: int = 0) -> SigmaTrial:
     corners = corner_points(TARGET.board)
     places = board_places()
     seen = [CAMERA.image(place.apply(corners)) for place in places]
-    errors = []
+    true, errors = from_fields(asdict(CAMERA)), []
     for number in range(seeds):
         rng = np.random.default_rng([seed, number])
         views = [
@@ -135,6 +136,5 @@ def sigma_trial(seeds: int, seed: int = 0) -> SigmaTrial:
         ]
         found = calibrate_camera(views, CAMERA.width, CAMERA.height)
         sigmas = np.sqrt(np.diag(found.covariance))
-        off = [getattr(found.camera, name) - getattr(CAMERA, name) for name in INTRINSICS]
-        errors.append(np.array(off) / sigmas)
-    return SigmaTrial(np.stack(errors))
+        errors.append((found.camera.parameters - true.parameters) / sigmas)
+    return SigmaTrial(true.parameter_names, np.stack(errors))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from bodyscan.evaluation.spheres import (
     centre_distances,
     measure_sphere,
 )
-from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.laboratory.chapter.captures import ChapterCaptures
 from bodyscan.laboratory.chapter.setup import (
@@ -102,16 +102,11 @@ def measure(
 
 def true_approach(setup: ChapterSetup, name: str = "true calibration") -> Approach:
     """What nothing can calibrate better: the simulator's own camera and planes."""
-    camera = Camera(
-        **{field: getattr(CAMERA, field) for field in ("alpha", "beta", "gamma", "u0", "v0")},
-        k1=CAMERA.k1,
-        k2=CAMERA.k2,
-        width=CAMERA.width,
-        height=CAMERA.height,
-    )
     planes = true_planes(setup)
     unknown = np.zeros((len(planes), 4, 4))
-    return Approach(name, camera, LightPlanes(planes, unknown, PROJECTOR.direction))
+    return Approach(
+        name, from_fields(asdict(CAMERA)), LightPlanes(planes, unknown, PROJECTOR.direction)
+    )
 
 
 @dataclass(frozen=True)

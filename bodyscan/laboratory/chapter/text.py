@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.calibration.camera import INTRINSICS
 from bodyscan.laboratory.chapter.calibrating import Calibrated, SigmaTrial
 from bodyscan.laboratory.chapter.measuring import Measured, NoiseBound
 from bodyscan.laboratory.chapter.point_sigma import PointSigma
@@ -75,14 +74,14 @@ def _heading(found: Reproduction) -> str:
 def _table_1(found: Reproduction) -> str:
     rows = []
     zhang, ours = found.calibrated.reference, found.calibrated.ours
-    for number, name in enumerate(INTRINSICS):
+    for number, name in enumerate(zhang.camera.parameter_names):
         true = getattr(CAMERA, name)
         row = [name, f"{true:.7g}"]
         for camera, covariance in (
             (zhang.camera, zhang.covariance),
             (ours.camera, found.calibrated.camera_covariance),
         ):
-            value, sigma = getattr(camera, name), float(np.sqrt(covariance[number, number]))
+            value, sigma = camera.parameters[number], float(np.sqrt(covariance[number, number]))
             row += [f"{value:.7g}", f"{sigma:.2g}", f"{(value - true) / sigma:+.1f}"]
         rows.append(row)
     heading = ["", "true", "corners", "sigma", "off by", "joint", "sigma", "off by"]
@@ -100,7 +99,7 @@ def _honesty(trial: SigmaTrial) -> str:
     rows = [["RMS of error / sigma", *(f"{value:.2f}" for value in trial.spread)]]
     return (
         f"Over {len(trial.errors)} draws of corner noise:\n\n"
-        + _table(["", *INTRINSICS], rows)
+        + _table(["", *trial.parameters], rows)
         + f"\n\n{trial.beyond_three} of {trial.errors.size} parameters were off by more than three "
         "sigmas."
     )

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.linalg import rq
 
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 
 Array = NDArray[np.float64]
@@ -50,8 +51,7 @@ def split_projection_matrix(
         gamma=float(inner[0, 1]),
         u0=float(inner[0, 2]),
         v0=float(inner[1, 2]),
-        k1=0.0,
-        k2=0.0,
+        lens=Radial(),
         width=width,
         height=height,
     )

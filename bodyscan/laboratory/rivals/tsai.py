@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 
 Array = NDArray[np.float64]
@@ -34,7 +35,7 @@ class TsaiCamera:
     rms_px: float
 
     def camera(self, width: int, height: int) -> Camera:
-        """As the chapter's camera: k1 and k2 that undo kappa best over the image."""
+        """As the chapter's camera: the radial lens that undoes kappa best over the image."""
         corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
         scale = np.array([self.focal * self.aspect, self.focal])
         real = np.linspace(0.0, 1.0, 201)[1:] * np.linalg.norm(
@@ -43,15 +44,14 @@ class TsaiCamera:
         ideal = real * (1.0 + self.kappa * real**2)
         # Weighted by the radius: there is more image there.
         rows = np.stack([ideal**3, ideal**5], axis=1) * np.sqrt(real)[:, None]
-        k1, k2 = np.linalg.lstsq(rows, (real - ideal) * np.sqrt(real), rcond=None)[0]
+        coefficients = np.linalg.lstsq(rows, (real - ideal) * np.sqrt(real), rcond=None)[0]
         return Camera(
             alpha=self.focal * self.aspect,
             beta=self.focal,
             gamma=0.0,
             u0=float(self.centre[0]),
             v0=float(self.centre[1]),
-            k1=float(k1),
-            k2=float(k2),
+            lens=Radial().with_coefficients(coefficients),
             width=width,
             height=height,
         )

@@ -1,0 +1,22 @@
+"""The lenses there are.  A new one is a file in this folder and its name in `LENSES`."""
+
+from __future__ import annotations
+
+from bodyscan.arrays import Array
+from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.lenses.radial import Radial
+
+LENSES: dict[str, type[Lens]] = {lens.kind: lens for lens in (Radial,)}
+"""By their names in files; of those that have given coefficients of OpenCV's the first is taken."""
+
+
+def lens_from_opencv(coefficients: Array) -> Lens:
+    """The lens with OpenCV's distortion coefficients k1, k2, p1, p2, k3, ... (5,) or more.
+
+    Raises ValueError if there is none.
+    """
+    for kind in LENSES.values():
+        lens = kind.from_opencv(coefficients)
+        if lens is not None:
+            return lens
+    raise ValueError(f"no lens here has all of the distortion coefficients {coefficients.tolist()}")
