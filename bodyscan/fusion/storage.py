@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from dataclasses import asdict, dataclass
@@ -15,6 +14,7 @@ import numpy as np
 from bodyscan import __version__
 from bodyscan.errors import ResultError, ScanFailed
 from bodyscan.files.atomic import write_json
+from bodyscan.files.hashing import file_hash
 from bodyscan.fusion.scan import Scan
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
@@ -80,7 +80,7 @@ def save_scan(
         folder / FILE_NAME,
         _origin(calibration_id, subject, when)
         | {
-            "sha256": {name: _sha256(folder / name) for name in (CLOUD_NAME, MESH_NAME)},
+            "sha256": {name: file_hash(folder / name) for name in (CLOUD_NAME, MESH_NAME)},
             "counts": {
                 "points": len(scan.cloud.points),
                 "vertices": len(scan.mesh.vertices),
@@ -142,7 +142,7 @@ def load_scan(folder: Path) -> StoredScan:
             reasons = "; ".join(facts["verdict"]["reasons"])
             raise ResultError(f"this scan gave no model: {reasons}", where=str(file))
         for name, digest in facts["sha256"].items():
-            if _sha256(folder / name) != digest:
+            if file_hash(folder / name) != digest:
                 raise ResultError(
                     "was changed or cut short", where=str(folder / name), remedy=remedy
                 )
@@ -179,8 +179,3 @@ def _alignment(scan: Scan) -> dict[str, Any] | None:
 
 def _number(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
+from bodyscan.files.locking import file_lock, for_owner_only
 from bodyscan.jobs.allocation import Allocation
 from bodyscan.jobs.job import BATCH_LOCK, STAGE, Job, write_job
-from bodyscan.jobs.locking import file_lock, for_owner_only
 from bodyscan.jobs.supervision import COMMAND, JobResult, Listen, ignore_events, supervise
 
 Run = Callable[[Sequence[Job]], Iterator[JobResult]]

@@ -20,9 +20,9 @@ from typing import Any
 from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_text
+from bodyscan.files.locking import file_lock, for_owner_only
 from bodyscan.files.yaml_file import YamlError, read_yaml
 from bodyscan.jobs.job import BATCH_LOCK, JOB, MANIFEST, SUMMARY
-from bodyscan.jobs.locking import file_lock, for_owner_only
 from bodyscan.jobs.summary import write_out_manifest
 
 # Removed in this order, so that what says whose a folder is goes last: a removal that was

@@ -16,8 +16,8 @@ from typing import Any
 
 from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput
+from bodyscan.files.hashing import files_below
 from bodyscan.jobs.discovery import find_jobs
-from bodyscan.jobs.hashing import files_below
 from bodyscan.jobs.job import LOCK, MANIFEST, STAGE, SUMMARY, Job, write_job
 from bodyscan.jobs.pipeline import Pipeline
 from bodyscan.jobs.supervision import COMMAND, JobResult, Listen, ignore_events, supervise

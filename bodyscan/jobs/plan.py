@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bodyscan.errors import BodyscanError
-from bodyscan.jobs.hashing import file_hashes, files_below
+from bodyscan.files.hashing import file_hashes, files_below
 from bodyscan.jobs.job import STAGE, STATE, Job
 from bodyscan.jobs.stages import Stage
 

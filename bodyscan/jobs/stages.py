@@ -11,8 +11,8 @@ from pathlib import Path
 from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import BadInput, CalibrationFileError, CaptureError
+from bodyscan.files.hashing import files_below
 from bodyscan.jobs.discovery import CALIBRATION, RIG_FILE
-from bodyscan.jobs.hashing import files_below
 from bodyscan.jobs.job import STAGE, Job
 from bodyscan.progress import Progress
 from bodyscan.rig.rig import Rig

@@ -13,7 +13,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.files.atomic import write_json, write_text
-from bodyscan.jobs.hashing import file_hash
+from bodyscan.files.hashing import file_hash
 from bodyscan.jobs.job import MANIFEST, SUMMARY, Job
 from bodyscan.jobs.supervision import JobResult
 

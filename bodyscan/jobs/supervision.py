@@ -54,12 +54,13 @@ def supervise(
     command: what follows the name of this Python.  Never raises for what a job does.
     """
     path, since = Path(folder), time.monotonic()
-    stages: list[str] = []
+    stages: tuple[str, ...] = ()
     reason = ""
     for attempt in range(1, ATTEMPTS + 1):
         listen({"event": "job", "job": path.name, "state": "running", "attempt": attempt})
         _note(path, {"state": "running", "attempts": attempt, "reason": reason})
-        reason = _attempt(path, threads, limit_s, command, listen, stages)
+        reason, ran = _attempt(path, threads, limit_s, command, listen)
+        stages += ran
         if not reason:
             break
     outcome = JobResult(
@@ -80,13 +81,12 @@ def _attempt(
     limit_s: float,
     command: Sequence[str],
     listen: Listen,
-    stages: list[str],
-) -> str:
-    """Why it failed; "" if it did not. Adds the stages that ran to `stages`."""
+) -> tuple[str, tuple[str, ...]]:
+    """Why it failed, "" if it did not; and the stages that ran."""
     try:
         log = _open_log(folder / LOG)
     except OSError as error:
-        return f"its log cannot be written: {error.strerror}"
+        return f"its log cannot be written: {error.strerror}", ()
     with log:
         try:
             process = subprocess.Popen(
@@ -98,11 +98,11 @@ def _attempt(
                 start_new_session=True,
             )
         except OSError as error:
-            return f"its process cannot be started: {error.strerror}"
+            return f"its process cannot be started: {error.strerror}", ()
         stuck = threading.Timer(limit_s, process.kill)
         stuck.start()
         try:
-            said = _listen_to(process, folder.name, listen, stages)
+            said, ran = _listen_to(process, folder.name, listen)
             status = process.wait()
         finally:
             in_time = stuck.is_alive()
@@ -110,19 +110,20 @@ def _attempt(
             if process.stdin:
                 process.stdin.close()
     if status == 0:
-        return ""
+        return "", ran
     if said:
-        return said
+        return said, ran
     if not in_time:
-        return f"was stuck: it took longer than {limit_s / 60.0:g} minutes"
-    return _how_it_died(status, folder / LOG)
+        return f"was stuck: it took longer than {limit_s / 60.0:g} minutes", ran
+    return _how_it_died(status, folder / LOG), ran
 
 
 def _listen_to(
-    process: subprocess.Popen[bytes], job: str, listen: Listen, stages: list[str]
-) -> str:
-    """Hands on what the process tells; returns the reason it gives for failing, if it gives one."""
-    reason = ""
+    process: subprocess.Popen[bytes], job: str, listen: Listen
+) -> tuple[str, tuple[str, ...]]:
+    """Hands on what the process tells; returns the reason it gives for failing, if it gives one, and
+    the stages that it ran."""
+    reason, ran = "", []
     assert process.stdout is not None
     with process.stdout as stream:
         for line in stream:
@@ -133,10 +134,10 @@ def _listen_to(
             if "failed" in told:
                 reason = printable(told["failed"])
             if "why" in told:
-                stages.append(told["stage"])
+                ran.append(told["stage"])
             if "stage" in told:
                 listen({"event": "stage", "job": job, **told})
-    return reason
+    return reason, tuple(ran)
 
 
 def _how_it_died(status: int, log: Path) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bodyscan.errors import BadInput, BodyscanError
-from bodyscan.jobs.hashing import content_hash, file_hash, files_below
+from bodyscan.files.hashing import content_hash, file_hash, files_below
 from bodyscan.jobs.job import MANIFEST, Job, read_job
 from bodyscan.jobs.stages import KINDS, Kinds
 

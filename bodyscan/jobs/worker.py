@@ -22,9 +22,9 @@ from typing import Any
 
 from bodyscan.errors import BodyscanError, CaptureError
 from bodyscan.files.atomic import json_text, write_json
-from bodyscan.jobs.hashing import content_hash, file_hash, file_hashes, files_below
+from bodyscan.files.hashing import content_hash, file_hash, file_hashes, files_below
+from bodyscan.files.locking import file_lock, for_owner_only
 from bodyscan.jobs.job import LOCK, MANIFEST, STAGE, Job, read_job
-from bodyscan.jobs.locking import file_lock, for_owner_only
 from bodyscan.jobs.plan import Origin, origin_of, reason_to_run, result_hashes
 from bodyscan.jobs.stages import KINDS, Kinds, Stage, stages_until
 from bodyscan.memory import keep_freed_memory

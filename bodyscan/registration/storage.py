@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import zipfile
 from dataclasses import asdict, fields
@@ -17,6 +16,7 @@ from bodyscan.calibration.light_choice import HeldOutModel
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import CalibrationFileError
 from bodyscan.files.atomic import write_json, write_npz
+from bodyscan.files.hashing import file_hash
 from bodyscan.geometry.camera_fields import from_fields, to_fields
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.placing_covariance import PlacingCovariance
@@ -48,7 +48,7 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
         "schema": SCHEMA,
         "version": VERSION,
         "software": f"bodyscan {__version__}",
-        "arrays_sha256": _sha256(folder / ARRAYS_NAME),
+        "arrays_sha256": file_hash(folder / ARRAYS_NAME),
         "rig": calibration.rig.model_dump(mode="json"),
         "pairs": {name: _pair_content(calibration, name) for name in calibration.pairs},
         "boards": [
@@ -87,7 +87,7 @@ def load_calibration(path: Path) -> RigCalibration:
                 remedy="calibrate again with this version of bodyscan",
             )
         arrays_file = file.with_name(ARRAYS_NAME)
-        if _sha256(arrays_file) != content["arrays_sha256"]:
+        if file_hash(arrays_file) != content["arrays_sha256"]:
             raise CalibrationFileError(
                 f"does not belong to {file.name}",
                 where=str(arrays_file),
@@ -119,7 +119,7 @@ def load_calibration(path: Path) -> RigCalibration:
 
 def calibration_id(path: Path) -> str:
     """SHA-256 of the calibration's JSON, which itself holds the hash of its arrays."""
-    return _sha256(path / FILE_NAME if path.is_dir() else path)
+    return file_hash(path / FILE_NAME if path.is_dir() else path)
 
 
 def _pair_content(calibration: RigCalibration, name: str) -> dict[str, Any]:
@@ -183,7 +183,3 @@ def _transform(matrix: Any) -> RigidTransform:
     """As written, to the last bit: no orthonormalisation on reading."""
     array = np.array(matrix, float)
     return RigidTransform(array[:3, :3].copy(), array[:3, 3].copy())
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -11,7 +11,7 @@ from pathlib import Path
 from cheap_batch import batch_command, jobs_of, results, run_cheap
 
 from bodyscan.errors import BadInput
-from bodyscan.jobs.locking import file_lock
+from bodyscan.files.locking import file_lock
 
 
 def test_ten_kills_leave_the_same_bytes_as_none(make_scans, tmp_path):

@@ -11,9 +11,9 @@ import pytest
 from cheap_batch import jobs_of, run_cheap
 
 from bodyscan.errors import BadInput
+from bodyscan.files.hashing import files_below
+from bodyscan.files.locking import file_lock
 from bodyscan.jobs.forgetting import find_subject, forget_subject
-from bodyscan.jobs.hashing import files_below
-from bodyscan.jobs.locking import file_lock
 from bodyscan.jobs.verification import verify
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import cheap_job
 
+from bodyscan.files.hashing import file_hash, files_below
 from bodyscan.jobs.discovery import find_jobs
-from bodyscan.jobs.hashing import file_hash, files_below
 from bodyscan.jobs.job import Job
 from bodyscan.jobs.pipeline import load_pipeline
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from small_workspace import PROJECT, run
 
-from bodyscan.jobs.hashing import file_hash, files_below
+from bodyscan.files.hashing import file_hash, files_below
 
 SMALL = ("--set", "fusion.points=20000", "--set", "mesh.depth=6", "--set", "export.formats=glb")
 ODD = "б 'q\"\n"
