@@ -12,16 +12,16 @@ import numpy as np
 
 from benchmarks.board_images import load_views, save_views
 from benchmarks.captures import open_real
-from benchmarks.rivals import RIVALS, run_rival, without_skew
-from bodyscan.boards.view import BoardView
-from bodyscan.calibration.located_view import apart
-from bodyscan.laboratory.free_triangulation import (
+from benchmarks.free_triangulation import (
     FreeTriangulation,
     HeldOut,
     pooled,
     triangulate_shots,
     without_shots,
 )
+from benchmarks.rivals import RIVALS, run_rival, without_skew
+from bodyscan.boards.view import BoardView
+from bodyscan.calibration.located_view import apart
 from bodyscan.registration.rig_solve import place_rig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.calibrate_rig import find_all_boards

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.captures import open_real
-from bodyscan.laboratory.held_out_boards import hold_out_boards
+from benchmarks.held_out_boards import hold_out_boards
 
 
 def report() -> str:

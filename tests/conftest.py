@@ -47,7 +47,7 @@ def cleaned(scan: Scan) -> list[RangeImage]:
 
 @pytest.fixture(scope="session")
 def cloud(scan: Scan, cleaned: list[RangeImage]) -> BodyCloud:
-    return merge(cleaned, scan.rig_from_camera, points=250_000)
+    return merge(cleaned, scan.rig_from_camera, points=250_000).cloud
 
 
 @pytest.fixture(scope="session")

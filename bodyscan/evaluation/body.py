@@ -10,7 +10,7 @@ import numpy as np
 import open3d as o3d
 
 from bodyscan.arrays import Array, Indices, Mask
-from bodyscan.evaluation.surface import covered, sample_surface
+from bodyscan.evaluation.surface import covered_spots, sample_surface
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
 from bodyscan.measurement.measuring import Slice, measure
@@ -24,7 +24,7 @@ SPOTS = 60_000
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
+class SwayResidual:
     """rig_from_still: where the model has the body of the truth.  apart_mm: RMS over pairs and the
     body of what is left of calibration error and sway, along all axes.
     """
@@ -33,9 +33,9 @@ class Settled:
     apart_mm: float
 
 
-def settled(
+def sway_residual(
     found: Mapping[str, RigidTransform], true_pairs: Mapping[str, Any], vertices: Array
-) -> Settled:
+) -> SwayResidual:
     """found: rig_from_camera as the scan used it; true_pairs: `pairs` of truth.json."""
     body = vertices[:: max(1, len(vertices) // 500)]
     placed = []
@@ -46,7 +46,7 @@ def settled(
         placed.append((placing @ camera.inverse() @ swayed).apply(body))
     mean = np.mean(placed, axis=0)
     apart = float(np.sqrt(np.mean(np.sum((np.array(placed) - mean) ** 2, axis=-1))))
-    return Settled(rigid_fit(body, mean), apart)
+    return SwayResidual(rigid_fit(body, mean), apart)
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def coverage_of_seen(
         for eye in (np.zeros(3), np.array(pair["projector"]["centre"])):
             index = index[_open(scene, spots[index], normals[index], still_from_camera.apply(eye))]
         seen[index] = True
-    return float(seen.mean()), float(covered(points, spots[seen], normals[seen]).mean())
+    return float(seen.mean()), float(covered_spots(points, spots[seen], normals[seen]).mean())
 
 
 def _open(scene: Any, spots: Array, normals: Array, eye: Array) -> Mask:

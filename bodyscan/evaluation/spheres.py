@@ -7,12 +7,11 @@ distances between the spheres' centres are judged too.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.arrays import Array, Indices
+from bodyscan.arrays import Array
 from bodyscan.errors import FailedWork
 from bodyscan.evaluation.planes import best_plane
 from bodyscan.geometry.least_squares import spread
@@ -120,17 +119,6 @@ def find_spheres(points: Array, normals: Array, radius: float, count: int) -> li
         left = np.linalg.norm(flat - sphere.centre, axis=1) > REACH * radius
         flat, votes = flat[left], votes[left]
     return _in_reading_order(found)
-
-
-def nearest_sphere(points: Array, spheres: Sequence[Sphere]) -> Indices:
-    """(N,) number of the sphere whose surface each point (N, 3) belongs to, -1 for none."""
-    off = np.stack([np.abs(sphere.distances(points)) for sphere in spheres], axis=-1)
-    nearest = np.argmin(np.nan_to_num(off, nan=np.inf), axis=-1)
-    radii = np.array([sphere.radius for sphere in spheres])
-    inside = np.take_along_axis(off, nearest[..., None], axis=-1)[..., 0] < (
-        OFF_SURFACE * radii[nearest]
-    )
-    return np.where(inside, nearest, -1).astype(np.int64)
 
 
 @dataclass(frozen=True)

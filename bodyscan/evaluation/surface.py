@@ -96,36 +96,21 @@ def deviation(signed_mm: Array) -> Deviation:
     )
 
 
-def honesty(signed_mm: Array, sigma_mm: NDArray[np.floating[Any]]) -> tuple[float, float]:
+def normalized_errors(signed_mm: Array, sigma_mm: NDArray[np.floating[Any]]) -> tuple[float, float]:
     """Errors over their sigmas: robust spread (1 if honest), and the share beyond three sigmas (0.003
     if Gaussian)."""
     over = np.abs(signed_mm / sigma_mm)
     return float(np.median(over) / 0.6745), float(np.mean(over > 3.0))
 
 
-def coverage(
-    points: Array,
-    vertices: Array,
-    faces: Indices,
-    *,
-    within_mm: float = 1.0,
-    samples: int = 200_000,
-    spacing_mm: float = 2.0,
-    seed: int = 0,
-) -> float:
-    """Fraction of a surface's area that the points cover.
+def covered_spots(
+    points: Array, spots: Array, normals: Array, within_mm: float = 1.0, spacing_mm: float = 2.0
+) -> Mask:
+    """(N,) which spots (N, 3) of a surface with normals (N, 3) points (M, 3) cover.
 
     A spot is covered if a point lies within `within_mm` along the surface's normal and, sideways,
     within `spacing_mm`, since even a perfect cloud has gaps between its points.
     """
-    spots, normals = sample_surface(vertices, faces, samples, seed)
-    return float(np.mean(covered(points, spots, normals, within_mm, spacing_mm)))
-
-
-def covered(
-    points: Array, spots: Array, normals: Array, within_mm: float = 1.0, spacing_mm: float = 2.0
-) -> Mask:
-    """(N,) which spots (N, 3) of a surface with normals (N, 3) points (M, 3) cover: see `coverage`."""
     distance, index = cKDTree(points).query(spots, k=4, distance_upper_bound=spacing_mm + within_mm)
     found = np.isfinite(distance)
     offset = points[np.where(found, index, 0)] - spots[:, None]

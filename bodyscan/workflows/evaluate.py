@@ -12,8 +12,8 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from bodyscan.errors import BadInput
-from bodyscan.evaluation.body import coverage_of_seen, girth_errors, settled
-from bodyscan.evaluation.surface import Deviation, deviation, honesty, signed_distances
+from bodyscan.evaluation.body import coverage_of_seen, girth_errors, sway_residual
+from bodyscan.evaluation.surface import Deviation, deviation, normalized_errors, signed_distances
 from bodyscan.export.scan import carried
 from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.geometry.transforms import RigidTransform
@@ -104,7 +104,7 @@ def evaluate_workspace(workspace: Path) -> str:
         return "\n".join([*lines, "  no scan to compare yet"])
     stored = load_scan(folder)
     pairs = truth.facts["pairs"]
-    place = settled(_placings(stored, calibration), pairs, truth.vertices)
+    place = sway_residual(_placings(stored, calibration), pairs, truth.vertices)
     still_from_rig = RigidTransform.identity()
     if truth.facts["settings"]["person"]["sway_mm"]:
         still_from_rig = place.rig_from_still.inverse()  # who sways stands nowhere in particular
@@ -115,7 +115,7 @@ def evaluate_workspace(workspace: Path) -> str:
     mesh = signed_distances(body.vertices[measured], truth.vertices, truth.faces)
     girths = girth_errors(body, truth.vertices, truth.faces)
     seen, covered = coverage_of_seen(points, truth.vertices, truth.faces, pairs)
-    spread, beyond = honesty(cloud, stored.cloud.sigma_mm)
+    spread, beyond = normalized_errors(cloud, stored.cloud.sigma_mm)
     shape = topology(stored.mesh.vertices, stored.mesh.faces)
     pictures = [folder / "cloud-deviation.png", folder / "mesh-deviation.png"]
     draw_deviation(stored.cloud.points, cloud, pictures[0], normals=stored.cloud.normals)

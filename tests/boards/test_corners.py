@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from board_rendering import render, true_corners, view_of
+from edge_lines import refine_by_lines
 
 from bodyscan.boards.board_map import fit_board_map
 from bodyscan.boards.corners import refine_corners
-from bodyscan.laboratory.edge_lines import refine_by_lines
 from bodyscan.rig.board import Board
 
 BOARD = Board(name="plain", columns=9, rows=6, square_mm=50, margin_mm=25)

@@ -6,7 +6,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from bodyscan.evaluation.body import coverage_of_seen, girth_errors, settled
+from bodyscan.evaluation.body import coverage_of_seen, girth_errors, sway_residual
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_fields import to_fields
 from bodyscan.geometry.lenses import Radial
@@ -80,10 +80,10 @@ def test_sway_left_in_is_told_and_a_common_motion_is_not():
     aside = RigidTransform(np.eye(3), np.array([0.0, 0.6, 0.0]))
     true = pairs([RigidTransform.identity(), RigidTransform.identity()])
     cameras = {name: RigidTransform.from_matrix(p["rig_from_camera"]) for name, p in true.items()}
-    together = settled({name: common @ t for name, t in cameras.items()}, true, vertices)
+    together = sway_residual({name: common @ t for name, t in cameras.items()}, true, vertices)
     assert together.apart_mm < 1e-9
     np.testing.assert_allclose(together.rig_from_still.matrix, common.matrix, atol=1e-6)
-    apart = settled({"p0": cameras["p0"], "p1": aside @ cameras["p1"]}, true, vertices)
+    apart = sway_residual({"p0": cameras["p0"], "p1": aside @ cameras["p1"]}, true, vertices)
     assert apart.apart_mm == pytest.approx(0.3)
 
 

@@ -7,8 +7,9 @@ import open3d as o3d
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from surface_coverage import coverage
 
-from bodyscan.evaluation.surface import coverage, deviation, sample_surface, signed_distances
+from bodyscan.evaluation.surface import deviation, sample_surface, signed_distances
 
 BOX = o3d.geometry.TriangleMesh.create_box(100.0, 200.0, 300.0)
 VERTICES = np.asarray(BOX.vertices) + np.array([1000.0, -500.0, 2000.0])

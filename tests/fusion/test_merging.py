@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from ray_cast_scan import Scan, scene_of
 from scipy.spatial import cKDTree
+from surface_coverage import coverage
 
 from bodyscan.errors import ScanFailed
-from bodyscan.evaluation.surface import coverage, deviation, sample_surface, signed_distances
+from bodyscan.evaluation.surface import deviation, sample_surface, signed_distances
 from bodyscan.fusion.merging import merge
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.free_triangulation import leave_shots_out, pooled
+from benchmarks.held_out_boards import hold_out_boards
 from bodyscan.captures.folder import open_captures
-from bodyscan.laboratory.free_triangulation import leave_shots_out, pooled
-from bodyscan.laboratory.held_out_boards import hold_out_boards
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.workflows.calibrate_rig import calibrate_rig
 

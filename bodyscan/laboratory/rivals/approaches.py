@@ -64,11 +64,6 @@ def planes_by_stage_camera(
     return _fitted(name, relocated(target, shots, stage.camera), target, free_planes)
 
 
-def planes_by_reference(target: Target, reference: Located, name: str = "(iii)") -> Approach:
-    """Approach (iii), the chapter's own: all from the reference plane, one plane a boundary."""
-    return _fitted(name, reference, target, free_planes)
-
-
 Model = Callable[[BoundaryPoints, int, Axis], LightPlanes]
 
 
