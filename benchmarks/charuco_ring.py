@@ -24,7 +24,7 @@ from bodyscan.boards.view import BoardView
 from bodyscan.calibration.located_view import apart
 from bodyscan.registration.rig_solve import place_rig
 from bodyscan.rig.rig import Rig
-from bodyscan.workflows.calibrate_rig import find_all_boards
+from bodyscan.workflows.find_boards import find_all_boards
 
 STORED = Path(__file__).parents[1] / "bench" / "charuco-ring" / "corners.npz"
 DIVERGED_PX = 10.0
@@ -110,7 +110,7 @@ def same_places(rig: Rig, found: Sequence[BoardView]) -> list[tuple[str, ...]]:
 def _find_corners() -> list[BoardView]:
     if STORED.exists():
         return list(load_views(STORED))
-    found = find_all_boards(*open_real("charuco-ring"), [])
+    found = find_all_boards(*open_real("charuco-ring")).value
     save_views(found, STORED)
     return found
 

@@ -17,7 +17,7 @@ from bodyscan.geometry.triangulation import triangulate
 from bodyscan.registration.board_shape import BoardShape
 from bodyscan.registration.rig_solve import PlacedRig, place_rig
 from bodyscan.rig.rig import Rig
-from bodyscan.workflows.calibrate_rig import calibrate_cameras, find_all_boards, locate_views
+from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards, locate_views
 
 Array = NDArray[np.float64]
 
@@ -99,14 +99,13 @@ def without_shots(rig: Rig, found: Sequence[BoardView], shots: Collection[str]) 
 
     Raises what `place_rig` raises.
     """
-    boards = {board.name: board for board in rig.boards}
     others = [view for view in found if view.shot not in shots]
-    calibrated, _ = calibrate_cameras(rig, others, boards)
-    views = locate_views(found, calibrated, boards, [])
+    calibrated = calibrate_cameras(rig, others).value
+    views = locate_views(rig, found, calibrated).value
     used = tuple(view for view in views if view.shot not in shots)
     cameras = {name: own.camera for name, own in calibrated.items()}
     left_out = tuple(view for view in views if view.shot in shots)
-    return HeldOut(cameras, used, place_rig(rig, used, cameras), left_out)
+    return HeldOut(cameras, used, place_rig(rig, used, cameras).value, left_out)
 
 
 def triangulate_shots(
@@ -129,7 +128,7 @@ def triangulate_shots(
 
 def leave_shots_out(rig: Rig, captures: Captures) -> list[FreeTriangulation]:
     """Each shot in turn left out of the joint solve, then its board triangulated by that rig."""
-    found = find_all_boards(rig, captures, [])
+    found = find_all_boards(rig, captures).value
     results = []
     for shot in captures.shots:
         held = without_shots(rig, found, [shot])

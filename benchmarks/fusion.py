@@ -183,7 +183,7 @@ def _ours(workspace: Path, folder: Path) -> Step:
         return result
 
     def work() -> Any:
-        images, _ = stage("range images", lambda: range_images(calibration, captures))
+        images = stage("range images", lambda: range_images(calibration, captures)).value
         placed = calibration.rig_from_camera
         cleaned = stage("cleaning", lambda: clean(images, placed, calibration.rig.volume))
         seen = [image for image in cleaned if image.valid.any()]

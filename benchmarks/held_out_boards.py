@@ -11,20 +11,21 @@ from numpy.typing import NDArray
 
 from bodyscan.boards.board import corner_points
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.boundary_points import BoundaryPoints, binned
+from bodyscan.calibration.boundary_points import BoundaryPoints, binned, join
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.light import fit_light, smooth_models
-from bodyscan.calibration.light_planes import fit_light_planes, join
-from bodyscan.calibration.pair import BoardBoundaries, on_board
+from bodyscan.calibration.light_planes import fit_light_planes
+from bodyscan.calibration.located_view import LocatedView
 from bodyscan.calibration.pinhole_projector import fit_pinhole, fit_pinhole_opencv
+from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Rig
 from bodyscan.stripes.stripe_map import StripeMap
-from bodyscan.workflows.calibrate_rig import calibrate_cameras, find_all_boards
 from bodyscan.workflows.decoding import decode_sequence
+from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards
 
 Array = NDArray[np.float64]
 
@@ -92,13 +93,11 @@ def _models(
 
 
 def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, list[_Shot]]:
-    notes: list[str] = []
-    boards = {board.name: board for board in rig.boards}
-    views = [view for view in find_all_boards(rig, captures, notes) if view.pair == pair]
-    cameras, failed = calibrate_cameras(rig, views, boards)
-    if pair not in cameras:
-        raise PairFailed(failed.get(pair, "no boards"), where=f"pair {pair}")
-    camera = cameras[pair]
+    views = [view for view in find_all_boards(rig, captures).value if view.pair == pair]
+    cameras = calibrate_cameras(rig, views)
+    if pair not in cameras.value:
+        raise PairFailed(cameras.failures.get(pair, "no boards"), where=f"pair {pair}")
+    camera = cameras.value[pair]
     spec = rig.pair(pair)
     assert spec.projector is not None
     shots = []
@@ -107,15 +106,17 @@ def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, 
         if sequence is None or not sequence.has_stripes:
             continue
         stripes = decode_sequence(sequence, spec, workers=2)
-        face_z = float(corner_points(boards[view.board])[view.corner_ids[0], 2])
-        pose = camera.camera_from_board[view.shot]
+        pose, board = camera.camera_from_board[view.shot], rig.board(view.board)
+        corners = corner_points(board)[view.corner_ids]
+        located = LocatedView(pair, view.shot, view.board, corners, view.pixels, pose)
         boundaries = BoardBoundaries(
             stripes.boundary_index,
             stripes.boundary_pixels,
             stripes.boundary_sigma_px.astype(np.float64),
         )
+        shot = StripedView(located, board, boundaries)
         points = on_board(
-            camera.camera, spec.projector, boards[view.board], pose, face_z, boundaries, number
+            camera.camera, spec.projector, board, shot.camera_from_face, boundaries, number
         )
         shots.append(_Shot(view, pose, points, stripes))
     if len(shots) < 3:

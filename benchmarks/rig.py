@@ -20,7 +20,7 @@ from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation.layout import TruePair
-from bodyscan.workflows.calibrate_rig import calibrate_cameras, locate_views
+from bodyscan.workflows.find_boards import calibrate_cameras, locate_views
 
 Array = NDArray[np.float64]
 
@@ -114,12 +114,11 @@ def with_plain_board(rig: Rig) -> Rig:
 
 
 def _run(seen: SeenRig) -> tuple[SeenRig, PlacedRig, dict[str, Camera], Scored]:
-    boards = {board.name: board for board in seen.rig.boards}
-    calibrated, _ = calibrate_cameras(seen.rig, seen.views, boards)
-    located = locate_views(seen.views, calibrated, boards, [])
+    calibrated = calibrate_cameras(seen.rig, seen.views).value
+    located = locate_views(seen.rig, seen.views, calibrated).value
     cameras = {name: found.camera for name, found in calibrated.items()}
     wall, cpu = time.perf_counter(), time.process_time()
-    placed = place_rig(seen.rig, located, cameras)
+    placed = place_rig(seen.rig, located, cameras).value
     seconds = time.perf_counter() - wall, time.process_time() - cpu
     return seen, placed, cameras, _score(seen, placed.rig_from_camera, *seconds)
 

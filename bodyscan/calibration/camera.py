@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.calibration.planar_view import PlanarView
 from bodyscan.calibration.zhang import (
     camera_from_plane,
     homography,
@@ -24,15 +25,6 @@ Array = NDArray[np.float64]
 
 FEWEST_POSES = 3
 CHAPTERS_LENS = Radial()
-
-
-@dataclass(frozen=True, eq=False)
-class PlanarView:
-    """One board in one image: points (N, 3) of its frame, all at one z, and pixels (N, 2)."""
-
-    shot: str
-    points: Array
-    pixels: Array
 
 
 @dataclass(frozen=True, eq=False)

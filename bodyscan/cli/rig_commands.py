@@ -71,12 +71,12 @@ def refine_rig(
 
     rig = load_calibration(calibration)
     with console.stage_clock() as clock:
-        images, failed = range_images(rig, open_scan(rig.rig, folder), clock)
+        measured = range_images(rig, open_scan(rig.rig, folder), clock)
         clock("aligning", 0, 1)
-        cleaned = clean(images, rig.rig_from_camera, rig.rig.volume)
+        cleaned = clean(measured.value, rig.rig_from_camera, rig.rig.volume)
         found = refine_on_object(require_subject(cleaned), rig.rig_from_camera, rig.covariance)
         clock("aligning", 1, 1)
-    for name, reason in failed.items():
+    for name, reason in measured.failures.items():
         console.console.print(f"left out: {name}: {reason}", style="red", highlight=False)
     console.console.print("\n".join(found.lines), highlight=False)
     if not found.better:

@@ -14,6 +14,7 @@ from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -69,8 +70,7 @@ def alignment_settings(matching: str) -> AlignmentSettings | None:
 
 def fuse(
     calibration: RigCalibration,
-    images: Sequence[RangeImage],
-    failed: dict[str, str],
+    measured: Outcome[Sequence[RangeImage]],
     settings: ScanSettings = ScanSettings(),
     progress: Progress = silent,
     *,
@@ -78,10 +78,11 @@ def fuse(
 ) -> Scan:
     """Range images of one person, background and all, to body model and mesh.
 
-    failed: pairs that gave none, with the reason. empty: as in `clean`. Raises ScanFailed if they
-    show no body.
+    measured: with the pairs that gave none as failures. empty: as in `clean`. Raises ScanFailed if
+    they show no body.
     """
     progress("cleaning", 0, 1)
+    images = measured.value
     cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume, empty=empty)
     seen = require_subject(cleaned)
     progress("cleaning", 1, 1)
@@ -109,8 +110,9 @@ def fuse(
         cloud, images, placing, depth=settings.mesh_depth, reach_mm=settings.mesh_reach_mm
     )
     progress("meshing", 1, 1)
-    measured = {image.pair: int(image.valid.sum()) for image in cleaned}
+    points = {image.pair: int(image.valid.sum()) for image in cleaned}
+    failed = dict(measured.failures)
     verdict = grade_scan(
         cloud, surface, alignment, failed, calibration.rig.volume, fused.contradicted
     )
-    return Scan(cloud, surface, alignment, measured, failed, verdict, tuple(seen), placing)
+    return Scan(cloud, surface, alignment, points, failed, verdict, tuple(seen), placing)

@@ -137,7 +137,8 @@ def _placed_by(
 ) -> tuple[dict[str, RigidTransform], Array]:
     """`rig_from_camera` from these shots alone and its covariance, in the frame of `placed`."""
     held = rig.model_copy(update={"rig_frame": RigFrame(pair=holder)})
-    half = place_rig(held, [view for view in placed.views if view.shot in shots], placed.cameras)
+    views = [view for view in placed.views if view.shot in shots]
+    half = place_rig(held, views, placed.cameras).value
     to_rig = placed.rig_from_camera[holder] @ half.rig_from_camera[holder].inverse()
     carry = np.kron(np.eye(len(half.covariance.names)), adjoint(to_rig))
     placings = {name: to_rig @ t for name, t in half.rig_from_camera.items()}

@@ -15,6 +15,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import cauchy_weights, spread
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.outcome import Outcome
 from bodyscan.registration.board_shape import BoardShape, ShapedSolution, with_board_shapes
 from bodyscan.registration.disagreement import error_limit, judge, own_errors
 from bodyscan.registration.full_solve import solve_fully
@@ -43,9 +44,8 @@ Array = NDArray[np.float64]
 class PlacedRig:
     """Everything in the rig frame; cameras as the joint solve left them; rms_px of each pair.
 
-    views: those used, their points where the boards' corners really lie.  left_out: pairs that agree
-    with the others in too few shots to be placed, with the reason.  board_shapes: of boards that
-    are not as described, where others' views confirm it.
+    views: those used, their points where the boards' corners really lie.  board_shapes: of boards
+    that are not as described, where others' views confirm it.
     """
 
     rig_from_camera: dict[str, RigidTransform]
@@ -54,8 +54,6 @@ class PlacedRig:
     covariance: PlacingCovariance
     rms_px: dict[str, float]
     views: tuple[LocatedView, ...]
-    notes: tuple[str, ...]
-    left_out: dict[str, str]
     board_shapes: dict[str, BoardShape]
 
 
@@ -73,8 +71,10 @@ def place_rig(
     cameras: Mapping[str, Camera],
     *,
     refine_cameras: bool = True,
-) -> PlacedRig:
+) -> Outcome[PlacedRig]:
     """Join all pairs by their shared board views.
+
+    Pairs that agree with the others in too few shots to be placed are failures.
 
     Raises RigDisconnected if groups of pairs share no view, only views whose board numbering leaves
     their placing open, or only views that contradict each other; BadInput if nothing fixes the rig
@@ -101,7 +101,8 @@ def place_rig(
     if refine:
         root = min(start)
         shaped = with_board_shapes(solved.views, solved.solution, root=root, refine_cameras=True)
-    return _placed(rig, shaped, refine, (*solved.notes, *shaped.notes), left_out)
+    placed = _placed(rig, shaped, refine)
+    return Outcome(placed, (*solved.notes, *shaped.notes), left_out)
 
 
 def _solve(
@@ -155,13 +156,7 @@ def _strangers(solved: _Solved) -> list[str]:
     return sorted(name for name, number in shared.items() if 2 * out[name] > number)
 
 
-def _placed(
-    rig: Rig,
-    solved: ShapedSolution,
-    refine: bool,
-    notes: tuple[str, ...],
-    left_out: dict[str, str],
-) -> PlacedRig:
+def _placed(rig: Rig, solved: ShapedSolution, refine: bool) -> PlacedRig:
     """The solution carried into the rig frame, with its covariance there."""
     solution, kept = _frame_board_turned(rig, solved.solution, solved.views)
     to_rig = rig_from_root(rig, solution.root_from_camera, solution.root_from_board)
@@ -193,8 +188,6 @@ def _placed(
         covariance,
         rms,
         tuple(kept),
-        notes,
-        left_out,
         solved.shapes,
     )
 

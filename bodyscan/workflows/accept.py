@@ -116,7 +116,7 @@ def _clouds(
     """All pairs' points merged as a scan's are (without alignment), then each pair's own, rig
     frame. Raises ScanFailed."""
     one = replace(captures, shots=(shot,), sequences=captures.of_shot(shot))
-    images, _ = range_images(calibration, one, progress)
+    images = range_images(calibration, one, progress).value
     cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
     seen = [image for image in cleaned if image.valid.any()]
     cloud = merge(seen, calibration.rig_from_camera, points=POINTS).cloud

@@ -1,29 +1,21 @@
-"""The rig's calibration, stage by stage: boards, cameras, one joint solve, light sheets."""
+"""The rig's calibration, stage by stage: boards, cameras, one joint solve, light sheets, advice."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
-from bodyscan.boards.board import corner_points
-from bodyscan.boards.detection import find_boards
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.camera import (
-    CameraCalibration,
-    PlanarView,
-    calibrate_camera,
-    locate_board,
-)
+from bodyscan.calibration.calibrate_pair import PlacedPair, calibrate_pair
+from bodyscan.calibration.camera import CameraCalibration, locate_board
 from bodyscan.calibration.coverage import coverage_notes
-from bodyscan.calibration.located_view import LocatedView, board_symmetries
-from bodyscan.calibration.pair import (
-    PairCalibration,
-    planar_view,
-    usable,
-)
-from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.captures.images import read_lit
-from bodyscan.errors import BadInput, BodyscanError, FailedWork
+from bodyscan.calibration.located_view import LocatedView
+from bodyscan.calibration.pair import PairCalibration
+from bodyscan.calibration.planar_view import PlanarView
+from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
+from bodyscan.captures.folder import Captures
+from bodyscan.errors import BadInput, BodyscanError, FailedWork, plainly
+from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.registration.advice import advise
 from bodyscan.registration.board_doubts import boards_not_found, size_doubt, what_was_found
@@ -32,10 +24,9 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import PlacedRig, place_rig
 from bodyscan.registration.seen_corners import seen_corners
-from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
-from bodyscan.workflows.calibrate_pairs import calibrate_pairs
-from bodyscan.workflows.decode_boards import decode_on_boards
+from bodyscan.workflows.decode_boards import ViewKey, decode_on_boards
+from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards, locate_views
 
 
 def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> RigCalibration:
@@ -45,37 +36,36 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
     FailedWork if no pair is left, RigDisconnected if the pairs do not hang together, BadInput if
     nothing fixes the rig frame.
     """
-    boards = {board.name: board for board in rig.boards}
-    notes: list[str] = []
-    views = find_all_boards(rig, captures, notes, progress)
-    notes += coverage_notes(rig, views)
-    notes += boards_not_found(rig, views, len(captures.sequences))
-    cameras, failed = calibrate_cameras(rig, views, boards, progress)
-    if not cameras:
-        remedy = what_was_found(rig, views, len(captures.sequences))
-        raise _nothing_calibrated(rig, failed, remedy)
+    views = find_all_boards(rig, captures, progress)
+    cameras = calibrate_cameras(rig, views.value, progress)
+    if not cameras.value:
+        remedy = what_was_found(rig, views.value, len(captures.sequences))
+        raise _nothing_calibrated(rig, cameras.failures, remedy)
     progress("joining the pairs", 0, 1)
-    located = locate_views(views, cameras, boards, notes)
-    try:
-        placed = place_rig(rig, located, {name: c.camera for name, c in cameras.items()})
-    except BadInput as error:
-        # The board or pair that fixes the frame may be missing because pairs failed before.
-        before = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
-        remedy = f"{error.remedy}\n  left out before: {before}" if before else error.remedy
-        raise BadInput(error.what, where=error.where, remedy=remedy) from error
-    failed |= placed.left_out
-    notes += size_doubt(rig, placed.rig_from_camera)
-    cameras = {name: own for name, own in cameras.items() if name in placed.rig_from_camera}
+    located = locate_views(rig, views.value, cameras.value)
+    joined = _join_pairs(rig, located.value, cameras)
+    placed = joined.value
     progress("joining the pairs", 1, 1)
-    decoded = decode_on_boards(rig, captures, placed, views, progress)
-    notes += decoded.notes
-    failed |= decoded.failed
-    cameras = {name: own for name, own in cameras.items() if name not in failed}
-    pairs = calibrate_pairs(rig, cameras, placed, decoded.boundaries, failed, notes, progress)
+    decoded = decode_on_boards(rig, captures, _of_views(placed, views.value), progress)
+    lost = {**cameras.failures, **joined.failures, **decoded.failures}
+    fitted = _fit_sheets(rig, placed, cameras.value, decoded, progress)
+    failed = lost | dict(fitted.failures)
+    pairs = fitted.value
     if not pairs:
         raise _nothing_calibrated(rig, failed)
     for pair in pairs.values():
         placed = placed_again(rig, placed, pair)
+    notes = (
+        *views.notes,
+        *coverage_notes(rig, views.value),
+        *boards_not_found(rig, views.value, len(captures.sequences)),
+        *located.notes,
+        *size_doubt(rig, placed.rig_from_camera),
+        *decoded.notes,
+        *fitted.notes,
+        *joined.notes,
+    )
+    advice = advice_on(rig, placed, progress) if not failed else ()
     return RigCalibration(
         rig,
         pairs,
@@ -83,8 +73,8 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
         placed.covariance,
         placed.rig_from_board,
         failed,
-        (*notes, *placed.notes),
-        (*(advice_on(rig, placed, progress) if not failed else ()), *through_the_stripes(pairs)),
+        notes,
+        (*advice, *through_the_stripes(pairs)),
         seen_corners(placed, pairs),
     )
 
@@ -93,6 +83,102 @@ def _nothing_calibrated(rig: Rig, failed: Mapping[str, str], remedy: str = "") -
     reasons = "".join(f"\n  {name}: {reason}" for name, reason in failed.items())
     return FailedWork(
         f"no pair could be calibrated:{reasons}", where=f"rig {rig.name}", remedy=remedy
+    )
+
+
+def _join_pairs(
+    rig: Rig, views: list[LocatedView], cameras: Outcome[dict[str, CameraCalibration]]
+) -> Outcome[PlacedRig]:
+    try:
+        return place_rig(rig, views, {name: own.camera for name, own in cameras.value.items()})
+    except BadInput as error:
+        # The board or pair that fixes the frame may be missing because pairs failed before.
+        before = "; ".join(f"{name}: {reason}" for name, reason in cameras.failures.items())
+        remedy = f"{error.remedy}\n  left out before: {before}" if before else error.remedy
+        raise BadInput(error.what, where=error.where, remedy=remedy) from error
+
+
+def _of_views(placed: PlacedRig, views: list[BoardView]) -> list[BoardView]:
+    """The views that took part in placing the rig."""
+    kept = {(view.pair, view.shot, view.board) for view in placed.views}
+    return [view for view in views if (view.pair, view.shot, view.board) in kept]
+
+
+def _fit_sheets(
+    rig: Rig,
+    placed: PlacedRig,
+    cameras: Mapping[str, CameraCalibration],
+    decoded: Outcome[dict[ViewKey, BoardBoundaries]],
+    progress: Progress,
+) -> Outcome[dict[str, PairCalibration]]:
+    """Light sheets of every pair that was placed and decoded."""
+    names = sorted(set(placed.rig_from_camera) - set(decoded.failures))
+
+    def fit(name: str) -> Outcome[PairCalibration] | str:
+        try:
+            return calibrate_pair(_placed_pair(rig, placed, name, cameras[name], decoded.value))
+        except BodyscanError as error:
+            return plainly(error)
+
+    results = threaded(fit, names, stage="fitting light sheets", progress=progress)
+    both = list(zip(names, results, strict=True))
+    return Outcome(
+        {name: found.value for name, found in both if isinstance(found, Outcome)},
+        tuple(note for _, found in both if isinstance(found, Outcome) for note in found.notes),
+        {name: found for name, found in both if isinstance(found, str)},
+    )
+
+
+def _placed_pair(
+    rig: Rig,
+    placed: PlacedRig,
+    name: str,
+    own: CameraCalibration,
+    boundaries: Mapping[ViewKey, BoardBoundaries],
+) -> PlacedPair:
+    camera_from_rig = placed.rig_from_camera[name].inverse()
+    views = [view for view in placed.views if view.pair == name]
+    shots = tuple(
+        StripedView(
+            replace(view, camera_from_board=camera_from_rig @ placed.rig_from_board[view.target]),
+            rig.board(view.board),
+            boundaries[name, view.shot, view.board],
+        )
+        for view in views
+        if (name, view.shot, view.board) in boundaries
+    )
+    return PlacedPair(
+        name,
+        placed.cameras[name],
+        own,
+        rig.pair(name).projector,
+        placed.rms_px[name],
+        len(views),
+        shots,
+        alone=len(placed.cameras) == 1,
+    )
+
+
+def placed_again(rig: Rig, placed: PlacedRig, pair: PairCalibration) -> PlacedRig:
+    """Where a pair's stripes changed its camera: camera and boards as that camera sees them, the
+    board that fixes the rig frame where it lies. Only a pair by itself is refined so."""
+    if pair.camera == placed.cameras[pair.name]:
+        return placed
+    seen = {
+        view.target: locate_board(pair.camera, PlanarView(view.shot, view.points, view.pixels))[0]
+        for view in placed.views
+    }
+    frame = frame_target(rig)
+    rig_from_camera = (
+        placed.rig_from_board[frame] @ seen[frame].inverse()
+        if frame in seen
+        else placed.rig_from_camera[pair.name]
+    )
+    return replace(
+        placed,
+        cameras={pair.name: pair.camera},
+        rig_from_camera={pair.name: rig_from_camera},
+        rig_from_board={target: rig_from_camera @ board for target, board in seen.items()},
     )
 
 
@@ -122,105 +208,3 @@ def through_the_stripes(pairs: Mapping[str, PairCalibration]) -> Iterator[str]:
             f"measured by the stripes, boards lie {mean:+.3f} mm (mean) and {rms:.3f} mm (RMS) from "
             f"where the corners put them; worst: {worst}, {boards[worst][1]:.3f} mm"
         )
-
-
-def placed_again(rig: Rig, placed: PlacedRig, pair: PairCalibration) -> PlacedRig:
-    """Where a pair's stripes changed its camera: camera and boards as that camera sees them, the
-    board that fixes the rig frame where it lies. Only a pair by itself is refined so."""
-    if pair.camera == placed.cameras[pair.name]:
-        return placed
-    seen = {
-        view.target: locate_board(pair.camera, PlanarView(view.shot, view.points, view.pixels))[0]
-        for view in placed.views
-    }
-    frame = frame_target(rig)
-    rig_from_camera = (
-        placed.rig_from_board[frame] @ seen[frame].inverse()
-        if frame in seen
-        else placed.rig_from_camera[pair.name]
-    )
-    return replace(
-        placed,
-        cameras={pair.name: pair.camera},
-        rig_from_camera={pair.name: rig_from_camera},
-        rig_from_board={target: rig_from_camera @ board for target, board in seen.items()},
-    )
-
-
-def find_all_boards(
-    rig: Rig, captures: Captures, notes: list[str], progress: Progress = silent
-) -> list[BoardView]:
-    """Boards in all lit images; images that cannot be read, or show no board, go into `notes`."""
-
-    def find(sequence: ImageSequence) -> tuple[list[BoardView], str | None]:
-        where = f"{sequence.lit} (pair {sequence.pair}, shot {sequence.shot})"
-        try:
-            image = read_lit(sequence, rig.pair(sequence.pair).camera)
-            found = find_boards(image, rig.boards, pair=sequence.pair, shot=sequence.shot)
-        except BodyscanError as error:
-            return [], str(error)
-        return found, None if found else f"{where}: no board found"
-
-    results = threaded(find, captures.sequences, stage="finding boards", progress=progress)
-    notes += [note for _, note in results if note]
-    return [view for found, _ in results for view in found]
-
-
-def calibrate_cameras(
-    rig: Rig,
-    views: Sequence[BoardView],
-    boards: Mapping[str, Board],
-    progress: Progress = silent,
-) -> tuple[dict[str, CameraCalibration], dict[str, str]]:
-    """Every pair's camera by itself; pairs that fail, with the reason."""
-
-    def calibrate(name: str) -> CameraCalibration | str:
-        spec = rig.pair(name).camera
-        own = [v for v in views if v.pair == name and usable(v, boards[v.board])]
-        try:
-            return calibrate_camera(
-                [planar_view(view, boards[view.board]) for view in own], spec.width, spec.height
-            )
-        except BodyscanError as error:
-            return str(error)
-
-    names = [pair.name for pair in rig.pairs]
-    results = threaded(calibrate, names, stage="calibrating cameras", progress=progress)
-    done = {n: r for n, r in zip(names, results, strict=True) if isinstance(r, CameraCalibration)}
-    failed = {n: r for n, r in zip(names, results, strict=True) if isinstance(r, str)}
-    return done, failed
-
-
-def locate_views(
-    views: Sequence[BoardView],
-    cameras: Mapping[str, CameraCalibration],
-    boards: Mapping[str, Board],
-    notes: list[str],
-) -> list[LocatedView]:
-    """The pose of each board in the camera that saw it; views that fit no pose are dropped."""
-    located = []
-    for view in views:
-        board = boards[view.board]
-        if view.pair not in cameras or not usable(view, board):
-            continue
-        pose, residuals = locate_board(cameras[view.pair].camera, planar_view(view, board))
-        rms = float((residuals**2).sum(axis=1).mean() ** 0.5)
-        if rms > max(1.0, 6.0 * cameras[view.pair].rms_px):
-            notes.append(
-                f"{view.pair}: board {board.name} in shot {view.shot} fits no pose ({rms:.2f} px); "
-                "not used"
-            )
-            continue
-        symmetries = board_symmetries(board) if view.turnable else board_symmetries(board)[:1]
-        located.append(
-            LocatedView(
-                view.pair,
-                view.shot,
-                view.board,
-                corner_points(board)[view.corner_ids],
-                view.pixels,
-                pose,
-                symmetries,
-            )
-        )
-    return located

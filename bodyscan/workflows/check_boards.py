@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.located_view import LocatedView
-from bodyscan.calibration.pair import BoardBoundaries, boundaries_near, on_board
-from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.errors import BoardNotFound, BodyscanError
+from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
+from bodyscan.captures.folder import Captures
+from bodyscan.errors import BoardNotFound
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.ray_depths import intersect_rays
-from bodyscan.progress import Progress, silent, threaded
+from bodyscan.outcome import Outcome
+from bodyscan.progress import Progress, silent
 from bodyscan.registration.drift import Drift, Move, find_drift, seen_pose
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.workflows.calibrate_rig import find_all_boards, locate_views
-from bodyscan.workflows.decoding import decode_sequence
+from bodyscan.workflows.decode_boards import decode_on_boards
+from bodyscan.workflows.find_boards import find_all_boards, locate_views
 
 Array = NDArray[np.float64]
 
@@ -75,11 +76,9 @@ def check_boards(
 
     Raises BoardNotFound if no board is seen by two pairs.
     """
-    notes: list[str] = []
-    views = find_all_boards(calibration.rig, captures, notes, progress)
-    cameras = _cameras(calibration)
-    boards = {board.name: board for board in calibration.rig.boards}
-    located = [view for view in locate_views(views, cameras, boards, notes) if not view.ambiguous]
+    views = find_all_boards(calibration.rig, captures, progress)
+    seen_by = locate_views(calibration.rig, views.value, _cameras(calibration))
+    located = [view for view in seen_by.value if not view.ambiguous]
     poses = [
         seen_pose(view, calibration.pairs[view.pair].camera, _noise_px(calibration, view.pair))
         for view in located
@@ -94,10 +93,11 @@ def check_boards(
             remedy="show a board whose corners are numbered (ChArUco) to as many cameras as can see "
             "it together",
         )
-    stripes = _stripe_offsets(calibration, captures, views, located, notes, progress)
+    stripes = _stripe_offsets(calibration, captures, views.value, located, progress)
     seen = tuple(sorted({view.pair for view in located}))
     unseen = tuple(sorted(set(calibration.pairs) - set(seen)))
-    return BoardCheck(drift, stripes, seen, unseen, tuple(notes))
+    notes = (*views.notes, *seen_by.notes, *stripes.notes)
+    return BoardCheck(drift, stripes.value, seen, unseen, notes)
 
 
 def repaired(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibration:
@@ -149,41 +149,23 @@ def _stripe_offsets(
     captures: Captures,
     views: Sequence[BoardView],
     located: Sequence[LocatedView],
-    notes: list[str],
     progress: Progress,
-) -> tuple[StripeOffset, ...]:
+) -> Outcome[tuple[StripeOffset, ...]]:
     """Of every pair that took stripes on a board it saw."""
-    seen = {(view.pair, view.shot): view for view in views}
-    wanted: dict[tuple[str, str], list[LocatedView]] = defaultdict(list)
-    for one in located:
-        wanted[one.pair, one.shot].append(one)
-    sequences = [
-        s
-        for s in captures.sequences
-        if s.has_stripes
-        and (s.pair, s.shot) in wanted
-        and calibration.pairs[s.pair].light is not None
-    ]
-
-    def read(sequence: ImageSequence) -> BoardBoundaries | str:
-        try:
-            stripes = decode_sequence(sequence, calibration.rig.pair(sequence.pair))
-        except BodyscanError as error:
-            return str(error)
-        return boundaries_near(stripes, seen[sequence.pair, sequence.shot])
-
-    results = threaded(read, sequences, stage="decoding stripes", progress=progress)
+    known = {
+        (view.pair, view.shot, view.board): view
+        for view in located
+        if calibration.pairs[view.pair].light is not None
+    }
+    wanted = [view for view in views if (view.pair, view.shot, view.board) in known]
+    decoded = decode_on_boards(calibration.rig, captures, wanted, progress)
     parts: dict[str, list[Array]] = defaultdict(list)
-    for sequence, found in zip(sequences, results, strict=True):
-        if isinstance(found, str):
-            notes.append(found)
-            continue
-        for view in wanted[sequence.pair, sequence.shot]:
-            parts[sequence.pair].append(_off_board(calibration, view, found))
-    return tuple(
-        offset
-        for pair, own in sorted(parts.items())
-        if (offset := _offset(pair, np.concatenate(own))) is not None
+    for key, boundaries in decoded.value.items():
+        parts[key[0]].append(_off_board(calibration, known[key], boundaries))
+    offsets = [_offset(pair, np.concatenate(own)) for pair, own in sorted(parts.items())]
+    lost = (f"{pair}: {reason}" for pair, reason in decoded.failures.items())
+    return Outcome(
+        tuple(offset for offset in offsets if offset is not None), (*decoded.notes, *lost)
     )
 
 
@@ -195,10 +177,9 @@ def _off_board(
     projector = rig.pair(view.pair).projector
     assert projector is not None
     assert pair.light is not None
-    face = float(view.points[0, 2])
-    board = rig.board(view.board)
+    shot = StripedView(view, rig.board(view.board), boundaries)
     points = on_board(
-        pair.camera, projector, board, view.camera_from_board, face, boundaries, number=0
+        pair.camera, projector, shot.board, shot.camera_from_face, boundaries, number=0
     )
     rays = points.points / points.points[:, 2:]
     measured = intersect_rays(pair.light, rays, points.index.astype(float))

@@ -83,7 +83,7 @@ def check_scans(
     """Raises ScanFailed if a scan shows nobody."""
     alignments = []
     for captures in scans:
-        images, _ = range_images(calibration, captures, progress)
+        images = range_images(calibration, captures, progress).value
         cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
         seen = require_subject(cleaned)
         alignments.append(align(seen, calibration.rig_from_camera, calibration.covariance))

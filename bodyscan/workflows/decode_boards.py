@@ -3,52 +3,50 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.pair import BoardBoundaries, boundaries_near
+from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_near
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.errors import BodyscanError, plainly
+from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, threaded
-from bodyscan.registration.rig_solve import PlacedRig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.decoding import decode_sequence
 
 FEW = 2
 """So many shots are told one by one, more with the same fault together."""
 
+ViewKey = tuple[str, str, str]
+"""Pair, shot and board: which view."""
+
 Failure = tuple[ImageSequence, BodyscanError]
 
 
-@dataclass(frozen=True, eq=False)
-class DecodedBoards:
-    """boundaries: near each board, by (pair, shot, board).  notes: on sequences that are bad.
-
-    failed: pairs of which none could be decoded, all for the same reason.
-    """
-
-    boundaries: dict[tuple[str, str, str], BoardBoundaries]
-    notes: tuple[str, ...]
-    failed: dict[str, str]
-
-
 def decode_on_boards(
-    rig: Rig,
-    captures: Captures,
-    placed: PlacedRig,
-    views: Sequence[BoardView],
-    progress: Progress = silent,
-) -> DecodedBoards:
-    """Stripe boundaries near the boards that took part in placing the rig."""
-    kept = {(view.pair, view.shot, view.board) for view in placed.views}
-    wanted: dict[tuple[str, str], list[BoardView]] = {}
-    for view in views:
-        if (view.pair, view.shot, view.board) in kept:
-            wanted.setdefault((view.pair, view.shot), []).append(view)
-    sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
+    rig: Rig, captures: Captures, views: Iterable[BoardView], progress: Progress = silent
+) -> Outcome[dict[ViewKey, BoardBoundaries]]:
+    """Stripe boundaries near each of these views; sequences that are bad are noted.
 
-    def decode(sequence: ImageSequence) -> dict[tuple[str, str, str], BoardBoundaries] | Failure:
+    A pair of which none can be decoded, all for the same reason, is a failure.
+    """
+    wanted: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
+    for view in views:
+        wanted[view.pair, view.shot].append(view)
+    sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
+    boundaries, failures = _decode(rig, sequences, wanted, progress)
+    failed = hopeless(failures, {pair for pair, _, _ in boundaries})
+    kept = [failure for failure in failures if failure[0].pair not in failed]
+    return Outcome(boundaries, tuple(failure_notes(kept)), failed)
+
+
+def _decode(
+    rig: Rig,
+    sequences: Sequence[ImageSequence],
+    wanted: Mapping[tuple[str, str], Sequence[BoardView]],
+    progress: Progress,
+) -> tuple[dict[ViewKey, BoardBoundaries], list[Failure]]:
+    def decode(sequence: ImageSequence) -> dict[ViewKey, BoardBoundaries] | Failure:
         try:
             stripes = decode_sequence(sequence, rig.pair(sequence.pair))
         except BodyscanError as error:
@@ -59,17 +57,11 @@ def decode_on_boards(
         }
 
     results = threaded(decode, sequences, stage="decoding stripes", progress=progress)
-    boundaries = {
-        key: found
-        for result in results
-        if isinstance(result, dict)
-        for key, found in result.items()
-    }
-    failures = [result for result in results if not isinstance(result, dict)]
-    failed = hopeless(failures, {pair for pair, _, _ in boundaries})
-    return DecodedBoards(
-        boundaries, tuple(failure_notes([f for f in failures if f[0].pair not in failed])), failed
-    )
+    boundaries: dict[ViewKey, BoardBoundaries] = {}
+    for result in results:
+        if isinstance(result, dict):
+            boundaries |= result
+    return boundaries, [result for result in results if not isinstance(result, dict)]
 
 
 def hopeless(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:
@@ -85,6 +77,7 @@ def hopeless(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:
 
 
 def failure_notes(failures: Sequence[Failure]) -> Iterator[str]:
+    """A line a shot, or one for all shots of a pair that failed alike."""
     same: dict[tuple[str, str], list[Failure]] = defaultdict(list)
     for failure in failures:
         same[failure[0].pair, plainly(failure[1])].append(failure)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.errors import BodyscanError, ScanFailed
+from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.scan_volume import stripes_in_volume
@@ -14,8 +15,8 @@ from bodyscan.workflows.decoding import decode_sequence
 
 def range_images(
     calibration: RigCalibration, captures: Captures, progress: Progress = silent
-) -> tuple[list[RangeImage], dict[str, str]]:
-    """The range image of every calibrated pair, and the pairs that gave none, with the reason.
+) -> Outcome[list[RangeImage]]:
+    """The range image of every calibrated pair; pairs that gave none are failures.
 
     They show the scan volume and a little around it. Raises ScanFailed if no pair gives one.
     """
@@ -48,4 +49,4 @@ def range_images(
     if not images:
         reasons = "\n".join(f"  {name}: {reason}" for name, reason in failed.items())
         raise ScanFailed(f"no pair gave a range image:\n{reasons}")
-    return images, failed
+    return Outcome(images, failures=failed)

@@ -22,6 +22,6 @@ def scan(
     empty: captures of the rig without anybody in it, whose surfaces are no part of the subject.
     Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left.
     """
-    images, failed = range_images(calibration, captures, progress)
-    background = range_images(calibration, empty, progress)[0] if empty else ()
-    return fuse(calibration, images, failed, settings, progress, empty=background)
+    images = range_images(calibration, captures, progress)
+    background = range_images(calibration, empty, progress).value if empty else ()
+    return fuse(calibration, images, settings, progress, empty=background)

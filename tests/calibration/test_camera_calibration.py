@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from bodyscan.calibration.camera import (
-    PlanarView,
     calibrate_camera,
     locate_board,
 )
+from bodyscan.calibration.planar_view import PlanarView
 from bodyscan.calibration.zhang import homography, matrix_from_homographies
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import Camera

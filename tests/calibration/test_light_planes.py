@@ -2,7 +2,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyscan.calibration.light_planes import boundary_points, fit_light_planes, join
+from bodyscan.calibration.boundary_points import boundary_points, join
+from bodyscan.calibration.light_planes import fit_light_planes
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt

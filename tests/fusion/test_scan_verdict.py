@@ -14,6 +14,7 @@ from bodyscan.errors import ScanFailed
 from bodyscan.fusion.scan import Scan, ScanSettings, fuse
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.outcome import Outcome
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Volume
@@ -79,7 +80,7 @@ def fused(images, *, placed=None, failed=None, volume: Volume = RIG.volume, empt
     covariance = PlacingCovariance(tuple(placed), np.diag(sigmas**2))
     rig = RIG.model_copy(update={"volume": volume})
     calibration = RigCalibration(rig, {}, placed, covariance, {}, {}, ())
-    return fuse(calibration, images, failed or {}, SETTINGS, empty=empty)
+    return fuse(calibration, Outcome(images, failures=failed or {}), SETTINGS, empty=empty)
 
 
 def said(scan: Scan) -> str:
@@ -199,6 +200,6 @@ def test_alignment_takes_no_part_if_not_wanted(images):
     placed = placings()
     known = PlacingCovariance(tuple(placed), np.zeros((6 * len(placed), 6 * len(placed))))
     calibration = RigCalibration(RIG, {}, placed, known, {}, {}, ())
-    scan = fuse(calibration, images, {}, replace(SETTINGS, alignment=None))
+    scan = fuse(calibration, Outcome(images), replace(SETTINGS, alignment=None))
     assert scan.alignment is None
     assert scan.verdict.grade == "good"

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
-from bodyscan.calibration.camera import PlanarView, locate_board
+from bodyscan.calibration.camera import locate_board
+from bodyscan.calibration.planar_view import PlanarView
 from bodyscan.registration.rig_solve import place_rig
 
 PLACINGS, CAMERAS = ring_of_cameras(heights=(700, 1200))
@@ -46,7 +47,7 @@ def placed():
 
 def rms(placed):
     errors = [
-        placed.rig_from_camera[name].translation - true.translation
+        placed.value.rig_from_camera[name].translation - true.translation
         for name, true in PLACINGS.items()
     ]
     return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
@@ -54,7 +55,7 @@ def rms(placed):
 
 def test_the_bend_and_the_stretch_are_measured(placed):
     bent, _ = placed
-    shape = bent.board_shapes[CHARUCO.name]
+    shape = bent.value.board_shapes[CHARUCO.name]
     found = shape.points + shape.offsets
     true = really(shape.points)
     gaps = np.linalg.norm(found[:, None] - found, axis=2)
@@ -72,10 +73,10 @@ def test_the_rig_is_as_good_as_with_a_flat_board(placed):
     bent, flat = placed
     # The size of the board is 0.3 per mille off on average, so are the distances of the cameras.
     assert rms(bent) < 2.0 * rms(flat) + 1e-3 * 1300.0
-    assert max(bent.rms_px.values()) < 1.1 * max(flat.rms_px.values())
+    assert max(bent.value.rms_px.values()) < 1.1 * max(flat.value.rms_px.values())
 
 
 def test_a_flat_board_is_left_alone(placed):
     _, flat = placed
-    assert not flat.board_shapes
+    assert not flat.value.board_shapes
     assert not flat.notes

@@ -16,7 +16,7 @@ POLES = {name: name[:2] for name in PLACINGS}
 @pytest.fixture(scope="module")
 def calibrated():
     views, _ = ring_views(PLACINGS, CAMERAS, shots=40, noise_px=NOISE_PX, seed=5)
-    return place_rig(ring_rig(PLACINGS), views, CAMERAS)
+    return place_rig(ring_rig(PLACINGS), views, CAMERAS).value
 
 
 def drift_after(calibrated, moved: dict[str, RigidTransform], shots=3, seed=11):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
-from bodyscan.calibration.camera import PlanarView, locate_board
+from bodyscan.calibration.camera import locate_board
+from bodyscan.calibration.planar_view import PlanarView
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.rig_solve import place_rig
@@ -22,8 +23,8 @@ def place(views):
 
 def rms(placed):
     errors = [
-        placed.rig_from_camera[name].translation - PLACINGS[name].translation
-        for name in placed.rig_from_camera
+        placed.value.rig_from_camera[name].translation - PLACINGS[name].translation
+        for name in placed.value.rig_from_camera
     ]
     return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
 
@@ -57,7 +58,7 @@ def test_a_camera_with_half_its_shots_missing(seen):
     missing = {view.shot for view in own[::2]}
     placed = place([v for v in views if not (v.pair == "p2-3" and v.shot in missing)])
     others = [
-        np.linalg.norm(placed.rig_from_camera[n].translation - PLACINGS[n].translation)
+        np.linalg.norm(placed.value.rig_from_camera[n].translation - PLACINGS[n].translation)
         for n in PLACINGS
         if n != "p2-3"
     ]
@@ -70,7 +71,7 @@ def test_a_pair_entirely_absent(seen):
     cameras = {name: camera for name, camera in CAMERAS.items() if name != "p3-2"}
     rig = ring_rig(PLACINGS)
     placed = place_rig(rig, [view for view in views if view.pair != "p3-2"], cameras)
-    assert sorted(placed.rig_from_camera) == sorted(cameras)
+    assert sorted(placed.value.rig_from_camera) == sorted(cameras)
     assert rms(placed) < 1.2 * clean
 
 
@@ -131,9 +132,9 @@ def test_a_camera_that_took_its_pictures_at_other_times(seen, step_mm):
         for v in views
     ]
     placed = place(changed)
-    assert list(placed.left_out) == ["p1-3"]
-    assert "p1-3" in placed.left_out["p1-3"]
-    assert "taken together" in placed.left_out["p1-3"]
+    assert list(placed.failures) == ["p1-3"]
+    assert "p1-3" in placed.failures["p1-3"]
+    assert "taken together" in placed.failures["p1-3"]
     assert rms(placed) < 1.2 * clean
 
 

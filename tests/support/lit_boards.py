@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, join
-from bodyscan.calibration.camera import PlanarView, locate_board
+from bodyscan.calibration.camera import locate_board
+from bodyscan.calibration.planar_view import PlanarView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform

@@ -15,7 +15,7 @@ from bodyscan.errors import ResultError
 from bodyscan.fusion.storage import load_scan
 from bodyscan.registration.storage import load_calibration
 from bodyscan.rig.rig_file import load_rig
-from bodyscan.workflows.calibrate_rig import calibrate_cameras, find_all_boards
+from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards
 
 
 @pytest.fixture
@@ -57,12 +57,11 @@ def test_bad_images_cost_only_themselves(copy):
 def test_a_pair_with_too_few_poses_is_named_and_left_out(workspace):
     rig = load_rig(workspace.folder / "rig.yaml")
     captures = open_captures(rig, workspace.folder / "rig.yaml")
-    boards = {board.name: board for board in rig.boards}
-    views = find_all_boards(rig, captures, [])
+    views = find_all_boards(rig, captures).value
     few = [v for v in views if v.pair != "p2-3"] + [v for v in views if v.pair == "p2-3"][:2]
-    done, failed = calibrate_cameras(rig, few, boards)
-    assert sorted(done) == ["p1-2", "p1-3", "p2-2"]
-    assert "at least 3" in failed["p2-3"]
+    cameras = calibrate_cameras(rig, few)
+    assert sorted(cameras.value) == ["p1-2", "p1-3", "p2-2"]
+    assert "at least 3" in cameras.failures["p2-3"]
 
 
 def test_an_image_without_a_board_is_named(copy):
@@ -72,8 +71,7 @@ def test_an_image_without_a_board_is_named(copy):
     )
     cv2.imwrite(str(path), np.full((512, 640), 90, np.uint8))
     rig = load_rig(copy / "rig.yaml")
-    notes: list[str] = []
-    find_all_boards(rig, open_captures(rig, copy / "rig.yaml"), notes)
+    notes = find_all_boards(rig, open_captures(rig, copy / "rig.yaml")).notes
     assert any(str(path) in note and "no board found" in note for note in notes)
 
 

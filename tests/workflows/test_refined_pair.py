@@ -25,7 +25,7 @@ def test_boards_follow_the_camera(change):
     placings, cameras = ring_of_cameras(poles=1, heights=(850,))
     views, _ = ring_views(placings, cameras, shots=8)
     rig = ring_rig(placings, fixed="p1-1")
-    placed = place_rig(rig, views, cameras)
+    placed = place_rig(rig, views, cameras).value
     camera = placed.cameras["p1-1"]
     other = replace(camera, alpha=camera.alpha + change, beta=camera.beta + change)
     pair = PairCalibration("p1-1", other, np.eye(len(camera.parameters)), None, PairQuality(0.1, 8))

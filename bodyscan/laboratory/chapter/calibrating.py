@@ -11,13 +11,12 @@ from bodyscan.boards.board import corner_points
 from bodyscan.calibration.boundary_points import binned
 from bodyscan.calibration.camera import (
     CameraCalibration,
-    PlanarView,
     calibrate_camera,
 )
 from bodyscan.calibration.joint_refinement import striped_board
 from bodyscan.calibration.light import fit_light
 from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
-from bodyscan.calibration.pair import planar_view
+from bodyscan.calibration.planar_view import PlanarView, planar_view
 from bodyscan.calibration.refinement_choice import refine_where_better
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.laboratory.chapter.captures import TARGET, ChapterCaptures

@@ -13,13 +13,9 @@ from numpy.typing import NDArray
 
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.boundary_points import BoundaryPoints, join
-from bodyscan.calibration.camera import (
-    CameraCalibration,
-    PlanarView,
-    calibrate_camera,
-    locate_board,
-)
-from bodyscan.calibration.pair import boundaries_near, on_board, planar_view
+from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
+from bodyscan.calibration.planar_view import PlanarView, planar_view
+from bodyscan.calibration.striped_view import boundaries_near, on_board
 from bodyscan.calibration.zhang import homography
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
@@ -125,7 +121,6 @@ def located(
             target.projector,
             target.board,
             camera_from_board[shot.view.shot],
-            0.0,
             boundaries_near(shot.stripes, shot.view),
             number,
         )
@@ -167,9 +162,7 @@ def _by_homography(
         return camera_from_board.apply(flat)
 
     # What lies on the checkered area is judged as for every other model.
-    everything = on_board(
-        camera, target.projector, target.board, camera_from_board, 0.0, near, number
-    )
+    everything = on_board(camera, target.projector, target.board, camera_from_board, near, number)
     pixels = camera.project(everything.points)
     horizontal = target.projector.direction == "horizontal"
     across = np.array([0.0, 0.5]) if horizontal else np.array([0.5, 0.0])

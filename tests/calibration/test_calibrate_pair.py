@@ -3,25 +3,32 @@
 import numpy as np
 import pytest
 
+from bodyscan.calibration.calibrate_pair import without_disagreeing
 from bodyscan.calibration.located_view import LocatedView
 from bodyscan.calibration.stripe_agreement import Disagreement
+from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.workflows.calibrate_pairs import agreeing
+from bodyscan.rig.board import Board
 
 NOTHING = np.zeros((0, 3))
-VIEWS = [
-    LocatedView("p1-1", shot, "board", NOTHING, NOTHING, RigidTransform.identity(), ())
+BOARD = Board(name="board", columns=8, rows=5, square_mm=30.0)
+STRIPES = BoardBoundaries(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
+SHOTS = [
+    StripedView(
+        LocatedView("p1-1", shot, "board", NOTHING, NOTHING, RigidTransform.identity(), ()),
+        BOARD,
+        STRIPES,
+    )
     for shot in ("a", "b", "c", "d", "e")
 ]
 
 
 def test_one_shot_that_fits_no_other_is_left_out_and_named():
-    notes: list[str] = []
     found = Disagreement(np.array([0, 1, 3, 4]), np.array([2]), 2.5, 0.1)
-    kept = agreeing("p1-1", VIEWS, found, notes)
-    assert [view.shot for view in kept] == ["a", "b", "d", "e"]
-    (note,) = notes
+    kept = without_disagreeing("p1-1", SHOTS, found)
+    assert [shot.view.shot for shot in kept.value] == ["a", "b", "d", "e"]
+    (note,) = kept.notes
     assert note.startswith("p1-1: the stripes of shot c ")
     assert "2.5 px" in note
 
@@ -29,5 +36,5 @@ def test_one_shot_that_fits_no_other_is_left_out_and_named():
 def test_a_projector_that_moved_costs_the_pair_and_the_shots_are_named():
     found = Disagreement(np.array([0, 1, 2]), np.array([3, 4]), 2.5, 0.1)
     with pytest.raises(PairFailed, match="moved between shots c and d") as error:
-        agreeing("p1-1", VIEWS, found, [])
+        without_disagreeing("p1-1", SHOTS, found)
     assert error.value.where == "pair p1-1"

@@ -1,0 +1,22 @@
+"""What a step of a workflow gives: its value, and what has to be said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+Value = TypeVar("Value", covariant=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome(Generic[Value]):
+    """value: what was asked for, as far as it could be had.
+
+    notes: a line for each thing that a person should know: what was dropped and why.
+    failures: pairs that the step lost, by name, with the reason.
+    """
+
+    value: Value
+    notes: tuple[str, ...] = ()
+    failures: Mapping[str, str] = field(default_factory=dict)

@@ -1,0 +1,93 @@
+"""Boards found in all lit images, cameras calibrated from them, and each board's pose per view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from bodyscan.boards.board import corner_points
+from bodyscan.boards.detection import find_boards
+from bodyscan.boards.view import BoardView
+from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
+from bodyscan.calibration.located_view import LocatedView, board_symmetries
+from bodyscan.calibration.planar_view import planar_view, usable
+from bodyscan.captures.folder import Captures, ImageSequence
+from bodyscan.captures.images import read_lit
+from bodyscan.errors import BodyscanError
+from bodyscan.outcome import Outcome
+from bodyscan.progress import Progress, silent, threaded
+from bodyscan.rig.rig import Rig
+
+NO_POSE_PX = 1.0
+"""A view that is farther off its best pose than this, and than NO_POSE_TIMES its camera's usual
+error, shows another board or mixed-up corners: real corners are good to a few tenths of a pixel."""
+NO_POSE_TIMES = 6.0
+
+
+def find_all_boards(
+    rig: Rig, captures: Captures, progress: Progress = silent
+) -> Outcome[list[BoardView]]:
+    """Boards in all lit images; images that cannot be read, or show no board, are noted."""
+
+    def find(sequence: ImageSequence) -> tuple[list[BoardView], str | None]:
+        where = f"{sequence.lit} (pair {sequence.pair}, shot {sequence.shot})"
+        try:
+            image = read_lit(sequence, rig.pair(sequence.pair).camera)
+            found = find_boards(image, rig.boards, pair=sequence.pair, shot=sequence.shot)
+        except BodyscanError as error:
+            return [], str(error)
+        return found, None if found else f"{where}: no board found"
+
+    results = threaded(find, captures.sequences, stage="finding boards", progress=progress)
+    return Outcome(
+        [view for found, _ in results for view in found],
+        tuple(note for _, note in results if note),
+    )
+
+
+def calibrate_cameras(
+    rig: Rig, views: Sequence[BoardView], progress: Progress = silent
+) -> Outcome[dict[str, CameraCalibration]]:
+    """Every pair's camera by itself; those that cannot be calibrated are failures."""
+
+    def calibrate(name: str) -> CameraCalibration | str:
+        spec = rig.pair(name).camera
+        own = [v for v in views if v.pair == name and usable(v, rig.board(v.board))]
+        try:
+            return calibrate_camera(
+                [planar_view(view, rig.board(view.board)) for view in own], spec.width, spec.height
+            )
+        except BodyscanError as error:
+            return str(error)
+
+    names = [pair.name for pair in rig.pairs]
+    results = threaded(calibrate, names, stage="calibrating cameras", progress=progress)
+    both = list(zip(names, results, strict=True))
+    return Outcome(
+        {name: found for name, found in both if isinstance(found, CameraCalibration)},
+        failures={name: found for name, found in both if isinstance(found, str)},
+    )
+
+
+def locate_views(
+    rig: Rig, views: Sequence[BoardView], cameras: Mapping[str, CameraCalibration]
+) -> Outcome[list[LocatedView]]:
+    """The pose of each board in the camera that saw it; views that fit no pose are dropped."""
+    located, notes = [], []
+    for view in views:
+        board = rig.board(view.board)
+        if view.pair not in cameras or not usable(view, board):
+            continue
+        pose, residuals = locate_board(cameras[view.pair].camera, planar_view(view, board))
+        rms = float((residuals**2).sum(axis=1).mean() ** 0.5)
+        if rms > max(NO_POSE_PX, NO_POSE_TIMES * cameras[view.pair].rms_px):
+            notes.append(
+                f"{view.pair}: board {board.name} in shot {view.shot} fits no pose ({rms:.2f} px); "
+                "not used"
+            )
+            continue
+        symmetries = board_symmetries(board) if view.turnable else board_symmetries(board)[:1]
+        points = corner_points(board)[view.corner_ids]
+        located.append(
+            LocatedView(view.pair, view.shot, view.board, points, view.pixels, pose, symmetries)
+        )
+    return Outcome(located, tuple(notes))
