@@ -115,16 +115,25 @@ def run_commands(
         if name == "simulate" and (workspace / "truth" / "truth.json").exists():
             continue  # the same rig gives the same bytes
         started = time.perf_counter()
-        outputs[name], memory[name] = _run([name, *map(str, arguments)])
+        outputs[name], memory[name] = _run([name, *map(_from_project, arguments)])
         seconds[name] = time.perf_counter() - started
     return outputs, seconds, memory
+
+
+def _from_project(argument: object) -> str:
+    """Paths relative to the project: what is printed names no folder of this machine."""
+    if isinstance(argument, Path) and argument.is_relative_to(PROJECT):
+        return str(argument.relative_to(PROJECT))
+    return str(argument)
 
 
 def _run(arguments: list[str]) -> tuple[str, float]:
     """What a bodyscan command printed, and the peak memory (GiB) of its own process."""
     with tempfile.TemporaryFile("w+") as printed:
         line = [sys.executable, "-m", "bodyscan", *arguments]
-        process = subprocess.Popen(line, stdout=printed, stderr=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            line, stdout=printed, stderr=subprocess.PIPE, text=True, cwd=PROJECT
+        )
         assert process.stderr is not None
         complaints = process.stderr.read()
         _, status, usage = os.wait4(process.pid, 0)
