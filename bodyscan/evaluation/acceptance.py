@@ -16,13 +16,14 @@ from scipy.spatial import ConvexHull
 from bodyscan.arrays import Array, Mask
 from bodyscan.errors import FailedWork
 from bodyscan.evaluation.planes import best_plane
-from bodyscan.evaluation.spheres import Sphere, find_spheres, fit_sphere
+from bodyscan.evaluation.sphere_search import find_spheres
+from bodyscan.evaluation.spheres import Sphere, fit_sphere
 
 REJECTED = 0.003
 """So many of the points may be left out, the farthest off, as VDI/VDE 2634 allows."""
 SHELL_SHARE = 0.9
 """ISO 20685-2 asks for the shell that holds nine tenths of the points."""
-REACH = 0.15
+OWN = 0.15
 """Points so far off a sphere's surface, in radii, are not taken for its own."""
 FACING = 0.8
 """Nor those whose normal is farther than 37 degrees from the radius: a stand, a rim."""
@@ -81,7 +82,7 @@ def read_sphere(points: Array, normals: Array, near: Sphere, radius_mm: float) -
     """
     arm = points - near.centre
     length = np.linalg.norm(arm, axis=1)
-    own = np.abs(length - radius_mm) < REACH * radius_mm
+    own = np.abs(length - radius_mm) < OWN * radius_mm
     own &= np.einsum("nc,nc->n", arm, normals) > FACING * length
     fitted = fit_sphere(points[own])
     off = _kept(fitted.distances(points[own]))

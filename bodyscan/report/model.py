@@ -14,10 +14,6 @@ from bodyscan.arrays import Array, Bytes, Indices
 
 Legend = dict[str, Any]
 
-MOST_VERTICES = 65_536
-"""As many as a 16-bit index tells apart."""
-STEPS = 65_535
-
 
 @dataclass(frozen=True, eq=False)
 class Layer:
@@ -52,6 +48,11 @@ class Standpoint:
 
     azimuth_deg: float = 25.0
     elevation_deg: float = 6.0
+
+
+MOST_VERTICES = 65_536
+"""As many as a 16-bit index tells apart."""
+STEPS = 65_535
 
 
 def pack(

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bodyscan.errors import FailedWork
+from bodyscan.evaluation.sphere_search import find_spheres
 from bodyscan.evaluation.spheres import (
     Sphere,
     centre_distances,
-    find_spheres,
     fit_sphere,
     mean_square,
     measure_sphere,

@@ -28,9 +28,6 @@ from bodyscan.laboratory.rivals.targets import (
 
 Array = NDArray[np.float64]
 
-MATRIX_POINTS = 20000
-"""So many points fix the few numbers of a matrix far better than the model fits."""
-
 
 @dataclass(frozen=True, eq=False)
 class Approach:
@@ -70,6 +67,10 @@ Model = Callable[[BoundaryPoints, int, Axis], LightPlanes]
 def free_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
     """One plane a stripe (Eq. 6)."""
     return fit_light_planes(points, stripes, direction).planes
+
+
+MATRIX_POINTS = 20000
+"""So many points fix the few numbers of a matrix far better than the model fits."""
 
 
 def pinhole_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
