@@ -105,8 +105,9 @@ def _run(
 ) -> int:
     """Returns the exit code: 1 if a job was set aside, or a scan has to be repeated."""
     from bodyscan.jobs import allocation, display, object_storage
-    from bodyscan.jobs.batch import finish, run_batch, run_locally, supervise_job
+    from bodyscan.jobs.batch import finish, run_batch, run_locally
     from bodyscan.jobs.cluster import run_on_cluster
+    from bodyscan.jobs.supervision import supervise_job
 
     resources = jobs[0].pipeline.resources
     shares = allocation.allocate(

@@ -7,24 +7,25 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from bodyscan.errors import BadInput, BodyscanError, FailedWork
 from bodyscan.files.locking import file_lock, for_owner_only
 from bodyscan.jobs.allocation import Allocation
 from bodyscan.jobs.job import BATCH_LOCK, STAGE, Job, write_job
-from bodyscan.jobs.supervision import COMMAND, JobResult, Listen, ignore_events, supervise
+from bodyscan.jobs.supervision import (
+    COMMAND,
+    JobProcess,
+    JobResult,
+    Listen,
+    ignore_events,
+    supervise_job,
+)
 
 Run = Callable[[Sequence[Job]], Iterator[JobResult]]
 """Starts jobs and yields how each ended, as soon as it did."""
 
-Work = Callable[..., JobResult]
+Work = Callable[[Job, JobProcess, Listen], JobResult]
 """What is done with a Job: `supervise_job`, or on its copy from elsewhere (see object_storage)."""
-
-
-def supervise_job(job: Job, **how: Any) -> JobResult:
-    """Work on a job in its folder, see `supervise`."""
-    return supervise(str(job.folder), **how)
 
 
 def run_batch(
@@ -95,10 +96,12 @@ def run_locally(
                 pool.submit(
                     work,
                     job,
-                    threads=shares.threads,
-                    limit_s=60.0 * job.pipeline.resources.limit_minutes,
-                    command=command,
-                    listen=listen,
+                    JobProcess(
+                        shares.threads,
+                        60.0 * job.pipeline.resources.limit_minutes,
+                        tuple(command),
+                    ),
+                    listen,
                 )
                 for job in jobs
             ]

@@ -11,9 +11,16 @@ import os
 from collections.abc import Iterator, Sequence
 
 from bodyscan.errors import BadInput, FailedWork
-from bodyscan.jobs.batch import Run, Work, supervise_job
+from bodyscan.jobs.batch import Run, Work
 from bodyscan.jobs.job import Job
-from bodyscan.jobs.supervision import COMMAND, JobResult, Listen, ignore_events
+from bodyscan.jobs.supervision import (
+    COMMAND,
+    JobProcess,
+    JobResult,
+    Listen,
+    ignore_events,
+    supervise_job,
+)
 
 _TIMEOUT_S = 20
 
@@ -55,9 +62,9 @@ def run_on_cluster(
                     run_on_worker,
                     work,
                     job,
-                    threads,
-                    60.0 * job.pipeline.resources.limit_minutes,
-                    tuple(command),
+                    JobProcess(
+                        threads, 60.0 * job.pipeline.resources.limit_minutes, tuple(command)
+                    ),
                     pure=False,
                 ): job.name
                 for job in jobs
@@ -74,9 +81,7 @@ def run_on_cluster(
     return run
 
 
-def run_on_worker(
-    work: Work, job: Job, threads: int, limit_s: float, command: Sequence[str]
-) -> JobResult:
+def run_on_worker(work: Work, job: Job, process: JobProcess) -> JobResult:
     """What a worker does with one job."""
     os.umask(0o077)
     if work is supervise_job and not job.folder.is_dir():
@@ -85,4 +90,4 @@ def run_on_worker(
             "set aside",
             reason=f"{job.folder} is not there on this worker: share folders under one path",
         )
-    return work(job, threads=threads, limit_s=limit_s, command=command)
+    return work(job, process, ignore_events)

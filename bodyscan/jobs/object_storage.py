@@ -20,7 +20,7 @@ from bodyscan.files.hashing import files_below
 from bodyscan.jobs.discovery import find_jobs
 from bodyscan.jobs.job import LOCK, MANIFEST, STAGE, SUMMARY, Job, write_job
 from bodyscan.jobs.pipeline import Pipeline
-from bodyscan.jobs.supervision import COMMAND, JobResult, Listen, ignore_events, supervise
+from bodyscan.jobs.supervision import JobProcess, JobResult, Listen, ignore_events, supervise_job
 
 _FIGURES = ("scan/scan.json", "calibration/calibration.json", MANIFEST)
 
@@ -62,13 +62,7 @@ def find_stored_jobs(store: Store, pipeline: Pipeline, until: str, work: Path) -
 
 
 def work_on_stored(
-    job: Job,
-    *,
-    store: Store,
-    threads: int,
-    limit_s: float,
-    command: Sequence[str] = COMMAND,
-    listen: Listen = ignore_events,
+    job: Job, process: JobProcess, listen: Listen = ignore_events, *, store: Store
 ) -> JobResult:
     """Fetch a job, bring it up to date, and put back what is new. Never raises for what it does."""
     try:
@@ -87,13 +81,7 @@ def work_on_stored(
             there.fetch(local.folder)
             was = _stages(local.folder)
             write_job(local)
-            outcome = supervise(
-                str(local.folder),
-                threads=threads,
-                limit_s=limit_s,
-                command=command,
-                listen=listen,
-            )
+            outcome = supervise_job(local, process, listen)
             _put_back(local.folder, there, was, outcome.stages)
             return outcome
     except Exception as error:  # a store fails in as many ways as there are stores

@@ -9,14 +9,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from bodyscan.files.atomic import write_json
-from bodyscan.jobs.job import LOG, STATE, printable
+from bodyscan.jobs.job import LOG, STATE, Job, printable
 
 Listen = Callable[[dict[str, Any]], None]
 
@@ -37,29 +37,30 @@ class JobResult:
     reason: str = ""
 
 
+@dataclass(frozen=True)
+class JobProcess:
+    """How a job's process is run.  threads: of the libraries in it.  limit_s: after so many seconds
+    it counts as stuck.  command: what follows the name of this Python."""
+
+    threads: int
+    limit_s: float
+    command: tuple[str, ...] = COMMAND
+
+
 def ignore_events(event: dict[str, Any]) -> None:
     """Whoever does not want to know."""
 
 
-def supervise(
-    folder: str,
-    *,
-    threads: int,
-    limit_s: float,
-    command: Sequence[str] = COMMAND,
-    listen: Listen = ignore_events,
-) -> JobResult:
-    """Run the job in `folder` in a process of its own, twice if need be.
-
-    command: what follows the name of this Python.  Never raises for what a job does.
-    """
-    path, since = Path(folder), time.monotonic()
+def supervise_job(job: Job, process: JobProcess, listen: Listen = ignore_events) -> JobResult:
+    """Run a job in its folder in a process of its own, twice if need be. Never raises for what it
+    does."""
+    path, since = job.folder, time.monotonic()
     stages: tuple[str, ...] = ()
     reason = ""
     for attempt in range(1, ATTEMPTS + 1):
         listen({"event": "job", "job": path.name, "state": "running", "attempt": attempt})
         _note(path, {"state": "running", "attempts": attempt, "reason": reason})
-        reason, ran = _attempt(path, threads, limit_s, command, listen)
+        reason, ran = _attempt(path, process, listen)
         stages += ran
         if not reason:
             break
@@ -75,13 +76,7 @@ def supervise(
     return outcome
 
 
-def _attempt(
-    folder: Path,
-    threads: int,
-    limit_s: float,
-    command: Sequence[str],
-    listen: Listen,
-) -> tuple[str, tuple[str, ...]]:
+def _attempt(folder: Path, how: JobProcess, listen: Listen) -> tuple[str, tuple[str, ...]]:
     """Why it failed, "" if it did not; and the stages that ran."""
     try:
         log = _open_log(folder / LOG)
@@ -90,16 +85,16 @@ def _attempt(
     with log:
         try:
             process = subprocess.Popen(
-                [sys.executable, *command, str(folder)],
+                [sys.executable, *how.command, str(folder)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
-                env=_environment(threads),
+                env=_environment(how.threads),
                 start_new_session=True,
             )
         except OSError as error:
             return f"its process cannot be started: {error.strerror}", ()
-        stuck = threading.Timer(limit_s, process.kill)
+        stuck = threading.Timer(how.limit_s, process.kill)
         stuck.start()
         try:
             said, ran = _listen_to(process, folder.name, listen)
@@ -114,7 +109,7 @@ def _attempt(
     if said:
         return said, ran
     if not in_time:
-        return f"was stuck: it took longer than {limit_s / 60.0:g} minutes", ran
+        return f"was stuck: it took longer than {how.limit_s / 60.0:g} minutes", ran
     return _how_it_died(status, folder / LOG), ran
 
 

@@ -10,7 +10,7 @@ import cheap_job
 from cheap_batch import jobs_of, results, run_cheap
 
 from bodyscan.jobs.job import write_job
-from bodyscan.jobs.supervision import supervise
+from bodyscan.jobs.supervision import JobProcess, supervise_job
 
 
 def test_crashes_and_errors_take_nobody_with_them(make_scans, tmp_path):
@@ -41,7 +41,7 @@ def test_crashes_and_errors_take_nobody_with_them(make_scans, tmp_path):
 def test_a_job_that_is_stuck_is_ended(make_scans, tmp_path):
     (job,) = jobs_of(make_scans(a="sleep 60"), tmp_path)
     write_job(job)
-    outcome = supervise(str(job.folder), threads=1, limit_s=1.5, command=cheap_job.COMMAND)
+    outcome = supervise_job(job, JobProcess(1, 1.5, tuple(cheap_job.COMMAND)))
     assert outcome.state == "set aside"
     assert "was stuck" in outcome.reason
 
