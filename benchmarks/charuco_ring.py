@@ -14,7 +14,7 @@ from benchmarks.board_images import load_views, save_views
 from benchmarks.captures import open_real
 from benchmarks.free_triangulation import (
     FreeTriangulation,
-    HeldOut,
+    RigWithoutShots,
     pooled,
     triangulate_shots,
     without_shots,
@@ -115,7 +115,7 @@ def _find_corners() -> list[BoardView]:
     return found
 
 
-def _ours(folds: Sequence[HeldOut], seconds: float) -> Run:
+def _ours(folds: Sequence[RigWithoutShots], seconds: float) -> Run:
     placed = [(held.left_out, held.placed) for held in folds]
     shots = [
         shot
@@ -125,14 +125,16 @@ def _ours(folds: Sequence[HeldOut], seconds: float) -> Run:
     return Run(shots, [seconds])
 
 
-def _seconds(rig: Rig, held: HeldOut) -> float:
+def _seconds(rig: Rig, held: RigWithoutShots) -> float:
     """Wall clock of one joint solve."""
     start = time.perf_counter()
     place_rig(rig, held.used, held.cameras)
     return time.perf_counter() - start
 
 
-def _rival(method: str, rig: Rig, folds: Sequence[HeldOut], *, our_lenses: bool = False) -> Run:
+def _rival(
+    method: str, rig: Rig, folds: Sequence[RigWithoutShots], *, our_lenses: bool = False
+) -> Run:
     run = Run([], [])
     for held in folds:
         cameras = held.placed.cameras if our_lenses else held.cameras

@@ -84,7 +84,7 @@ def _off_board(corners: Array, points: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
+class RigWithoutShots:
     """cameras: each calibrated by itself without the shots left out; `used` views of the others and
     the rig placed by them; `left_out`: views of the shots left out."""
 
@@ -94,7 +94,7 @@ class HeldOut:
     left_out: tuple[LocatedView, ...]
 
 
-def without_shots(rig: Rig, found: Sequence[BoardView], shots: Collection[str]) -> HeldOut:
+def without_shots(rig: Rig, found: Sequence[BoardView], shots: Collection[str]) -> RigWithoutShots:
     """The rig calibrated by all views but those of `shots`.
 
     Raises what `place_rig` raises.
@@ -105,7 +105,7 @@ def without_shots(rig: Rig, found: Sequence[BoardView], shots: Collection[str]) 
     used = tuple(view for view in views if view.shot not in shots)
     cameras = {name: own.camera for name, own in calibrated.items()}
     left_out = tuple(view for view in views if view.shot in shots)
-    return HeldOut(cameras, used, place_rig(rig, used, cameras).value, left_out)
+    return RigWithoutShots(cameras, used, place_rig(rig, used, cameras).value, left_out)
 
 
 def triangulate_shots(

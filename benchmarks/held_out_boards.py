@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutBoard:
     """One model on one held-out board: median absolute distance of measured points to the board's
     plane, RMS of the points about their own best plane (flatness), share of points measured.
     """
@@ -51,7 +51,7 @@ class _Shot:
     stripes: StripeMap
 
 
-def hold_out_boards(rig: Rig, captures: Captures, pair: str) -> list[HeldOut]:
+def hold_out_boards(rig: Rig, captures: Captures, pair: str) -> list[HeldOutBoard]:
     """Hold each shot out in turn, fit every model on the others, measure the held-out board.
 
     Boards are placed by their corners and a camera calibrated on all of them; the stripes of the
@@ -138,7 +138,7 @@ def _corners_with_stripe(rig: Rig, shot: _Shot) -> tuple[Array, Array, Array]:
     return corners[known], shot.view.pixels[known], s[known].astype(float)
 
 
-def _measure(model: str, sheets: LightSheets, held: _Shot) -> HeldOut:
+def _measure(model: str, sheets: LightSheets, held: _Shot) -> HeldOutBoard:
     rays = held.points.points / held.points.points[:, 2:]
     depth = sheets.depth(rays, held.points.index.astype(float))
     known = np.isfinite(depth)
@@ -149,4 +149,4 @@ def _measure(model: str, sheets: LightSheets, held: _Shot) -> HeldOut:
     near = np.abs(distance - np.median(distance)) < 10.0 * max(typical, 1e-6)
     centred = measured[near] - measured[near].mean(axis=0)
     flatness = float(np.sqrt(max(np.linalg.eigvalsh(centred.T @ centred)[0], 0.0) / len(centred)))
-    return HeldOut(model, held.view.shot, typical, flatness, float(known.mean()))
+    return HeldOutBoard(model, held.view.shot, typical, flatness, float(known.mean()))

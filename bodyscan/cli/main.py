@@ -291,8 +291,8 @@ def measure(
     from bodyscan.cli import console
     from bodyscan.files.atomic import write_json
     from bodyscan.fusion.storage import load_scan
-    from bodyscan.measurement.measuring import heights_from, measure
-    from bodyscan.measurement.reporting import document, tables
+    from bodyscan.measurement.measurements import heights_from, measure
+    from bodyscan.report.measurements import document, tables
 
     levels = None if heights is None else heights_from(heights)
     stored = load_scan(result)

@@ -85,7 +85,7 @@ def read_sphere(points: Array, normals: Array, near: Sphere, radius_mm: float) -
     own = np.abs(length - radius_mm) < OWN * radius_mm
     own &= np.einsum("nc,nc->n", arm, normals) > FACING * length
     fitted = fit_sphere(points[own])
-    off = _kept(fitted.distances(points[own]))
+    off = _drop_farthest(fitted.distances(points[own]))
     return SphereReading(
         fitted,
         int(own.sum()),
@@ -121,7 +121,9 @@ def read_plate(points: Array, normals: Array, seed: int = 0) -> PlateReading:
         raise FailedWork("no plate is among the points")
     normal, offset = best_plane(kept)
     off = kept @ normal - offset
-    return PlateReading(len(kept), float(np.ptp(_kept(off))), float(np.sqrt(np.mean(off**2))), area)
+    return PlateReading(
+        len(kept), float(np.ptp(_drop_farthest(off))), float(np.sqrt(np.mean(off**2))), area
+    )
 
 
 def _distances(centres: Array) -> Array:
@@ -129,7 +131,7 @@ def _distances(centres: Array) -> Array:
     return np.linalg.norm(centres[first] - centres[second], axis=1)
 
 
-def _kept(off: Array) -> Array:
+def _drop_farthest(off: Array) -> Array:
     """Signed distances (N,) without the 3 per mille that are largest."""
     size = np.abs(off)
     return off[np.argsort(size, kind="stable")[: max(1, round((1.0 - REJECTED) * len(off)))]]

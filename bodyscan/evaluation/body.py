@@ -13,7 +13,7 @@ from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.evaluation.surface import covered_spots, sample_surface
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
-from bodyscan.measurement.measuring import Slice, measure
+from bodyscan.measurement.measurements import Slice, measure
 from bodyscan.mesh.body import BodyMesh
 
 STEP_MM = 20.0

@@ -57,7 +57,7 @@ def compare(mesh: BodyMesh, other: Path) -> list[Comparison]:
         )
     measured = np.unique(mesh.faces[~mesh.filled])
     points = mesh.vertices[measured]
-    laid = laid_on(points, vertices, faces)
+    laid = fit_to_surface(points, vertices, faces)
     return [
         Comparison(
             _name(other), _is_scan(other), measured, signed, deviation(signed), fitted, place
@@ -67,7 +67,7 @@ def compare(mesh: BodyMesh, other: Path) -> list[Comparison]:
     ]
 
 
-def laid_on(points: Array, vertices: Array, faces: Indices) -> RigidTransform:
+def fit_to_surface(points: Array, vertices: Array, faces: Indices) -> RigidTransform:
     """`other_from_scan`: the rigid motion that brings points (N, 3) nearest to a mesh.
 
     Point to plane (Chen and Medioni 1992) with Tukey's weights, in Open3D.

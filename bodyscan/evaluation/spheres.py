@@ -61,7 +61,7 @@ def fit_sphere(points: Array, radius: float | None = None) -> Sphere:
     """
     if len(points) < FEWEST_POINTS:
         raise FailedWork(f"{len(points)} points are too few for a sphere")
-    sphere = _algebraic(points)
+    sphere = _fit_algebraically(points)
     if radius is not None:
         sphere = Sphere(sphere.centre, radius)
     for _ in range(ROUNDS):
@@ -107,7 +107,7 @@ def centre_distances(measured: Array, true: Array) -> CentreDistances:
     return CentreDistances(float(np.sqrt(np.mean((found - wanted) ** 2))), 1e6 * scale)
 
 
-def _algebraic(points: Array) -> Sphere:
+def _fit_algebraically(points: Array) -> Sphere:
     """|p|^2 = 2 c . p + (r^2 - c^2), linear in c and the last term; about the points' middle."""
     middle = points.mean(axis=0)
     centred = points - middle

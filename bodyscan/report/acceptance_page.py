@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.table import Table as ScreenTable
 
 from bodyscan.evaluation.acceptance_readings import ALL, Figure, Readings, grade_acceptance
-from bodyscan.report.page import Column, Lines, Number, Numbers, Page, Section, Table, shown
+from bodyscan.report.page import Column, Lines, Number, Numbers, Page, Section, Table, format_value
 
 NO_STANDARD = (
     "Modelled on VDI/VDE 2634 parts 2 and 3 and ISO 20685-2; it is no test by these standards, "
@@ -93,4 +93,4 @@ def acceptance_page(
 
 
 def _signed(value: float | None) -> str:
-    return shown(value) if value is None else f"{value:.3f}"
+    return format_value(value) if value is None else f"{value:.3f}"

@@ -75,7 +75,7 @@ def pack(
     step = float((high - low).max()) / STEPS or 1.0
 
     def whole(points: Array) -> str:
-        return encoded(np.rint((points - low) / step).astype("<u2"))
+        return encode(np.rint((points - low) / step).astype("<u2"))
 
     packed: dict[str, Any] = {
         "low": low.tolist(),
@@ -95,13 +95,13 @@ def pack(
         normals = np.clip(np.rint(127 * np.nan_to_num(shape.normals)), -127, 127)
         packed |= {
             "positions": whole(shape.vertices),
-            "normals": encoded(normals.astype(np.int8)),
-            "faces": encoded(shape.faces.astype("<u2")),
+            "normals": encode(normals.astype(np.int8)),
+            "faces": encode(shape.faces.astype("<u2")),
         }
     packed["layers"] = [
         {
             "name": layer.name,
-            "colours": encoded(layer.colours),
+            "colours": encode(layer.colours),
             "legend": layer.legend,
             "unlit": layer.unlit,
         }
@@ -110,12 +110,12 @@ def pack(
     if strokes is not None:
         packed["lines"] = {
             "positions": whole(strokes.ends.reshape(-1, 3)),
-            "colours": encoded(np.repeat(strokes.colours, 2, axis=0)),
+            "colours": encode(np.repeat(strokes.colours, 2, axis=0)),
         }
     return packed
 
 
-def encoded(array: NDArray[Any]) -> str:
+def encode(array: NDArray[Any]) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
 
 

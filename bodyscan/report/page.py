@@ -30,7 +30,7 @@ class Number:
     digits: int = 3
 
     @property
-    def kept(self) -> bool | None:
+    def within_limit(self) -> bool | None:
         """Whether the limit is kept; None without a limit or without a value."""
         if self.limit is None or not isinstance(self.value, float | int):
             return None
@@ -38,17 +38,19 @@ class Number:
 
     @property
     def mark(self) -> str:
-        return {None: "", True: "good", False: "bad"}[self.kept]
+        return {None: "", True: "good", False: "bad"}[self.within_limit]
 
     @property
     def text(self) -> str:
-        return shown(self.value, self.digits)
+        return format_value(self.value, self.digits)
 
     @property
     def limit_text(self) -> str:
         if self.limit is None:
             return "–"
-        return f"{'at least' if self.at_least else 'at most'} {shown(self.limit, self.digits)}"
+        return (
+            f"{'at least' if self.at_least else 'at most'} {format_value(self.limit, self.digits)}"
+        )
 
 
 @dataclass(frozen=True)
@@ -183,7 +185,7 @@ def render(page: Page) -> str:
     )
 
 
-def shown(value: float | str | None, digits: int = 3) -> str:
+def format_value(value: float | str | None, digits: int = 3) -> str:
     """A value as people read it."""
     if value is None:
         return "–"

@@ -178,10 +178,10 @@ def test_a_slip_of_the_pen_is_not_taken_for_the_folder_above(scan: MadeScan):
 
 
 def test_limits_are_kept_or_not():
-    assert Number("n", 0.4, "mm", "", 0.4).kept
-    assert not Number("n", 0.41, "mm", "", 0.4).kept
-    assert Number("n", 7, "", "", 6, at_least=True).kept
-    assert Number("n", None, "", "", 6).kept is None
+    assert Number("n", 0.4, "mm", "", 0.4).within_limit
+    assert not Number("n", 0.41, "mm", "", 0.4).within_limit
+    assert Number("n", 7, "", "", 6, at_least=True).within_limit
+    assert Number("n", None, "", "", 6).within_limit is None
     assert Number("n", 0.4, "mm", "").limit_text == "–"
 
 

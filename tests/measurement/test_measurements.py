@@ -11,8 +11,8 @@ from made_bodies import cylinder, ellipsoid, mesh_of, together
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.measurement.measuring import measure
-from bodyscan.measurement.reporting import document, tables
+from bodyscan.measurement.measurements import measure
+from bodyscan.report.measurements import document, tables
 
 SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
 

@@ -41,7 +41,7 @@ class Girth:
 
 @dataclass(frozen=True)
 class Slice:
-    """The parts of the body at one height over the floor."""
+    """The name_parts of the body at one height over the floor."""
 
     height_mm: float
     girths: tuple[Girth, ...]
@@ -113,11 +113,11 @@ def _slice(vertices: Array, mesh: BodyMesh, height_mm: float) -> Slice:
             f"there is no body at a height of {height_mm:g} mm",
             remedy=f"Give heights between {low:.0f} and {high:.0f} mm.",
         )
-    girths = [_girth(part, loop) for part, loop in zip(parts(loops), loops, strict=True)]
+    girths = [_girth(part, loop) for part, loop in zip(name_parts(loops), loops, strict=True)]
     return Slice(height_mm, tuple(sorted(girths, key=lambda girth: (girth.part, -girth.area_mm2))))
 
 
-def parts(loops: Sequence[Loop]) -> list[str]:
+def name_parts(loops: Sequence[Loop]) -> list[str]:
     """Which part of the body each loop of a slice is; body frame, largest loop first.
 
     A loop that holds the middle (y = 0) well inside is the trunk; then all others are arms. If

@@ -9,7 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from bodyscan import __version__
-from bodyscan.measurement.measuring import Measurements
+from bodyscan.measurement.measurements import Measurements
 
 MOSTLY = 0.5
 LITTLE = 0.95
