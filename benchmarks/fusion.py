@@ -25,9 +25,10 @@ import numpy as np
 from benchmarks import full_size
 from bodyscan.memory import keep_freed_memory
 from bodyscan.mesh.body import BodyCloud
+from bodyscan.settings import ScanSettings
 
 Figures = dict[str, Any]
-POINTS = 1_000_000
+SETTINGS = ScanSettings()
 ICP_VOXEL_MM, ICP_REACH_MM = 3.0, 6.0
 MEASURED_MM = 4.0  # a vertex nearer than this to a point of the cloud was measured
 STEPS = ("read", "ours", "mesh", "open3d", "open3d-poisson-9", "open3d-poisson-10", "pymeshlab")
@@ -187,9 +188,11 @@ def _ours(workspace: Path, folder: Path) -> Step:
         placed = calibration.rig_from_camera
         cleaned = stage("cleaning", lambda: clean(images, placed, calibration.rig.volume))
         seen = [image for image in cleaned if image.valid.any()]
-        alignment = stage("aligning", lambda: align(seen, placed, calibration.covariance))
+        alignment = stage(
+            "aligning", lambda: align(seen, placed, calibration.covariance, SETTINGS.alignment)
+        )
         placing = {**placed, **alignment.rig_from_camera}
-        cloud = stage("merging", lambda: merge(seen, placing, points=POINTS).cloud)
+        cloud = stage("merging", lambda: merge(seen, placing, SETTINGS.fusion).cloud)
         there = {image.pair: placing[image.pair] for image in seen}
         cloud = stage("error bars", lambda: add_pose_variance(cloud, there, calibration.covariance))
         return images, seen, placed, placing, cloud, alignment
@@ -219,7 +222,7 @@ def _mesh(workspace: Path, folder: Path) -> Step:
             **versions(found),
         }
 
-    return lambda: mesh(cloud, images, placing), finish
+    return lambda: mesh(cloud, SETTINGS.mesh, images, placing), finish
 
 
 def versions(full: Any) -> Figures:

@@ -18,6 +18,7 @@ from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import mesh
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.settings import FusionSettings, MeshSettings
 
 # What is compiled is compiled at its first call, and machines may be loaded.
 settings.register_profile("bodyscan", deadline=None)
@@ -47,9 +48,9 @@ def cleaned(scan: Scan) -> list[RangeImage]:
 
 @pytest.fixture(scope="session")
 def cloud(scan: Scan, cleaned: list[RangeImage]) -> BodyCloud:
-    return merge(cleaned, scan.rig_from_camera, points=250_000).cloud
+    return merge(cleaned, scan.rig_from_camera, FusionSettings(points=250_000)).cloud
 
 
 @pytest.fixture(scope="session")
 def body(scan: Scan, cloud: BodyCloud) -> BodyMesh:
-    return mesh(cloud, scan.range_images, scan.rig_from_camera, depth=8)
+    return mesh(cloud, MeshSettings(depth=8), scan.range_images, scan.rig_from_camera)

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import permutations
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -28,39 +28,13 @@ from bodyscan.alignment.sway import SwayPrior, bound_motions, centre_shifts
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.settings import AlignmentSettings
 
 Result = TypeVar("Result")
 
 COARSE = 4  # only one in so many points takes part
 FINE_ROUNDS = 2  # at the end, with all of them
 UNKNOWN = 0, float("nan")
-
-
-@dataclass(frozen=True)
-class AlignmentSettings:
-    """matching: `projected` (into the other camera's pixel grid) or `nearest` (Open3D's ICP).
-
-    spacing_mm: of the points that take part.  reach_mm: farthest match, halved each round down to
-    `least_reach_mm`.  fewest: matches below which two pairs do not count as overlapping.
-    sway_mm, sway_deg: how far a subject is believed to move between pairs (standard deviations; a
-    rotation about the body's centre); 0 for a rigid object.  Each round believes what the last one
-    found, from `least_sway` to `most_sway` times that.  limit_sigmas: a pair that wants to move
-    farther than this many standard deviations, most_sway taken, stays where it was.
-    correlated: neighbouring points share their errors, so many count as one.
-    """
-
-    matching: Literal["projected", "nearest"] = "projected"
-    spacing_mm: float = 3.0
-    reach_mm: float = 12.0
-    least_reach_mm: float = 3.0
-    rounds: int = 5
-    fewest: int = 30
-    sway_mm: float = 1.0
-    sway_deg: float = 0.05
-    least_sway: float = 0.3
-    most_sway: float = 4.0
-    limit_sigmas: float = 5.0
-    correlated: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -100,11 +74,14 @@ def align(
     images: Sequence[RangeImage],
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PlacingCovariance,
-    settings: AlignmentSettings = AlignmentSettings(),
+    settings: AlignmentSettings,
     *,
     workers: int = 2,
 ) -> Alignment:
-    """Small motions of all range images that bring their overlaps together."""
+    """Small motions of all range images that bring their overlaps together.
+
+    Each round believes the sway that the last one found, within the settings' bounds.
+    """
     names = [image.pair for image in images]
     start = [rig_from_camera[name] for name in names]
     motion = np.zeros((len(names), 6))

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from bodyscan.alignment.icp import Alignment, AlignmentSettings, align
+from bodyscan.alignment.icp import Alignment, align
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.settings import AlignmentSettings
 
-STILL = AlignmentSettings(sway_mm=0.0, sway_deg=0.0)
+STILL = AlignmentSettings(sway_mm=0.0, sway_deg=0.0)  # a rigid object
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +50,12 @@ def refine_on_object(
     images: Sequence[RangeImage],
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PlacingCovariance,
-    settings: AlignmentSettings = STILL,
 ) -> ObjectRefinement:
     """images: one object that stood still while all pairs scanned it, its background cut away.
 
     Raises FailedWork if no two pairs saw the same part of it.
     """
-    found = align(images, rig_from_camera, prior, replace(settings, sway_mm=0.0, sway_deg=0.0))
+    found = align(images, rig_from_camera, prior, STILL)
     if not found.overlaps:
         raise FailedWork(
             "no two pairs see the same part of the object",

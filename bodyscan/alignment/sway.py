@@ -14,8 +14,9 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint
+from bodyscan.settings import BODY_CENTRE_MM
 
-BODY_CENTRE_MM = np.array([0.0, 0.0, 900.0])
+BODY_CENTRE = np.array(BODY_CENTRE_MM)
 SWAY_ROOM = 1.5  # standard deviations are believed this much larger than what was found
 
 
@@ -47,14 +48,14 @@ class SwayPrior:
         order = np.concatenate([6 * boards.names.index(name) + np.arange(6) for name in names])
         rotation, translation = scale * np.radians(self.rotation_deg), scale * self.shift_mm
         own = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
-        carry = adjoint(RigidTransform(np.eye(3), BODY_CENTRE_MM))
+        carry = adjoint(RigidTransform(np.eye(3), BODY_CENTRE))
         each = np.kron(np.eye(len(names)), carry @ own @ carry.T)
         return boards.matrix[np.ix_(order, order)] + each
 
 
 def centre_shifts(motion: Array) -> Array:
     """(P, 3) mm: how far motions (P, 6) carry the body's centre."""
-    return motion[:, 3:] + np.cross(motion[:, :3], BODY_CENTRE_MM)
+    return motion[:, 3:] + np.cross(motion[:, :3], BODY_CENTRE)
 
 
 def bound_motions(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -15,6 +15,7 @@ from bodyscan.cli import report_commands as reports
 from bodyscan.cli import rig_commands
 from bodyscan.errors import BadInput, BodyscanError
 from bodyscan.memory import keep_freed_memory
+from bodyscan.settings import AlignmentSettings, ExportSettings, FusionSettings, ScanSettings
 
 app = typer.Typer(
     add_completion=False,
@@ -194,9 +195,11 @@ def scan(
     folder: Folder,
     calibration: Annotated[Path, typer.Option(help="What calibrate-rig wrote.")],
     out: Annotated[Path | None, typer.Option(help="Default: FOLDER-model.")] = None,
-    points: Annotated[int, typer.Option(min=1000, help="Size of the body cloud.")] = 1_000_000,
+    points: Annotated[
+        int, typer.Option(min=1000, help="Size of the body cloud.")
+    ] = FusionSettings().points,
     align: Annotated[
-        str,
+        Literal["projected", "nearest", "none"],
         typer.Option(
             help="Range images: projected, nearest (Open3D's ICP), or none (boards only)."
         ),
@@ -216,7 +219,6 @@ def scan(
     from bodyscan.captures.folder import open_scan
     from bodyscan.cli import console
     from bodyscan.errors import ScanFailed
-    from bodyscan.fusion.scan import ScanSettings, alignment_settings
     from bodyscan.fusion.storage import clear, make_room, save_failure, save_scan
     from bodyscan.registration.storage import calibration_id, load_calibration
     from bodyscan.report.pictures import draw_scan
@@ -226,7 +228,9 @@ def scan(
     make_room(out or folder.with_name(f"{folder.name}-model"), overwrite)
     rig_calibration = load_calibration(calibration)
     captures = open_scan(rig_calibration.rig, folder)
-    settings = ScanSettings(points, alignment_settings(align))
+    settings = ScanSettings(
+        fusion=FusionSettings(points=points), alignment=AlignmentSettings(matching=align)
+    )
     out = out or folder.with_name(f"{folder.name}-model")
     background = open_scan(rig_calibration.rig, empty) if empty else None
     subject, when = captures.subject, captures.when
@@ -257,7 +261,9 @@ def scan(
 def export(
     result: Folder,
     out: Annotated[Path | None, typer.Option(help="Default: `export` inside the result.")] = None,
-    formats: Annotated[str, typer.Option("--format", help="Comma-separated.")] = "ply,obj,stl,glb",
+    formats: Annotated[str, typer.Option("--format", help="Comma-separated.")] = ",".join(
+        ExportSettings().formats
+    ),
     deface: Annotated[
         bool, typer.Option("--deface", help="A plain head for sharing; goes into `shared`.")
     ] = False,

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from bodyscan.errors import BadInput
+from bodyscan.settings import RigExportSettings
 
 
 def register(app: typer.Typer) -> None:
@@ -19,7 +20,9 @@ def register(app: typer.Typer) -> None:
 def export_rig(
     calibration: Annotated[Path, typer.Argument(help="What calibrate-rig wrote.")],
     out: Annotated[Path, typer.Option(help="Folder to write into.")],
-    formats: Annotated[str, typer.Option("--format", help="Comma-separated.")] = "colmap,opencv",
+    formats: Annotated[str, typer.Option("--format", help="Comma-separated.")] = ",".join(
+        RigExportSettings().formats
+    ),
 ) -> None:
     """Write a calibrated rig for other programs: a COLMAP model with rig, OpenCV's YAML."""
     from bodyscan.cli import console

@@ -18,6 +18,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.decimation import decimate
+from bodyscan.settings import ExportSettings
 
 FRAMES = ("rig", "body")
 
@@ -32,7 +33,7 @@ def export_scan(
     scan: StoredScan,
     folder: Path,
     formats: Sequence[str],
-    versions: Sequence[str] = ("full", "light"),
+    versions: Sequence[str] = ExportSettings().versions,
     *,
     deface: bool = False,
     frame: str = "rig",

@@ -18,6 +18,7 @@ from bodyscan.fusion.thinning import take_samples
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.settings import FusionSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,28 +32,27 @@ class MergedCloud:
 def merge(
     range_images: Sequence[RangeImage],
     rig_from_camera: dict[str, RigidTransform],
+    settings: FusionSettings,
     *,
-    points: int = 1_000_000,
-    window_mm: float = 7.0,
-    agreement_mm: float = 1.5,
-    double_mm: float = 6.0,
     workers: int = 2,
 ) -> MergedCloud:
-    """One evenly spread cloud of about `points` points from aligned, cleaned range images.
+    """One evenly spread cloud of about `settings.points` points from aligned, cleaned range images.
 
-    Surfaces of two pairs within `agreement_mm` along the normal are averaged by weight; between
-    that and `double_mm` they are a double surface, of which the heavier one stays.
+    Surfaces of two pairs within `settings.agreement_mm` along the normal are averaged by weight;
+    between that and `settings.double_mm` they are a double surface, of which the heavier one stays.
     Raises ScanFailed if the range images show next to nothing.
     """
     with ThreadPoolExecutor(workers) as pool:
         smoothed = pool.map(
-            lambda image: smooth(image, rig_from_camera[image.pair], window_mm=window_mm),
+            lambda image: smooth(image, rig_from_camera[image.pair], settings.window_mm),
             range_images,
         )
         surfaces = [surface for surface in smoothed if surface is not None]
-        samples = take_samples(surfaces, points)
+        samples = take_samples(surfaces, settings.points)
         compared = pool.map(
-            lambda number: compare(samples, surfaces[number], number, agreement_mm, double_mm),
+            lambda number: compare(
+                samples, surfaces[number], number, settings.agreement_mm, settings.double_mm
+            ),
             range(len(surfaces)),
         )
         evidence = list(compared)

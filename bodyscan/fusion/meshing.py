@@ -20,6 +20,7 @@ from bodyscan.mesh.topology import (
     vertex_normals,
 )
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.settings import MeshSettings
 
 FEWEST_POINTS = 1000
 ROUGH_POINTS = 100_000
@@ -27,19 +28,17 @@ ROUGH_POINTS = 100_000
 
 def mesh(
     cloud: BodyCloud,
+    settings: MeshSettings,
     range_images: Sequence[RangeImage] = (),
     rig_from_camera: dict[str, RigidTransform] | None = None,
     *,
-    depth: int = 9,
-    reach_mm: float = 4.0,
     workers: int = 2,
 ) -> BodyMesh:
     """One closed manifold surface around a cloud, faces outward.
 
     range_images: as measured, background and all (not cleaned); with them, gaps that cameras saw
-    through are not webbed over. depth: of the octree; each step halves the cells (about 3.5 mm at
-    9 for a standing person). reach_mm: a vertex farther than this from every point was measured
-    by nobody. Raises ScanFailed if no closed surface comes out.
+    through are not webbed over. A vertex farther than `settings.reach_mm` from every point was
+    measured by nobody. Raises ScanFailed if no closed surface comes out.
     """
     if len(cloud.points) < FEWEST_POINTS:
         raise ScanFailed(
@@ -50,17 +49,17 @@ def mesh(
     tree = cKDTree(cloud.points, balanced_tree=False, compact_nodes=False)
     points, normals = cloud.points, cloud.normals.astype(np.float64)
     some = slice(None, None, max(1, len(points) // ROUGH_POINTS))
-    rough = largest_piece(*poisson(points[some], normals[some], depth - 1, linear=True))
-    made_up = _filled_faces(*rough, tree, 2.0 * reach_mm)
+    rough = largest_piece(*poisson(points[some], normals[some], settings.depth - 1, linear=True))
+    made_up = _filled_faces(*rough, tree, 2.0 * settings.reach_mm)
     extra = poisson_hints(
         *rough, made_up, tree, range_images, rig_from_camera or {}, workers=workers
     )
     points, normals = np.concatenate([points, extra[0]]), np.concatenate([normals, extra[1]])
-    vertices, faces = largest_piece(*poisson(points, normals, depth, linear=True))
+    vertices, faces = largest_piece(*poisson(points, normals, settings.depth, linear=True))
     found = topology(vertices, faces)
     if not found.manifold:
         raise ScanFailed(f"no closed surface came out of the cloud ({found})")
-    return attach_attributes(vertices, faces, cloud, tree, reach_mm)
+    return attach_attributes(vertices, faces, cloud, tree, settings.reach_mm)
 
 
 def poisson(

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from bodyscan.alignment.icp import Alignment, AlignmentSettings, align
-from bodyscan.errors import BadInput
+from bodyscan.alignment.icp import Alignment, align
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.error_bar import add_pose_variance
 from bodyscan.fusion.merging import merge
@@ -18,23 +17,8 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Verdict
-
-
-@dataclass(frozen=True)
-class ScanSettings:
-    """points: size of the body cloud.  alignment: of range images; None: not at all.
-
-    window_mm, agreement_mm, double_mm: see `merge`.  mesh_depth, mesh_reach_mm: see `mesh`.
-    """
-
-    points: int = 1_000_000
-    alignment: AlignmentSettings | None = field(default_factory=AlignmentSettings)
-    window_mm: float = 7.0
-    agreement_mm: float = 1.5
-    double_mm: float = 6.0
-    mesh_depth: int = 9
-    mesh_reach_mm: float = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,24 +38,10 @@ class Scan:
     rig_from_camera: dict[str, RigidTransform]
 
 
-def alignment_settings(matching: str) -> AlignmentSettings | None:
-    """Default settings with one way of matching: projected, nearest; none: no alignment.
-
-    Raises BadInput for another word.
-    """
-    if matching == "none":
-        return None
-    if matching not in ("projected", "nearest"):
-        raise BadInput(
-            f"there is no alignment {matching!r}", remedy="choose projected, nearest or none"
-        )
-    return AlignmentSettings(matching="projected" if matching == "projected" else "nearest")
-
-
 def fuse(
     calibration: RigCalibration,
     measured: Outcome[Sequence[RangeImage]],
-    settings: ScanSettings = ScanSettings(),
+    settings: ScanSettings,
     progress: Progress = silent,
     *,
     empty: Sequence[RangeImage] = (),
@@ -88,27 +58,18 @@ def fuse(
     progress("cleaning", 1, 1)
     placing = dict(calibration.rig_from_camera)
     alignment = None
-    if settings.alignment is not None and len(seen) > 1:
+    if settings.alignment.matching != "none" and len(seen) > 1:
         progress("aligning", 0, 1)
         alignment = align(seen, placing, calibration.covariance, settings.alignment)
         placing |= alignment.rig_from_camera
         progress("aligning", 1, 1)
     progress("merging", 0, 1)
-    fused = merge(
-        seen,
-        placing,
-        points=settings.points,
-        window_mm=settings.window_mm,
-        agreement_mm=settings.agreement_mm,
-        double_mm=settings.double_mm,
-    )
+    fused = merge(seen, placing, settings.fusion)
     there = {image.pair: placing[image.pair] for image in seen}
     cloud = add_pose_variance(fused.cloud, there, calibration.covariance)
     progress("merging", 1, 1)
     progress("meshing", 0, 1)
-    surface = mesh(
-        cloud, images, placing, depth=settings.mesh_depth, reach_mm=settings.mesh_reach_mm
-    )
+    surface = mesh(cloud, settings.mesh, images, placing)
     progress("meshing", 1, 1)
     points = {image.pair: int(image.valid.sum()) for image in cleaned}
     failed = dict(measured.failures)

@@ -55,7 +55,7 @@ class SmoothSurface:
 
 
 def smooth(
-    image: RangeImage, rig_from_camera: RigidTransform, *, window_mm: float = 7.0
+    image: RangeImage, rig_from_camera: RigidTransform, window_mm: float
 ) -> SmoothSurface | None:
     """Fit a quadratic in a square window of about `window_mm` around every pixel.
 

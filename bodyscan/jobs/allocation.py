@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from bodyscan.jobs.pipeline import Resources
+from bodyscan.settings import Resources
 
 
 @dataclass(frozen=True)

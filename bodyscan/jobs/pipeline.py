@@ -5,81 +5,26 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from pydantic import Field
+from typing import Any, Literal
 
 from bodyscan.errors import BadInput
 from bodyscan.files.model import Model, Name, Problem
 from bodyscan.files.model_file import apply_changes, load_model
+from bodyscan.settings import (
+    AlignmentSettings,
+    ExportSettings,
+    FusionSettings,
+    MeshSettings,
+    Resources,
+    RigExportSettings,
+    ScanSettings,
+)
 
 _REMEDY = "Mend the pipeline file; docs/formats.md explains every key."
-
-Millimetres = Annotated[float, Field(gt=0)]
-MeshFormat = Literal["ply", "obj", "stl", "glb"]
 
 
 class PipelineError(BadInput):
     """The pipeline file, or a --set, is wrong."""
-
-
-class Resources(Model):
-    """What one job takes.  limit_minutes: after which it counts as stuck and is ended."""
-
-    threads: int = Field(default=2, ge=1)
-    memory_mb: int = Field(default=4000, ge=100)
-    limit_minutes: float = Field(default=120.0, gt=0)
-
-
-class Alignment(Model):
-    """See bodyscan.alignment.icp.AlignmentSettings; matching none: boards alone."""
-
-    matching: Literal["projected", "nearest", "none"] = "projected"
-    spacing_mm: Millimetres = 3.0
-    reach_mm: Millimetres = 12.0
-    least_reach_mm: Millimetres = 3.0
-    rounds: int = Field(default=5, ge=1)
-    fewest: int = Field(default=30, ge=6)
-    sway_mm: float = Field(default=1.0, ge=0)
-    sway_deg: float = Field(default=0.05, ge=0)
-    least_sway: float = Field(default=0.3, ge=0)
-    most_sway: float = Field(default=4.0, gt=0)
-    limit_sigmas: float = Field(default=5.0, gt=0)
-    correlated: float = Field(default=5.0, ge=1)
-
-
-class Fusion(Model):
-    """See bodyscan.fusion.merging.merge."""
-
-    points: int = Field(default=1_000_000, ge=1000)
-    window_mm: Millimetres = 7.0
-    agreement_mm: Millimetres = 1.5
-    double_mm: Millimetres = 6.0
-
-
-class Mesh(Model):
-    """See bodyscan.fusion.meshing.mesh."""
-
-    depth: int = Field(default=9, ge=5, le=12)
-    reach_mm: Millimetres = 4.0
-
-
-class Export(Model):
-    """deface: without a recognisable face, everything below the neck as it is."""
-
-    formats: tuple[MeshFormat, ...] = Field(default=("ply", "obj", "stl", "glb"), min_length=1)
-    versions: tuple[Literal["full", "light", "open"], ...] = Field(
-        default=("full", "light"), min_length=1
-    )
-    deface: bool = False
-
-
-class RigExport(Model):
-    """The calibrated rig for other programs."""
-
-    formats: tuple[Literal["colmap", "opencv"], ...] = Field(
-        default=("colmap", "opencv"), min_length=1
-    )
 
 
 SECTIONS = {
@@ -89,23 +34,31 @@ SECTIONS = {
 
 
 class Pipeline(Model):
-    """The whole file.  kind: what a job is, one scan (fuse) or one rig file (calibrate)."""
+    """The whole file.  kind: what a job is, one scan (fuse) or one rig file (calibrate).
+
+    Its sections, with their defaults, are those of bodyscan.settings.
+    """
 
     version: Literal[1] = 1
     name: Name
     kind: Literal["fuse", "calibrate"]
     resources: Resources = Resources()
-    alignment: Alignment = Alignment()
-    fusion: Fusion = Fusion()
-    mesh: Mesh = Mesh()
-    export: Export = Export()
-    rig_export: RigExport = RigExport()
+    alignment: AlignmentSettings = AlignmentSettings()
+    fusion: FusionSettings = FusionSettings()
+    mesh: MeshSettings = MeshSettings()
+    export: ExportSettings = ExportSettings()
+    rig_export: RigExportSettings = RigExportSettings()
 
     def problems(self) -> Iterator[Problem]:
         own = SECTIONS[self.kind]
         every = {name for names in SECTIONS.values() for name in names}
         for name in sorted((every - set(own)) & self.model_fields_set):
             yield (name,), f"is for another kind of pipeline than {self.kind}"
+
+    @property
+    def scan(self) -> ScanSettings:
+        """What decides what a scan comes out as."""
+        return ScanSettings(alignment=self.alignment, fusion=self.fusion, mesh=self.mesh)
 
     def section(self, name: str) -> dict[str, Any]:
         """One section as plain data."""

@@ -65,27 +65,14 @@ def scan_inputs(job: Job) -> dict[str, Path]:
 
 def run_scan(job: Job, out: Path, progress: Progress) -> None:
     """As `bodyscan scan` does: cloud, mesh, what they are, pictures."""
-    from bodyscan.alignment.icp import AlignmentSettings
-    from bodyscan.fusion.scan import ScanSettings
     from bodyscan.fusion.storage import save_scan
     from bodyscan.registration.storage import calibration_id, load_calibration
     from bodyscan.report.pictures import draw_scan
     from bodyscan.workflows.scan_person import scan
 
-    align = job.pipeline.section("alignment")
-    fusion, mesh = job.pipeline.fusion, job.pipeline.mesh
-    settings = ScanSettings(
-        points=fusion.points,
-        alignment=None if align["matching"] == "none" else AlignmentSettings(**align),
-        window_mm=fusion.window_mm,
-        agreement_mm=fusion.agreement_mm,
-        double_mm=fusion.double_mm,
-        mesh_depth=mesh.depth,
-        mesh_reach_mm=mesh.reach_mm,
-    )
     calibration = load_calibration(_calibration(job))
     captures = open_scan(calibration.rig, job.source)
-    result = scan(calibration, captures, settings, progress)
+    result = scan(calibration, captures, job.pipeline.scan, progress)
     save_scan(
         result,
         out,

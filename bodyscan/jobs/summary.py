@@ -16,8 +16,8 @@ from bodyscan.files.atomic import write_json, write_text
 from bodyscan.files.hashing import file_hash
 from bodyscan.jobs.job import MANIFEST, SUMMARY, Job
 from bodyscan.jobs.supervision import JobResult
+from bodyscan.settings import BODY_CENTRE_MM
 
-BODY_CENTRE_MM = np.array([0.0, 0.0, 900.0])
 NEIGHBOURS = 2  # scans before and after that tell drift from the sway of one person
 
 COLUMNS = {

@@ -24,11 +24,12 @@ from bodyscan.fusion.cleaning import clean
 from bodyscan.fusion.merging import merge
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.settings import FusionSettings
 from bodyscan.workflows.range_images import range_images
 
 Array = NDArray[np.float64]
 
-POINTS = 200_000
+FUSION = FusionSettings(points=200_000)  # a sphere of 60 mm has some 3,000 of them
 FEWEST_OF_ONE = 400
 """A single pair's sphere or plate is judged from so many points on."""
 
@@ -119,7 +120,7 @@ def _clouds(
     images = range_images(calibration, one, progress).value
     cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
     seen = [image for image in cleaned if image.valid.any()]
-    cloud = merge(seen, calibration.rig_from_camera, points=POINTS).cloud
+    cloud = merge(seen, calibration.rig_from_camera, FUSION).cloud
     found = [_Cloud(ALL, cloud.points, cloud.normals.astype(np.float64))]
     for image in seen:
         valid = image.valid & np.isfinite(image.normals).all(axis=-1)

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.alignment.icp import Alignment, align
-from bodyscan.alignment.sway import BODY_CENTRE_MM
+from bodyscan.alignment.sway import BODY_CENTRE
 from bodyscan.captures.folder import Captures
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.settings import AlignmentSettings
 from bodyscan.workflows.range_images import range_images
 
 Array = NDArray[np.float64]
@@ -86,7 +87,9 @@ def check_scans(
         images = range_images(calibration, captures, progress).value
         cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
         seen = require_subject(cleaned)
-        alignments.append(align(seen, calibration.rig_from_camera, calibration.covariance))
+        alignments.append(
+            align(seen, calibration.rig_from_camera, calibration.covariance, AlignmentSettings())
+        )
     return judge_scans(alignments, calibration.rig_from_camera, calibration.rig.poles)
 
 
@@ -99,7 +102,7 @@ def judge_scans(
     shifts = {
         name: np.array(
             [
-                (found.rig_from_camera[name] @ at.inverse()).apply(BODY_CENTRE_MM) - BODY_CENTRE_MM
+                (found.rig_from_camera[name] @ at.inverse()).apply(BODY_CENTRE) - BODY_CENTRE
                 for found in alignments
                 if name in found.rig_from_camera
             ]

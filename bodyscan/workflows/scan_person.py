@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from bodyscan.captures.folder import Captures
-from bodyscan.fusion.scan import Scan, ScanSettings, fuse
+from bodyscan.fusion.scan import Scan, fuse
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.settings import ScanSettings
 from bodyscan.workflows.range_images import range_images
 
 
 def scan(
     calibration: RigCalibration,
     captures: Captures,
-    settings: ScanSettings = ScanSettings(),
+    settings: ScanSettings,
     progress: Progress = silent,
     *,
     empty: Captures | None = None,

@@ -5,7 +5,7 @@ import open3d as o3d
 import pytest
 from ring import looking_at
 
-from bodyscan.alignment.icp import AlignmentSettings, align
+from bodyscan.alignment.icp import align
 from bodyscan.alignment.matching import Matches
 from bodyscan.alignment.object_refinement import refine_on_object
 from bodyscan.alignment.overlap_equations import OverlapEquations
@@ -16,6 +16,7 @@ from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.triangulation import grid_normals
+from bodyscan.settings import AlignmentSettings
 
 CAMERA = Camera(380.0, 380.0, 0.0, 160.0, 128.0, Radial(), 320, 256)
 NOISE_MM = 0.2
@@ -110,7 +111,7 @@ def test_a_pair_without_overlap_stays(scanned):
     images, truth = scanned
     alone = [image for image in images if image.pair in ("p0", "p2")]
     two = {name: truth[name] for name in ("p0", "p2")}
-    found = align(alone, two, known_to(two, 1.0, 0.02))
+    found = align(alone, two, known_to(two, 1.0, 0.02), AlignmentSettings())
     assert not found.overlaps
     assert max(found.motion_mm.values()) < 1e-9
 
@@ -124,7 +125,7 @@ def test_sway_is_found_whatever_its_size(scanned, sway_mm):
         name: t.moved([*rng.normal(0.0, 1e-4 * sway_mm, 3), *rng.normal(0.0, sway_mm, 3)])
         for name, t in truth.items()
     }
-    found = align(images, start, known_to(truth, 0.02, 0.001))
+    found = align(images, start, known_to(truth, 0.02, 0.001), AlignmentSettings())
     # Noise of 0.2 mm on pixels of 3.4 mm; a fixed prior of 1 mm leaves 0.5 mm of the 3.
     assert disagreement_mm(found.rig_from_camera, truth) < 0.25
     assert not found.refused

@@ -11,6 +11,7 @@ from ray_cast_scan import Scan
 from bodyscan.fusion.brightness import gains, log_ratio
 from bodyscan.fusion.merging import merge
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.settings import FusionSettings
 
 
 def test_gains_undo_known_exposures():
@@ -39,7 +40,7 @@ def test_no_seams_between_exposures(scan: Scan, cleaned: list[RangeImage]):
         replace(image, colours=np.full_like(image.colours, round(120 * factor)))
         for image, factor in zip(cleaned, factors, strict=True)
     ]
-    cloud = merge(images, scan.rig_from_camera, points=100_000).cloud
+    cloud = merge(images, scan.rig_from_camera, FusionSettings(points=100_000)).cloud
     grey = cloud.colours[:, 0].astype(float)
     # Without gains the scatter is that of the factors, 0.25.
     assert grey.std() / grey.mean() < 0.02

@@ -24,7 +24,7 @@ def wall(depth: float, grey: int, placing: RigidTransform) -> SmoothSurface:
     points = (depth * CAMERA.pixel_rays()).astype(np.float32)
     sigma = np.full(points.shape[:2], 0.1, np.float32)
     colours = np.full(points.shape[:2], grey, np.uint8)
-    surface = smooth(RangeImage("pair", CAMERA, points, points, sigma, colours), placing)
+    surface = smooth(RangeImage("pair", CAMERA, points, points, sigma, colours), placing, 7.0)
     assert surface is not None
     return surface
 

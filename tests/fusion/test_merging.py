@@ -14,6 +14,9 @@ from bodyscan.fusion.merging import merge
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.settings import FusionSettings
+
+SETTINGS = FusionSettings(points=250_000)
 
 
 def test_the_cloud_lies_on_the_body(scan: Scan, cloud: BodyCloud):
@@ -82,7 +85,7 @@ def test_more_pairs_are_better(scan: Scan, cloud: BodyCloud):
 def test_the_same_images_give_the_same_bytes(
     scan: Scan, cleaned: list[RangeImage], cloud: BodyCloud
 ):
-    again = merge(cleaned, scan.rig_from_camera, points=250_000, workers=3).cloud
+    again = merge(cleaned, scan.rig_from_camera, SETTINGS, workers=3).cloud
     for name in BodyCloud.__dataclass_fields__:
         assert getattr(again, name).tobytes() == getattr(cloud, name).tobytes()
 
@@ -95,7 +98,7 @@ def test_small_misalignments_are_averaged(scan: Scan, cleaned: list[RangeImage])
         @ RigidTransform.from_rotation_vector(rng.normal(0, 1e-4, 3), rng.normal(0, 0.2, 3))
         for name, placing in scan.rig_from_camera.items()
     }
-    cloud = merge(cleaned, moved, points=250_000).cloud
+    cloud = merge(cleaned, moved, SETTINGS).cloud
     off = signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
     # 0.2 mm and 0.1 mrad times 1.3 m are 0.24 mm along the normal where one pair sees alone.
     assert deviation(off).rms_mm < 0.3
@@ -108,7 +111,7 @@ def test_a_misplaced_pair_leaves_no_double_surface(scan: Scan, cleaned: list[Ran
     """One pair 3 mm too far: where others see the same, one of the surfaces has to go."""
     shift = RigidTransform(np.eye(3), np.array([0.0, 0.0, 3.0]))
     moved = {**scan.rig_from_camera, "p1-2": scan.rig_from_camera["p1-2"] @ shift}
-    cloud = merge(cleaned, moved, points=250_000).cloud
+    cloud = merge(cleaned, moved, SETTINGS).cloud
     off = signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
     assert np.mean(np.abs(off) > 1.5) > 0.02  # what only that pair saw
     assert _share_of_doubles(cloud, off, 1.5) < 0.01
@@ -134,7 +137,7 @@ def test_points_in_front_of_what_others_see_go(scan: Scan, cleaned: list[RangeIm
         image.pair, image.camera, points, image.normals, image.sigma_mm, image.colours
     )
     images = [*cleaned[:number], wrong, *cleaned[number + 1 :]]
-    cloud = merge(images, scan.rig_from_camera, points=250_000).cloud
+    cloud = merge(images, scan.rig_from_camera, SETTINGS).cloud
     floating = points[patch].reshape(-1, 3)
     floating = scan.rig_from_camera["p1-3"].apply(
         floating[np.isfinite(floating[:, 0])].astype(float)
@@ -157,12 +160,12 @@ def test_nothing_to_merge_is_an_error(scan: Scan, cleaned: list[RangeImage]):
     )
     for images in ([], [image]):
         with pytest.raises(ScanFailed, match="next to nothing"):
-            merge(images, scan.rig_from_camera)
+            merge(images, scan.rig_from_camera, SETTINGS)
 
 
 def test_few_points_are_all_kept(scan: Scan, cleaned: list[RangeImage]):
     image = cleaned[3]
-    cloud = merge([image], scan.rig_from_camera, points=10_000_000).cloud
+    cloud = merge([image], scan.rig_from_camera, FusionSettings(points=10_000_000)).cloud
     assert 0.9 * image.valid.sum() < len(cloud.points) <= image.valid.sum()
     assert (cloud.pairs_seen == 1).all()
 

@@ -15,6 +15,7 @@ from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.fusion.meshing import mesh, poisson
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.topology import signed_volume, topology
+from bodyscan.settings import MeshSettings
 
 
 def crossings(body: BodyMesh, start: np.ndarray, way: np.ndarray) -> np.ndarray:
@@ -82,7 +83,7 @@ def test_made_up_faces_are_marked(scan: Scan, body: BodyMesh):
 
 def test_no_web_between_the_legs(scan: Scan, cloud: BodyCloud, body: BodyMesh):
     start, way = between_the_thighs()
-    without = mesh(cloud, depth=7)
+    without = mesh(cloud, MeshSettings(depth=7))
     # Poisson alone closes the gap, which no camera sees from the front; the back pole sees
     # through it, and that knowledge opens it.
     assert crossings(without, start, way).max() >= 2
@@ -100,7 +101,13 @@ def test_feet_stand_on_the_floor(cloud: BodyCloud, body: BodyMesh):
 def test_the_same_cloud_gives_the_same_bytes(scan: Scan, cloud: BodyCloud):
     some = BodyCloud(*(getattr(cloud, name)[::4] for name in BodyCloud.__dataclass_fields__))
     one, other = (
-        mesh(some, scan.range_images[:6], scan.rig_from_camera, depth=6, workers=workers)
+        mesh(
+            some,
+            MeshSettings(depth=6),
+            scan.range_images[:6],
+            scan.rig_from_camera,
+            workers=workers,
+        )
         for workers in (1, 2)
     )
     for name in BodyMesh.__dataclass_fields__:
@@ -109,7 +116,7 @@ def test_the_same_cloud_gives_the_same_bytes(scan: Scan, cloud: BodyCloud):
 
 def test_a_body_clear_of_the_floor_needs_no_hints(cloud: BodyCloud):
     lifted = replace(cloud, points=cloud.points + np.array([0.0, 0.0, 200.0]))
-    found = mesh(lifted, depth=6)
+    found = mesh(lifted, MeshSettings(depth=6))
     assert topology(found.vertices, found.faces).manifold
     assert found.vertices[:, 2].min() > 100.0
 
@@ -117,4 +124,4 @@ def test_a_body_clear_of_the_floor_needs_no_hints(cloud: BodyCloud):
 def test_a_handful_of_points_is_an_error(cloud: BodyCloud):
     few = BodyCloud(*(getattr(cloud, name)[:50] for name in BodyCloud.__dataclass_fields__))
     with pytest.raises(ScanFailed, match="too small"):
-        mesh(few)
+        mesh(few, MeshSettings())

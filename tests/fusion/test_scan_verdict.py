@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import open3d as o3d
 import pytest
 from ray_cast_scan import Truth, cast_scan, load_body, load_rig, looking, without
 
-from bodyscan.alignment.icp import AlignmentSettings
 from bodyscan.errors import ScanFailed
-from bodyscan.fusion.scan import Scan, ScanSettings, fuse
+from bodyscan.fusion.scan import Scan, fuse
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Volume
+from bodyscan.settings import AlignmentSettings, FusionSettings, MeshSettings, ScanSettings
 
 RIG = load_rig()
 SETTINGS = ScanSettings(
-    points=66_000,
-    alignment=AlignmentSettings(spacing_mm=3.0),
-    mesh_depth=7,
-    mesh_reach_mm=16.0,  # four times what it is at depth 9, as the cells are
+    fusion=FusionSettings(points=66_000),
+    mesh=MeshSettings(depth=7, reach_mm=16.0),  # four times what it is at depth 9, as the cells are
 )
 
 
@@ -200,6 +196,7 @@ def test_alignment_takes_no_part_if_not_wanted(images):
     placed = placings()
     known = PlacingCovariance(tuple(placed), np.zeros((6 * len(placed), 6 * len(placed))))
     calibration = RigCalibration(RIG, {}, placed, known, {}, {}, ())
-    scan = fuse(calibration, Outcome(images), replace(SETTINGS, alignment=None))
+    boards_alone = SETTINGS.model_copy(update={"alignment": AlignmentSettings(matching="none")})
+    scan = fuse(calibration, Outcome(images), boards_alone)
     assert scan.alignment is None
     assert scan.verdict.grade == "good"

@@ -13,9 +13,11 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.settings import FusionSettings
 
 CAMERA = Camera(430.0, 428.0, 0.7, 161.0, 118.0, Radial(-0.12, 0.08), 320, 240)
 DISTANCE = 320.0  # a pixel is 0.75 mm wide there, as in the real rigs
+WINDOW_MM = FusionSettings().window_mm
 RAYS = CAMERA.pixel_rays()
 POSE = RigidTransform.from_rotation_vector([0.3, -2.0, 0.4], [700.0, -200.0, 900.0])
 
@@ -52,7 +54,7 @@ def sphere_depth(radius: float) -> np.ndarray:
 
 def smoothed(image: RangeImage) -> tuple[SmoothSurface, np.ndarray, np.ndarray]:
     """With points and normals in the camera frame, (N, 3)."""
-    surface = smooth(image, POSE)
+    surface = smooth(image, POSE, WINDOW_MM)
     assert surface is not None
     camera_from_rig = POSE.inverse()
     points = camera_from_rig.apply(surface.points.astype(float))
@@ -114,7 +116,7 @@ def test_sigmas_that_promise_too_much_are_corrected():
     depth = plane_depth(np.array([0.0, 0.0, 1.0]))
     honest, boastful = image_of(depth, 0.3), image_of(depth, 0.3)
     boastful.sigma_mm[:] /= 4.0
-    one, other = smooth(honest, POSE), smooth(boastful, POSE)
+    one, other = smooth(honest, POSE, WINDOW_MM), smooth(boastful, POSE, WINDOW_MM)
     assert one is not None
     assert other is not None
     np.testing.assert_allclose(np.median(other.sigma_mm), np.median(one.sigma_mm), rtol=0.03)
@@ -190,4 +192,4 @@ def test_a_window_cut_by_a_rim_is_fitted_exactly():
 
 
 def test_an_image_of_nothing_gives_nothing():
-    assert smooth(image_of(np.full((240, 320), np.nan)), POSE) is None
+    assert smooth(image_of(np.full((240, 320), np.nan)), POSE, WINDOW_MM) is None

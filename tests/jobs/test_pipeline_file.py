@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 import yaml
 
-from bodyscan.alignment.icp import AlignmentSettings
-from bodyscan.fusion.scan import ScanSettings
 from bodyscan.jobs.pipeline import (
     SECTIONS,
-    Alignment,
-    Fusion,
-    Mesh,
     Pipeline,
     PipelineError,
     load_pipeline,
 )
+from bodyscan.settings import ScanSettings
 
 PIPELINES = sorted((Path(__file__).parents[2] / "pipelines").glob("*.yaml"))
 FUSE = next(path for path in PIPELINES if path.stem == "fuse")
@@ -38,15 +33,7 @@ def test_every_file_names_every_parameter_with_a_comment(path):
 
 def test_the_defaults_are_those_of_the_commands():
     """A batch fuses as `bodyscan scan` does, and fuse.yaml says the same as no word at all."""
-    assert Alignment().model_dump() == asdict(AlignmentSettings())
-    scan = ScanSettings()
-    assert Fusion().model_dump() == {
-        "points": scan.points,
-        "window_mm": scan.window_mm,
-        "agreement_mm": scan.agreement_mm,
-        "double_mm": scan.double_mm,
-    }
-    assert Mesh().model_dump() == {"depth": scan.mesh_depth, "reach_mm": scan.mesh_reach_mm}
+    assert Pipeline(name="fuse", kind="fuse").scan == ScanSettings()
     assert load_pipeline(FUSE) == Pipeline(name="fuse", kind="fuse")
 
 

@@ -10,8 +10,9 @@ import pytest
 from cheap_batch import jobs_of
 
 from bodyscan.jobs.batch import seconds_left
-from bodyscan.jobs.summary import BODY_CENTRE_MM, to_repeat, write_summary
+from bodyscan.jobs.summary import to_repeat, write_summary
 from bodyscan.jobs.supervision import JobResult
+from bodyscan.settings import BODY_CENTRE_MM
 
 NAMES = [f"s{number}" for number in range(9)]
 
