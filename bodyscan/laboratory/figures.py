@@ -8,16 +8,14 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.geometry.light_planes import Axis, baseline_angle_tilt
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
-
-Array = NDArray[np.float64]
 
 INK, GREY = "#333333", "#999999"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")

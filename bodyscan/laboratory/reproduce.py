@@ -7,30 +7,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.files.atomic import write_text
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import rigid_fit
+from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.calibrating import Calibrated, calibrate_all, sigma_trial
 from bodyscan.laboratory.chapter.captures import ChapterCaptures, take_captures
 from bodyscan.laboratory.chapter.measuring import (
     Measured,
-    measure,
+    measure_artefacts,
     noise_bound,
     points_of,
     true_approach,
 )
 from bodyscan.laboratory.chapter.point_sigma import point_sigma
-from bodyscan.laboratory.chapter.setup import (
-    CAMERA,
-    PROJECTOR,
-    chapter_setup,
-    ideal_settings,
-    real_settings,
-    true_planes,
-)
 from bodyscan.laboratory.chapter.text import Reproduction, report
 from bodyscan.laboratory.rivals.approaches import Approach
 from bodyscan.progress import Progress, silent
@@ -39,7 +32,6 @@ from bodyscan.reconstruction.triangulation import grid_normals
 if TYPE_CHECKING:
     from bodyscan.laboratory.figures import RangeData
 
-Array = NDArray[np.float64]
 
 SEEDS, STAGE_STOPS, SAMPLES = 250, 7, 5
 QUICK_SEEDS, QUICK_STAGE_STOPS, QUICK_SAMPLES = 5, 3, 3
@@ -61,10 +53,10 @@ def reproduce(
     seed: of all noise.  quick: coarser rendering and fewer shots, to try it out.  real_light: a
     bowed board, speckle and all else that an ideal simulation leaves out.
     """
-    settings = (real_settings if real_light else ideal_settings)(
+    settings = (apparatus.real_settings if real_light else apparatus.ideal_settings)(
         QUICK_SAMPLES if quick else SAMPLES
     )
-    setup = chapter_setup(settings, seed)
+    setup = apparatus.chapter_setup(settings, seed)
     stops = QUICK_STAGE_STOPS if quick else STAGE_STOPS
     captures = take_captures(setup, stage_stops=stops, progress=progress)
     calibrated = calibrate_all(captures)
@@ -95,7 +87,9 @@ def _measure_all(
     for approaches, whole in groups:
         done = sum(map(len, results))
         progress("measuring", done, total)
-        results.append(tuple(measure(approach, captures, whole=whole) for approach in approaches))
+        results.append(
+            tuple(measure_artefacts(approach, captures, whole=whole) for approach in approaches)
+        )
     progress("measuring", total, total)
     return Reproduction(
         seed=seed,
@@ -122,15 +116,15 @@ def draw(captures: ChapterCaptures, calibrated: Calibrated, out: Path) -> None:
     from bodyscan.laboratory.figures import PlaneCurve, draw_projector, draw_range_data
 
     by_name = {approach.name: approach for approach in calibrated.approaches}
-    s = np.arange(PROJECTOR.stripes + 1.0)
+    s = np.arange(apparatus.PROJECTOR.stripes + 1.0)
     curves = [PlaneCurve(name, s, _planes(by_name[name], s)) for name in ("(iii)", "ours", "(i)")]
-    true = PlaneCurve("true", s, true_planes(captures.setup))
+    true = PlaneCurve("true", s, apparatus.true_planes(captures.setup))
     distances = calibrated.planes.distances_mm
     draw_projector(
         curves,
         true,
         distances[np.isfinite(distances)],
-        PROJECTOR.direction,
+        apparatus.PROJECTOR.direction,
         out / FIGURES[0],
     )
     wanted = [by_name[name] for name in ("(i)", "(ii)", "(iii)", "ours")]
@@ -152,7 +146,10 @@ def _range_data(approach: Approach, captures: ChapterCaptures) -> RangeData:
 
     s = captures.spheres.stripes.s
     points = points_of(approach, s).reshape(*s.shape, 3)
-    true = CAMERA.directions(CAMERA.grid()) * captures.spheres.truth.depth[..., None]
+    true = (
+        apparatus.CAMERA.directions(apparatus.CAMERA.grid())
+        * captures.spheres.truth.depth[..., None]
+    )
     both = np.isfinite(points[..., 2]) & np.isfinite(captures.spheres.truth.s)
     laid = np.full(points.shape, np.nan)
     laid[both] = rigid_fit(points[both], true[both]).apply(points[both])

@@ -6,27 +6,17 @@ import pytest
 from bodyscan.boards.detection import find_boards
 from bodyscan.evaluation.spheres import find_spheres
 from bodyscan.geometry.light_planes import baseline_angle_tilt
+from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.calibrating import calibrate_all, sigma_trial
 from bodyscan.laboratory.chapter.captures import take_captures
 from bodyscan.laboratory.chapter.measuring import (
-    measure,
+    measure_artefacts,
     noise_bound,
     points_of,
     true_approach,
     whole_stripes,
 )
 from bodyscan.laboratory.chapter.point_sigma import point_sigma
-from bodyscan.laboratory.chapter.setup import (
-    BOARD,
-    CAMERA,
-    CENTRES,
-    board_places,
-    chapter_setup,
-    ideal_settings,
-    stage_places,
-    stage_readings,
-    true_planes,
-)
 from bodyscan.laboratory.chapter.text import Reproduction, report
 from bodyscan.laboratory.reproduce import FIGURES, draw
 from bodyscan.reconstruction.triangulation import grid_normals
@@ -35,7 +25,7 @@ from bodyscan.reconstruction.triangulation import grid_normals
 @pytest.fixture(scope="module")
 def captures():
     # Two rays a pixel each way: boundaries are then some 0.02 px worse than in the real run.
-    return take_captures(chapter_setup(ideal_settings(2)), stage_stops=3)
+    return take_captures(apparatus.chapter_setup(apparatus.ideal_settings(2)), stage_stops=3)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +37,9 @@ def calibrated(captures):
 def measured(captures, calibrated):
     approaches = [*calibrated.approaches, true_approach(captures.setup)]
     return {
-        whole: {m.name: m for m in (measure(a, captures, whole=whole) for a in approaches)}
+        whole: {
+            m.name: m for m in (measure_artefacts(a, captures, whole=whole) for a in approaches)
+        }
         for whole in (True, False)
     }
 
@@ -55,7 +47,7 @@ def measured(captures, calibrated):
 def test_baselines_reduce_angles_grow_tilts_stay():
     # Fig. 6, in words.
     baseline, angle, tilt = baseline_angle_tilt(
-        true_planes(chapter_setup(ideal_settings(1))), "vertical"
+        apparatus.true_planes(apparatus.chapter_setup(apparatus.ideal_settings(1))), "vertical"
     )
     assert (np.diff(baseline) < 0).all()
     assert (np.diff(angle) > 0).all()
@@ -71,7 +63,7 @@ def test_boards_and_stage_are_wholly_in_the_picture(captures):
 
 def test_corners_are_the_simulated_boards(captures):
     camera = captures.setup.view.camera
-    places = [*board_places(), *stage_places(stage_readings(3), 0)]
+    places = [*apparatus.board_places(), *apparatus.stage_places(apparatus.stage_readings(3), 0)]
     for shot, place in zip((*captures.boards, *captures.stage), places, strict=True):
         true = camera.image(place.apply(captures.setup.board.corners))[shot.view.corner_ids]
         # Two rays a pixel move an edge by up to 0.1 px in one pixel; a corner has thirty of them.
@@ -80,12 +72,12 @@ def test_corners_are_the_simulated_boards(captures):
 
 def test_true_stripes_and_true_calibration_leave_nothing(captures):
     truth = true_approach(captures.setup)
-    for number, centre in enumerate(CENTRES):
+    for number, centre in enumerate(apparatus.CENTRES):
         own = captures.owner == number
         points = points_of(truth, captures.spheres.truth.s, own)
         # 0.0005 mm of facets, and float32 in the ray caster.
         assert np.abs(np.linalg.norm(points - centre, axis=1) - 25.0).max() < 0.003
-    assert measure(truth, captures).plate_systematic_mm < 1e-3
+    assert measure_artefacts(truth, captures).plate_systematic_mm < 1e-3
 
 
 def test_whole_stripes_hide_the_calibration(measured):
@@ -120,14 +112,14 @@ def test_the_plate_and_the_centres_tell_calibrations_apart(measured):
     assert fine["ours"].distances.rms_mm < 0.02
     assert fine["(i)"].distances.rms_mm > 0.05
     for name in ("(iii)", "ours"):
-        for sphere, true in zip(fine[name].spheres, CENTRES, strict=True):
+        for sphere, true in zip(fine[name].spheres, apparatus.CENTRES, strict=True):
             # An error of 1e-3 in the focal length is 0.4 mm of depth at 400 mm.
             assert np.linalg.norm(sphere.given.centre - true) < 0.8
 
 
 def test_table_1_is_recovered(calibrated):
     found, sigmas = calibrated.reference.camera, np.sqrt(np.diag(calibrated.reference.covariance))
-    errors = found.parameters - [getattr(CAMERA, name) for name in found.parameter_names]
+    errors = found.parameters - [getattr(apparatus.CAMERA, name) for name in found.parameter_names]
     # Three sigmas is the bound; a fixed seed makes it no matter of chance.
     assert np.all(np.abs(errors) < 3.0 * sigmas), np.array(errors) / sigmas
 
@@ -145,7 +137,7 @@ def test_the_spheres_are_found_without_knowing_where_they_are(captures, calibrat
     points = points_of(calibrated.ours, s).reshape(*s.shape, 3).astype(np.float32)
     found = find_spheres(points.astype(float), grid_normals(points).astype(float), 25.0, 5)
     places = np.stack([sphere.centre for sphere in found])
-    assert np.allclose(places, CENTRES, atol=0.8)
+    assert np.allclose(places, apparatus.CENTRES, atol=0.8)
 
 
 def test_noise_is_less_than_everything(captures, measured):
@@ -199,4 +191,4 @@ def test_the_report_says_all_of_it(tmp_path, captures, calibrated, measured):
 
 
 def test_no_board_is_seen_among_the_spheres(captures):
-    assert find_boards(captures.spheres.lit, [BOARD], pair="p", shot="s") == []
+    assert find_boards(captures.spheres.lit, [apparatus.BOARD], pair="p", shot="s") == []

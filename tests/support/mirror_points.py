@@ -10,20 +10,12 @@ import numpy as np
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, join
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.laboratory.chapter.setup import (
-    BOARD,
-    CAMERA,
-    PROJECTOR,
-    board_places,
-    chapter_setup,
-    ideal_settings,
-    true_planes,
-)
+from bodyscan.laboratory.chapter import apparatus
 
-LENS = from_fields(asdict(CAMERA))
-MIRROR = chapter_setup(ideal_settings(1)).projector
-TRUE_PLANES = true_planes(chapter_setup(ideal_settings(1)))
-STRIPES = PROJECTOR.stripes
+LENS = from_fields(asdict(apparatus.CAMERA))
+MIRROR = apparatus.chapter_setup(apparatus.ideal_settings(1)).projector
+TRUE_PLANES = apparatus.true_planes(apparatus.chapter_setup(apparatus.ideal_settings(1)))
+STRIPES = apparatus.PROJECTOR.stripes
 
 
 def seen_on(place: RigidTransform, stripe, *, every_px: int = 8) -> tuple[np.ndarray, np.ndarray]:
@@ -31,7 +23,7 @@ def seen_on(place: RigidTransform, stripe, *, every_px: int = 8) -> tuple[np.nda
     normal = place.rotation[:, 2]
 
     def s_at(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rays = CAMERA.directions(pixels)
+        rays = apparatus.CAMERA.directions(pixels)
         points = rays * (normal @ place.translation / (rays @ normal))[:, None]
         return stripe(points), points
 
@@ -46,7 +38,10 @@ def seen_on(place: RigidTransform, stripe, *, every_px: int = 8) -> tuple[np.nda
         pixels[:, 0] -= np.clip((s - index) / slope, -80.0, 80.0)
     s, points = s_at(pixels)
     x, y, _ = place.inverse().apply(points).T
-    width, height = BOARD.columns * BOARD.square_mm, BOARD.rows * BOARD.square_mm
+    width, height = (
+        apparatus.BOARD.columns * apparatus.BOARD.square_mm,
+        apparatus.BOARD.rows * apparatus.BOARD.square_mm,
+    )
     on = (x > 0) & (x < width) & (y > 0) & (y < height) & (np.abs(s - index) < 1e-7)
     return index[on], pixels[on]
 
@@ -61,7 +56,7 @@ def mirror_points(
     """On the chapter's three boards, as a perfect calibration of the camera has them."""
     rng = np.random.default_rng(0)
     parts = []
-    for number, place in enumerate(places or board_places()):
+    for number, place in enumerate(places or apparatus.board_places()):
         index, pixels = seen_on(place, stripe, every_px=every_px)
         pixels[:, 0] += noise_px * rng.standard_normal(len(pixels))
         sigma = np.full(len(index), max(noise_px, 0.01))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.boards.board import corner_points
 from bodyscan.calibration.boundary_points import binned
 from bodyscan.calibration.camera import (
@@ -19,8 +19,8 @@ from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
 from bodyscan.calibration.planar_view import PlanarView, planar_view
 from bodyscan.calibration.refinement_choice import refine_where_better
 from bodyscan.geometry.camera_fields import from_fields
+from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.captures import TARGET, ChapterCaptures
-from bodyscan.laboratory.chapter.setup import CAMERA, board_places
 from bodyscan.laboratory.rivals.approaches import (
     Approach,
     mended_pinhole_by_stage,
@@ -29,8 +29,6 @@ from bodyscan.laboratory.rivals.approaches import (
     rivals,
 )
 from bodyscan.laboratory.rivals.targets import Located, by_reference_plane, by_slide_stage
-
-Array = NDArray[np.float64]
 
 CORNER_NOISE_PX = 0.012
 """What corners found in the rendered images are off, each way."""
@@ -124,16 +122,16 @@ class SigmaTrial:
 def sigma_trial(seeds: int, seed: int = 0) -> SigmaTrial:
     """Table 1's camera from the three poses, with `seeds` draws of corner noise."""
     corners = corner_points(TARGET.board)
-    places = board_places()
-    seen = [CAMERA.image(place.apply(corners)) for place in places]
-    true, errors = from_fields(asdict(CAMERA)), []
+    places = apparatus.board_places()
+    seen = [apparatus.CAMERA.image(place.apply(corners)) for place in places]
+    true, errors = from_fields(asdict(apparatus.CAMERA)), []
     for number in range(seeds):
         rng = np.random.default_rng([seed, number])
         views = [
             PlanarView(f"s{k}", corners, pixels + rng.normal(0.0, CORNER_NOISE_PX, pixels.shape))
             for k, pixels in enumerate(seen)
         ]
-        found = calibrate_camera(views, CAMERA.width, CAMERA.height)
+        found = calibrate_camera(views, apparatus.CAMERA.width, apparatus.CAMERA.height)
         sigmas = np.sqrt(np.diag(found.covariance))
         errors.append((found.camera.parameters - true.parameters) / sigmas)
     return SigmaTrial(true.parameter_names, np.stack(errors))

@@ -7,37 +7,20 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Indices, Mask
 from bodyscan.boards.detection import find_boards
 from bodyscan.errors import BoardNotFound
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.laboratory.chapter.setup import (
-    BOARD,
-    CENTRES,
-    PROJECTOR,
-    RADIUS_MM,
-    ChapterSetup,
-    board_places,
-    board_surfaces,
-    expose_scene,
-    expose_twice,
-    plane_surfaces,
-    scene_truth,
-    sphere_surfaces,
-    stage_places,
-    stage_readings,
-)
+from bodyscan.laboratory.chapter import apparatus, scenes
+from bodyscan.laboratory.chapter.apparatus import ChapterSetup
 from bodyscan.laboratory.rivals.targets import StripedShot, Target
 from bodyscan.progress import Progress, silent
 from bodyscan.simulation.render import PixelTruth
 from bodyscan.simulation.scene import Surface
 from bodyscan.stripes.stripe_map import StripeMap
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-TARGET = Target(BOARD, PROJECTOR)
+TARGET = Target(apparatus.BOARD, apparatus.PROJECTOR)
 ON_SPHERE_MM = 0.02
 RIM_PX = 4
 WALL_MM = 600.0
@@ -48,7 +31,7 @@ _BOARDS, _STAGE, _SPHERES, _PLATE = 0, 100, 200, 300
 class Seen:
     """One scene: the lit image, its stripes, the same light exposed once more, and the truth."""
 
-    lit: NDArray[np.uint8]
+    lit: Bytes
     stripes: StripeMap
     again: StripeMap
     truth: PixelTruth
@@ -68,7 +51,7 @@ class ChapterCaptures:
     readings: Array
     spheres: Seen
     plate: Seen
-    owner: NDArray[np.int64]
+    owner: Indices
     on_plate: Mask
 
 
@@ -76,8 +59,8 @@ def take_captures(
     setup: ChapterSetup, *, stage_stops: int = 7, progress: Progress = silent
 ) -> ChapterCaptures:
     """Render, expose and decode all of it. Raises BoardNotFound if a board is not found."""
-    readings = stage_readings(stage_stops)
-    boards, stage = board_places(), stage_places(readings, setup.seed)
+    readings = apparatus.stage_readings(stage_stops)
+    boards, stage = apparatus.board_places(), apparatus.stage_places(readings, setup.seed)
     total = len(boards) + len(stage) + 2
     progress("rendering", 0, total)
     shots = []
@@ -87,9 +70,9 @@ def take_captures(
         name = f"stage{of_stage + 1}" if of_stage >= 0 else f"board{number + 1}"
         shots.append(_board_shot(setup, place, name, stream))
         progress("rendering", number + 1, total)
-    spheres = _seen(setup, sphere_surfaces(), _SPHERES)
+    spheres = _seen(setup, scenes.sphere_surfaces(), _SPHERES)
     progress("rendering", total - 1, total)
-    plate = _seen(setup, plane_surfaces(), _PLATE)
+    plate = _seen(setup, scenes.plane_surfaces(), _PLATE)
     progress("rendering", total, total)
     return ChapterCaptures(
         setup,
@@ -104,22 +87,24 @@ def take_captures(
 
 
 def _board_shot(setup: ChapterSetup, place: RigidTransform, shot: str, number: int) -> StripedShot:
-    taken = expose_scene(setup, board_surfaces(setup, place), number)
-    views = find_boards(taken.lit, [BOARD], pair="chapter", shot=shot)
+    taken = scenes.expose_scene(setup, scenes.board_surfaces(setup, place), number)
+    views = find_boards(taken.lit, [apparatus.BOARD], pair="chapter", shot=shot)
     if not views:
         raise BoardNotFound("the simulated board was not found", where=f"shot {shot}")
     return StripedShot(views[0], taken.stripes)
 
 
 def _seen(setup: ChapterSetup, surfaces: Sequence[Surface], number: int) -> Seen:
-    first, second = expose_twice(setup, surfaces, number)
-    return Seen(first.lit, first.stripes, second.stripes, scene_truth(setup, surfaces))
+    first, second = scenes.expose_twice(setup, surfaces, number)
+    return Seen(first.lit, first.stripes, second.stripes, scenes.scene_truth(setup, surfaces))
 
 
-def _owners(setup: ChapterSetup, truth: PixelTruth) -> NDArray[np.int64]:
+def _owners(setup: ChapterSetup, truth: PixelTruth) -> Indices:
     camera = setup.view.camera
     points = camera.directions(camera.grid()) * truth.depth[..., None]
-    off = np.abs(np.linalg.norm(points[..., None, :] - CENTRES, axis=-1) - RADIUS_MM)
+    off = np.abs(
+        np.linalg.norm(points[..., None, :] - apparatus.CENTRES, axis=-1) - apparatus.RADIUS_MM
+    )
     off = np.nan_to_num(off, nan=np.inf)
     nearest = np.argmin(off, axis=-1)
     on = (off.min(axis=-1) < ON_SPHERE_MM) & np.isfinite(truth.s)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Mask
 from bodyscan.evaluation.planes import Flatness, flatness
 from bodyscan.evaluation.spheres import (
     CentreDistances,
@@ -17,19 +18,11 @@ from bodyscan.evaluation.spheres import (
 )
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.light_planes import LightPlanes
+from bodyscan.laboratory.chapter import apparatus
+from bodyscan.laboratory.chapter.apparatus import ChapterSetup
 from bodyscan.laboratory.chapter.captures import ChapterCaptures
-from bodyscan.laboratory.chapter.setup import (
-    CAMERA,
-    CENTRES,
-    PROJECTOR,
-    RADIUS_MM,
-    ChapterSetup,
-    true_planes,
-)
 from bodyscan.laboratory.rivals.approaches import Approach
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Stripes = NDArray[np.floating[Any]]
 
 
@@ -75,7 +68,7 @@ def whole_stripes(s: Stripes) -> Stripes:
     return np.floor(s) + 0.5
 
 
-def measure(
+def measure_artefacts(
     approach: Approach, captures: ChapterCaptures, *, whole: bool = False, name: str | None = None
 ) -> Measured:
     """whole: the stripe number of each pixel only, no fraction."""
@@ -84,17 +77,17 @@ def measure(
     on_spheres = captures.owner >= 0
     points, owner = points_of(approach, spheres_s, on_spheres), captures.owner[on_spheres]
     found, covered = [], []
-    for number in range(len(CENTRES)):
+    for number in range(len(apparatus.CENTRES)):
         own = owner == number
         measured = _known(points[own])
-        found.append(measure_sphere(measured, RADIUS_MM))
+        found.append(measure_sphere(measured, apparatus.RADIUS_MM))
         covered.append(len(measured) / int(own.sum()))
     centres = np.stack([sphere.given.centre for sphere in found])
     return Measured(
         name or approach.name,
         tuple(found),
         tuple(covered),
-        centre_distances(centres, CENTRES),
+        centre_distances(centres, apparatus.CENTRES),
         flatness(_known(points_of(approach, plate_s, captures.on_plate))),
         flatness(_known(points_of(approach, captures.plate.truth.s, captures.on_plate))).rms_mm,
     )
@@ -102,10 +95,12 @@ def measure(
 
 def true_approach(setup: ChapterSetup, name: str = "true calibration") -> Approach:
     """What nothing can calibrate better: the simulator's own camera and planes."""
-    planes = true_planes(setup)
+    planes = apparatus.true_planes(setup)
     unknown = np.zeros((len(planes), 4, 4))
     return Approach(
-        name, from_fields(asdict(CAMERA)), LightPlanes(planes, unknown, PROJECTOR.direction)
+        name,
+        from_fields(asdict(apparatus.CAMERA)),
+        LightPlanes(planes, unknown, apparatus.PROJECTOR.direction),
     )
 
 
@@ -126,7 +121,7 @@ def noise_bound(captures: ChapterCaptures, share: float = 0.9) -> NoiseBound:
     truth = true_approach(captures.setup)
     seen = captures.spheres
     everything, best = [], []
-    for number, centre in enumerate(CENTRES):
+    for number, centre in enumerate(apparatus.CENTRES):
         own = captures.owner == number
         both = (points_of(truth, stripes.s, own) for stripes in (seen.stripes, seen.again))
         distance = [np.linalg.norm(points - centre, axis=1) for points in both]

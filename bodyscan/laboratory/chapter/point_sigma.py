@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.ray_depths import intersect_rays
 from bodyscan.laboratory.chapter.captures import ChapterCaptures, Seen
 from bodyscan.laboratory.rivals.approaches import Approach
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.calibrating import Calibrated, SigmaTrial
 from bodyscan.laboratory.chapter.measuring import Measured, NoiseBound
 from bodyscan.laboratory.chapter.point_sigma import PointSigma
-from bodyscan.laboratory.chapter.setup import CAMERA, RADIUS_MM
 
 CHAPTER_TABLE_2 = {
     "(i)": (0.41, 0.38, 0.26, 0.26, 0.31),
@@ -75,7 +75,7 @@ def _table_1(found: Reproduction) -> str:
     rows = []
     zhang, ours = found.calibrated.reference, found.calibrated.ours
     for number, name in enumerate(zhang.camera.parameter_names):
-        true = getattr(CAMERA, name)
+        true = getattr(apparatus.CAMERA, name)
         row = [name, f"{true:.7g}"]
         for camera, covariance in (
             (zhang.camera, zhang.covariance),
@@ -231,8 +231,8 @@ def _remarks(found: Reproduction) -> str:
             f"{_times(found.fine, first):.1f} times with sub-pixel boundaries: whole stripes hide what "
             "a calibration is worth. Mended (lens corrected, index re-mapped) it has "
             f"{_times(found.fine, mended):.2f} times.",
-            f"- A sphere of {RADIUS_MM:g} mm is small against the bend of a wrong calibration; the "
-            f"plate shows it: {first.plate_systematic_mm:.3f} mm RMS for (i), "
+            f"- A sphere of {apparatus.RADIUS_MM:g} mm is small against the bend of a wrong "
+            f"calibration; the plate shows it: {first.plate_systematic_mm:.3f} mm RMS for (i), "
             f"{mended.plate_systematic_mm:.3f} mended.",
         ]
     )

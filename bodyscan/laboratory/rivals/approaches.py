@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from bodyscan.arrays import Array
 from bodyscan.calibration.boundary_points import BoundaryPoints, thinned
 from bodyscan.calibration.light_planes import fit_light_planes
 from bodyscan.calibration.pinhole_projector import fit_pinhole
@@ -25,8 +23,6 @@ from bodyscan.laboratory.rivals.targets import (
     by_matrix,
     relocated,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,12 +10,10 @@ is taken to be the camera's own axis.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints
 from bodyscan.geometry.light_planes import Axis, LightPlanes
-
-Array = NDArray[np.float64]
 
 FEWEST_POINTS = 12
 REWEIGHTINGS = 4
@@ -74,7 +72,7 @@ def _axes(vectors: Array, direction: Axis) -> tuple[Array, Array, Array]:
 
 
 def _solve(
-    own: Array, common: Array, right: Array, weights: Array, group: NDArray[np.int64], groups: int
+    own: Array, common: Array, right: Array, weights: Array, group: Indices, groups: int
 ) -> tuple[Array, Array]:
     """Least squares with K unknowns for each group and M for all: (groups, K), (M,).
 

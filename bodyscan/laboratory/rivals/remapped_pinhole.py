@@ -7,13 +7,11 @@ A smooth function of the index makes up for that; what is left is that the strip
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.geometry.light_planes import Axis, LightPlanes
-
-Array = NDArray[np.float64]
 
 POWERS = (3, 4, 5)
 """The matrix has a scale, a shift and a perspective of the index itself: powers 0 to 2."""

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.boundary_points import BoundaryPoints, join
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
@@ -27,8 +27,6 @@ from bodyscan.laboratory.rivals.tsai import TsaiCamera, calibrate_tsai
 from bodyscan.rig.board import Board
 from bodyscan.stripes.projector_spec import ProjectorSpec
 from bodyscan.stripes.stripe_map import StripeMap
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

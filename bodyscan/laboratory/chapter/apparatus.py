@@ -7,22 +7,18 @@ lay; these are chosen so that all fits into the picture, at about 400 mm.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.simulation.board import MadeBoard, make_board
-from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import build_mirror
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector
-from bodyscan.simulation.render import PixelTruth, View, pixel_truth, render_pair
-from bodyscan.simulation.scene import Scene, Surface, grid_surface
-from bodyscan.simulation.sensor import expose
+from bodyscan.simulation.render import View
 from bodyscan.simulation.settings import (
     BoardMaking,
     Noise,
@@ -30,12 +26,7 @@ from bodyscan.simulation.settings import (
     Projection,
     SimulationSettings,
 )
-from bodyscan.stripes.codes import read_stripes
 from bodyscan.stripes.projector_spec import ProjectorSpec
-from bodyscan.stripes.stripe_map import StripeMap
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 CAMERA = TrueCamera(1061.71, 1064.09, -0.562002, 350.08, 286.547, -0.140279, -0.0916363, 640, 480)
 """Table 1, to the last digit."""
@@ -68,13 +59,9 @@ CENTRES = np.array(
 PLATE_TURN = (0.15, 0.1, 0.0)
 PLATE_MM = (160.0, 120.0)
 PLATE_MIDDLE = (-11.0, -17.0, 402.0)
-SPHERE_RINGS = 400
-"""Facets of a sphere then lie less than 0.0005 mm inside it."""
-LAMP_GREY, AMBIENT_GREY = 255.0, 13.0
-WHITE, GROUND, WALL = 0.8, 0.5, 0.3
-
 _PROJECTOR_SEED = 1
-_RAYS, _BOARD, _STAGE, _NOISE = range(1, 5)
+RAYS, BOARD_MAKING, STAGE, NOISE = range(1, 5)
+"""What a random number is drawn for: each has a stream of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,14 +76,6 @@ class ChapterSetup:
     board: MadeBoard
     view: View
     seed: int
-
-
-@dataclass(frozen=True, eq=False)
-class Exposure:
-    """What the camera took: the lit image and the stripes read from the whole sequence."""
-
-    lit: Image
-    stripes: StripeMap
 
 
 def ideal_settings(samples: int = 5) -> SimulationSettings:
@@ -137,8 +116,8 @@ def chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
     return ChapterSetup(
         settings,
         projector,
-        make_board(BOARD, settings.board, np.random.default_rng([seed, _BOARD])),
-        View.of(CAMERA, settings.optics, np.random.default_rng([seed, _RAYS])),
+        make_board(BOARD, settings.board, np.random.default_rng([seed, BOARD_MAKING])),
+        View.of(CAMERA, settings.optics, np.random.default_rng([seed, RAYS])),
         seed,
     )
 
@@ -151,7 +130,7 @@ def true_planes(setup: ChapterSetup) -> Array:
 
 def board_places() -> list[RigidTransform]:
     """camera_from_board of the three poses."""
-    return [_about(m, t) for m, t in zip(BOARD_MIDDLES, BOARD_TURNS, strict=True)]
+    return [place_about(m, t) for m, t in zip(BOARD_MIDDLES, BOARD_TURNS, strict=True)]
 
 
 def stage_readings(count: int = len(STAGE_MM)) -> Array:
@@ -162,78 +141,14 @@ def stage_readings(count: int = len(STAGE_MM)) -> Array:
 def stage_places(readings: Array, seed: int) -> list[RigidTransform]:
     """camera_from_board at each stop: the stage slides along its board's own normal, and stops
     nearly where it should."""
-    rng = np.random.default_rng([seed, _STAGE])
-    stage = _about(STAGE_MIDDLE, STAGE_TURN)
+    rng = np.random.default_rng([seed, STAGE])
+    stage = place_about(STAGE_MIDDLE, STAGE_TURN)
     stops = readings + STAGE_ERROR_MM * rng.standard_normal(len(readings))
     slides = [RigidTransform(np.eye(3), np.array([0.0, 0.0, stop])) for stop in stops]
     return [stage @ slide for slide in slides]
 
 
-def board_surfaces(setup: ChapterSetup, camera_from_board: RigidTransform) -> list[Surface]:
-    """The board, and a wall behind it."""
-    return [*(surface.moved(camera_from_board) for surface in setup.board.surfaces), _wall()]
-
-
-def sphere_surfaces() -> list[Surface]:
-    """Five white spheres on the ground, and a wall behind."""
-    mesh = o3d.geometry.TriangleMesh.create_sphere(RADIUS_MM, resolution=SPHERE_RINGS)
-    arms = np.asarray(mesh.vertices)
-    ball = Surface(arms, np.asarray(mesh.triangles), WHITE, normals=arms / RADIUS_MM)
-    spheres = [replace(ball, vertices=arms + centre) for centre in CENTRES]
-    return [*spheres, _ground(), _wall()]
-
-
-def plane_surfaces() -> list[Surface]:
-    """A flat white plate, somewhat smaller than the board: no calibration reaches beyond that."""
-    place = _about(PLATE_MIDDLE, PLATE_TURN, middle=np.zeros(3))
-    width, height = PLATE_MM
-    across, down = np.array([width, 0.0, 0.0]), np.array([0.0, height, 0.0])
-    plate = grid_surface(-0.5 * (across + down), across, down, albedo=WHITE)
-    return [replace(plate, open_to_light=True).moved(place), _wall()]
-
-
-def expose_scene(setup: ChapterSetup, surfaces: Sequence[Surface], number: int) -> Exposure:
-    """Render the sequence, expose it and read the stripes; `number` tells one shot's noise from
-    another's."""
-    return expose_twice(setup, surfaces, number)[0]
-
-
-def expose_twice(
-    setup: ChapterSetup, surfaces: Sequence[Surface], number: int
-) -> tuple[Exposure, Exposure]:
-    """The same light (jitter and speckle too) with the sensor's noise drawn twice."""
-    rng = np.random.default_rng([setup.seed, _NOISE, number])
-    settings = setup.settings
-    lamps = Lamps(LAMP_GREY, AMBIENT_GREY, DISTANCE_MM * 1.05, DISTANCE_MM)
-    images = render_pair(
-        Scene(surfaces), setup.view, setup.projector, lamps, settings.projection, rng
-    )
-    first, second = (
-        {name: expose(image, settings.noise, rng) for name, image in images.items()}
-        for _ in range(2)
-    )
-    return _read(first), _read(second)
-
-
-def scene_truth(setup: ChapterSetup, surfaces: Sequence[Surface]) -> PixelTruth:
-    """Depth and stripe coordinate at every pixel's centre."""
-    return pixel_truth(Scene(surfaces), CAMERA, setup.projector)
-
-
-def _read(frames: dict[str, Image]) -> Exposure:
-    bits = range(PROJECTOR.bits)
-    stripes = read_stripes(
-        frames["lit"],
-        frames["dark"],
-        np.stack([frames[f"bit{bit:02d}"] for bit in bits]),
-        np.stack([frames[f"bit{bit:02d}-inverse"] for bit in bits]),
-        stripes=PROJECTOR.stripes,
-        direction=PROJECTOR.direction,
-    )
-    return Exposure(frames["lit"], stripes)
-
-
-def _about(
+def place_about(
     place: Sequence[float], turn: Sequence[float], middle: Array | None = None
 ) -> RigidTransform:
     """camera_from_board with the board's middle at a place, turned about it."""
@@ -241,22 +156,3 @@ def _about(
         middle = BOARD.square_mm / 2.0 * np.array([BOARD.columns, BOARD.rows, 0.0])
     rotation = RigidTransform.from_rotation_vector(turn, np.zeros(3)).rotation
     return RigidTransform(rotation, np.asarray(place) - rotation @ middle)
-
-
-def _ground() -> Surface:
-    """The plane on which all five spheres lie."""
-    across, down = np.array([1.0, 0.0, 0.0]), CENTRES[3] - CENTRES[0]
-    down = (down - (down @ across) * across) / np.linalg.norm(down[1:])
-    below = CENTRES[1] + RADIUS_MM * np.cross(across, down)
-    return grid_surface(
-        below - 300.0 * (across + down), 600.0 * across, 600.0 * down, albedo=GROUND
-    )
-
-
-def _wall() -> Surface:
-    corner = np.array([-1500.0, -1500.0, 2.0 * DISTANCE_MM])
-    return grid_surface(corner, *_sides(3000.0), albedo=WALL, encloses=True)
-
-
-def _sides(size: float) -> tuple[Array, Array]:
-    return np.array([size, 0.0, 0.0]), np.array([0.0, size, 0.0])

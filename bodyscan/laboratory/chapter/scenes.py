@@ -1,0 +1,116 @@
+"""What stands before the chapter's camera, and what the camera takes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import open3d as o3d
+
+from bodyscan.arrays import Array, Bytes
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.laboratory.chapter import apparatus
+from bodyscan.laboratory.chapter.apparatus import ChapterSetup
+from bodyscan.simulation.lamps import Lamps
+from bodyscan.simulation.render import PixelTruth, pixel_truth, render_pair
+from bodyscan.simulation.scene import Scene, Surface, grid_surface
+from bodyscan.simulation.sensor import expose
+from bodyscan.stripes.codes import read_stripes
+from bodyscan.stripes.stripe_map import StripeMap
+
+SPHERE_RINGS = 400
+"""Facets of a sphere then lie less than 0.0005 mm inside it."""
+LAMP_GREY, AMBIENT_GREY = 255.0, 13.0
+WHITE, GROUND, WALL = 0.8, 0.5, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """What the camera took: the lit image and the stripes read from the whole sequence."""
+
+    lit: Bytes
+    stripes: StripeMap
+
+
+def board_surfaces(setup: ChapterSetup, camera_from_board: RigidTransform) -> list[Surface]:
+    """The board, and a wall behind it."""
+    return [*(surface.moved(camera_from_board) for surface in setup.board.surfaces), _wall()]
+
+
+def sphere_surfaces() -> list[Surface]:
+    """Five white spheres on the ground, and a wall behind."""
+    mesh = o3d.geometry.TriangleMesh.create_sphere(apparatus.RADIUS_MM, resolution=SPHERE_RINGS)
+    arms = np.asarray(mesh.vertices)
+    ball = Surface(arms, np.asarray(mesh.triangles), WHITE, normals=arms / apparatus.RADIUS_MM)
+    spheres = [replace(ball, vertices=arms + centre) for centre in apparatus.CENTRES]
+    return [*spheres, _ground(), _wall()]
+
+
+def plane_surfaces() -> list[Surface]:
+    """A flat white plate, somewhat smaller than the board: no calibration reaches beyond that."""
+    place = apparatus.place_about(apparatus.PLATE_MIDDLE, apparatus.PLATE_TURN, middle=np.zeros(3))
+    width, height = apparatus.PLATE_MM
+    across, down = np.array([width, 0.0, 0.0]), np.array([0.0, height, 0.0])
+    plate = grid_surface(-0.5 * (across + down), across, down, albedo=WHITE)
+    return [replace(plate, open_to_light=True).moved(place), _wall()]
+
+
+def expose_scene(setup: ChapterSetup, surfaces: Sequence[Surface], number: int) -> Exposure:
+    """Render the sequence, expose it and read the stripes; `number` tells one shot's noise from
+    another's."""
+    return expose_twice(setup, surfaces, number)[0]
+
+
+def expose_twice(
+    setup: ChapterSetup, surfaces: Sequence[Surface], number: int
+) -> tuple[Exposure, Exposure]:
+    """The same light (jitter and speckle too) with the sensor's noise drawn twice."""
+    rng = np.random.default_rng([setup.seed, apparatus.NOISE, number])
+    settings = setup.settings
+    lamps = Lamps(LAMP_GREY, AMBIENT_GREY, apparatus.DISTANCE_MM * 1.05, apparatus.DISTANCE_MM)
+    images = render_pair(
+        Scene(surfaces), setup.view, setup.projector, lamps, settings.projection, rng
+    )
+    first, second = (
+        {name: expose(image, settings.noise, rng) for name, image in images.items()}
+        for _ in range(2)
+    )
+    return _read(first), _read(second)
+
+
+def scene_truth(setup: ChapterSetup, surfaces: Sequence[Surface]) -> PixelTruth:
+    """Depth and stripe coordinate at every pixel's centre."""
+    return pixel_truth(Scene(surfaces), apparatus.CAMERA, setup.projector)
+
+
+def _read(frames: dict[str, Bytes]) -> Exposure:
+    bits = range(apparatus.PROJECTOR.bits)
+    stripes = read_stripes(
+        frames["lit"],
+        frames["dark"],
+        np.stack([frames[f"bit{bit:02d}"] for bit in bits]),
+        np.stack([frames[f"bit{bit:02d}-inverse"] for bit in bits]),
+        stripes=apparatus.PROJECTOR.stripes,
+        direction=apparatus.PROJECTOR.direction,
+    )
+    return Exposure(frames["lit"], stripes)
+
+
+def _ground() -> Surface:
+    """The plane on which all five spheres lie."""
+    across, down = np.array([1.0, 0.0, 0.0]), apparatus.CENTRES[3] - apparatus.CENTRES[0]
+    down = (down - (down @ across) * across) / np.linalg.norm(down[1:])
+    below = apparatus.CENTRES[1] + apparatus.RADIUS_MM * np.cross(across, down)
+    return grid_surface(
+        below - 300.0 * (across + down), 600.0 * across, 600.0 * down, albedo=GROUND
+    )
+
+
+def _wall() -> Surface:
+    corner = np.array([-1500.0, -1500.0, 2.0 * apparatus.DISTANCE_MM])
+    return grid_surface(corner, *_sides(3000.0), albedo=WALL, encloses=True)
+
+
+def _sides(size: float) -> tuple[Array, Array]:
+    return np.array([size, 0.0, 0.0]), np.array([0.0, size, 0.0])
