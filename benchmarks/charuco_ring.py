@@ -21,7 +21,7 @@ from benchmarks.free_triangulation import (
 )
 from benchmarks.rivals import RIVALS, run_rival, without_skew
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.located_view import apart
+from bodyscan.calibration.board_views import apart
 from bodyscan.registration.rig_solve import place_rig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import find_all_boards

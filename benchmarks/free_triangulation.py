@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.located_view import LocatedView
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.captures.folder import Captures
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from bodyscan.boards.board import corner_points
 from bodyscan.boards.view import BoardView
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.boundary_points import BoundaryPoints, binned, join
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.light import fit_light, smooth_models
 from bodyscan.calibration.light_planes import fit_light_planes
-from bodyscan.calibration.located_view import LocatedView
 from bodyscan.calibration.pinhole_projector import fit_pinhole, fit_pinhole_opencv
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
@@ -24,7 +24,7 @@ from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Rig
 from bodyscan.stripes.stripe_map import StripeMap
-from bodyscan.workflows.decoding import decode_sequence
+from bodyscan.workflows.decode import decode_sequence
 from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards
 
 Array = NDArray[np.float64]

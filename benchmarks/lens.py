@@ -23,7 +23,7 @@ from bodyscan.simulation import SimulationSettings, simulate
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import PinholeProjector
 from bodyscan.simulation.settings import Projection
-from bodyscan.workflows.decoding import decode_sequence
+from bodyscan.workflows.decode import decode_sequence
 from bodyscan.workflows.evaluate import load_truth
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.planar_view import PlanarView
+from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.zhang import (
     camera_from_plane,
     homography,

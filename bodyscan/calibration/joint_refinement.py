@@ -14,8 +14,8 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import BoundaryPoints, points_on_board
-from bodyscan.calibration.planar_view import PlanarView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import cauchy_weights, spread
 from bodyscan.geometry.smooth_sheets import SmoothSheets

@@ -1,15 +1,27 @@
-"""One pair by itself, as the chapter does it (3.3): its camera, then a plane for each stripe."""
+"""One pair from boards of known pose: do its stripes agree, its light sheets, and what they reach."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.calibration.board_views import PlanarView
+from bodyscan.calibration.boundary_points import BoundaryPoints, binned
+from bodyscan.calibration.camera import CameraCalibration
+from bodyscan.calibration.joint_refinement import striped_board
+from bodyscan.calibration.light import fit_light
 from bodyscan.calibration.light_choice import HeldOutModel
+from bodyscan.calibration.refinement_choice import refine_where_better
+from bodyscan.calibration.stripe_agreement import Disagreement, boards_off, find_disagreement
+from bodyscan.calibration.striped_view import StripedView, boundaries_on_boards
+from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.outcome import Outcome
+from bodyscan.stripes.projector_spec import ProjectorSpec
 
 Array = NDArray[np.float64]
 
@@ -56,3 +68,109 @@ class PairCalibration:
     camera_covariance: Array
     light: LightSheets | None
     quality: PairQuality
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedPair:
+    """A pair whose camera and boards are known: what its light sheets are fitted from.
+
+    camera: as all corners of the rig have left it.  own: the camera as it was calibrated by itself.
+    views: number of the board views it took part with.  shots: those on which stripes were decoded,
+    with `camera_from_board` as the rig's solve has it.  alone: no other pair holds the boards.
+    """
+
+    name: str
+    camera: Camera
+    own: CameraCalibration
+    projector: ProjectorSpec | None
+    rms_px: float
+    views: int
+    shots: tuple[StripedView, ...]
+    alone: bool
+
+
+def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
+    """Light sheets of one pair. Raises PairFailed if its stripes cannot give any."""
+    quality = PairQuality(pair.rms_px, pair.views)
+    camera, projector = pair.camera, pair.projector
+    if projector is None:
+        return Outcome(
+            PairCalibration(pair.name, camera, pair.own.covariance, None, quality),
+        )
+    notes: tuple[str, ...] = ()
+    shots = pair.shots
+    points = boundaries_on_boards(pair.name, camera, projector, shots)
+    disagreement = find_disagreement(points, camera, projector.stripes, projector.direction)
+    if disagreement is not None:
+        agreed = drop_disagreeing(pair.name, shots, disagreement)
+        shots, notes = agreed.value, agreed.notes
+        points = boundaries_on_boards(pair.name, camera, projector, shots)
+    fit = fit_light(points, projector.stripes, projector.direction, camera)
+    quality = replace(
+        quality,
+        planes_rms_mm=fit.rms_mm,
+        stripe_shots=len(shots),
+        stripes_calibrated=fit.stripes_calibrated,
+        stripes_projected=projector.stripes - 1,
+        held_out=fit.held_out,
+        boards_mm=_mean_and_rms(boards_off(points, fit.sheets)),
+    )
+    found = PairCalibration(pair.name, camera, pair.own.covariance, fit.sheets, quality)
+    if pair.alone:
+        # In a rig of several pairs the boards are held by all cameras together, far better than
+        # one pair's stripes could.
+        found = _refined(found, pair.own, shots, points)
+    return Outcome(found, notes)
+
+
+def drop_disagreeing(
+    name: str, shots: Sequence[StripedView], found: Disagreement
+) -> Outcome[tuple[StripedView, ...]]:
+    """The shots less the one that fits no other. Raises PairFailed if it is more than one."""
+    names = [shot.view.shot for shot in shots]
+    misfit = f"{found.together_px:.1f} px off together, {found.apart_px:.1f} px apart"
+    if not found.one_board:
+        before, after = names[found.kept[-1]], names[found.others[0]]
+        raise PairFailed(
+            f"the projector moved between shots {before} and {after} (stripes are {misfit})",
+            where=f"pair {name}",
+            remedy="fasten it and capture the boards again, or delete the shots before it moved",
+        )
+    odd = int(found.others[0])
+    note = (
+        f"{name}: the stripes of shot {names[odd]} do not fit the other shots' ({misfit}): the "
+        "board or the projector moved during it; its stripes are not used"
+    )
+    return Outcome(tuple(shot for k, shot in enumerate(shots) if k != odd), (note,))
+
+
+def _refined(
+    pair: PairCalibration,
+    own: CameraCalibration,
+    shots: Sequence[StripedView],
+    points: BoundaryPoints,
+) -> PairCalibration:
+    """Camera, boards and light of a pair by itself in one solve, where held-out boards gain."""
+    assert pair.light is not None
+    data = binned(points, pair.camera, pair.light.direction)
+    boards = [
+        striped_board(
+            PlanarView(shot.view.shot, shot.view.points, shot.view.pixels), pair.camera, data, k
+        )
+        for k, shot in enumerate(shots)
+    ]
+    choice = refine_where_better(own, pair.light, boards, data)
+    quality = replace(pair.quality, refinement=choice.reason, flatness_mm=choice.flatness_mm)
+    if choice.joint is None:
+        return replace(pair, quality=quality)
+    return replace(
+        pair,
+        camera=choice.joint.camera,
+        camera_covariance=choice.joint.camera_covariance,
+        light=choice.joint.sheets,
+        quality=replace(quality, corners_rms_px=choice.joint.corners_rms_px),
+    )
+
+
+def _mean_and_rms(values: Array) -> tuple[float, float] | None:
+    return (float(values.mean()), float(np.sqrt((values**2).mean()))) if values.size else None

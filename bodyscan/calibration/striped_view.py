@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.boards.view import BoardView
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, join, part
-from bodyscan.calibration.located_view import LocatedView
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform

@@ -102,11 +102,11 @@ def check_calibration(
     """Say whether the rig still is what it was, and which pair or pole moved by how much."""
     from bodyscan.cli import console
     from bodyscan.registration.storage import load_calibration, save_calibration
-    from bodyscan.workflows.check_rig import look_at
+    from bodyscan.workflows.check_rig import check_rig
 
     rig = load_calibration(calibration)
     with console.stage_clock() as clock:
-        found = look_at(rig, folders, clock)
+        found = check_rig(rig, folders, clock)
     console.console.print("\n".join(found.lines), highlight=False)
     console.console.print(console.times_table(clock.seconds))
     if repair is not None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.located_view import LocatedView
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.least_squares import cauchy_weights, spread
 from bodyscan.geometry.transforms import rigid_fit
 from bodyscan.registration.disagreement import fit_board

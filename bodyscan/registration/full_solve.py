@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.located_view import LocatedView
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.normal_equations import NormalEquations, normal_equations
 

@@ -9,7 +9,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.located_view import LocatedView
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
 from bodyscan.registration.rig_solve import PlacedRig, place_rig

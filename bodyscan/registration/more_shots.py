@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.boards.board import corner_points, corners_per_face
-from bodyscan.calibration.located_view import LocatedView
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.visibility import in_image

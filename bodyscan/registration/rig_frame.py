@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bodyscan.calibration.located_view import board_symmetries
+from bodyscan.calibration.board_views import board_symmetries
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.view_graph import Target

@@ -22,8 +22,7 @@ from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.registration.seen_corners import SeenCorners
+from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
 from bodyscan.rig.rig import Rig
 
 SCHEMA = "bodyscan-calibration"

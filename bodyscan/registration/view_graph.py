@@ -11,7 +11,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.located_view import LocatedView, apart
+from bodyscan.calibration.board_views import LocatedView, apart
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
 

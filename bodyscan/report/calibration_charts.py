@@ -14,8 +14,7 @@ from bodyscan.calibration.pair import PairCalibration
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
 from bodyscan.geometry.smooth_sheets import SmoothSheets
-from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.registration.seen_corners import SeenCorners
+from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
 from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, plt, style, svg
 
 COLUMNS = 4

@@ -6,12 +6,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.calibrate_pair import PlacedPair, calibrate_pair
+from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import CameraCalibration, locate_board
 from bodyscan.calibration.coverage import coverage_notes
-from bodyscan.calibration.located_view import LocatedView
-from bodyscan.calibration.pair import PairCalibration
-from bodyscan.calibration.planar_view import PlanarView
+from bodyscan.calibration.pair import PairCalibration, PlacedPair, calibrate_pair
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BadInput, BodyscanError, FailedWork, plainly
@@ -20,12 +18,11 @@ from bodyscan.progress import Progress, silent, threaded
 from bodyscan.registration.advice import advise
 from bodyscan.registration.board_doubts import boards_not_found, size_doubt, what_was_found
 from bodyscan.registration.halves import compare_halves
-from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.registration.rig_calibration import RigCalibration, seen_corners
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import PlacedRig, place_rig
-from bodyscan.registration.seen_corners import seen_corners
 from bodyscan.rig.rig import Rig
-from bodyscan.workflows.decode_boards import ViewKey, decode_on_boards
+from bodyscan.workflows.decode import ViewKey, decode_on_boards
 from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards, locate_views
 
 
@@ -54,7 +51,7 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
     if not pairs:
         raise _nothing_calibrated(rig, failed)
     for pair in pairs.values():
-        placed = placed_again(rig, placed, pair)
+        placed = update_poses(rig, placed, pair)
     notes = (
         *views.notes,
         *coverage_notes(rig, views.value),
@@ -74,7 +71,7 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
         placed.rig_from_board,
         failed,
         notes,
-        (*advice, *through_the_stripes(pairs)),
+        (*advice, *stripe_board_notes(pairs)),
         seen_corners(placed, pairs),
     )
 
@@ -159,7 +156,7 @@ def _placed_pair(
     )
 
 
-def placed_again(rig: Rig, placed: PlacedRig, pair: PairCalibration) -> PlacedRig:
+def update_poses(rig: Rig, placed: PlacedRig, pair: PairCalibration) -> PlacedRig:
     """Where a pair's stripes changed its camera: camera and boards as that camera sees them, the
     board that fixes the rig frame where it lies. Only a pair by itself is refined so."""
     if pair.camera == placed.cameras[pair.name]:
@@ -197,7 +194,7 @@ def advice_on(rig: Rig, placed: PlacedRig, progress: Progress = silent) -> tuple
     return tuple(said)
 
 
-def through_the_stripes(pairs: Mapping[str, PairCalibration]) -> Iterator[str]:
+def stripe_board_notes(pairs: Mapping[str, PairCalibration]) -> Iterator[str]:
     """A line on whether stripes measure the boards where the corners put them."""
     boards = {n: p.quality.boards_mm for n, p in pairs.items() if p.quality.boards_mm is not None}
     if boards:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.boards.view import BoardView
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.camera import CameraCalibration
-from bodyscan.calibration.located_view import LocatedView
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BoardNotFound
@@ -21,7 +21,7 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.drift import Drift, Move, find_drift, seen_pose
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.workflows.decode_boards import decode_on_boards
+from bodyscan.workflows.decode import decode_on_boards
 from bodyscan.workflows.find_boards import find_all_boards, locate_views
 
 Array = NDArray[np.float64]

@@ -47,7 +47,7 @@ class Findings:
         return repaired(calibration, self.check.drift.moves)
 
 
-def look_at(
+def check_rig(
     calibration: RigCalibration, folders: Sequence[Path], progress: Progress = silent
 ) -> Findings:
     """Folders of one kind: shots of the board, or scans of people.

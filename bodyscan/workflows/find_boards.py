@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from bodyscan.boards.board import corner_points
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.view import BoardView
+from bodyscan.calibration.board_views import LocatedView, board_symmetries, planar_view, usable
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
-from bodyscan.calibration.located_view import LocatedView, board_symmetries
-from bodyscan.calibration.planar_view import planar_view, usable
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_lit
 from bodyscan.errors import BodyscanError

@@ -10,7 +10,7 @@ from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.scan_volume import stripes_in_volume
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.workflows.decoding import decode_sequence
+from bodyscan.workflows.decode import decode_sequence
 
 
 def range_images(

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
+from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.camera import (
     calibrate_camera,
     locate_board,
 )
-from bodyscan.calibration.planar_view import PlanarView
 from bodyscan.calibration.zhang import homography, matrix_from_homographies
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import Camera

@@ -3,11 +3,11 @@
 import numpy as np
 from lit_boards import Mirror, Scene
 
+from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import binned, boundary_points, join
 from bodyscan.calibration.camera import calibrate_camera
 from bodyscan.calibration.joint_refinement import refine_jointly, striped_board
 from bodyscan.calibration.light import fit_light
-from bodyscan.calibration.planar_view import PlanarView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
 

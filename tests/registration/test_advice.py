@@ -3,7 +3,7 @@ import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.boards.board import corner_points, corners_per_face
-from bodyscan.calibration.located_view import LocatedView
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.placing_covariance import position_sigma
 from bodyscan.registration.advice import advise, crucial_shots
 from bodyscan.registration.normal_equations import normal_equations, scaled_inverse

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
+from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.camera import locate_board
-from bodyscan.calibration.planar_view import PlanarView
 from bodyscan.registration.rig_solve import place_rig
 
 PLACINGS, CAMERAS = ring_of_cameras(heights=(700, 1200))

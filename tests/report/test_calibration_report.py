@@ -13,8 +13,7 @@ from ring import ring_of_cameras, ring_rig
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.registration.seen_corners import SeenCorners
+from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.report.calibration_charts import shared_boards
 from bodyscan.report.calibration_page import calibration_page

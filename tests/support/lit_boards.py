@@ -9,9 +9,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, join
 from bodyscan.calibration.camera import locate_board
-from bodyscan.calibration.planar_view import PlanarView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform

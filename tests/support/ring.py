@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bodyscan.boards.board import corner_points
+from bodyscan.calibration.board_views import LocatedView, PlanarView, board_symmetries
 from bodyscan.calibration.camera import locate_board
-from bodyscan.calibration.located_view import LocatedView, board_symmetries
-from bodyscan.calibration.planar_view import PlanarView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform

@@ -8,7 +8,7 @@ from ring import ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.registration.rig_solve import place_rig
-from bodyscan.workflows.calibrate_rig import placed_again
+from bodyscan.workflows.calibrate_rig import update_poses
 
 
 def misfit_px(placed, views) -> float:
@@ -29,7 +29,7 @@ def test_boards_follow_the_camera(change):
     camera = placed.cameras["p1-1"]
     other = replace(camera, alpha=camera.alpha + change, beta=camera.beta + change)
     pair = PairCalibration("p1-1", other, np.eye(len(camera.parameters)), None, PairQuality(0.1, 8))
-    again = placed_again(rig, placed, pair)
+    again = update_poses(rig, placed, pair)
     assert (again is placed) == (change == 0.0)
     assert again.cameras["p1-1"] == other
     # Another focal length is made up for by another distance, nearly.

@@ -8,6 +8,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.boards.board import corner_points
+from bodyscan.calibration.board_views import PlanarView, planar_view
 from bodyscan.calibration.boundary_points import binned
 from bodyscan.calibration.camera import (
     CameraCalibration,
@@ -16,7 +17,6 @@ from bodyscan.calibration.camera import (
 from bodyscan.calibration.joint_refinement import striped_board
 from bodyscan.calibration.light import fit_light
 from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
-from bodyscan.calibration.planar_view import PlanarView, planar_view
 from bodyscan.calibration.refinement_choice import refine_where_better
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.laboratory.chapter import apparatus

@@ -12,9 +12,9 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
+from bodyscan.calibration.board_views import PlanarView, planar_view
 from bodyscan.calibration.boundary_points import BoundaryPoints, join
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
-from bodyscan.calibration.planar_view import PlanarView, planar_view
 from bodyscan.calibration.striped_view import boundaries_near, on_board
 from bodyscan.calibration.zhang import homography
 from bodyscan.geometry.camera import Camera

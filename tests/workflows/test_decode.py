@@ -4,7 +4,7 @@ from pathlib import Path
 
 from bodyscan.captures.folder import ImageSequence
 from bodyscan.errors import DecodingFailed
-from bodyscan.workflows.decode_boards import failure_notes, hopeless
+from bodyscan.workflows.decode import failed_pairs, failure_notes
 
 
 def failures(pair: str, what: str, *shots: str):
@@ -20,10 +20,10 @@ def failures(pair: str, what: str, *shots: str):
 def test_a_pair_whose_stripes_all_run_the_other_way_fails_for_that_reason():
     same = failures("p1", "the stripes run vertically", "a", "b", "c")
     mixed = [*failures("p2", "one", "a"), *failures("p2", "other", "b")]
-    assert hopeless([*same, *mixed], good={"p3"}) == {
+    assert failed_pairs([*same, *mixed], good={"p3"}) == {
         "p1": "the stripes run vertically\n  do something"
     }
-    assert hopeless(same, good={"p1"}) == {}
+    assert failed_pairs(same, good={"p1"}) == {}
 
 
 def test_many_shots_with_one_fault_share_a_note():

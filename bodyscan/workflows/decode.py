@@ -1,4 +1,4 @@
-"""The stripes of all pairs on all boards, decoded; what could not be, said once for each cause."""
+"""Stripe sequences from their files to stripe maps, and those on boards to stripe boundaries."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_near
 from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.errors import BodyscanError, plainly
+from bodyscan.captures.images import read_sequence
+from bodyscan.errors import BodyscanError, DecodingFailed, plainly
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, threaded
+from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
-from bodyscan.workflows.decoding import decode_sequence
+from bodyscan.stripes.codes import read_code
+from bodyscan.stripes.stripe_map import StripeMap
+from bodyscan.stripes.wanted_stripes import WantedStripes
 
 FEW = 2
 """So many shots are told one by one, more with the same fault together."""
@@ -21,6 +25,22 @@ ViewKey = tuple[str, str, str]
 """Pair, shot and board: which view."""
 
 Failure = tuple[ImageSequence, BodyscanError]
+
+
+def decode_sequence(
+    sequence: ImageSequence, pair: Pair, *, wanted: WantedStripes | None = None, workers: int = 1
+) -> StripeMap:
+    """Read and decode what `pair` took in one shot; wanted: see `read_code`.
+
+    Raises ImageError for bad files, DecodingFailed (naming pair and shot) for frames that do not
+    add up or a pair without projector.
+    """
+    where = f"pair {sequence.pair}, shot {sequence.shot}"
+    if pair.projector is None:
+        raise DecodingFailed("this pair has no projector", where=where)
+    images = read_sequence(sequence, pair.camera, workers=workers)
+    frames = (images.lit, images.dark, images.coded)
+    return read_code(pair.projector, *frames, wanted=wanted, where=where)
 
 
 def decode_on_boards(
@@ -35,7 +55,7 @@ def decode_on_boards(
         wanted[view.pair, view.shot].append(view)
     sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
     boundaries, failures = _decode(rig, sequences, wanted, progress)
-    failed = hopeless(failures, {pair for pair, _, _ in boundaries})
+    failed = failed_pairs(failures, {pair for pair, _, _ in boundaries})
     kept = [failure for failure in failures if failure[0].pair not in failed]
     return Outcome(boundaries, tuple(failure_notes(kept)), failed)
 
@@ -64,7 +84,7 @@ def _decode(
     return boundaries, [result for result in results if not isinstance(result, dict)]
 
 
-def hopeless(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:
+def failed_pairs(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:
     """Pairs that failed in every shot and in the same way, with the reason."""
     reasons: dict[str, set[str]] = defaultdict(set)
     for sequence, error in failures:
