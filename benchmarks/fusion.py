@@ -172,7 +172,7 @@ def _ours(workspace: Path, folder: Path) -> Step:
     from bodyscan.fusion.cleaning import clean
     from bodyscan.fusion.error_bar import add_pose_variance
     from bodyscan.fusion.merging import merge
-    from bodyscan.workflows.range_images import range_images
+    from bodyscan.workflows.range_images import reconstruct_range_images
 
     calibration, captures = _scan_of(workspace)
     stages: dict[str, float] = {}
@@ -184,7 +184,9 @@ def _ours(workspace: Path, folder: Path) -> Step:
         return result
 
     def work() -> Any:
-        images = stage("range images", lambda: range_images(calibration, captures)).value
+        images = stage(
+            "range images", lambda: reconstruct_range_images(calibration, captures)
+        ).value
         placed = calibration.rig_from_camera
         cleaned = stage("cleaning", lambda: clean(images, placed, calibration.rig.volume))
         seen = [image for image in cleaned if image.valid.any()]

@@ -222,7 +222,7 @@ def scan(
     from bodyscan.fusion.storage import clear, make_room, save_failure, save_scan
     from bodyscan.registration.storage import calibration_id, load_calibration
     from bodyscan.report.pictures import draw_scan
-    from bodyscan.workflows.scan_person import scan as fuse
+    from bodyscan.workflows.scan_person import scan_person as fuse
 
     _refuse_file(out)
     make_room(out or folder.with_name(f"{folder.name}-model"), overwrite)

@@ -70,11 +70,11 @@ def refine_rig(
     from bodyscan.errors import FailedWork
     from bodyscan.fusion.cleaning import clean, require_subject
     from bodyscan.registration.storage import load_calibration, save_calibration
-    from bodyscan.workflows.range_images import range_images
+    from bodyscan.workflows.range_images import reconstruct_range_images
 
     rig = load_calibration(calibration)
     with console.stage_clock() as clock:
-        measured = range_images(rig, open_scan(rig.rig, folder), clock)
+        measured = reconstruct_range_images(rig, open_scan(rig.rig, folder), clock)
         clock("aligning", 0, 1)
         cleaned = clean(measured.value, rig.rig_from_camera, rig.rig.volume)
         found = refine_on_object(require_subject(cleaned), rig.rig_from_camera, rig.covariance)

@@ -68,11 +68,11 @@ def run_scan(job: Job, out: Path, progress: Progress) -> None:
     from bodyscan.fusion.storage import save_scan
     from bodyscan.registration.storage import calibration_id, load_calibration
     from bodyscan.report.pictures import draw_scan
-    from bodyscan.workflows.scan_person import scan
+    from bodyscan.workflows.scan_person import scan_person
 
     calibration = load_calibration(_calibration(job))
     captures = open_scan(calibration.rig, job.source)
-    result = scan(calibration, captures, job.pipeline.scan, progress)
+    result = scan_person(calibration, captures, job.pipeline.scan, progress)
     save_scan(
         result,
         out,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -25,7 +26,7 @@ from bodyscan.fusion.merging import merge
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import FusionSettings
-from bodyscan.workflows.range_images import range_images
+from bodyscan.workflows.range_images import reconstruct_range_images
 
 Array = NDArray[np.float64]
 
@@ -50,15 +51,11 @@ def read_spheres(
 ) -> Readings:
     """Every shot of a folder of the spheres at one place."""
     centres, radius = np.array(file.spheres.centres_mm), file.spheres.radius_mm
-    total = Readings()
-    for shot in captures.shots:
-        try:
-            merged, *single = _clouds(calibration, captures, shot, progress)
-            near = acceptance.locate_spheres(merged.points, merged.normals, radius, centres)
-            read = [acceptance.read_sphere(merged.points, merged.normals, s, radius) for s in near]
-        except BodyscanError as error:
-            total += Readings(problems=(f"{place}, {shot}: {error.what}",))
-            continue
+
+    def read(shot: str, clouds: Sequence[_Cloud]) -> Readings:
+        merged, *single = clouds
+        near = acceptance.locate_spheres(merged.points, merged.normals, radius, centres)
+        read = [acceptance.read_sphere(merged.points, merged.normals, s, radius) for s in near]
         rows = [_row(place, shot, ALL, k, one) for k, one in enumerate(read, start=1)]
         for cloud in single:
             rows += _of_one(cloud, place, shot, read, radius)
@@ -68,8 +65,9 @@ def read_spheres(
             SpacingRow(place, shot, f"{a}-{b}", float(error))
             for (a, b), error in zip(pairs, errors, strict=True)
         )
-        total += Readings(tuple(rows), spacings)
-    return total
+        return Readings(tuple(rows), spacings)
+
+    return _each_shot(calibration, captures, place, read, progress)
 
 
 def read_plates(
@@ -81,33 +79,37 @@ def read_plates(
 ) -> Readings:
     """Every shot of a folder of the plate at one place."""
     width, height = file.plate.size_mm
+
+    def row(shot: str, cloud: _Cloud) -> PlateRow:
+        one = acceptance.read_plate(cloud.points, cloud.normals)
+        share = 100.0 * one.area_mm2 / (width * height)
+        return PlateRow(place, shot, cloud.view, one.points, one.flatness_mm, one.rms_mm, share)
+
+    def read(shot: str, clouds: Sequence[_Cloud]) -> Readings:
+        rows = [row(shot, clouds[0])]
+        for cloud in clouds[1:]:
+            if len(cloud.points) >= FEWEST_OF_ONE:
+                with suppress(BodyscanError):  # it sees an edge of it alone
+                    rows.append(row(shot, cloud))
+        return Readings(plates=tuple(rows))
+
+    return _each_shot(calibration, captures, place, read, progress)
+
+
+def _each_shot(
+    calibration: RigCalibration,
+    captures: Captures,
+    place: str,
+    read: Callable[[str, Sequence[_Cloud]], Readings],
+    progress: Progress,
+) -> Readings:
+    """What `read` makes of every shot's clouds; a shot that fails is a problem, and named."""
     total = Readings()
     for shot in captures.shots:
         try:
-            clouds = _clouds(calibration, captures, shot, progress)
-            read = [(clouds[0].view, acceptance.read_plate(clouds[0].points, clouds[0].normals))]
+            total += read(shot, _clouds(calibration, captures, shot, progress))
         except BodyscanError as error:
             total += Readings(problems=(f"{place}, {shot}: {error.what}",))
-            continue
-        for cloud in clouds[1:]:
-            if len(cloud.points) >= FEWEST_OF_ONE:
-                try:
-                    read.append((cloud.view, acceptance.read_plate(cloud.points, cloud.normals)))
-                except BodyscanError:
-                    continue  # it sees an edge of it alone
-        rows = tuple(
-            PlateRow(
-                place,
-                shot,
-                view,
-                one.points,
-                one.flatness_mm,
-                one.rms_mm,
-                100.0 * one.area_mm2 / (width * height),
-            )
-            for view, one in read
-        )
-        total += Readings(plates=rows)
     return total
 
 
@@ -117,7 +119,7 @@ def _clouds(
     """All pairs' points merged as a scan's are (without alignment), then each pair's own, rig
     frame. Raises ScanFailed."""
     one = replace(captures, shots=(shot,), sequences=captures.of_shot(shot))
-    images = range_images(calibration, one, progress).value
+    images = reconstruct_range_images(calibration, one, progress).value
     cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
     seen = [image for image in cleaned if image.valid.any()]
     cloud = merge(seen, calibration.rig_from_camera, FUSION).cloud

@@ -17,7 +17,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import AlignmentSettings
-from bodyscan.workflows.range_images import range_images
+from bodyscan.workflows.range_images import reconstruct_range_images
 
 Array = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def check_scans(
     """Raises ScanFailed if a scan shows nobody."""
     alignments = []
     for captures in scans:
-        images = range_images(calibration, captures, progress).value
+        images = reconstruct_range_images(calibration, captures, progress).value
         cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
         seen = require_subject(cleaned)
         alignments.append(

@@ -13,7 +13,7 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.workflows.decode import decode_sequence
 
 
-def range_images(
+def reconstruct_range_images(
     calibration: RigCalibration, captures: Captures, progress: Progress = silent
 ) -> Outcome[list[RangeImage]]:
     """The range image of every calibrated pair; pairs that gave none are failures.

@@ -7,10 +7,10 @@ from bodyscan.fusion.scan import Scan, fuse
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
-from bodyscan.workflows.range_images import range_images
+from bodyscan.workflows.range_images import reconstruct_range_images
 
 
-def scan(
+def scan_person(
     calibration: RigCalibration,
     captures: Captures,
     settings: ScanSettings,
@@ -23,6 +23,6 @@ def scan(
     empty: captures of the rig without anybody in it, whose surfaces are no part of the subject.
     Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left.
     """
-    images = range_images(calibration, captures, progress)
-    background = range_images(calibration, empty, progress).value if empty else ()
+    images = reconstruct_range_images(calibration, captures, progress)
+    background = reconstruct_range_images(calibration, empty, progress).value if empty else ()
     return fuse(calibration, images, settings, progress, empty=background)
