@@ -11,16 +11,10 @@ import os
 from collections.abc import Iterator, Sequence
 
 from bodyscan.errors import BadInput, FailedWork
+from bodyscan.jobs import supervision
 from bodyscan.jobs.batch import Run, Work
 from bodyscan.jobs.job import Job
-from bodyscan.jobs.supervision import (
-    COMMAND,
-    JobProcess,
-    JobResult,
-    Listen,
-    ignore_events,
-    supervise_job,
-)
+from bodyscan.jobs.supervision import JobProcess, JobResult, Listen, ignore_events
 
 _TIMEOUT_S = 20
 
@@ -28,9 +22,9 @@ _TIMEOUT_S = 20
 def run_on_cluster(
     address: str,
     threads: int,
-    command: Sequence[str] = COMMAND,
+    command: Sequence[str] = supervision.COMMAND,
     listen: Listen = ignore_events,
-    work: Work = supervise_job,
+    work: Work = supervision.supervise_job,
 ) -> Run:
     """Runs jobs on the cluster whose scheduler listens at `address`, such as tcp://host:8786.
 
@@ -84,7 +78,7 @@ def run_on_cluster(
 def run_on_worker(work: Work, job: Job, process: JobProcess) -> JobResult:
     """What a worker does with one job."""
     os.umask(0o077)
-    if work is supervise_job and not job.folder.is_dir():
+    if work is supervision.supervise_job and not job.folder.is_dir():
         return JobResult(
             job.name,
             "set aside",

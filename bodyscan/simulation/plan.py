@@ -16,20 +16,6 @@ from bodyscan.simulation.layout import TruePair
 
 Array = NDArray[np.float64]
 
-STRIPES_WITHIN_DEG, LIT_WITHIN_DEG = 50.0, 70.0
-STRIPES_INSIDE, LIT_INSIDE = 0.5, 0.25
-GRAZING_DEG = 12.0
-"""A pair takes the board that lies on the floor from this angle above it."""
-
-_CELLS = (6, 8)
-_NEAR, _FAR = 0.73, 1.12
-_ASIDE = 0.22
-_TILT_DEG = 35.0
-_OFF_FLOOR_MM = 5.0
-_CANDIDATES = 3000
-_FADE = 0.35
-"""How quickly a merit loses its worth once it is had often enough."""
-
 
 @dataclass(frozen=True, eq=False)
 class BoardShot:
@@ -66,6 +52,22 @@ class Merits:
     offered: NDArray[np.bool_]
     worth: Array
     needed: Array
+
+
+STRIPES_WITHIN_DEG, LIT_WITHIN_DEG = 50.0, 70.0
+"""A face is seen well enough for stripes, and at all, up to these angles from straight ahead."""
+STRIPES_INSIDE, LIT_INSIDE = 0.5, 0.25
+"""Shares of a board that must lie in the image for either."""
+GRAZING_DEG = 12.0
+"""A pair takes the board that lies on the floor from this angle above it."""
+
+_CELLS = (6, 8)  # rows and columns of an image that boards are to cover
+_CANDIDATES = 3000  # poses, of which the best are chosen
+_NEAR, _FAR = 0.73, 1.12  # working distances at which boards are held
+_ASIDE = 0.22  # working distances off the axis, at most
+_TILT_DEG = 35.0  # of a board against the way to the camera, at most
+_OFF_FLOOR_MM = 5.0
+_FADE = 0.35  # how quickly a merit loses its worth once it is had often enough
 
 
 def default_shots(pairs: int) -> int:
