@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.triangulation import triangulate
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.captures.folder import Captures
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
-from bodyscan.geometry.triangulation import triangulate
 from bodyscan.registration.board_shape import BoardShape
 from bodyscan.registration.rig_solve import PlacedRig, place_rig
 from bodyscan.rig.rig import Rig

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.pinhole_opencv import fit_pinhole_opencv
 from bodyscan.boards.board import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
@@ -16,7 +17,7 @@ from bodyscan.calibration.boundary_points import BoundaryPoints, binned, join
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.light import fit_light, smooth_models
 from bodyscan.calibration.light_planes import fit_light_planes
-from bodyscan.calibration.pinhole_projector import fit_pinhole, fit_pinhole_opencv
+from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import PairFailed

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 import pytest
+from made_bodies import mesh_of
 
 from bodyscan.evaluation.body import coverage_of_seen, girth_errors, sway_residual
 from bodyscan.geometry.camera import Camera
@@ -21,18 +22,6 @@ def column(radius: float, height: float = 1700.0) -> tuple[np.ndarray, np.ndarra
     made = o3d.geometry.TriangleMesh.create_cylinder(radius, height, resolution=90, split=80)
     vertices = np.asarray(made.vertices) + [0.0, 0.0, height / 2]
     return vertices, np.asarray(made.triangles).astype(np.int64)
-
-
-def mesh_of(vertices: np.ndarray, faces: np.ndarray) -> BodyMesh:
-    count = len(vertices)
-    return BodyMesh(
-        vertices,
-        faces,
-        vertex_normals(vertices, faces),
-        np.zeros((count, 3), np.uint8),
-        np.zeros(count, np.float32),
-        np.zeros(len(faces), bool),
-    )
 
 
 def test_a_body_half_a_millimetre_too_thick():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bodyscan.boards.detection import find_boards
-from bodyscan.evaluation.spheres import find_spheres
+from bodyscan.evaluation.sphere_search import find_spheres
 from bodyscan.geometry.light_planes import baseline_angle_tilt
 from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.calibrating import calibrate_all, sigma_trial

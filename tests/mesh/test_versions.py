@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 import pytest
+from made_bodies import mesh_of
 
 from benchmarks.self_intersections import self_intersections
 from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.decimation import decimate
-from bodyscan.mesh.topology import face_areas, topology, vertex_normals
+from bodyscan.mesh.topology import face_areas, topology
 
 
 def filled_share(mesh: BodyMesh) -> float:
@@ -66,15 +67,7 @@ def test_a_reduction_that_folds_is_mended():
     vertices = np.asarray(sphere.vertices) * [100.0, 60.0, 0.05]
     vertices[:, 2] += 3.0 * np.sin(vertices[:, 0] / 8.0) * np.cos(vertices[:, 1] / 5.0)
     faces = np.asarray(sphere.triangles).astype(np.int64)
-    count = len(vertices)
-    sheet = BodyMesh(
-        vertices,
-        faces,
-        vertex_normals(vertices, faces),
-        np.zeros((count, 3), np.uint8),
-        np.zeros(count, np.float32),
-        np.zeros(len(faces), bool),
-    )
+    sheet = mesh_of(vertices, faces)
     reduced = decimate(sheet, faces=1000)
     found = topology(reduced.vertices, reduced.faces)
     assert found.manifold
