@@ -170,8 +170,8 @@ def _read_with_opencv(paths: list[list[str]]) -> None:
 def _ours(workspace: Path, folder: Path) -> Step:
     from bodyscan.alignment.icp import align
     from bodyscan.fusion.cleaning import clean
-    from bodyscan.fusion.error_bar import add_pose_variance
     from bodyscan.fusion.merging import merge
+    from bodyscan.fusion.pose_variance import add_pose_variance
     from bodyscan.workflows.range_images import reconstruct_range_images
 
     calibration, captures = _scan_of(workspace)

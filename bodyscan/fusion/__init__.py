@@ -1,0 +1,7 @@
+"""Range images of one person to a body cloud and a closed mesh.
+
+Read in this order: scan (all of it), cleaning (what is not the subject goes), merging (smoothing,
+with quadratics and robust_windows; thinning; comparing; brightness; averaging), pose_variance (what
+the rig adds to each point's sigma), meshing (carving, with free_space; support), scan_verdict (is it
+good), storage.
+"""

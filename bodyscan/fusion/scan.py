@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.fusion.cleaning import clean, require_subject
-from bodyscan.fusion.error_bar import add_pose_variance
 from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import mesh
+from bodyscan.fusion.pose_variance import add_pose_variance
 from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh

@@ -1,0 +1,3 @@
+"""A pair's stripe map to a range image: range_image (what it is), scan_volume (which stripes are
+looked for), triangulation (rays meet light sheets).
+"""

@@ -1,4 +1,4 @@
-"""Stripe map to range image: a point, a normal and a sigma for every lit pixel."""
+"""The range image: what one pair saw of a subject, with a sigma for every point."""
 
 from __future__ import annotations
 

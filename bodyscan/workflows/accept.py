@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BodyscanError
-from bodyscan.evaluation import acceptance
+from bodyscan.evaluation import artefacts
 from bodyscan.evaluation.acceptance_file import AcceptanceFile
 from bodyscan.evaluation.acceptance_readings import (
     ALL,
@@ -54,13 +54,13 @@ def read_spheres(
 
     def read(shot: str, clouds: Sequence[_Cloud]) -> Readings:
         merged, *single = clouds
-        near = acceptance.locate_spheres(merged.points, merged.normals, radius, centres)
-        read = [acceptance.read_sphere(merged.points, merged.normals, s, radius) for s in near]
+        near = artefacts.locate_spheres(merged.points, merged.normals, radius, centres)
+        read = [artefacts.read_sphere(merged.points, merged.normals, s, radius) for s in near]
         rows = [_row(place, shot, ALL, k, one) for k, one in enumerate(read, start=1)]
         for cloud in single:
             rows += _of_one(cloud, place, shot, read, radius)
         pairs = combinations(range(1, len(centres) + 1), 2)
-        errors = acceptance.spacing_errors(read, centres)
+        errors = artefacts.spacing_errors(read, centres)
         spacings = tuple(
             SpacingRow(place, shot, f"{a}-{b}", float(error))
             for (a, b), error in zip(pairs, errors, strict=True)
@@ -81,7 +81,7 @@ def read_plates(
     width, height = file.plate.size_mm
 
     def row(shot: str, cloud: _Cloud) -> PlateRow:
-        one = acceptance.read_plate(cloud.points, cloud.normals)
+        one = artefacts.read_plate(cloud.points, cloud.normals)
         share = 100.0 * one.area_mm2 / (width * height)
         return PlateRow(place, shot, cloud.view, one.points, one.flatness_mm, one.rms_mm, share)
 
@@ -141,17 +141,17 @@ def _of_one(
     cloud: _Cloud,
     place: str,
     shot: str,
-    merged: Sequence[acceptance.SphereReading],
+    merged: Sequence[artefacts.SphereReading],
     radius_mm: float,
 ) -> Iterator[SphereRow]:
     for k, sphere in enumerate(merged, start=1):
         try:
-            one = acceptance.read_sphere(cloud.points, cloud.normals, sphere.fitted, radius_mm)
+            one = artefacts.read_sphere(cloud.points, cloud.normals, sphere.fitted, radius_mm)
         except BodyscanError:
             continue  # this pair does not see it
         if one.points >= FEWEST_OF_ONE:
             yield _row(place, shot, cloud.view, k, one)
 
 
-def _row(place: str, shot: str, view: str, sphere: int, one: acceptance.SphereReading) -> SphereRow:
+def _row(place: str, shot: str, view: str, sphere: int, one: artefacts.SphereReading) -> SphereRow:
     return SphereRow(place, shot, view, sphere, one.points, one.form_mm, one.shell_mm, one.size_mm)

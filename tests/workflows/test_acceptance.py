@@ -10,13 +10,6 @@ from typer.testing import CliRunner
 
 from bodyscan.cli.main import app
 from bodyscan.errors import FailedWork
-from bodyscan.evaluation.acceptance import (
-    RIM_MM,
-    locate_spheres,
-    read_plate,
-    read_sphere,
-    spacing_errors,
-)
 from bodyscan.evaluation.acceptance_file import AcceptanceError, load_acceptance
 from bodyscan.evaluation.acceptance_readings import (
     ALL,
@@ -25,6 +18,13 @@ from bodyscan.evaluation.acceptance_readings import (
     SpacingRow,
     SphereRow,
     figures,
+)
+from bodyscan.evaluation.artefacts import (
+    RIM_MM,
+    locate_spheres,
+    read_plate,
+    read_sphere,
+    spacing_errors,
 )
 from bodyscan.evaluation.spheres import Sphere
 from bodyscan.rig.rig import Volume

@@ -1,4 +1,4 @@
-"""Acceptance by artefacts: spheres and a plate of known size, measured at several places.
+"""Artefacts of an acceptance test read from points: spheres and a plate of known size.
 
 The figures are modelled on VDI/VDE 2634 parts 2 and 3 and on ISO 20685-2: what is computed is said
 here; it is no test by these standards, which ask for more (artefacts, places, operators).

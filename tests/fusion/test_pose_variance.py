@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bodyscan.fusion.error_bar import add_pose_variance
+from bodyscan.fusion.pose_variance import add_pose_variance
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
