@@ -1,0 +1,55 @@
+"""Files that version 0.1.0 wrote are read as they were meant.
+
+`tests/data/stored-0.1.0`: the calibration of a simulated rig of four pairs by commit 723e584, and a scan
+by it, cut down to 200 points and a tetrahedron by that commit's own writers.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodyscan.fusion.storage import load_scan
+from bodyscan.registration.storage import load_calibration, save_calibration
+
+STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0"
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return load_calibration(STORED / "calibration")
+
+
+def test_a_calibration_gives_the_depths_that_it_was_fitted_for(calibration):
+    assert sorted(calibration.pairs) == ["p1-2", "p1-3", "p2-2", "p2-3"]
+    for name, pair in calibration.pairs.items():
+        seen = calibration.seen[name]
+        assert np.sqrt(np.mean(seen.residuals_px**2)) == pytest.approx(
+            pair.quality.corners_rms_px / np.sqrt(2.0), rel=0.2
+        )
+        middle = pair.camera.rays(np.array([[pair.camera.width / 2.0, pair.camera.height / 2.0]]))
+        assert pair.light is not None
+        depth = pair.light.depth(middle, np.array([160.0]))
+        # The subject stands about 1.3 m before every camera of this rig.
+        assert 900.0 < depth[0] < 1800.0
+
+
+def test_a_calibration_is_written_again_as_it_was(calibration, tmp_path):
+    save_calibration(calibration, tmp_path)
+    before = json.loads((STORED / "calibration" / "calibration.json").read_text("utf-8"))
+    after = json.loads((tmp_path / "calibration.json").read_text("utf-8"))
+    assert after == before
+    with (
+        np.load(STORED / "calibration" / "calibration.npz") as old,
+        np.load(tmp_path / "calibration.npz") as new,
+    ):
+        assert sorted(new.files) == sorted(old.files)
+        assert all(np.array_equal(new[key], old[key], equal_nan=True) for key in old.files)
+
+
+def test_a_scan_is_read():
+    stored = load_scan(STORED / "scan")
+    assert len(stored.cloud.points) == 200
+    assert stored.mesh.filled.tolist() == [False, True, True, True]
+    assert stored.facts["verdict"]["grade"] in ("good", "usable", "repeat")
