@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
 
 Progress = Callable[[str, int, int], None]
@@ -13,6 +14,14 @@ Result = TypeVar("Result")
 
 def silent(stage: str, done: int, total: int) -> None:
     """The progress of whoever does not want to know."""
+
+
+@contextmanager
+def step(progress: Progress, stage: str) -> Iterator[None]:
+    """Tell that a stage begins, and that it is done, unless it raises."""
+    progress(stage, 0, 1)
+    yield
+    progress(stage, 1, 1)
 
 
 def threaded(

@@ -1,4 +1,4 @@
-"""One person: range images aligned, merged to a body cloud, meshed and judged."""
+"""One person: range images aligned, merged to a body cloud, meshed and graded."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, silent
+from bodyscan.progress import Progress, silent, step
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
@@ -51,26 +51,22 @@ def fuse(
     measured: with the pairs that gave none as failures. empty: as in `clean`. Raises ScanFailed if
     they show no body.
     """
-    progress("cleaning", 0, 1)
     images = measured.value
-    cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume, empty=empty)
-    seen = require_subject(cleaned)
-    progress("cleaning", 1, 1)
+    with step(progress, "cleaning"):
+        cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume, empty=empty)
+        seen = require_subject(cleaned)
     placing = dict(calibration.rig_from_camera)
     alignment = None
     if settings.alignment.matching != "none" and len(seen) > 1:
-        progress("aligning", 0, 1)
-        alignment = align(seen, placing, calibration.covariance, settings.alignment)
-        placing |= alignment.rig_from_camera
-        progress("aligning", 1, 1)
-    progress("merging", 0, 1)
-    fused = merge(seen, placing, settings.fusion)
-    there = {image.pair: placing[image.pair] for image in seen}
-    cloud = add_pose_variance(fused.cloud, there, calibration.covariance)
-    progress("merging", 1, 1)
-    progress("meshing", 0, 1)
-    surface = mesh(cloud, settings.mesh, images, placing)
-    progress("meshing", 1, 1)
+        with step(progress, "aligning"):
+            alignment = align(seen, placing, calibration.covariance, settings.alignment)
+            placing |= alignment.rig_from_camera
+    with step(progress, "merging"):
+        fused = merge(seen, placing, settings.fusion)
+        there = {image.pair: placing[image.pair] for image in seen}
+        cloud = add_pose_variance(fused.cloud, there, calibration.covariance)
+    with step(progress, "meshing"):
+        surface = mesh(cloud, settings.mesh, images, placing)
     points = {image.pair: int(image.valid.sum()) for image in cleaned}
     failed = dict(measured.failures)
     verdict = grade_scan(

@@ -14,7 +14,7 @@ from bodyscan.errors import BadInput, CalibrationFileError, CaptureError
 from bodyscan.files.hashing import files_below
 from bodyscan.jobs.discovery import CALIBRATION, RIG_FILE
 from bodyscan.jobs.job import STAGE, Job
-from bodyscan.progress import Progress
+from bodyscan.progress import Progress, step
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 
@@ -80,9 +80,8 @@ def run_scan(job: Job, out: Path, progress: Progress) -> None:
         subject=captures.subject,
         when=captures.when,
     )
-    progress("drawing", 0, 1)
-    draw_scan(result.cloud, result.mesh, out)
-    progress("drawing", 1, 1)
+    with step(progress, "drawing"):
+        draw_scan(result.cloud, result.mesh, out)
 
 
 def run_export(job: Job, out: Path, progress: Progress) -> None:
@@ -91,10 +90,9 @@ def run_export(job: Job, out: Path, progress: Progress) -> None:
     from bodyscan.fusion.storage import load_scan
 
     settings = job.pipeline.export
-    progress("exporting", 0, 1)
-    scan = load_scan(job.folder / "scan")
-    export_scan(scan, out, settings.formats, settings.versions, deface=settings.deface)
-    progress("exporting", 1, 1)
+    with step(progress, "exporting"):
+        scan = load_scan(job.folder / "scan")
+        export_scan(scan, out, settings.formats, settings.versions, deface=settings.deface)
 
 
 def run_report(job: Job, out: Path, progress: Progress) -> None:
@@ -103,10 +101,9 @@ def run_report(job: Job, out: Path, progress: Progress) -> None:
     from bodyscan.report.page import render
     from bodyscan.report.result_page import build_page
 
-    progress("reporting", 0, 1)
-    folder = job.folder / ("scan" if job.pipeline.kind == "fuse" else "calibration")
-    write_text(out / "report.html", render(build_page(folder)))
-    progress("reporting", 1, 1)
+    with step(progress, "reporting"):
+        folder = job.folder / ("scan" if job.pipeline.kind == "fuse" else "calibration")
+        write_text(out / "report.html", render(build_page(folder)))
 
 
 def rig_inputs(job: Job) -> dict[str, Path]:
@@ -131,10 +128,9 @@ def run_rig_export(job: Job, out: Path, progress: Progress) -> None:
     from bodyscan.export.rig import export_rig
     from bodyscan.registration.storage import load_calibration
 
-    progress("exporting", 0, 1)
-    formats = job.pipeline.rig_export.formats
-    export_rig(load_calibration(job.folder / "calibration"), out, formats)
-    progress("exporting", 1, 1)
+    with step(progress, "exporting"):
+        formats = job.pipeline.rig_export.formats
+        export_rig(load_calibration(job.folder / "calibration"), out, formats)
 
 
 def results_of(stage: str) -> Callable[[Job], dict[str, Path]]:
