@@ -1,7 +1,7 @@
 """Files that version 0.1.0 wrote are read as they were meant.
 
-`tests/data/stored-0.1.0`: the calibration of a simulated rig of four pairs by commit 723e584, and a scan
-by it, cut down to 200 points and a tetrahedron by that commit's own writers.
+`tests/data/stored-0.1.0`: the calibration of a simulated rig of four pairs by commit 723e584, and a
+scan by it, cut down to 200 points and a tetrahedron by that commit's own writers.
 """
 
 import json
