@@ -20,8 +20,9 @@ from bodyscan.simulation.render import PixelTruth, View, pixel_truth, render_pai
 from bodyscan.simulation.scene import Scene, grid_surface
 from bodyscan.simulation.sensor import expose, exposure
 from bodyscan.simulation.settings import InterReflection, SimulationSettings
-from bodyscan.stripes.codes import read_code
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.codes import stripe_code
+from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.stripe_code import StripeCode
 
 RIG = Path(__file__).parents[1] / "rigs" / "one-pair.yaml"
 SEED = 7
@@ -66,9 +67,8 @@ def report() -> str:
         truth = pixel_truth(scene, pair.camera, pair.projector)
         rows.append(f"| **{group}** | | | | | | | |")
         for name in names:
-            spec = ProjectorSpec.model_validate(
-                {**projector.model_dump(exclude_none=True), **CODES[name]}
-            )
+            same = {"stripes": projector.stripes, "direction": projector.direction}
+            spec = stripe_code({**same, **CODES[name]})
             rows.append(f"| {name} | {_row(spec, scene, pair, truth, chosen)} |")
     return f"""## Every code on one scene
 
@@ -103,7 +103,7 @@ def _board(board: Board, settings: SimulationSettings) -> Scene:
 
 
 def _row(
-    spec: ProjectorSpec,
+    spec: StripeCode,
     scene: Scene,
     pair: TruePair,
     truth: PixelTruth,
@@ -126,10 +126,10 @@ def _row(
     )
     length = exposure(images[frames.lit], light.board_grey, light)
     seen = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}
-    if spec.code == "stripe-index":
+    if not spec.is_projected:
         seen = instrument_images(seen, spec, frames)
     coded = np.stack([seen[name] for name in frames.of_code(spec)])
-    found = read_code(spec, seen[frames.lit], seen.get(frames.dark or ""), coded)
+    found = decode_stripes(spec, seen[frames.lit], seen.get(frames.dark or ""), coded)
     lit = np.isfinite(truth.s)
     known = lit & np.isfinite(found.s)
     error = np.abs(found.s - truth.s)[known]

@@ -21,7 +21,7 @@ from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.outcome import Outcome
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.stripe_code import StripeCode
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ class PlacedPair:
     name: str
     camera: Camera
     own: CameraCalibration
-    projector: ProjectorSpec | None
+    projector: StripeCode | None
     rms_px: float
     views: int
     shots: tuple[StripedView, ...]

@@ -15,7 +15,7 @@ from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
 
 Array = NDArray[np.float64]
@@ -63,7 +63,7 @@ def boundaries_near(stripes: StripeMap, view: BoardView) -> BoardBoundaries:
 
 
 def boundaries_on_boards(
-    name: str, camera: Camera, projector: ProjectorSpec, shots: Sequence[StripedView]
+    name: str, camera: Camera, projector: StripeCode, shots: Sequence[StripedView]
 ) -> BoundaryPoints:
     """The boundaries of all shots on their boards, `board` counting the shots.
 
@@ -85,7 +85,7 @@ def boundaries_on_boards(
 
 def on_board(
     camera: Camera,
-    projector: ProjectorSpec,
+    projector: StripeCode,
     board: Board,
     camera_from_face: RigidTransform,
     boundaries: BoardBoundaries,

@@ -288,8 +288,8 @@ def _sequence(
         return tuple(fill(template, shot=shot, pair=pair.name, frame=name) for name in names)
 
     lit = files(frames.lit)
-    takes_dark = projector is not None and projector.takes_dark and frames.dark is not None
-    dark = files(frames.dark or "") if takes_dark else ()
+    dark_name = frames.dark if projector and projector.uses_dark else None
+    dark = files(dark_name) if dark_name is not None else ()
     coded = files(*frames.of_code(projector)) if projector else ()
     missing = [name for name in (*lit, *dark, *coded) if not listing.has(name)]
     root = listing.root

@@ -14,8 +14,8 @@ from bodyscan.files.atomic import write_bytes, write_json
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
-from bodyscan.stripes.codes import pattern_frames
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.patterns import pattern_frames
+from bodyscan.stripes.stripe_code import StripeCode
 
 LIST_NAME = "patterns.json"
 
@@ -31,7 +31,7 @@ def uneven_stripes(rig: Rig, width: int, height: int) -> tuple[str, ...]:
     counts = {
         (kind.stripes, height if kind.direction == "horizontal" else width)
         for kind in kinds
-        if kind.code not in ("stripe-index", "phase-shift")
+        if kind.has_edges
     }
     return tuple(
         f"{stripes} stripes cannot be equally wide on {across} px: choose a number that divides it"
@@ -46,9 +46,9 @@ def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, 
     width, height: of the projector's image, px. Returns the lists. Raises BadInput for a rig whose
     projectors show no images, and as `pattern_frames`.
     """
-    kinds: dict[ProjectorSpec, list[Pair]] = {}
+    kinds: dict[StripeCode, list[Pair]] = {}
     for pair in rig.pairs:
-        if pair.projector and pair.projector.code != "stripe-index":
+        if pair.projector and pair.projector.is_projected:
             kinds.setdefault(pair.projector, []).append(pair)
     if not kinds:
         raise BadInput(
@@ -65,9 +65,9 @@ def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, 
     )
 
 
-def _folder_names(kinds: tuple[ProjectorSpec, ...]) -> dict[ProjectorSpec, str]:
+def _folder_names(kinds: tuple[StripeCode, ...]) -> dict[StripeCode, str]:
     """Such as gray-640-horizontal, with a number where that is not enough."""
-    names: dict[ProjectorSpec, str] = {}
+    names: dict[StripeCode, str] = {}
     for kind in kinds:
         name = f"{kind.code}-{kind.stripes}-{kind.direction}"
         again = sum(taken.startswith(name) for taken in names.values())
@@ -78,7 +78,7 @@ def _folder_names(kinds: tuple[ProjectorSpec, ...]) -> dict[ProjectorSpec, str]:
 def _write_kind(
     folder: Path,
     frames: FrameNames,
-    kind: ProjectorSpec,
+    kind: StripeCode,
     pairs: list[Pair],
     coded: NDArray[np.uint8],
 ) -> Path:
@@ -90,7 +90,7 @@ def _write_kind(
         order.append({"file": f"{name}.png", "frame": name})
     content = {
         "version": 1,
-        "code": kind.model_dump(mode="json", exclude_none=True),
+        "code": {"code": kind.code, **kind.model_dump(mode="json", exclude_defaults=True)},
         "width": width,
         "height": height,
         "pairs": [pair.name for pair in pairs],
@@ -101,11 +101,11 @@ def _write_kind(
 
 
 def _in_order(
-    frames: FrameNames, kind: ProjectorSpec, coded: NDArray[np.uint8]
+    frames: FrameNames, kind: StripeCode, coded: NDArray[np.uint8]
 ) -> Iterator[tuple[str, NDArray[np.uint8]]]:
     """Name and image (H, W): lit, dark if it is taken, then those of the code."""
     blank = np.zeros(coded.shape[1:], np.uint8)
     yield frames.lit, blank + 255
-    if frames.dark is not None and kind.takes_dark:
+    if frames.dark is not None and kind.uses_dark:
         yield frames.dark, blank
     yield from zip(frames.of_code(kind), coded, strict=True)

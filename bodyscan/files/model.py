@@ -26,17 +26,43 @@ class Model(BaseModel):
 
     @model_validator(mode="after")
     def _refuse_problems(self) -> Self:
-        details = [
-            InitErrorDetails(
-                type=PydanticCustomError("problem", "{text}", {"text": text}),
-                loc=where,
-                input=None,
-            )
-            for where, text in self.problems()
-        ]
+        details = [problem_error(problem) for problem in self.problems()]
         if details:
             raise ValidationError.from_exception_data(type(self).__name__, details)
         return self
+
+
+def problem_error(problem: Problem) -> InitErrorDetails:
+    """A problem as pydantic takes it."""
+    where, text = problem
+    said = PydanticCustomError("problem", "{text}", {"text": text})
+    return InitErrorDetails(type=said, loc=where, input=None)
+
+
+def unknown_key_error(key: str, known: Iterable[str]) -> InitErrorDetails:
+    """As pydantic refuses a key; with those that it may have been meant for."""
+    said = PydanticCustomError("extra_forbidden", "is no key known here", {"known": list(known)})
+    return InitErrorDetails(type=said, loc=(key,), input=None)
+
+
+def choice_error(key: str, value: str, choices: Iterable[str]) -> InitErrorDetails:
+    """As pydantic refuses a value that is none of the choices."""
+    choices = list(choices)
+    wanted = alternatives(choices) + did_you_mean(value, choices)
+    said = PydanticCustomError("literal_error", "{expected}", {"expected": wanted})
+    return InitErrorDetails(type=said, loc=(key,), input=None)
+
+
+def repeated_errors(refused: ValidationError) -> list[InitErrorDetails]:
+    """The errors of one model, to be raised together with others."""
+    return [
+        InitErrorDetails(
+            type=PydanticCustomError(e["type"], "{said}", {"said": e["msg"], **e.get("ctx", {})}),
+            loc=e["loc"],
+            input=None,
+        )
+        for e in refused.errors(include_url=False)
+    ]
 
 
 def duplicates(names: list[str | None] | tuple[str | None, ...]) -> Iterator[tuple[int, str]]:
@@ -47,6 +73,12 @@ def duplicates(names: list[str | None] | tuple[str | None, ...]) -> Iterator[tup
             yield index, name
         elif name is not None:
             seen.add(name)
+
+
+def alternatives(words: Iterable[str]) -> str:
+    """`'a', 'b' or 'c'`."""
+    *others, last = map(repr, words)
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

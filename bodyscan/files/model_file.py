@@ -155,7 +155,7 @@ def _translated(
         if e["type"] == "missing":
             missing.append(where)
         elif e["type"] == "extra_forbidden":
-            known = _keys_at(model, where[:-1])
+            known = e.get("ctx", {}).get("known") or _keys_at(model, where[:-1])
             hint = did_you_mean(str(where[-1]), known)
             guessed |= {(*where[:-1], key) for key in known if f"'{key}'" in hint}
             place = document.place(where, of_key=True)

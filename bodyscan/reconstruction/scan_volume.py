@@ -11,7 +11,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.ray_depths import intersect_rays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Volume
-from bodyscan.stripes.wanted_stripes import WantedStripes
+from bodyscan.stripes.stripe_limits import StripeLimits
 
 BLOCKS_ACROSS = 40
 STEP_STRIPES = 8
@@ -24,7 +24,7 @@ ANYTHING = 1e6  # more stripes than there are
 
 def stripes_in_volume(
     pair: PairCalibration, rig_from_camera: RigidTransform, volume: Volume
-) -> WantedStripes | None:
+) -> StripeLimits | None:
     """The stripes that light what stands in the scan volume, or lies beside it at its bottom.
 
     None, that is everything, if the pair has no projector, or if depth does not grow (or fall)
@@ -56,7 +56,7 @@ def stripes_in_volume(
     unknown = np.array([-ANYTHING, ANYTHING, ANYTHING])[:, None, None]
     limits = np.where(np.isnan(limits), unknown, limits).astype(np.float32)
     pixel_mm = float(np.linalg.norm(rig_from_camera.translation)) / pair.camera.alpha
-    return WantedStripes(
+    return StripeLimits(
         limits[0], limits[1], limits[2], rising, block_px, around_px=AROUND_MM / pixel_mm
     )
 

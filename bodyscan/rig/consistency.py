@@ -9,10 +9,11 @@ from bodyscan.files.model import Problem, did_you_mean, duplicates
 from bodyscan.rig.board import Board
 from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.dictionaries import family
-from bodyscan.rig.frame_names import NUMBERED, FrameNames
+from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig_frame import RigFrame
 from bodyscan.rig.templates import template_faults
+from bodyscan.stripes.codes import image_kinds
 
 
 @dataclass(frozen=True)
@@ -60,23 +61,25 @@ def _marker_overlaps(boards: Sequence[Board | None]) -> Iterator[Problem]:
 
 def _wrong_frames(parts: RigParts) -> Iterator[Problem]:
     projectors = [(pair.name, pair.projector) for pair in parts.pairs if pair and pair.projector]
-    for kind, number in NUMBERED.items():
-        names = getattr(parts.frames, kind, "")
+    if parts.frames is None:
+        return
+    for kind in image_kinds():
+        names = parts.frames.given(kind)
         if isinstance(names, str):
             continue
-        for pair, projector in projectors:
-            count = projector.frame_counts.get(kind, len(names))
+        for pair, code in projectors:
+            count = code.image_counts.get(kind, len(names))
             if count != len(names):
                 yield (
-                    ("frames", kind),
-                    f"has {len(names)} names, but the {projector.stripes} stripes of pair"
-                    f" {pair} take {count} {number}s",
+                    ("frames", kind.name),
+                    f"has {len(names)} names, but the {code.stripes} stripes of pair"
+                    f" {pair} take {count} {kind.number}s",
                 )
                 break
-    if parts.frames is None or parts.frames.dark is not None:
+    if parts.frames.dark is not None:
         return
-    for pair, projector in projectors:
-        if projector.bits and not projector.has_inverses:
+    for pair, code in projectors:
+        if code.needs_dark:
             wrong = f"is needed: pair {pair} takes no inverses, so only it shows what black is"
             yield ("frames", "dark"), wrong
             break

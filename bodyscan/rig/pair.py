@@ -9,7 +9,7 @@ from pydantic import Field
 
 from bodyscan.files.model import Model, Name, Problem
 from bodyscan.rig.rig_frame import Vector
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.codes import AnyStripeCode
 
 Pixels = Annotated[int, Field(gt=0, le=32767)]
 
@@ -38,7 +38,7 @@ class Pair(Model):
     name: Name
     pole: Name | None = None
     camera: CameraSpec
-    projector: ProjectorSpec | None = None
+    projector: AnyStripeCode | None = None
     nominal: NominalPose | None = None
     projector_nominal: NominalPose | None = None
 

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.gray import bit_count, code_bits
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.codes.stripe_index import INDEX
+from bodyscan.stripes.stripe_code import StripeCode
 
 Image = NDArray[np.uint8]
 
@@ -16,22 +17,23 @@ _NONE, _TOO_BRIGHT = 0, 255
 
 
 def instrument_images(
-    images: dict[str, Image], spec: ProjectorSpec, frames: FrameNames
+    images: dict[str, Image], code: StripeCode, frames: FrameNames
 ) -> dict[str, Image]:
     """The lit image and the stripe-index image, from what its camera saw of its Gray code.
 
-    images: by the names of `patterns.thrown`, with lit and a dark one named "".
+    images: by the names of `patterns.projected_patterns`, with lit and a dark one named "".
     """
     lit, dark = images[frames.lit], images[""]
     seen = [name for name in images if name not in (frames.lit, "")]
-    bits = bit_count(spec.stripes)
+    bits = bit_count(code.stripes)
     words = sum(
         (images[pattern] > images[inverse]).astype(int) << (bits - 1 - bit)
         for bit, (pattern, inverse) in enumerate(zip(seen[:bits], seen[bits:], strict=True))
     )
     number = np.zeros(2**bits, np.uint8)
-    number[(1 << np.arange(bits)[::-1]) @ code_bits(spec.stripes)] = np.arange(spec.stripes) + 1
+    number[(1 << np.arange(bits)[::-1]) @ code_bits(code.stripes)] = np.arange(code.stripes) + 1
     index = number[words]
     index[lit.astype(int) - dark < _LEAST_LIGHT] = _NONE
     index[lit == _TOO_BRIGHT] = _TOO_BRIGHT
-    return {frames.lit: lit, frames.index: index}
+    (name,) = frames.of_kind(INDEX, 1)
+    return {frames.lit: lit, name: index}

@@ -1,54 +1,69 @@
-"""The light of every image of every code, for the simulator alone: its own formulas."""
+"""The light of every image of every code, for the simulator alone: its own formulas.
+
+Only names, numbers and counts are taken from the codes' descriptions, never their `intensity`: a
+mistake in that would be made again here, and cancel out when the images are decoded.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.errors import BadInput
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.gray import bit_count, code_bits
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.codes.gray import INVERSE, PATTERN, Binary, Gray
+from bodyscan.stripes.codes.light_section import STRIPE, LightSection
+from bodyscan.stripes.codes.phase_shift import PHASE, PhaseShift
+from bodyscan.stripes.codes.stripe_index import StripeIndex
+from bodyscan.stripes.stripe_code import ImageKind, StripeCode
 
 Array = NDArray[np.float64]
 
 PARTS = 16
 """Values of light in a stripe, where it changes inside stripes."""
 
+KNOWN = (Gray, Binary, LightSection, PhaseShift, StripeIndex)
 
-def projected_patterns(spec: ProjectorSpec, frames: FrameNames) -> dict[str, Array]:
+
+def refuse_unknown_code(code: StripeCode, pair: str) -> None:
+    """Raises BadInput for a code for which there are no formulas here."""
+    if type(code) not in KNOWN:
+        raise BadInput(
+            f"its code {code.code} is none that the simulator knows how to project",
+            where=f"pair {pair}",
+            remedy="the simulator has formulas of its own for each code, so that no mistake is made "
+            "twice: add those of this code to bodyscan/simulation/patterns.py",
+        )
+
+
+def projected_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]:
     """By name of the image, its light (stripes * k,), 0 to 1, at evenly spaced places of the sweep.
 
-    Of a stripe-index rig, what its instrument throws for itself: Gray code (see `instrument`).
+    Of a stripe-index rig, what its instrument projects for itself: Gray code (see `instrument`).
     """
-    if spec.code == "light-section":
-        images = np.eye(spec.stripes)
-        return {_named(frames.stripe, "stripe", i): image for i, image in enumerate(images)}
-    if spec.code == "phase-shift":
-        place = (np.arange(spec.stripes * PARTS) + 0.5) / PARTS
-        halves = np.floor(2.0 * place / spec.period_stripes).astype(int)
+    if isinstance(code, LightSection):
+        return _named(frames, STRIPE, np.eye(code.stripes))
+    if isinstance(code, PhaseShift):
+        place = (np.arange(code.stripes * PARTS) + 0.5) / PARTS
+        halves = np.floor(2.0 * place / code.period).astype(int)
         bits = code_bits(int(halves[-1]) + 1)[:, halves].astype(float)
-        return _bit_images(spec, frames, bits) | _waves(spec, frames, place)
-    if spec.code == "binary":
-        shifts = np.arange(bit_count(spec.stripes))[::-1]
-        bits = (np.arange(spec.stripes) >> shifts[:, None] & 1).astype(float)
-        return _bit_images(spec, frames, bits)
-    return _bit_images(spec, frames, code_bits(spec.stripes).astype(float))
+        waves = np.stack(
+            [np.cos(np.pi * (place / code.period - i / code.steps)) ** 2 for i in range(code.steps)]
+        )
+        return _bit_images(frames, bits, code.inverses) | _named(frames, PHASE, waves)
+    if isinstance(code, Binary):
+        shifts = np.arange(bit_count(code.stripes))[::-1]
+        bits = (np.arange(code.stripes) >> shifts[:, None] & 1).astype(float)
+        return _bit_images(frames, bits, code.inverses)
+    inverses = code.inverses if isinstance(code, Gray) else True
+    return _bit_images(frames, code_bits(code.stripes).astype(float), inverses)
 
 
-def _bit_images(spec: ProjectorSpec, frames: FrameNames, bits: Array) -> dict[str, Array]:
-    images = {_named(frames.pattern, "bit", i): bit for i, bit in enumerate(bits)}
-    if spec.inverses is not False:
-        images |= {_named(frames.inverse, "bit", i): 1.0 - bit for i, bit in enumerate(bits)}
-    return images
+def _bit_images(frames: FrameNames, bits: Array, inverses: bool) -> dict[str, Array]:
+    inverse = _named(frames, INVERSE, 1.0 - bits) if inverses else {}
+    return _named(frames, PATTERN, bits) | inverse
 
 
-def _waves(spec: ProjectorSpec, frames: FrameNames, place: Array) -> dict[str, Array]:
-    steps, turns = spec.phase_steps, place / spec.period_stripes
-    return {
-        _named(frames.phase, "step", i): np.cos(np.pi * (turns - i / steps)) ** 2
-        for i in range(steps)
-    }
-
-
-def _named(names: str | tuple[str, ...], number: str, place: int) -> str:
-    return names.format(**{number: place}) if isinstance(names, str) else names[place]
+def _named(frames: FrameNames, kind: ImageKind, images: Array) -> dict[str, Array]:
+    return dict(zip(frames.of_kind(kind, len(images)), images, strict=True))

@@ -19,7 +19,8 @@ from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene
 from bodyscan.simulation.sensor import add_speckle, blur, off_focus, shade
 from bodyscan.simulation.settings import InterReflection, Optics, Projection
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.codes.gray import Gray
+from bodyscan.stripes.stripe_code import StripeCode
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -68,7 +69,7 @@ def render_pair(
     rng: np.random.Generator,
     *,
     frames: FrameNames | None = None,
-    code: ProjectorSpec | None = None,
+    code: StripeCode | None = None,
     sequence: bool = True,
     inter_reflection: InterReflection | None = None,
 ) -> dict[str, Floats]:
@@ -80,7 +81,7 @@ def render_pair(
     keeps to itself, is named "". `sensor.expose` makes 8-bit images of them.
     """
     frames = frames or FrameNames()
-    code = code or ProjectorSpec(stripes=projector.stripes, direction="vertical")
+    code = code or Gray(stripes=projector.stripes, direction="vertical")
     tables = _tables(code, projection, rng, frames, sequence)
     shape = (view.camera.height, view.camera.width)
     laser = {name: np.zeros(shape, np.float32) for name in tables}
@@ -102,7 +103,7 @@ def render_pair(
             for name, light in between.at(hits, samples).items():
                 laser[name][rows] += (albedo * light).reshape(-1, shape[1])
         depth[rows] = hits.depth.reshape(-1, samples).min(axis=1).reshape(-1, shape[1])
-    dark = "" if code.code == "stripe-index" else frames.dark if code.takes_dark else None
+    dark = frames.dark if code.uses_dark else None if code.is_projected else ""
     if sequence and dark is not None:
         laser[dark] = np.zeros(shape, np.float32)
     shading, focus = shade(view.camera, view.optics), off_focus(depth, lamps.focus_mm)
@@ -163,7 +164,7 @@ def pixel_truth(scene: Scene, camera: TrueCamera, projector: Projector) -> Pixel
 
 
 def _tables(
-    code: ProjectorSpec,
+    code: StripeCode,
     projection: Projection,
     rng: np.random.Generator,
     frames: FrameNames,
@@ -184,7 +185,7 @@ def _tables(
 
 @lru_cache(maxsize=8)
 def _steady_tables(
-    code: ProjectorSpec, frames: FrameNames, projection: Projection
+    code: StripeCode, frames: FrameNames, projection: Projection
 ) -> tuple[tuple[str, LightTable], ...]:
     """Of lit and the code's images, when no boundary strays."""
     blurs = _blurs(projection)
@@ -194,7 +195,7 @@ def _steady_tables(
     )
 
 
-def _lights(code: ProjectorSpec, frames: FrameNames) -> list[tuple[str, Array]]:
+def _lights(code: StripeCode, frames: FrameNames) -> list[tuple[str, Array]]:
     """Lit and the code's images: name, and light along the sweep."""
     return [(frames.lit, np.ones(code.stripes)), *projected_patterns(code, frames).items()]
 

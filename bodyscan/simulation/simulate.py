@@ -21,6 +21,7 @@ from bodyscan.simulation.board import make_board
 from bodyscan.simulation.instrument import instrument_images
 from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import TruePair, build_pairs
+from bodyscan.simulation.patterns import refuse_unknown_code
 from bodyscan.simulation.plan import default_shots, plan_boards
 from bodyscan.simulation.render import View, render_pair
 from bodyscan.simulation.room import build_room
@@ -70,10 +71,13 @@ def simulate(
     scale: of image size and number of stripes.  board_shots: besides the one that fixes the rig
     frame; 40 for twelve pairs if not given.  workers: pairs at the same time.
     The same arguments give the same bytes. Raises RigFileError, and BadInput for a rig without
-    nominal placings or a subject that cannot be read.
+    nominal placings, a stripe code that only its decoder knows, or a subject that cannot be read.
     """
     settings = settings or SimulationSettings()
     rig = files.scale_rig(load_rig(rig_file), scale, CALIBRATION)
+    for pair in rig.pairs:
+        if pair.projector is not None:
+            refuse_unknown_code(pair.projector, pair.name)
     truth = _decide(rig, subject, settings, seed, board_shots)
     _render_all(rig, truth, Path(out), workers, progress)
     write_rig(out / "rig.yaml", rig)
@@ -214,7 +218,7 @@ def render_task(
     )
     length = exposure(images[rig.frames.lit], task.bright_grey, light)
     exposed = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}
-    if code and code.code == "stripe-index" and task.sequence:
+    if code and not code.is_projected and task.sequence:
         exposed = instrument_images(exposed, code, rig.frames)
     for frame, image in exposed.items():
         name = fill(rig.files, shot=task.shot, pair=pair.name, frame=frame)

@@ -11,7 +11,7 @@ from scipy.special import erfinv
 
 from bodyscan.compiled import compiled
 from bodyscan.stripes.albedo_edges import Brightness
-from bodyscan.stripes.gray_code import bit_that_flips
+from bodyscan.stripes.bit_words import bit_that_flips
 from bodyscan.stripes.indirect_light import imbalance
 from bodyscan.stripes.scan_lines import ScanLines
 

@@ -25,7 +25,7 @@ class ScanLines:
     """Frames as scan lines: L lines, each of P positions across the stripes.
 
     lit, dark: (L, P) uint8.  patterns: (F, L, P) uint8, the images of the code.
-    inverses: (F, L, P) uint8, None where none are thrown.
+    inverses: (F, L, P) uint8, None where none are projected.
     turned: the lines are the camera image's columns (its stripes are horizontal).
     """
 
@@ -43,8 +43,8 @@ class ScanLines:
         if direction != "horizontal":
             return ScanLines(lit, dark, patterns, inverses, False)
         lit, dark = cv2.transpose(lit), cv2.transpose(dark)
-        turned = None if inverses is None else transposed(inverses)
-        return ScanLines(lit, dark, transposed(patterns), turned, True)
+        turned = None if inverses is None else transpose(inverses)
+        return ScanLines(lit, dark, transpose(patterns), turned, True)
 
     @property
     def contrast(self) -> NDArray[np.float32]:
@@ -94,12 +94,12 @@ class ScanLines:
 
     @property
     def _inverses(self) -> Bytes:
-        """(F, L, P), or (0, L, P) where none are thrown."""
+        """(F, L, P), or (0, L, P) where none are projected."""
         return self.patterns[:0] if self.inverses is None else self.inverses
 
 
-def transposed(images: Bytes) -> Bytes:
-    """Each image of a stack (F, H, W) transposed."""
+def transpose(images: Bytes) -> Bytes:
+    """Each image of a stack (F, H, W) transpose."""
     turned = np.empty((len(images), *images.shape[:0:-1]), np.uint8)
     for image, target in zip(images, turned, strict=True):
         cv2.transpose(image, dst=target)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bodyscan.compiled import compiled
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes.gray_code import WordCode
+from bodyscan.stripes.bit_words import WordCode
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.usable_pixels import SATURATED
 
@@ -45,24 +45,6 @@ ENOUGH = 200_000
 """Of the pixels lines are taken until there are so many, to look at neighbours along them."""
 
 
-def check_sizes(
-    lit: NDArray[np.uint8], dark: NDArray[np.uint8] | None, coded: NDArray[np.uint8], count: int
-) -> None:
-    """Raises DecodingFailed if there are too few or too many frames, or of different sizes.
-
-    lit, dark: (H, W).  coded: (F, H, W).  count: how many the code has.
-    """
-    if len(coded) != count:
-        raise DecodingFailed(
-            f"{len(coded)} images of the code, but it has {count}",
-            remedy="give every image of the code, or correct `code` and `stripes`",
-        )
-    if coded.shape[1:] != lit.shape:
-        raise DecodingFailed(f"images of {coded.shape[1:]} px, lit frame of {lit.shape} px")
-    if dark is not None and dark.shape != lit.shape:
-        raise DecodingFailed(f"dark frame of {dark.shape} px, lit frame of {lit.shape} px")
-
-
 def check_exposure(images: ScanLines) -> None:
     """Raises DecodingFailed for frames that are black, overexposed, or do not add up in light.
 
@@ -79,7 +61,7 @@ def check_exposure(images: ScanLines) -> None:
             "the dark frame is brighter than the lit frame",
             remedy="see whether the names of the two are exchanged in the rig file",
         )
-    check_light(seen, lit)
+    check_illumination(seen, lit)
     bright = seen & (lit < SATURATED)
     bright &= contrast >= np.median(contrast[bright])
     line, place = np.nonzero(bright)
@@ -98,7 +80,7 @@ def _step(images: ScanLines) -> int:
     return max(1, round(math.sqrt(images.lit.size / SAMPLES)))
 
 
-def check_light(seen: Mask, lit: NDArray[Any]) -> None:
+def check_illumination(seen: Mask, lit: NDArray[Any]) -> None:
     """Raises DecodingFailed where the projector lights next to nothing, or most of it too bright.
 
     seen: pixels that are lit.  lit: how bright they are then, grey levels.

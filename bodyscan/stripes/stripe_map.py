@@ -26,7 +26,7 @@ class StripeMap:
     boundary_sigma_px: (N,) float32, standard deviation across the stripe, px.
     stripes: S, the number of stripes projected.
     beyond: (height, width) bool, lit by a stripe that lies deeper than wanted; None where all stripes
-    were wanted. s is NaN there (see `WantedStripes`).
+    were wanted. s is NaN there (see `StripeLimits`).
     """
 
     s: NDArray[np.float32]

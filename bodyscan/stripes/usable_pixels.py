@@ -38,13 +38,13 @@ def usable_pixels(
     least = np.maximum(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * np.sqrt(variance))
     least = np.minimum(np.ceil(least), 255).astype(np.uint8)
     bright = contrast >= cv2.LUT(cv2.max(images.lit, images.dark), least)
-    bright &= ~half_covered(contrast, bright)
+    bright &= ~half_covered_pixels(contrast, bright)
     usable = bright & (images.lit < SATURATED) & (codes < stripes)
     usable &= ~beside_jumps(codes, usable)
     return usable & mostly_direct(images, usable, fine_bit, variance)
 
 
-def half_covered(contrast: NDArray[Any], lit: Mask) -> Mask:
+def half_covered_pixels(contrast: NDArray[Any], lit: Mask) -> Mask:
     """(L, P): pixels beside one that is not lit and much darker than their brightest neighbour.
 
     They straddle the rim of the surface, and tell s of its part of them, not of their middle.

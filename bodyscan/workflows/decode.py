@@ -14,9 +14,9 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
-from bodyscan.stripes.codes import read_code
+from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap
-from bodyscan.stripes.wanted_stripes import WantedStripes
 
 FEW = 2
 """So many shots are told one by one, more with the same fault together."""
@@ -28,9 +28,9 @@ Failure = tuple[ImageSequence, BodyscanError]
 
 
 def decode_sequence(
-    sequence: ImageSequence, pair: Pair, *, wanted: WantedStripes | None = None, workers: int = 1
+    sequence: ImageSequence, pair: Pair, *, limits: StripeLimits | None = None, workers: int = 1
 ) -> StripeMap:
-    """Read and decode what `pair` took in one shot; wanted: see `read_code`.
+    """Read and decode what `pair` took in one shot; limits: see `decode_stripes`.
 
     Raises ImageError for bad files, DecodingFailed (naming pair and shot) for frames that do not
     add up or a pair without projector.
@@ -40,7 +40,7 @@ def decode_sequence(
         raise DecodingFailed("this pair has no projector", where=where)
     images = read_sequence(sequence, pair.camera, workers=workers)
     frames = (images.lit, images.dark, images.coded)
-    return read_code(pair.projector, *frames, wanted=wanted, where=where)
+    return decode_stripes(pair.projector, *frames, limits=limits, where=where)
 
 
 def decode_on_boards(

@@ -37,9 +37,9 @@ def reconstruct_range_images(
     def reconstruct(sequence: ImageSequence) -> RangeImage | tuple[str, str]:
         try:
             pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
-            wanted = stripes_in_volume(pair, at, calibration.rig.volume)
+            limits = stripes_in_volume(pair, at, calibration.rig.volume)
             spec = calibration.rig.pair(sequence.pair)
-            return reconstruct_range_image(pair, decode_sequence(sequence, spec, wanted=wanted))
+            return reconstruct_range_image(pair, decode_sequence(sequence, spec, limits=limits))
         except BodyscanError as error:
             return sequence.pair, str(error)
 

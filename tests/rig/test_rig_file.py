@@ -19,7 +19,8 @@ from bodyscan.rig.dictionaries import MARKERS_IN
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig, write_rig
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.codes import stripe_code
+from bodyscan.stripes.codes.gray import INVERSE, PATTERN, Gray
 
 RIGS = Path(__file__).parents[2] / "rigs"
 
@@ -99,7 +100,15 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
         ("direction: h", "direction: diagonal-h", "must be 'horizontal' or 'vertical' (got diag"),
         ("stripes: 12", "stripes: 1", "pairs[0].projector.stripes: must be 2 or more (got 1)"),
         ("code: gray", "code: grey", "8:23: pairs[0].projector.code: must be 'gray', 'binary', 'li"),
-        ("code: gray", "code: light-section, inverses: true", "inverses: is for codes with bits"),
+        ("code: gray", "code: grey", "or 'stripe-index' (did you mean 'gray'?) (got grey)"),
+        ("code: gray", "code: 7", "projector.code: must be 'gray', 'binary'"),
+        ("code: gray", "code: gray, invreses: true",
+         "8:29: pairs[0].projector.invreses: is no key known here (did you mean 'inverses'?)"),
+        ("code: gray", "code: phase-shift, step: 4", "is no key known here (did you mean 'steps'?)"),
+        ("code: gray", "code: phase-shift, steps: 4.5", "8:43: pairs[0].projector.steps: must be a w"),
+        (", stripes: 12", "", "8:16: pairs[0].projector.stripes: is missing"),
+        ("{code: gray, stripes: 12, direction: horizontal}", "gray", "projector: must be a mapping"),
+        ("code: gray", "code: light-section, inverses: true", "inverses: is for code: gray"),
         ("code: gray", "code: gray, steps: 4", "projector.steps: is for code: phase-shift"),
         ("code: gray", "code: phase-shift, steps: 2", "projector.steps: must be 3 or more (got 2)"),
         ("code: gray", "code: phase-shift, period: 20", "period: must be 12 (stripes) or less (got"),
@@ -119,6 +128,11 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
         ("version: 1", "version: 1\nframes: {pattern: bit}", "frames.pattern: needs {bit}, or"),
         ("version: 1", "version: 1\nframes: {pattern: '{bit.real}'}", "may only hold {bit}"),
         ("version: 1", "version: 1\nframes: {pattern: '{bit:999999999d}'}", "may only hold {bit}"),
+        ("version: 1", "version: 1\nframes: {patern: x}",
+         "2:10: frames.patern: is no key known here (did you mean 'pattern'?)"),
+        ("version: 1", "version: 1\nframes: {index: [a]}", "frames.index: must be text: there is"),
+        ("version: 1", "version: 1\nframes: {lit: 5}", "frames.lit: must be text (got 5: write"),
+        ("version: 1", "version: 1\nframes: all", "2:9: frames: must be a mapping"),
         ("version: 1", "version: 1\nframes: {pattern: 5}", "frames.pattern: must be text or a li"),
         ("version: 1", "version: 1\nframes: {pattern: [a, 5]}", "frames.pattern[1]: must be text"),
         ("version: 1", "version: 1\nframes: {pattern: [a, b, c]}",
@@ -141,6 +155,24 @@ def test_one_mistake_is_one_line(tmp_path: Path, old: str, new: str, line: str) 
     assert len(lines) == 1
     assert lines[0].startswith("rig.yaml:")
     assert line in lines[0]
+
+
+def test_what_is_wrong_with_codes_and_names_is_said_at_once(tmp_path: Path) -> None:
+    text = changed("code: gray, stripes: 12", "code: grey, stripes: 1, steps: 4, colour: red")
+    lines = refused(tmp_path, text + "frames: {patern: x, phase: '{bit}', lit: ../up, dark: 7}\n")
+    told = "\n".join(lines)
+    for part in ("code: must be", "stripes: must be 2", "colour: is no key", "frames.patern: is no",
+                 "frames.dark: must be text"):  # fmt: skip
+        assert part in told
+    assert len(lines) == 5, "steps may be right for the code that was meant"
+
+
+def test_keys_without_a_value_are_keys_not_given() -> None:
+    """As calibrations have them that were written when every code had every key."""
+    keys = {"stripes": 12, "direction": "vertical"}
+    nothing = {"inverses": None, "steps": None, "period": None}
+    assert stripe_code({"code": "gray", **keys, **nothing}) == Gray(**keys)
+    assert stripe_code({"code": "stripe-index", **keys, **nothing}).code == "stripe-index"
 
 
 CHARUCO = "square_mm: 30, kind: charuco"
@@ -258,7 +290,7 @@ def test_marker_count_is_that_of_opencv(columns: int, rows: int) -> None:
 
 @given(st.integers(2, 65535))
 def test_bits_are_enough_for_the_stripes_and_not_one_too_many(stripes: int) -> None:
-    bits = ProjectorSpec(stripes=stripes, direction="vertical").bits
+    bits = Gray(stripes=stripes, direction="vertical").bits
     assert 2 ** (bits - 1) < stripes <= 2**bits
 
 
@@ -282,14 +314,14 @@ def test_a_code_without_inverses_needs_a_dark_image(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_each_code_has_its_images(code: dict, names: str) -> None:
-    spec = ProjectorSpec.model_validate({**code, "stripes": 5, "direction": "vertical"})
+    spec = stripe_code({**code, "stripes": 5, "direction": "vertical"})
     assert FrameNames().of_code(spec) == tuple(names.split())
 
 
 def test_frame_names() -> None:
     names = FrameNames(inverse=("a", "b", "c"))
-    assert names.of_kind("pattern", 3) == ("bit00", "bit01", "bit02")
-    assert names.of_kind("inverse", 3) == ("a", "b", "c")
+    assert names.of_kind(PATTERN, 3) == ("bit00", "bit01", "bit02")
+    assert names.of_kind(INVERSE, 3) == ("a", "b", "c")
 
 
 @given(

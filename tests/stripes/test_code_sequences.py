@@ -7,15 +7,17 @@ import pytest
 from stripe_rendering import code_light, render
 
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes.codes import read_code
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.codes import stripe_code
+from bodyscan.stripes.codes.phase_shift import PhaseShift
+from bodyscan.stripes.codes.stripe_index import StripeIndex
+from bodyscan.stripes.decoding import decode_stripes
 
 STRIPES = 60
 
 
 def rendered(**code):
     """A function that reads a good sequence after `change` has been at its images."""
-    spec = ProjectorSpec.model_validate({**code, "stripes": STRIPES, "direction": "horizontal"})
+    spec = stripe_code({**code, "stripes": STRIPES, "direction": "horizontal"})
     lights = code_light(stripes=STRIPES, **code)
     lit, dark, coded, _ = render(
         lambda u, v: 1.2 + (v + 0.1 * u + 2 * np.sin(u / 20)) / 2.3,
@@ -27,7 +29,7 @@ def rendered(**code):
     def read(change=lambda images: None, *, spec=spec, lit=lit):
         images = {"coded": coded.copy(), "dark": dark, "lit": lit}
         change(images)
-        return read_code(spec, images["lit"], images["dark"], images["coded"], where="pair a")
+        return decode_stripes(spec, images["lit"], images["dark"], images["coded"], where="pair a")
 
     assert np.isfinite(read().s).mean() > 0.8
     return read
@@ -156,9 +158,7 @@ def test_phase_images_that_are_missing_or_double_are_named(phase):
 
 
 def test_a_wrong_period_is_noticed(phase):
-    spec = ProjectorSpec(
-        code="phase-shift", stripes=STRIPES, direction="horizontal", steps=4, period=6
-    )
+    spec = PhaseShift(stripes=STRIPES, direction="horizontal", steps=4, period=6)
     with pytest.raises(DecodingFailed):
         phase(spec=spec)
 
@@ -168,9 +168,9 @@ def index_image(s):
 
 
 def read_index(image, stripes=STRIPES, direction="horizontal"):
-    spec = ProjectorSpec(code="stripe-index", stripes=stripes, direction=direction)
+    spec = StripeIndex(stripes=stripes, direction=direction)
     lit = np.full(image.shape, 200, np.uint8)
-    return read_code(spec, lit, None, image.astype(np.uint8)[None])
+    return decode_stripes(spec, lit, None, image.astype(np.uint8)[None])
 
 
 def test_a_stripe_index_image_is_read_or_refused():

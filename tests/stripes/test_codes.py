@@ -6,16 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from stripe_rendering import decode_gray
 
 from bodyscan.errors import BadInput
-from bodyscan.stripes.codes import pattern_frames, read_stripes
-from bodyscan.stripes.gray_code import (
-    bit_that_flips,
-    bits_needed,
-    gray_from_stripe,
-    stripe_from_gray,
-)
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.bit_words import bit_that_flips, gray_from_stripe, stripe_from_gray
+from bodyscan.stripes.codes.gray import Gray, bits_needed
+from bodyscan.stripes.patterns import pattern_frames
 
 
 @given(st.integers(2, 65535))
@@ -38,7 +34,7 @@ def test_exactly_one_known_bit_flips_at_a_boundary(boundary):
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @given(stripes=st.integers(2, 40))
 def test_patterns_are_stripes_that_differ_in_one_bit_from_their_neighbours(direction, stripes):
-    spec = ProjectorSpec(stripes=stripes, direction=direction)
+    spec = Gray(stripes=stripes, direction=direction)
     frames = pattern_frames(spec, width=41, height=40)
     frames, inverses = np.split(frames, 2)
     np.testing.assert_array_equal(inverses, 255 - frames)
@@ -58,17 +54,17 @@ def test_patterns_are_stripes_that_differ_in_one_bit_from_their_neighbours(direc
 
 def test_stripes_narrower_than_a_projector_pixel_are_refused():
     with pytest.raises(BadInput, match="do not fit"):
-        pattern_frames(ProjectorSpec(stripes=50, direction="vertical"), width=49, height=100)
+        pattern_frames(Gray(stripes=50, direction="vertical"), width=49, height=100)
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("with_dark", [True, False])
 def test_projected_frames_seen_as_they_are_give_their_stripes(direction, with_dark):
-    spec = ProjectorSpec(stripes=40, direction=direction)
+    spec = Gray(stripes=40, direction=direction)
     patterns, inverses = np.split(pattern_frames(spec, width=120, height=160) // 2 + 20, 2)
     lit = np.full((160, 120), 147, np.uint8)
     dark = np.full_like(lit, 20) if with_dark else None
-    seen = read_stripes(lit, dark, patterns, inverses, stripes=40, direction=direction)
+    seen = decode_gray(lit, dark, patterns, inverses, stripes=40, direction=direction)
     pixel = np.arange(160 if direction == "horizontal" else 120)
     stripe_px = len(pixel) / 40
     true = (pixel + 0.5) / stripe_px

@@ -7,10 +7,12 @@ import pytest
 from stripe_rendering import checkered, code_light, render, white
 
 from bodyscan.errors import BadInput, DecodingFailed
-from bodyscan.stripes.codes import pattern_frames, read_code
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.codes import stripe_code
+from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.patterns import pattern_frames
+from bodyscan.stripes.stripe_code import StripeCode
+from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap
-from bodyscan.stripes.wanted_stripes import WantedStripes
 
 PLAIN_GRAY = {"code": "gray", "inverses": False}
 BINARY = {"code": "binary"}
@@ -28,8 +30,8 @@ def name(value):
     return "-".join(str(part) for part in value.values())
 
 
-def spec_of(code: dict, stripes: int, direction: str = "horizontal") -> ProjectorSpec:
-    return ProjectorSpec.model_validate({**code, "stripes": stripes, "direction": direction})
+def spec_of(code: dict, stripes: int, direction: str = "horizontal") -> StripeCode:
+    return stripe_code({**code, "stripes": stripes, "direction": direction})
 
 
 def wavy(stripe_px):
@@ -51,7 +53,7 @@ def captured(code: dict, s_at, stripes: int, **scene):
 
 def read(code: dict, images, stripes: int) -> StripeMap:
     lit, dark, coded, _ = images
-    return read_code(spec_of(code, stripes), lit, dark, coded)
+    return decode_stripes(spec_of(code, stripes), lit, dark, coded)
 
 
 def rms(values):
@@ -142,7 +144,7 @@ def test_vertical_stripes_are_horizontal_ones_transposed(code):
     images = captured(code, wavy(3.0), 64, shape=(120, 140))
     seen = read(code, images, 64)
     lit, dark, coded = images[0].T, images[1].T, images[2].transpose(0, 2, 1)
-    turned = read_code(
+    turned = decode_stripes(
         spec_of(code, 64, "vertical"), *map(np.ascontiguousarray, (lit, dark, coded))
     )
     np.testing.assert_array_equal(turned.s.T, seen.s)
@@ -154,9 +156,9 @@ def test_vertical_stripes_are_horizontal_ones_transposed(code):
 def test_what_is_projected_is_read_as_it_is(code, direction):
     spec = spec_of(code, 40, direction)
     coded = pattern_frames(spec, 120, 160) // 2 + 20
-    assert len(coded) == sum(spec.frame_counts.values())
+    assert len(coded) == sum(spec.image_counts.values())
     lit = np.full((160, 120), 147, np.uint8)
-    seen = read_code(spec, lit, np.full_like(lit, 20), np.ascontiguousarray(coded))
+    seen = decode_stripes(spec, lit, np.full_like(lit, 20), np.ascontiguousarray(coded))
     pixel = np.arange(160 if direction == "horizontal" else 120)
     true = (pixel + 0.5) / (len(pixel) / 40)
     true = np.broadcast_to(true[:, None] if direction == "horizontal" else true, lit.shape)
@@ -193,7 +195,7 @@ def test_too_bright_and_doubly_lit_pixels_have_no_value_in_a_light_section():
     coded = coded.copy()
     twice = np.s_[80:100, 100:130]
     coded[5][twice] = coded[45][twice] = 150  # light by way of another surface
-    seen = read_code(spec_of(SECTION, 50), lit, dark, coded)
+    seen = decode_stripes(spec_of(SECTION, 50), lit, dark, coded)
     v, u = np.mgrid[: lit.shape[0], : lit.shape[1]]
     spot = (u - 60) ** 2 + (v - 60) ** 2 < 17**2
     assert np.isnan(seen.s[spot & (coded.max(axis=0) >= 254)]).all()
@@ -218,7 +220,7 @@ def test_an_instrument_projects_stripes_of_its_own():
 def test_black_must_be_known():
     lit, _, coded, _ = captured(PLAIN_GRAY, wavy(3.0), 64, shape=(60, 80))
     with pytest.raises(DecodingFailed, match="show what black is"):
-        read_code(spec_of(PLAIN_GRAY, 64), lit, None, coded)
+        decode_stripes(spec_of(PLAIN_GRAY, 64), lit, None, coded)
 
 
 @pytest.mark.parametrize("code", [{"code": "gray"}, *ALL], ids=name)
@@ -229,9 +231,9 @@ def test_wanted_stripes_are_decoded_as_if_all_were(code, rising):
     whole = read(code, images, stripes)
     low, high = (20.0, 35.0) if rising else (-35.0, -20.0)
     corners = np.ones((3, 4), np.float32)
-    wanted = WantedStripes(low * corners, high * corners, high * corners, rising, 64, 5.0)
+    limits = StripeLimits(low * corners, high * corners, high * corners, rising, 64, 5.0)
     lit, dark, coded, _ = images
-    part = read_code(spec_of(code, stripes), lit, dark, coded, wanted=wanted)
+    part = decode_stripes(spec_of(code, stripes), lit, dark, coded, limits=limits)
     # Within two stripes of the ends a run, and what is smoothed along it, ends earlier.
     inside = np.isfinite(whole.s) & (whole.s > 22.0) & (whole.s < 33.0)
     assert inside.sum() > 1000

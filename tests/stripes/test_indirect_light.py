@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from stripe_rendering import Sequence, gray_bits, render_sequence
+from stripe_rendering import Sequence, decode_gray, gray_bits, render_sequence
 
-from bodyscan.stripes.codes import read_stripes
 from bodyscan.stripes.stripe_map import StripeMap
 
 STRIPES, PX = 50, 4.0
@@ -42,7 +41,7 @@ def with_indirect(sequence: Sequence, grey: float) -> Sequence:
 
 def read(sequence: Sequence) -> StripeMap:
     frames = (sequence.lit, sequence.dark, sequence.patterns, sequence.inverses)
-    return read_stripes(*frames, stripes=STRIPES, direction="vertical")
+    return decode_gray(*frames, stripes=STRIPES, direction="vertical")
 
 
 def rms(found: StripeMap, s: np.ndarray) -> float:
@@ -86,8 +85,8 @@ def test_direct_light_is_never_taken_for_indirect(pixels: float, monkeypatch) ->
         lambda u, v: 0.5 + u / pixels, stripes=int(250 / pixels), light=60.0, noise=1.0
     )
     frames = (plain.lit, plain.dark, plain.patterns, plain.inverses)
-    found = read_stripes(*frames, stripes=int(250 / pixels), direction="vertical")
+    found = decode_gray(*frames, stripes=int(250 / pixels), direction="vertical")
     monkeypatch.setattr("bodyscan.stripes.indirect_light.LEAST_DIRECT", -1.0)
-    everything = read_stripes(*frames, stripes=int(250 / pixels), direction="vertical")
+    everything = decode_gray(*frames, stripes=int(250 / pixels), direction="vertical")
     assert np.isfinite(everything.s).mean() > 0.8
     assert np.isfinite(found.s).sum() >= 0.999 * np.isfinite(everything.s).sum()

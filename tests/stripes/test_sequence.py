@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stripe_rendering import Sequence, render_sequence
+from stripe_rendering import Sequence, decode_gray, render_sequence
 
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes.codes import read_stripes
 
 STRIPES = 100
 BITS = 7
@@ -23,7 +22,7 @@ def good() -> Sequence:
 
 
 def read(sequence, direction="horizontal"):
-    return read_stripes(
+    return decode_gray(
         sequence.lit, sequence.dark, sequence.patterns, sequence.inverses,
         stripes=STRIPES, direction=direction,
     )  # fmt: skip
@@ -83,10 +82,10 @@ def test_a_bit_in_place_of_another_is_noticed(good):
 
 
 def test_a_sequence_of_the_wrong_length_or_size_is_refused(good):
-    with pytest.raises(DecodingFailed, match="6 patterns, but the code has 7 bits"):
+    with pytest.raises(DecodingFailed, match="13 images of the code, but it has 14"):
         read(replace(good, patterns=good.patterns[1:]))
-    with pytest.raises(DecodingFailed, match="inverses of"):
-        read(replace(good, inverses=good.inverses[:, :-1]))
+    with pytest.raises(DecodingFailed, match="images of"):
+        read(replace(good, lit=good.lit[:-1]))
     with pytest.raises(DecodingFailed, match="dark frame of"):
         read(replace(good, dark=good.dark[:-1]))
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from stripe_rendering import checkered, render_sequence, white
+from stripe_rendering import checkered, decode_gray, render_sequence, white
 
 from bodyscan.boards.detection import find_boards
 from bodyscan.rig.board import Board
-from bodyscan.stripes.codes import read_stripes
 
 
 def wavy(stripe_px, *, slant=0.1, first=3.3):
@@ -22,7 +21,7 @@ def wavy(stripe_px, *, slant=0.1, first=3.3):
 
 
 def read(sequence, stripes, direction="horizontal"):
-    return read_stripes(
+    return decode_gray(
         sequence.lit, sequence.dark, sequence.patterns, sequence.inverses,
         stripes=stripes, direction=direction,
     )  # fmt: skip
@@ -92,7 +91,7 @@ def test_vertical_stripes_are_horizontal_ones_transposed():
     s_at = wavy(3.0)
     sequence = render_sequence(s_at, stripes=80, shape=(120, 140))
     seen = read(sequence, 80)
-    turned = read_stripes(
+    turned = decode_gray(
         np.ascontiguousarray(sequence.lit.T),
         np.ascontiguousarray(sequence.dark.T),
         np.ascontiguousarray(sequence.patterns.transpose(0, 2, 1)),
@@ -192,7 +191,7 @@ def test_the_same_frames_give_the_same_bytes():
 def test_real_stripes_on_a_real_board_are_smooth(captures, pose):
     folder = captures / "procam-board" / f"capture_{pose}"
     frame = {k: cv2.imread(str(folder / f"graycode_{k}.png"), 0) for k in range(20, 42)}
-    seen = read_stripes(
+    seen = decode_gray(
         frame[40], frame[41],
         np.stack([frame[k] for k in range(20, 40, 2)]),
         np.stack([frame[k] for k in range(21, 40, 2)]),

@@ -8,12 +8,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from bodyscan.stripes.codes.gray import Gray
+from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.stripe_map import StripeMap
+
 SUPERSAMPLING = 5
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """Frames as `read_stripes` takes them, and the truth at pixel centres (NaN: no surface)."""
+    """Frames of a Gray code with inverses, and the truth at pixel centres (NaN: no surface)."""
 
     lit: np.ndarray
     dark: np.ndarray
@@ -49,6 +53,20 @@ def render_sequence(s_at: Field, *, stripes: int, **scene) -> Sequence:
     lit, dark, coded, s = render(s_at, np.concatenate([bits, 1 - bits]), stripes=stripes, **scene)
     patterns, inverses = np.split(coded, 2)
     return Sequence(lit, dark, patterns, inverses, s)
+
+
+def decode_gray(
+    lit: np.ndarray,
+    dark: np.ndarray | None,
+    patterns: np.ndarray,
+    inverses: np.ndarray,
+    *,
+    stripes: int,
+    direction: str,
+) -> StripeMap:
+    """`decode_stripes` of a Gray code with inverses. patterns, inverses: (bits, H, W)."""
+    code = Gray.model_validate({"stripes": stripes, "direction": direction})
+    return decode_stripes(code, lit, dark, np.concatenate([patterns, inverses]))
 
 
 def gray_bits(words: np.ndarray) -> np.ndarray:

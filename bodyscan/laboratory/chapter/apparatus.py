@@ -26,11 +26,11 @@ from bodyscan.simulation.settings import (
     Projection,
     SimulationSettings,
 )
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.codes.gray import Gray
 
 CAMERA = TrueCamera(1061.71, 1064.09, -0.562002, 350.08, 286.547, -0.140279, -0.0916363, 640, 480)
 """Table 1, to the last digit."""
-PROJECTOR = ProjectorSpec(stripes=254, direction="vertical")
+PROJECTOR = Gray(stripes=254, direction="vertical")
 BOARD = Board(name="board", columns=9, rows=7, square_mm=20, margin_mm=15)
 """8 x 6 = 48 inner corners, 20 mm apart."""
 RADIUS_MM = 25.0

@@ -12,11 +12,12 @@ from bodyscan.arrays import Array, Bytes
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.apparatus import ChapterSetup
+from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.render import PixelTruth, pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.sensor import expose
-from bodyscan.stripes.codes import read_stripes
+from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_map import StripeMap
 
 SPHERE_RINGS = 400
@@ -85,15 +86,9 @@ def scene_truth(setup: ChapterSetup, surfaces: Sequence[Surface]) -> PixelTruth:
 
 
 def _read(frames: dict[str, Bytes]) -> Exposure:
-    bits = range(apparatus.PROJECTOR.bits)
-    stripes = read_stripes(
-        frames["lit"],
-        frames["dark"],
-        np.stack([frames[f"bit{bit:02d}"] for bit in bits]),
-        np.stack([frames[f"bit{bit:02d}-inverse"] for bit in bits]),
-        stripes=apparatus.PROJECTOR.stripes,
-        direction=apparatus.PROJECTOR.direction,
-    )
+    code = apparatus.PROJECTOR
+    coded = np.stack([frames[name] for name in FrameNames().of_code(code)])
+    stripes = decode_stripes(code, frames["lit"], frames["dark"], coded)
     return Exposure(frames["lit"], stripes)
 
 

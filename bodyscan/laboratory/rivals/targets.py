@@ -25,7 +25,7 @@ from bodyscan.laboratory.rivals.projection_matrix import (
 )
 from bodyscan.laboratory.rivals.tsai import TsaiCamera, calibrate_tsai
 from bodyscan.rig.board import Board
-from bodyscan.stripes.projector_spec import ProjectorSpec
+from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
 
 
@@ -42,7 +42,7 @@ class Target:
     """What the shots have in common."""
 
     board: Board
-    projector: ProjectorSpec
+    projector: StripeCode
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Phase shift: waves of light, shifted by a part of their period from image to image.
+"""Waves of light, shifted by a part of their period from image to image: s from their phase.
 
 Image n of N shows 1/2 + 1/2 cos(phi - 2 pi n / N) with phi = 2 pi s / period, so that
 
@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes import bit_codes
+from bodyscan.stripes.bit_patterns import read_words
+from bodyscan.stripes.bit_words import GRAY
 from bodyscan.stripes.grey_noise import noise_variance
 from bodyscan.stripes.pixel_stripes import pixel_stripe_map
-from bodyscan.stripes.projector_spec import ProjectorSpec
-from bodyscan.stripes.scan_lines import ScanLines, transposed
+from bodyscan.stripes.scan_lines import ScanLines, transpose
 from bodyscan.stripes.stripe_map import StripeMap
 from bodyscan.stripes.usable_pixels import MIN_CONTRAST_TO_NOISE, usable_pixels
 
@@ -44,32 +44,30 @@ LEAP = 0.6
 """Of a period, between neighbouring pixels on both sides of two half periods' boundary."""
 
 
-def light(spec: ProjectorSpec, s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(steps, N): light of the images at s (N,), 0 to 1."""
-    shift = np.arange(spec.phase_steps)[:, None] / spec.phase_steps
-    return 0.5 + 0.5 * np.cos(2.0 * np.pi * (s / spec.period_stripes - shift))
+def decode_phase(
+    images: ScanLines, lit: Images, waves: Images, half_periods: int, period: int, stripes: int
+) -> StripeMap:
+    """The stripe map.  images: scan lines of the Gray code of half periods.  lit: (H, W) as the
+    camera has it.  waves: (steps, H, W).  period: in stripes.
 
-
-def read(spec: ProjectorSpec, lit: Images, dark: Images | None, coded: Images) -> StripeMap:
-    """See `codes.read_code`."""
-    words, waves = np.split(coded, [len(coded) - spec.phase_steps])
-    images = bit_codes.bit_lines(spec, lit, dark, words)
-    code = bit_codes.word_code(spec)
-    halves = code.stripes(bit_codes.checked_words(spec, images))
+    Raises DecodingFailed if the images do not add up.
+    """
+    halves = GRAY.stripes(read_words(GRAY, images, half_periods))
     variance = noise_variance(images)
-    usable = usable_pixels(images, halves, variance, spec.words, code.two_wide(spec.bits))
-    waves = transposed(waves) if images.turned else waves
+    fine_bit = GRAY.two_wide(len(images.patterns))
+    usable = usable_pixels(images, halves, variance, half_periods, fine_bit)
+    waves = transpose(waves) if images.turned else waves
     _check_waves(images, waves, usable)
     turn, amplitude, middle = _wave(waves)
     noise = np.sqrt(variance[np.clip(middle, 0, 255).astype(np.uint8)])
     usable &= amplitude >= np.maximum(MIN_AMPLITUDE, MIN_CONTRAST_TO_NOISE * noise)
     coarse = (halves.astype(np.float32) + 0.5) / 2.0
     _check_phase(waves, coarse, usable)
-    s = (turn + np.rint(coarse - turn)) * np.float32(spec.period_stripes)
+    s = (turn + np.rint(coarse - turn)) * np.float32(period)
     sigma = np.hypot(noise / amplitude / np.sqrt(2.0 * len(waves)) / np.pi, LEAST_SIGMA)
     s[~usable] = np.nan
-    sigma = np.where(usable, sigma * spec.period_stripes, np.nan).astype(np.float32)
-    return pixel_stripe_map(images, lit, s, sigma, variance, spec.stripes)
+    sigma = np.where(usable, sigma * period, np.nan).astype(np.float32)
+    return pixel_stripe_map(images, lit, s, sigma, variance, stripes)
 
 
 def _wave(waves: Images) -> tuple[Floats, Floats, Floats]:

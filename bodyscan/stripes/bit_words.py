@@ -13,10 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-
-def bits_needed(stripes: int) -> int:
-    """Number of bits, and so of pattern frames, for this many stripes (>= 2)."""
-    return (stripes - 1).bit_length()
+from bodyscan.arrays import Array, Indices
 
 
 def gray_from_stripe(stripe: NDArray[Any]) -> NDArray[Any]:
@@ -53,6 +50,11 @@ class WordCode:
     stripes: Callable[[NDArray[np.uint16]], NDArray[np.int32]]
     single: bool
     doubt_px: float
+
+    def bits(self, stripes: Indices, count: int) -> Array:
+        """(count, N): 1 or 0 for each bit of stripes (N,), the most significant first."""
+        shift = np.arange(count)[::-1, None]
+        return np.asarray(self.words(stripes) >> shift & 1, float)
 
     @property
     def finest_run(self) -> int:

@@ -19,7 +19,7 @@ LEAST_STANDING = 1e-3  # of what is seen in the volume
 
 
 @dataclass(frozen=True, eq=False)
-class WantedStripes:
+class StripeLimits:
     """Between which stripe coordinates a pixel's point lies in the scan volume.
 
     near, far: (rows, columns) float32 at the corners of blocks of `block_px` x `block_px` camera

@@ -1,4 +1,4 @@
-"""Light section: a line of light is swept over the scene, one image a stripe.
+"""A line of light swept over the scene, one image a stripe: s from when it comes and goes.
 
 At a pixel whose stripe coordinate is s the light comes and goes over the images. The part of it
 that comes in images i and later is, whatever the line's width and blur sigma,
@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from bodyscan.stripes.pixel_stripes import pixel_stripe_map
-from bodyscan.stripes.projector_spec import ProjectorSpec
 from bodyscan.stripes.scan_lines import ScanLines
-from bodyscan.stripes.sequence import check_light
+from bodyscan.stripes.sequence import check_illumination
 from bodyscan.stripes.stripe_map import StripeMap
 from bodyscan.stripes.stripe_order import check_order
 from bodyscan.stripes.usable_pixels import (
@@ -28,7 +27,7 @@ from bodyscan.stripes.usable_pixels import (
     MIN_CONTRAST_TO_NOISE,
     SATURATED,
     beside_jumps,
-    half_covered,
+    half_covered_pixels,
 )
 
 Images = NDArray[np.uint8]
@@ -51,25 +50,24 @@ BANDS = 8
 ENOUGH_PIXELS = 200
 
 
-def light(spec: ProjectorSpec, s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(stripes, N): stripe i is lit in image i, at s (N,)."""
-    return np.asarray(np.floor(s) == np.arange(spec.stripes)[:, None], float)
+def decode_sweep(lit: Images, frames: Images, direction: str) -> StripeMap:
+    """The stripe map.  lit: (H, W).  frames: (stripes, H, W), most of them dark at any one pixel.
 
-
-def read(spec: ProjectorSpec, lit: Images, dark: Images | None, coded: Images) -> StripeMap:
-    """See `codes.read_code`. `dark` is not looked at: most images are dark at any one pixel."""
-    lines = ScanLines.along_lines(lit, lit, coded, None, spec.direction)
+    Raises DecodingFailed if the images do not add up.
+    """
+    stripes = len(frames)
+    lines = ScanLines.along_lines(lit, lit, frames, None, direction)
     sweep = _Sweep.of(lines.patterns)
     base_noise2 = sweep.base_noise2(lines.patterns)
     rise = sweep.noise_rise(lines.lit, base_noise2)
     noise = np.sqrt(base_noise2 + rise * sweep.height)
     shown = sweep.height >= np.maximum(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * noise)
-    check_light(shown, np.where(shown, sweep.height + sweep.base, 0))
+    check_illumination(shown, np.where(shown, sweep.height + sweep.base, 0))
     usable = shown & (sweep.height + sweep.base < SATURATED)
-    check_order(sweep.peak, usable, lines.turned, spec.stripes)
+    check_order(sweep.peak, usable, lines.turned, stripes)
     usable &= sweep.second < np.maximum(MAX_SECOND * sweep.height, MIN_CONTRAST_TO_NOISE * noise)
-    usable &= (sweep.peak > 0) & (sweep.peak < spec.stripes - 1)
-    usable &= ~half_covered(sweep.total, shown) & ~beside_jumps(sweep.peak, usable)
+    usable &= (sweep.peak > 0) & (sweep.peak < stripes - 1)
+    usable &= ~half_covered_pixels(sweep.total, shown) & ~beside_jumps(sweep.peak, usable)
     s, sigma = sweep.coordinates(base_noise2, rise)
     s[~usable] = np.nan
     sigma[~usable] = np.nan
@@ -78,7 +76,7 @@ def read(spec: ProjectorSpec, lit: Images, dark: Images | None, coded: Images) -
     whole = np.clip(sweep.total + sweep.base, 0, 255).astype(np.uint8)
     images = ScanLines(whole, sweep.base.astype(np.uint8), lines.patterns, None, lines.turned)
     variance = variance.astype(np.float32)
-    return pixel_stripe_map(images, lit, s, sigma, variance, spec.stripes, codes=sweep.peak)
+    return pixel_stripe_map(images, lit, s, sigma, variance, stripes, codes=sweep.peak)
 
 
 class _Sweep:

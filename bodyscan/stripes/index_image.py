@@ -1,7 +1,6 @@
-"""The stripe-index image: luminance 1 to 254 is the stripe's number, 0 and 255 are none.
+"""One image of stripe numbers: luminance 1 to 254 is the number, 0 and 255 are none.
 
-It is what instruments of the chapter's kind hand out (4.1, Fig. 5). Luminance n is stripe n - 1 of
-this program, which counts from 0: s lies between n - 1 and n.
+Luminance n is stripe n - 1 of this program, which counts from 0: s lies between n - 1 and n.
 """
 
 from __future__ import annotations
@@ -11,9 +10,8 @@ from numpy.typing import NDArray
 
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.boundaries import Boundaries, joined_to_next
-from bodyscan.stripes.projector_spec import ProjectorSpec
 from bodyscan.stripes.scan_lines import ScanLines
-from bodyscan.stripes.sequence import check_light
+from bodyscan.stripes.sequence import check_illumination
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
 from bodyscan.stripes.stripe_map import StripeMap, stripe_map
 from bodyscan.stripes.stripe_order import check_order
@@ -29,34 +27,35 @@ MAX_SHARE_BEYOND = 0.01
 NONE = (0, 255)
 
 
-def read(spec: ProjectorSpec, lit: Images, dark: Images | None, coded: Images) -> StripeMap:
-    """See `codes.read_code`. The board is looked for in `lit`; `dark` is not looked at.
+def decode_index(lit: Images, numbers: Images, direction: str, stripes: int) -> StripeMap:
+    """The stripe map.  lit: (H, W).  numbers: (1, H, W).
 
     A boundary is known to lie between two pixels, no better. Along a line of boundaries s is
     interpolated all the same: it is nearer to the truth than the middle of the stripe, which
-    remains for pixels that lie between no two boundaries.
+    remains for pixels that lie between no two boundaries. Raises DecodingFailed if neighbours do
+    not lie in neighbouring stripes.
     """
     black = np.zeros_like(lit)
-    images = ScanLines.along_lines(lit, black, coded, None, spec.direction)
+    images = ScanLines.along_lines(lit, black, numbers, None, direction)
     index = images.patterns[0]
     numbered = ~np.isin(index, NONE)
-    check_light(numbered, np.zeros_like(index))
+    check_illumination(numbered, np.zeros_like(index))
     codes = index.astype(np.int32) - 1
-    beyond = np.mean(codes[numbered] >= spec.stripes)
+    beyond = np.mean(codes[numbered] >= stripes)
     if beyond > MAX_SHARE_BEYOND:
         raise DecodingFailed(
-            f"{beyond:.0%} of the pixels have a stripe number above {spec.stripes}",
+            f"{beyond:.0%} of the pixels have a stripe number above {stripes}",
             remedy="correct `stripes` in the rig file, or give the stripe-index image itself",
         )
     check_order(np.where(numbered, codes, 0), numbered, images.turned, 256)
-    usable = numbered & (codes < spec.stripes)
+    usable = numbered & (codes < stripes)
     usable &= ~beside_jumps(codes, usable)
     boundaries = _boundaries(codes, usable)
     s, sigma = interpolate_stripes(boundaries, codes, usable)
     alone = usable & np.isnan(s)
     s[alone] = codes[alone] + 0.5
     sigma[alone] = SIGMA
-    return stripe_map(images, lit, s, sigma, boundaries, spec.stripes)
+    return stripe_map(images, lit, s, sigma, boundaries, stripes)
 
 
 def _boundaries(codes: NDArray[np.int32], usable: Mask) -> Boundaries:

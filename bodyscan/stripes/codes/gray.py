@@ -1,0 +1,94 @@
+"""Stripes numbered in bits: one image a bit, and one of each bit's inverse where wanted.
+
+The inverse makes a boundary the crossing of two curves, wherever the surface is black or white;
+without it, black must be known from a dark image.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
+
+if TYPE_CHECKING:
+    from bodyscan.arrays import Array
+    from bodyscan.stripes.bit_words import WordCode
+    from bodyscan.stripes.stripe_limits import StripeLimits
+    from bodyscan.stripes.stripe_map import StripeMap
+
+PATTERN = ImageKind("pattern", "bit{bit:02d}", "bit", most=16)
+INVERSE = ImageKind("inverse", "bit{bit:02d}-inverse", "bit", most=16)
+
+
+def bits_needed(words: int) -> int:
+    """Number of bits, and so of pattern images, for this many words (>= 2): ceil(log2(words))."""
+    return max(1, (words - 1).bit_length())
+
+
+class _NumberedStripes(StripeCode):
+    """inverses: whether each pattern is projected inverted as well."""
+
+    kinds: ClassVar = (PATTERN, INVERSE)
+
+    inverses: bool = True
+
+    @property
+    def bits(self) -> int:
+        """Number of patterns."""
+        return bits_needed(self.stripes)
+
+    @property
+    @abstractmethod
+    def word_code(self) -> WordCode:
+        """How stripes are written in bits."""
+
+    @property
+    def needs_dark(self) -> bool:
+        return not self.inverses
+
+    @property
+    def image_counts(self) -> Mapping[ImageKind, int]:
+        inverse = {INVERSE: self.bits} if self.inverses else {}
+        return {PATTERN: self.bits} | inverse
+
+    def intensity(self, kind: ImageKind, s: Array) -> Array:
+        import numpy as np
+
+        bright = self.word_code.bits(np.floor(s).astype(np.int64), self.bits)
+        return bright if kind == PATTERN else 1.0 - bright
+
+    def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
+        from bodyscan.stripes.bit_patterns import bit_lines, decode_bits
+
+        patterns, inverses = images.coded[PATTERN], images.coded.get(INVERSE)
+        lines = bit_lines(images.lit, images.dark, patterns, inverses, self.direction)
+        return decode_bits(self.word_code, lines, images.lit, self.stripes, limits)
+
+
+class Gray(_NumberedStripes):
+    """The reflected binary code: one bit flips from stripe to stripe."""
+
+    code: Literal["gray"] = "gray"
+
+    @property
+    def word_code(self) -> WordCode:
+        from bodyscan.stripes.bit_words import GRAY
+
+        return GRAY
+
+
+class Binary(_NumberedStripes):
+    """The plain binary code."""
+
+    code: Literal["binary"] = "binary"
+
+    @property
+    def word_code(self) -> WordCode:
+        from bodyscan.stripes.bit_words import BINARY
+
+        return BINARY
+
+
+CODES = (Gray, Binary)

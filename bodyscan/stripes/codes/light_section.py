@@ -1,0 +1,42 @@
+"""Light section: a line of light swept over the scene, one image a stripe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
+
+if TYPE_CHECKING:
+    from bodyscan.arrays import Array
+    from bodyscan.stripes.stripe_limits import StripeLimits
+    from bodyscan.stripes.stripe_map import StripeMap
+
+STRIPE = ImageKind("stripe", "stripe{stripe:03d}", "stripe", most=1000)
+
+
+class LightSection(StripeCode):
+    """Most images are dark at any one pixel, so that no dark image is needed."""
+
+    kinds: ClassVar = (STRIPE,)
+    uses_dark: ClassVar = False
+
+    code: Literal["light-section"] = "light-section"
+
+    @property
+    def image_counts(self) -> Mapping[ImageKind, int]:
+        return {STRIPE: self.stripes}
+
+    def intensity(self, kind: ImageKind, s: Array) -> Array:
+        """Stripe i is lit in image i."""
+        import numpy as np
+
+        return np.asarray(np.floor(s) == np.arange(self.stripes)[:, None], float)
+
+    def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
+        from bodyscan.stripes.line_sweep import decode_sweep
+
+        return decode_sweep(images.lit, images.coded[STRIPE], self.direction)
+
+
+CODES = (LightSection,)

@@ -1,0 +1,56 @@
+"""The stripe-index image: luminance 1 to 254 is the stripe's number, 0 and 255 are none.
+
+It is what instruments of the chapter's kind hand out (4.1, Fig. 5), which project for themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from bodyscan.errors import BadInput
+from bodyscan.files.model import Problem
+from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
+
+if TYPE_CHECKING:
+    from bodyscan.arrays import Array
+    from bodyscan.stripes.stripe_limits import StripeLimits
+    from bodyscan.stripes.stripe_map import StripeMap
+
+INDEX = ImageKind("index", "index")
+LARGEST_NUMBER = 254
+
+
+class StripeIndex(StripeCode):
+    """Boards are looked for in the lit image, which is as light comes without any stripes."""
+
+    kinds: ClassVar = (INDEX,)
+    uses_dark: ClassVar = False
+    is_projected: ClassVar = False
+    has_edges: ClassVar = False
+
+    code: Literal["stripe-index"] = "stripe-index"
+
+    def problems(self) -> Iterator[Problem]:
+        if self.stripes > LARGEST_NUMBER:
+            wrong = f"must be {LARGEST_NUMBER} or less for stripe-index (got {self.stripes})"
+            yield ("stripes",), wrong
+
+    @property
+    def image_counts(self) -> Mapping[ImageKind, int]:
+        return {INDEX: 1}
+
+    def intensity(self, kind: ImageKind, s: Array) -> Array:
+        """Raises BadInput: there is nothing to project."""
+        raise BadInput(
+            "a stripe-index image is what an instrument hands out: it projects stripes of its own",
+            remedy="choose another code for a projector that shows images",
+        )
+
+    def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
+        from bodyscan.stripes.index_image import decode_index
+
+        return decode_index(images.lit, images.coded[INDEX], self.direction, self.stripes)
+
+
+CODES = (StripeIndex,)

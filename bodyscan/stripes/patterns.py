@@ -1,0 +1,28 @@
+"""The images that a projector shows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodyscan.arrays import Bytes
+from bodyscan.errors import BadInput
+from bodyscan.stripes.stripe_code import StripeCode
+
+
+def pattern_frames(code: StripeCode, width: int, height: int) -> Bytes:
+    """(F, height, width) uint8, read-only, in the order of the code's `image_counts`.
+
+    The stripes divide the projector's image evenly. Raises BadInput if they are narrower than one
+    of its pixels, or if the code is one that its instrument projects by itself.
+    """
+    across = height if code.direction == "horizontal" else width
+    if code.stripes > across:
+        raise BadInput(
+            f"{code.stripes} stripes do not fit on {across} projector pixels",
+            remedy="project fewer stripes",
+        )
+    s = (np.arange(across) + 0.5) * code.stripes / across
+    lines = np.concatenate([code.intensity(kind, s) for kind in code.image_counts])
+    grey = np.rint(255.0 * lines).astype(np.uint8)
+    grey = grey[:, :, None] if code.direction == "horizontal" else grey[:, None, :]
+    return np.broadcast_to(grey, (len(grey), height, width))

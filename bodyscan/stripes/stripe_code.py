@@ -1,0 +1,102 @@
+"""What a stripe code is: the images a projector shows one after the other, and how they are read.
+
+Each code is one file of `bodyscan.stripes.codes`. Every rig file needs the codes' descriptions, so
+what is heavy (numpy, numba, OpenCV) is imported inside `intensity` and `decode`.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, SerializationInfo, SerializerFunctionWrapHandler, model_serializer
+
+from bodyscan.files.model import Model
+
+if TYPE_CHECKING:
+    from bodyscan.arrays import Array, Bytes
+    from bodyscan.stripes.stripe_limits import StripeLimits
+    from bodyscan.stripes.stripe_map import StripeMap
+
+DEFAULT_CODE = "gray"
+
+
+@dataclass(frozen=True)
+class ImageKind:
+    """Images of one purpose in a sequence, such as the patterns of bits.
+
+    name: its key below `frames` in a rig file.  template: how its images are named if the rig file
+    does not say.  number: the field of the template that numbers them from 0, None for a single
+    image.  most: how many there can be.
+    """
+
+    name: str
+    template: str
+    number: str | None = None
+    most: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceImages:
+    """What a camera saw of a sequence, grey levels.
+
+    lit, dark: (H, W) uint8; no dark where none was taken.  coded: (n, H, W) uint8 of each kind.
+    """
+
+    lit: Bytes
+    dark: Bytes | None
+    coded: Mapping[ImageKind, Bytes]
+
+
+class StripeCode(Model):
+    """The stripes that a projector shows: how many, which way they run, and how they are told apart.
+
+    A code adds the keys that the rig file may give it as fields, and what follows here.
+
+    kinds: of its images, in the order in which they are shown.  uses_dark: whether it has use for an
+    image without the projector's light.  is_projected: False where an instrument projects stripes
+    of its own and hands out what it read.  has_edges: whether its light changes at boundaries of
+    stripes, which then lie best on whole projector pixels.
+    """
+
+    kinds: ClassVar[tuple[ImageKind, ...]]
+    uses_dark: ClassVar[bool] = True
+    is_projected: ClassVar[bool] = True
+    has_edges: ClassVar[bool] = True
+
+    code: str
+    stripes: Annotated[int, Field(ge=2, le=65535)]
+    direction: Literal["horizontal", "vertical"]
+
+    @property
+    def needs_dark(self) -> bool:
+        """Whether it cannot be read without a dark image."""
+        return False
+
+    @property
+    @abstractmethod
+    def image_counts(self) -> Mapping[ImageKind, int]:
+        """How many images of each kind are shown, in their order, besides lit and dark."""
+
+    @abstractmethod
+    def intensity(self, kind: ImageKind, s: Array) -> Array:
+        """Of the images of one kind at stripe coordinates s (N,): (images, N), 0 to 1."""
+
+    @abstractmethod
+    def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
+        """The stripe coordinate of every pixel.
+
+        limits: a code may leave out stripes beyond them, and say so in `beyond`; it need not.
+        Raises DecodingFailed, naming the image where it can be told, if they do not add up.
+        """
+
+    @model_serializer(mode="wrap")
+    def _with_its_name(
+        self, serialize: SerializerFunctionWrapHandler, info: SerializationInfo
+    ) -> dict[str, Any]:
+        """`code` is a default of each class; of a rig file only one of them is."""
+        keys = serialize(self)
+        plain = info.exclude_defaults and self.code == DEFAULT_CODE
+        return keys if plain else {"code": self.code, **keys}
