@@ -39,6 +39,12 @@ def test_a_calibration_is_written_again_as_it_was(calibration, tmp_path):
     save_calibration(calibration, tmp_path)
     before = json.loads((STORED / "calibration" / "calibration.json").read_text("utf-8"))
     after = json.loads((tmp_path / "calibration.json").read_text("utf-8"))
+    # Then every code had every key, null where it was not given; now each has its own, with values.
+    for pair in before["rig"]["pairs"]:
+        keys = pair["projector"]
+        assert (keys["code"], keys["inverses"]) == ("gray", None)
+        assert (keys.pop("steps"), keys.pop("period")) == (None, None)
+        keys["inverses"] = True
     assert after == before
     with (
         np.load(STORED / "calibration" / "calibration.npz") as old,
