@@ -13,8 +13,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Floats
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.view import BoardView
 from bodyscan.geometry.transforms import RigidTransform
@@ -26,8 +26,6 @@ from bodyscan.simulation.lens import sample_directions
 from bodyscan.simulation.plan import BoardShot, default_shots, plan_boards
 from bodyscan.simulation.sensor import expose, exposure
 from bodyscan.simulation.settings import SimulationSettings
-
-Floats = NDArray[np.float32]
 
 BACKGROUND = 0.25
 TEXELS_PER_MM = 8

@@ -6,9 +6,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.triangulation import triangulate
+from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.captures.folder import Captures
@@ -18,8 +18,6 @@ from bodyscan.registration.board_shape import BoardShape
 from bodyscan.registration.rig_solve import PlacedRig, place_rig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards, locate_views
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.pinhole_opencv import fit_pinhole_opencv
+from bodyscan.arrays import Array
 from bodyscan.boards.board import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
@@ -27,8 +27,6 @@ from bodyscan.rig.rig import Rig
 from bodyscan.stripes.stripe_map import StripeMap
 from bodyscan.workflows.decode import decode_sequence
 from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.boards.board import corner_points
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.captures.folder import open_captures, open_scan
@@ -25,8 +25,6 @@ from bodyscan.simulation.projector import PinholeProjector
 from bodyscan.simulation.settings import Projection
 from bodyscan.workflows.decode import decode_sequence
 from bodyscan.workflows.evaluate import load_truth
-
-Array = NDArray[np.float64]
 
 PROJECT = Path(__file__).parents[1]
 WORKSPACE = PROJECT / "bench" / "lens"
@@ -131,7 +129,7 @@ def pair_rows(workspace: Path, calibration_folder: Path) -> list[str]:
     return [*rows, _row("all", "", every, np.zeros(len(every[0]), bool))]
 
 
-def _row(name: str, model: str, sets: list[Array], few: NDArray[np.bool_]) -> str:
+def _row(name: str, model: str, sets: list[Array], few: Mask) -> str:
     true, true_aligned, ours, ours_aligned, in_rig = map(Errors.of, sets)
     few_true, few_ours = Errors.of(sets[1][few]), Errors.of(sets[3][few])
     return (
@@ -198,7 +196,7 @@ def striped_shots(rig: Rig, workspace: Path) -> dict[str, list[str]]:
 
 def boards_reached(
     rig: Rig, facts: dict[str, Any], pair: str, shots: dict[str, list[str]], s: Array
-) -> NDArray[np.int64]:
+) -> Indices:
     """(N,) on how many boards that the camera saw the sheets s (N,) fell, of the truth."""
     true = facts["pairs"][pair]
     camera, projector = TrueCamera(**true["camera"]), true_projector(true)
@@ -219,7 +217,7 @@ def boards_reached(
 class Body:
     """The true surface, ready for points."""
 
-    def __init__(self, vertices: Array, faces: NDArray[np.int64]) -> None:
+    def __init__(self, vertices: Array, faces: Indices) -> None:
         self._centre = vertices.mean(axis=0)
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=2)
         self._scene.add_triangles(
@@ -227,7 +225,7 @@ class Body:
             o3d.core.Tensor(faces.astype(np.uint32)),
         )
 
-    def struck(self, body_from_camera: RigidTransform, points: Array) -> NDArray[np.bool_]:
+    def struck(self, body_from_camera: RigidTransform, points: Array) -> Mask:
         """(N,) whether the ray of a point (N, 3), camera frame, meets the body about there."""
         start = body_from_camera.translation - self._centre
         ways = body_from_camera.rotate(points)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.board_images import SeenRig, see_boards
 from benchmarks.rivals import RIVALS, run_rival
+from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.placing_covariance import position_sigma
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
@@ -21,8 +21,6 @@ from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation.layout import TruePair
 from bodyscan.workflows.find_boards import calibrate_cameras, locate_views
-
-Array = NDArray[np.float64]
 
 PROJECT = Path(__file__).parents[1]
 SHOTS = 40
@@ -184,7 +182,7 @@ def _two_pairs(seen: SeenRig, placed: PlacedRig) -> Array:
     return np.concatenate(apart)
 
 
-def _sees(pair: TruePair, points: Array, normals: Array) -> NDArray[np.bool_]:
+def _sees(pair: TruePair, points: Array, normals: Array) -> Mask:
     """Which points (N, 3) with normals (N, 3) face the camera and lie in its picture."""
     towards = pair.rig_from_camera.translation - points
     cosine = np.sum(towards * normals, axis=1) / np.linalg.norm(towards, axis=1)

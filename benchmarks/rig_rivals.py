@@ -18,10 +18,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-Array = NDArray[np.float64]
+from bodyscan.arrays import Array, Mask
+
 Corners = dict[str, Any]
 Found = tuple[Array, Array, Array]
 """camera_from_first (C, 4, 4), matrices (C, 3, 3), lenses (C, 5)."""
@@ -223,7 +223,7 @@ METHODS: dict[str, Callable[[Corners], Found]] = {
 }
 
 
-def _seen(corners: Corners) -> tuple[Array, NDArray[np.bool_]]:
+def _seen(corners: Corners) -> tuple[Array, Mask]:
     pixels = np.asarray(corners["pixels"], float)
     return pixels, np.isfinite(pixels[..., 0])
 

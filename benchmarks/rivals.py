@@ -12,16 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.boards.board import corner_points
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
-
-Array = NDArray[np.float64]
 
 RIVALS = {
     "opencv-multiview": "OpenCV 5 `calibrateMultiview`",

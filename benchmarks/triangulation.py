@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
-
-Array = NDArray[np.float64]
 
 STEPS = 5
 
@@ -43,7 +41,7 @@ def _nearest_to_rays(
     cameras: Sequence[Camera],
     camera_from_rig: Sequence[RigidTransform],
     pixels: Array,
-    seen: NDArray[np.bool_],
+    seen: Mask,
 ) -> Array:
     normal, right = np.zeros((pixels.shape[1], 3, 3)), np.zeros((pixels.shape[1], 3))
     for camera, transform, seen_at, here in zip(

@@ -12,12 +12,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
-
-Array = NDArray[np.float64]
 
 
 def corners_per_face(board: Board) -> int:
@@ -101,7 +99,7 @@ def markers_per_face(board: Board) -> int:
     return squares // 2
 
 
-def marker_corners(board: Board, face: int = 0) -> tuple[NDArray[np.int64], Array]:
+def marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
     """Marker ids (M,) and their four corners on the face's print, (M, 4, 2) mm.
 
     Corners clockwise as printed, from the marker's own top left, as OpenCV's detector gives them.

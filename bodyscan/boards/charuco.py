@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Indices, Mask
 from bodyscan.boards import board as boards
 from bodyscan.boards.board_map import BoardMap, fit_board_map
 from bodyscan.boards.corners import SightedCorners, refine_corners
 from bodyscan.rig.board import Board
-
-Array = NDArray[np.float64]
 
 MIN_CORNERS = 4
 MIN_CORNERS_FOR_LENS = 12
@@ -25,11 +23,11 @@ ROUNDS = 4
 class Markers:
     """ids: (M,) int64.  corners: (M, 4, 2) float64 px, from each marker's top left, clockwise."""
 
-    ids: NDArray[np.int64]
+    ids: Indices
     corners: Array
 
 
-def detect_markers(image: NDArray[np.uint8], board: Board) -> Markers:
+def detect_markers(image: Bytes, board: Board) -> Markers:
     """All markers of the board's dictionary in the image (H, W)."""
     detector = cv2.aruco.ArucoDetector(boards.marker_dictionary(board), _parameters())
     corners, ids, _ = detector.detectMarkers(image)
@@ -45,18 +43,14 @@ def _parameters() -> cv2.aruco.DetectorParameters:
     return parameters
 
 
-def locate_charuco(
-    image: NDArray[np.uint8], board: Board, markers: Markers
-) -> SightedCorners | None:
+def locate_charuco(image: Bytes, board: Board, markers: Markers) -> SightedCorners | None:
     """The board's corners beside the markers seen, of the face that shows more of them."""
     found = [_locate_face(image, board, face, markers) for face in range(board.faces)]
     seen = [corners for corners in found if corners is not None]
     return max(seen, key=lambda corners: len(corners.ids), default=None)
 
 
-def _locate_face(
-    image: NDArray[np.uint8], board: Board, face: int, markers: Markers
-) -> SightedCorners | None:
+def _locate_face(image: Bytes, board: Board, face: int, markers: Markers) -> SightedCorners | None:
     face_ids, printed = boards.marker_corners(board, face)
     _, seen, of_face = np.intersect1d(markers.ids, face_ids, return_indices=True)
     if len(seen) < 2:
@@ -74,12 +68,12 @@ def _locate_face(
 
 
 def _refine(
-    image: NDArray[np.uint8],
+    image: Bytes,
     board: Board,
     board_map: BoardMap,
-    corner_ids: NDArray[np.int64],
+    corner_ids: Indices,
     markers: Array,
-) -> tuple[Array, NDArray[np.bool_]]:
+) -> tuple[Array, Mask]:
     """Corners fitted where the markers say they are; then, as corners say it better than
     markers, once more where the corners found say that those not found must be."""
     points = boards.corner_points(board.model_copy(update={"faces": 1}))[corner_ids, :2]
@@ -88,7 +82,7 @@ def _refine(
     row, column = np.divmod(corner_ids, board.columns - 1)
     bright_diagonal = (row + column + marked) % 2 == 0
 
-    def refine(at: BoardMap) -> tuple[Array, NDArray[np.bool_]]:
+    def refine(at: BoardMap) -> tuple[Array, Mask]:
         along = board.square_mm * at.jacobian(points)
         return refine_corners(image, at.apply(points), along, bright_diagonal, marker_gap=gap)
 
@@ -100,9 +94,7 @@ def _refine(
     return pixels, good
 
 
-def _fit_markers(
-    printed: Array, corners: Array, board: Board
-) -> tuple[BoardMap, NDArray[np.bool_]] | None:
+def _fit_markers(printed: Array, corners: Array, board: Board) -> tuple[BoardMap, Mask] | None:
     """Where the print appears, and which markers (M,) agree on it; None if no two do.
 
     A homography picks those that agree; a lens that bends the board's far parts away from it is
@@ -124,7 +116,7 @@ def _fit_markers(
     return (board_map, agree) if agree.sum() >= 2 else None
 
 
-def _corners_beside(board: Board, centres: Array) -> NDArray[np.int64]:
+def _corners_beside(board: Board, centres: Array) -> Indices:
     """Ids, on one face, of the inner corners that touch squares with these centres (M, 2) mm."""
     square = np.floor(centres / board.square_mm).astype(int)
     column = (square[:, 0, None] + np.array([-1, 0, -1, 0])).ravel()

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.boards import board as boards
 from bodyscan.boards.board_map import fit_board_map
 from bodyscan.boards.corners import SightedCorners, refine_corners
@@ -19,14 +19,11 @@ from bodyscan.boards.regions import Region, board_regions
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
-
 CONSISTENT_PX = 1.0
 MIN_SHARE_OF_CORNERS = 0.8
 
 
-def find_checkerboard(image: Image, board: Board) -> SightedCorners | None:
+def find_checkerboard(image: Bytes, board: Board) -> SightedCorners | None:
     """All inner corners of a checkerboard seen whole, numbered by the convention above."""
     _refuse_square(board)
     printed = boards.corner_points(board.model_copy(update={"faces": 1}))[:, :2]
@@ -56,7 +53,7 @@ def _refuse_square(board: Board) -> None:
         )
 
 
-def _candidates(image: Image, board: Board) -> Iterator[Array]:
+def _candidates(image: Bytes, board: Board) -> Iterator[Array]:
     """Corner sets (N, 2) px that the detectors offer, quickest and most often right first.
 
     Of 60 pictures (slants to 70 degrees, spacings from 5 px, dim light, another board behind) the
@@ -77,11 +74,11 @@ def _candidates(image: Image, board: Board) -> Iterator[Array]:
         yield from _found(_sector_based, image, size, region, 1.0)
 
 
-Detector = Callable[[Image, tuple[int, int]], tuple[bool, NDArray[np.float32] | None]]
+Detector = Callable[[Bytes, tuple[int, int]], tuple[bool, Floats | None]]
 
 
 def _found(
-    detect: Detector, image: Image, size: tuple[int, int], region: Region, scale: float
+    detect: Detector, image: Bytes, size: tuple[int, int], region: Region, scale: float
 ) -> Iterator[Array]:
     """What a detector sees in a part of the image, enlarged."""
     part = region.cut(image)
@@ -93,16 +90,16 @@ def _found(
         yield (pixels + 0.5) / scale - 0.5 + [region.left, region.top]
 
 
-def _classic(image: Image, size: tuple[int, int]) -> tuple[bool, NDArray[np.float32] | None]:
+def _classic(image: Bytes, size: tuple[int, int]) -> tuple[bool, Floats | None]:
     return cv2.findChessboardCorners(image, size, flags=0)
 
 
-def _sector_based(image: Image, size: tuple[int, int]) -> tuple[bool, NDArray[np.float32] | None]:
+def _sector_based(image: Bytes, size: tuple[int, int]) -> tuple[bool, Floats | None]:
     return cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
 
 
 def _numbered_as_printed(
-    image: Image, board: Board, corners: Array, printed: Array
+    image: Bytes, board: Board, corners: Array, printed: Array
 ) -> tuple[Array, bool]:
     """Corners (N, 2) in the print's order, and whether its first square is black.
 
@@ -120,7 +117,7 @@ def _numbered_as_printed(
     return np.ascontiguousarray(pixels), first_is_black
 
 
-def _first_is_black(image: Image, board: Board, pixels: Array, printed: Array) -> bool:
+def _first_is_black(image: Bytes, board: Board, pixels: Array, printed: Array) -> bool:
     """Whether the squares with an even sum of column and row are darker than the others.
 
     Judged by the middles of all squares between inner corners, so that light across the board

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes
 from bodyscan.boards.charuco import detect_markers, locate_charuco
 from bodyscan.boards.checkerboard import find_checkerboard
 from bodyscan.boards.corners import SightedCorners
@@ -16,9 +16,7 @@ from bodyscan.rig.board import Board
 MIN_CORNERS = 6
 
 
-def find_boards(
-    image: NDArray[np.uint8], boards: Sequence[Board], *, pair: str, shot: str
-) -> list[BoardView]:
+def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) -> list[BoardView]:
     """Every board of `boards` that the image (H, W) shows, in their order; none: an empty list.
 
     ChArUco boards may be seen in part (at least 6 corners, not on one line), from either face.

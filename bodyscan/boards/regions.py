@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]
+from bodyscan.arrays import Bytes
 
 BLUR_PX = 1.5
 LIGHT_PX = 12.0
@@ -37,12 +37,12 @@ class Region:
         """px^2."""
         return (self.right - self.left) * (self.bottom - self.top)
 
-    def cut(self, image: Image) -> Image:
+    def cut(self, image: Bytes) -> Bytes:
         """That part of the image."""
         return np.ascontiguousarray(image[self.top : self.bottom, self.left : self.right])
 
 
-def board_regions(image: Image, corners: int) -> list[Region]:
+def board_regions(image: Bytes, corners: int) -> list[Region]:
     """Parts of the image (H, W) that hold saddles enough for a board of that many corners.
 
     Clusters of saddles nearer to each other than one of `REACHES_PX`; the largest first.
@@ -70,7 +70,7 @@ def board_regions(image: Image, corners: int) -> list[Region]:
     return regions
 
 
-def _strongest_saddles(image: Image, count: int) -> NDArray[np.intp]:
+def _strongest_saddles(image: Bytes, count: int) -> NDArray[np.intp]:
     """The (at most) `count` strongest saddles, (N, 2) px, by the Hessian's determinant measured
     against the contrast around."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR_PX)

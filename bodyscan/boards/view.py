@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from bodyscan.arrays import Array, Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +19,6 @@ class BoardView:
     pair: str
     shot: str
     board: str
-    corner_ids: NDArray[np.int64]
+    corner_ids: Indices
     pixels: Array
     turnable: bool = False

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.boards.board import corner_points, corners_per_face
 from bodyscan.boards.view import BoardView
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
-
-Array = NDArray[np.float64]
 
 FEWEST_CORNERS = 8
 

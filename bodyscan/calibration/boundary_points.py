@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
-
-Array = NDArray[np.float64]
 
 BIN_PX = 16
 
@@ -26,8 +24,8 @@ class BoundaryPoints:
     the stripe.  sigma_px: (N,).
     """
 
-    index: NDArray[np.int64]
-    board: NDArray[np.int64]
+    index: Indices
+    board: Indices
     points: Array
     per_pixel: Array
     sigma_px: Array
@@ -43,7 +41,7 @@ def points_on_board(camera: Camera, camera_from_board: RigidTransform, pixels: A
 def boundary_points(
     camera: Camera,
     camera_from_board: RigidTransform,
-    index: NDArray[np.int64],
+    index: Indices,
     pixels: Array,
     sigma_px: Array,
     *,
@@ -72,7 +70,7 @@ def join(parts: Sequence[BoundaryPoints]) -> BoundaryPoints:
     )
 
 
-def part(data: BoundaryPoints, kept: NDArray[np.bool_]) -> BoundaryPoints:
+def part(data: BoundaryPoints, kept: Mask) -> BoundaryPoints:
     """The points where `kept` (N,) is true."""
     return BoundaryPoints(*(getattr(data, field.name)[kept] for field in fields(data)))
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.zhang import (
     camera_from_plane,
@@ -20,8 +20,6 @@ from bodyscan.geometry.least_squares import minimize
 from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
-
-Array = NDArray[np.float64]
 
 FEWEST_POSES = 3
 CHAPTERS_LENS = Radial()

@@ -6,12 +6,10 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.rig.rig import Rig
-
-Array = NDArray[np.float64]
 
 CELLS = 64
 """The picture is divided so finely, across and down."""

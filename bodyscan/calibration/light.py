@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints, binned, thinned
 from bodyscan.calibration.light_choice import Candidate, HeldOutModel, choose, folds, hold_out
 from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
@@ -18,8 +18,6 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
 from bodyscan.geometry.smooth_sheets import SmoothSheets
-
-Array = NDArray[np.float64]
 
 CHOICE_BINS, FIT_BINS = 4000, 25000
 START_BINS, START_STEPS, FOLD_STEPS = 1000, 15, 8
@@ -44,7 +42,7 @@ class LightFit:
     held_out: tuple[HeldOutModel, ...]
     rms_mm: float
     board_error_mm: float
-    boards_seen: NDArray[np.int64]
+    boards_seen: Indices
 
     @property
     def stripes_calibrated(self) -> int:
@@ -119,7 +117,7 @@ def _lens_start(plain: LensSheets, data: BoundaryPoints) -> LensSheets:
     return min(fits, key=lambda fit: fit.noise).sheets
 
 
-def boards_seen(data: BoundaryPoints, stripes: int) -> NDArray[np.int64]:
+def boards_seen(data: BoundaryPoints, stripes: int) -> Indices:
     """(S + 1,) on how many boards each boundary was seen."""
     boards = int(data.board.max(initial=0)) + 1
     points = np.bincount(data.index * boards + data.board, minlength=(stripes + 1) * boards)

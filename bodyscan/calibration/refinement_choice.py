@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bodyscan.calibration.boundary_points import BoundaryPoints, part
 from bodyscan.calibration.camera import CameraCalibration
@@ -19,8 +18,6 @@ from bodyscan.calibration.sheet_fit import fit_sheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.smooth_sheets import SmoothSheets
-
-Array = NDArray[np.float64]
 
 FEWEST_BOARDS = 3
 MOST_DRIFT = 24.3

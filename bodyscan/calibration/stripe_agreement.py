@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
     binned,
@@ -21,9 +21,6 @@ from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import Axis, LightSheets
 from bodyscan.geometry.ray_depths import intersect_rays
-
-Array = NDArray[np.float64]
-Boards = NDArray[np.int64]
 
 FEW_POINTS = 1200
 STEPS = 12
@@ -42,8 +39,8 @@ class Disagreement:
     how well the stripes of all boards fit one light, and those of each group theirs.
     """
 
-    kept: Boards
-    others: Boards
+    kept: Indices
+    others: Indices
     together_px: float
     apart_px: float
 
@@ -84,12 +81,12 @@ def boards_off(data: BoundaryPoints, sheets: LightSheets) -> Array:
     return np.array(medians, np.float64)
 
 
-def _by_board(values: Array, board: Boards) -> Iterator[Array]:
+def _by_board(values: Array, board: Indices) -> Iterator[Array]:
     for number in np.unique(board):
         yield values[board == number]
 
 
-def _partitions(boards: Boards) -> Iterator[tuple[Boards, Boards, list[Boards]]]:
+def _partitions(boards: Indices) -> Iterator[tuple[Indices, Indices, list[Indices]]]:
     """Each board against the rest, then all before against all after; the groups to fit."""
     for board in boards:
         kept = boards[boards != board]
@@ -98,7 +95,7 @@ def _partitions(boards: Boards) -> Iterator[tuple[Boards, Boards, list[Boards]]]
         yield boards[:first], boards[first:], [boards[:first], boards[first:]]
 
 
-def _misfit(data: BoundaryPoints, groups: list[Boards], stripes: int, direction: Axis) -> float:
+def _misfit(data: BoundaryPoints, groups: list[Indices], stripes: int, direction: Axis) -> float:
     """Root mean square over boards of the median distance (px) of its stripes from its group's
     sheets. Sheets that may bow, so that no kind of projector is taken for one that moved."""
     medians = []

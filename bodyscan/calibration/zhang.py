@@ -8,12 +8,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.transforms import RigidTransform
-
-Array = NDArray[np.float64]
 
 LEAST_TURN_DEG = 3.0
 

@@ -11,18 +11,16 @@ from typing import cast
 
 import numpy as np
 from isal import isal_zlib
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes
 from bodyscan.captures.image_header import png_chunks
 from bodyscan.compiled import compiled
-
-Grey = NDArray[np.uint8]
 
 BAD_STREAM = cast("type[Exception]", isal_zlib.error)
 SUB, UP, AVERAGE, PAETH = 1, 2, 3, 4
 
 
-def decode_grey_png(data: bytes, width: int, height: int) -> Grey | None:
+def decode_grey_png(data: bytes, width: int, height: int) -> Bytes | None:
     """(height, width) uint8; None if the file, whose chunks are sound, shows something else than a
     grey image of that size, or nothing."""
     if data[16:29] != struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0):
@@ -41,7 +39,7 @@ def decode_grey_png(data: bytes, width: int, height: int) -> Grey | None:
 
 
 @compiled
-def _unfilter(rows: Grey, image: Grey) -> bool:
+def _unfilter(rows: Bytes, image: Bytes) -> bool:
     """Fills in the image (H, W) from its rows (H, W + 1), each behind the number of its filter;
     false if there is no such filter."""
     above = np.zeros(image.shape[1], np.uint8)
@@ -64,7 +62,7 @@ def _unfilter(rows: Grey, image: Grey) -> bool:
 
 
 @compiled
-def _add_left(row: Grey, image: Grey) -> None:
+def _add_left(row: Bytes, image: Bytes) -> None:
     left = np.uint8(0)
     for u in range(row.size):
         left = np.uint8(left + row[u])
@@ -72,13 +70,13 @@ def _add_left(row: Grey, image: Grey) -> None:
 
 
 @compiled
-def _add_above(row: Grey, above: Grey, image: Grey) -> None:
+def _add_above(row: Bytes, above: Bytes, image: Bytes) -> None:
     for u in range(row.size):
         image[u] = np.uint8(row[u] + above[u])
 
 
 @compiled
-def _add_average(row: Grey, above: Grey, image: Grey) -> None:
+def _add_average(row: Bytes, above: Bytes, image: Bytes) -> None:
     left = np.int64(0)
     for u in range(row.size):
         left = (np.int64(row[u]) + ((left + np.int64(above[u])) >> 1)) & 255
@@ -86,7 +84,7 @@ def _add_average(row: Grey, above: Grey, image: Grey) -> None:
 
 
 @compiled
-def _add_paeth(row: Grey, above: Grey, image: Grey) -> None:
+def _add_paeth(row: Bytes, above: Bytes, image: Bytes) -> None:
     left, corner = np.int64(0), np.int64(0)
     for u in range(row.size):
         up = np.int64(above[u])

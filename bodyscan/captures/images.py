@@ -8,16 +8,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes
 from bodyscan.captures.folder import ImageSequence
 from bodyscan.captures.grey_png import decode_grey_png
 from bodyscan.captures.image_faults import header_fault, image_error
 from bodyscan.captures.image_header import png_damage
 from bodyscan.errors import ImageError
 from bodyscan.rig.pair import CameraSpec
-
-Grey = NDArray[np.uint8]
 
 SHOWS_NOTHING_BELOW = 8
 """Grey levels (sensor offset and noise): a lit image without a brighter pixel is black."""
@@ -33,14 +31,14 @@ class StripeImages:
 
     pair: str
     shot: str
-    lit: Grey
-    dark: Grey | None
-    coded: Grey
+    lit: Bytes
+    dark: Bytes | None
+    coded: Bytes
 
 
 def read_image(
     path: Path, width: int, height: int, *, pair: str = "", shot: str = "", lit: bool = False
-) -> Grey:
+) -> Bytes:
     """One image as grey levels, (height, width) uint8; colour is turned to grey (luma).
 
     The size is compared with the header before anything is decoded. 16-bit images are refused: how
@@ -75,7 +73,7 @@ def read_image(
     return image
 
 
-def read_lit(sequence: ImageSequence, camera: CameraSpec) -> Grey:
+def read_lit(sequence: ImageSequence, camera: CameraSpec) -> Bytes:
     """The lit image of a sequence, (H, W) uint8. Raises ImageError as `read_image`."""
     return read_image(
         sequence.lit, camera.width, camera.height, pair=sequence.pair, shot=sequence.shot, lit=True
@@ -94,7 +92,7 @@ def read_sequence(sequence: ImageSequence, camera: CameraSpec, *, workers: int =
             remedy="Take the stripes as well, or leave this pair out of this shot.",
         )
 
-    def read(path: Path) -> Grey:
+    def read(path: Path) -> Bytes:
         names = {"pair": sequence.pair, "shot": sequence.shot}
         return read_image(path, camera.width, camera.height, lit=path == sequence.lit, **names)
 

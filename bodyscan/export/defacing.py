@@ -10,8 +10,8 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.errors import FailedWork
 from bodyscan.export.neck import REACH_MM, Neck
 from bodyscan.mesh.body import BodyMesh
@@ -21,9 +21,6 @@ from bodyscan.mesh.topology import (
     face_components,
     vertex_normals,
 )
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 GREY = 150
 RINGS = 40
@@ -63,7 +60,7 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
 
 
 def _dressed(
-    mesh: BodyMesh, head: NDArray[np.bool_], used: Indices, vertices: Array, faces: Indices
+    mesh: BodyMesh, head: Mask, used: Indices, vertices: Array, faces: Indices
 ) -> BodyMesh:
     """What was kept as it was, what was added grey, filled and without sigma."""
     added = len(vertices) - len(used)
@@ -78,7 +75,7 @@ def _dressed(
     )
 
 
-def _head_faces(mesh: BodyMesh, neck: Neck) -> NDArray[np.bool_]:
+def _head_faces(mesh: BodyMesh, neck: Neck) -> Mask:
     """(F,) faces that reach above the neck, in pieces that come near the head's axis.
 
     Hands held up beside the head are other pieces, and stay.
@@ -96,7 +93,7 @@ def _head_faces(mesh: BodyMesh, neck: Neck) -> NDArray[np.bool_]:
     return head
 
 
-def _with_simple_rim(faces: Indices, head: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _with_simple_rim(faces: Indices, head: Mask) -> Mask:
     """Less of the head where its rim touches itself, until each point of the rim has one next."""
     for _ in range(_MENDINGS):
         points, times = np.unique(_free_edges(faces[head])[:, 0], return_counts=True)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes, Indices
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 
@@ -47,7 +48,7 @@ def _y_up(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
     return vectors[:, [1, 2, 0]]
 
 
-def _linear(colours: NDArray[np.uint8]) -> NDArray[np.uint16]:
+def _linear(colours: Bytes) -> NDArray[np.uint16]:
     """(N, 3) sRGB bytes to (N, 4) linear shorts: glTF's vertex colours are linear, with alpha."""
     encoded = np.arange(256) / 255.0
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
@@ -56,7 +57,7 @@ def _linear(colours: NDArray[np.uint8]) -> NDArray[np.uint16]:
 
 
 def _document(
-    attributes: dict[str, NDArray[Any]], indices: NDArray[np.int64] | None
+    attributes: dict[str, NDArray[Any]], indices: Indices | None
 ) -> tuple[dict[str, Any], list[bytes]]:
     """The JSON part and the chunks of the binary part (each a multiple of four bytes)."""
     accessors: list[dict[str, Any]] = []

@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.errors import FailedWork
 from bodyscan.mesh.topology import directed_edges
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 # Crown to neck over stature, from a small child's head (a quarter of it) to a tall adult's.
 HIGHEST, LOWEST = 0.09, 0.24

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
+from bodyscan.arrays import Bytes, Indices
 
 
 def fixed(values: NDArray[np.floating], decimals: int) -> Bytes:
@@ -41,7 +41,7 @@ def lines(columns: Sequence[Bytes | str]) -> bytes:
     return text[text != 0].tobytes()
 
 
-def _digits(values: NDArray[np.int64], fewest: int) -> Bytes:
+def _digits(values: Indices, fewest: int) -> Bytes:
     """(N, width) digits; zero bytes instead of leading zeros, but at least `fewest` digits."""
     width = max(fewest, len(str(int(values.max(initial=0)))))
     digits = np.empty((len(values), width), np.uint8)

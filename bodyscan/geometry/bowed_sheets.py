@@ -16,12 +16,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
-
-Array = NDArray[np.float64]
 
 PLANE_DEGREE, BOW_DEGREE = 7, 3
 FALL = 0.3

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from bodyscan.arrays import Mask
 
 
-def crop_of(shown: NDArray[np.bool_]) -> tuple[slice, slice] | None:
+def crop_of(shown: Mask) -> tuple[slice, slice] | None:
     """Slices (rows, columns) of the smallest box around what is true; None if nothing is."""
     rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
     if not rows.size:

@@ -6,11 +6,10 @@ frame: (3, 4) of projector_from_camera.  lens: (6,) f, c, k1, k2, p1, p2, as in 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 NEWTON_STEPS = 5

@@ -13,14 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.lens_points import measure_rays, stripes_of_points
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, cross_matrix
-
-Array = NDArray[np.float64]
 
 FRAME, SCALE = 6, 2
 LENS_SPREAD = (0.3, 0.3, 0.03, 0.03)

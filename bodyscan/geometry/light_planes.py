@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bodyscan.arrays import Array, Indices, Mask
+
 Axis = Literal["horizontal", "vertical"]
 
 
@@ -66,7 +66,7 @@ class LightPlanes:
         return len(self.coefficients) - 1
 
     @property
-    def calibrated(self) -> NDArray[np.bool_]:
+    def calibrated(self) -> Mask:
         """(S + 1,): which boundaries have a plane."""
         return np.isfinite(self.coefficients[:, 0])
 
@@ -110,7 +110,7 @@ class LightPlanes:
         lower, upper = np.where(share < 1.0, lower, 0.0), np.where(share > 0.0, upper, 0.0)
         return (((1.0 - share) * lower + share * upper) / facing) ** 2
 
-    def _between(self, s: Array) -> tuple[NDArray[np.int64], Array]:
+    def _between(self, s: Array) -> tuple[Indices, Array]:
         """The plane below s, and how far s is on its way to the next."""
         last = len(self.coefficients) - 2
         below = np.clip(np.nan_to_num(np.floor(s), nan=0.0).astype(np.int64), 0, last)

@@ -9,13 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Mask
 from bodyscan.compiled import compiled
 from bodyscan.geometry.camera import Camera
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 NODES = 2048
 

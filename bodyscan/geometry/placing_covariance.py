@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import twist_jacobian
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

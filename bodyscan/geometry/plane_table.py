@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
 from bodyscan.geometry.bowed_sheets import PLANE_DEGREE, BowedSheets
-
-Array = NDArray[np.float64]
 
 NODES_PER_STRIPE = 8
 UPPER = tuple(np.triu_indices(3))

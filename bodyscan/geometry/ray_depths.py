@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
@@ -16,9 +16,6 @@ from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.pixel_rays import PixelRays
 from bodyscan.geometry.plane_table import PlaneTable
 
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Way = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 MOST_SIGMA = 1e-3

@@ -6,15 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.bowed_sheets import BOW_DEGREE, PLANE_DEGREE, BowedSheets
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform
-
-Array = NDArray[np.float64]
 
 KINDS = ("planes", "smooth-planes", "bowed", "lens")
 

@@ -12,12 +12,11 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 
-Array = NDArray[np.float64]
 Sheets = TypeVar("Sheets", bound="SmoothSheets")
 
 NEWTON_STEPS = 5

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
 
-Array = NDArray[np.float64]
 
-
-def in_image(camera: Camera, points: Array, margin_px: float = 0.0) -> NDArray[np.bool_]:
+def in_image(camera: Camera, points: Array, margin_px: float = 0.0) -> Mask:
     """Points (..., 3), camera frame -> (...) whether they lie ahead and inside the image.
 
     Far outside its image a lens model folds back: such points project inside though

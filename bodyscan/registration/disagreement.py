@@ -11,14 +11,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.view_graph import Target
-
-Array = NDArray[np.float64]
 
 TIMES_OWN = 6.0
 LEAST_BAD_PX = 0.2

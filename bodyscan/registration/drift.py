@@ -11,15 +11,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.placing_covariance import PlacingCovariance, point_covariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
 from bodyscan.registration.view_graph import Target
 
-Array = NDArray[np.float64]
 Group = tuple[str, tuple[str, ...]]
 """A name for people, and the pairs that move as one."""
 

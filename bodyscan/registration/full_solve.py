@@ -8,14 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.normal_equations import NormalEquations, normal_equations
-
-Array = NDArray[np.float64]
 
 MOST_STEPS = 12
 CONVERGED = 1e-5

@@ -8,15 +8,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.view_graph import Target
-
-Array = NDArray[np.float64]
 
 COLMAP_PIXEL_CENTRE = 0.5
 WITHOUT_LENS = "SIMPLE_PINHOLE"

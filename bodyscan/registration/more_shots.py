@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.boards.board import corner_points, corners_per_face
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
@@ -22,8 +22,6 @@ from bodyscan.registration.normal_equations import (
 )
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Volume
-
-Array = NDArray[np.float64]
 
 HEIGHTS_MM = {"knee": 500.0, "waist": 1000.0, "chest": 1350.0}
 # Shots at one place differ a little, as held boards do: about x, about y, in the board's plane.

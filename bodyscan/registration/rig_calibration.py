@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Floats
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.geometry.transforms import RigidTransform
@@ -23,8 +24,8 @@ class SeenCorners:
     target: (N,) int16, number of its (shot, board) among those of `rig_from_board`, sorted.
     """
 
-    pixels: NDArray[np.float32]
-    residuals_px: NDArray[np.float32]
+    pixels: Floats
+    residuals_px: Floats
     target: NDArray[np.int16]
 
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Volume
-
-Array = NDArray[np.float64]
 
 SPHERES = (
     ("middle, across", (0.0, 0.0, 0.45), (0.0, 1.0, 0.0)),

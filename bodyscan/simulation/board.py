@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
-from bodyscan.simulation.scene import Floats, Surface, grid_surface, grid_triangles
+from bodyscan.simulation.scene import Surface, grid_surface, grid_triangles
 from bodyscan.simulation.settings import BoardMaking
-
-Array = NDArray[np.float64]
 
 _STEPS = 4
 """Mesh cells a square, when the board is not flat."""
@@ -67,13 +66,13 @@ def board_print(board: Board, face: int, making: BoardMaking) -> BoardPrint:
     return BoardPrint(board.square_mm, board.marker_mm or 0.5 * board.square_mm, albedo)
 
 
-def _dark_squares(board: Board) -> NDArray[np.bool_]:
+def _dark_squares(board: Board) -> Mask:
     row, column = np.indices((board.rows, board.columns))
     turned = board.kind == "charuco" and board.legacy_layout and board.rows % 2 == 0
     return (row + column) % 2 == (1 if turned else 0)
 
 
-def _markers(board: Board, face: int, count: int) -> NDArray[np.bool_]:
+def _markers(board: Board, face: int, count: int) -> Mask:
     """(count, m, m): dark modules of the markers of one face, their border included."""
     if not hasattr(cv2.aruco, board.dictionary):
         raise BadInput(f"OpenCV has no marker dictionary {board.dictionary}", where=board.name)

@@ -6,15 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.simulation.scene import Surface
 from bodyscan.simulation.settings import Person
-
-Array = NDArray[np.float64]
 
 
 def load_subject(path: Path, person: Person, rng: np.random.Generator) -> Surface:

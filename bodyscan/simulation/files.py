@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes
 from bodyscan.captures.captures_file import CapturesFile, ShotEntry, write_captures_file
 from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.pair import Pair
@@ -65,7 +64,7 @@ def write_captures(
     write_captures_file(folder, CapturesFile(kind=kind, when=WHEN, subject=subject, shots=entries))
 
 
-def write_image(path: Path, image: NDArray[np.uint8]) -> None:
+def write_image(path: Path, image: Bytes) -> None:
     """An image, PNG packed quickly; whole or not at all.
 
     It is not flushed to the disk one by one: there are thousands, and they can be made again.

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Floats, Mask
+
 PAD = 4
 """Stripes by which a table of light reaches beyond the sweep."""
 
@@ -23,7 +25,7 @@ def bit_count(stripes: int) -> int:
     return int(np.ceil(np.log2(stripes)))
 
 
-def code_bits(stripes: int) -> NDArray[np.bool_]:
+def code_bits(stripes: int) -> Mask:
     """(bits, stripes): whether stripe i is lit in pattern k, 0 the most significant."""
     index = np.arange(stripes)
     code = index ^ (index >> 1)
@@ -38,9 +40,9 @@ class LightTable:
     values: (blurs, entries) float32 in 0..1.
     """
 
-    values: NDArray[np.float32]
+    values: Floats
 
-    def at(self, index: NDArray[np.int32]) -> NDArray[np.float32]:
+    def at(self, index: NDArray[np.int32]) -> Floats:
         """Light at entries from `table_index`."""
         return self.values.ravel().take(index)
 
@@ -57,8 +59,8 @@ def table_index(
 
 def light_table(
     lit: NDArray[Any],
-    blurs: NDArray[np.float64],
-    jitter: NDArray[np.float64] | None = None,
+    blurs: Array,
+    jitter: Array | None = None,
     parts: int = 1,
 ) -> LightTable:
     """Light of one frame: the stripes that are lit, smeared by Gaussians.
@@ -79,7 +81,7 @@ def light_table(
     return LightTable(np.stack([_smeared(sharp, blur) for blur in blurs]).astype(np.float32))
 
 
-def _smeared(values: NDArray[np.float64], blur: float) -> NDArray[np.float64]:
+def _smeared(values: Array, blur: float) -> Array:
     if blur <= 0:
         return values
     reach = int(np.ceil(min(4.0 * blur, PAD) * FINE))

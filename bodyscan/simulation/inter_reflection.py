@@ -17,13 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.simulation.lamps import Lamps, laser_light
 from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene, dot
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 _SAMPLES = 32
 """Of a facet: a stripe is much narrower than a facet, which shall throw back their mean."""
@@ -48,14 +45,14 @@ class LitFacets:
     """
 
     samples: Hits
-    facet: Ints
+    facet: Indices
     weight: Floats
     s: Floats
-    lit: Ints
+    lit: Indices
     middles: Floats
     normals: Floats
     area: Floats
-    seen: NDArray[np.bool_]
+    seen: Mask
 
     def radiosity(self, light: Floats) -> Floats:
         """(L,) grey levels, where light (N,), 0 to 1, falls on the samples."""
@@ -78,7 +75,7 @@ class LitFacets:
             result[:, known[cut]] = radiosity @ factors.T
         return result
 
-    def _factors(self, hits: Hits, places: Ints) -> Floats:
+    def _factors(self, hits: Hits, places: Indices) -> Floats:
         """(P, L) form factors from places (P,) to facets that nothing hides."""
         points, normals = hits.points[places], hits.normals[places]
         towards = np.where(dot(points, normals) < 0.0, np.float32(1.0), np.float32(-1.0))
@@ -142,12 +139,12 @@ def _samples(scene: Scene, facet_mm: float) -> tuple[Hits, Array]:
     return hits, np.concatenate(shares)
 
 
-def _sums(group: Ints, values: NDArray[np.floating]) -> Array:
+def _sums(group: Indices, values: NDArray[np.floating]) -> Array:
     """(K, 3) of values (N, 3) in K groups."""
     return np.stack([np.bincount(group, column) for column in values.T], axis=1)
 
 
-def _nearest_to_mean(group: Ints, points: Floats) -> Ints:
+def _nearest_to_mean(group: Indices, points: Floats) -> Indices:
     """(K,) numbers of the points (N, 3) nearest to the mean of each group: they lie on a surface."""
     count = np.bincount(group)
     off = points - (_sums(group, points) / count[:, None])[group]
@@ -155,7 +152,7 @@ def _nearest_to_mean(group: Ints, points: Floats) -> Ints:
     return order[np.cumsum(count) - count]
 
 
-def _seen(scene: Scene, middles: Floats, lit: Ints) -> NDArray[np.bool_]:
+def _seen(scene: Scene, middles: Floats, lit: Indices) -> Mask:
     """(K, L) whether nothing stands between the middles (K, 3) and those that are lit."""
     rows = [scene.joined(middles, np.broadcast_to(middles[i], middles.shape)) for i in lit]
     return np.stack(rows, axis=1) if rows else np.zeros((len(middles), 0), bool)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Floats
 from bodyscan.simulation.gray import PAD
 from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene, dot
-
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bodyscan.arrays import Array, Floats
 
 _TABLE = 1 << 15
 
@@ -80,7 +79,7 @@ def sample_offsets(count: int) -> Array:
 
 def sample_directions(
     camera: TrueCamera, count: int, rng: np.random.Generator, rows: slice
-) -> NDArray[np.float32]:
+) -> Floats:
     """Rays of some rows, (rows * width * count^2, 3) float32; each pixel shifts its samples."""
     shift = rng.random((*camera.grid(rows).shape[:2], 1, 2))
     inside = np.mod(sample_offsets(count) + shift, 1.0) - 0.5

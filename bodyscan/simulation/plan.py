@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 from bodyscan.simulation.layout import TruePair
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +37,10 @@ class Sight:
     """
 
     angle_deg: Array
-    back: NDArray[np.bool_]
+    back: Mask
     inside: Array
-    cells: NDArray[np.bool_]
-    lean: NDArray[np.int64]
+    cells: Mask
+    lean: Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +48,7 @@ class Merits:
     """What poses are good for. offered: (poses, merits) bool.  worth: (merits,) of each time it is
     had, up to `needed` (merits,) times; it fades quickly from there."""
 
-    offered: NDArray[np.bool_]
+    offered: Mask
     worth: Array
     needed: Array
 
@@ -122,9 +121,7 @@ def look(pair: TruePair, poses: Sequence[RigidTransform], board: Board) -> Sight
     )
 
 
-def _covered(
-    pixel: Array, within: NDArray[np.bool_], far: NDArray[np.bool_], width: int, height: int
-) -> NDArray[np.bool_]:
+def _covered(pixel: Array, within: Mask, far: Mask, width: int, height: int) -> Mask:
     rows, columns = _CELLS
     row = np.clip(pixel[..., 1] * rows / height, 0, rows - 1).astype(int)
     column = np.clip(pixel[..., 0] * columns / width, 0, columns - 1).astype(int)
@@ -141,7 +138,7 @@ def _grid(board: Board) -> Array:
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
 
-def _can(board: Board, sight: Sight, stripes: bool) -> NDArray[np.bool_]:
+def _can(board: Board, sight: Sight, stripes: bool) -> Mask:
     """(N,) poses in which a pair takes stripes (or at least the lit image).
 
     A plain board is found only if it is seen whole; a board's back only if it is printed.
@@ -259,7 +256,7 @@ def _chosen(merits: Merits, shots: int) -> list[int]:
 def _merits(sights: Mapping[str, Sight], pairs: Mapping[str, TruePair], board: Board) -> Merits:
     """Every cell of every image three times, once near and once far; tilts to all sides; six
     boards a pair; two pairs on one face of a board, or on both, three times."""
-    parts: list[tuple[NDArray[np.bool_], float, float]] = []
+    parts: list[tuple[Mask, float, float]] = []
     striped = {n: _can(board, s, True) & pairs[n].has_stripes for n, s in sights.items()}
     seen = {name: _can(board, sight, False) for name, sight in sights.items()}
     for name, sight in sights.items():

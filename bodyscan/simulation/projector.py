@@ -12,8 +12,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Floats = NDArray[Any]
+from bodyscan.arrays import Array
+
+Reals = NDArray[Any]
 
 
 class Projector(Protocol):
@@ -22,10 +23,10 @@ class Projector(Protocol):
     @property
     def stripes(self) -> int: ...
 
-    def stripe(self, points: Floats) -> Floats:
+    def stripe(self, points: Reals) -> Reals:
         """Stripe coordinate s (...) of the light that reaches points; NaN where none does."""
 
-    def source(self, s: Floats) -> Floats:
+    def source(self, s: Reals) -> Reals:
         """(..., 3): the point from which the light of stripe coordinate s seems to come."""
 
 
@@ -54,7 +55,7 @@ class MirrorProjector:
     fan: float = 1.0
     smile_stripes: float = 0.0
 
-    def angle(self, points: Floats) -> Floats:
+    def angle(self, points: Reals) -> Reals:
         """Mirror angle at which the sheet passes through points (...,), radians.
 
         Mirrored point P' = P - 2 (n.q - e) n, q = P - centre, lies on the laser's own sheet:
@@ -76,7 +77,7 @@ class MirrorProjector:
             theta = 0.5 * _wrapped(phase - branch * np.arccos(ratio))
         return theta
 
-    def stripe(self, points: Floats) -> Floats:
+    def stripe(self, points: Reals) -> Reals:
         theta = self.angle(points)
         s = (theta - self.first_angle) * (self.stripes / self.sweep_angle)
         across = self.across(points, theta) / self.fan
@@ -84,7 +85,7 @@ class MirrorProjector:
             s = s + self.smile_stripes * across**2
         return np.where(np.abs(across) <= 1.0, s, np.nan).astype(points.dtype)
 
-    def across(self, points: Floats, theta: Floats) -> Floats:
+    def across(self, points: Reals, theta: Reals) -> Reals:
         """Tangent of the angle, inside the fan, between a point's ray and the middle ray.
 
         It is taken after the point is mirrored back to the laser's side: (P' - laser) against
@@ -96,7 +97,7 @@ class MirrorProjector:
         height = cos * _along(points, zero, self.centre) + sin * _along(points, side, self.centre)
         height = height - self.offset_mm
 
-        def mirrored(way: Array) -> Floats:
+        def mirrored(way: Array) -> Reals:
             tilt = cos * float(zero @ way) + sin * float(side @ way)
             return _along(points, way, self.laser) - 2.0 * height * tilt
 
@@ -104,7 +105,7 @@ class MirrorProjector:
         lit = (forward > 0) & (height > 0)
         return np.divide(mirrored(edge), forward, out=np.full_like(forward, np.inf), where=lit)
 
-    def source(self, s: Floats) -> Floats:
+    def source(self, s: Reals) -> Reals:
         theta = self.first_angle + s * (self.sweep_angle / self.stripes)
         cos, sin = np.cos(theta), np.sin(theta)
         zero, side = self._normals
@@ -114,7 +115,7 @@ class MirrorProjector:
         parts = [float(self.laser[i]) - c * float(zero[i]) - d * float(side[i]) for i in range(3)]
         return np.stack(parts, axis=-1)
 
-    def plane(self, s: Floats) -> Floats:
+    def plane(self, s: Reals) -> Reals:
         """(..., 4): a, b, c (unit normal), d of Eq. 6 for stripe coordinates s, without smile."""
         theta = self.first_angle + np.asarray(s, float) * (self.sweep_angle / self.stripes)
         zero, side = self._normals
@@ -148,7 +149,7 @@ class PinholeProjector:
     k2: float = 0.0
     smile_stripes: float = 0.0
 
-    def slide(self, points: Floats) -> tuple[Floats, Floats]:
+    def slide(self, points: Reals) -> tuple[Reals, Reals]:
         """Slide coordinates (along, across) of points; NaN behind the projector."""
         x, y, z = (_along(points, row, self.centre) for row in self.rotation)
         front = np.where(z > 0, z, np.nan).astype(points.dtype)
@@ -157,23 +158,23 @@ class PinholeProjector:
         grow = 1.0 + self.k1 * square + self.k2 * square**2
         return x * grow, y * grow
 
-    def stripe(self, points: Floats) -> Floats:
+    def stripe(self, points: Reals) -> Reals:
         along, across = self.slide(points)
         s = (across - self.first) * (self.stripes / (self.last - self.first))
         s = s + self.smile_stripes * (along / self.half) ** 2
         return np.where(np.abs(along) <= self.half, s, np.nan).astype(points.dtype)
 
-    def source(self, s: Floats) -> Floats:
+    def source(self, s: Reals) -> Reals:
         return np.broadcast_to(self.centre.astype(s.dtype), (*s.shape, 3))
 
 
-def _along(points: Floats, vector: Array, origin: Array) -> Floats:
+def _along(points: Reals, vector: Array, origin: Array) -> Reals:
     """How far points (..., 3) lie from the origin along a vector."""
     x, y, z = (points[..., i] * float(vector[i]) for i in range(3))
     return x + y + z - float(vector @ origin)
 
 
-def _wrapped(angle: Floats) -> Floats:
+def _wrapped(angle: Reals) -> Reals:
     """To (-pi, pi]."""
     turn = angle.dtype.type(2.0 * np.pi)
     return angle - turn * np.round(angle / turn)

@@ -10,10 +10,9 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.geometry.transforms import RigidTransform
 
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 Tensor = o3d.core.Tensor
 
 _THREADS = 2
@@ -126,7 +125,7 @@ class Scene:
             surface=np.full(len(points), number, np.uint32),
         )
 
-    def joined(self, starts: Floats, ends: Floats) -> NDArray[np.bool_]:
+    def joined(self, starts: Floats, ends: Floats) -> Mask:
         """(N,) whether nothing stands between two places (N, 3) each that lie on surfaces."""
         way = ends - starts
         reach = np.maximum(np.sqrt(dot(way, way)), np.float32(3.0 * _LIFT_MM))
@@ -140,9 +139,7 @@ class Scene:
         )
         return np.asarray(~hidden.numpy())
 
-    def is_shadowed(
-        self, points: Floats, towards: Floats, surface: NDArray[np.uint32]
-    ) -> NDArray[np.bool_]:
+    def is_shadowed(self, points: Floats, towards: Floats, surface: NDArray[np.uint32]) -> Mask:
         """Whether something stands between points (N, 3) on surfaces and their light's source.
 
         towards: (N, 3) from each point to the source.
@@ -243,7 +240,7 @@ def grid_surface(
     return Surface(vertices, grid_triangles(columns, rows), places=places, **more)
 
 
-def grid_triangles(columns: int, rows: int) -> NDArray[np.int64]:
+def grid_triangles(columns: int, rows: int) -> Indices:
     """Two triangles for each cell of a grid of (rows + 1) x (columns + 1) vertices."""
     first = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
     below = first + columns + 1

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes, Floats
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.settings import Lighting, Noise, Optics
-
-Floats = NDArray[np.float32]
-Image = NDArray[np.uint8]
 
 _FOCUS_STEPS = 5
 
@@ -21,7 +18,7 @@ def exposure(lit: Floats, grey: float, lighting: Lighting) -> float:
     return float(np.clip(grey / bright, lighting.shortest, lighting.longest))
 
 
-def expose(image: Floats, noise: Noise, rng: np.random.Generator) -> Image:
+def expose(image: Floats, noise: Noise, rng: np.random.Generator) -> Bytes:
     """What the sensor makes of a noiseless image: shot and read noise, 8 bits."""
     electrons = noise.electrons_per_grey * noise.photons
     spread = np.sqrt(np.maximum(image, 0.0) / electrons + noise.read_grey**2)

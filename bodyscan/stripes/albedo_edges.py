@@ -12,15 +12,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.geometry.crop import crop_of, ends_of
 from bodyscan.stripes.scan_lines import ScanLines
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 USUAL_BLUR2 = 0.45
 LARGEST_BLUR2 = 2.0
@@ -48,13 +44,13 @@ class Brightness:
     shading: (L, P) the gradient along the line of the gentle part, of many pixels around.
     """
 
-    logarithm: NDArray[np.float32]
-    noise2: NDArray[np.float32]
-    across: NDArray[np.float32]
-    shading: NDArray[np.float32]
+    logarithm: Floats
+    noise2: Floats
+    across: Floats
+    shading: Floats
 
     @staticmethod
-    def of(images: ScanLines, variance: NDArray[np.float32], usable: Mask) -> Brightness:
+    def of(images: ScanLines, variance: Floats, usable: Mask) -> Brightness:
         """variance: (256,) of each grey level.  usable: (L, P) pixels on a lit surface."""
         logarithm, noise2 = np.empty((2, *images.lit.shape), np.float32)
         _measure(images.lit, images.dark, variance, _LOGARITHMS, logarithm, noise2)
@@ -62,7 +58,7 @@ class Brightness:
         _sharpen(logarithm, noise2, across)
         return Brightness(logarithm, noise2, across, along)
 
-    def at(self, place: NDArray[np.int64]) -> BrightnessEdges:
+    def at(self, place: Indices) -> BrightnessEdges:
         """Between the pixels at flat places `place` (N,) and those behind them."""
         logarithm, noise2 = self.logarithm.ravel(), self.noise2.ravel()
         return BrightnessEdges(
@@ -79,13 +75,13 @@ class BrightnessEdges:
     to line, likewise.  sigma: (N,) the noise of `along`.
     """
 
-    before: Floats
-    behind: Floats
-    along: Floats
-    across: Floats
-    sigma: Floats
+    before: Array
+    behind: Array
+    along: Array
+    across: Array
+    sigma: Array
 
-    def blur2(self, position: Floats, joined: Mask) -> float:
+    def blur2(self, position: Array, joined: Mask) -> float:
         """blur^2, px^2, that makes boundaries next to edges line up with their neighbours.
 
         position: (N,) px along the scan line.  joined: (N - 1,) whether the next boundary is the
@@ -97,14 +93,14 @@ class BrightnessEdges:
             return USUAL_BLUR2
         return float(np.clip(-np.median(shifts), 0.0, LARGEST_BLUR2))
 
-    def doubt(self, blur2: float) -> Floats:
+    def doubt(self, blur2: float) -> Array:
         """Standard deviation (N,) px of the shift blur2 * (along, across)."""
         return _doubt(self.along, self.across, self.sigma, blur2)
 
 
 def without_edges_across(
-    s: NDArray[np.float32], sigma: NDArray[np.float32], brightness: Brightness, blur2: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    s: Floats, sigma: Floats, brightness: Brightness, blur2: float
+) -> tuple[Floats, Floats]:
     """s and sigma (L, P) with the pull of edges that run along the scan lines taken out of s.
 
     A pixel tells s at its light's centre of mass, which lies off the line by blur2 * across.
@@ -115,7 +111,7 @@ def without_edges_across(
     return freed, doubt
 
 
-def gentle_gradient(image: Image, usable: Mask) -> tuple[Image, Image]:
+def gentle_gradient(image: Floats, usable: Mask) -> tuple[Floats, Floats]:
     """Gradient along and across the lines (L, P), 1/px, at usable pixels: least squares over the
     usable ones of a small window; 0 where there are too few, and elsewhere."""
     along, across = np.zeros((2, *image.shape), np.float32)
@@ -127,7 +123,7 @@ def gentle_gradient(image: Image, usable: Mask) -> tuple[Image, Image]:
 
 @compiled
 def _gentle(
-    image: Image, usable: Mask, box: tuple[int, int, int, int], along: Image, across: Image
+    image: Floats, usable: Mask, box: tuple[int, int, int, int], along: Floats, across: Floats
 ) -> None:
     """Writes the gradient (L, P) line by line of a box that holds all usable pixels.
 
@@ -162,7 +158,7 @@ def _gentle(
 
 
 @compiled
-def _shown(image: Image, usable: Mask, inside: Image, values: Image) -> None:
+def _shown(image: Floats, usable: Mask, inside: Floats, values: Floats) -> None:
     """Writes of a line (P,) what is usable, as 1 or 0, and what it shows there, else 0."""
     for u in range(image.size):
         inside[u] = usable[u]
@@ -170,7 +166,7 @@ def _shown(image: Image, usable: Mask, inside: Image, values: Image) -> None:
 
 
 @compiled
-def _sum_columns(rows: Image, middle: int, sums: Image) -> None:
+def _sum_columns(rows: Floats, middle: int, sums: Floats) -> None:
     """Writes sums (3, P) of v, y v and y^2 v over columns of WINDOW lines (line k is in row k mod
     WINDOW), where y counts from the line in the middle."""
     above3, above2, above = (
@@ -189,7 +185,7 @@ def _sum_columns(rows: Image, middle: int, sums: Image) -> None:
 
 
 @compiled
-def _fit_windows(columns: Image, usable: Mask, along: Image, across: Image) -> None:
+def _fit_windows(columns: Floats, usable: Mask, along: Floats, across: Floats) -> None:
     """Writes the gradient of a line (P,) from the sums over its columns, (2, 3, P + 2 GENTLE_PX).
 
     What lies between is in arrays of its own: only then does the compiler know that they do not
@@ -214,7 +210,7 @@ def _fit_windows(columns: Image, usable: Mask, along: Image, across: Image) -> N
 
 
 @compiled
-def _even(row: Image) -> Image:
+def _even(row: Floats) -> Floats:
     """Sums (P,) over WINDOW places of a row (P + 2 GENTLE_PX,)."""
     total = np.empty(row.size - 2 * GENTLE_PX, np.float32)
     for u in range(total.size):
@@ -224,7 +220,7 @@ def _even(row: Image) -> Image:
 
 
 @compiled
-def _odd(row: Image) -> Image:
+def _odd(row: Floats) -> Floats:
     """The same of x v, where x counts from the window's middle."""
     total = np.empty(row.size - 2 * GENTLE_PX, np.float32)
     for u in range(total.size):
@@ -234,7 +230,7 @@ def _odd(row: Image) -> Image:
 
 
 @compiled
-def _square(row: Image) -> Image:
+def _square(row: Floats) -> Floats:
     """The same of x^2 v."""
     total = np.empty(row.size - 2 * GENTLE_PX, np.float32)
     for u in range(total.size):
@@ -252,12 +248,12 @@ def _significant(gradient: float, variance: float) -> float:
 
 @compiled
 def _measure(
-    lit: NDArray[np.uint8],
-    dark: NDArray[np.uint8],
-    variance: Image,
-    logarithms: Image,
-    logarithm: Image,
-    noise2: Image,
+    lit: Bytes,
+    dark: Bytes,
+    variance: Floats,
+    logarithms: Floats,
+    logarithm: Floats,
+    noise2: Floats,
 ) -> None:
     """Writes the logarithm of lit minus dark (L, P), and its variance."""
     for line in range(lit.shape[0]):
@@ -270,7 +266,7 @@ def _measure(
 
 
 @compiled
-def _sharpen(logarithm: Image, noise2: Image, across: Image) -> None:
+def _sharpen(logarithm: Floats, noise2: Floats, across: Floats) -> None:
     """Adds to the gentle gradient from line to line (L, P) what noise does not explain."""
     for line in range(1, logarithm.shape[0] - 1):
         for place in range(logarithm.shape[1]):
@@ -281,8 +277,8 @@ def _sharpen(logarithm: Image, noise2: Image, across: Image) -> None:
 
 @compiled
 def _between(
-    logarithm: Image, noise2: Image, across: Image, shading: Image, place: NDArray[np.int64]
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    logarithm: Floats, noise2: Floats, across: Floats, shading: Floats, place: Indices
+) -> tuple[Array, Array, Array, Array, Array]:
     """Fields of BrightnessEdges at flat places (N,)."""
     before, behind = np.empty(place.size), np.empty(place.size)
     along, sideways, sigma = np.empty(place.size), np.empty(place.size), np.empty(place.size)
@@ -299,7 +295,7 @@ def _between(
 
 
 @compiled
-def _shifts_at_edges(along: Floats, sigma: Floats, position: Floats, joined: Mask) -> Floats:
+def _shifts_at_edges(along: Array, sigma: Array, position: Array, joined: Mask) -> Array:
     """Of boundaries within runs that lie on edges: how far they lie off the middle of their
     neighbours, over how much steeper the brightness is there."""
     shifts, count = np.empty(along.size), 0
@@ -315,7 +311,7 @@ def _shifts_at_edges(along: Floats, sigma: Floats, position: Floats, joined: Mas
 
 
 @compiled
-def _doubt(along: Floats, across: Floats, sigma: Floats, blur2: float) -> Floats:
+def _doubt(along: Array, across: Array, sigma: Array, blur2: float) -> Array:
     doubt = np.empty(along.size)
     for k in range(along.size):
         noise = min(sigma[k], abs(along[k]))
@@ -326,7 +322,7 @@ def _doubt(along: Floats, across: Floats, sigma: Floats, blur2: float) -> Floats
 
 @compiled
 def _pull_out(
-    s: Image, sigma: Image, across: Image, blur2: float, freed: Image, doubt: Image
+    s: Floats, sigma: Floats, across: Floats, blur2: float, freed: Floats, doubt: Floats
 ) -> None:
     """`without_edges_across`, written to freed and doubt (L, P)."""
     lines = s.shape[0]

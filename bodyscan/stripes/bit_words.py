@@ -29,7 +29,7 @@ def stripe_from_gray(gray: NDArray[np.uint16]) -> NDArray[np.int32]:
     return stripe.astype(np.int32)
 
 
-def bit_that_flips(boundary: NDArray[np.int64], bits: int) -> NDArray[np.int64]:
+def bit_that_flips(boundary: Indices, bits: int) -> Indices:
     """Which bit (0 the most significant) flips at boundary i > 0, between stripes i - 1 and i.
 
     Of the plain code, in which several do, it is the coarsest.

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.scan_lines import ScanLines
-
-Bytes = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-Sums = NDArray[np.int64]
 
 LEVELS = 16
 ENOUGH_PIXELS = 500
@@ -20,7 +16,7 @@ LEAST_VARIANCE = 0.15
 """Rounding to whole grey levels (1/12), and a little."""
 
 
-def noise_variance(images: ScanLines) -> NDArray[np.float32]:
+def noise_variance(images: ScanLines) -> Floats:
     """(256,) variance of one frame's grey level, for each grey level.
 
     Away from the few edges of the coarsest pattern, the brighter of it and its inverse shows what
@@ -50,7 +46,7 @@ def noise_variance(images: ScanLines) -> NDArray[np.float32]:
 
 
 @compiled
-def _sums(lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, bright: Mask) -> Sums:
+def _sums(lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, bright: Mask) -> Indices:
     """How many, sum and sum of squares (LEVELS,) of what differs between two frames that show the
     same, by bands of grey levels; of every other pixel of every other line.
 
@@ -70,7 +66,7 @@ def _sums(lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, bright: Mask)
 
 
 @compiled
-def _add(sums: Sums, once: int, again: int) -> None:
+def _add(sums: Indices, once: int, again: int) -> None:
     difference = np.int64(again) - np.int64(once)
     if abs(difference) <= LARGEST_DIFFERENCE and once < BRIGHTEST:
         band = once // LEVELS

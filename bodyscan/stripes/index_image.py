@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes, Mask
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.boundaries import Boundaries, joined_to_next
 from bodyscan.stripes.scan_lines import ScanLines
@@ -17,9 +18,6 @@ from bodyscan.stripes.stripe_map import StripeMap, stripe_map
 from bodyscan.stripes.stripe_order import check_order
 from bodyscan.stripes.usable_pixels import beside_jumps
 
-Images = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-
 SIGMA = 12.0**-0.5
 """Of a place known to lie within one pixel, or of s within one stripe."""
 
@@ -27,7 +25,7 @@ MAX_SHARE_BEYOND = 0.01
 NONE = (0, 255)
 
 
-def decode_index(lit: Images, numbers: Images, direction: str, stripes: int) -> StripeMap:
+def decode_index(lit: Bytes, numbers: Bytes, direction: str, stripes: int) -> StripeMap:
     """The stripe map.  lit: (H, W).  numbers: (1, H, W).
 
     A boundary is known to lie between two pixels, no better. Along a line of boundaries s is

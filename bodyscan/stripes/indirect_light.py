@@ -15,14 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.scan_lines import WHOLE_SHARE, ScanLines
-
-Bytes = NDArray[np.uint8]
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 LEAST_DIRECT = 0.5
 WIDEST_DIP_PX = 7
@@ -39,7 +34,7 @@ SIGNIFICANCE = 4.0
 UNEXPLAINED = 0.3
 
 
-def mostly_direct(images: ScanLines, usable: Mask, bit: int, variance: NDArray[np.float32]) -> Mask:
+def mostly_direct(images: ScanLines, usable: Mask, bit: int, variance: Floats) -> Mask:
     """(L, P): pixels that get more light from the projector than from other surfaces.
 
     bit: of the patterns, the one of stripes two wide. It tells, or the next coarser one that the
@@ -61,12 +56,12 @@ def imbalance(
     images: ScanLines,
     codes: NDArray[np.int32],
     usable: Mask,
-    variance: NDArray[np.float32],
-    bit: Ints,
-    index: Ints,
-    at: Ints,
-    reach: Ints,
-) -> tuple[Floats, Floats]:
+    variance: Floats,
+    bit: Indices,
+    index: Indices,
+    at: Indices,
+    reach: Indices,
+) -> tuple[Array, Array]:
     """J / (D + I) at boundaries `index` (N,) of `bit` (N,), and how far it may be off.
 
     at: (N,) flat pixels before the boundaries.  reach: (N,) stripes beside them for which the bit
@@ -85,7 +80,9 @@ def imbalance(
 
 
 @compiled
-def _beside(codes: NDArray[np.int32], usable: Mask, at: Ints, index: Ints, reach: Ints) -> Ints:
+def _beside(
+    codes: NDArray[np.int32], usable: Mask, at: Indices, index: Indices, reach: Indices
+) -> Indices:
     """(N, 2 * len(BESIDE_PX)) flat pixels on both sides of boundaries, clear of this one and of where
     the bit flips again; -1 instead of both where one is not."""
     width = codes.shape[1]
@@ -104,8 +101,8 @@ def _beside(codes: NDArray[np.int32], usable: Mask, at: Ints, index: Ints, reach
 
 @compiled
 def _mean_imbalance(
-    lit: Bytes, dark: Bytes, pixels: Ints, difference: Image, noise: Image
-) -> tuple[Floats, Floats]:
+    lit: Bytes, dark: Bytes, pixels: Indices, difference: Floats, noise: Floats
+) -> tuple[Array, Array]:
     """See `imbalance`: (N,) from the differences (N, K) at pixels beside each boundary."""
     result, doubt = np.zeros(len(pixels)), np.zeros(len(pixels))
     for k in range(len(pixels)):

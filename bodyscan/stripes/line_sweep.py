@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from bodyscan.arrays import Bytes, Floats
 from bodyscan.stripes.pixel_stripes import pixel_stripe_map
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.sequence import check_illumination
@@ -30,11 +31,8 @@ from bodyscan.stripes.usable_pixels import (
     half_covered_pixels,
 )
 
-Images = NDArray[np.uint8]
-Floats = NDArray[np.float32]
-
 REACH = 3
-"""Images before and behind the brightest in which its light may be seen."""
+"""Bytes before and behind the brightest in which its light may be seen."""
 
 SAMPLES = 15
 MAX_SECOND = 0.3
@@ -50,7 +48,7 @@ BANDS = 8
 ENOUGH_PIXELS = 200
 
 
-def decode_sweep(lit: Images, frames: Images, direction: str) -> StripeMap:
+def decode_sweep(lit: Bytes, frames: Bytes, direction: str) -> StripeMap:
     """The stripe map.  lit: (H, W).  frames: (stripes, H, W), most of them dark at any one pixel.
 
     Raises DecodingFailed if the images do not add up.
@@ -91,7 +89,7 @@ class _Sweep:
         self.height, self.total = window[REACH], window.sum(axis=0)
 
     @staticmethod
-    def of(frames: Images) -> _Sweep:
+    def of(frames: Bytes) -> _Sweep:
         """frames: (F, L, P)."""
         base = np.median(frames[:: max(1, len(frames) // SAMPLES)], axis=0).astype(np.float32)
         peak = frames.argmax(axis=0).astype(np.int32)
@@ -123,7 +121,7 @@ class _Sweep:
         s = (self.peak + share).astype(np.float32)
         return s, sigma
 
-    def base_noise2(self, frames: Images) -> float:
+    def base_noise2(self, frames: Bytes) -> float:
         """Variance of an image where the line is not."""
         every = max(1, len(frames) // SAMPLES)
         apart = [
@@ -134,7 +132,7 @@ class _Sweep:
         # Grey levels are whole numbers, so their median would be one too; the mean is not.
         return float(max(np.mean(np.minimum(stray, 8.0)) ** 2 * np.pi / 2.0, 0.15))
 
-    def noise_rise(self, lit: Images, base_noise2: float) -> float:
+    def noise_rise(self, lit: Bytes, base_noise2: float) -> float:
         """By how much the variance grows with each grey level of light.
 
         The window adds up to what the lit image shows, but for the noise of both.

@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes, Floats, Mask
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.bit_patterns import read_words
 from bodyscan.stripes.bit_words import GRAY
@@ -25,10 +25,6 @@ from bodyscan.stripes.pixel_stripes import pixel_stripe_map
 from bodyscan.stripes.scan_lines import ScanLines, transpose
 from bodyscan.stripes.stripe_map import StripeMap
 from bodyscan.stripes.usable_pixels import MIN_CONTRAST_TO_NOISE, usable_pixels
-
-Images = NDArray[np.uint8]
-Floats = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 MIN_AMPLITUDE = 2.0
 LEAST_SIGMA = 5e-4
@@ -45,7 +41,7 @@ LEAP = 0.6
 
 
 def decode_phase(
-    images: ScanLines, lit: Images, waves: Images, half_periods: int, period: int, stripes: int
+    images: ScanLines, lit: Bytes, waves: Bytes, half_periods: int, period: int, stripes: int
 ) -> StripeMap:
     """The stripe map.  images: scan lines of the Gray code of half periods.  lit: (H, W) as the
     camera has it.  waves: (steps, H, W).  period: in stripes.
@@ -70,7 +66,7 @@ def decode_phase(
     return pixel_stripe_map(images, lit, s, sigma, variance, stripes)
 
 
-def _wave(waves: Images) -> tuple[Floats, Floats, Floats]:
+def _wave(waves: Bytes) -> tuple[Floats, Floats, Floats]:
     """Phase in turns (0 to 1), amplitude and mean (grey levels) of waves (N, L, P)."""
     angle = 2.0 * np.pi * np.arange(len(waves)) / len(waves)
     sine, cosine, middle = (
@@ -81,7 +77,7 @@ def _wave(waves: Images) -> tuple[Floats, Floats, Floats]:
     return np.arctan2(sine, cosine) / np.float32(2.0 * np.pi) % np.float32(1.0), amplitude, middle
 
 
-def _check_waves(images: ScanLines, waves: Images, usable: Mask) -> None:
+def _check_waves(images: ScanLines, waves: Bytes, usable: Mask) -> None:
     """Raises DecodingFailed if an image is missing, taken twice or exposed otherwise.
 
     Each is, over the picture, half as bright as lit, and so are all together at each pixel.
@@ -113,7 +109,7 @@ def _check_waves(images: ScanLines, waves: Images, usable: Mask) -> None:
         )
 
 
-def _check_phase(waves: Images, coarse: Floats, usable: Mask) -> None:
+def _check_phase(waves: Bytes, coarse: Floats, usable: Mask) -> None:
     """Raises DecodingFailed if phases do not lie in their half periods, or leap between them."""
     across = (np.abs(np.diff(coarse, axis=1)) == 0.5) & usable[:, 1:] & usable[:, :-1]
     line, place = np.nonzero(across)

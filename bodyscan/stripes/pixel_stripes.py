@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes, Floats
 from bodyscan.stripes.albedo_edges import Brightness, without_edges_across
 from bodyscan.stripes.boundaries import LEAST_SIGMA_PX, Boundaries, joined_to_next
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
 from bodyscan.stripes.stripe_map import StripeMap, stripe_map
-
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 LARGEST_STEP = 1.5
 """Stripes between neighbouring pixels of one surface, at most."""
@@ -20,10 +18,10 @@ LARGEST_STEP = 1.5
 
 def pixel_stripe_map(
     images: ScanLines,
-    lit: NDArray[np.uint8],
-    s: Image,
-    sigma: Image,
-    variance: NDArray[np.float32],
+    lit: Bytes,
+    s: Floats,
+    sigma: Floats,
+    variance: Floats,
     stripes: int,
     *,
     codes: NDArray[np.int32] | None = None,
@@ -51,7 +49,7 @@ def pixel_stripe_map(
     return stripe_map(images, lit, s, sigma, boundaries, stripes)
 
 
-def whole_numbers(s: Image, sigma: Image, blur2: float) -> Boundaries:
+def whole_numbers(s: Floats, sigma: Floats, blur2: float) -> Boundaries:
     """Where s passes a whole number between two neighbours of a line; linear between them."""
     here, there = s[:, :-1], s[:, 1:]
     step = there - here
@@ -76,8 +74,8 @@ def whole_numbers(s: Image, sigma: Image, blur2: float) -> Boundaries:
 
 
 def without_edges_along(
-    s: Image, sigma: Image, brightness: Brightness, blur2: float
-) -> tuple[Image, Image]:
+    s: Floats, sigma: Floats, brightness: Brightness, blur2: float
+) -> tuple[Floats, Floats]:
     """s and sigma (L, P) with the pull of edges that cross the scan lines taken out of s."""
     lines, places = s.shape
     at = np.arange(lines * places - 1)
@@ -87,7 +85,7 @@ def without_edges_along(
     return np.ascontiguousarray(freed.T), np.ascontiguousarray(doubt.T)
 
 
-def _middle(step: Image) -> Image:
+def _middle(step: Floats) -> Floats:
     """Gradient at pixels, from that between each and the next of its line."""
     gradient = np.zeros_like(step)
     gradient[:, 1:-1] = (step[:, 1:-1] + step[:, :-2]) / 2

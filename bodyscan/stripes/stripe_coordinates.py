@@ -8,13 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.boundaries import MIN_STRIPE_PX, Boundaries
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 SMOOTHERS = (
     np.array([-3.0, 12.0, 17.0, 12.0, -3.0]) / 35.0,
@@ -35,7 +31,7 @@ MAX_PULL = 0.05
 
 def interpolate_stripes(
     boundaries: Boundaries, codes: NDArray[np.int32], usable: Mask
-) -> tuple[Image, Image]:
+) -> tuple[Floats, Floats]:
     """s and its standard deviation, (L, P) each, NaN where there is none.
 
     Between two boundaries s is a cubic with the slopes that the boundaries around them tell
@@ -60,14 +56,14 @@ class _Segments:
     where s bends, blur^2 / 2 times its second derivative.  sigma: of s.
     """
 
-    start: Floats
-    width: Floats
-    index: Floats
-    rise: Floats
-    slope_in: Floats
-    slope_out: Floats
-    pull: Floats
-    sigma: Floats
+    start: Array
+    width: Array
+    index: Array
+    rise: Array
+    slope_in: Array
+    slope_out: Array
+    pull: Array
+    sigma: Array
 
     @staticmethod
     def of(boundaries: Boundaries) -> _Segments:
@@ -86,14 +82,14 @@ class _Segments:
 
 @compiled
 def _fill(
-    s: Image,
-    sigma: Image,
+    s: Floats,
+    sigma: Floats,
     codes: NDArray[np.int32],
     usable: Mask,
-    line: Ints,
-    before: Ints,
-    segments: tuple[Floats, ...],
-    bends: tuple[Floats, ...],
+    line: Indices,
+    before: Indices,
+    segments: tuple[Array, ...],
+    bends: tuple[Array, ...],
 ) -> None:
     """Writes s and sigma (L, P) of usable pixels from the segments they lie in; beyond a run's
     ends from the run's last one, the one before the pixel rather than the one behind.
@@ -122,7 +118,7 @@ def _fill(
 
 @compiled
 def _within(
-    place: int, code: int, k: int, segments: tuple[Floats, ...], bends: tuple[Floats, ...]
+    place: int, code: int, k: int, segments: tuple[Array, ...], bends: tuple[Array, ...]
 ) -> tuple[float, float]:
     """s and its standard deviation at a place (px) between the boundaries of segment k, or NaN."""
     start, width, index, rise, sigma = segments
@@ -136,7 +132,7 @@ def _within(
 
 @compiled
 def _beside(
-    place: int, code: int, k: int, segments: tuple[Floats, ...], bends: tuple[Floats, ...]
+    place: int, code: int, k: int, segments: tuple[Array, ...], bends: tuple[Array, ...]
 ) -> tuple[float, float]:
     """s and its standard deviation at a place (px) before or behind segment k, or NaN: its bend
     goes on, and s is doubted by as much as that adds."""
@@ -160,7 +156,7 @@ def _credible(value: float, doubt: float, code: int, middle: float) -> tuple[flo
 
 
 @compiled
-def end_slopes(secant: Floats, width: Floats) -> tuple[Floats, Floats]:
+def end_slopes(secant: Array, width: Array) -> tuple[Array, Array]:
     """Slopes of s at both ends of every segment from the segments beside it; their own secant where
     there are none.
 
@@ -189,7 +185,7 @@ def _completed(slope: float, other: float, secant: float) -> float:
     return secant if math.isnan(other) else 2.0 * secant - other
 
 
-def smoothed(boundaries: Boundaries, joined: Mask) -> tuple[Floats, Floats]:
+def smoothed(boundaries: Boundaries, joined: Mask) -> tuple[Array, Array]:
     """Positions and their sigmas, px, after a local quadratic fit along each unbroken run.
 
     Along a run the index counts evenly, so the fit of place against index is a fixed filter. It
@@ -204,12 +200,12 @@ def smoothed(boundaries: Boundaries, joined: Mask) -> tuple[Floats, Floats]:
 
 @compiled
 def _smooth(
-    seen: Floats,
-    sigma_px: Floats,
+    seen: Array,
+    sigma_px: Array,
     joined: Mask,
-    weights: Floats,
-    position: Floats,
-    sigma: Floats,
+    weights: Array,
+    position: Array,
+    sigma: Array,
 ) -> None:
     """One filter of `smoothed`; overwrites position and sigma (N,) where it fits."""
     half = weights.size // 2

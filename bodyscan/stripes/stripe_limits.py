@@ -8,10 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Floats, Mask
 from bodyscan.compiled import compiled
-
-Floats = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 TILE_PX = 8  # which is what fits into a word of 64 bits
 

@@ -7,11 +7,11 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Mask
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.sequence import check_direction
 
 Numbers = NDArray[np.signedinteger]
-Mask = NDArray[np.bool_]
 
 ENOUGH = 20
 MIN_SHARE_IN_STEP = 0.6

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BodyscanError
 from bodyscan.evaluation import artefacts
@@ -27,8 +27,6 @@ from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import FusionSettings
 from bodyscan.workflows.range_images import reconstruct_range_images
-
-Array = NDArray[np.float64]
 
 FUSION = FusionSettings(points=200_000)  # a sphere of 60 mm has some 3,000 of them
 FEWEST_OF_ONE = 400

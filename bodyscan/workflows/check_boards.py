@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.camera import CameraCalibration
@@ -23,8 +23,6 @@ from bodyscan.registration.drift import Drift, Move, find_drift, seen_pose
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.workflows.decode import decode_on_boards
 from bodyscan.workflows.find_boards import find_all_boards, locate_views
-
-Array = NDArray[np.float64]
 
 LEAST_NOISE_PX = 0.02
 STRIPE_SIGMAS, STRIPE_MM = 5.0, 0.25

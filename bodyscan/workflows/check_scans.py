@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import networkx as nx
 import numpy as np
-from numpy.typing import NDArray
 
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.sway import BODY_CENTRE
+from bodyscan.arrays import Array
 from bodyscan.captures.folder import Captures
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.geometry.transforms import RigidTransform
@@ -18,8 +18,6 @@ from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import AlignmentSettings
 from bodyscan.workflows.range_images import reconstruct_range_images
-
-Array = NDArray[np.float64]
 
 FEWEST_SCANS = 3
 """A person sways by as much as a pair may have moved: from so many scans on the two are told apart."""

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
 from bodyscan.evaluation.body import coverage_of_seen, girth_errors, sway_residual
 from bodyscan.evaluation.surface import Deviation, deviation, normalized_errors, signed_distances
@@ -21,8 +21,6 @@ from bodyscan.mesh.topology import topology
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
 from bodyscan.report.pictures import draw_deviation
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +50,7 @@ class Truth:
 
     facts: dict[str, Any]
     vertices: Array | None
-    faces: NDArray[np.int64] | None
+    faces: Indices | None
 
 
 def load_truth(folder: Path) -> Truth:

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bodyscan.arrays import Array, Bytes, Floats
 
 NEAR_PX = 2.5
 """Edges are looked at from here on: nearer, the two lines blur into each other."""
@@ -25,7 +24,7 @@ PROFILE = 21
 ROUNDS = 3
 
 
-def refine_by_lines(image: NDArray[np.uint8], start: Array, along: Array) -> Array:
+def refine_by_lines(image: Bytes, start: Array, along: Array) -> Array:
     """Corners (N, 2) px from starts within about a pixel; NaN where lines cannot be fitted.
 
     along: (N, 2, 2) px, columns: one square along the print's x, one along its y.
@@ -41,7 +40,7 @@ def refine_by_lines(image: NDArray[np.uint8], start: Array, along: Array) -> Arr
 
 
 def _line(
-    grey: NDArray[np.float32], corner: Array, direction: Array, length: Array, axis: int
+    grey: Floats, corner: Array, direction: Array, length: Array, axis: int
 ) -> tuple[Array, Array]:
     """A point (N, 2) and direction (N, 2) of the edges on both sides of each corner."""
     tangent = direction[:, :, axis]
@@ -68,7 +67,7 @@ def _line(
     return middle, axes[:, 0] * towards
 
 
-def _edge_places(grey: NDArray[np.float32], place: Array, offset: Array) -> Array:
+def _edge_places(grey: Floats, place: Array, offset: Array) -> Array:
     """Where along each profile the edge is, (N, stations) px: the centre of its gradient."""
     count = place.shape[0] * place.shape[1]
     sampled = cv2.remap(

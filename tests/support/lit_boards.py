@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, join
 from bodyscan.calibration.camera import locate_board
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.transforms import RigidTransform
-
-Array = NDArray[np.float64]
 
 
 class Projector(Protocol):
@@ -129,7 +127,7 @@ class Scene:
 
     def crossings(
         self, camera_from_board: RigidTransform, every_px: int = 8
-    ) -> tuple[NDArray[np.int64], Array]:
+    ) -> tuple[Indices, Array]:
         """Boundaries and the pixels where they cross every n-th line of the image, on the board."""
         tall = self.direction == "horizontal"
         width, height = self.camera.width, self.camera.height
