@@ -16,8 +16,7 @@ def coverage(
     within_mm: float = 1.0,
     samples: int = 200_000,
     spacing_mm: float = 2.0,
-    seed: int = 0,
 ) -> float:
     """Fraction of a surface's area that the points cover, see `covered_spots`."""
-    spots, normals = sample_surface(vertices, faces, samples, seed)
+    spots, normals = sample_surface(vertices, faces, samples)
     return float(np.mean(covered_spots(points, spots, normals, within_mm, spacing_mm)))
