@@ -65,7 +65,7 @@ class GirthErrors:
 
 def girth_errors(mesh: BodyMesh, vertices: Array, faces: Indices) -> GirthErrors:
     """mesh in the truth's frame; vertices, faces: the truth."""
-    truth = _plain(vertices, faces)
+    truth = _as_measured(vertices, faces)
     stature = float(vertices[:, 2].max())
     levels = np.arange(TORSO[0] * stature, TORSO[1] * stature, STEP_MM).tolist()
     ours, true = measure(mesh, levels), measure(truth, levels)
@@ -91,7 +91,7 @@ def _trunk_error(ours: Slice, true: Slice) -> float | None:
     return one.tape_mm - other.tape_mm
 
 
-def _plain(vertices: Array, faces: Indices) -> BodyMesh:
+def _as_measured(vertices: Array, faces: Indices) -> BodyMesh:
     count = len(vertices)
     return BodyMesh(
         vertices,
@@ -125,12 +125,14 @@ def coverage_of_seen(
         inside = ahead & (u > 0) & (u < camera.width - 1) & (v > 0) & (v < camera.height - 1)
         index = np.flatnonzero(inside & ~seen)
         for eye in (np.zeros(3), np.array(pair["projector"]["centre"])):
-            index = index[_open(scene, spots[index], normals[index], still_from_camera.apply(eye))]
+            index = index[
+                _in_sight(scene, spots[index], normals[index], still_from_camera.apply(eye))
+            ]
         seen[index] = True
     return float(seen.mean()), float(covered_spots(points, spots[seen], normals[seen]).mean())
 
 
-def _open(scene: Any, spots: Array, normals: Array, eye: Array) -> Mask:
+def _in_sight(scene: Any, spots: Array, normals: Array, eye: Array) -> Mask:
     """(N,) which spots face the eye, with nothing between."""
     way = eye - spots
     distance = np.linalg.norm(way, axis=1)

@@ -28,7 +28,7 @@ def find_spheres(points: Array, normals: Array, radius: float, count: int) -> li
     flat, votes = flat[known].astype(float), votes[known].astype(float)
     found: list[Sphere] = []
     for _ in range(count):
-        sphere = _most_voted(flat, votes, radius)
+        sphere = _find_sphere(flat, votes, radius)
         if sphere is None:
             raise FailedWork(
                 f"{len(found)} spheres of radius {radius:g} mm found, {count} were expected",
@@ -40,7 +40,7 @@ def find_spheres(points: Array, normals: Array, radius: float, count: int) -> li
     return _in_reading_order(found)
 
 
-def _most_voted(points: Array, votes: Array, radius: float) -> Sphere | None:
+def _find_sphere(points: Array, votes: Array, radius: float) -> Sphere | None:
     cells = np.floor(votes / (VOTE_CELL * radius)).astype(np.int64)
     if len(cells) < FEWEST_POINTS:
         return None

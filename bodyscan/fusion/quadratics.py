@@ -129,13 +129,13 @@ def fit_full_windows(inverse: Floats, noise: Floats, reach: int) -> Fit:
     normal = np.linalg.inv(basis.T @ basis)
     one, slope, square = np.ones_like(offsets), offsets, offsets**2
 
-    def filtered(rows: Array, columns: Array) -> Floats:
+    def convolve(rows: Array, columns: Array) -> Floats:
         return cv2.sepFilter2D(inverse, cv2.CV_32F, columns, rows, borderType=cv2.BORDER_CONSTANT)
 
     constant, along_u2, along_v2 = normal[0, 0], normal[0, 3], normal[0, 5]
-    value = filtered(one, constant * one + along_u2 * square) + filtered(along_v2 * square, one)
-    slope_u = filtered(one, normal[1, 1] * slope)
-    slope_v = filtered(normal[2, 2] * slope, one)
+    value = convolve(one, constant * one + along_u2 * square) + convolve(along_v2 * square, one)
+    slope_u = convolve(one, normal[1, 1] * slope)
+    slope_v = convolve(normal[2, 2] * slope, one)
     return Fit(value, slope_u, slope_v, noise * np.float32(np.sqrt(constant)))
 
 

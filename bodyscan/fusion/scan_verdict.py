@@ -47,10 +47,10 @@ def grade_scan(
         *_motion(alignment),
         *_contradictions(contradicted),
         *_company(cloud),
-        *_cut_off(cloud, volume),
-        *_left_out(cloud, mesh),
+        *_cuts(cloud, volume),
+        *_omissions(cloud, mesh),
         *_contacts(mesh),
-        *_unmeasured(mesh),
+        *_gaps(mesh),
     ]
     worst_first = sorted(findings, key=lambda finding: -GRADES.index(finding[0]))
     grade = worst_first[0][0] if worst_first else "good"
@@ -119,7 +119,7 @@ def _company(cloud: BodyCloud) -> Iterator[Finding]:
             )
 
 
-def _cut_off(cloud: BodyCloud, volume: Volume) -> Iterator[Finding]:
+def _cuts(cloud: BodyCloud, volume: Volume) -> Iterator[Finding]:
     x, y, z = cloud.points.T
     if np.mean(z > volume.top_mm - RIM_MM) > AT_RIM:
         yield "usable", f"cut off at the scan volume's top, {volume.top_mm:.0f} mm: no stature"
@@ -127,7 +127,7 @@ def _cut_off(cloud: BodyCloud, volume: Volume) -> Iterator[Finding]:
         yield "usable", f"cut off at the scan volume's side, {volume.radius_mm:.0f} mm"
 
 
-def _left_out(cloud: BodyCloud, mesh: BodyMesh) -> Iterator[Finding]:
+def _omissions(cloud: BodyCloud, mesh: BodyMesh) -> Iterator[Finding]:
     """Points that the mesh, one closed piece, has no surface for."""
     some = cloud.points[:: max(1, len(cloud.points) // 20_000)]
     distance = cKDTree(mesh.vertices).query(some, distance_upper_bound=OUTSIDE_MM)[0]
@@ -154,7 +154,7 @@ def _contacts(mesh: BodyMesh) -> Iterator[Finding]:
         )
 
 
-def _unmeasured(mesh: BodyMesh) -> Iterator[Finding]:
+def _gaps(mesh: BodyMesh) -> Iterator[Finding]:
     """The made-up share of all, and of each height."""
     area = face_areas(mesh.vertices, mesh.faces)
     filled = mesh.filled_share

@@ -59,17 +59,17 @@ def take_samples(surfaces: Sequence[SmoothSurface], points: int) -> Samples:
         parts = np.split(chosen, np.searchsorted(chosen, ends[1:-1]))
         pixels = [part - start for part, start in zip(parts, ends, strict=False)]
 
-    def pooled(name: str) -> NDArray[Any]:
+    def pool(name: str) -> NDArray[Any]:
         fields = [getattr(surface, name) for surface in surfaces]
         taken = [field.take(some, axis=0) for field, some in zip(fields, pixels, strict=True)]
         return np.concatenate(taken)
 
     return Samples(
-        pooled("points"),
-        pooled("normals"),
-        pooled("sigma_mm"),
-        pooled("weight"),
-        pooled("colours"),
+        pool("points"),
+        pool("normals"),
+        pool("sigma_mm"),
+        pool("weight"),
+        pool("colours"),
         np.cumsum([0, *(some.size for some in pixels)]),
     )
 
@@ -85,7 +85,7 @@ def voxel_size_for(points: Floats, wanted: int) -> float:
     layers = SOME_LAYERS if len(points) > MANY else 1
     for _ in range(ROUNDS):
         found = _Voxels.of(points, box, size, layers)
-        ratio = layers * _occupied(found.number, found.count) / wanted
+        ratio = layers * _count_occupied(found.number, found.count) / wanted
         size *= float(np.clip(np.sqrt(ratio), 0.25, 4.0))
         if abs(ratio - 1.0) < CLOSE_ENOUGH:
             break
@@ -185,7 +185,7 @@ def _number(
 
 
 @compiled
-def _occupied(voxels: Numbers, count: int) -> int:
+def _count_occupied(voxels: Numbers, count: int) -> int:
     """How many of `count` voxels are among `voxels`."""
     found = np.zeros(count, np.bool_)
     occupied = 0

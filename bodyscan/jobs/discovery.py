@@ -39,7 +39,7 @@ def find_jobs(
 
 
 def _job(path: Path, pipeline: Pipeline, out: Path, calibration: Path | None, until: str) -> Job:
-    name, subject = job_name(path.name), _said(path).get("subject")
+    name, subject = job_name(path.name), _captures_content(path).get("subject")
     subject = subject if isinstance(subject, str) else None
     return Job(name, out.absolute() / name, path, calibration, pipeline, until, subject)
 
@@ -55,7 +55,7 @@ def _scans(scans: Path, out: Path) -> list[Path]:
         path
         for path in _folders(scans, out)
         if not any((path / name).exists() for name in RESULTS)
-        and _said(path).get("kind") != "calibration"
+        and _captures_content(path).get("kind") != "calibration"
     ]
 
 
@@ -74,7 +74,7 @@ def _folders(folder: Path, out: Path) -> list[Path]:
     ]
 
 
-def _said(folder: Path) -> dict[str, Any]:
+def _captures_content(folder: Path) -> dict[str, Any]:
     """What the folder's captures.yaml says, unchecked; nothing if it cannot be read."""
     try:
         data = read_yaml(folder / CAPTURES).data

@@ -99,17 +99,17 @@ def _scan_figures(facts: Mapping[str, Any]) -> dict[str, Any]:
         "when": facts["when"],
         "points": counts["points"],
         "faces": counts["faces"],
-        "coverage_percent": _rounded(100.0 * (1.0 - counts["filled_share"]), 2),
-        "sigma_mm": _rounded(facts["median_sigma_mm"]),
+        "coverage_percent": _round(100.0 * (1.0 - counts["filled_share"]), 2),
+        "sigma_mm": _round(facts["median_sigma_mm"]),
         "pairs_measured": sum(points > 0 for points in facts["measured"].values()),
         "pairs_failed": " ".join(sorted(facts["failed"])),
     }
     if alignment and alignment["motion_mm"]:
         pair, motion = max(alignment["motion_mm"].items(), key=lambda item: item[1])
         figures |= {
-            "overlap_rms_before_mm": _rounded(alignment["rms_before_mm"]),
-            "overlap_rms_after_mm": _rounded(alignment["rms_after_mm"]),
-            "sway_mm": _rounded(motion),
+            "overlap_rms_before_mm": _round(alignment["rms_before_mm"]),
+            "overlap_rms_after_mm": _round(alignment["rms_after_mm"]),
+            "sway_mm": _round(motion),
             "sway_pair": pair,
         }
     return figures
@@ -123,8 +123,8 @@ def _rig_figures(content: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "pairs": len(qualities),
         "pairs_failed": " ".join(sorted(content["failed"])),
-        "corners_rms_px": _rounded(max(q["corners_rms_px"] for q in qualities)),
-        "sheets_rms_mm": _rounded(max(sheets)) if sheets else None,
+        "corners_rms_px": _round(max(q["corners_rms_px"] for q in qualities)),
+        "sheets_rms_mm": _round(max(sheets)) if sheets else None,
     }
 
 
@@ -149,7 +149,7 @@ def _add_drift(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> None:
             for pair in own
         }
         pair = max(drift, key=lambda name: drift[name])
-        rows[number].update(drift_mm=_rounded(drift[pair]), drift_pair=pair)
+        rows[number].update(drift_mm=_round(drift[pair]), drift_pair=pair)
 
 
 def _motions(job: Job) -> Motions:
@@ -159,13 +159,13 @@ def _motions(job: Job) -> Motions:
         return {}
     calibrated = _read(job.calibration / "calibration.json").get("pairs", {})
     return {
-        pair: _moved(matrix, calibrated[pair]["rig_from_camera"])
+        pair: _centre_motion(matrix, calibrated[pair]["rig_from_camera"])
         for pair, matrix in alignment["rig_from_camera"].items()
         if pair in calibrated and pair not in alignment["refused"]
     }
 
 
-def _moved(now: Any, calibrated: Any) -> Array:
+def _centre_motion(now: Any, calibrated: Any) -> Array:
     change = np.asarray(now, float) @ np.linalg.inv(np.asarray(calibrated, float))
     return np.asarray(change[:3, :3] @ BODY_CENTRE_MM + change[:3, 3] - BODY_CENTRE_MM)
 
@@ -178,5 +178,5 @@ def _read(path: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _rounded(value: float | None, digits: int = 4) -> float | None:
+def _round(value: float | None, digits: int = 4) -> float | None:
     return None if value is None else round(value, digits)

@@ -14,10 +14,10 @@ from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import rigid_fit
 from bodyscan.laboratory.chapter import apparatus
-from bodyscan.laboratory.chapter.calibrating import Calibrated, calibrate_all, sigma_trial
+from bodyscan.laboratory.chapter.calibrating import Calibrations, calibrate_all, sigma_trial
 from bodyscan.laboratory.chapter.captures import ChapterCaptures, take_captures
 from bodyscan.laboratory.chapter.measuring import (
-    Measured,
+    ApproachAccuracy,
     measure_artefacts,
     noise_bound,
     points_of,
@@ -69,7 +69,7 @@ def reproduce(
 
 def _measure_all(
     captures: ChapterCaptures,
-    calibrated: Calibrated,
+    calibrated: Calibrations,
     seed: int,
     quick: bool,
     real_light: bool,
@@ -83,7 +83,7 @@ def _measure_all(
         (calibrated.by_reference, False),
     ]
     total = sum(len(approaches) for approaches, _ in groups)
-    results: list[tuple[Measured, ...]] = []
+    results: list[tuple[ApproachAccuracy, ...]] = []
     for approaches, whole in groups:
         done = sum(map(len, results))
         progress("measuring", done, total)
@@ -110,7 +110,7 @@ def _with_sigmas(approaches: Sequence[Approach]) -> list[Approach]:
     return [approach for approach in approaches if approach.name in ("(iii)", "ours")]
 
 
-def draw(captures: ChapterCaptures, calibrated: Calibrated, out: Path) -> None:
+def draw(captures: ChapterCaptures, calibrated: Calibrations, out: Path) -> None:
     """Fig. 6 and Fig. 7 into the folder `out`."""
     # Matplotlib takes a second to import: only whoever draws waits for it.
     from bodyscan.laboratory.figures import PlaneCurve, draw_projector, draw_range_data

@@ -80,7 +80,7 @@ def loops_at(
     corner, one, other = (faces[crossed, (lone + k) % 3] for k in range(3))
     start, end = np.where(alone_above, one, other), np.where(alone_above, other, one)
     segments = np.stack([_crossing(vertices, corner, way, height_mm) for way in (start, end)], 1)
-    labels = _joined(corner, start, end, len(vertices))
+    labels = _label_loops(corner, start, end, len(vertices))
     measured = np.ones(crossed.size, bool) if filled is None else ~filled[crossed]
     order = np.argsort(labels, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
@@ -95,7 +95,7 @@ def _crossing(vertices: Array, a: Indices, b: Indices, height_mm: float) -> Arra
     return low[:, :2] + share[:, None] * (high[:, :2] - low[:, :2])
 
 
-def _joined(corner: Indices, start: Indices, end: Indices, count: int) -> Indices:
+def _label_loops(corner: Indices, start: Indices, end: Indices, count: int) -> Indices:
     """(N,) number of the loop of each segment: neighbours share the edge that they end on."""
     keys = [np.minimum(corner, x) * count + np.maximum(corner, x) for x in (start, end)]
     edges, number = np.unique(np.concatenate(keys), return_inverse=True)

@@ -22,7 +22,7 @@ def screen_table(found: Sequence[Figure], synthetic: bool) -> ScreenTable:
     for one in found:
         table.add_row(
             one.name.removesuffix("_mm").replace("_", " "),
-            _signed(one.value_mm),
+            _format_signed(one.value_mm),
             "–" if one.limit_mm is None else f"{one.limit_mm:g}",
             one.where,
             style="red" if one.exceeded else None,
@@ -92,5 +92,5 @@ def acceptance_page(
     )
 
 
-def _signed(value: float | None) -> str:
+def _format_signed(value: float | None) -> str:
     return format_value(value) if value is None else f"{value:.3f}"

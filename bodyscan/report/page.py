@@ -89,7 +89,7 @@ class Table:
         return [[c.cell(v) for c, v in zip(self.columns, row, strict=True)] for row in self.rows]
 
     @property
-    def defined(self) -> list[Column]:
+    def definitions(self) -> list[Column]:
         return [column for column in self.columns if column.meaning]
 
 

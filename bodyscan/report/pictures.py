@@ -96,7 +96,7 @@ def draw_mesh(
         raise ValueError(f"colour is filled, photo or plain, not {colour!r}")
     scene, centre = centred_scene(mesh.vertices, mesh.faces)
     panels = [
-        _named(
+        _write_name(
             _cast_view(scene, centre, base, _Frame.of(mesh.vertices, _view(view), height_px)), view
         )
         for view in views
@@ -164,7 +164,9 @@ def draw_points(
     panels = []
     for view in views:
         frame = _Frame.of(points, _view(view), height_px)
-        panels.append(_named(_splat_view(points, normals, colours, frame, dot_mm, shaded), view))
+        panels.append(
+            _write_name(_splat_view(points, normals, colours, frame, dot_mm, shaded), view)
+        )
     save_panels(path, panels if scale is None else [*panels, colour_bar(scale, height_px)])
 
 
@@ -200,7 +202,7 @@ def _view(view: str | View) -> View:
     return VIEWS[view] if isinstance(view, str) else view
 
 
-def _named(panel: Bytes, view: str | View) -> Bytes:
+def _write_name(panel: Bytes, view: str | View) -> Bytes:
     """The panel with the name of its view, if it has one, in its upper left corner."""
     if isinstance(view, str):
         write_text(panel, view, (6, 16))

@@ -33,7 +33,7 @@ def rig_model(calibration: RigCalibration) -> tuple[dict[str, object], float]:
         for name, placing in calibration.rig_from_camera.items()
     }
     colours, _ = line_styles(calibration)
-    shape, tint = _joined(shapes, {name: _rgb(colours[name]) for name in shapes})
+    shape, tint = _join(shapes, {name: _rgb(colours[name]) for name in shapes})
     labels = [(name, t.translation) for name, t in calibration.rig_from_camera.items()]
     return (
         pack(
@@ -75,7 +75,7 @@ def _ellipsoid(middle: Array, covariance: Array) -> Shape:
     )
 
 
-def _joined(shapes: dict[str, Shape], tints: dict[str, Bytes]) -> tuple[Shape, Bytes]:
+def _join(shapes: dict[str, Shape], tints: dict[str, Bytes]) -> tuple[Shape, Bytes]:
     counts = [len(shape.vertices) for shape in shapes.values()]
     starts = np.cumsum([0, *counts[:-1]])
     every = list(shapes.values())
@@ -97,17 +97,17 @@ def _strokes(calibration: RigCalibration) -> Strokes:
         corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
         far = placing.apply(FRUSTUM_MM * camera.rays(corners))
         sides = np.stack([np.broadcast_to(placing.translation, far.shape), far], axis=1)
-        parts.append((np.concatenate([sides, _closed(far)]), _rgb(colours[name])))
+        parts.append((np.concatenate([sides, _close(far)]), _rgb(colours[name])))
     for (_, board_name), rig_from_board in calibration.rig_from_board.items():
         board = calibration.rig.board(board_name)
         x, y = board.columns * board.square_mm, board.rows * board.square_mm
         outline = np.array([[0.0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]])
-        parts.append((_closed(rig_from_board.apply(outline)), np.array(BOARD, np.uint8)))
+        parts.append((_close(rig_from_board.apply(outline)), np.array(BOARD, np.uint8)))
     volume = calibration.rig.volume
     turn = 2.0 * np.pi * np.arange(48) / 48
     circle = volume.radius_mm * np.stack([np.cos(turn), np.sin(turn), np.zeros(48)], axis=1)
     for height in (volume.bottom_mm, volume.top_mm):
-        parts.append((_closed(circle + [0.0, 0.0, height]), np.array(VOLUME, np.uint8)))
+        parts.append((_close(circle + [0.0, 0.0, height]), np.array(VOLUME, np.uint8)))
     upright = circle[::6, None] + np.array([[0.0, 0, volume.bottom_mm], [0.0, 0, volume.top_mm]])
     parts.append((upright, np.array(VOLUME, np.uint8)))
     for axis, colour in zip(np.eye(3), AXES, strict=True):
@@ -117,7 +117,7 @@ def _strokes(calibration: RigCalibration) -> Strokes:
     return Strokes(ends, tint.astype(np.uint8))
 
 
-def _closed(corners: Array) -> Array:
+def _close(corners: Array) -> Array:
     """(N, 2, 3) sides of a polygon (N, 3)."""
     return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
 

@@ -28,14 +28,14 @@ from bodyscan.laboratory.rivals.approaches import (
     planes_by_stage_camera,
     rivals,
 )
-from bodyscan.laboratory.rivals.targets import Located, by_reference_plane, by_slide_stage
+from bodyscan.laboratory.rivals.targets import LocatedBoards, by_reference_plane, by_slide_stage
 
 CORNER_NOISE_PX = 0.012
 """What corners found in the rendered images are off, each way."""
 
 
 @dataclass(frozen=True, eq=False)
-class Calibrated:
+class Calibrations:
     """reference: Zhang's camera.  planes: the chapter's fit of its free planes.
 
     camera, camera_covariance: ours, after the joint solve if held-out boards took it.
@@ -54,21 +54,21 @@ class Calibrated:
     by_reference: tuple[Approach, ...]
 
 
-def calibrate_all(captures: ChapterCaptures) -> Calibrated:
+def calibrate_all(captures: ChapterCaptures) -> Calibrations:
     """Everything that is to be compared, from the same shots."""
-    reference, located = by_reference_plane(TARGET, captures.boards)
+    reference, reference_boards = by_reference_plane(TARGET, captures.boards)
     _, stage = by_slide_stage(TARGET, captures.stage, captures.readings)
     projector = TARGET.projector
-    planes = fit_light_planes(located.points, projector.stripes, projector.direction)
-    ours, covariance, model, refinement = _ours(captures, reference, located)
+    planes = fit_light_planes(reference_boards.points, projector.stripes, projector.direction)
+    ours, covariance, model, refinement = _ours(captures, reference, reference_boards)
     approaches = (
         pinhole_by_stage(TARGET, captures.stage, captures.readings),
         mended_pinhole_by_stage(TARGET, stage),
         planes_by_stage_camera(TARGET, stage, captures.boards),
-        Approach("(iii)", located.camera, planes.planes),
+        Approach("(iii)", reference_boards.camera, planes.planes),
         ours,
     )
-    return Calibrated(
+    return Calibrations(
         reference,
         planes,
         ours,
@@ -77,25 +77,25 @@ def calibrate_all(captures: ChapterCaptures) -> Calibrated:
         refinement,
         approaches,
         tuple(rivals(TARGET, stage)),
-        tuple(rivals(TARGET, located)),
+        tuple(rivals(TARGET, reference_boards)),
     )
 
 
 def _ours(
-    captures: ChapterCaptures, reference: CameraCalibration, located: Located
+    captures: ChapterCaptures, reference: CameraCalibration, boards: LocatedBoards
 ) -> tuple[Approach, Array, str, str]:
     """As `bodyscan calibrate-rig` does a pair by itself: the model of the light that held-out boards
     choose, and one solve for all where they gain by it."""
     projector = TARGET.projector
-    data = binned(located.points, located.camera, projector.direction)
-    fit = fit_light(located.points, projector.stripes, projector.direction, located.camera)
-    boards = [
-        striped_board(planar_view(shot.view, TARGET.board), located.camera, data, number)
+    data = binned(boards.points, boards.camera, projector.direction)
+    fit = fit_light(boards.points, projector.stripes, projector.direction, boards.camera)
+    striped = [
+        striped_board(planar_view(shot.view, TARGET.board), boards.camera, data, number)
         for number, shot in enumerate(captures.boards)
     ]
-    refined = refine_where_better(reference, fit.sheets, boards, data)
+    refined = refine_where_better(reference, fit.sheets, striped, data)
     if refined.joint is None:
-        approach = Approach("ours", located.camera, fit.sheets)
+        approach = Approach("ours", boards.camera, fit.sheets)
         return approach, reference.covariance, fit.model, refined.reason
     approach = Approach("ours", refined.joint.camera, refined.joint.sheets)
     return approach, refined.joint.camera_covariance, fit.model, refined.reason

@@ -28,7 +28,7 @@ _BOARDS, _STAGE, _SPHERES, _PLATE = 0, 100, 200, 300
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SceneCapture:
     """One scene: the lit image, its stripes, the same light exposed once more, and the truth."""
 
     lit: Bytes
@@ -49,8 +49,8 @@ class ChapterCaptures:
     boards: tuple[StripedShot, ...]
     stage: tuple[StripedShot, ...]
     readings: Array
-    spheres: Seen
-    plate: Seen
+    spheres: SceneCapture
+    plate: SceneCapture
     owner: Indices
     on_plate: Mask
 
@@ -70,9 +70,9 @@ def take_captures(
         name = f"stage{of_stage + 1}" if of_stage >= 0 else f"board{number + 1}"
         shots.append(_board_shot(setup, place, name, stream))
         progress("rendering", number + 1, total)
-    spheres = _seen(setup, scenes.sphere_surfaces(), _SPHERES)
+    spheres = _expose(setup, scenes.sphere_surfaces(), _SPHERES)
     progress("rendering", total - 1, total)
-    plate = _seen(setup, scenes.plane_surfaces(), _PLATE)
+    plate = _expose(setup, scenes.plane_surfaces(), _PLATE)
     progress("rendering", total, total)
     return ChapterCaptures(
         setup,
@@ -94,9 +94,11 @@ def _board_shot(setup: ChapterSetup, place: RigidTransform, shot: str, number: i
     return StripedShot(views[0], taken.stripes)
 
 
-def _seen(setup: ChapterSetup, surfaces: Sequence[Surface], number: int) -> Seen:
+def _expose(setup: ChapterSetup, surfaces: Sequence[Surface], number: int) -> SceneCapture:
     first, second = scenes.expose_twice(setup, surfaces, number)
-    return Seen(first.lit, first.stripes, second.stripes, scenes.scene_truth(setup, surfaces))
+    return SceneCapture(
+        first.lit, first.stripes, second.stripes, scenes.scene_truth(setup, surfaces)
+    )
 
 
 def _owners(setup: ChapterSetup, truth: PixelTruth) -> Indices:

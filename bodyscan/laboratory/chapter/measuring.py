@@ -27,7 +27,7 @@ Stripes = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class ApproachAccuracy:
     """One approach on the same images.
 
     spheres: No. 1 to 5, from every measured pixel that a sphere covers and the projector lights.
@@ -70,7 +70,7 @@ def whole_stripes(s: Stripes) -> Stripes:
 
 def measure_artefacts(
     approach: Approach, captures: ChapterCaptures, *, whole: bool = False, name: str | None = None
-) -> Measured:
+) -> ApproachAccuracy:
     """whole: the stripe number of each pixel only, no fraction."""
     maps = [captures.spheres.stripes.s, captures.plate.stripes.s]
     spheres_s, plate_s = (whole_stripes(s) if whole else s for s in maps)
@@ -79,17 +79,19 @@ def measure_artefacts(
     found, covered = [], []
     for number in range(len(apparatus.CENTRES)):
         own = owner == number
-        measured = _known(points[own])
+        measured = _drop_unknown(points[own])
         found.append(measure_sphere(measured, apparatus.RADIUS_MM))
         covered.append(len(measured) / int(own.sum()))
     centres = np.stack([sphere.given.centre for sphere in found])
-    return Measured(
+    return ApproachAccuracy(
         name or approach.name,
         tuple(found),
         tuple(covered),
         centre_distances(centres, apparatus.CENTRES),
-        flatness(_known(points_of(approach, plate_s, captures.on_plate))),
-        flatness(_known(points_of(approach, captures.plate.truth.s, captures.on_plate))).rms_mm,
+        flatness(_drop_unknown(points_of(approach, plate_s, captures.on_plate))),
+        flatness(
+            _drop_unknown(points_of(approach, captures.plate.truth.s, captures.on_plate))
+        ).rms_mm,
     )
 
 
@@ -133,5 +135,5 @@ def noise_bound(captures: ChapterCaptures, share: float = 0.9) -> NoiseBound:
     return NoiseBound(tuple(everything), tuple(best))
 
 
-def _known(points: Array) -> Array:
+def _drop_unknown(points: Array) -> Array:
     return points[np.isfinite(points[..., 2])]

@@ -8,7 +8,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.ray_depths import intersect_rays
-from bodyscan.laboratory.chapter.captures import ChapterCaptures, Seen
+from bodyscan.laboratory.chapter.captures import ChapterCaptures, SceneCapture
 from bodyscan.laboratory.rivals.approaches import Approach
 
 
@@ -44,7 +44,7 @@ def point_sigma(approach: Approach, captures: ChapterCaptures) -> PointSigma:
     )
 
 
-def _errors(approach: Approach, seen: Seen, where: Mask) -> tuple[Array, Array]:
+def _errors(approach: Approach, seen: SceneCapture, where: Mask) -> tuple[Array, Array]:
     """Error of depth and its sigma, mm, of the measured pixels among `where` (H, W)."""
     rows, columns = np.nonzero(where & np.isfinite(seen.stripes.s))
     rays = approach.camera.rays(np.column_stack([columns, rows]).astype(float))

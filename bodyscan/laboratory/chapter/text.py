@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.laboratory.chapter import apparatus
-from bodyscan.laboratory.chapter.calibrating import Calibrated, SigmaTrial
-from bodyscan.laboratory.chapter.measuring import Measured, NoiseBound
+from bodyscan.laboratory.chapter.calibrating import Calibrations, SigmaTrial
+from bodyscan.laboratory.chapter.measuring import ApproachAccuracy, NoiseBound
 from bodyscan.laboratory.chapter.point_sigma import PointSigma
 
 CHAPTER_TABLE_2 = {
@@ -30,12 +30,12 @@ class Reproduction:
 
     seed: int
     real_light: bool
-    calibrated: Calibrated
+    calibrated: Calibrations
     trial: SigmaTrial
-    whole: tuple[Measured, ...]
-    fine: tuple[Measured, ...]
-    by_stage: tuple[Measured, ...]
-    by_reference: tuple[Measured, ...]
+    whole: tuple[ApproachAccuracy, ...]
+    fine: tuple[ApproachAccuracy, ...]
+    by_stage: tuple[ApproachAccuracy, ...]
+    by_reference: tuple[ApproachAccuracy, ...]
     noise: NoiseBound
     sigmas: tuple[PointSigma, ...]
 
@@ -185,7 +185,7 @@ def _point_sigmas(found: Reproduction) -> str:
 _FIGURES = ["", "mean E", "plate RMS", "smooth part", "systematic", "centres RMS", "scale ppm"]
 
 
-def _figures(m: Measured) -> list[str]:
+def _figures(m: ApproachAccuracy) -> list[str]:
     return [
         m.name,
         f"{m.mean_e:.5f}",
@@ -238,7 +238,7 @@ def _remarks(found: Reproduction) -> str:
     )
 
 
-def _times(all_: Sequence[Measured], one: Measured) -> float:
+def _times(all_: Sequence[ApproachAccuracy], one: ApproachAccuracy) -> float:
     third = next(m for m in all_ if m.name == "(iii)")
     return one.mean_e / third.mean_e
 

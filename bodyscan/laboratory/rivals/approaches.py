@@ -17,11 +17,11 @@ from bodyscan.laboratory.rivals.baseline_models import (
 )
 from bodyscan.laboratory.rivals.remapped_pinhole import fit_remapped_pinhole
 from bodyscan.laboratory.rivals.targets import (
-    Located,
+    LocatedBoards,
     StripedShot,
     Target,
     by_matrix,
-    relocated,
+    locate_again,
 )
 
 
@@ -39,22 +39,24 @@ def pinhole_by_stage(
 ) -> Approach:
     """Approach (i) as the chapter has it: a 3 x 4 and a 2 x 4 matrix from a slide stage, no lens,
     and the index taken for a place on the projector's slide."""
-    return _fitted(name, by_matrix(target, shots, readings), target, pinhole_planes)
+    return _fit(name, by_matrix(target, shots, readings), target, pinhole_planes)
 
 
-def mended_pinhole_by_stage(target: Target, stage: Located, name: str = "(i) mended") -> Approach:
+def mended_pinhole_by_stage(
+    target: Target, stage: LocatedBoards, name: str = "(i) mended"
+) -> Approach:
     """Approach (i) with what it lacks: Tsai's camera with its lens, and a re-mapped index."""
-    return _fitted(name, stage, target, remapped_planes)
+    return _fit(name, stage, target, remapped_planes)
 
 
 def planes_by_stage_camera(
-    target: Target, stage: Located, shots: Sequence[StripedShot], name: str = "(ii)"
+    target: Target, stage: LocatedBoards, shots: Sequence[StripedShot], name: str = "(ii)"
 ) -> Approach:
     """Approach (ii): Tsai's camera from the slide stage, planes from the reference plane.
 
     So the chapter's text has it, though it is headed `calibrated by slide stage`.
     """
-    return _fitted(name, relocated(target, shots, stage.camera), target, free_planes)
+    return _fit(name, locate_again(target, shots, stage.camera), target, free_planes)
 
 
 Model = Callable[[BoundaryPoints, int, Axis], LightPlanes]
@@ -103,12 +105,12 @@ PROJECTORS: dict[str, Model] = {
 image is found too, not taken for the camera's x axis."""
 
 
-def rivals(target: Target, where: Located) -> list[Approach]:
+def rivals(target: Target, where: LocatedBoards) -> list[Approach]:
     """Each model fitted to the same boundaries."""
-    return [_fitted(name, where, target, model) for name, model in PROJECTORS.items()]
+    return [_fit(name, where, target, model) for name, model in PROJECTORS.items()]
 
 
-def _fitted(name: str, where: Located, target: Target, model: Model) -> Approach:
+def _fit(name: str, where: LocatedBoards, target: Target, model: Model) -> Approach:
     projector = target.projector
     sheets = model(where.points, projector.stripes, projector.direction)
     return Approach(name, where.camera, sheets)

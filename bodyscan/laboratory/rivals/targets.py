@@ -46,7 +46,7 @@ class Target:
 
 
 @dataclass(frozen=True, eq=False)
-class Located:
+class LocatedBoards:
     """camera, camera_from_board by shot, and the boundaries on the boards, camera frame."""
 
     camera: Camera
@@ -56,17 +56,17 @@ class Located:
 
 def by_reference_plane(
     target: Target, shots: Sequence[StripedShot]
-) -> tuple[CameraCalibration, Located]:
+) -> tuple[CameraCalibration, LocatedBoards]:
     """The chapter's way (3): Zhang's camera, which also says where the boards are."""
     height, width = shots[0].stripes.s.shape
     views = [planar_view(shot.view, target.board) for shot in shots]
     found = calibrate_camera(views, width, height)
-    return found, located(target, shots, found.camera, found.camera_from_board)
+    return found, locate(target, shots, found.camera, found.camera_from_board)
 
 
 def by_slide_stage(
     target: Target, shots: Sequence[StripedShot], readings: Array
-) -> tuple[TsaiCamera, Located]:
+) -> tuple[TsaiCamera, LocatedBoards]:
     """Tsai's camera from a board that slid along its normal to `readings` (shots,) mm."""
     height, width = shots[0].stripes.s.shape
     points, pixels = stage_points(target.board, shots, readings)
@@ -76,10 +76,10 @@ def by_slide_stage(
         shot.view.shot: tsai.camera_from_points @ _slid(float(reading))
         for shot, reading in zip(shots, readings, strict=True)
     }
-    return tsai, located(target, shots, tsai.camera(width, height), poses)
+    return tsai, locate(target, shots, tsai.camera(width, height), poses)
 
 
-def by_matrix(target: Target, shots: Sequence[StripedShot], readings: Array) -> Located:
+def by_matrix(target: Target, shots: Sequence[StripedShot], readings: Array) -> LocatedBoards:
     """A 3 x 4 camera from the same stage, without a lens (Bolles et al. 1981).
 
     Where the stripes fall is read off each board by its own homography, which knows no lens either.
@@ -94,24 +94,24 @@ def by_matrix(target: Target, shots: Sequence[StripedShot], readings: Array) -> 
         poses[shot.view.shot] = pose
         view = planar_view(shot.view, target.board)
         parts.append(_by_homography(target, shot, view, camera, pose, number))
-    return Located(camera, poses, join(parts))
+    return LocatedBoards(camera, poses, join(parts))
 
 
-def relocated(target: Target, shots: Sequence[StripedShot], camera: Camera) -> Located:
+def locate_again(target: Target, shots: Sequence[StripedShot], camera: Camera) -> LocatedBoards:
     """Boards anywhere, seen by a camera that is known already."""
     poses = {
         shot.view.shot: locate_board(camera, planar_view(shot.view, target.board))[0]
         for shot in shots
     }
-    return located(target, shots, camera, poses)
+    return locate(target, shots, camera, poses)
 
 
-def located(
+def locate(
     target: Target,
     shots: Sequence[StripedShot],
     camera: Camera,
     camera_from_board: dict[str, RigidTransform],
-) -> Located:
+) -> LocatedBoards:
     """Carry the boundaries onto boards of known place (Eq. 18)."""
     parts = [
         on_board(
@@ -124,7 +124,7 @@ def located(
         )
         for number, shot in enumerate(shots)
     ]
-    return Located(camera, camera_from_board, join(parts))
+    return LocatedBoards(camera, camera_from_board, join(parts))
 
 
 def stage_points(
@@ -154,7 +154,7 @@ def _by_homography(
     near = boundaries_near(shot.stripes, shot.view)
     onto_board = np.linalg.inv(homography(view.points[:, :2], view.pixels))
 
-    def carried(pixels: Array) -> Array:
+    def onto_plane(pixels: Array) -> Array:
         image = np.column_stack([pixels, np.ones(len(pixels))]) @ onto_board.T
         flat = np.column_stack([image[:, :2] / image[:, 2:], np.zeros(len(image))])
         return camera_from_board.apply(flat)
@@ -167,7 +167,7 @@ def _by_homography(
     return BoundaryPoints(
         everything.index,
         everything.board,
-        carried(pixels),
-        carried(pixels + across) - carried(pixels - across),
+        onto_plane(pixels),
+        onto_plane(pixels + across) - onto_plane(pixels - across),
         everything.sigma_px,
     )

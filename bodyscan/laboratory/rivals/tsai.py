@@ -61,11 +61,11 @@ def calibrate_tsai(points: Array, pixels: Array, centre: Array) -> TsaiCamera:
     The centre is taken where radial alignment is best (Lenz and Tsai 1988), then all is refined.
     """
 
-    def misaligned(place: Array) -> Array:
-        return _alignment(points, pixels - place)[1]
+    def misalignment(place: Array) -> Array:
+        return _solve_alignment(points, pixels - place)[1]
 
-    found = least_squares(misaligned, centre).x
-    rotation, across, aspect = _aligned(points, pixels - found)
+    found = least_squares(misalignment, centre).x
+    rotation, across, aspect = _align(points, pixels - found)
     focal, depth = _focal_and_depth(points, pixels - found, rotation, across)
     start = np.concatenate(
         [
@@ -82,7 +82,7 @@ def calibrate_tsai(points: Array, pixels: Array, centre: Array) -> TsaiCamera:
     )
 
 
-def _alignment(points: Array, image: Array) -> tuple[Array, Array]:
+def _solve_alignment(points: Array, image: Array) -> tuple[Array, Array]:
     """Unknowns (8,) s r1, s tx, r2, ty with |r2| = 1, s the aspect, and residuals (N,), px mm."""
     u, v = image[:, :1], image[:, 1:]
     whole = np.column_stack([points, np.ones(len(points))])
@@ -94,9 +94,9 @@ def _alignment(points: Array, image: Array) -> tuple[Array, Array]:
     return solved, rows @ solved
 
 
-def _aligned(points: Array, image: Array) -> tuple[Array, Array, float]:
+def _align(points: Array, image: Array) -> tuple[Array, Array, float]:
     """Rotation (3, 3), shift across (2,), aspect."""
-    solved, _ = _alignment(points, image)
+    solved, _ = _solve_alignment(points, image)
     aspect = float(np.linalg.norm(solved[:3]))
     first, second = solved[:4] / aspect, solved[4:]
     whole = np.column_stack([points, np.ones(len(points))])
