@@ -18,7 +18,7 @@ from bodyscan.mesh.topology import topology
 from bodyscan.report import charts
 from bodyscan.report.body_model import layers, light_mesh, shape_of
 from bodyscan.report.canvas import PICTURE_PX, png_of
-from bodyscan.report.comparison import comparison_section, map_limit
+from bodyscan.report.comparison_section import comparison_section, map_limit
 from bodyscan.report.model import pack
 from bodyscan.report.page import (
     Column,
