@@ -19,9 +19,7 @@ from pydantic import Field
 from bodyscan.files.model import Model
 
 Millimetres = Annotated[float, Field(gt=0)]
-MeshFormat = Literal["ply", "obj", "stl", "glb"]
 MeshVersion = Literal["full", "light", "open"]
-RigFormat = Literal["colmap", "opencv"]
 
 BODY_CENTRE_MM = (0.0, 0.0, 900.0)
 """Rig frame, mm: about where the middle of a standing person is. A pair's motion is told there, and
@@ -111,8 +109,9 @@ class ScanSettings(Model):
 class ExportSettings(Model):
     """A scan for other programs (`export.scan`)."""
 
-    formats: tuple[MeshFormat, ...] = Field(default=("ply", "obj", "stl", "glb"), min_length=1)
-    """files of each version; ply, obj, stl in mm, z up, glb in metres, y up."""
+    formats: tuple[str, ...] = Field(default=("ply", "obj", "stl", "glb"), min_length=1)
+    """files of each version, of the formats in bodyscan/export/formats; ply, obj, stl in mm, z up, glb
+    in metres, y up."""
 
     versions: tuple[MeshVersion, ...] = Field(default=("full", "light"), min_length=1)
     """full; light: 50,000 faces, which any viewer turns; open: without what was made up."""
@@ -124,8 +123,9 @@ class ExportSettings(Model):
 class RigExportSettings(Model):
     """A calibrated rig for other programs (`export.rig`)."""
 
-    formats: tuple[RigFormat, ...] = Field(default=("colmap", "opencv"), min_length=1)
-    """colmap: a text model with its rig; opencv: YAML, an entry a pair."""
+    formats: tuple[str, ...] = Field(default=("colmap", "opencv"), min_length=1)
+    """of those in bodyscan/export/rig_formats; colmap: a text model with its rig; opencv: YAML, an
+    entry a pair."""
 
 
 class Resources(Model):

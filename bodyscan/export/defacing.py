@@ -56,10 +56,12 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
         cap = vertices[rim].mean(axis=0)[None] if number else _dome(vertices[rim], crown_mm)
         all_vertices.append(cap)
         all_faces.append(_stitched(rim, start, len(cap)))
-    return _dressed(mesh, head, used, np.concatenate(all_vertices), np.concatenate(all_faces))
+    return _attach_attributes(
+        mesh, head, used, np.concatenate(all_vertices), np.concatenate(all_faces)
+    )
 
 
-def _dressed(
+def _attach_attributes(
     mesh: BodyMesh, head: Mask, used: Indices, vertices: Array, faces: Indices
 ) -> BodyMesh:
     """What was kept as it was, what was added grey, filled and without sigma."""

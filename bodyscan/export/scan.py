@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from bodyscan.errors import BadInput
+from bodyscan.export.body_file import Provenance, write_body
+from bodyscan.export.body_format import BODY_FORMATS
 from bodyscan.export.defacing import deface as without_face
-from bodyscan.export.exporting import MESH_FORMATS, Origin, export
 from bodyscan.export.neck import find_neck
+from bodyscan.files.model import did_you_mean
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
@@ -38,27 +40,28 @@ def export_scan(
     deface: bool = False,
     frame: str = "rig",
 ) -> list[Path]:
-    """Write the mesh in each format (ply, obj, stl, glb) and version; returns what was written.
+    """Write the mesh in each format (see `BODY_FORMATS`) and version; returns what was written.
 
     Versions: full, light (50,000 faces), open (without filled faces). Each file has a JSON beside
     it. deface: with a plain head instead of the subject's, below the neck as without. frame: rig, or
     body (origin under the body, x the way it faces). Raises BadInput for a format, version or frame
     that there is not, FailedWork where no neck is found.
     """
-    suffixes = [f".{name.strip().lower().lstrip('.')}" for name in formats]
-    asked = [(s, MESH_FORMATS) for s in suffixes] + [(v, VERSIONS) for v in versions]
-    for name, known in [*asked, (frame, FRAMES)]:
+    names = [name.strip().lower().removeprefix(".") for name in formats]
+    for name in names:
+        BODY_FORMATS.find(name)
+    for name, known in [*((version, VERSIONS) for version in versions), (frame, FRAMES)]:
         if name not in known:
             raise BadInput(
-                f"there is no {name.lstrip('.')!r} to export",
-                remedy=f"Choose from {', '.join(k.lstrip('.') for k in known)}.",
+                f"there is no {name!r} to export{did_you_mean(name, known)}",
+                remedy=f"Choose from {', '.join(known)}.",
             )
     placing = rig_from_body(scan.mesh.vertices) if frame == "body" else None
-    origin = Origin(
+    origin = Provenance(
         scan.facts.get("subject"),
         scan.facts["calibration_id"],
         deface,
-        found_by_scan(scan.facts),
+        scan_facts(scan.facts),
         placing,
     )
     neck = find_neck(scan.mesh.vertices, scan.mesh.faces) if deface else None
@@ -67,14 +70,14 @@ def export_scan(
         stem, made = VERSIONS[version]
         mesh = made(scan.mesh) if neck is None else without_face(made(scan.mesh), neck)
         if placing is not None:
-            mesh = carried(mesh, placing.inverse())
-        for suffix in suffixes:
-            written.append(folder / f"{stem}{suffix}")
-            export(written[-1], mesh, origin)
+            mesh = transform_mesh(mesh, placing.inverse())
+        for name in names:
+            written.append(folder / f"{stem}.{name}")
+            write_body(written[-1], mesh, origin)
     return written
 
 
-def found_by_scan(facts: Mapping[str, Any]) -> dict[str, Any]:
+def scan_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
     """What an export repeats of scan.json: the verdict, pairs left out, the subject's sway (mm)."""
     alignment = facts.get("alignment")
     return {
@@ -85,7 +88,7 @@ def found_by_scan(facts: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def carried(mesh: BodyMesh, a_from_b: RigidTransform) -> BodyMesh:
+def transform_mesh(mesh: BodyMesh, a_from_b: RigidTransform) -> BodyMesh:
     """A mesh given in b, in a."""
     return replace(
         mesh,

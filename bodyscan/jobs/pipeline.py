@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bodyscan.errors import BadInput
-from bodyscan.files.model import Model, Name, Problem
+from bodyscan.export.body_format import BODY_FORMATS
+from bodyscan.export.rig_format import RIG_FORMATS
+from bodyscan.files.model import Model, Name, Problem, alternatives, did_you_mean
 from bodyscan.files.model_file import apply_changes, load_model
 from bodyscan.settings import (
     AlignmentSettings,
@@ -54,6 +56,8 @@ class Pipeline(Model):
         every = {name for names in SECTIONS.values() for name in names}
         for name in sorted((every - set(own)) & self.model_fields_set):
             yield (name,), f"is for another kind of pipeline than {self.kind}"
+        yield from _unknown_formats("export", self.export.formats, BODY_FORMATS.names())
+        yield from _unknown_formats("rig_export", self.rig_export.formats, RIG_FORMATS.names())
 
     @property
     def scan(self) -> ScanSettings:
@@ -63,6 +67,15 @@ class Pipeline(Model):
     def section(self, name: str) -> dict[str, Any]:
         """One section as plain data."""
         return dict(getattr(self, name).model_dump(mode="json"))
+
+
+def _unknown_formats(
+    section: str, formats: Sequence[str], known: Sequence[str]
+) -> Iterator[Problem]:
+    for index, name in enumerate(formats):
+        if name not in known:
+            wrong = f"must be {alternatives(known)}{did_you_mean(name, known)} (got {name!r})"
+            yield (section, "formats", index), wrong
 
 
 def load_pipeline(path: Path, changes: Sequence[str] = ()) -> Pipeline:

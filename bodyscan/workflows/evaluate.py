@@ -14,7 +14,7 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
 from bodyscan.evaluation.body import coverage_of_seen, girth_errors, sway_residual
 from bodyscan.evaluation.surface import Deviation, deviation, normalized_errors, signed_distances
-from bodyscan.export.scan import carried
+from bodyscan.export.scan import transform_mesh
 from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.topology import topology
@@ -106,7 +106,7 @@ def evaluate_workspace(workspace: Path) -> str:
     still_from_rig = RigidTransform.identity()
     if truth.facts["settings"]["person"]["sway_mm"]:
         still_from_rig = place.rig_from_still.inverse()  # who sways stands nowhere in particular
-    body = carried(stored.mesh, still_from_rig)
+    body = transform_mesh(stored.mesh, still_from_rig)
     points = still_from_rig.apply(stored.cloud.points)
     cloud = signed_distances(points, truth.vertices, truth.faces)
     measured = np.unique(body.faces[~body.filled])

@@ -16,22 +16,24 @@ from small_bodies import ball, points
 
 from bodyscan import __version__
 from bodyscan.errors import BadInput
-from bodyscan.export.exporting import CLOUD_FORMATS, MESH_FORMATS, Origin, export
-from bodyscan.export.glb import write_glb
-from bodyscan.export.obj import write_obj
+from bodyscan.export.body_file import Provenance, write_body
+from bodyscan.export.decimal_text import format_decimals, format_integers, join_columns
+from bodyscan.export.formats.glb import write_glb
+from bodyscan.export.formats.obj import write_obj
+from bodyscan.export.formats.stl import write_stl
 from bodyscan.export.scan import export_scan
-from bodyscan.export.stl import write_stl
-from bodyscan.export.text import fixed, lines, whole
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.ply import read_ply_mesh
 
-ORIGIN = Origin("S-0042", "3f2a")
+MESH_FORMATS = ("ply", "obj", "stl", "glb")
+CLOUD_FORMATS = ("ply", "glb")
+ORIGIN = Provenance("S-0042", "3f2a")
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20), st.integers(0, 6))
 def test_fixed_writes_what_python_writes(values: list[float], decimals: int):
-    text = lines([fixed(np.array(values), decimals), "\n"]).decode().split()
+    text = join_columns([format_decimals(np.array(values), decimals), "\n"]).decode().split()
     assert len(text) == len(values)
     for mine, value in zip(text, values, strict=True):
         # Ties may round either way, since ours are scaled first: half a unit in the last place.
@@ -45,7 +47,7 @@ def test_fixed_writes_what_python_writes(values: list[float], decimals: int):
 
 @given(st.lists(st.integers(0, 10**7), min_size=1, max_size=20))
 def test_whole_writes_what_python_writes(values: list[int]):
-    assert lines(["f ", whole(np.array(values)), "\n"]).decode() == "".join(
+    assert join_columns(["f ", format_integers(np.array(values)), "\n"]).decode() == "".join(
         f"f {value}\n" for value in values
     )
 
@@ -152,10 +154,10 @@ def test_glb_cloud(tmp_path: Path):
     np.testing.assert_allclose(position[:, 1] * 1000.0, cloud.points[:, 2], atol=2e-4)
 
 
-@pytest.mark.parametrize("suffix", MESH_FORMATS)
+@pytest.mark.parametrize("suffix", [f".{name}" for name in MESH_FORMATS])
 def test_beside_each_mesh_stands_what_it_is(tmp_path: Path, suffix: str):
     mesh = ball()
-    export(tmp_path / f"body{suffix}", mesh, ORIGIN)
+    write_body(tmp_path / f"body{suffix}", mesh, ORIGIN)
     told = json.loads((tmp_path / f"body{suffix}.json").read_text())
     assert told["units"] == ("m" if suffix == ".glb" else "mm")
     assert told["axes"]["y"] == ("up" if suffix == ".glb" else "left")
@@ -169,9 +171,9 @@ def test_beside_each_mesh_stands_what_it_is(tmp_path: Path, suffix: str):
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"body{suffix}", f"body{suffix}.json"]
 
 
-@pytest.mark.parametrize("suffix", CLOUD_FORMATS)
+@pytest.mark.parametrize("suffix", [f".{name}" for name in CLOUD_FORMATS])
 def test_beside_each_cloud_too(tmp_path: Path, suffix: str):
-    export(tmp_path / f"cloud{suffix}", points(), ORIGIN)
+    write_body(tmp_path / f"cloud{suffix}", points(), ORIGIN)
     told = json.loads((tmp_path / f"cloud{suffix}.json").read_text())
     assert told["kind"] == "cloud"
     assert told["points"] == 500
@@ -182,14 +184,14 @@ def test_beside_each_cloud_too(tmp_path: Path, suffix: str):
 )
 def test_an_unknown_format_is_refused(tmp_path: Path, name: str, body):
     with pytest.raises(BadInput, match="cannot be written"):
-        export(tmp_path / name, body, ORIGIN)
+        write_body(tmp_path / name, body, ORIGIN)
     assert not list(tmp_path.iterdir())
 
 
 def test_the_same_body_gives_the_same_bytes(tmp_path: Path):
     for folder in ("one", "other"):
-        for suffix in MESH_FORMATS:
-            export(tmp_path / folder / f"body{suffix}", ball(), ORIGIN)
+        for name in MESH_FORMATS:
+            write_body(tmp_path / folder / f"body.{name}", ball(), ORIGIN)
     for path in (tmp_path / "one").iterdir():
         assert path.read_bytes() == (tmp_path / "other" / path.name).read_bytes()
 
@@ -203,9 +205,10 @@ def test_a_scan_in_several_versions(tmp_path: Path):
     told = json.loads((tmp_path / "body-open.ply.json").read_text())
     assert told["filled_faces"] == 0
     assert told["subject"] is None
-    for formats, versions in ((["fbx"], ["full"]), (["ply"], ["heavy"])):
-        with pytest.raises(BadInput, match="to export"):
-            export_scan(scan, tmp_path, formats, versions)
+    with pytest.raises(BadInput, match="cannot be written as 'fbx'"):
+        export_scan(scan, tmp_path, ["fbx"], ["full"])
+    with pytest.raises(BadInput, match="no 'heavy' to export"):
+        export_scan(scan, tmp_path, ["ply"], ["heavy"])
 
 
 def test_in_the_body_frame_the_body_faces_x_over_the_origin(tmp_path: Path):

@@ -8,13 +8,9 @@ from ring import ring_of_cameras, ring_rig
 
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput
-from bodyscan.export.rig import (
-    export_rig,
-    read_colmap_rig,
-    read_opencv_rig,
-    write_colmap_rig,
-    write_opencv_rig,
-)
+from bodyscan.export.rig import export_rig
+from bodyscan.export.rig_formats.colmap import read_colmap_rig, write_colmap_rig
+from bodyscan.export.rig_formats.opencv import read_opencv_rig, write_opencv_rig
 from bodyscan.geometry.camera_fields import to_fields
 from bodyscan.geometry.placing_covariance import PlacingCovariance
 from bodyscan.registration.rig_calibration import RigCalibration

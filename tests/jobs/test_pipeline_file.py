@@ -53,6 +53,10 @@ def test_changes_are_applied():
         ("fusion.points=many", '--set fusion.points: must be a whole number (got "many")'),
         ("fusion.points=10", "must be 1000 or more"),
         ("fusion.pionts=5000", "is no key known here"),
+        (
+            "export.formats=ply,obi",
+            "formats[1]: must be 'glb', 'obj', 'ply' or 'stl' (did you mean 'obj'",
+        ),
         ("nonsense", "is no change"),
         ("fusion.points.x=1", "has nothing inside"),
         ("rig_export.formats=colmap", "is for another kind"),

@@ -10,22 +10,16 @@ from typing import Any
 import numpy as np
 
 from bodyscan import __version__
-from bodyscan.errors import BadInput
-from bodyscan.export.glb import write_glb
-from bodyscan.export.obj import write_obj
-from bodyscan.export.stl import write_stl
+from bodyscan.export.body_format import BODY_FORMATS, BodyFormat
+from bodyscan.export.registry import unknown_format
 from bodyscan.files.atomic import write_json
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.mesh.ply import write_ply
 from bodyscan.mesh.topology import face_areas
-
-CLOUD_FORMATS = (".ply", ".glb")
-MESH_FORMATS = (".ply", ".obj", ".stl", ".glb")
 
 
 @dataclass(frozen=True)
-class Origin:
+class Provenance:
     """What a body was made from: the subject's pseudonym (if any) and the calibration.
 
     defaced: the head was replaced by a plain one.  found: what the scan says of itself (verdict,
@@ -39,39 +33,35 @@ class Origin:
     rig_from_body: RigidTransform | None = None
 
 
-def export(path: Path, body: BodyCloud | BodyMesh, origin: Origin) -> None:
+def write_body(path: Path, body: BodyCloud | BodyMesh, origin: Provenance) -> None:
     """Write `body` in the format that `path`'s suffix names, and `<path>.json` beside it.
 
     Raises BadInput for a suffix that is no format of ours, or none for a cloud.
     """
     path = Path(path)
-    suffix, is_cloud = path.suffix.lower(), isinstance(body, BodyCloud)
-    formats = CLOUD_FORMATS if is_cloud else MESH_FORMATS
-    if suffix not in formats:
-        what = "a cloud" if is_cloud else "a mesh"
-        raise BadInput(
-            f"{what} cannot be written as {suffix or 'a file without suffix'!r}",
-            where=str(path),
-            remedy=f"Choose one of {', '.join(formats)}.",
-        )
-    if suffix == ".ply":
-        write_ply(path, body)
-    elif suffix == ".glb":
-        write_glb(path, body)
-    elif isinstance(body, BodyMesh):
-        {".obj": write_obj, ".stl": write_stl}[suffix](path, body)
-    write_json(path.with_name(f"{path.name}.json"), description(path, body, origin))
+    format_ = _format_for(path, body)
+    format_.write(path, body)
+    write_json(path.with_name(f"{path.name}.json"), description(path.name, format_, body, origin))
 
 
-def description(path: Path, body: BodyCloud | BodyMesh, origin: Origin) -> dict[str, Any]:
-    """What the JSON beside an export says."""
-    metres = path.suffix.lower() == ".glb"
-    axes = {"x": "front", "y": "left", "z": "up"}
+def _format_for(path: Path, body: BodyCloud | BodyMesh) -> BodyFormat:
+    kind = "cloud" if isinstance(body, BodyCloud) else "mesh"
+    name = path.suffix.lower().removeprefix(".")
+    able = [known for known in BODY_FORMATS.names() if kind in BODY_FORMATS.find(known).holds]
+    if name not in able:
+        raise unknown_format(f"a {kind}", name or "a file without suffix", able, where=str(path))
+    return BODY_FORMATS.find(name)
+
+
+def description(
+    name: str, format_: BodyFormat, body: BodyCloud | BodyMesh, origin: Provenance
+) -> dict[str, Any]:
+    """What the JSON beside an exported file of that name says."""
     in_body = origin.rig_from_body
     said: dict[str, Any] = dict(origin.found) | {
-        "file": path.name,
-        "units": "m" if metres else "mm",
-        "axes": {"x": "left", "y": "up", "z": "front"} if metres else axes,
+        "file": name,
+        "units": format_.unit,
+        "axes": dict(zip("xyz", format_.axes, strict=True)),
         "frame": "rig" if in_body is None else "body",
         "origin": f"on the floor, {'at the rig centre' if in_body is None else 'under the body'}",
         "rig_from_frame": (in_body or RigidTransform.identity()).matrix,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.arrays import Bytes, Indices
+from bodyscan.export.body_format import BodyFormat
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 
@@ -110,3 +111,11 @@ def _document(
         "buffers": [{"byteLength": sum(len(chunk) for chunk in chunks)}],
     }
     return document, chunks
+
+
+FORMAT = BodyFormat(
+    write_glb,
+    holds=frozenset({"mesh", "cloud", "colours", "normals", "filled"}),
+    unit="m",
+    axes=("left", "up", "front"),
+)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bodyscan.arrays import Bytes, Indices
 
 
-def fixed(values: NDArray[np.floating], decimals: int) -> Bytes:
+def format_decimals(values: NDArray[np.floating], decimals: int) -> Bytes:
     """Numbers (N,) as rows of text (N, width), filled up in front with zero bytes.
 
     Rounded to `decimals` places; no number is written as -0.
@@ -23,12 +23,12 @@ def fixed(values: NDArray[np.floating], decimals: int) -> Bytes:
     return np.concatenate([sign, *(text if decimals else text[:1])], axis=1)
 
 
-def whole(values: NDArray[np.integer]) -> Bytes:
+def format_integers(values: NDArray[np.integer]) -> Bytes:
     """Whole numbers (N,), not negative, as rows of text (N, width)."""
     return _digits(values.astype(np.int64), 1)
 
 
-def lines(columns: Sequence[Bytes | str]) -> bytes:
+def join_columns(columns: Sequence[Bytes | str]) -> bytes:
     """Rows of text from columns, strings standing in every row; zero bytes left out."""
     count = next(len(column) for column in columns if not isinstance(column, str))
     parts = []

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bodyscan.export.body_format import BodyFormat
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyMesh
 
@@ -25,3 +26,6 @@ def write_stl(path: Path, mesh: BodyMesh) -> None:
         stream.write(HEADER.ljust(80, b"\0"))
         stream.write(np.uint32(len(triangles)).astype("<u4").tobytes())
         stream.write(triangles.data)
+
+
+FORMAT = BodyFormat(write_stl, holds=frozenset({"mesh"}))

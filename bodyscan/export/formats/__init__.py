@@ -1,0 +1,1 @@
+"""The formats in which a body is written: one file each, named as the format, that has FORMAT."""

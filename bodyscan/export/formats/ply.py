@@ -1,0 +1,11 @@
+"""PLY as bodyscan itself stores bodies: exact, and all that is known of them."""
+
+from __future__ import annotations
+
+from bodyscan.export.body_format import BodyFormat
+from bodyscan.mesh.ply import write_ply
+
+FORMAT = BodyFormat(
+    write_ply,
+    holds=frozenset({"mesh", "cloud", "colours", "normals", "sigma", "filled"}),
+)

@@ -1,0 +1,55 @@
+"""Formats by name: each is one file of a folder, imported when it is asked for."""
+
+from __future__ import annotations
+
+import pkgutil
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Generic, TypeVar, cast
+
+from bodyscan.errors import BadInput
+from bodyscan.files.model import did_you_mean
+
+Format = TypeVar("Format")
+
+
+@dataclass(frozen=True)
+class Registry(Generic[Format]):
+    """The modules of a package, of which each has a FORMAT, and what was registered besides.
+
+    package: its dotted name.  what: what its formats hold, such as "a mesh".
+    """
+
+    package: str
+    what: str
+    registered: dict[str, Format] = field(default_factory=dict)
+
+    def names(self) -> tuple[str, ...]:
+        """Of all formats; nothing is imported for that."""
+        modules = pkgutil.iter_modules(import_module(self.package).__path__)
+        return (*(module.name for module in modules), *self.registered)
+
+    def find(self, name: str) -> Format:
+        """The format of that name. Raises BadInput, with the list, if there is none."""
+        if name not in self.names():
+            raise unknown_format(self.what, name, self.names())
+        if name in self.registered:
+            return self.registered[name]
+        return cast(Format, import_module(f"{self.package}.{name}").FORMAT)
+
+    def register(self, name: str, format_: Format) -> None:
+        """Make a format known that lives elsewhere. Raises ValueError if the name is taken."""
+        if name in self.names():
+            raise ValueError(f"there is a format {name!r} already")
+        self.registered[name] = format_
+
+
+def unknown_format(what: str, name: str, known: Iterable[str], where: str = "") -> BadInput:
+    """An error that names the formats there are."""
+    known = tuple(known)
+    return BadInput(
+        f"{what} cannot be written as {name!r}{did_you_mean(name, known)}",
+        where=where,
+        remedy=f"choose from {', '.join(known)}",
+    )

@@ -1,0 +1,111 @@
+"""A new format is one new file, for bodies and for rigs: nothing else of the package names it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xyz_format
+from made_scan import make_scan
+from small_bodies import ball, points
+from typer.testing import CliRunner
+
+import bodyscan
+from bodyscan.cli.main import app
+from bodyscan.errors import BadInput
+from bodyscan.export.body_file import Provenance, write_body
+from bodyscan.export.body_format import BODY_FORMATS
+from bodyscan.export.rig_format import RIG_FORMATS
+from bodyscan.export.scan import export_scan
+from bodyscan.fusion.storage import StoredScan
+from bodyscan.jobs.pipeline import Pipeline
+
+SCAN = StoredScan(points(), ball(), {"subject": None, "calibration_id": "3f2a"})
+
+
+@pytest.fixture
+def registered():
+    BODY_FORMATS.register("xyz", xyz_format.FORMAT)
+    yield
+    del BODY_FORMATS.registered["xyz"]
+
+
+@pytest.mark.usefixtures("registered")
+def test_it_is_exported_as_all_are(tmp_path: Path):
+    (written,) = export_scan(SCAN, tmp_path, ["XYZ"], ["full"])
+    assert written == tmp_path / "body.xyz"
+    np.testing.assert_allclose(np.loadtxt(written)[:, :3], ball().vertices, atol=6e-4)
+    told = json.loads((tmp_path / "body.xyz.json").read_text())
+    assert (told["kind"], told["units"], told["axes"]["z"]) == ("mesh", "mm", "up")
+    write_body(tmp_path / "cloud.xyz", points(), Provenance(None, "3f2a"))
+    assert len(np.loadtxt(tmp_path / "cloud.xyz")) == 500
+    export = {"formats": ["ply", "xyz"]}
+    assert Pipeline(name="p", kind="fuse", export=export).export.formats == ("ply", "xyz")
+
+
+@pytest.mark.usefixtures("registered")
+def test_a_name_that_is_taken_is_refused():
+    for name in ("xyz", "ply"):
+        with pytest.raises(ValueError, match=f"there is a format '{name}' already"):
+            BODY_FORMATS.register(name, xyz_format.FORMAT)
+
+
+def test_a_format_that_there_is_not_is_named_with_those_there_are(tmp_path: Path):
+    with pytest.raises(BadInput, match=r"'xyz'") as caught:
+        export_scan(SCAN, tmp_path, ["xyz"])
+    assert caught.value.remedy == "choose from glb, obj, ply, stl"
+    with pytest.raises(BadInput, match=r"'gbl' \(did you mean 'glb'\?\)"):
+        export_scan(SCAN, tmp_path, ["gbl"])
+    with pytest.raises(BadInput, match=r"'opencvv' \(did you mean 'opencv'\?\)"):
+        RIG_FORMATS.find("opencvv")
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_are_known_without_importing_what_writes_them():
+    code = (
+        "import sys, bodyscan.jobs.pipeline as p; p.Pipeline(name='p', kind='fuse')\n"
+        "print([m for m in ('numpy', 'cv2', 'pycolmap') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path):
+    copy = tmp_path / "bodyscan"
+    package = Path(bodyscan.__file__).parent
+    shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(xyz_format.__file__, copy / "export" / "formats" / "xyz.py")
+    make_scan(tmp_path / "scan")
+    done = subprocess.run(
+        [sys.executable, "-m", "bodyscan", "export", "scan", "--format", "xyz"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "scan" / "export" / "body.xyz").is_file()
+
+
+@pytest.mark.usefixtures("registered")
+def test_the_command_says_which_formats_there_are(tmp_path: Path):
+    make_scan(tmp_path / "scan")
+    done = CliRunner().invoke(app, ["export", str(tmp_path / "scan"), "--format", "xyzz"])
+    assert "did you mean 'xyz'?" in str(done.exception)
+    assert "glb, obj, ply, stl, xyz" in str(done.exception)
+
+
+def test_the_docs_have_every_format_with_what_it_holds():
+    text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
+    rows = dict(re.findall(r"^\| `\.(\w+)` \| (.*?) \|", text, re.MULTILINE))
+    assert set(rows) == set(BODY_FORMATS.names())
+    for name, told in rows.items():
+        assert set(told.split(", ")) == set(BODY_FORMATS.find(name).holds), name
