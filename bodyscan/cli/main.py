@@ -298,13 +298,13 @@ def measure(
     from bodyscan.files.atomic import write_json
     from bodyscan.fusion.storage import load_scan
     from bodyscan.measurement.measurements import heights_from, measure
-    from bodyscan.report.measurements import document, tables
+    from bodyscan.report.measurements import measurements_document, tables
 
     levels = None if heights is None else heights_from(heights)
     stored = load_scan(result)
     measured = measure(stored.mesh, levels)
     path = out or result / "measurements.json"
-    write_json(path, document(measured, stored.facts))
+    write_json(path, measurements_document(measured, stored.facts))
     console.console.print(*tables(measured), sep="\n")
     console.console.print(f"measurements: {path}")
 

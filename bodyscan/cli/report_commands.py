@@ -123,13 +123,13 @@ def _judge(
 ) -> int:
     """Writes and prints what was found; returns the exit code."""
     from bodyscan.cli import console
-    from bodyscan.evaluation.acceptance_readings import document, figures
+    from bodyscan.evaluation.acceptance_readings import acceptance_document, figures
     from bodyscan.files.atomic import write_json, write_text
     from bodyscan.report.acceptance_page import NO_STANDARD, acceptance_page, screen_table
     from bodyscan.report.page import render
 
     found = figures(readings, file)
-    content = document(readings, found, file, synthetic=synthetic, calibration_id=origin)
+    content = acceptance_document(readings, found, file, synthetic=synthetic, calibration_id=origin)
     write_json(folder / "acceptance.json", content)
     page = acceptance_page(found, readings, rig.rig.name, origin, synthetic)
     write_text(folder / "acceptance.html", render(page))

@@ -132,7 +132,7 @@ def grade_acceptance(found: Sequence[Figure], readings: Readings) -> Verdict:
     return Verdict("accepted")
 
 
-def document(
+def acceptance_document(
     readings: Readings, found: Sequence[Figure], file: AcceptanceFile, **origin: Any
 ) -> dict[str, Any]:
     """What acceptance.json holds."""

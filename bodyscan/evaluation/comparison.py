@@ -41,7 +41,7 @@ class Comparison:
     other_from_scan: RigidTransform
 
 
-def compare(mesh: BodyMesh, other: Path) -> list[Comparison]:
+def compare_surfaces(mesh: BodyMesh, other: Path) -> list[Comparison]:
     """The mesh's measured part against `other`: a scan's folder or a PLY in mm, rig frame.
 
     First as they stand, then with the scan laid on the other as a whole.  Raises ResultError or

@@ -24,7 +24,7 @@ from bodyscan.laboratory.chapter.measuring import (
     true_approach,
 )
 from bodyscan.laboratory.chapter.point_sigma import point_sigma
-from bodyscan.laboratory.chapter.text import Reproduction, report
+from bodyscan.laboratory.chapter.text import Reproduction, reproduction_text
 from bodyscan.laboratory.rivals.approaches import Approach
 from bodyscan.progress import Progress, silent
 from bodyscan.reconstruction.triangulation import grid_normals
@@ -61,7 +61,7 @@ def reproduce(
     captures = take_captures(setup, stage_stops=stops, progress=progress)
     calibrated = calibrate_all(captures)
     found = _measure_all(captures, calibrated, seed, quick, real_light, progress)
-    text = report(found)
+    text = reproduction_text(found)
     draw(captures, calibrated, Path(out))
     write_text(Path(out) / TEXT, text)
     return text

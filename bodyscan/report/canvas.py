@@ -45,8 +45,8 @@ def colour_bar(scale: Scale, height_px: int) -> Bytes:
         share = (value - scale.low) / (scale.high - scale.low)
         row = round(bottom - share * (bottom - top))
         panel[row, 50:54] = INK
-        write_text(panel, f"{value:g}", (58, row + 5))
-    write_text(panel, scale.caption, (8, top - 20))
+        write_label(panel, f"{value:g}", (58, row + 5))
+    write_label(panel, scale.caption, (8, top - 20))
     return panel
 
 
@@ -59,7 +59,7 @@ def round_ticks(low: float, high: float) -> list[float]:
     return [float(np.round(k * step, 10)) + 0.0 for k in np.arange(first, last + 1)]
 
 
-def write_text(panel: Bytes, text: str, corner: tuple[int, int]) -> None:
+def write_label(panel: Bytes, text: str, corner: tuple[int, int]) -> None:
     cv2.putText(panel, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
 
 

@@ -44,7 +44,7 @@ def tables(measured: Measurements) -> Iterator[Table]:
     yield slices
 
 
-def document(measured: Measurements, facts: Mapping[str, Any]) -> dict[str, Any]:
+def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> dict[str, Any]:
     """What `measurements.json` says; facts: of the scan, as in its scan.json."""
     return {
         "schema": "bodyscan-measurements",

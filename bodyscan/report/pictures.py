@@ -24,7 +24,7 @@ from bodyscan.report.canvas import (
     colour_bar,
     save_panels,
     turbo,
-    write_text,
+    write_label,
 )
 
 FILLED_TINT = (60, 160, 255)  # blue, green, red: orange
@@ -205,7 +205,7 @@ def _view(view: str | View) -> View:
 def _write_name(panel: Bytes, view: str | View) -> Bytes:
     """The panel with the name of its view, if it has one, in its upper left corner."""
     if isinstance(view, str):
-        write_text(panel, view, (6, 16))
+        write_label(panel, view, (6, 16))
     return panel
 
 

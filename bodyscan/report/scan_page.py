@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bodyscan.errors import ResultError
-from bodyscan.evaluation.comparison import Comparison, compare
+from bodyscan.evaluation.comparison import Comparison, compare_surfaces
 from bodyscan.fusion import scan_verdict as limits
 from bodyscan.fusion.storage import FILE_NAME, SCHEMA, StoredScan, load_scan
 from bodyscan.mesh.holes import holes
@@ -53,7 +53,7 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
     sections: list[Section] = []
     if "sha256" in facts:
         scan = load_scan(folder)
-        found = compare(scan.mesh, other) if other is not None else []
+        found = compare_surfaces(scan.mesh, other) if other is not None else []
         sections = _sections(scan, found)
     return Page(
         f"Scan of {subject}" if subject else f"Scan {folder.resolve().name}",

@@ -20,7 +20,7 @@ from bodyscan.report.canvas import (
     colour_bar,
     save_panels,
     turbo,
-    write_text,
+    write_label,
 )
 from bodyscan.rig.rig import Volume
 
@@ -116,7 +116,7 @@ def _panel(values: Array, scale: Scale, caption: str, volume: Volume, height_px:
     for height in np.arange(0.0, volume.top_mm, 500.0):
         row = round(MARGIN_PX + (volume.top_mm - height) * px_per_mm)
         if row <= MARGIN_PX + tall + 5:
-            write_text(panel, f"{height:.0f}", (8, row))
+            write_label(panel, f"{height:.0f}", (8, row))
             cv2.line(panel, (MARGIN_PX - 8, row), (MARGIN_PX - 2, row), INK, 1)
-    write_text(panel, f"{caption}, mm", (MARGIN_PX, MARGIN_PX - 20))
+    write_label(panel, f"{caption}, mm", (MARGIN_PX, MARGIN_PX - 20))
     return panel

@@ -17,7 +17,7 @@ from bodyscan.laboratory.chapter.measuring import (
     whole_stripes,
 )
 from bodyscan.laboratory.chapter.point_sigma import point_sigma
-from bodyscan.laboratory.chapter.text import Reproduction, report
+from bodyscan.laboratory.chapter.text import Reproduction, reproduction_text
 from bodyscan.laboratory.reproduce import FIGURES, draw
 from bodyscan.reconstruction.triangulation import grid_normals
 
@@ -63,7 +63,7 @@ def test_boards_and_stage_are_wholly_in_the_picture(captures):
 
 def test_corners_are_the_simulated_boards(captures):
     camera = captures.setup.view.camera
-    places = [*apparatus.board_places(), *apparatus.stage_places(apparatus.stage_readings(3), 0)]
+    places = [*apparatus.board_poses(), *apparatus.stage_poses(apparatus.stage_readings(3), 0)]
     for shot, place in zip((*captures.boards, *captures.stage), places, strict=True):
         true = camera.image(place.apply(captures.setup.board.corners))[shot.view.corner_ids]
         # Two rays a pixel move an edge by up to 0.1 px in one pixel; a corner has thirty of them.
@@ -176,7 +176,7 @@ def test_the_report_says_all_of_it(tmp_path, captures, calibrated, measured):
         noise=noise_bound(captures),
         sigmas=(point_sigma(calibrated.ours, captures),),
     )
-    text = report(found)
+    text = reproduction_text(found)
     for wanted in ("Table 1", "Table 2", "mean square", "contradicts", "scale ppm", "noise alone"):
         assert wanted in text
     assert f"{fine[3].spheres[2].e_given:.5f}" in text

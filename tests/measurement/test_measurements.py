@@ -12,7 +12,7 @@ from made_bodies import cylinder, ellipsoid, mesh_of, together
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.measurements import measure
-from bodyscan.report.measurements import document, tables
+from bodyscan.report.measurements import measurements_document, tables
 
 SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
 
@@ -103,7 +103,7 @@ def test_no_body_at_that_height(subject):
 
 def test_table_and_document_say_the_same(subject):
     found = measure(subject, [900.0])
-    said = document(found, {"subject": "s1", "calibration_id": "c", "when": None})
+    said = measurements_document(found, {"subject": "s1", "calibration_id": "c", "when": None})
     assert said["stature_mm"] == found.stature_mm
     assert said["slices"][0]["girths"][-1]["tape_mm"] == found.slices[0].of("trunk").tape_mm
     assert [table.row_count for table in tables(found)] == [4, 3]

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from bodyscan.cli.main import app
 from bodyscan.errors import BadInput, ResultError
-from bodyscan.evaluation.comparison import compare
+from bodyscan.evaluation.comparison import compare_surfaces
 from bodyscan.files.atomic import write_json
 from bodyscan.jobs.forgetting import find_subject
 from bodyscan.mesh.holes import holes
@@ -115,7 +115,7 @@ def test_holes_are_found_where_nothing_was_measured():
 
 def test_a_larger_body_lies_outside_of_a_smaller_one(tmp_path: Path):
     small, large = make_scan(tmp_path / "small"), make_scan(tmp_path / "large", grown_mm=0.5)
-    standing, laid = compare(large.mesh, small.folder)
+    standing, laid = compare_surfaces(large.mesh, small.folder)
     assert (standing.fitted, laid.fitted) == (False, True)
     # A vertex went outwards by 0.5 mm of its place on the unit sphere; the normal has its share of it.
     place = (small.mesh.vertices[standing.vertices] - MIDDLE_MM) / SEMI_AXES_MM
@@ -132,7 +132,7 @@ def test_a_scan_that_stood_elsewhere_is_laid_on_the_other(tmp_path: Path):
     other = make_scan(tmp_path / "there")
     mesh = egg()
     away = replace(mesh, vertices=mesh.vertices + np.array([6.0, -4.0, 2.0]))
-    standing, laid = compare(away, other.folder)
+    standing, laid = compare_surfaces(away, other.folder)
     assert standing.figures.median_mm > 1.0
     assert laid.figures.p95_mm < 0.05
     assert laid.other_from_scan.translation == pytest.approx([-6.0, 4.0, -2.0], abs=0.3)
@@ -142,7 +142,7 @@ def test_a_surface_in_metres_is_refused(tmp_path: Path):
     ball = o3d.geometry.TriangleMesh.create_sphere(0.9)
     o3d.io.write_triangle_mesh(str(tmp_path / "metres.ply"), ball)
     with pytest.raises(BadInput, match="millimetres"):
-        compare(egg(20), tmp_path / "metres.ply")
+        compare_surfaces(egg(20), tmp_path / "metres.ply")
 
 
 def test_a_scan_without_a_model_has_a_report_of_why(tmp_path: Path):

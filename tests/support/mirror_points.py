@@ -56,7 +56,7 @@ def mirror_points(
     """On the chapter's three boards, as a perfect calibration of the camera has them."""
     rng = np.random.default_rng(0)
     parts = []
-    for number, place in enumerate(places or apparatus.board_places()):
+    for number, place in enumerate(places or apparatus.board_poses()):
         index, pixels = seen_on(place, stripe, every_px=every_px)
         pixels[:, 0] += noise_px * rng.standard_normal(len(pixels))
         sigma = np.full(len(index), max(noise_px, 0.01))

@@ -128,7 +128,7 @@ def true_planes(setup: ChapterSetup) -> Array:
     return planes * np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
 
 
-def board_places() -> list[RigidTransform]:
+def board_poses() -> list[RigidTransform]:
     """camera_from_board of the three poses."""
     return [place_about(m, t) for m, t in zip(BOARD_MIDDLES, BOARD_TURNS, strict=True)]
 
@@ -138,7 +138,7 @@ def stage_readings(count: int = len(STAGE_MM)) -> Array:
     return np.linspace(STAGE_MM[0], STAGE_MM[-1], count)
 
 
-def stage_places(readings: Array, seed: int) -> list[RigidTransform]:
+def stage_poses(readings: Array, seed: int) -> list[RigidTransform]:
     """camera_from_board at each stop: the stage slides along its board's own normal, and stops
     nearly where it should."""
     rng = np.random.default_rng([seed, STAGE])

@@ -122,7 +122,7 @@ class SigmaTrial:
 def sigma_trial(seeds: int, seed: int = 0) -> SigmaTrial:
     """Table 1's camera from the three poses, with `seeds` draws of corner noise."""
     corners = corner_points(TARGET.board)
-    places = apparatus.board_places()
+    places = apparatus.board_poses()
     seen = [apparatus.CAMERA.image(place.apply(corners)) for place in places]
     true, errors = from_fields(asdict(apparatus.CAMERA)), []
     for number in range(seeds):

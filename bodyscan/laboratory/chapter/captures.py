@@ -60,7 +60,7 @@ def take_captures(
 ) -> ChapterCaptures:
     """Render, expose and decode all of it. Raises BoardNotFound if a board is not found."""
     readings = apparatus.stage_readings(stage_stops)
-    boards, stage = apparatus.board_places(), apparatus.stage_places(readings, setup.seed)
+    boards, stage = apparatus.board_poses(), apparatus.stage_poses(readings, setup.seed)
     total = len(boards) + len(stage) + 2
     progress("rendering", 0, total)
     shots = []
@@ -70,9 +70,9 @@ def take_captures(
         name = f"stage{of_stage + 1}" if of_stage >= 0 else f"board{number + 1}"
         shots.append(_board_shot(setup, place, name, stream))
         progress("rendering", number + 1, total)
-    spheres = _expose(setup, scenes.sphere_surfaces(), _SPHERES)
+    spheres = _expose(setup, scenes.sphere_scene(), _SPHERES)
     progress("rendering", total - 1, total)
-    plate = _expose(setup, scenes.plane_surfaces(), _PLATE)
+    plate = _expose(setup, scenes.plate_scene(), _PLATE)
     progress("rendering", total, total)
     return ChapterCaptures(
         setup,
@@ -87,7 +87,7 @@ def take_captures(
 
 
 def _board_shot(setup: ChapterSetup, place: RigidTransform, shot: str, number: int) -> StripedShot:
-    taken = scenes.expose_scene(setup, scenes.board_surfaces(setup, place), number)
+    taken = scenes.expose_scene(setup, scenes.board_scene(setup, place), number)
     views = find_boards(taken.lit, [apparatus.BOARD], pair="chapter", shot=shot)
     if not views:
         raise BoardNotFound("the simulated board was not found", where=f"shot {shot}")

@@ -34,12 +34,12 @@ class Exposure:
     stripes: StripeMap
 
 
-def board_surfaces(setup: ChapterSetup, camera_from_board: RigidTransform) -> list[Surface]:
+def board_scene(setup: ChapterSetup, camera_from_board: RigidTransform) -> list[Surface]:
     """The board, and a wall behind it."""
     return [*(surface.moved(camera_from_board) for surface in setup.board.surfaces), _wall()]
 
 
-def sphere_surfaces() -> list[Surface]:
+def sphere_scene() -> list[Surface]:
     """Five white spheres on the ground, and a wall behind."""
     mesh = o3d.geometry.TriangleMesh.create_sphere(apparatus.RADIUS_MM, resolution=SPHERE_RINGS)
     arms = np.asarray(mesh.vertices)
@@ -48,7 +48,7 @@ def sphere_surfaces() -> list[Surface]:
     return [*spheres, _ground(), _wall()]
 
 
-def plane_surfaces() -> list[Surface]:
+def plate_scene() -> list[Surface]:
     """A flat white plate, somewhat smaller than the board: no calibration reaches beyond that."""
     place = apparatus.place_about(apparatus.PLATE_MIDDLE, apparatus.PLATE_TURN, middle=np.zeros(3))
     width, height = apparatus.PLATE_MM

@@ -40,7 +40,7 @@ class Reproduction:
     sigmas: tuple[PointSigma, ...]
 
 
-def report(found: Reproduction) -> str:
+def reproduction_text(found: Reproduction) -> str:
     """Everything, as one text."""
     parts = [
         _heading(found),
