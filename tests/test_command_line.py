@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
+import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from bodyscan.cli.main import app
+from bodyscan.cli.options import SHARED
+from bodyscan.settings import ExportSettings, RigExportSettings, ScanSettings
+
 RIGS = Path(__file__).parents[1] / "rigs"
-HEAVY = ("open3d", "pycolmap", "cv2", "scipy")
+HEAVY = ("open3d", "pycolmap", "cv2", "scipy", "numba")
 
 
 def bodyscan(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -62,3 +71,78 @@ def test_the_version_needs_no_command():
     done = bodyscan("--version")
     assert done.returncode == 0
     assert done.stdout.startswith("bodyscan ")
+
+
+COMMANDS = {command.name: command for command in app.registered_commands}
+
+
+def parameters(name: str) -> dict[str, inspect.Parameter]:
+    return dict(inspect.signature(COMMANDS[name].callback).parameters)
+
+
+def test_commands_stand_in_three_groups():
+    said = bodyscan("--help").stdout
+    places = [said.index(group) for group in ("Builder", "Operator", "Laboratory")]
+    assert places == sorted(places)
+    assert "--install-completion" in said
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_takes_the_shared_options(name):
+    own = parameters(name)
+    assert [own[shared.name] for shared in SHARED] == SHARED
+
+
+def test_defaults_are_those_of_the_settings():
+    scan = ScanSettings()
+    assert parameters("scan")["points"].default == scan.fusion.points
+    assert parameters("scan")["align"].default == scan.alignment.matching
+    assert parameters("export")["formats"].default == ",".join(ExportSettings().formats)
+    assert parameters("export-rig")["formats"].default == ",".join(RigExportSettings().formats)
+
+
+def test_the_page_of_commands_is_as_the_commands_are():
+    docs = RIGS.parent / "docs"
+    page = runpy.run_path(str(docs / "write_commands.py"))["page"]
+    assert page() == (docs / "commands.md").read_text("utf-8"), "run docs/write_commands.py"
+
+
+def test_json_is_one_document_that_says_what_was_made(tmp_path):
+    done = bodyscan("patterns", RIGS / "one-pair.yaml", "--out", tmp_path, "--width", 300,
+                    "--height", 48, "--json")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert document["command"] == "patterns"
+    assert document["exit_code"] == 0
+    assert document["error"] is None
+    (order,) = next(iter(document["made"].values()))
+    assert Path(order).is_file()
+    assert document["notes"]  # stripes that cannot be equally wide on so few pixels
+
+
+def test_json_says_what_went_wrong_too(tmp_path):
+    done = bodyscan("scan", tmp_path, "--calibration", tmp_path, "--json")
+    assert done.returncode == 2
+    document = json.loads(done.stdout)
+    assert document["exit_code"] == 2
+    assert "calibration.json" in document["error"]["where"]
+    assert "calibrate-rig" in document["error"]["remedy"]
+
+
+def test_quiet_says_nothing_but_errors(tmp_path):
+    done = bodyscan("patterns", RIGS / "one-pair.yaml", "--out", tmp_path, "--width", 300,
+                    "--height", 48, "--quiet")  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    wrong = bodyscan("check", RIGS / "three-pole-12.yaml", "--quiet")
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    assert "captures/calibration" in wrong.stderr
+
+
+def test_libraries_that_print_do_not_spoil_the_document(capfd):
+    from bodyscan.cli.console import Output
+
+    with Output("x", json=True):
+        subprocess.run(["echo", "a library's warning"], check=True)
+    said = capfd.readouterr()
+    assert json.loads(said.out)["command"] == "x"
+    assert "a library's warning" in said.err

@@ -1,26 +1,187 @@
-"""What the command line shows: a bar for what takes longer than a second, times, tables."""
+"""What a command tells of its work: to a person as text, to another program as one JSON document.
+
+Text and documents go to standard output, errors and progress to standard error.  A command is a
+function whose first parameter is its `Output`; `add_command` gives it the options that all share.
+"""
 
 from __future__ import annotations
 
+import inspect
+import math
+import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from functools import wraps
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Bar
-from rich.table import Table
+import typer
+from rich.console import Console, RenderableType
 
-from bodyscan.fusion.scan import Scan
-from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.verdict import Verdict
+from bodyscan.cli.options import SHARED
+from bodyscan.errors import BodyscanError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
+
+    from bodyscan.outcome import Outcome
+    from bodyscan.verdict import Verdict
 
 # Tables keep their lines whole when the output goes into a file.
-console = Console() if sys.stdout.isatty() else Console(width=120)
-errors = Console(stderr=True)
+CONSOLE = Console() if sys.stdout.isatty() else Console(width=120)
+ERRORS = Console(stderr=True)
+MOST_NOTES = 20  # are shown without --verbose, the first line of each
+STYLES = {"good": "green", "usable": "yellow", "bad": "red"}
+
+
+@dataclass
+class Output:
+    """Collects what was made and what has to be said of it; shows it as it comes, or as JSON.
+
+    exit_code: 1 where the work came to its end but its result must not be used as it is.
+    """
+
+    command: str
+    json: bool = False
+    quiet: bool = False
+    verbose: bool = False
+    exit_code: int = 0
+    _made: dict[str, list[str]] = field(default_factory=dict)
+    _figures: dict[str, Any] = field(default_factory=dict)
+    _lines: list[str] = field(default_factory=list)
+    _notes: list[str] = field(default_factory=list)
+    _failures: dict[str, str] = field(default_factory=dict)
+    _verdict: Verdict | None = None
+    _seconds: dict[str, float] = field(default_factory=dict)
+    _standard_output: int | None = None
+    _events: bool = False
+
+    @property
+    def silent(self) -> bool:
+        """Whether nothing is shown to a person."""
+        return self.json or self.quiet
+
+    def made(self, what: str, *paths: Path) -> None:
+        """Files or folders that were written."""
+        self._made.setdefault(what, []).extend(str(path) for path in paths)
+        self._print(f"{what}: {', '.join(map(str, paths))}")
+
+    def say(self, *lines: str, wrong: bool = False) -> None:
+        """Findings in words; `wrong`: --quiet shows them too, for they are why the command fails."""
+        self._lines += lines
+        for line in lines:
+            self._print(line, wrong=wrong)
+
+    def show(self, *tables: RenderableType) -> None:
+        """Tables, which --json leaves to `figures`."""
+        if not self.silent:
+            CONSOLE.print(*tables, sep="\n")
+
+    def figures(self, **values: Any) -> None:
+        """Numbers for --json; people see them in tables."""
+        self._figures |= values
+
+    def notes(self, notes: Iterable[str], what: str = "note") -> None:
+        """What a person should know; without --verbose the first line of the first few."""
+        every = list(notes)
+        self._notes += every
+        for note in every if self.verbose else every[:MOST_NOTES]:
+            shown = note if self.verbose else note.partition("\n")[0]
+            self._print(f"{what}: {shown}", style="yellow")
+        if len(every) > MOST_NOTES and not self.verbose:
+            self._print(f"and {len(every) - MOST_NOTES} more: see --verbose", style="yellow")
+
+    def failures(self, failures: Mapping[str, str], what: str = "failed") -> None:
+        """Pairs that were lost, with the reason."""
+        self._failures |= failures
+        for name, reason in failures.items():
+            self._print(f"{what}: {name}: {reason}", style="red")
+
+    def told(self, outcome: Outcome[Any], what: str = "left out") -> None:
+        """Notes and failures of a step."""
+        self.notes(outcome.notes)
+        self.failures(outcome.failures, what)
+
+    def verdict(self, verdict: Verdict) -> None:
+        """A grade and its reasons."""
+        self._verdict = verdict
+        self._print(str(verdict), style=STYLES[verdict.mark], wrong=verdict.mark == "bad")
+
+    @contextmanager
+    def stages(self) -> Iterator[StageClock]:
+        """A bar for the stages of the work, whose times --verbose shows."""
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as Bar
+
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+        with Bar(*columns, TimeElapsedColumn(), console=ERRORS, disable=self.quiet) as bar:
+            clock = StageClock(bar)
+            try:
+                yield clock
+            finally:
+                clock.finish()
+                self._seconds |= clock.seconds
+        if self.verbose:
+            from bodyscan.cli.tables import times_table
+
+            self.show(times_table(clock.seconds))
+
+    def as_document(self, error: BodyscanError | None = None) -> dict[str, Any]:
+        """What --json prints; docs/commands.md says what each key holds."""
+        return {
+            "command": self.command,
+            "exit_code": error.exit_code if error else self.exit_code,
+            "made": self._made,
+            "figures": _finite(self._figures),
+            "lines": self._lines,
+            "notes": self._notes,
+            "failures": self._failures,
+            "verdict": asdict(self._verdict) if self._verdict else None,
+            "seconds": {stage: round(taken, 3) for stage, taken in self._seconds.items()},
+            "error": error and {"what": error.what, "where": error.where, "remedy": error.remedy},
+        }
+
+    def tell_events(self) -> None:
+        """The command writes JSON of its own to standard output, event by event."""
+        self._give_back()
+        self._events = True
+
+    def __enter__(self) -> Output:
+        if self.json:
+            # Libraries print what they like on standard output, which is for the document alone.
+            sys.stdout.flush()
+            self._standard_output = os.dup(1)
+            os.dup2(2, 1)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._give_back()
+        known = error if isinstance(error, BodyscanError) else None
+        if self.json and not self._events and (known or error is None):
+            from bodyscan.files.atomic import json_text
+
+            sys.stdout.write(json_text(self.as_document(known)))
+
+    def _give_back(self) -> None:
+        if self._standard_output is not None:
+            os.dup2(self._standard_output, 1)
+            os.close(self._standard_output)
+            self._standard_output = None
+
+    def _print(self, text: str, style: str | None = None, wrong: bool = False) -> None:
+        if self.json or (self.quiet and not wrong):
+            return
+        console = ERRORS if self.quiet else CONSOLE
+        console.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
 
 
 @dataclass
@@ -30,7 +191,7 @@ class StageClock:
     bar: Bar
     seconds: dict[str, float] = field(default_factory=dict)
     _running: tuple[str, float] | None = None
-    _tasks: dict[str, int] = field(default_factory=dict)
+    _tasks: dict[str, Any] = field(default_factory=dict)
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         now = time.perf_counter()
@@ -39,7 +200,7 @@ class StageClock:
             self._running = (stage, now)
         if stage not in self._tasks:
             self._tasks[stage] = self.bar.add_task(stage, total=total)
-        self.bar.update(self._tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
+        self.bar.update(self._tasks[stage], completed=done, total=total)
 
     def _close(self, now: float) -> None:
         if self._running is not None:
@@ -51,87 +212,32 @@ class StageClock:
         self._close(time.perf_counter())
 
 
-@contextmanager
-def stage_clock() -> Iterator[StageClock]:
-    """A progress bar for the stages of one command."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Bar(*columns, TimeElapsedColumn(), console=errors) as bar:
-        clock = StageClock(bar)
-        try:
-            yield clock
-        finally:
-            clock.finish()
+def _finite(value: Any) -> Any:
+    """The same with None for what is no number: JSON has no NaN."""
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def times_table(seconds: dict[str, float]) -> Table:
-    """Seconds of each stage and of all."""
-    table = Table("stage", "seconds", title="time")
-    table.columns[1].justify = "right"
-    for stage, taken in seconds.items():
-        table.add_row(stage, f"{taken:.1f}")
-    table.add_row("all", f"{sum(seconds.values()):.1f}", style="bold")
-    return table
+def add_command(app: typer.Typer, panel: str, function: Callable[..., None]) -> None:
+    """Add `function` to the commands under its own name, with --json, --quiet and --verbose.
 
+    Its first parameter is the Output that it tells what it makes; the others are its options.
+    """
+    name = function.__name__.rstrip("_").replace("_", "-")
+    _, *own = inspect.signature(function, eval_str=True).parameters.values()
+    parameters = [*(one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own), *SHARED]
 
-def calibration_table(calibration: RigCalibration) -> Table:
-    """One row a pair: residuals, stripes, position and its sigma in the rig frame."""
-    from bodyscan.geometry.placing_covariance import position_sigma
+    @wraps(function)
+    def run(*, json: bool, quiet: bool, verbose: bool, **given: Any) -> None:
+        with Output(name, json, quiet, verbose) as output:
+            function(output, **given)
+        raise typer.Exit(output.exit_code)
 
-    table = Table(title=f"rig {calibration.rig.name}")
-    for heading in (
-        "pair",
-        "corners RMS px",
-        "poses",
-        "light",
-        "sheets RMS mm",
-        "stripes",
-        "position mm (x, y, z)",
-        "sigma mm",
-    ):
-        table.add_column(heading, justify="left" if heading == "pair" else "right")
-    for name, pair in calibration.pairs.items():
-        quality = pair.quality
-        place = calibration.rig_from_camera[name].translation
-        sigma = position_sigma(calibration.covariance, name, place)
-        table.add_row(
-            name,
-            f"{quality.corners_rms_px:.3f}",
-            str(quality.poses),
-            quality.light_model or "-",
-            "-" if quality.planes_rms_mm is None else f"{quality.planes_rms_mm:.3f}",
-            f"{quality.stripes_calibrated} of {quality.stripes_projected}"
-            if pair.light is not None
-            else "-",
-            " ".join(f"{value:.1f}" for value in place),
-            " ".join(f"{value:.3f}" for value in sigma),
-        )
-    for name in calibration.failed:
-        table.add_row(name, "failed", *["-"] * 6, style="red")
-    return table
-
-
-def print_verdict(verdict: Verdict) -> None:
-    """Good, usable or repeat, and the reasons."""
-    style = {"good": "green", "usable": "yellow", "repeat": "red"}[verdict.grade]
-    console.print(str(verdict), style=style, highlight=False, markup=False)
-
-
-def scan_table(scan: Scan) -> Table:
-    """What a scan gave: counts, error bars, alignment."""
-    table = Table("", "", title="body model", show_header=False)
-    table.columns[1].justify = "right"
-    cloud, surface = scan.cloud, scan.mesh
-    table.add_row("pairs measured", str(sum(points > 0 for points in scan.measured.values())))
-    table.add_row("points measured by all pairs", f"{sum(scan.measured.values()):,}")
-    table.add_row("points in the cloud", f"{len(cloud.points):,}")
-    table.add_row("sigma of a point, median", f"{np.nanmedian(cloud.sigma_mm):.3f} mm")
-    table.add_row("faces of the mesh", f"{len(surface.faces):,}")
-    table.add_row("of its surface made up", f"{100.0 * surface.filled_share:.1f} %")
-    if scan.alignment is not None:
-        farthest = max(scan.alignment.motion_mm.items(), key=lambda item: item[1])
-        before, after = scan.alignment.rms_before_mm, scan.alignment.rms_after_mm
-        table.add_row("overlaps before, after alignment", f"{before:.3f}, {after:.3f} mm RMS")
-        table.add_row("farthest moved", f"{farthest[0]}, {farthest[1]:.2f} mm")
-        for name, sigmas in scan.alignment.refused.items():
-            table.add_row("left where it was", f"{name} (asked for {sigmas:.1f} sigmas)")
-    return table
+    # What typer reads is the wrapped function's parameters, without the Output, and the shared.
+    del run.__wrapped__
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    app.command(name, rich_help_panel=panel)(run)

@@ -32,6 +32,12 @@ def json_lines() -> Iterator[Listen]:
 
 
 @contextmanager
+def silence() -> Iterator[Listen]:
+    """Nothing: errors alone are told."""
+    yield lambda event: None
+
+
+@contextmanager
 def screen() -> Iterator[Listen]:
     """One bar for all jobs with the time left, a line for each that runs, one for each that ended."""
     columns = (

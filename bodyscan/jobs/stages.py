@@ -65,23 +65,9 @@ def scan_inputs(job: Job) -> dict[str, Path]:
 
 def run_scan(job: Job, out: Path, progress: Progress) -> None:
     """As `bodyscan scan` does: cloud, mesh, what they are, pictures."""
-    from bodyscan.fusion.storage import save_scan
-    from bodyscan.registration.storage import calibration_id, load_calibration
-    from bodyscan.report.pictures import draw_scan
-    from bodyscan.workflows.scan_person import scan_person
+    from bodyscan.workflows.scan_folder import scan_folder
 
-    calibration = load_calibration(_calibration(job))
-    captures = open_scan(calibration.rig, job.source)
-    result = scan_person(calibration, captures, job.pipeline.scan, progress)
-    save_scan(
-        result,
-        out,
-        calibration_id=calibration_id(_calibration(job)),
-        subject=captures.subject,
-        when=captures.when,
-    )
-    with step(progress, "drawing"):
-        draw_scan(result.cloud, result.mesh, out)
+    scan_folder(job.source, _calibration(job), out, job.pipeline.scan, progress)
 
 
 def run_export(job: Job, out: Path, progress: Progress) -> None:

@@ -1,0 +1,169 @@
+"""The builder's commands: a rig described, calibrated, looked at, kept right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bodyscan.cli.console import Output, add_command
+from bodyscan.cli.options import (
+    Calibration,
+    CalibrationArgument,
+    OutFolder,
+    RigFile,
+    refuse_file,
+)
+from bodyscan.settings import RigExportSettings
+
+PANEL = "Builder: calibrate a rig"
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the command line, in the order in which a rig needs them."""
+    for command in (
+        check,
+        patterns,
+        calibrate_rig,
+        check_calibration,
+        refine_rig,
+        sigma_map,
+        export_rig,
+    ):
+        add_command(app, PANEL, command)
+
+
+def check(output: Output, rig_file: RigFile) -> None:
+    """Validate a rig file and its capture folders, and list what is missing."""
+    from bodyscan.captures.check import check as look_over
+    from bodyscan.captures.check import report_lines
+
+    found = look_over(rig_file)
+    output.say(*report_lines(found), wrong=not found.ok)
+    output.figures(images=found.images, shots=len(found.shots))
+    output.exit_code = 0 if found.ok else 2
+
+
+def patterns(
+    output: Output,
+    rig_file: RigFile,
+    out: OutFolder,
+    width: Annotated[int, typer.Option(min=1, max=32767, help="Of the projector, px.")] = 1920,
+    height: Annotated[int, typer.Option(min=1, max=32767, help="Of the projector, px.")] = 1080,
+) -> None:
+    """Write the images that a rig's projectors are to show, as PNG, with their order."""
+    from bodyscan.captures.pattern_files import uneven_stripes, write_patterns
+    from bodyscan.rig.rig_file import load_rig
+
+    refuse_file(out)
+    rig = load_rig(rig_file)
+    orders = write_patterns(rig, out, width, height)
+    output.notes(uneven_stripes(rig, width, height))
+    for order in orders:
+        output.made("patterns, in the order of", order)
+
+
+def calibrate_rig(
+    output: Output,
+    rig_file: RigFile,
+    out: Annotated[
+        Path | None, typer.Option(help="Default: `calibration` beside the rig file.")
+    ] = None,
+) -> None:
+    """Calibrate every pair of a rig and join them in one frame."""
+    from bodyscan.captures.folder import open_captures
+    from bodyscan.cli import tables
+    from bodyscan.registration.storage import save_calibration
+    from bodyscan.rig.rig_file import load_rig
+    from bodyscan.workflows.calibrate_rig import calibrate_rig as calibrate
+
+    refuse_file(out)
+    rig = load_rig(rig_file)
+    captures = open_captures(rig, rig_file)
+    with output.stages() as progress:
+        found = calibrate(rig, captures, progress)
+    saved = save_calibration(found, out or rig_file.parent / "calibration")
+    output.notes(found.notes)
+    output.failures(found.failed)
+    output.show(tables.calibration_table(found))
+    output.figures(**tables.calibration_figures(found))
+    output.say(*found.advice)
+    output.made("calibration", saved)
+
+
+def check_calibration(
+    output: Output,
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="FOLDER...", help="A board's shots, or scans of people.")
+    ],
+    calibration: Calibration,
+    repair: Annotated[
+        Path | None,
+        typer.Option(help="Write a calibration with what moved put right into this folder."),
+    ] = None,
+) -> None:
+    """Say whether the rig still is what it was, and which pair or pole moved by how much."""
+    from bodyscan.registration.storage import load_calibration, save_calibration
+    from bodyscan.workflows.check_rig import check_rig
+
+    rig = load_calibration(calibration)
+    with output.stages() as progress:
+        found = check_rig(rig, folders, progress)
+    output.say(*found.lines, wrong=not found.valid)
+    output.figures(valid=found.valid)
+    if repair is not None:
+        output.made("repaired", save_calibration(found.repaired(rig), repair))
+    output.exit_code = 0 if found.valid else 1
+
+
+def refine_rig(
+    output: Output,
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="A scan of a rigid object that stood still.")
+    ],
+    calibration: Calibration,
+    out: Annotated[Path, typer.Option(help="Folder for the refined calibration.")],
+) -> None:
+    """Bring the pairs closer together on an object they scanned, within what the boards allow."""
+    from bodyscan.captures.folder import open_scan
+    from bodyscan.registration.storage import load_calibration, save_calibration
+    from bodyscan.workflows.refine_rig import refine_rig as refine
+
+    refuse_file(out)
+    rig = load_calibration(calibration)
+    with output.stages() as progress:
+        found = refine(rig, open_scan(rig.rig, folder), folder.name, progress)
+    output.failures(found.failures, "left out")
+    output.say(*found.notes)
+    output.made("calibration", save_calibration(found.value, out))
+
+
+def sigma_map(
+    output: Output,
+    calibration: CalibrationArgument,
+    out: Annotated[
+        Path | None, typer.Option(help="Default: `sigma-map.png` beside the calibration.")
+    ] = None,
+) -> None:
+    """Draw how well the rig's placing knows each place of the scan volume, front and side."""
+    from bodyscan.workflows.draw_sigma_map import draw_sigma_map
+
+    output.made("picture", draw_sigma_map(calibration, out))
+
+
+def export_rig(
+    output: Output,
+    calibration: CalibrationArgument,
+    out: OutFolder,
+    formats: Annotated[str, typer.Option("--format", help="Comma-separated.")] = ",".join(
+        RigExportSettings().formats
+    ),
+) -> None:
+    """Write a calibrated rig for other programs: a COLMAP model with rig, OpenCV's YAML."""
+    from bodyscan.export.rig import export_rig as write
+    from bodyscan.registration.storage import load_calibration
+
+    refuse_file(out)
+    for path in write(load_calibration(calibration), out, formats.split(",")):
+        output.made("rig", path)

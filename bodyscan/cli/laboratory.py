@@ -1,0 +1,174 @@
+"""The laboratory's commands: what is simulated, measured against truth, accepted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from bodyscan.cli.console import Output, add_command
+from bodyscan.cli.options import OutFolder, Overwrite, RigFile, refuse_file
+from bodyscan.errors import BadInput
+from bodyscan.progress import step
+
+PANEL = "Laboratory: simulate, measure against truth, accept"
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the command line."""
+    for command in (simulate, evaluate, accept, reproduce):
+        add_command(app, PANEL, command)
+
+
+def simulate(
+    output: Output,
+    rig_file: RigFile,
+    out: OutFolder,
+    subject: Annotated[
+        Path | None, typer.Option(help="A body surface (PLY, metres, z up, facing -y).")
+    ] = None,
+    scale: Annotated[
+        float, typer.Option(min=0.1, max=4.0, help="Of image size and number of stripes.")
+    ] = 1.0,
+    seed: Annotated[int, typer.Option(help="Of every random draw.")] = 0,
+    projector: Annotated[
+        Literal["mirror", "pinhole"],
+        typer.Option(help="A laser and a rotating mirror, or a projector with a lens."),
+    ] = "mirror",
+    sway_mm: Annotated[
+        float, typer.Option(min=0.0, help="How far the person moves while the pairs capture.")
+    ] = 0.0,
+    board_shots: Annotated[
+        int | None, typer.Option(min=3, help="Number of board poses; 40 for twelve pairs.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Simulate captures of a rig, a board and (with --subject) a person, with known truth."""
+    refuse_file(out)
+    if not overwrite and ((out / "captures").exists() or (out / "rig.yaml").exists()):
+        raise BadInput(
+            "this folder holds captures already, which would be written over",
+            where=str(out),
+            remedy="give another --out, or say --overwrite",
+        )
+    from bodyscan.simulation import settings_for
+    from bodyscan.simulation import simulate as run
+
+    with output.stages() as progress:
+        run(
+            rig_file,
+            out,
+            subject=subject,
+            scale=scale,
+            seed=seed,
+            settings=settings_for(projector, sway_mm=sway_mm),
+            board_shots=board_shots,
+            progress=progress,
+        )
+    output.made("captures", out / "captures")
+    output.made("rig file", out / "rig.yaml")
+
+
+def evaluate(
+    output: Output,
+    workspace: Annotated[
+        Path, typer.Argument(metavar="WORKSPACE", help="--out of simulate, calibrated and scanned.")
+    ],
+) -> None:
+    """Compare the calibration and scan of a simulated workspace with the truth beside it."""
+    from bodyscan.workflows.evaluate import evaluate_workspace
+
+    with output.stages() as progress, step(progress, "comparing"):
+        text = evaluate_workspace(workspace)
+    output.say(*text.splitlines())
+
+
+def accept(
+    output: Output,
+    artefact: Annotated[
+        Path | None,
+        typer.Argument(metavar="ARTEFACT.YAML", help="Artefacts as calibrated, and limits."),
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="What calibrate-rig wrote; with --simulate: that beside it.")
+    ] = None,
+    spheres: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FOLDER", help="A scan of the spheres at one place; repeatable."),
+    ] = None,
+    plate: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FOLDER", help="A scan of the plate at one place; repeatable."),
+    ] = None,
+    simulate: Annotated[
+        Path | None,
+        typer.Option(metavar="WORKSPACE", help="Simulate the artefacts in this simulated rig."),
+    ] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="Simulated shots of each place.")] = 2,
+    places: Annotated[
+        int | None, typer.Option(min=1, help="Simulate only so many of the places.")
+    ] = None,
+    limit: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=MM", help="Such as flatness_mm=0.5.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Default: `acceptance` beside the calibration.")
+    ] = None,
+) -> None:
+    """Measure spheres and a plate of known size at several places and judge the figures."""
+    from bodyscan.evaluation.acceptance_file import limit_from, load_acceptance
+    from bodyscan.laboratory.simulated_acceptance import simulate_readings
+    from bodyscan.registration.storage import load_calibration
+    from bodyscan.report.acceptance_page import NO_STANDARD, screen_table
+    from bodyscan.report.page import is_synthetic
+    from bodyscan.workflows.accept_rig import judge_readings, read_captures
+
+    captured = [*(spheres or ()), *(plate or ())]
+    if bool(captured) == (simulate is not None):
+        raise BadInput(
+            "both captures and --simulate" if captured else "there is nothing to measure",
+            remedy="give --spheres and --plate folders, or --simulate WORKSPACE",
+        )
+    if calibration is None and simulate is None:
+        raise BadInput("no calibration", remedy="give --calibration, what calibrate-rig wrote")
+    file = load_acceptance(artefact, dict(limit_from(text) for text in limit or ()))
+    place = calibration or (simulate or Path()) / "calibration"
+    rig = load_calibration(place)
+    with output.stages() as progress:
+        if simulate is not None:
+            readings = simulate_readings(rig, simulate, file, repeats, places, progress)
+        else:
+            readings = read_captures(rig, spheres or [], plate or [], file, progress)
+    synthetic = simulate is not None or any(map(is_synthetic, captured))
+    folder = out or (place if place.is_dir() else place.parent).parent / "acceptance"
+    found = judge_readings(readings, file, rig, place, folder, synthetic=synthetic)
+    output.show(screen_table(found.figures, synthetic))
+    output.figures(**{one.name: one.value_mm for one in found.figures})
+    output.notes([NO_STANDARD])
+    output.notes(readings.problems, "problem")
+    output.verdict(found.verdict)
+    output.made("report", found.page)
+    output.exit_code = 1 if found.verdict.grade == "not accepted" else 0
+
+
+def reproduce(
+    output: Output,
+    out: Annotated[Path, typer.Option(help="Folder for the text and the figures.")],
+    seed: Annotated[int, typer.Option(help="Of all noise.")] = 0,
+    real_light: Annotated[
+        bool, typer.Option("--real-light", help="A bowed board, speckle, jitter, a smile, defocus.")
+    ] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Coarser rendering and fewer shots.")
+    ] = False,
+) -> None:
+    """Simulate the chapter's own set-up: its Tables 1 and 2, its Fig. 6 and 7, and all rivals."""
+    from bodyscan.laboratory.reproduce import FIGURES, TEXT
+    from bodyscan.laboratory.reproduce import reproduce as run
+
+    refuse_file(out)
+    with output.stages() as progress:
+        text = run(out, seed=seed, quick=quick, real_light=real_light, progress=progress)
+    output.say(*text.splitlines())
+    output.made("written", *(out / name for name in (TEXT, *FIGURES)))

@@ -1,0 +1,326 @@
+"""The operator's commands: people scanned, fused in batches, looked at, handed on, forgotten."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from bodyscan.cli.console import Output, add_command
+from bodyscan.cli.options import Calibration, Overwrite, Result, ScanFolder, refuse_file
+from bodyscan.errors import BadInput, FailedWork
+from bodyscan.progress import step
+from bodyscan.settings import AlignmentSettings, ExportSettings, FusionSettings, ScanSettings
+
+if TYPE_CHECKING:
+    from bodyscan.jobs.job import Job
+    from bodyscan.jobs.object_storage import Store
+    from bodyscan.jobs.stages import Stage
+
+PANEL = "Operator: scan people"
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the command line, in the order of a day."""
+    for command in (scan, report, measure, export, batch, verify, forget):
+        add_command(app, PANEL, command)
+
+
+def scan(
+    output: Output,
+    folder: ScanFolder,
+    calibration: Calibration,
+    out: Annotated[Path | None, typer.Option(help="Default: FOLDER-model.")] = None,
+    points: Annotated[
+        int, typer.Option(min=1000, help="Size of the body cloud.")
+    ] = FusionSettings().points,
+    align: Annotated[
+        Literal["projected", "nearest", "none"],
+        typer.Option(help="Range images: into each other's pixels, Open3D's ICP, or boards only."),
+    ] = AlignmentSettings().matching,
+    empty: Annotated[
+        Path | None,
+        typer.Option(help="Captures of the rig with nobody in it: cut away what they show."),
+    ] = None,
+    overwrite: Overwrite = False,
+    e57: Annotated[
+        bool, typer.Option("--e57", help="Write each pair's raw cloud too: `raw.e57` (pye57).")
+    ] = False,
+) -> None:
+    """Fuse one person's captures into a body cloud and a closed mesh."""
+    from bodyscan.cli import tables
+    from bodyscan.fusion.storage import make_room
+    from bodyscan.workflows.scan_folder import scan_folder
+
+    refuse_file(out)
+    out = out or folder.with_name(f"{folder.name}-model")
+    make_room(out, overwrite)
+    settings = ScanSettings(
+        fusion=FusionSettings(points=points), alignment=AlignmentSettings(matching=align)
+    )
+    with output.stages() as progress:
+        found, saved, pictures = scan_folder(
+            folder, calibration, out, settings, progress, empty=empty
+        )
+    output.show(tables.scan_table(found))
+    output.figures(**tables.scan_figures(found))
+    output.made("result", saved)
+    output.made("pictures", *pictures)
+    if e57:
+        from bodyscan.export.e57 import export_raw_clouds
+        from bodyscan.fusion.storage import load_scan
+
+        facts = load_scan(out).facts
+        export_raw_clouds(
+            out / "raw.e57",
+            found,
+            subject=facts["subject"],
+            calibration_id=facts["calibration_id"],
+        )
+        output.made("raw clouds", out / "raw.e57")
+    output.verdict(found.verdict)
+    output.exit_code = 1 if found.verdict.grade == "repeat" else 0
+
+
+def report(
+    output: Output,
+    result: Annotated[
+        Path, typer.Argument(metavar="RESULT", help="What calibrate-rig or scan wrote.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Default: report.html in the result.")
+    ] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(metavar="OTHER", help="Another scan, or a known surface (PLY, mm)."),
+    ] = None,
+) -> None:
+    """Write one HTML file about a calibration or a scan that opens anywhere, and prints."""
+    from bodyscan.workflows.write_report import write_report
+
+    path, verdict = write_report(result, out, compare)
+    output.verdict(verdict)
+    output.made("report", path)
+
+
+def measure(
+    output: Output,
+    result: Result,
+    heights: Annotated[
+        str | None,
+        typer.Option(help="Of slices over the floor, mm: 800,1050. Default: every 100."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Default: `measurements.json` inside the result.")
+    ] = None,
+) -> None:
+    """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
+    from bodyscan.files.atomic import write_json
+    from bodyscan.fusion.storage import load_scan
+    from bodyscan.measurement.measurements import heights_from
+    from bodyscan.measurement.measurements import measure as measure_mesh
+    from bodyscan.report.measurements import measurements_document, tables
+
+    levels = None if heights is None else heights_from(heights)
+    stored = load_scan(result)
+    measured = measure_mesh(stored.mesh, levels)
+    content = measurements_document(measured, stored.facts)
+    path = out or result / "measurements.json"
+    write_json(path, content)
+    output.show(*tables(measured))
+    output.figures(**content)
+    output.made("measurements", path)
+
+
+def export(
+    output: Output,
+    result: Result,
+    out: Annotated[Path | None, typer.Option(help="Default: `export` inside the result.")] = None,
+    formats: Annotated[str, typer.Option("--format", help="Comma-separated.")] = ",".join(
+        ExportSettings().formats
+    ),
+    deface: Annotated[
+        bool, typer.Option("--deface", help="A plain head for sharing; goes into `shared`.")
+    ] = False,
+    frame: Annotated[str, typer.Option(help="rig, or body: under it, x the way it faces.")] = "rig",
+) -> None:
+    """Write a scan's mesh as PLY, OBJ, STL and GLB for other programs."""
+    from bodyscan.export.scan import export_scan
+    from bodyscan.fusion.storage import load_scan
+
+    refuse_file(out)
+    folder = out or result / ("shared" if deface else "export")
+    with output.stages() as progress, step(progress, "exporting"):
+        written = export_scan(
+            load_scan(result), folder, formats.split(","), deface=deface, frame=frame
+        )
+    for path in written:
+        output.made("export", path)
+
+
+def batch(
+    output: Output,
+    pipeline: Annotated[Path, typer.Argument(metavar="PIPELINE.YAML", help="See pipelines/.")],
+    scans: Annotated[str, typer.Option(help="Folder (or URL) of scan folders, or of rigs.")],
+    out: Annotated[str, typer.Option(help="Folder (or URL) for a job folder of each.")],
+    calibration: Annotated[
+        str | None,
+        typer.Option(help="Default: `calibration` in the folder of scans, beside or above it."),
+    ] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Such as fusion.points=2000000."),
+    ] = None,
+    until: Annotated[str | None, typer.Option(metavar="STAGE", help="The last stage.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Jobs at the same time.")] = None,
+    cluster: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:PORT", help="A dask scheduler to send to.")
+    ] = None,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Say why each stage would run; do nothing.")
+    ] = False,
+) -> None:
+    """Fuse every scan of a day (or calibrate every rig), each in a process of its own.
+
+    With --json each event is a line of JSON as it happens; the last one is the summary.
+    """
+    from bodyscan.jobs.discovery import find_jobs
+    from bodyscan.jobs.object_storage import Store, find_stored_jobs, is_url
+    from bodyscan.jobs.pipeline import load_pipeline
+    from bodyscan.jobs.stages import KINDS, stages_until
+
+    settings = load_pipeline(pipeline, changes or ())
+    every = KINDS[settings.kind]
+    last = until or every[-1].name
+    stages = stages_until(every, last)
+    if not is_url(scans) and not is_url(out):
+        folder, given = Path(out), Path(calibration) if calibration else None
+        jobs = find_jobs(settings, Path(scans), folder, given, last)
+        if explain:
+            _explain(output, jobs, stages)
+            return
+        refuse_file(folder)
+        _run(output, jobs, folder, workers, cluster)
+        return
+    fuses = settings.kind == "fuse"
+    if explain or not (is_url(scans) and is_url(out)) or (fuses and not is_url(calibration or "")):
+        raise BadInput(
+            "of scans, output and calibration either all lie in object storage or none; "
+            "--explain is for folders",
+            where=f"{scans}, {out}, {calibration}",
+            remedy="give a URL to each of --scans, --out and --calibration",
+        )
+    store = Store(scans, out, calibration if fuses else None)
+    with TemporaryDirectory(prefix="bodyscan-") as outline:
+        jobs = find_stored_jobs(store, settings, last, Path(outline))
+        _run(output, jobs, Path(outline) / "out", workers, cluster, store)
+
+
+def _explain(output: Output, jobs: Sequence[Job], stages: Sequence[Stage]) -> None:
+    from concurrent.futures import ThreadPoolExecutor
+
+    from bodyscan.jobs.job import printable
+    from bodyscan.jobs.plan import plan
+
+    with ThreadPoolExecutor() as pool:
+        for job, steps in zip(jobs, pool.map(lambda job: plan(job, stages), jobs), strict=True):
+            for step in steps:
+                said = f"will run: {step.why}" if step.why else "up to date"
+                output.say(printable(f"{job.name}: {step.stage}: {said}"))
+
+
+def _run(
+    output: Output,
+    jobs: Sequence[Job],
+    out: Path,
+    workers: int | None,
+    cluster: str | None,
+    store: Store | None = None,
+) -> None:
+    """The exit code is 1 if a job was set aside, or a scan has to be repeated."""
+    from bodyscan.jobs import allocation, display, object_storage
+    from bodyscan.jobs.batch import finish, run_batch, run_locally
+    from bodyscan.jobs.cluster import run_on_cluster
+    from bodyscan.jobs.supervision import supervise_job
+
+    output.tell_events()
+    resources = jobs[0].pipeline.resources
+    shares = allocation.allocate(
+        resources, len(jobs), workers, allocation.cores(), allocation.free_memory_mb()
+    )
+    work = partial(object_storage.work_on_stored, store=store) if store else supervise_job
+    show = (
+        display.json_lines if output.json else display.silence if output.quiet else display.screen
+    )
+    try:
+        with show() as listen:
+            if cluster:
+                run = run_on_cluster(cluster, resources.threads, listen=listen, work=work)
+            else:
+                listen({"event": "shares", **asdict(shares)})
+                run = run_locally(shares, listen=listen, work=work)
+            outcomes = run_batch(jobs, out, run, listen)
+            if store:
+                object_storage.fetch_figures(jobs, store)
+            summary = finish(jobs, outcomes, out)
+            if store:
+                summary |= {"table": object_storage.put_summary(out, store)}
+            listen(summary)
+    except KeyboardInterrupt:
+        sys.stdout.flush()
+        typer.secho("stopped; the same command goes on from here", err=True)
+        os._exit(130)  # the jobs' processes end with this one
+    output.exit_code = 1 if summary["set_aside"] or summary["repeat"] else 0
+
+
+def verify(
+    output: Output,
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="--out of a batch, or a job.")],
+) -> None:
+    """Hold images, calibration and results against the manifest; find any byte that changed."""
+    from bodyscan.jobs.job import printable
+    from bodyscan.jobs.verification import verify as look
+
+    verified = look(folder)
+    output.figures(files=verified.files)
+    output.say(*(printable(fault) for fault in verified.faults), wrong=True)
+    if verified.faults:
+        raise FailedWork(
+            f"{len(verified.faults)} of {verified.files} files are not as they were",
+            where=str(folder),
+            remedy="restore them, or start the batch again: it makes anew what was touched",
+        )
+    output.say(f"{verified.files} files, every byte as it was")
+
+
+def forget(
+    output: Output,
+    subject: Annotated[str, typer.Argument(metavar="SUBJECT", help="The pseudonym.")],
+    workspace: Annotated[Path, typer.Option(help="Folder to look through.")] = Path(),
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would go; remove nothing.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask first.")] = False,
+) -> None:
+    """Remove every file of a subject: images, jobs, results, exports, rows of summaries."""
+    from bodyscan.jobs import forgetting
+    from bodyscan.jobs.job import printable
+
+    found = forgetting.find_subject(subject, workspace)
+    if not dry_run:
+        if sys.stdin.isatty() and not yes and found.files:
+            question = f"remove {len(found.files)} files of {subject} for ever?"
+            typer.confirm(question, abort=True, err=True)
+        found = forgetting.forget_subject(subject, workspace)
+    verb = "would remove" if dry_run else "removed"
+    output.say(*(f"{verb} {printable(str(path))}" for path in found.files))
+    output.notes((printable(str(path)) for path in found.unreadable), "cannot tell whose")
+    output.figures(files=len(found.files), removed=not dry_run)
+    output.say(f"{verb} {len(found.files)} files of {subject}")

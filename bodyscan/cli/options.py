@@ -1,0 +1,43 @@
+"""Options and arguments that several commands share: each is declared once."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bodyscan.errors import BadInput
+
+RigFile = Annotated[Path, typer.Argument(metavar="RIG.YAML", help="The rig file.")]
+ScanFolder = Annotated[Path, typer.Argument(metavar="FOLDER", help="One scan's captures.")]
+Result = Annotated[Path, typer.Argument(metavar="RESULT", help="What `scan` wrote.")]
+CalibrationArgument = Annotated[
+    Path, typer.Argument(metavar="CALIBRATION", help="What calibrate-rig wrote.")
+]
+Calibration = Annotated[Path, typer.Option("--calibration", help="What calibrate-rig wrote.")]
+OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write into.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace what lies there, with all that was made of it.")
+]
+
+Json = Annotated[
+    bool, typer.Option("--json", help="Print one JSON document: what was made, notes, verdict.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print times, and notes in full.")]
+
+SHARED = [
+    inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
+    for name, option in {"json": Json, "quiet": Quiet, "verbose": Verbose}.items()
+]
+"""What every command takes."""
+
+
+def refuse_file(folder: Path | None) -> None:
+    """A folder to write into must not be a file: said before the work, not after it."""
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise BadInput(
+            "is a file; results go into a folder", where=str(folder), remedy="give another --out"
+        )

@@ -1,0 +1,105 @@
+"""Tables for people, and the same figures for --json."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from bodyscan.fusion.scan import Scan
+from bodyscan.geometry.placing_covariance import position_sigma
+from bodyscan.registration.rig_calibration import RigCalibration
+
+
+def times_table(seconds: dict[str, float]) -> Table:
+    """Seconds of each stage and of all."""
+    table = Table("stage", "seconds", title="time")
+    table.columns[1].justify = "right"
+    for stage, taken in seconds.items():
+        table.add_row(stage, f"{taken:.1f}")
+    table.add_row("all", f"{sum(seconds.values()):.1f}", style="bold")
+    return table
+
+
+def calibration_table(calibration: RigCalibration) -> Table:
+    """One row a pair: residuals, stripes, position and its sigma in the rig frame."""
+    table = Table(title=f"rig {calibration.rig.name}")
+    for heading in (
+        "pair",
+        "corners RMS px",
+        "poses",
+        "light",
+        "sheets RMS mm",
+        "stripes",
+        "position mm (x, y, z)",
+        "sigma mm",
+    ):
+        table.add_column(heading, justify="left" if heading == "pair" else "right")
+    for name, pair in calibration.pairs.items():
+        quality = pair.quality
+        place = calibration.rig_from_camera[name].translation
+        sigma = position_sigma(calibration.covariance, name, place)
+        table.add_row(
+            name,
+            f"{quality.corners_rms_px:.3f}",
+            str(quality.poses),
+            quality.light_model or "-",
+            "-" if quality.planes_rms_mm is None else f"{quality.planes_rms_mm:.3f}",
+            f"{quality.stripes_calibrated} of {quality.stripes_projected}"
+            if pair.light is not None
+            else "-",
+            " ".join(f"{value:.1f}" for value in place),
+            " ".join(f"{value:.3f}" for value in sigma),
+        )
+    for name in calibration.failed:
+        table.add_row(name, "failed", *["-"] * 6, style="red")
+    return table
+
+
+def calibration_figures(calibration: RigCalibration) -> dict[str, Any]:
+    """The table's figures, by pair."""
+    return {
+        name: {
+            "corners_rms_px": pair.quality.corners_rms_px,
+            "poses": pair.quality.poses,
+            "light_model": pair.quality.light_model,
+            "sheets_rms_mm": pair.quality.planes_rms_mm,
+            "stripes_calibrated": pair.quality.stripes_calibrated,
+            "position_mm": calibration.rig_from_camera[name].translation.tolist(),
+        }
+        for name, pair in calibration.pairs.items()
+    }
+
+
+def scan_table(scan: Scan) -> Table:
+    """What a scan gave: counts, error bars, alignment."""
+    table = Table("", "", title="body model", show_header=False)
+    table.columns[1].justify = "right"
+    cloud, surface = scan.cloud, scan.mesh
+    table.add_row("pairs measured", str(sum(points > 0 for points in scan.measured.values())))
+    table.add_row("points measured by all pairs", f"{sum(scan.measured.values()):,}")
+    table.add_row("points in the cloud", f"{len(cloud.points):,}")
+    table.add_row("sigma of a point, median", f"{np.nanmedian(cloud.sigma_mm):.3f} mm")
+    table.add_row("faces of the mesh", f"{len(surface.faces):,}")
+    table.add_row("of its surface made up", f"{100.0 * surface.filled_share:.1f} %")
+    if scan.alignment is not None:
+        farthest = max(scan.alignment.motion_mm.items(), key=lambda item: item[1])
+        before, after = scan.alignment.rms_before_mm, scan.alignment.rms_after_mm
+        table.add_row("overlaps before, after alignment", f"{before:.3f}, {after:.3f} mm RMS")
+        table.add_row("farthest moved", f"{farthest[0]}, {farthest[1]:.2f} mm")
+        for name, sigmas in scan.alignment.refused.items():
+            table.add_row("left where it was", f"{name} (asked for {sigmas:.1f} sigmas)")
+    return table
+
+
+def scan_figures(scan: Scan) -> dict[str, Any]:
+    """The table's figures."""
+    return {
+        "points_measured": scan.measured,
+        "points": len(scan.cloud.points),
+        "faces": len(scan.mesh.faces),
+        "sigma_mm": float(np.nanmedian(scan.cloud.sigma_mm)),
+        "filled_share": scan.mesh.filled_share,
+        "sway_mm": scan.alignment.motion_mm if scan.alignment else None,
+    }

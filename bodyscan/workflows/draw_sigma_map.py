@@ -1,0 +1,25 @@
+"""A stored calibration's sigma over the scan volume, as a picture beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bodyscan.errors import BadInput
+from bodyscan.registration.storage import load_calibration
+from bodyscan.report.sigma_map import draw_sigma_map as draw
+
+FILE_NAME = "sigma-map.png"
+
+
+def draw_sigma_map(calibration: Path, path: Path | None = None) -> Path:
+    """Where the picture is; beside the calibration if no path is given.
+
+    Raises BadInput for a path that is not a PNG's, CalibrationFileError.
+    """
+    path = path or (calibration if calibration.is_dir() else calibration.parent) / FILE_NAME
+    if path.suffix.lower() != ".png":
+        raise BadInput("the map is drawn as PNG", where=str(path), remedy="name it .png")
+    rig = load_calibration(calibration)
+    cameras = {name: pair.camera for name, pair in rig.pairs.items()}
+    draw(rig.rig.volume, rig.rig_from_camera, cameras, rig.covariance, path)
+    return path

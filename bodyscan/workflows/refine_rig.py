@@ -1,0 +1,41 @@
+"""A calibrated rig refined on a rigid object that its pairs scanned."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from bodyscan.alignment.object_refinement import refine_on_object
+from bodyscan.captures.folder import Captures
+from bodyscan.errors import FailedWork
+from bodyscan.fusion.cleaning import clean, require_subject
+from bodyscan.outcome import Outcome
+from bodyscan.progress import Progress, silent, step
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.workflows.range_images import reconstruct_range_images
+
+
+def refine_rig(
+    calibration: RigCalibration, captures: Captures, name: str, progress: Progress = silent
+) -> Outcome[RigCalibration]:
+    """The calibration with the pairs brought closer together, within what the boards allow.
+
+    captures: a scan of an object that stood still, called `name` in the calibration's notes.
+    Raises FailedWork where the overlaps do not come closer, ScanFailed if nothing was scanned.
+    """
+    measured = reconstruct_range_images(calibration, captures, progress)
+    with step(progress, "aligning"):
+        cleaned = clean(measured.value, calibration.rig_from_camera, calibration.rig.volume)
+        seen = require_subject(cleaned)
+        found = refine_on_object(seen, calibration.rig_from_camera, calibration.covariance)
+    if not found.better:
+        raise FailedWork(
+            "\n".join(
+                [
+                    "the overlaps do not come closer: the calibration is better as it is",
+                    *(f"  {line}" for line in found.lines),
+                ]
+            )
+        )
+    notes = (*calibration.notes, *(f"refined on {name}: {line}" for line in found.lines))
+    refined = replace(calibration, rig_from_camera=found.rig_from_camera, notes=notes)
+    return Outcome(refined, tuple(found.lines), measured.failures)

@@ -1,0 +1,46 @@
+"""One person's capture folder fused, kept in a folder with pictures of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bodyscan.captures.folder import open_scan
+from bodyscan.errors import ScanFailed
+from bodyscan.fusion.scan import Scan
+from bodyscan.fusion.storage import clear, save_failure, save_scan
+from bodyscan.progress import Progress, silent, step
+from bodyscan.registration.storage import calibration_id, load_calibration
+from bodyscan.report.pictures import draw_scan
+from bodyscan.settings import ScanSettings
+from bodyscan.workflows.scan_person import scan_person
+
+
+def scan_folder(
+    folder: Path,
+    calibration: Path,
+    out: Path,
+    settings: ScanSettings,
+    progress: Progress = silent,
+    *,
+    empty: Path | None = None,
+) -> tuple[Scan, Path, list[Path]]:
+    """The scan, its scan.json in `out`, and the pictures beside it. A result that lay there goes.
+
+    empty: captures of the rig with nobody in it. Raises ScanFailed after saying so in scan.json.
+    """
+    rig = load_calibration(calibration)
+    captures = open_scan(rig.rig, folder)
+    nobody = open_scan(rig.rig, empty) if empty else None
+    origin = calibration_id(calibration)
+    subject, when = captures.subject, captures.when
+    try:
+        scan = scan_person(rig, captures, settings, progress, empty=nobody)
+    except ScanFailed as error:
+        clear(out)
+        save_failure(error, out, calibration_id=origin, subject=subject, when=when)
+        raise
+    clear(out)
+    saved = save_scan(scan, out, calibration_id=origin, subject=subject, when=when)
+    with step(progress, "drawing"):
+        pictures = draw_scan(scan.cloud, scan.mesh, out)
+    return scan, saved, pictures
