@@ -53,13 +53,13 @@ def write_e57(
                 "columnIndex": columns,
             }
             data |= {f"color{name}": grey for name in ("Red", "Green", "Blue")}
-            placing = rig_from_camera[image.pair]
-            qx, qy, qz, qw = Rotation.from_matrix(placing.rotation).as_quat()
+            pose = rig_from_camera[image.pair]
+            qx, qy, qz, qw = Rotation.from_matrix(pose.rotation).as_quat()
             file.write_scan_raw(
                 data,
                 name=image.pair,
                 rotation=np.array([qw, qx, qy, qz]),
-                translation=placing.translation / 1000.0,
+                translation=pose.translation / 1000.0,
             )
         file.close()
     return counts

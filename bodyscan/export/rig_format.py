@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from bodyscan.geometry.transforms import RigidTransform
     from bodyscan.registration.rig_calibration import RigCalibration
 
-PlacedCameras: TypeAlias = "dict[str, tuple[Camera, RigidTransform]]"
+RigCameras: TypeAlias = "dict[str, tuple[Camera, RigidTransform]]"
 """Camera and `rig_from_camera` by the pair's name."""
 
 
@@ -26,13 +26,13 @@ class RigFormat:
 
     path: str
     write: Callable[[RigCalibration, Path], Path]
-    read: Callable[[Path], PlacedCameras]
+    read: Callable[[Path], RigCameras]
 
 
 RIG_FORMATS: Registry[RigFormat] = Registry("bodyscan.export.rig_formats", "a rig")
 
 
-def cameras_of(calibration: RigCalibration) -> PlacedCameras:
+def cameras_of(calibration: RigCalibration) -> RigCameras:
     """Camera and pose of every pair of a calibration."""
     return {
         name: (pair.camera, calibration.rig_from_camera[name])

@@ -56,21 +56,21 @@ def export_scan(
                 f"there is no {name!r} to export{did_you_mean(name, known)}",
                 remedy=f"Choose from {', '.join(known)}.",
             )
-    placing = rig_from_body(scan.mesh.vertices) if frame == "body" else None
+    pose = rig_from_body(scan.mesh.vertices) if frame == "body" else None
     origin = Provenance(
         scan.facts.get("subject"),
         scan.facts["calibration_id"],
         deface,
         scan_facts(scan.facts),
-        placing,
+        pose,
     )
     neck = find_neck(scan.mesh.vertices, scan.mesh.faces) if deface else None
     written = []
     for version in versions:
         stem, made = VERSIONS[version]
         mesh = made(scan.mesh) if neck is None else without_face(made(scan.mesh), neck)
-        if placing is not None:
-            mesh = transform_mesh(mesh, placing.inverse())
+        if pose is not None:
+            mesh = transform_mesh(mesh, pose.inverse())
         for name in names:
             written.append(folder / f"{stem}.{name}")
             write_body(written[-1], mesh, origin)

@@ -6,9 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from bodyscan.files.model import Problem, did_you_mean, duplicates
-from bodyscan.rig.board import Board
+from bodyscan.rig.board import Board, family
 from bodyscan.rig.capture_folder import CaptureFolder
-from bodyscan.rig.dictionaries import family
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig_frame import RigFrame

@@ -11,10 +11,10 @@ Vector = tuple[float, float, float]
 
 
 class RigFrame(Model):
-    """How the rig frame is fixed: by a board in one shot, or by one pair at its nominal placing.
+    """How the rig frame is fixed: by a board in one shot, or by one pair at its nominal pose.
 
-    With `pair`: that pair's camera stands exactly at its `nominal` placing (image upright: its y
-    axis points down as far as may be); without a nominal placing the rig frame is the camera frame
+    With `pair`: that pair's camera stands exactly at its `nominal` pose (image upright: its y
+    axis points down as far as may be); without a nominal pose the rig frame is the camera frame
     itself. With neither, the first pair of the file is meant.
 
     With `shot`: the board's origin lies at `origin_mm`, its x axis points along `x_axis` and its

@@ -14,7 +14,7 @@ from bodyscan.stripes.bit_words import WordCode
 from bodyscan.stripes.boundaries import find_boundaries
 from bodyscan.stripes.grey_noise import noise_variance
 from bodyscan.stripes.scan_lines import ScanLines
-from bodyscan.stripes.sequence import check_codes, check_exposure
+from bodyscan.stripes.sequence_checks import check_codes, check_exposure
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap, stripe_map

@@ -85,7 +85,7 @@ def find_boundaries(
         *middle,
     )
     position = before + fraction
-    joined = joined_to_next(line, before, position, index, usable)
+    joined = continues_to_next(line, before, position, index, usable)
     blur2 = edges.blur2(position, joined)
     return Boundaries(
         line=line,
@@ -99,7 +99,9 @@ def find_boundaries(
     )
 
 
-def joined_to_next(line: Ints, before: Ints, position: Floats, index: Ints, usable: Mask) -> Mask:
+def continues_to_next(
+    line: Ints, before: Ints, position: Floats, index: Ints, usable: Mask
+) -> Mask:
     """(N - 1,) whether the next boundary ends the stripe that this one begins.
 
     All pixels between the two must be usable (L, P): where one is not, the surface may end, and

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Bytes, Mask
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes.boundaries import Boundaries, joined_to_next
+from bodyscan.stripes.boundaries import Boundaries, continues_to_next
 from bodyscan.stripes.scan_lines import ScanLines
-from bodyscan.stripes.sequence import check_illumination
+from bodyscan.stripes.sequence_checks import check_illumination
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
 from bodyscan.stripes.stripe_map import StripeMap, stripe_map
 from bodyscan.stripes.stripe_order import check_order
@@ -69,6 +69,6 @@ def _boundaries(codes: NDArray[np.int32], usable: Mask) -> Boundaries:
         line_position=line.astype(np.float64),
         sigma_px=np.full(len(line), SIGMA),
         index=index,
-        joined=joined_to_next(line, before, position, index, usable),
+        joined=continues_to_next(line, before, position, index, usable),
         blur2=0.0,
     )

@@ -38,7 +38,7 @@ def mostly_direct(images: ScanLines, usable: Mask, bit: int, variance: Floats) -
     """(L, P): pixels that get more light from the projector than from other surfaces.
 
     bit: of the patterns, the one of stripes two wide. It tells, or the next coarser one that the
-    projector throws sharply (in procam-board its lens leaves a fifth of the finest). Where a bit
+    projector shows sharply (in procam-board its lens leaves a fifth of the finest). Where a bit
     flips its difference is small whatever the light; such dips along the lines are filled.
     usable: (L, P) that are looked at.  variance: (256,) of each grey level.
     """

@@ -20,7 +20,7 @@ from scipy.special import ndtri
 from bodyscan.arrays import Bytes, Floats
 from bodyscan.stripes.pixel_stripes import pixel_stripe_map
 from bodyscan.stripes.scan_lines import ScanLines
-from bodyscan.stripes.sequence import check_illumination
+from bodyscan.stripes.sequence_checks import check_illumination
 from bodyscan.stripes.stripe_map import StripeMap
 from bodyscan.stripes.stripe_order import check_order
 from bodyscan.stripes.usable_pixels import (

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Bytes, Floats
 from bodyscan.stripes.albedo_edges import Brightness, without_edges_across
-from bodyscan.stripes.boundaries import LEAST_SIGMA_PX, Boundaries, joined_to_next
+from bodyscan.stripes.boundaries import LEAST_SIGMA_PX, Boundaries, continues_to_next
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
 from bodyscan.stripes.stripe_map import StripeMap, stripe_map
@@ -68,7 +68,7 @@ def whole_numbers(s: Floats, sigma: Floats, blur2: float) -> Boundaries:
         line_position=line.astype(np.float64),
         sigma_px=np.hypot(doubt / np.abs(slope), LEAST_SIGMA_PX),
         index=index,
-        joined=joined_to_next(line, before, position, index, np.isfinite(s)),
+        joined=continues_to_next(line, before, position, index, np.isfinite(s)),
         blur2=blur2,
     )
 

@@ -67,7 +67,7 @@ class _Segments:
 
     @staticmethod
     def of(boundaries: Boundaries) -> _Segments:
-        position, sigma_px = smoothed(boundaries, boundaries.joined)
+        position, sigma_px = smooth_runs(boundaries, boundaries.joined)
         width = np.where(boundaries.joined, np.diff(position), np.nan)
         width[width < MIN_STRIPE_PX] = np.nan
         rise = np.diff(boundaries.index).astype(float)
@@ -185,7 +185,7 @@ def _completed(slope: float, other: float, secant: float) -> float:
     return secant if math.isnan(other) else 2.0 * secant - other
 
 
-def smoothed(boundaries: Boundaries, joined: Mask) -> tuple[Array, Array]:
+def smooth_runs(boundaries: Boundaries, joined: Mask) -> tuple[Array, Array]:
     """Positions and their sigmas, px, after a local quadratic fit along each unbroken run.
 
     Along a run the index counts evenly, so the fit of place against index is a fixed filter. It
@@ -207,7 +207,7 @@ def _smooth(
     position: Array,
     sigma: Array,
 ) -> None:
-    """One filter of `smoothed`; overwrites position and sigma (N,) where it fits."""
+    """One filter of `smooth_runs`; overwrites position and sigma (N,) where it fits."""
     half = weights.size // 2
     share = math.sqrt(np.sum(weights * weights))
     run = 0  # how many boundaries before this one belong to its run

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Mask
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes.sequence import check_direction
+from bodyscan.stripes.sequence_checks import check_direction
 
 Numbers = NDArray[np.signedinteger]
 

@@ -14,8 +14,7 @@ from small_captures import RIG, write
 
 from bodyscan.errors import RigFileError
 from bodyscan.files.yaml_file import dump_yaml, read_yaml
-from bodyscan.rig.board import Board
-from bodyscan.rig.dictionaries import MARKERS_IN
+from bodyscan.rig.board import MARKERS_IN, Board
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig, write_rig

@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from bodyscan.errors import BadInput
-from bodyscan.export.rig_format import PlacedCameras, RigFormat, cameras_of
+from bodyscan.export.rig_format import RigCameras, RigFormat, cameras_of
 from bodyscan.files.atomic import write_bytes, write_json
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import lens_from_opencv
@@ -52,8 +52,8 @@ def write_colmap_rig(calibration: RigCalibration, folder: Path) -> Path:
     return folder
 
 
-def read_colmap_rig(folder: Path) -> PlacedCameras:
-    """Cameras and placings as the COLMAP model says (another program may have refined it); the skew
+def read_colmap_rig(folder: Path) -> RigCameras:
+    """Cameras and poses as the COLMAP model says (another program may have refined it); the skew
     from `bodyscan.json`.  Raises BadInput if files are missing or do not belong together."""
     folder, model = Path(folder), pycolmap.Reconstruction()
     try:

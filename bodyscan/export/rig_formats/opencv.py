@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from bodyscan.errors import BadInput
-from bodyscan.export.rig_format import PlacedCameras, RigFormat, cameras_of
+from bodyscan.export.rig_format import RigCameras, RigFormat, cameras_of
 from bodyscan.files.atomic import write_text
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import lens_from_opencv
@@ -53,8 +53,8 @@ def write_opencv_rig(calibration: RigCalibration, path: Path) -> Path:
     return Path(path)
 
 
-def read_opencv_rig(path: Path) -> PlacedCameras:
-    """Cameras and placings of a file that `write_opencv_rig` wrote.
+def read_opencv_rig(path: Path) -> RigCameras:
+    """Cameras and poses of a file that `write_opencv_rig` wrote.
 
     Raises BadInput if it is no such file, or has a lens that there is not here.
     """
