@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.pinhole_opencv import fit_pinhole_opencv
 from bodyscan.arrays import Array
-from bodyscan.boards.board import corner_points
+from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.boundary_points import BoundaryPoints, binned, join

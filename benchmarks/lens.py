@@ -12,7 +12,7 @@ import numpy as np
 import open3d as o3d
 
 from bodyscan.arrays import Array, Indices, Mask
-from bodyscan.boards.board import corner_points
+from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.captures.folder import open_captures, open_scan
 from bodyscan.geometry.transforms import RigidTransform

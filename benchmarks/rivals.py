@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board import corner_points
+from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial

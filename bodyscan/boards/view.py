@@ -11,7 +11,7 @@ from bodyscan.arrays import Array, Indices
 class BoardView:
     """A board as one camera saw it in one shot.
 
-    corner_ids: (N,) int, index into `boards.corner_points(board)` (front face first, then back).
+    corner_ids: (N,) int, index into `board_layout.corner_points(board)` (front face first, then back).
     pixels: (N, 2) float64, real image coordinates, px.
     turnable: the detector may have numbered this board from its other end.
     """

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board import corner_points, corners_per_face
+from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.boards.view import BoardView
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board

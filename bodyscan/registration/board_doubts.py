@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from bodyscan.boards.board import corners_per_face
+from bodyscan.boards.board_layout import corners_per_face
 from bodyscan.boards.view import BoardView
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board

@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board import corner_points, corners_per_face
+from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from bodyscan.boards.board import corner_points
+from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView, board_symmetries, planar_view, usable

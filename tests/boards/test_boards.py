@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyscan.boards.board import corner_points, corners_per_face, marker_corners, outline
+from bodyscan.boards.board_layout import corner_points, corners_per_face, marker_corners, outline
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 

@@ -10,7 +10,7 @@ import pytest
 from board_rendering import render, true_corners, view_of
 
 from bodyscan.boards import checkerboard
-from bodyscan.boards.board import corner_points
+from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.board_map import fit_board_map
 from bodyscan.boards.detection import find_boards
 from bodyscan.errors import BadInput

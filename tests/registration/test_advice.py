@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
-from bodyscan.boards.board import corner_points, corners_per_face
+from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.placing_covariance import position_sigma
 from bodyscan.registration.advice import advise, crucial_shots

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodyscan.boards.board import corner_points
+from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import LocatedView, PlanarView, board_symmetries
 from bodyscan.calibration.camera import locate_board
 from bodyscan.geometry.camera import Camera

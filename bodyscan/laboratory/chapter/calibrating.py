@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board import corner_points
+from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import PlanarView, planar_view
 from bodyscan.calibration.boundary_points import binned
 from bodyscan.calibration.camera import (
