@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Indices, Mask
-from bodyscan.boards import board as boards
+from bodyscan.boards import board_layout
 from bodyscan.boards.board_map import BoardMap, fit_board_map
 from bodyscan.boards.corners import SightedCorners, refine_corners
 from bodyscan.rig.board import Board
@@ -29,7 +29,7 @@ class Markers:
 
 def detect_markers(image: Bytes, board: Board) -> Markers:
     """All markers of the board's dictionary in the image (H, W)."""
-    detector = cv2.aruco.ArucoDetector(boards.marker_dictionary(board), _parameters())
+    detector = cv2.aruco.ArucoDetector(board_layout.marker_dictionary(board), _parameters())
     corners, ids, _ = detector.detectMarkers(image)
     if ids is None or len(ids) == 0:
         return Markers(np.empty(0, np.int64), np.empty((0, 4, 2)))
@@ -51,7 +51,7 @@ def locate_charuco(image: Bytes, board: Board, markers: Markers) -> SightedCorne
 
 
 def _locate_face(image: Bytes, board: Board, face: int, markers: Markers) -> SightedCorners | None:
-    face_ids, printed = boards.marker_corners(board, face)
+    face_ids, printed = board_layout.marker_corners(board, face)
     _, seen, of_face = np.intersect1d(markers.ids, face_ids, return_indices=True)
     if len(seen) < 2:
         return None
@@ -63,8 +63,8 @@ def _locate_face(image: Bytes, board: Board, face: int, markers: Markers) -> Sig
     if len(nearby) < MIN_CORNERS:
         return None
     pixels, good = _refine(image, board, board_map, nearby, printed)
-    ids = nearby[good] + face * boards.corners_per_face(board)
-    return SightedCorners(ids, pixels[good], boards.corners_per_face(board))
+    ids = nearby[good] + face * board_layout.corners_per_face(board)
+    return SightedCorners(ids, pixels[good], board_layout.corners_per_face(board))
 
 
 def _refine(
@@ -76,7 +76,7 @@ def _refine(
 ) -> tuple[Array, Mask]:
     """Corners fitted where the markers say they are; then, as corners say it better than
     markers, once more where the corners found say that those not found must be."""
-    points = boards.corner_points(board.model_copy(update={"faces": 1}))[corner_ids, :2]
+    points = board_layout.corner_points(board.model_copy(update={"faces": 1}))[corner_ids, :2]
     gap = (1.0 - (board.marker_mm or 0.0) / board.square_mm) / 2.0
     marked = np.floor(markers[0].mean(axis=0) / board.square_mm).astype(int).sum()
     row, column = np.divmod(corner_ids, board.columns - 1)

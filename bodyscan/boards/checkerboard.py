@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Floats
-from bodyscan.boards import board as boards
+from bodyscan.boards import board_layout
 from bodyscan.boards.board_map import fit_board_map
 from bodyscan.boards.corners import SightedCorners, refine_corners
 from bodyscan.boards.regions import Region, board_regions
@@ -26,7 +26,7 @@ MIN_SHARE_OF_CORNERS = 0.8
 def find_checkerboard(image: Bytes, board: Board) -> SightedCorners | None:
     """All inner corners of a checkerboard seen whole, numbered by the convention above."""
     _refuse_square(board)
-    printed = boards.corner_points(board.model_copy(update={"faces": 1}))[:, :2]
+    printed = board_layout.corner_points(board.model_copy(update={"faces": 1}))[:, :2]
     row, column = np.divmod(np.arange(len(printed)), board.columns - 1)
     even = (row + column) % 2 == 0
     for candidate in _candidates(image, board):
