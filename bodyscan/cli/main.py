@@ -12,10 +12,10 @@ from typing import Annotated
 
 import typer
 
-from bodyscan import __version__
 from bodyscan.cli import builder, laboratory, operator
 from bodyscan.errors import BodyscanError
 from bodyscan.memory import keep_freed_memory
+from bodyscan.version import __version__
 
 app = typer.Typer(
     no_args_is_help=True,

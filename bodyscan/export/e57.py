@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bodyscan import __version__
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import atomic_replacement, write_json
 from bodyscan.fusion.scan import Scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.version import __version__
 
 
 def write_e57(

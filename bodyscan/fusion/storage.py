@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from bodyscan import __version__
 from bodyscan.errors import ResultError, ScanFailed
 from bodyscan.files.atomic import write_json
 from bodyscan.files.hashing import file_hash
@@ -19,6 +18,7 @@ from bodyscan.fusion.scan import Scan
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
 from bodyscan.verdict import Verdict
+from bodyscan.version import __version__
 
 SCHEMA = "bodyscan-scan"
 VERSION = 1

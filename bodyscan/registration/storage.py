@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from bodyscan import __version__
 from bodyscan.calibration.light_choice import HeldOutModel
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import CalibrationFileError
@@ -24,6 +23,7 @@ from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
 from bodyscan.rig.rig import Rig
+from bodyscan.version import __version__
 
 SCHEMA = "bodyscan-calibration"
 VERSION = 1

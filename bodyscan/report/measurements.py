@@ -8,8 +8,8 @@ from typing import Any
 
 from rich.table import Table
 
-from bodyscan import __version__
 from bodyscan.measurement.measurements import Measurements
+from bodyscan.version import __version__
 
 MOSTLY = 0.5
 LITTLE = 0.95

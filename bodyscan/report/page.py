@@ -13,8 +13,8 @@ from typing import Any, Literal
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from bodyscan import __version__
 from bodyscan.verdict import Verdict
+from bodyscan.version import __version__
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_bodies import ball, points
 
-from bodyscan import __version__
 from bodyscan.errors import BadInput
 from bodyscan.export.body_file import Provenance, write_body
 from bodyscan.export.decimal_text import format_decimals, format_integers, join_columns
@@ -25,6 +24,7 @@ from bodyscan.export.scan import export_scan
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.ply import read_ply_mesh
+from bodyscan.version import __version__
 
 MESH_FORMATS = ("ply", "obj", "stl", "glb")
 CLOUD_FORMATS = ("ply", "glb")

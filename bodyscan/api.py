@@ -1,0 +1,276 @@
+"""The front door: a rig calibrated, people scanned, measured and handed on, from Python.
+
+    import bodyscan
+
+    calibration = bodyscan.calibrate_rig("rig.yaml")
+    bodyscan.save_calibration(calibration, "calibration")
+
+    person = bodyscan.scan("captures/person", calibration)
+    print(person.verdict)
+    print(bodyscan.measure(person).stature_mm)
+
+    kept = bodyscan.save_scan(person, "person-model", calibration="calibration")
+    bodyscan.export(kept, "person-export")
+
+Lengths are millimetres; a point is in the rig frame (origin on the floor, x the way the subject faces,
+y to its left, z up) unless its name says otherwise. What goes wrong is a `BodyscanError`: `BadInput`
+where the caller can mend something, `FailedWork` where good input gave no result; both say what, where
+and what to do. `progress` is any function of a stage's name, what is done of it and what there is.
+
+**What is stable.** The names of `bodyscan.__all__`, their arguments, the fields of what they return
+and the files that they write. From one minor version to the next they grow; a name is warned of
+(DeprecationWarning) for one minor version before it goes. Files stay readable, or are refused with a
+message that says what to do. Figures may get better from version to version: CHANGELOG.md says when.
+Any other module may be imported as well (`bodyscan.geometry`, say) and may change at any time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime
+from importlib import import_module
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+from bodyscan.errors import BadInput, BodyscanError, FailedWork
+from bodyscan.outcome import Outcome
+from bodyscan.progress import Progress, silent
+from bodyscan.settings import (
+    AlignmentSettings,
+    ExportSettings,
+    FusionSettings,
+    MeshSettings,
+    ScanSettings,
+)
+from bodyscan.verdict import Verdict
+
+if TYPE_CHECKING:
+    from bodyscan.fusion.scan import Scan
+    from bodyscan.fusion.storage import StoredScan
+    from bodyscan.measurement.measurements import Measurements
+    from bodyscan.mesh.body import BodyCloud, BodyMesh
+    from bodyscan.reconstruction.range_image import RangeImage
+    from bodyscan.registration.rig_calibration import RigCalibration
+    from bodyscan.rig.rig import Rig
+
+AnyPath: TypeAlias = str | PathLike[str]
+
+_HOMES = {
+    "BodyCloud": "bodyscan.mesh.body",
+    "BodyMesh": "bodyscan.mesh.body",
+    "Measurements": "bodyscan.measurement.measurements",
+    "RangeImage": "bodyscan.reconstruction.range_image",
+    "Rig": "bodyscan.rig.rig",
+    "RigCalibration": "bodyscan.registration.rig_calibration",
+    "Scan": "bodyscan.fusion.scan",
+    "StoredScan": "bodyscan.fusion.storage",
+}
+"""Types that only cost time where nobody asks for them."""
+
+__all__ = [
+    "AlignmentSettings",
+    "BadInput",
+    "BodyCloud",
+    "BodyMesh",
+    "BodyscanError",
+    "ExportSettings",
+    "FailedWork",
+    "FusionSettings",
+    "Measurements",
+    "MeshSettings",
+    "Outcome",
+    "RangeImage",
+    "Rig",
+    "RigCalibration",
+    "Scan",
+    "ScanSettings",
+    "StoredScan",
+    "Verdict",
+    "calibrate_rig",
+    "export",
+    "load_calibration",
+    "load_rig",
+    "load_scan",
+    "measure",
+    "save_calibration",
+    "save_scan",
+    "scan",
+    "triangulate",
+    "write_report",
+]
+
+
+def load_rig(path: AnyPath) -> Rig:
+    """A rig's description. Raises RigFileError with every problem, by line and column.
+
+    >>> rig = load_rig("rigs/three-pole-12.yaml")
+    >>> len(rig.pairs), rig.pairs[0].name, rig.volume.radius_mm
+    (12, 'p1-1', 700.0)
+    """
+    from bodyscan.rig.rig_file import load_rig as load
+
+    return load(Path(path))
+
+
+def calibrate_rig(rig_file: AnyPath, *, progress: Progress = silent) -> RigCalibration:
+    """Every pair of a rig calibrated and placed, from the board images that its file names.
+
+    `notes` and `failed` of what is returned say what was left out and why. Raises RigFileError,
+    CaptureError; FailedWork if no pair can be calibrated or the pairs do not hang together.
+    """
+    from bodyscan.captures.folder import open_captures
+    from bodyscan.workflows.calibrate_rig import calibrate_rig as calibrate
+
+    rig = load_rig(rig_file)
+    return calibrate(rig, open_captures(rig, Path(rig_file)), progress)
+
+
+def save_calibration(calibration: RigCalibration, folder: AnyPath) -> Path:
+    """Write calibration.json and its arrays into `folder`; the path of the JSON."""
+    from bodyscan.registration.storage import save_calibration as save
+
+    return save(calibration, Path(folder))
+
+
+def load_calibration(path: AnyPath) -> RigCalibration:
+    """What `save_calibration` or `bodyscan calibrate-rig` wrote, exact to the last bit.
+
+    Raises CalibrationFileError:
+
+    >>> try:
+    ...     load_calibration("nowhere")
+    ... except BadInput as error:
+    ...     print(error)
+    nowhere: there is no such file
+      give the folder that `bodyscan calibrate-rig` wrote
+    """
+    from bodyscan.registration.storage import load_calibration as load
+
+    return load(Path(path))
+
+
+def triangulate(
+    folder: AnyPath, calibration: RigCalibration, *, progress: Progress = silent
+) -> Outcome[list[RangeImage]]:
+    """What each pair measured of a scan by itself, background and all, in its camera's frame.
+
+    Pairs that gave nothing are failures of the outcome, with the reason. Raises CaptureError;
+    ScanFailed if no pair gave anything.
+    """
+    from bodyscan.captures.folder import open_scan
+    from bodyscan.workflows.range_images import reconstruct_range_images
+
+    captures = open_scan(calibration.rig, Path(folder))
+    return reconstruct_range_images(calibration, captures, progress)
+
+
+def scan(
+    folder: AnyPath,
+    calibration: RigCalibration,
+    settings: ScanSettings = ScanSettings(),
+    *,
+    empty: AnyPath | None = None,
+    progress: Progress = silent,
+) -> Scan:
+    """One person's captures fused: a cloud, a closed mesh, and a verdict on them.
+
+    empty: captures of the rig with nobody in it, whose surfaces are cut away. Raises CaptureError;
+    ScanFailed if there is no body.
+
+    >>> ScanSettings(fusion=FusionSettings(points=200_000)).mesh.depth
+    9
+    """
+    from bodyscan.captures.folder import open_scan
+    from bodyscan.workflows.scan_person import scan_person
+
+    captures = open_scan(calibration.rig, Path(folder))
+    nobody = None if empty is None else open_scan(calibration.rig, Path(empty))
+    return scan_person(calibration, captures, settings, progress, empty=nobody)
+
+
+def save_scan(
+    scan: Scan,
+    folder: AnyPath,
+    *,
+    calibration: AnyPath,
+    subject: str | None = None,
+    when: datetime | None = None,
+) -> StoredScan:
+    """Write the body model and what it is (scan.json) into `folder`; as it is read back.
+
+    calibration: where the one that it was made with is stored, which scan.json refers to by hash.
+    subject: a pseudonym, by which `bodyscan forget` finds all that was made of a person.
+    """
+    from bodyscan.fusion.storage import save_scan as save
+    from bodyscan.registration.storage import calibration_id
+
+    origin = calibration_id(Path(calibration))
+    save(scan, Path(folder), calibration_id=origin, subject=subject, when=when)
+    return load_scan(folder)
+
+
+def load_scan(folder: AnyPath) -> StoredScan:
+    """What `save_scan` or `bodyscan scan` wrote. Raises ResultError if it is missing or damaged."""
+    from bodyscan.fusion.storage import load_scan as load
+
+    return load(Path(folder))
+
+
+def measure(
+    body: Scan | StoredScan | BodyMesh, heights_mm: Sequence[float] | None = None
+) -> Measurements:
+    """Stature, volume, area and the girths of horizontal slices, how much of each was measured.
+
+    heights_mm: of the slices over the floor, every 100 mm if none are given. Raises BadInput for
+    a height at which there is no body.
+    """
+    from bodyscan.measurement.measurements import measure as measure_mesh
+    from bodyscan.mesh.body import BodyMesh
+
+    return measure_mesh(body if isinstance(body, BodyMesh) else body.mesh, heights_mm)
+
+
+def export(
+    stored: StoredScan,
+    folder: AnyPath,
+    settings: ExportSettings = ExportSettings(),
+    *,
+    frame: Literal["rig", "body"] = "rig",
+) -> list[Path]:
+    """Write a scan for other programs, each file with a JSON beside it; the paths.
+
+    frame: the rig's, or the body's own (origin under it, x the way it faces). Raises BadInput for
+    a format that there is not; FailedWork where a face is to be removed and no neck is found.
+
+    >>> ExportSettings().formats
+    ('ply', 'obj', 'stl', 'glb')
+    """
+    from bodyscan.export.scan import export_scan
+
+    return export_scan(
+        stored,
+        Path(folder),
+        settings.formats,
+        settings.versions,
+        deface=settings.deface,
+        frame=frame,
+    )
+
+
+def write_report(result: AnyPath, path: AnyPath | None = None) -> Verdict:
+    """One HTML file about a stored calibration or scan, report.html in it if no path is given.
+
+    Its verdict is returned. Raises BadInput for what is neither.
+    """
+    from bodyscan.workflows.write_report import write_report as write
+
+    return write(Path(result), None if path is None else Path(path))[1]
+
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        if name not in _HOMES:
+            raise AttributeError(f"module 'bodyscan' has no attribute {name!r}")
+        return getattr(import_module(_HOMES[name]), name)

@@ -1,0 +1,73 @@
+"""The front door: quick to open, the same for type checkers and at run time, its examples run."""
+
+from __future__ import annotations
+
+import doctest
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import bodyscan
+from bodyscan import api
+
+PROJECT = Path(__file__).parents[1]
+HEAVY = ("numpy", "open3d", "pycolmap", "cv2", "scipy", "numba", "pydantic")
+
+
+def python(program: str) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-c", program]
+    return subprocess.run(line, capture_output=True, text=True, check=True, cwd=PROJECT)
+
+
+def test_importing_it_costs_nothing():
+    said = python(f"import bodyscan, sys; print([m for m in {HEAVY} if m in sys.modules])")
+    assert said.stdout == "[]\n"
+
+
+def test_a_rig_is_loaded_without_what_fuses():
+    said = python(
+        "import bodyscan, sys; bodyscan.load_rig('rigs/one-pair.yaml')\n"
+        "print([m for m in ('open3d', 'pycolmap', 'cv2', 'numba') if m in sys.modules])"
+    )
+    assert said.stdout == "[]\n"
+
+
+@pytest.mark.parametrize("name", api.__all__)
+def test_every_name_is_there_and_says_what_it_is(name):
+    assert getattr(bodyscan, name) is getattr(api, name)
+    assert getattr(bodyscan, name).__doc__
+    assert name in dir(bodyscan)
+
+
+def test_the_list_is_sorted_and_short():
+    assert api.__all__ == sorted(api.__all__)
+    assert len(api.__all__) < 32
+
+
+def test_a_word_that_is_no_name_is_refused():
+    with pytest.raises(AttributeError, match="scann"):
+        bodyscan.scann  # noqa: B018
+
+
+def test_star_gives_the_list():
+    given: dict[str, object] = {}
+    exec("from bodyscan import *", given)
+    assert set(api.__all__) <= set(given)
+
+
+def test_the_examples_run(monkeypatch):
+    monkeypatch.chdir(PROJECT)
+    found = doctest.testmod(api)
+    assert found.attempted >= 5
+    assert found.failed == 0
+
+
+def test_the_page_names_every_name():
+    page = (PROJECT / "docs" / "api.md").read_text("utf-8")
+    assert [name for name in api.__all__ if f"`{name}`" not in page] == []
+
+
+def test_the_package_says_that_it_is_typed():
+    assert (Path(bodyscan.__file__).parent / "py.typed").is_file()
