@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import BoundaryPoints, binned
 from bodyscan.calibration.camera import CameraCalibration
@@ -22,8 +22,6 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.outcome import Outcome
 from bodyscan.stripes.stripe_code import StripeCode
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, join, part
@@ -18,8 +18,6 @@ from bodyscan.rig.board import Board
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
 
-Array = NDArray[np.float64]
-
 FEWEST_STRIPE_SHOTS = 2
 RIM_SQUARES = 0.1
 """Of the outermost squares so much is left out: beside the print the board may be cut unevenly."""
@@ -29,7 +27,7 @@ RIM_SQUARES = 0.1
 class BoardBoundaries:
     """Stripe boundaries of one shot that lie near a board: index (N,), pixels (N, 2), sigma (N,)."""
 
-    index: NDArray[np.int64]
+    index: Indices
     pixels: Array
     sigma_px: Array
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_bytes, write_json
 from bodyscan.rig.frame_names import FrameNames
@@ -80,7 +80,7 @@ def _write_kind(
     frames: FrameNames,
     kind: StripeCode,
     pairs: list[Pair],
-    coded: NDArray[np.uint8],
+    coded: Bytes,
 ) -> Path:
     height, width = coded.shape[1:]
     order = []
@@ -100,9 +100,7 @@ def _write_kind(
     return folder / LIST_NAME
 
 
-def _in_order(
-    frames: FrameNames, kind: StripeCode, coded: NDArray[np.uint8]
-) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+def _in_order(frames: FrameNames, kind: StripeCode, coded: Bytes) -> Iterator[tuple[str, Bytes]]:
     """Name and image (H, W): lit, dark if it is taken, then those of the code."""
     blank = np.zeros(coded.shape[1:], np.uint8)
     yield frames.lit, blank + 255

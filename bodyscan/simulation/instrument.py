@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.gray import bit_count, code_bits
 from bodyscan.stripes.codes.stripe_index import INDEX
 from bodyscan.stripes.stripe_code import StripeCode
-
-Image = NDArray[np.uint8]
 
 _LEAST_LIGHT = 12
 _NONE, _TOO_BRIGHT = 0, 255
 
 
 def instrument_images(
-    images: dict[str, Image], code: StripeCode, frames: FrameNames
-) -> dict[str, Image]:
+    images: dict[str, Bytes], code: StripeCode, frames: FrameNames
+) -> dict[str, Bytes]:
     """The lit image and the stripe-index image, from what its camera saw of its Gray code.
 
     images: by the names of `patterns.projected_patterns`, with lit and a dark one named "".

@@ -7,8 +7,8 @@ mistake in that would be made again here, and cancel out when the images are dec
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.gray import bit_count, code_bits
@@ -17,8 +17,6 @@ from bodyscan.stripes.codes.light_section import STRIPE, LightSection
 from bodyscan.stripes.codes.phase_shift import PHASE, PhaseShift
 from bodyscan.stripes.codes.stripe_index import StripeIndex
 from bodyscan.stripes.stripe_code import ImageKind, StripeCode
-
-Array = NDArray[np.float64]
 
 PARTS = 16
 """Values of light in a stripe, where it changes inside stripes."""

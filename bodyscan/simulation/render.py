@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Floats
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.gray import LightTable, light_table, table_index
 from bodyscan.simulation.inter_reflection import LitFacets, light_facets
@@ -21,9 +22,6 @@ from bodyscan.simulation.sensor import add_speckle, blur, off_focus, shade
 from bodyscan.simulation.settings import InterReflection, Optics, Projection
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.stripe_code import StripeCode
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 
 _BAND = 250_000
 _DEFOCUS_STEPS = 12

@@ -9,16 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfinv
 
+from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.albedo_edges import Brightness
 from bodyscan.stripes.bit_words import bit_that_flips
 from bodyscan.stripes.indirect_light import imbalance
 from bodyscan.stripes.scan_lines import ScanLines
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 MAX_RATIO = 0.98
 TABLE_SIZE = 4096
@@ -45,12 +41,12 @@ class Boundaries:
     begins.  blur2: px^2, of lens and pixel, see `albedo_edges`.
     """
 
-    line: Ints
-    before: Ints
-    position: Floats
-    line_position: Floats
-    sigma_px: Floats
-    index: Ints
+    line: Indices
+    before: Indices
+    position: Array
+    line_position: Array
+    sigma_px: Array
+    index: Indices
     joined: Mask
     blur2: float
 
@@ -60,7 +56,7 @@ def find_boundaries(
     brightness: Brightness,
     codes: NDArray[np.int32],
     usable: Mask,
-    variance: NDArray[np.float32],
+    variance: Floats,
     finest_run: int = 2,
 ) -> Boundaries:
     """All places where the code changes by one between two usable pixels of a line.
@@ -100,7 +96,7 @@ def find_boundaries(
 
 
 def continues_to_next(
-    line: Ints, before: Ints, position: Floats, index: Ints, usable: Mask
+    line: Indices, before: Indices, position: Array, index: Indices, usable: Mask
 ) -> Mask:
     """(N - 1,) whether the next boundary ends the stripe that this one begins.
 
@@ -111,7 +107,7 @@ def continues_to_next(
 
 
 @compiled
-def _joined(line: Ints, before: Ints, position: Floats, index: Ints, usable: Mask) -> Mask:
+def _joined(line: Indices, before: Indices, position: Array, index: Indices, usable: Mask) -> Mask:
     joined = np.zeros(max(line.size - 1, 0), np.bool_)
     for k in range(joined.size):
         if line[k + 1] != line[k] or abs(index[k + 1] - index[k]) != 1:
@@ -124,7 +120,7 @@ def _joined(line: Ints, before: Ints, position: Floats, index: Ints, usable: Mas
 
 
 @compiled
-def _crossings(codes: NDArray[np.int32], usable: Mask) -> Ints:
+def _crossings(codes: NDArray[np.int32], usable: Mask) -> Indices:
     """(N,) flat pixels, usable as the next of their line is, whose codes differ by one."""
     found, count = np.empty(codes.size, np.int64), 0
     for line in range(codes.shape[0]):
@@ -140,13 +136,13 @@ def _crossings(codes: NDArray[np.int32], usable: Mask) -> Ints:
 
 @compiled
 def _zeros(
-    difference: Image,
-    noise: Image,
-    before: Floats,
-    behind: Floats,
-    middle: Floats,
-    middle_sigma: Floats,
-) -> tuple[Floats, Floats]:
+    difference: Floats,
+    noise: Floats,
+    before: Array,
+    behind: Array,
+    middle: Array,
+    middle_sigma: Array,
+) -> tuple[Array, Array]:
     """Where the difference is the middle one, px behind the pixel before it, and its sigma.
 
     difference, noise: (N, 2) in the pixels before and behind; before, behind: (N,) lit minus dark.

@@ -8,12 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 
-Bytes = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-Ints = NDArray[np.int64]
-Image = NDArray[np.float32]
 Words = NDArray[np.uint16]
 
 WHOLE_SHARE = 128
@@ -47,7 +44,7 @@ class ScanLines:
         return ScanLines(lit, dark, transpose(patterns), turned, True)
 
     @property
-    def contrast(self) -> NDArray[np.float32]:
+    def contrast(self) -> Floats:
         """Lit minus dark, (L, P), grey levels."""
         return cv2.subtract(self.lit, self.dark, dtype=cv2.CV_32F)
 
@@ -70,9 +67,7 @@ class ScanLines:
         middle = cv2.add(self.lit, self.dark, dtype=cv2.CV_16S)
         return np.asarray(2 * self.patterns[bit].astype(np.int16) > middle)
 
-    def difference(
-        self, bit: NDArray[np.int64], at: NDArray[np.int64], variance: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def difference(self, bit: Indices, at: Indices, variance: Floats) -> tuple[Floats, Floats]:
         """Pattern minus inverse of bits (N,) at flat pixels (N, K), and its noise, grey levels.
 
         Pixels below 0 get 0. Without inverses, twice what the pattern is above the middle of lit
@@ -83,7 +78,7 @@ class ScanLines:
             self.lit.ravel(), self.dark.ravel(), patterns, inverses, bit, at, variance
         )
 
-    def direct_share(self, bit: int, variance: NDArray[np.float32]) -> Bytes:
+    def direct_share(self, bit: int, variance: Floats) -> Bytes:
         """(L, P): what part of lit minus dark shows in `difference` of one bit, or as much as its
         noise allows, in 1/WHOLE_SHARE; at most 255."""
         share = np.empty(self.lit.size, np.uint8)
@@ -115,7 +110,7 @@ def _append_bit(words: Words, pattern: Bytes, inverse: Bytes) -> None:
 
 @compiled
 def _difference(
-    pattern: int, inverse: int, lit: int, dark: int, inverted: bool, variance: Image
+    pattern: int, inverse: int, lit: int, dark: int, inverted: bool, variance: Floats
 ) -> tuple[np.float32, np.float32]:
     """See `ScanLines.difference`; of one pixel."""
     seen = np.float32(pattern)
@@ -128,8 +123,14 @@ def _difference(
 
 @compiled
 def _differences(
-    lit: Bytes, dark: Bytes, patterns: Bytes, inverses: Bytes, bit: Ints, at: Ints, variance: Image
-) -> tuple[Image, Image]:
+    lit: Bytes,
+    dark: Bytes,
+    patterns: Bytes,
+    inverses: Bytes,
+    bit: Indices,
+    at: Indices,
+    variance: Floats,
+) -> tuple[Floats, Floats]:
     difference, noise = np.zeros(at.shape, np.float32), np.zeros(at.shape, np.float32)
     inverted = inverses.size > 0
     for k in range(at.shape[0]):
@@ -147,7 +148,7 @@ def _differences(
 
 @compiled
 def _share(
-    lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, variance: Image, share: Bytes
+    lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, variance: Floats, share: Bytes
 ) -> None:
     inverted = inverse.size > 0
     other = inverse if inverted else pattern

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Bytes, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.bit_words import WordCode
@@ -19,8 +20,6 @@ from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.usable_pixels import SATURATED
 
 Codes = NDArray[np.uint16]
-Greys = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 SAMPLES = 50_000
 """About so many pixels are looked at where the whole picture is meant."""
@@ -125,7 +124,7 @@ def _check_range(bit: int, error: float) -> None:
 
 @compiled
 def _in_sum(
-    lit: Greys, dark: Greys, pattern: Greys, inverse: Greys, at: NDArray[np.int64]
+    lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, at: Indices
 ) -> tuple[float, float]:
     """At flat pixels (N,): the share at which pattern and inverse look alike, and by how much of its
     contrast their sum differs from the lit frame's and the dark one's."""
@@ -141,7 +140,7 @@ def _in_sum(
 
 
 @compiled
-def _out_of_range(lit: Greys, dark: Greys, pattern: Greys, at: NDArray[np.int64]) -> float:
+def _out_of_range(lit: Bytes, dark: Bytes, pattern: Bytes, at: Indices) -> float:
     """At flat pixels (N,): by how much of its contrast a pattern is brighter than the lit frame or
     darker than the dark one."""
     error = 0.0

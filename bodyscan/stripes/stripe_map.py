@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
 from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.scan_lines import ScanLines
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,24 +27,24 @@ class StripeMap:
     were wanted. s is NaN there (see `StripeLimits`).
     """
 
-    s: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    lit: NDArray[np.uint8]
-    boundary_index: NDArray[np.int64]
+    s: Floats
+    sigma: Floats
+    lit: Bytes
+    boundary_index: Indices
     boundary_pixels: Array
-    boundary_sigma_px: NDArray[np.float32]
+    boundary_sigma_px: Floats
     stripes: int
-    beyond: NDArray[np.bool_] | None = None
+    beyond: Mask | None = None
 
 
 def stripe_map(
     images: ScanLines,
-    lit: NDArray[np.uint8],
-    s: NDArray[np.float32],
-    sigma: NDArray[np.float32],
+    lit: Bytes,
+    s: Floats,
+    sigma: Floats,
     boundaries: Boundaries,
     stripes: int,
-    beyond: NDArray[np.bool_] | None = None,
+    beyond: Mask | None = None,
 ) -> StripeMap:
     """What was read along scan lines, back in the camera's own layout."""
     pixels = np.stack([boundaries.position, boundaries.line_position], axis=-1)

@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bodyscan.arrays import Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.indirect_light import mostly_direct
 from bodyscan.stripes.scan_lines import ScanLines
-
-Mask = NDArray[np.bool_]
 
 SATURATED = 254
 MIN_CONTRAST = 4.0
@@ -23,7 +22,7 @@ WHOLLY_COVERED = 0.7
 def usable_pixels(
     images: ScanLines,
     codes: NDArray[np.int32],
-    variance: NDArray[np.float32],
+    variance: Floats,
     stripes: int,
     fine_bit: int,
 ) -> Mask:
