@@ -10,7 +10,6 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
-from bodyscan.fusion.grid import carried, rotated
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -47,7 +46,7 @@ def sees_through(
 
     Either something was measured behind them, or they lie in a gap: `gaps`.
     """
-    in_camera = carried(points, rig_from_camera.inverse())
+    in_camera = _transform_points(points, rig_from_camera.inverse())
     ahead = in_camera[:, 2] > 1.0
     u, v = image.camera.project(np.where(ahead[:, None], in_camera, np.float32(1.0))).T
     columns, rows = np.rint(u).astype(np.intp), np.rint(v).astype(np.intp)
@@ -118,7 +117,7 @@ def _rays(
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).astype(float)
     rays = np.empty((*pixels.shape[:2], 6), np.float32)
     rays[..., :3] = rig_from_camera.translation
-    rays[..., 3:] = rotated(camera.rays(pixels).astype(np.float32), rig_from_camera)
+    rays[..., 3:] = _rotate_directions(camera.rays(pixels).astype(np.float32), rig_from_camera)
     return rays
 
 
@@ -135,3 +134,14 @@ def _only_made_up(guess: Guess, rays: Floats) -> Mask:
     ray, face = crossings["ray_ids"].numpy(), crossings["primitive_ids"].numpy()
     real = np.bincount(ray[~guess.filled[face]], minlength=len(rays))
     return real == 0
+
+
+def _transform_points(points: Floats, a_from_b: RigidTransform) -> Floats:
+    """Points (..., 3) float32 in b to a; several times quicker than numpy on triples."""
+    matrix = np.column_stack([a_from_b.rotation, a_from_b.translation])
+    return cv2.transform(points.reshape(1, -1, 3), matrix).reshape(points.shape)
+
+
+def _rotate_directions(directions: Floats, a_from_b: RigidTransform) -> Floats:
+    """Directions (..., 3) float32 in b to a."""
+    return cv2.transform(directions.reshape(1, -1, 3), a_from_b.rotation).reshape(directions.shape)
