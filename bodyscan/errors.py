@@ -1,6 +1,6 @@
 """What went wrong, where, and what to do about it.
 
-`BadInput` is something a user can mend (the command line exits with 2); `FailedWork` is good input
+`BadInput` is something a user can correct (the command line exits with 2); `FailedWork` is good input
 on which the work did not succeed (exit 1).
 """
 

@@ -114,7 +114,7 @@ class ExportSettings(Model):
     in metres, y up."""
 
     versions: tuple[MeshVersion, ...] = Field(default=("full", "light"), min_length=1)
-    """full; light: 50,000 faces, which any viewer turns; open: without what was made up."""
+    """full; light: 50,000 faces, which any viewer turns; open: without what was filled."""
 
     deface: bool = False
     """without a recognisable face, for sharing; everything below the neck as it is."""

@@ -17,8 +17,8 @@ STILL = AlignmentSettings(sway_mm=0.0, sway_deg=0.0)  # a rigid object
 
 @dataclass(frozen=True, eq=False)
 class ObjectRefinement:
-    """alignment: what the object's overlaps asked for.  rig_from_camera: of all pairs; those that
-    saw nothing of it, or wanted to move farther than the boards allow, stay where they were."""
+    """alignment: what the object's overlaps ask for.  rig_from_camera: of all pairs; those that
+    saw nothing of it, or would have moved farther than the boards allow, stay where they were."""
 
     alignment: Alignment
     rig_from_camera: dict[str, RigidTransform]
@@ -40,7 +40,7 @@ class ObjectRefinement:
             farthest = max(sorted(found.motion_mm), key=lambda name: found.motion_mm[name])
             said.append(f"farthest moved: {farthest}, {found.motion_mm[farthest]:.3f} mm")
         said += [
-            f"{name} wanted to move by {sigmas:.1f} sigmas of what the boards allow: left where it is"
+            f"{name} would have moved by {sigmas:.1f} sigmas, more than the boards allow: left as is"
             for name, sigmas in sorted(found.refused.items())
         ]
         return said

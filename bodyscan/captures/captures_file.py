@@ -15,7 +15,7 @@ from bodyscan.files.yaml_file import dump_yaml
 from bodyscan.rig.rig import Rig
 
 FILE_NAME = "captures.yaml"
-_REMEDY = "Mend captures.yaml; docs/formats.md explains every key."
+_REMEDY = "Correct captures.yaml; docs/formats.md explains every key."
 
 
 class ShotEntry(Model):

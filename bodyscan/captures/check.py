@@ -129,7 +129,7 @@ def report_lines(report: CheckReport) -> list[str]:
     lines += [f"error: {text}" for text in report.errors]
     lines += [f"warning: {text}" for text in report.warnings]
     faults = len(report.errors) + len(report.bad_images)
-    lines.append("good" if report.ok else f"{_several(faults, 'fault')} to mend")
+    lines.append("good" if report.ok else f"{_several(faults, 'fault')} to correct")
     return lines
 
 

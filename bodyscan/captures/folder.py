@@ -182,7 +182,7 @@ def _open(
         raise CaptureError(
             f"is of kind {file.kind}, but {kind} captures are wanted here",
             where=str(folder / FILE_NAME),
-            remedy="Name the right folder, or mend `kind` in its captures.yaml.",
+            remedy="Name the right folder, or correct `kind` in its captures.yaml.",
         )
     entries = {shot.name: shot for shot in (file.shots if file else None) or ()}
     names = wanted or tuple(entries) or _discover(rig, listing, template)
@@ -201,7 +201,7 @@ def _open(
         raise CaptureError(
             f"holds no image of rig {rig.name} by the template {template}",
             where=str(folder),
-            remedy=f"An image should be named such as {example}; mend `files` in the rig file.",
+            remedy=f"An image should be named such as {example}; correct `files` in the rig file.",
         )
     when, subject = (file.when, file.subject) if file else (None, None)
     return Captures(rig, (folder,), names, sequences, when, subject)

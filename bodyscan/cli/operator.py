@@ -275,7 +275,7 @@ def _run(
             listen(summary)
     except KeyboardInterrupt:
         sys.stdout.flush()
-        typer.secho("stopped; the same command goes on from here", err=True)
+        typer.secho("stopped; run the same command again to go on", err=True)
         os._exit(130)  # the jobs' processes end with this one
     output.exit_code = 1 if summary["set_aside"] or summary["repeat"] else 0
 
@@ -293,11 +293,11 @@ def verify(
     output.say(*(printable(fault) for fault in verified.faults), wrong=True)
     if verified.faults:
         raise FailedWork(
-            f"{len(verified.faults)} of {verified.files} files are not as they were",
+            f"{len(verified.faults)} of {verified.files} files have changed",
             where=str(folder),
-            remedy="restore them, or start the batch again: it makes anew what was touched",
+            remedy="restore them, or start the batch again: it redoes what was changed",
         )
-    output.say(f"{verified.files} files, every byte as it was")
+    output.say(f"{verified.files} files, every byte unchanged")
 
 
 def forget(
@@ -316,7 +316,7 @@ def forget(
     found = forgetting.find_subject(subject, workspace)
     if not dry_run:
         if sys.stdin.isatty() and not yes and found.files:
-            question = f"remove {len(found.files)} files of {subject} for ever?"
+            question = f"remove {len(found.files)} files of {subject} for good?"
             typer.confirm(question, abort=True, err=True)
         found = forgetting.forget_subject(subject, workspace)
     verb = "would remove" if dry_run else "removed"

@@ -13,7 +13,7 @@ from bodyscan.errors import BadInput
 from bodyscan.files.model import Model, Problem
 from bodyscan.files.model_file import apply_changes, load_model
 
-_REMEDY = "Mend the acceptance file; docs/report.md explains every key."
+_REMEDY = "Correct the acceptance file; docs/report.md explains every key."
 MOST_SPHERES = 6
 """Spheres are told apart by trying every order of them."""
 
@@ -91,5 +91,5 @@ def limit_from(text: str) -> tuple[str, float]:
         return name.strip(), float(value)
     except ValueError:
         raise AcceptanceError(
-            f"{text!r} is no limit", remedy="write it as --limit flatness_mm=0.5"
+            f"{text!r} is not a limit", remedy="write it as --limit flatness_mm=0.5"
         ) from None

@@ -44,7 +44,7 @@ class Comparison:
 def compare_surfaces(mesh: BodyMesh, other: Path) -> list[Comparison]:
     """The mesh's measured part against `other`: a scan's folder or a PLY in mm, rig frame.
 
-    First as they stand, then with the scan laid on the other as a whole.  Raises ResultError or
+    First as they stand, then with the scan fitted to the other as a whole.  Raises ResultError or
     BadInput where `other` cannot be read, or cannot be the same subject.
     """
     vertices, faces = _surface(other)

@@ -18,13 +18,13 @@ _BLOCK = 1 << 20
 def file_hash(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal.
 
-    Raises BadInput for what is no plain file (a pipe would be waited on for ever), OSError when it
+    Raises BadInput for what is not a regular file (a pipe would be waited on for ever), OSError when it
     cannot be read.
     """
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     with open(handle, "rb", buffering=0) as stream:
         if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise BadInput("is no plain file", where=str(path), remedy="take it away")
+            raise BadInput("is not a regular file", where=str(path), remedy="take it away")
         digest = hashlib.sha256()
         while block := stream.read(_BLOCK):
             digest.update(block)

@@ -41,7 +41,7 @@ def problem_error(problem: Problem) -> InitErrorDetails:
 
 def unknown_key_error(key: str, known: Iterable[str]) -> InitErrorDetails:
     """As pydantic refuses a key; with those that it may have been meant for."""
-    said = PydanticCustomError("extra_forbidden", "is no key known here", {"known": list(known)})
+    said = PydanticCustomError("extra_forbidden", "is not a key known here", {"known": list(known)})
     return InitErrorDetails(type=said, loc=(key,), input=None)
 
 

@@ -159,7 +159,7 @@ def _translated(
             hint = did_you_mean(str(where[-1]), known)
             guessed |= {(*where[:-1], key) for key in known if f"'{key}'" in hint}
             place = document.place(where, of_key=True)
-            other.append(YamlProblem(place, dotted_path(where), f"is no key known here{hint}"))
+            other.append(YamlProblem(place, dotted_path(where), f"is not a key known here{hint}"))
         elif e["type"] in _MUST_BE:
             limits = {key: _plain(value) for key, value in e.get("ctx", {}).items()}
             wrong.setdefault(where, []).append(_MUST_BE[e["type"]].format(**limits))

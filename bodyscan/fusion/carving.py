@@ -52,7 +52,7 @@ def poisson_hints(
 ) -> tuple[Array, Array]:
     """Points (N, 3) and outward normals (N, 3) of a likely surface where nothing was measured.
 
-    vertices, faces, filled: a rough closed surface, and which of its faces are made up.
+    vertices, faces, filled: a rough closed surface, and which of its faces are filled.
     measured: the tree of the cloud's points.
     """
     guess = Guess.of(vertices, faces, filled)

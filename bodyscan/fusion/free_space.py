@@ -20,7 +20,7 @@ WIDEST_GAP_MM = 200.0
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """A closed surface that is partly made up: a ray-casting scene, and which faces are."""
+    """A closed surface that is partly filled: a ray-casting scene, and which faces are."""
 
     scene: o3d.t.geometry.RaycastingScene
     filled: Mask

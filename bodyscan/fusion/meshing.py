@@ -1,4 +1,4 @@
-"""A closed mesh from a body cloud: screened Poisson, then what it made up is marked."""
+"""A closed mesh from a body cloud: screened Poisson, then what it filled is marked."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def poisson(
 def attach_attributes(
     vertices: Array, faces: Indices, cloud: BodyCloud, tree: cKDTree, reach_mm: float
 ) -> BodyMesh:
-    """Brought onto the points, with normals, the points' colours and sigmas, and what was made up.
+    """Brought onto the points, with normals, the points' colours and sigmas, and what was filled.
 
     Poisson's surface is smoother than the points are exact; vertices move along their normals to
     where the points around say, less the farther these are.

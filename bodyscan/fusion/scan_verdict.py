@@ -82,7 +82,7 @@ def _motion(alignment: Alignment | None) -> Iterator[Finding]:
     if motion > SOME_MOTION_MM:
         yield (
             "repeat" if motion > MOST_MOTION_MM else "usable",
-            f"the person moved by {motion:.1f} mm (pair {name}) while the pairs fired",
+            f"the person moved by {motion:.1f} mm (pair {name}) between the pairs' captures",
         )
 
 
@@ -143,7 +143,7 @@ def _omissions(cloud: BodyCloud, mesh: BodyMesh) -> Iterator[Finding]:
 
 def _contacts(mesh: BodyMesh) -> Iterator[Finding]:
     if mesh.filled.mean() > MOST_FILLED:
-        return  # what is made up touches anywhere
+        return  # what is filled touches anywhere
     middle = 0.5 * (mesh.vertices[:, 1].min() + mesh.vertices[:, 1].max())
     for ring in rings(mesh.vertices, mesh.faces):
         side = "left" if ring.y_mm > middle else "right"
@@ -161,7 +161,7 @@ def _gaps(mesh: BodyMesh) -> Iterator[Finding]:
     if filled > SOME_FILLED:
         yield (
             "repeat" if filled > MOST_FILLED else "usable",
-            f"{filled:.0%} of the surface is made up: nothing was measured there",
+            f"{filled:.0%} of the surface is filled: nothing was measured there",
         )
     height = mesh.vertices[mesh.faces, 2].mean(axis=1)
     band = np.maximum(height / BAND_MM, 0.0).astype(np.int64)

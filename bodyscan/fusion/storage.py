@@ -153,7 +153,7 @@ def load_scan(folder: Path) -> StoredScan:
         ) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ResultError(
-            f"is no readable scan result ({type(error).__name__}: {error})",
+            f"is not a readable scan result ({type(error).__name__}: {error})",
             where=str(file),
             remedy=remedy,
         ) from error

@@ -94,9 +94,9 @@ def read_job(folder: Path) -> Job:
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ResultError(
-            f"is no readable job ({type(error).__name__}: {error})",
+            f"is not a readable job ({type(error).__name__}: {error})",
             where=str(folder / JOB),
-            remedy="start the batch again: it writes this file anew",
+            remedy="start the batch again: it rewrites this file",
         ) from error
 
 

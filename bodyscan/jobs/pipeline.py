@@ -22,7 +22,7 @@ from bodyscan.settings import (
     ScanSettings,
 )
 
-_REMEDY = "Mend the pipeline file; docs/formats.md explains every key."
+_REMEDY = "Correct the pipeline file; docs/formats.md explains every key."
 
 
 class PipelineError(BadInput):
@@ -94,7 +94,7 @@ def _change(text: str) -> tuple[tuple[str, ...], Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise PipelineError(
-            f"--set {text} is no change",
+            f"--set {text} is not a change",
             remedy="write --set KEY=VALUE, such as fusion.points=2000000",
         )
     where = tuple(key.strip().split("."))

@@ -86,7 +86,7 @@ def reason_to_run(job: Job, now: Origin) -> str:
     if said := _difference(inputs, now.inputs):
         return f"inputs changed: {said}"
     if said := _difference(outputs, result_hashes(folder)):
-        return f"its result was touched: {said}"
+        return f"its result was changed: {said}"
     return ""
 
 

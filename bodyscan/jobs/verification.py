@@ -25,7 +25,7 @@ class Verification:
 def verify(folder: Path, kinds: Kinds = KINDS) -> Verification:
     """Of a batch's output folder, or of one job's folder.
 
-    Raises BadInput when there is no manifest at all.
+    Raises BadInput when there is not a manifest at all.
     """
     if not (folder / MANIFEST).exists():
         raise BadInput(
@@ -63,7 +63,7 @@ def _job(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
         own = content.pop("own_sha256")
         inputs, outputs = dict(content["inputs"]), dict(content["outputs"])
     except (KeyError, TypeError, ValueError, AttributeError):
-        yield path, "is no manifest"
+        yield path, "is not a manifest"
         return
     yield path, "" if content_hash(content) == own else "was changed"
     for name, digest in outputs.items():

@@ -96,7 +96,7 @@ def heights_from(text: str) -> list[float]:
         return [float(word) for word in text.split(",")]
     except ValueError as error:
         raise BadInput(
-            f"{text!r} is no list of heights", remedy="Write mm with commas between: 800,1050."
+            f"{text!r} is not a list of heights", remedy="Write mm with commas between: 800,1050."
         ) from error
 
 

@@ -32,7 +32,7 @@ class BodyMesh:
 
     vertices: (V, 3) float64, mm.  faces: (F, 3) int64.  normals: (V, 3) float32, unit, outward.
     colours: (V, 3) uint8.  sigma_mm: (V,) float32, NaN on filled vertices.
-    filled: (F,) bool, faces that no pair measured and that were made up to close the mesh.
+    filled: (F,) bool, faces that no pair measured and that were filled to close the mesh.
     """
 
     vertices: Array
@@ -44,7 +44,7 @@ class BodyMesh:
 
     @property
     def filled_share(self) -> float:
-        """Share of the surface's area that was made up."""
+        """Share of the surface's area that was filled."""
         area = face_areas(self.vertices, self.faces)
         return float(area[self.filled].sum() / area.sum()) if area.any() else 0.0
 

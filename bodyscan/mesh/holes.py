@@ -1,4 +1,4 @@
-"""Where a body mesh was made up: its filled patches, how large, and where they lie."""
+"""Where a body mesh was filled: the patches, how large, and where they lie."""
 
 from __future__ import annotations
 

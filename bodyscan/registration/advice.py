@@ -80,8 +80,8 @@ class Advice:
     def lines(self) -> list[str]:
         """For the builder of the rig."""
         said = [
-            f"nothing but {_shots(link.shots)} in common ties {link.first} and {link.second}, and "
-            "nothing else the parts of the rig on either side of them"
+            f"{_shots(link.shots)} in common is all that ties {link.first} to {link.second}, and with "
+            "them the parts of the rig on either side"
             for link in self.bridges
         ]
         if self.crucial:
@@ -236,8 +236,8 @@ def _shots(count: int) -> str:
 def _sentence(more: MoreShots) -> str:
     if more.after_mm > WORTH * more.before_mm:
         return (
-            f"no further shots of this board would help {more.pair} much: {more.shots} more bring "
-            f"{more.before_mm:.3f} to {more.after_mm:.3f} mm"
+            f"further shots of this board would not help {more.pair} much: {more.shots} more bring its "
+            f"sigma from {more.before_mm:.3f} to {more.after_mm:.3f} mm"
         )
     a, b = more.between
     place = more.place
@@ -247,12 +247,12 @@ def _sentence(more: MoreShots) -> str:
     effect = (
         f"would halve the sigma of {more.pair}"
         if more.halves
-        else f"would sharpen {more.pair}, though not by half"
+        else f"would improve {more.pair}, though not by half"
     )
     return (
         f"{more.shots} more {'shot' if more.shots == 1 else 'shots'} seen by both {a} and {b}{also}, "
         f"board at {place.height} height "
-        f"(middle at {x:.0f}, {y:.0f}, {z:.0f} mm, facing {_facing(place.facing_deg)}, tilted this way "
-        f"and that), {effect}: {more.before_mm:.3f} to "
+        f"(middle at {x:.0f}, {y:.0f}, {z:.0f} mm, facing {_facing(place.facing_deg)}, tilted in turn "
+        f"in all directions), {effect}: {more.before_mm:.3f} to "
         f"{more.after_mm:.3f} mm"
     )

@@ -77,6 +77,6 @@ def size_doubt(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> list[
     ratio = float(np.median(ratios))
     boards = ", ".join(f"{board.name}: {board.square_mm:g}" for board in rig.boards)
     return [
-        f"the cameras stand {ratio:.3f} times as far apart as their nominal placings: square_mm may be "
+        f"the cameras stand {ratio:.3f} times as far apart as their nominal poses: square_mm may be "
         f"wrong in the rig file ({boards}; {rig.boards[0].square_mm / ratio:.2f} would fit)"
     ]

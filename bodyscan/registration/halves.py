@@ -49,7 +49,7 @@ class HalvesComparison:
             np.sqrt((values**2).sum(axis=1).mean()) for values in (self.shifts_mm, self.sigmas_mm)
         )
         return (
-            f"placed from either half of the shots, cameras differ by {shift:.3f} mm RMS "
+            f"solved from either half of the shots, cameras differ by {shift:.3f} mm RMS "
             f"({sigma:.3f} expected); all differences are {self.over_expected:.2f} times what is "
             "expected"
         )
@@ -76,7 +76,7 @@ def compare_halves(rig: Rig, placed: PlacedRig, *, seed: int = 0) -> HalvesCompa
     """
     names = tuple(sorted(placed.rig_from_camera))
     if len(names) < 2:
-        raise FailedWork("one pair alone has no placing to compare", where=f"rig {rig.name}")
+        raise FailedWork("one pair alone has no pose to compare", where=f"rig {rig.name}")
     halves = split_shots(placed.views, names, seed=seed)
     holder = rig.frame_pair.name if rig.frame_pair else names[0]
     first, second = (_placed_by(rig, placed, shots, holder) for shots in halves)

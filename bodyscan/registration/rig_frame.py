@@ -88,7 +88,7 @@ def rig_from_root(
         raise BadInput(
             f"the rig frame is fixed by pair {pair.name}, which could not be calibrated",
             where=f"rig {rig.name}",
-            remedy="mend that pair's captures, or name another pair in rig_frame",
+            remedy="correct that pair's captures, or name another pair in rig_frame",
         )
     placed = nominal_pose(pair.nominal) if pair.nominal else RigidTransform.identity()
     return placed @ root_from_camera[pair.name].inverse()

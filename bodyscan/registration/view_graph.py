@@ -105,7 +105,7 @@ def placings(
 def not_together(names: Iterable[str]) -> str:
     """What is said of pairs whose views agree with those of others in too few shots."""
     return (
-        f"the relative placing of {', '.join(sorted(names))} that follows from shared boards differs "
+        f"the relative pose of {', '.join(sorted(names))} that follows from shared boards differs "
         "from shot to shot: their pictures were not taken together with the others', or the board "
         "moved meanwhile"
     )
@@ -247,7 +247,7 @@ def _refuse_disconnected(graph: nx.Graph) -> None:
 def _open_tie(first: Group, second: Group, tie: Tie) -> RigDisconnected:
     shots = ", ".join(sorted({shot for shot, _ in tie.targets})[:6])
     return RigDisconnected(
-        f"the placing of {', '.join(sorted(first))} and {', '.join(sorted(second))} stays open: "
+        f"the relative pose of {', '.join(sorted(first))} and {', '.join(sorted(second))} stays open: "
         "their shared board may be numbered from either end, and their views do not settle which "
         f"(shots {shots})",
         remedy="capture one or two more shots that both see, the board tilted differently; or use "

@@ -56,7 +56,7 @@ def layers(
     pairs = np.array(PAIRS, np.uint8)[np.clip(cloud.pairs_seen[nearest], 1, len(PAIRS)) - 1]
     tint = FILLED_TINT[::-1]
     plain = np.full(small.vertices.shape, SKIN, np.uint8)
-    grey = (css(UNKNOWN), "made up, nothing measured")
+    grey = (css(UNKNOWN), "filled, nothing measured")
     found = [
         Layer("photo", small.colours, None, unlit=True),
         Layer("shape", plain),
@@ -69,7 +69,7 @@ def layers(
             "swatches": [grey],
         }),
         Layer("filled", np.where(made_up[:, None], tint, SKIN).astype(np.uint8), {
-            "swatches": [(css(SKIN), "measured"), (css(tint), "made up to close the mesh")],
+            "swatches": [(css(SKIN), "measured"), (css(tint), "filled to close the mesh")],
         }),
     ]  # fmt: skip
     if comparison is not None:
@@ -101,7 +101,7 @@ def _deviation(
     return Layer(
         "deviation",
         _without(colours, made_up),
-        legend | {"swatches": [(css(UNKNOWN), "made up, not compared")]},
+        legend | {"swatches": [(css(UNKNOWN), "filled, not compared")]},
     )
 
 

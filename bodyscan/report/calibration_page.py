@@ -86,7 +86,7 @@ def _pairs(figures: list[PairFigures], calibration: RigCalibration) -> Section:
         Column(
             "corners",
             "px RMS",
-            "distance of the boards' corners from where camera and placing put them.",
+            "distance of the boards' corners from where camera and pose put them.",
             limits.CORNERS_RMS_PX,
         ),
         Column("poses", "", "views of a board that were used.", limits.POSES, True, 0),
@@ -130,7 +130,7 @@ def _pairs(figures: list[PairFigures], calibration: RigCalibration) -> Section:
             "joint solve.",
             limits.SIGMA_MM,
         ),
-        Column("light", "", "model of the sheets of light that held-out boards chose."),
+        Column("light", "", "model of the light sheets, chosen by held-out boards."),
     )
     rows = tuple(
         (
@@ -151,7 +151,7 @@ def _pairs(figures: list[PairFigures], calibration: RigCalibration) -> Section:
 
 
 def _advice(calibration: RigCalibration) -> Section:
-    lines = calibration.advice or ("Nothing was advised: one pair has nothing to be tied to.",)
+    lines = calibration.advice or ("No advice: a single pair has nothing to be tied to.",)
     return Section("How well the pairs are tied, and what would help", "", [Lines(lines)])
 
 
@@ -184,9 +184,9 @@ def _boards(calibration: RigCalibration) -> Section:
 
 def _planes(calibration: RigCalibration) -> Section:
     if all(pair.light is None for pair in calibration.pairs.values()):
-        return Section("Planes of light", "", [Lines(("No pair has a projector.",))])
+        return Section("Light sheets", "", [Lines(("No pair has a projector.",))])
     return Section(
-        "Planes of light",
+        "Light sheets",
         "",
         [
             Picture(
@@ -244,9 +244,9 @@ def _sigma(calibration: RigCalibration) -> Section:
     cameras = {name: pair.camera for name, pair in calibration.pairs.items()}
     picture = Picture(
         "Sigma over the scan volume",
-        "How far the rig's placing alone may put a point wrong (one sigma, all axes together, mm), in "
-        "two upright planes through the rig's axis. No noise of stripes and no swaying subject is "
-        "in it. Light grey: no camera sees anything.",
+        "How far the poses of the pairs alone may put a point wrong (one sigma, all axes together, "
+        "mm), in two upright planes through the rig's axis. Stripe noise and the subject's sway are "
+        "not in it. Light grey: no camera sees anything.",
         png_of(
             lambda path: draw_sigma_map(
                 calibration.rig.volume,

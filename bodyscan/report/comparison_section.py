@@ -35,7 +35,7 @@ def comparison_section(
     return Section(
         f"Compared with {shown.name}",
         f"Distances of the {len(points):,} measured vertices of this scan's mesh from the surface of "
-        f"{shown.name}; what was made up is left out. To lay one on the other the scan was moved "
+        f"{shown.name}; what was filled is left out. To fit it, the scan was moved "
         f"by {moved:.2f} mm and turned by {np.degrees(laid.angle):.3f} degrees as a whole.",
         [
             Table(columns, rows),
@@ -70,7 +70,7 @@ def _row(figures: Deviation) -> tuple[float, ...]:
 
 
 def _standing(one: Comparison) -> str:
-    return "laid on the other as a whole" if one.fitted else "as it stands in its rig frame"
+    return "fitted to the other as a whole" if one.fitted else "as it stands in its rig frame"
 
 
 def map_limit(one: Comparison) -> float:

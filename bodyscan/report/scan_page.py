@@ -80,7 +80,7 @@ def _facts(folder: Path) -> dict[str, Any]:
         known = False
     if not known:
         raise ResultError(
-            "is no readable scan result",
+            "is not a readable scan result",
             where=str(file),
             remedy="give the folder that `bodyscan scan` wrote",
         )
@@ -136,7 +136,7 @@ def _numbers(scan: StoredScan) -> Numbers:
             "95 of 100 points have less",
         ),
         Number(
-            "made up",
+            "filled",
             made_up,
             "% of area",
             "of the mesh's surface, filled to close it where nothing was measured",
@@ -158,7 +158,7 @@ def _numbers(scan: StoredScan) -> Numbers:
 def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
     alignment = facts.get("alignment")
     if alignment is None:
-        return [Number("overlaps", "not aligned", "", "pairs stand where the boards placed them")]
+        return [Number("overlaps", "not aligned", "", "pairs stand where the boards put them")]
     farthest, motion = max(alignment["motion_mm"].items(), key=lambda item: item[1])
     return [
         Number(
@@ -172,7 +172,7 @@ def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
             "overlap residual before",
             alignment["rms_before_mm"],
             "mm RMS",
-            "the same where the calibration alone places the pairs",
+            "the same with the poses of the calibration alone",
         ),
         Number(
             "sway",
@@ -200,7 +200,7 @@ def _pictures(scan: StoredScan) -> Section:
             ),
             Picture(
                 "Mesh",
-                views + "Orange: made up to close the mesh.",
+                views + "Orange: filled to close the mesh.",
                 png_of(lambda path: draw_mesh(mesh, path, height_px=PICTURE_PX)),
             ),
             Picture(
@@ -246,7 +246,7 @@ def _pairs(facts: Mapping[str, Any]) -> Section:
     )
     lost = [f"{name} gave nothing: {reason}" for name, reason in facts["failed"].items()]
     lost += [
-        f"{name} was left where the boards placed it: it asked for {sigmas:.1f} sigmas"
+        f"{name} was left where the boards put it: alignment would have moved it by {sigmas:.1f} sigmas"
         for name, sigmas in alignment["refused"].items()
     ]
     blocks: list[Any] = [Table(columns, rows)]

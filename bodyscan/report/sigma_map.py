@@ -1,4 +1,4 @@
-"""How well the placing of the pairs knows each place of the scan volume, as a picture."""
+"""How well each place of the scan volume is known by the poses of the pairs, as a picture."""
 
 from __future__ import annotations
 

@@ -68,7 +68,10 @@ def _problems(board: Board) -> Iterator[Problem]:
         yield ("marker_mm",), wrong
     if board.dictionary not in MARKERS_IN:
         hint = did_you_mean(board.dictionary, MARKERS_IN)
-        yield ("dictionary",), f"is no dictionary of OpenCV{hint} (got {board.dictionary!r})"
+        yield (
+            ("dictionary",),
+            f"is not one of OpenCV's dictionaries{hint} (got {board.dictionary!r})",
+        )
     elif board.first_marker + board.marker_count > MARKERS_IN[board.dictionary]:
         end = board.first_marker + board.marker_count - 1
         held = MARKERS_IN[board.dictionary]

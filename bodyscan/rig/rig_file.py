@@ -19,7 +19,7 @@ from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import RigFrame
 
-_REMEDY = "Mend the rig file; docs/formats.md explains every key."
+_REMEDY = "Correct the rig file; docs/formats.md explains every key."
 
 
 def load_rig(path: Path) -> Rig:

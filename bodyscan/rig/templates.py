@@ -33,7 +33,7 @@ def template_faults(template: str, *, many_pairs: bool, needs_frame: bool) -> It
     try:
         fields = _fields(template)
     except ValueError as error:
-        yield f"is no file-name template: {error}"
+        yield f"is not a file-name template: {error}"
         return
     if many_pairs and "pair" not in fields:
         yield "needs {pair}, since the rig has several pairs"
@@ -51,7 +51,7 @@ def frame_name_faults(name: str, number: str) -> Iterator[str]:
     try:
         parts = list(Formatter().parse(name))
     except ValueError as error:
-        yield f"is no frame name: {error}"
+        yield f"is not a frame name: {error}"
         return
     fields = [(field, spec, how) for _, field, spec, how in parts if field is not None]
     if not fields:

@@ -53,7 +53,7 @@ def open_workspace(workspace: Path) -> SimulatedRig:
         placings = {name: pair["rig_from_camera"] for name, pair in truth["pairs"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise BadInput(
-            f"is no simulated workspace ({type(error).__name__}: {error})",
+            f"is not a simulated workspace ({type(error).__name__}: {error})",
             where=str(workspace),
             remedy=remedy,
         ) from error

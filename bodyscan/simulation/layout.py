@@ -59,7 +59,7 @@ def _build(
 ) -> TruePair:
     if pair.nominal is None:
         raise BadInput(
-            "a rig can be simulated only if every pair has a nominal placing",
+            "a rig can be simulated only if every pair has a nominal pose",
             where=f"pair {pair.name}",
             remedy="Add nominal: {position_mm: [x, y, z], look_at_mm: [x, y, z]} to the rig file.",
         )

@@ -214,7 +214,7 @@ def test_folders_are_joined_and_shots_of_one_name_are_one_moment(tmp_path: Path)
         ("kind: film", "1:7: kind: must be 'calibration' or 'scan' (got film)"),
         ("shots: []", "kind: is missing"),
         ("kind: calibration\nwhen: today", "when: must be a date and time such as 2026-"),
-        ("kind: calibration\nshot: []", "shot: is no key known here (did you mean 'shots'?)"),
+        ("kind: calibration\nshot: []", "shot: is not a key known here (did you mean 'shots'?)"),
         ("kind: calibration\nkind: scan", "2:1: kind: is given twice"),
         ("kind: scan", "is of kind scan, but calibration captures are wanted"),
         ("kind: [", "is not YAML"),

@@ -122,11 +122,11 @@ def test_a_failed_pair_is_named(images):
 
 
 def test_half_the_pairs_give_half_a_body(images):
-    """One pole of three: the other side is all made up, and the verdict says so."""
+    """One pole of three: the other side is all filled, and the verdict says so."""
     one_pole = [image for image in images if image.pair in ("p2-2", "p2-3")]
     scan = fused(one_pole, failed={"p1-2": "is missing", "p3-2": "is missing"})
     assert scan.verdict.grade == "repeat"
-    assert "of the surface is made up" in said(scan)
+    assert "of the surface is filled" in said(scan)
 
 
 def test_cut_off_at_the_top_of_the_volume(images):

@@ -61,7 +61,7 @@ def test_a_pipe_among_the_images_is_not_waited_for(make_scans, tmp_path):
     scans = make_scans(a="nothing", b="nothing")
     os.mkfifo(scans / "a" / "image2.txt")
     ends = run_cheap(scans, tmp_path / "out").endings()
-    assert "is no plain file" in ends["a"]["reason"]
+    assert "is not a regular file" in ends["a"]["reason"]
     assert ends["b"]["state"] == "done"
 
 

@@ -52,7 +52,7 @@ def test_changes_are_applied():
     [
         ("fusion.points=many", '--set fusion.points: must be a whole number (got "many")'),
         ("fusion.points=10", "must be 1000 or more"),
-        ("fusion.pionts=5000", "is no key known here"),
+        ("fusion.pionts=5000", "is not a key known here"),
         (
             "export.formats=ply,obi",
             "formats[1]: must be 'glb', 'obj', 'ply' or 'stl' (did you mean 'obj'",
@@ -74,7 +74,7 @@ def test_wrong_files_are_told_by_line(tmp_path):
     with pytest.raises(PipelineError) as caught:
         load_pipeline(path)
     assert f"{path}:4:11: fusion.points: must be 1000 or more" in str(caught.value)
-    assert f"{path}:5:3: fusion.colour: is no key known here" in str(caught.value)
+    assert f"{path}:5:3: fusion.colour: is not a key known here" in str(caught.value)
 
 
 def test_a_billion_laughs_end_early(tmp_path):

@@ -72,7 +72,7 @@ def test_the_version_of_a_stage_counts(day):
 def test_results_that_were_touched_are_made_again(day):
     result = day / "out" / "anna" / "scan" / "1.bin"
     result.write_bytes(b"x" + result.read_bytes()[1:])
-    assert steps(day)[0] == "its result was touched: 1.bin has other content"
+    assert steps(day)[0] == "its result was changed: 1.bin has other content"
     assert run_cheap(day / "scans", day / "out").endings()["anna"]["stages"] == ["scan"]
     assert steps(day) == ["", ""]
 

@@ -71,11 +71,15 @@ def test_it_goes_all_the_way_from_the_rig_file_to_stripes(tmp_path: Path):
     ("old", "new", "line"),
     [
         ("first: 9", "first: -1", "8:82: pairs[0].projector.first: must be 0 or more (got -1)"),
-        ("first: 9", "frist: 9", "projector.frist: is no key known here (did you mean 'first'?)"),
+        (
+            "first: 9",
+            "frist: 9",
+            "projector.frist: is not a key known here (did you mean 'first'?)",
+        ),
         ("first: 9", "steps: 4", "steps: is for code: phase-shift (the code here is shifted-bin"),
         ("shifted-binary", "gray", "first: is for code: shifted-binary (the code here is gray)"),
         ("shifted-binary", "shiftd-binary", "(did you mean 'shifted-binary'?)"),
-        ("digit: 'd", "dgit: 'd", "frames.dgit: is no key known here (did you mean 'digit'?)"),
+        ("digit: 'd", "dgit: 'd", "frames.dgit: is not a key known here (did you mean 'digit'?)"),
         ("d{digit}", "d{bit}", "frames.digit: may only hold {digit}"),
         ("'d{digit}'", "[a, b]", "has 2 names, but the 12 stripes of pair p1 take 5 digits"),
         ("frames: {", "frames: {dark: null, ", "frames.dark: is needed: pair p1"),
