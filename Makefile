@@ -31,6 +31,11 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+# The site, in build/site: a dead link or a reference to what is not there fails it.
+.PHONY: docs
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
 bench: setup
 	$(BIN)/python -m benchmarks
 

@@ -57,7 +57,7 @@ def test_changes_are_applied():
             "export.formats=ply,obi",
             "formats[1]: must be 'glb', 'obj', 'ply' or 'stl' (did you mean 'obj'",
         ),
-        ("nonsense", "is no change"),
+        ("nonsense", "is not a change"),
         ("fusion.points.x=1", "has nothing inside"),
         ("rig_export.formats=colmap", "is for another kind"),
     ],

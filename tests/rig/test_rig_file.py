@@ -145,7 +145,7 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
         ("version: 1", "version: 1\nfiles: '/{shot}/{pair}/{frame}.png'", "must be relative"),
         ("version: 1", "version: 1\nfiles: 'C:/{shot}/{pair}/{frame}.png'", "nor a drive letter"),
         ("version: 1", "version: 1\nfiles: '{shot}/{pole}/{frame}.png'", "not {pole}"),
-        ("version: 1", "version: 1\nfiles: '{shot.__class__}{pair}{frame}.png'", "no file-name te"),
+        ("version: 1", "version: 1\nfiles: '{shot.__class__}{pair}{frame}.png'", "not a file-name te"),
         ("version: 1", "version: 1\nfiles: '{shot'", "files: is not a file-name template"),
     ],
 )  # fmt: skip
@@ -160,7 +160,7 @@ def test_what_is_wrong_with_codes_and_names_is_said_at_once(tmp_path: Path) -> N
     text = changed("code: gray, stripes: 12", "code: grey, stripes: 1, steps: 4, colour: red")
     lines = refused(tmp_path, text + "frames: {patern: x, phase: '{bit}', lit: ../up, dark: 7}\n")
     told = "\n".join(lines)
-    for part in ("code: must be", "stripes: must be 2", "colour: is no key", "frames.patern: is no",
+    for part in ("code: must be", "stripes: must be 2", "colour: is not a key", "frames.patern: is not",
                  "frames.dark: must be text"):  # fmt: skip
         assert part in told
     assert len(lines) == 5, "steps may be right for the code that was meant"
