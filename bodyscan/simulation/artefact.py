@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import Progress, silent, threaded
@@ -24,8 +24,6 @@ from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Surface, grid_surface
 from bodyscan.simulation.settings import SimulationSettings
 from bodyscan.simulation.simulate import Task, render_task, true_pairs
-
-Array = NDArray[np.float64]
 
 ALBEDO = 0.7
 RINGS = 200

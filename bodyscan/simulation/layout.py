@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.pair import NominalPose, Pair
@@ -16,7 +16,6 @@ from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
 from bodyscan.simulation.settings import Optics, Projection, SimulationSettings
 
-Array = NDArray[np.float64]
 AnyProjector = MirrorProjector | PinholeProjector
 
 _UP = np.array([0.0, 0.0, 1.0])
