@@ -10,7 +10,7 @@
     print(bodyscan.measure(person).stature_mm)
 
     kept = bodyscan.save_scan(person, "person-model", calibration="calibration")
-    bodyscan.export(kept, "person-export")
+    bodyscan.export_scan(kept, "person-export")
 
 Lengths are millimetres; a point is in the rig frame (origin on the floor, x the way the subject faces,
 y to its left, z up) unless its name says otherwise. What goes wrong is a `BodyscanError`: `BadInput`
@@ -88,7 +88,7 @@ __all__ = [
     "StoredScan",
     "Verdict",
     "calibrate_rig",
-    "export",
+    "export_scan",
     "load_calibration",
     "load_rig",
     "load_scan",
@@ -231,7 +231,7 @@ def measure(
     return measure_mesh(body if isinstance(body, BodyMesh) else body.mesh, heights_mm)
 
 
-def export(
+def export_scan(
     stored: StoredScan,
     folder: AnyPath,
     settings: ExportSettings = ExportSettings(),
@@ -246,9 +246,9 @@ def export(
     >>> ExportSettings().formats
     ('ply', 'obj', 'stl', 'glb')
     """
-    from bodyscan.export.scan import export_scan
+    from bodyscan.export.scan import export_scan as export
 
-    return export_scan(
+    return export(
         stored,
         Path(folder),
         settings.formats,

@@ -41,6 +41,12 @@ def test_every_name_is_there_and_says_what_it_is(name):
     assert name in dir(bodyscan)
 
 
+def test_no_name_is_that_of_a_room():
+    """Once a room is imported it would stand before the name of the same word."""
+    rooms = {path.stem for path in Path(bodyscan.__file__).parent.iterdir()}
+    assert not rooms & set(api.__all__)
+
+
 def test_the_list_is_sorted_and_short():
     assert api.__all__ == sorted(api.__all__)
     assert len(api.__all__) < 32

@@ -1,0 +1,43 @@
+"""A new export format, OFF, as one file: `python examples/new_exporter.py SCAN OUT`.
+
+Put into bodyscan/export/formats as off.py it is a format from then on: for `bodyscan export --format
+off`, for pipelines and for Python. Here it is registered from outside.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import bodyscan
+from bodyscan.export.body_format import BODY_FORMATS, BodyFormat
+from bodyscan.files.atomic import write_text
+
+
+def write_off(path: Path, mesh: bodyscan.BodyMesh) -> None:
+    """Geomview's Object File Format: counts, vertices (mm), then the corners of each face."""
+    corners = np.insert(mesh.faces, 0, 3, axis=1)
+    lines = [
+        "OFF",
+        f"{len(mesh.vertices)} {len(mesh.faces)} 0",
+        *(f"{x:.4f} {y:.4f} {z:.4f}" for x, y, z in mesh.vertices.tolist()),
+        *(" ".join(map(str, row)) for row in corners.tolist()),
+    ]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+FORMAT = BodyFormat(write_off, holds=frozenset({"mesh"}))
+
+
+def main(scan: Path, out: Path) -> None:
+    """A stored scan in the new format, and a JSON beside it as beside every export."""
+    BODY_FORMATS.register("off", FORMAT)
+    chosen = bodyscan.ExportSettings(formats=("off",), versions=("full",))
+    for path in bodyscan.export_scan(bodyscan.load_scan(scan), out, chosen):
+        print(f"written: {path}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

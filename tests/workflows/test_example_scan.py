@@ -1,0 +1,25 @@
+"""The first example, on the small workspace."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+from small_workspace import PROJECT
+
+import bodyscan
+
+
+def test_calibrate_and_scan(workspace, tmp_path: Path, capsys):
+    example = runpy.run_path(str(PROJECT / "examples" / "calibrate_and_scan.py"))
+    example["main"](workspace.folder, tmp_path)
+    said = capsys.readouterr().out
+    assert "verdict: " in said
+    assert "mm by tape" in said
+    assert (tmp_path / "export" / "body.glb").stat().st_size > 10_000
+    stored = bodyscan.load_scan(tmp_path / "person")
+    assert 1500 < bodyscan.measure(stored).stature_mm < 1800
+    calibration = bodyscan.load_calibration(tmp_path / "calibration")
+    images = bodyscan.triangulate(workspace.folder / "captures" / "person", calibration)
+    assert {image.pair for image in images.value} == set(calibration.pairs)
+    assert not images.failures
