@@ -78,6 +78,11 @@ class Figure:
     meaning: str
 
     @property
+    def title(self) -> str:
+        """As people read it."""
+        return self.name.removesuffix("_mm").replace("_", " ")
+
+    @property
     def exceeded(self) -> bool:
         """A limit on what was not measured is not kept either."""
         return self.limit_mm is not None and (

@@ -12,6 +12,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.geometry.light_planes import Axis, baseline_angle_tilt
+from bodyscan.report.canvas import round_up
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -80,7 +81,7 @@ def draw_range_data(data: Sequence[RangeData], path: Path) -> Path:
         grey = np.clip(np.nan_to_num(one.normals @ light, nan=0.0), 0.0, 1.0)
         shown.imshow(grey, cmap="gray", vmin=0.0, vmax=1.0)
         shown.set_title(one.name)
-        limit = _round_up(float(np.nanpercentile(np.abs(one.off_mm), 95)))
+        limit = round_up(max(float(np.nanpercentile(np.abs(one.off_mm), 95)), 1e-6))
         colours = matplotlib.colormaps["RdBu_r"].with_extremes(bad="#dddddd")
         picture = below.imshow(one.off_mm, cmap=colours, vmin=-limit, vmax=limit)
         figure.colorbar(picture, ax=below, shrink=0.8, label="off by, mm")
@@ -115,12 +116,6 @@ def _plain(axis: Axes) -> None:
     for side in ("top", "right"):
         axis.spines[side].set_visible(False)
     axis.grid(color=GREY, alpha=0.25, linewidth=0.6)
-
-
-def _round_up(value: float) -> float:
-    """To 1, 2 or 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(max(value, 1e-6)))
-    return float(next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value))
 
 
 def _save(figure: matplotlib.figure.Figure, path: Path) -> Path:

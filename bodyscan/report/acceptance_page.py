@@ -21,8 +21,8 @@ def screen_table(found: Sequence[Figure], synthetic: bool) -> ScreenTable:
         table.add_column(heading, justify="right" if heading in ("mm", "limit") else "left")
     for one in found:
         table.add_row(
-            one.name.removesuffix("_mm").replace("_", " "),
-            _format_signed(one.value_mm),
+            one.title,
+            format_value(one.value_mm),
             "–" if one.limit_mm is None else f"{one.limit_mm:g}",
             one.where,
             style="red" if one.exceeded else None,
@@ -36,7 +36,7 @@ def acceptance_page(
     numbers = Numbers(
         tuple(
             Number(
-                one.name.removesuffix("_mm").replace("_", " "),
+                one.title,
                 None if one.value_mm is None else abs(one.value_mm),
                 "mm",
                 f"{one.meaning}; the largest: {one.where}",
@@ -84,13 +84,9 @@ def acceptance_page(
         synthetic,
         (("calibration", calibration_id[:12]),),
         [
-            Section("Figures", NO_STANDARD, [numbers]),
-            Section("Spheres, all pairs merged", "", [spheres, spacings]),
-            Section("Plate", "", [plates]),
-            Section("Problems", "", [Lines(readings.problems or ("None.",))]),
+            Section("Figures", [numbers], NO_STANDARD),
+            Section("Spheres, all pairs merged", [spheres, spacings]),
+            Section("Plate", [plates]),
+            Section("Problems", [Lines(readings.problems or ("None.",))]),
         ],
     )
-
-
-def _format_signed(value: float | None) -> str:
-    return format_value(value) if value is None else f"{value:.3f}"

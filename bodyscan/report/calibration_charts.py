@@ -15,6 +15,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
+from bodyscan.report.canvas import round_down
 from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, plt, style, svg
 
 COLUMNS = 4
@@ -55,7 +56,7 @@ def residual_chart(calibration: RigCalibration) -> tuple[bytes, float]:
     lengths = _finite([np.linalg.norm(mean, axis=-1) for _, mean, _ in maps.values()])
     top = float(np.percentile(rms_known, 98))
     widest = max(calibration.pairs[name].camera.width for name in maps)
-    times = _one_digit(ARROW * widest / max(float(np.percentile(lengths, 98)), 1e-6))
+    times = round_down(ARROW * widest / max(float(np.percentile(lengths, 98)), 1e-6), 1)
     with style():
         figure, axes = grid_of(len(maps), COLUMNS, (2.6, 2.3))
         for axis, (name, (rms, mean, middles)) in zip(axes, maps.items(), strict=True):
@@ -226,8 +227,3 @@ def _finite(arrays: list[Array]) -> Array:
     """All known values of some arrays, (1,) of 1 if there are none."""
     known = np.concatenate([array[np.isfinite(array)] for array in arrays])
     return known if known.size else np.ones(1)
-
-
-def _one_digit(value: float) -> float:
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(np.floor(value / power) * power)

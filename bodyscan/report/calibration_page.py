@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from bodyscan.report import calibration_charts as draw
 from bodyscan.report import calibration_verdict as limits
 from bodyscan.report import charts
 from bodyscan.report.calibration_verdict import PairFigures, figures_of, grade_calibration
-from bodyscan.report.canvas import png_of
+from bodyscan.report.canvas import PICTURE_PX
 from bodyscan.report.page import (
     Block,
     Column,
@@ -28,7 +29,6 @@ from bodyscan.report.page import (
 from bodyscan.report.rig_model import rig_model
 from bodyscan.report.sigma_map import draw_sigma_map
 
-SVG = "image/svg+xml"
 NOT_STORED = (
     "This calibration was made before corners were kept with it: calibrate again to see where the "
     "boards lay in each picture and how far their corners are off."
@@ -66,7 +66,6 @@ def _rig(calibration: RigCalibration) -> Section:
     model, times = rig_model(calibration)
     return Section(
         "The rig",
-        "",
         [
             Viewer(
                 "Cameras in the rig frame",
@@ -133,42 +132,28 @@ def _pairs(figures: list[PairFigures], calibration: RigCalibration) -> Section:
         Column("light", "", "model of the light sheets, chosen by held-out boards."),
     )
     rows = tuple(
-        (
-            one.name,
-            one.corners_rms_px,
-            one.poses,
-            one.covered_percent,
-            one.sheets_rms_mm,
-            one.held_out_mm,
-            one.stripe_shots,
-            one.stripes_percent,
-            one.sigma_mm,
-            calibration.pairs[one.name].quality.light_model,
-        )
-        for one in figures
+        (*astuple(one), calibration.pairs[one.name].quality.light_model) for one in figures
     )
-    return Section("Pairs", "", [Table(columns, rows)])
+    return Section("Pairs", [Table(columns, rows)])
 
 
 def _advice(calibration: RigCalibration) -> Section:
     lines = calibration.advice or ("No advice: a single pair has nothing to be tied to.",)
-    return Section("How well the pairs are tied, and what would help", "", [Lines(lines)])
+    return Section("How well the pairs are tied, and what would help", [Lines(lines)])
 
 
 def _boards(calibration: RigCalibration) -> Section:
     if not calibration.seen:
-        return Section("Boards in the pictures", "", [Lines((NOT_STORED,))])
+        return Section("Boards in the pictures", [Lines((NOT_STORED,))])
     residuals, times = draw.residual_chart(calibration)
     return Section(
         "Boards in the pictures",
-        "",
         [
             Picture(
                 "Coverage of each camera by boards",
                 "Each camera's picture, and the hull of the corners of every board seen in it. Empty "
                 "corners of a picture are where its lens is known least.",
                 draw.coverage_chart(calibration),
-                SVG,
             ),
             Picture(
                 "Residuals of corners",
@@ -176,7 +161,6 @@ def _boards(calibration: RigCalibration) -> Section:
                 f"{times:,.0f} times too long; arrows that all point one way in a part of the picture "
                 "mean that the lens model does not fit there. Empty: fewer than three corners.",
                 residuals,
-                SVG,
             ),
         ],
     )
@@ -184,10 +168,9 @@ def _boards(calibration: RigCalibration) -> Section:
 
 def _planes(calibration: RigCalibration) -> Section:
     if all(pair.light is None for pair in calibration.pairs.values()):
-        return Section("Light sheets", "", [Lines(("No pair has a projector.",))])
+        return Section("Light sheets", [Lines(("No pair has a projector.",))])
     return Section(
         "Light sheets",
-        "",
         [
             Picture(
                 "Baseline, projection angle and tilt",
@@ -197,7 +180,6 @@ def _planes(calibration: RigCalibration) -> Section:
                 "stripes x and y are exchanged. Smooth curves are right; a projector's lens bends "
                 "them, a rotating mirror hardly does. Of bent sheets: their tangent planes.",
                 draw.planes_chart(calibration),
-                SVG,
             ),
             Picture(
                 "Models of the light on held-out boards",
@@ -205,7 +187,6 @@ def _planes(calibration: RigCalibration) -> Section:
                 "(mm, outliers capped). Filled: the model in use, the simplest that is as good as "
                 "the best within 15 %.",
                 draw.held_out_chart(calibration),
-                SVG,
             ),
         ],
     )
@@ -213,17 +194,16 @@ def _planes(calibration: RigCalibration) -> Section:
 
 def _view_graph(calibration: RigCalibration) -> Section:
     if len(calibration.seen) < 2:
-        return Section("Who shares boards with whom", "", [Lines(("There is nothing to share.",))])
+        return Section("Who shares boards with whom", [Lines(("There is nothing to share.",))])
     together = draw.shared_boards(calibration)
     return Section(
         "Who shares boards with whom",
-        "Two pairs are tied together by boards that both saw at the same moment.",
-        [
+        intro="Two pairs are tied together by boards that both saw at the same moment.",
+        blocks=[
             Picture(
                 "View graph",
                 "Thicker: more boards in common.",
                 draw.view_graph_chart(calibration),
-                SVG,
             ),
             Picture(
                 "Boards in common",
@@ -234,7 +214,6 @@ def _view_graph(calibration: RigCalibration) -> Section:
                     "boards",
                     ".0f",
                 ),
-                SVG,
             ),
         ],
     )
@@ -247,18 +226,15 @@ def _sigma(calibration: RigCalibration) -> Section:
         "How far the poses of the pairs alone may put a point wrong (one sigma, all axes together, "
         "mm), in two upright planes through the rig's axis. Stripe noise and the subject's sway are "
         "not in it. Light grey: no camera sees anything.",
-        png_of(
-            lambda path: draw_sigma_map(
-                calibration.rig.volume,
-                calibration.rig_from_camera,
-                cameras,
-                calibration.covariance,
-                path,
-                height_px=760,
-            )
+        draw_sigma_map(
+            calibration.rig.volume,
+            calibration.rig_from_camera,
+            cameras,
+            calibration.covariance,
+            height_px=PICTURE_PX,
         ),
     )
-    return Section("How well each place is known", "", [picture])
+    return Section("How well each place is known", [picture])
 
 
 def _notes(calibration: RigCalibration) -> Section:
@@ -267,4 +243,4 @@ def _notes(calibration: RigCalibration) -> Section:
         failed = (f"failed: {name}: {why}" for name, why in calibration.failed.items())
         blocks.append(Lines(tuple(failed)))
     blocks.append(Lines(calibration.notes or ("Every image and view was used.",)))
-    return Section("What was not used, and notes", "", blocks)
+    return Section("What was not used, and notes", blocks)

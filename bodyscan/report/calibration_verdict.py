@@ -27,7 +27,8 @@ FAR_BEYOND = 2.0
 
 @dataclass(frozen=True)
 class PairFigures:
-    """What a calibrated pair is judged by; None where it does not apply or was not stored."""
+    """What a calibrated pair is judged by, in the order of the report's columns; None where it does
+    not apply or was not stored."""
 
     name: str
     corners_rms_px: float

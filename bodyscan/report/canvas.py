@@ -1,18 +1,15 @@
-"""What pictures are made of: colour scales, panels with text, PNG files."""
+"""What pictures are made of: colour scales, round numbers, panels with text, PNG files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.arrays import Bytes
-from bodyscan.files.atomic import write_bytes
 
 BACKGROUND = (250, 250, 250)
 INK = (40, 40, 40)
@@ -75,15 +72,21 @@ def blue_white_red() -> Bytes:
     return np.rint(white + np.abs(share) ** 0.8 * (ends - white)).astype(np.uint8)
 
 
-def save_panels(path: Path, panels: Sequence[Bytes]) -> None:
-    ok, data = cv2.imencode(".png", np.concatenate(panels, axis=1))
+def png(panels: Iterable[Bytes]) -> bytes:
+    """Panels of one height side by side, as a PNG file's bytes."""
+    ok, data = cv2.imencode(".png", np.concatenate(list(panels), axis=1))
     if not ok:
-        raise ValueError(f"no PNG could be made for {path}")
-    write_bytes(Path(path), data.tobytes())
+        raise ValueError("no PNG could be made")
+    return data.tobytes()
 
 
-def png_of(draw: Callable[[Path], object]) -> bytes:
-    """What a function that draws into a file draws."""
-    with TemporaryDirectory(prefix="bodyscan-") as folder:
-        draw(Path(folder) / "picture.png")
-        return (Path(folder) / "picture.png").read_bytes()
+def round_down(value: float, digits: int) -> float:
+    """A positive number to so many digits."""
+    power = 10.0 ** (np.floor(np.log10(value)) - digits + 1)
+    return float(np.floor(value / power) * power)
+
+
+def round_up(value: float) -> float:
+    """A positive number to 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
 
 from bodyscan.evaluation.comparison import Comparison
-from bodyscan.evaluation.surface import Deviation
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.report import charts
-from bodyscan.report.canvas import PICTURE_PX, png_of
+from bodyscan.report.canvas import PICTURE_PX, round_up
 from bodyscan.report.page import Column, Picture, Section, Table
 from bodyscan.report.pictures import draw_deviation
 
@@ -25,48 +26,37 @@ def comparison_section(
         Column("95 %", "mm", "of the absolute distances are less."),
         Column("worst", "mm", "the largest of the absolute distances.", digits=2),
     )
-    rows: tuple[tuple[float | str | None, ...], ...] = tuple(
-        (_standing(one), *_row(one.figures)) for one in found
-    )
+    rows = tuple((_standing(one), *astuple(one.figures)[1:]) for one in found)
     points = mesh.vertices[shown.vertices]
-    normals = mesh.normals[shown.vertices]
     laid = found[-1].other_from_scan
     moved = float(np.linalg.norm(laid.apply(points.mean(axis=0)) - points.mean(axis=0)))
     return Section(
         f"Compared with {shown.name}",
-        f"Distances of the {len(points):,} measured vertices of this scan's mesh from the surface of "
-        f"{shown.name}; what was filled is left out. To fit it, the scan was moved "
+        intro=f"Distances of the {len(points):,} measured vertices of this scan's mesh from the "
+        f"surface of {shown.name}; what was filled is left out. To fit it, the scan was moved "
         f"by {moved:.2f} mm and turned by {np.degrees(laid.angle):.3f} degrees as a whole.",
-        [
+        blocks=[
             Table(columns, rows),
             Picture(
                 "Deviation map",
                 f"Front, left side, back; the scan {_standing(shown)}. Red: outside of {shown.name}, "
                 "blue: inside. Beyond the ends of the scale the colour is that of the end.",
-                png_of(
-                    lambda path: draw_deviation(
-                        points,
-                        shown.signed_mm,
-                        path,
-                        limit,
-                        normals=normals,
-                        height_px=PICTURE_PX,
-                        caption="deviation, mm",
-                    )
+                draw_deviation(
+                    points,
+                    mesh.normals[shown.vertices],
+                    shown.signed_mm,
+                    limit_mm=limit,
+                    height_px=PICTURE_PX,
+                    caption="deviation, mm",
                 ),
             ),
             Picture(
                 "How the deviations are distributed",
                 "The line stands at their mean; the outermost bars hold all that lies beyond.",
                 charts.histogram(shown.signed_mm, limit, "signed distance, mm"),
-                "image/svg+xml",
             ),
         ],
     )
-
-
-def _row(figures: Deviation) -> tuple[float, ...]:
-    return figures.bias_mm, figures.median_mm, figures.rms_mm, figures.p95_mm, figures.worst_mm
 
 
 def _standing(one: Comparison) -> str:
@@ -75,5 +65,4 @@ def _standing(one: Comparison) -> str:
 
 def map_limit(one: Comparison) -> float:
     """The map's end, mm: a round number that most deviations stay below."""
-    power = 10.0 ** np.floor(np.log10(max(one.figures.p95_mm, 1e-3)))
-    return float(next(s * power for s in (1.0, 2.0, 5.0, 10.0) if s * power >= one.figures.p95_mm))
+    return round_up(max(one.figures.p95_mm, 1e-3))

@@ -103,17 +103,17 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """An image as its file's bytes, `image/png` or `image/svg+xml`."""
+    """An image as its file's bytes, PNG or SVG."""
 
     title: str
     caption: str
     data: bytes
-    media: str = "image/png"
     kind: Literal["picture"] = "picture"
 
     @property
     def source(self) -> str:
-        return f"data:{self.media};base64,{base64.b64encode(self.data).decode('ascii')}"
+        media = "png" if self.data.startswith(b"\x89PNG") else "svg+xml"
+        return f"data:image/{media};base64,{base64.b64encode(self.data).decode('ascii')}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +138,8 @@ Block = Numbers | Table | Lines | Picture | Viewer
 @dataclass(frozen=True, eq=False)
 class Section:
     title: str
-    intro: str
     blocks: Sequence[Block]
+    intro: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Bytes
+from bodyscan.files.atomic import write_bytes
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.scene import centred_scene
 from bodyscan.report.canvas import (
@@ -22,152 +23,99 @@ from bodyscan.report.canvas import (
     Scale,
     blue_white_red,
     colour_bar,
-    save_panels,
+    png,
     turbo,
     write_label,
 )
 
 FILLED_TINT = (60, 160, 255)  # blue, green, red: orange
 WRONG_SIDE = (200, 40, 200)
-
-
-@dataclass(frozen=True)
-class View:
-    """Where the viewer stands: azimuth from the subject's front towards its left, degrees.
-
-    `around_mm` and `extent_mm` zoom in on a detail: a square of that size about that point.
-    """
-
-    azimuth_deg: float
-    elevation_deg: float = 0.0
-    around_mm: tuple[float, float, float] | None = None
-    extent_mm: float | None = None
-
-    @property
-    def axes(self) -> Array:
-        """(3, 3) rows: the picture's right, its up, and the way to the viewer, rig frame."""
-        azimuth, elevation = np.radians([self.azimuth_deg, self.elevation_deg])
-        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-        flat = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        towards = np.cos(elevation) * flat + np.array([0.0, 0.0, np.sin(elevation)])
-        return np.stack([right, np.cross(towards, right), towards])
-
-
-VIEWS = {
-    "front": View(0.0),
-    "left": View(90.0),
-    "side": View(90.0),
-    "back": View(180.0),
-    "right": View(270.0),
-    "above": View(0.0, 89.9),
-    "below": View(0.0, -89.9),
-}
+AZIMUTHS_DEG = {"front": 0.0, "side": 90.0, "back": 180.0}
+"""Where the viewer of each view stands, from the subject's front towards its left."""
 
 
 def draw_scan(cloud: BodyCloud, mesh: BodyMesh, folder: Path) -> list[Path]:
     """The pictures that a scan leaves beside its result: the cloud by photo, sigma and number of
     pairs, and the mesh with its filled faces marked."""
-    paths = [folder / f"{name}.png" for name in ("cloud", "sigma", "pairs", "mesh")]
-    draw_cloud(cloud, paths[0], colour="photo")
-    draw_cloud(cloud, paths[1], colour="sigma")
-    draw_cloud(cloud, paths[2], colour="pairs_seen")
-    draw_mesh(mesh, paths[3], colour="filled")
-    return paths
+    pictures = {
+        folder / "cloud.png": draw_cloud(cloud, colour="photo"),
+        folder / "sigma.png": draw_cloud(cloud, colour="sigma"),
+        folder / "pairs.png": draw_cloud(cloud, colour="pairs_seen"),
+        folder / "mesh.png": draw_mesh(mesh),
+    }
+    for path, picture in pictures.items():
+        write_bytes(path, picture)
+    return list(pictures)
 
 
 def draw_mesh(
-    mesh: BodyMesh,
-    path: Path,
-    views: Sequence[str | View] = ("front", "side", "back"),
-    *,
-    colour: str = "filled",
-    height_px: int = 900,
-) -> None:
-    """Shaded pictures of a mesh; `colour` is filled (made-up faces orange), photo or plain.
-
-    Faces seen from their inside are magenta.
-    """
+    mesh: BodyMesh, views: Sequence[str] = tuple(AZIMUTHS_DEG), *, height_px: int = 900
+) -> bytes:
+    """Shaded pictures of a mesh: made-up faces orange, faces seen from their inside magenta."""
     base = np.full((len(mesh.faces), 3), 210, np.uint8)
-    if colour == "filled":
-        base[mesh.filled] = FILLED_TINT
-    elif colour == "photo":
-        base = mesh.colours[mesh.faces[:, 0], ::-1]
-    elif colour != "plain":
-        raise ValueError(f"colour is filled, photo or plain, not {colour!r}")
+    base[mesh.filled] = FILLED_TINT
     scene, centre = centred_scene(mesh.vertices, mesh.faces)
-    panels = [
+    return png(
         _write_name(
-            _cast_view(scene, centre, base, _Frame.of(mesh.vertices, _view(view), height_px)), view
+            _cast_view(scene, centre, base, _Frame.of(mesh.vertices, view, height_px)), view
         )
         for view in views
-    ]
-    save_panels(path, panels)
+    )
 
 
 def draw_cloud(
     cloud: BodyCloud,
-    path: Path,
-    views: Sequence[str | View] = ("front", "side", "back"),
+    views: Sequence[str] = tuple(AZIMUTHS_DEG),
     *,
     colour: str = "photo",
     height_px: int = 900,
-) -> None:
-    """Pictures of a cloud; `colour` is photo, sigma, pairs_seen or plain (shaded)."""
+) -> bytes:
+    """Pictures of a cloud; `colour` is photo, sigma or pairs_seen."""
     if colour == "photo":
-        draw_points(cloud.points, cloud.normals, cloud.colours[:, ::-1], path, views, height_px)
-        return
-    if colour == "plain":
-        grey = np.full((len(cloud.points), 3), 210, np.uint8)
-        draw_points(cloud.points, cloud.normals, grey, path, views, height_px, shaded=True)
-        return
+        return _draw_points(cloud.points, cloud.normals, cloud.colours[:, ::-1], views, height_px)
     if colour == "sigma":
         top = float(np.percentile(cloud.sigma_mm, 98))
         scale, values = Scale(0.0, top, "sigma, mm", turbo()), cloud.sigma_mm
     elif colour == "pairs_seen":
         scale, values = Scale(0.0, 6.0, "pairs", turbo()), cloud.pairs_seen.astype(np.float32)
     else:
-        raise ValueError(f"colour is photo, plain, sigma or pairs_seen, not {colour!r}")
+        raise ValueError(f"colour is photo, sigma or pairs_seen, not {colour!r}")
     colours = scale.colours(values)
-    draw_points(cloud.points, cloud.normals, colours, path, views, height_px, scale=scale)
+    return _draw_points(cloud.points, cloud.normals, colours, views, height_px, scale)
 
 
 def draw_deviation(
     points: Array,
+    normals: NDArray[np.floating],
     signed_mm: Array,
-    path: Path,
-    limit_mm: float = 1.0,
-    views: Sequence[str | View] = ("front", "side", "back"),
+    views: Sequence[str] = tuple(AZIMUTHS_DEG),
     *,
-    normals: NDArray[np.floating] | None = None,
+    limit_mm: float = 1.0,
     height_px: int = 900,
     caption: str = "from truth, mm",
-) -> None:
+) -> bytes:
     """Points coloured by signed distance to a known surface: blue inside, red outside."""
     scale = Scale(-limit_mm, limit_mm, caption, blue_white_red())
-    colours = scale.colours(signed_mm)
-    draw_points(points, normals, colours, path, views, height_px, scale=scale)
+    return _draw_points(points, normals, scale.colours(signed_mm), views, height_px, scale)
 
 
-def draw_points(
+def _draw_points(
     points: Array,
-    normals: NDArray[np.floating] | None,
+    normals: NDArray[np.floating],
     colours: Bytes,
-    path: Path,
-    views: Sequence[str | View],
+    views: Sequence[str],
     height_px: int,
-    *,
     scale: Scale | None = None,
-    shaded: bool = False,
-) -> None:
+) -> bytes:
     """Points (N, 3) with colours (N, 3) blue, green, red; those facing away are left out."""
     dot_mm = _dot_size(points)
-    panels = []
-    for view in views:
-        frame = _Frame.of(points, _view(view), height_px)
-        panels.append(
-            _write_name(_splat_view(points, normals, colours, frame, dot_mm, shaded), view)
+    panels = [
+        _write_name(
+            _splat_view(points, normals, colours, _Frame.of(points, view, height_px), dot_mm), view
         )
-    save_panels(path, panels if scale is None else [*panels, colour_bar(scale, height_px)])
+        for view in views
+    ]
+    return png(panels if scale is None else [*panels, colour_bar(scale, height_px)])
 
 
 @dataclass(frozen=True)
@@ -182,13 +130,8 @@ class _Frame:
     height: int
 
     @staticmethod
-    def of(points: Array, view: View, height_px: int) -> _Frame:
-        axes = view.axes
-        if view.around_mm is not None and view.extent_mm is not None:
-            x, y, _ = axes @ np.array(view.around_mm)
-            half = view.extent_mm / 2
-            step = view.extent_mm / height_px
-            return _Frame(axes, x - half, y + half, step, height_px, height_px)
+    def of(points: Array, view: str, height_px: int) -> _Frame:
+        axes = _axes(view)
         flat = points @ axes[:2].T
         low, high = flat.min(axis=0) - 20.0, flat.max(axis=0) + 20.0
         # All views of a subject share one scale: that of its greatest extent.
@@ -198,14 +141,17 @@ class _Frame:
         return _Frame(axes, low[0], middle + step * height_px / 2, step, width, height_px)
 
 
-def _view(view: str | View) -> View:
-    return VIEWS[view] if isinstance(view, str) else view
+def _axes(view: str) -> Array:
+    """(3, 3) rows: the picture's right, its up, and the way to the viewer, rig frame."""
+    azimuth = np.radians(AZIMUTHS_DEG[view])
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    towards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    return np.stack([right, np.cross(towards, right), towards])
 
 
-def _write_name(panel: Bytes, view: str | View) -> Bytes:
-    """The panel with the name of its view, if it has one, in its upper left corner."""
-    if isinstance(view, str):
-        write_label(panel, view, (6, 16))
+def _write_name(panel: Bytes, view: str) -> Bytes:
+    """The panel with the name of its view in its upper left corner."""
+    write_label(panel, view, (6, 16))
     return panel
 
 
@@ -229,19 +175,11 @@ def _cast_view(
 
 
 def _splat_view(
-    points: Array,
-    normals: NDArray[np.floating] | None,
-    colours: Bytes,
-    frame: _Frame,
-    dot_mm: float,
-    shaded: bool,
+    points: Array, normals: NDArray[np.floating], colours: Bytes, frame: _Frame, dot_mm: float
 ) -> Bytes:
     right, up, towards = frame.axes
-    facing = np.ones(len(points)) if normals is None else normals @ towards
-    front = facing > 0
-    points, colours, facing = points[front], colours[front], facing[front]
-    if shaded:
-        colours = (colours * (0.25 + 0.75 * facing[:, None])).astype(np.uint8)
+    front = normals @ towards > 0
+    points, colours = points[front], colours[front]
     columns = np.floor((points @ right - frame.left) / frame.step_mm).astype(np.int64)
     rows = np.floor((frame.top - points @ up) / frame.step_mm).astype(np.int64)
     order = np.argsort(points @ towards)  # far to near: the nearest is written last

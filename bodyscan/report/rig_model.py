@@ -8,6 +8,7 @@ from bodyscan.arrays import Array, Bytes
 from bodyscan.geometry.placing_covariance import point_covariance
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.calibration_charts import line_styles
+from bodyscan.report.canvas import round_down
 from bodyscan.report.model import Layer, Shape, Standpoint, Strokes, pack
 
 SHOWN_MM = 140.0
@@ -27,7 +28,7 @@ def rig_model(calibration: RigCalibration) -> tuple[dict[str, object], float]:
         for name, placing in calibration.rig_from_camera.items()
     }
     longest = max(float(np.sqrt(np.linalg.eigvalsh(one)[-1])) for one in spread.values())
-    times = _two_digits(SHOWN_MM / max(longest, LEAST_MM))
+    times = round_down(SHOWN_MM / max(longest, LEAST_MM), 2)
     shapes = {
         name: _ellipsoid(placing.translation, times**2 * spread[name])
         for name, placing in calibration.rig_from_camera.items()
@@ -124,8 +125,3 @@ def _close(corners: Array) -> Array:
 
 def _rgb(colour: str) -> Bytes:
     return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], np.uint8)
-
-
-def _two_digits(value: float) -> float:
-    power = 10.0 ** (np.floor(np.log10(value)) - 1)
-    return float(np.floor(value / power) * power)

@@ -17,7 +17,7 @@ from bodyscan.mesh.holes import holes
 from bodyscan.mesh.topology import topology
 from bodyscan.report import charts
 from bodyscan.report.body_model import layers, light_mesh, shape_of
-from bodyscan.report.canvas import PICTURE_PX, png_of
+from bodyscan.report.canvas import PICTURE_PX
 from bodyscan.report.comparison_section import comparison_section, map_limit
 from bodyscan.report.model import pack
 from bodyscan.report.page import (
@@ -92,8 +92,8 @@ def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
     shown = next((one for one in found if one.fitted == one.is_scan), None)
     limit = map_limit(shown) if shown else 1.0
     sections = [
-        Section("The body", "", [_viewer(scan, shown, limit)]),
-        Section("Figures", "", [_numbers(scan)]),
+        Section("The body", [_viewer(scan, shown, limit)]),
+        Section("Figures", [_numbers(scan)]),
     ]
     if shown:
         sections.append(comparison_section(scan.mesh, found, shown, limit))
@@ -191,29 +191,26 @@ def _pictures(scan: StoredScan) -> Section:
     views = "From the front, from the subject's left side, from the back. "
     return Section(
         "Pictures",
-        "",
         [
             Picture(
                 "Measured points, as photographed",
                 views + "White: nothing was measured there.",
-                png_of(lambda path: draw_cloud(cloud, path, height_px=PICTURE_PX)),
+                draw_cloud(cloud, height_px=PICTURE_PX),
             ),
             Picture(
                 "Mesh",
                 views + "Orange: filled to close the mesh.",
-                png_of(lambda path: draw_mesh(mesh, path, height_px=PICTURE_PX)),
+                draw_mesh(mesh, height_px=PICTURE_PX),
             ),
             Picture(
                 "Sigma of the points",
                 views + "Standard deviation of each point along its normal, mm.",
-                png_of(lambda path: draw_cloud(cloud, path, colour="sigma", height_px=PICTURE_PX)),
+                draw_cloud(cloud, colour="sigma", height_px=PICTURE_PX),
             ),
             Picture(
                 "Pairs",
                 views + "How many pairs measured each place.",
-                png_of(
-                    lambda path: draw_cloud(cloud, path, colour="pairs_seen", height_px=PICTURE_PX)
-                ),
+                draw_cloud(cloud, colour="pairs_seen", height_px=PICTURE_PX),
             ),
         ],
     )
@@ -254,7 +251,7 @@ def _pairs(facts: Mapping[str, Any]) -> Section:
         blocks.append(Lines(tuple(lost)))
     if overlaps:
         blocks += [_overlap_picture(overlaps), _sway_picture(motion)]
-    return Section("Pairs and their overlaps", "", blocks)
+    return Section("Pairs and their overlaps", blocks)
 
 
 def _pair_residual(overlaps: list[dict[str, Any]], name: str) -> float | None:
@@ -276,7 +273,6 @@ def _overlap_picture(overlaps: list[dict[str, Any]]) -> Picture:
         "RMS distance (mm) of the points of the pair at the left from the surface of the pair below, "
         "after alignment. Empty: the two share too little of the subject.",
         charts.matrix(names, values, "mm RMS"),
-        "image/svg+xml",
     )
 
 
@@ -285,7 +281,6 @@ def _sway_picture(motion: Mapping[str, float]) -> Picture:
         "Sway",
         "How far the alignment moved each pair against the subject, at the body's middle.",
         charts.bars(dict(sorted(motion.items())), "moved, mm", (limits.SOME_MOTION_MM,)),
-        "image/svg+xml",
     )
 
 
@@ -308,4 +303,4 @@ def _holes(scan: StoredScan) -> Section:
         + (f", of which the {MOST_HOLES} largest are listed" if len(found) > MOST_HOLES else "")
         + ". Height and place are of the patch's middle."
     )
-    return Section("Holes", intro, [Table(columns, rows)] if rows else [])
+    return Section("Holes", [Table(columns, rows)] if rows else [], intro)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,7 +17,7 @@ from bodyscan.report.canvas import (
     INK,
     Scale,
     colour_bar,
-    save_panels,
+    png,
     turbo,
     write_label,
 )
@@ -71,25 +70,23 @@ def draw_sigma_map(
     rig_from_camera: Mapping[str, RigidTransform],
     cameras: Mapping[str, Camera],
     covariance: PlacingCovariance,
-    path: Path,
     *,
-    step_mm: float = STEP_MM,
     height_px: int = 900,
-) -> None:
+) -> bytes:
     """Maps of `sigma_at` in the planes x = 0 (front) and y = 0 (side), one colour scale, as PNG.
 
     Light grey where no pair sees anything.
     """
     maps = {}
     for caption, right in PLANES.items():
-        points = plane_points(volume, np.array(right), step_mm)
+        points = plane_points(volume, np.array(right), STEP_MM)
         sigma, _ = sigma_at(points.reshape(-1, 3), rig_from_camera, cameras, covariance)
         maps[caption] = sigma.reshape(points.shape[:2])
     known = np.concatenate([values[np.isfinite(values)] for values in maps.values()])
     top = float(np.percentile(known, 98)) if known.size else 1.0
     scale = Scale(0.0, max(top, 1e-6), "sigma, mm", turbo())
     panels = [_panel(values, scale, caption, volume, height_px) for caption, values in maps.items()]
-    save_panels(path, [*panels, colour_bar(scale, height_px)])
+    return png([*panels, colour_bar(scale, height_px)])
 
 
 def plane_points(volume: Volume, right: Array, step_mm: float) -> Array:

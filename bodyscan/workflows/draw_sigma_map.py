@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from bodyscan.errors import BadInput
+from bodyscan.files.atomic import write_bytes
 from bodyscan.registration.storage import load_calibration
 from bodyscan.report.sigma_map import draw_sigma_map as draw
 
@@ -21,5 +22,5 @@ def draw_sigma_map(calibration: Path, path: Path | None = None) -> Path:
         raise BadInput("the map is drawn as PNG", where=str(path), remedy="name it .png")
     rig = load_calibration(calibration)
     cameras = {name: pair.camera for name, pair in rig.pairs.items()}
-    draw(rig.rig.volume, rig.rig_from_camera, cameras, rig.covariance, path)
+    write_bytes(path, draw(rig.rig.volume, rig.rig_from_camera, cameras, rig.covariance))
     return path

@@ -15,6 +15,7 @@ from bodyscan.errors import BadInput
 from bodyscan.evaluation.body import coverage_of_seen, girth_errors, sway_residual
 from bodyscan.evaluation.surface import Deviation, deviation, normalized_errors, signed_distances
 from bodyscan.export.scan import transform_mesh
+from bodyscan.files.atomic import write_bytes
 from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.topology import topology
@@ -115,11 +116,11 @@ def evaluate_workspace(workspace: Path) -> str:
     seen, covered = coverage_of_seen(points, truth.vertices, truth.faces, pairs)
     spread, beyond = normalized_errors(cloud, stored.cloud.sigma_mm)
     shape = topology(stored.mesh.vertices, stored.mesh.faces)
-    pictures = [folder / "cloud-deviation.png", folder / "mesh-deviation.png"]
-    draw_deviation(stored.cloud.points, cloud, pictures[0], normals=stored.cloud.normals)
-    draw_deviation(
-        stored.mesh.vertices[measured], mesh, pictures[1], normals=stored.mesh.normals[measured]
-    )
+    drawn = draw_deviation(stored.cloud.points, stored.cloud.normals, cloud)
+    write_bytes(folder / "cloud-deviation.png", drawn)
+    own = stored.mesh
+    drawn = draw_deviation(own.vertices[measured], own.normals[measured], mesh)
+    write_bytes(folder / "mesh-deviation.png", drawn)
     lines += [
         f"  cloud, {len(stored.cloud.points):,} points   {_figures(deviation(cloud))}",
         f"  error over sigma        {spread:.2f} (robust; 1 is honest), {100.0 * beyond:.2f} % of the "

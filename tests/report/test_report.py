@@ -165,7 +165,7 @@ def test_what_is_no_result_is_said(tmp_path: Path, content: str):
     with pytest.raises(BadInput, match="neither"):
         build_page(tmp_path)
     (tmp_path / "scan.json").write_text(content)
-    with pytest.raises(ResultError, match="no readable scan"):
+    with pytest.raises(ResultError, match="not a readable scan"):
         build_page(tmp_path)
 
 
