@@ -22,7 +22,7 @@ from benchmarks.free_triangulation import (
 from benchmarks.rivals import RIVALS, run_rival, without_skew
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import apart
-from bodyscan.registration.rig_solve import place_rig
+from bodyscan.registration.rig_solve import solve_rig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import find_all_boards
 
@@ -128,7 +128,7 @@ def _ours(folds: Sequence[RigWithoutShots], seconds: float) -> Run:
 def _seconds(rig: Rig, held: RigWithoutShots) -> float:
     """Wall clock of one joint solve."""
     start = time.perf_counter()
-    place_rig(rig, held.used, held.cameras)
+    solve_rig(rig, held.used, held.cameras)
     return time.perf_counter() - start
 
 

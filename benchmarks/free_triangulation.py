@@ -15,7 +15,7 @@ from bodyscan.captures.folder import Captures
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
 from bodyscan.registration.board_shape import BoardShape
-from bodyscan.registration.rig_solve import PlacedRig, place_rig
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards, locate_views
 
@@ -88,14 +88,14 @@ class RigWithoutShots:
 
     cameras: dict[str, Camera]
     used: tuple[LocatedView, ...]
-    placed: PlacedRig
+    placed: RigSolution
     left_out: tuple[LocatedView, ...]
 
 
 def without_shots(rig: Rig, found: Sequence[BoardView], shots: Collection[str]) -> RigWithoutShots:
     """The rig calibrated by all views but those of `shots`.
 
-    Raises what `place_rig` raises.
+    Raises what `solve_rig` raises.
     """
     others = [view for view in found if view.shot not in shots]
     calibrated = calibrate_cameras(rig, others).value
@@ -103,7 +103,7 @@ def without_shots(rig: Rig, found: Sequence[BoardView], shots: Collection[str]) 
     used = tuple(view for view in views if view.shot not in shots)
     cameras = {name: own.camera for name, own in calibrated.items()}
     left_out = tuple(view for view in views if view.shot in shots)
-    return RigWithoutShots(cameras, used, place_rig(rig, used, cameras).value, left_out)
+    return RigWithoutShots(cameras, used, solve_rig(rig, used, cameras).value, left_out)
 
 
 def triangulate_shots(

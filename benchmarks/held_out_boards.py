@@ -13,10 +13,10 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.calibration.boundary_points import BoundaryPoints, binned, join
+from bodyscan.calibration.boundary_points import BoundaryPoints, bin_points, concatenate
 from bodyscan.calibration.camera import CameraCalibration
-from bodyscan.calibration.light import fit_light, smooth_models
 from bodyscan.calibration.light_planes import fit_light_planes
+from bodyscan.calibration.light_sheets import fit_light_sheets, smooth_models
 from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
@@ -70,7 +70,7 @@ def _models(
 ) -> dict[str, LightSheets]:
     projector = rig.pair(pair).projector
     assert projector is not None
-    points = join([shot.points for shot in shots])
+    points = concatenate([shot.points for shot in shots])
     stripes, direction = projector.stripes, projector.direction
     pinhole = fit_pinhole(points.points, points.index.astype(float))
     corners = [_corners_with_stripe(rig, shot) for shot in shots]
@@ -81,11 +81,13 @@ def _models(
         [c[2] for c in corners],
         pinhole,
     )
-    smooth = dict(smooth_models(binned(points, camera.camera, direction), stripes, direction))
+    smooth = dict(smooth_models(bin_points(points, camera.camera, direction), stripes, direction))
     return {
         "smooth planes": smooth["smooth planes"],
         "free planes": fit_light_planes(points, stripes, direction).planes,
-        "chosen by held-out boards": fit_light(points, stripes, direction, camera.camera).sheets,
+        "chosen by held-out boards": fit_light_sheets(
+            points, stripes, direction, camera.camera
+        ).sheets,
         "pinhole (2 x 4, stripes)": pinhole.planes(stripes, direction),
         "pinhole (OpenCV, corners)": opencv.planes(stripes, direction),
     }

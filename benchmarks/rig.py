@@ -13,9 +13,9 @@ from benchmarks.board_images import SeenRig, see_boards
 from benchmarks.rivals import RIVALS, run_rival
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.placing_covariance import position_sigma
+from bodyscan.geometry.pose_covariance import position_sigma
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
-from bodyscan.registration.rig_solve import PlacedRig, place_rig
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
@@ -111,12 +111,12 @@ def with_plain_board(rig: Rig) -> Rig:
     return rig.model_copy(update={"boards": (plain,)})
 
 
-def _run(seen: SeenRig) -> tuple[SeenRig, PlacedRig, dict[str, Camera], Scored]:
+def _run(seen: SeenRig) -> tuple[SeenRig, RigSolution, dict[str, Camera], Scored]:
     calibrated = calibrate_cameras(seen.rig, seen.views).value
     located = locate_views(seen.rig, seen.views, calibrated).value
     cameras = {name: found.camera for name, found in calibrated.items()}
     wall, cpu = time.perf_counter(), time.process_time()
-    placed = place_rig(seen.rig, located, cameras).value
+    placed = solve_rig(seen.rig, located, cameras).value
     seconds = time.perf_counter() - wall, time.process_time() - cpu
     return seen, placed, cameras, _score(seen, placed.rig_from_camera, *seconds)
 
@@ -146,7 +146,7 @@ def _aligned(seen: SeenRig, placings: dict[str, RigidTransform], scored: Scored)
 
 
 def _solve_row(
-    title: str, runs: Sequence[tuple[SeenRig, PlacedRig, dict[str, Camera], Scored]]
+    title: str, runs: Sequence[tuple[SeenRig, RigSolution, dict[str, Camera], Scored]]
 ) -> str:
     normalized = np.concatenate([_normalized(seen, placed) for seen, placed, _, _ in runs])
     scores = [scored for *_, scored in runs]
@@ -161,7 +161,7 @@ def _solve_row(
     )
 
 
-def _two_pairs(seen: SeenRig, placed: PlacedRig) -> Array:
+def _two_pairs(seen: SeenRig, placed: RigSolution) -> Array:
     """(M,) mm: how far apart two estimated placings put one point of a body-sized cylinder, for
     every point and any two cameras that see it."""
     angles = np.arange(0.0, 2.0 * np.pi, BODY_STEP_MM / BODY_RADIUS_MM)
@@ -198,7 +198,7 @@ def _sees(pair: TruePair, points: Array, normals: Array) -> Mask:
     return np.asarray(before & ~beside & within & (cosine > STEEPEST_COSINE))
 
 
-def _normalized(seen: SeenRig, placed: PlacedRig) -> Array:
+def _normalized(seen: SeenRig, placed: RigSolution) -> Array:
     """Error over sigma of every coordinate of every centre."""
     return np.concatenate(
         [
@@ -210,7 +210,7 @@ def _normalized(seen: SeenRig, placed: PlacedRig) -> Array:
 
 
 def _rival_rows(
-    title: str, seen: SeenRig, placed: PlacedRig, cameras: dict[str, Camera], scored: Scored
+    title: str, seen: SeenRig, placed: RigSolution, cameras: dict[str, Camera], scored: Scored
 ) -> list[str]:
     ours = _aligned(seen, placed.rig_from_camera, scored)
     rows = [

@@ -25,7 +25,7 @@ from bodyscan.alignment.matching import (
 )
 from bodyscan.alignment.overlap_equations import OverlapEquations, solve_motions
 from bodyscan.alignment.sway import SwayPrior, bound_motions, centre_shifts
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
@@ -73,7 +73,7 @@ class Alignment:
 def align(
     images: Sequence[RangeImage],
     rig_from_camera: Mapping[str, RigidTransform],
-    prior: PlacingCovariance,
+    prior: PoseCovariance,
     settings: AlignmentSettings,
     *,
     workers: int = 2,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.errors import FailedWork
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
@@ -49,7 +49,7 @@ class ObjectRefinement:
 def refine_on_object(
     images: Sequence[RangeImage],
     rig_from_camera: Mapping[str, RigidTransform],
-    prior: PlacingCovariance,
+    prior: PoseCovariance,
 ) -> ObjectRefinement:
     """images: one object that stood still while all pairs scanned it, its background cut away.
 

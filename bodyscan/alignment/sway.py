@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.settings import BODY_CENTRE_MM
 
@@ -41,9 +41,7 @@ class SwayPrior:
         found = float(np.sqrt(np.mean(centre_shifts(motion) ** 2))) / self.shift_mm
         return float(np.clip(SWAY_ROOM * found, self.least, self.most))
 
-    def covariance(
-        self, names: Sequence[str], boards: PlacingCovariance, scale: float = 1.0
-    ) -> Array:
+    def covariance(self, names: Sequence[str], boards: PoseCovariance, scale: float = 1.0) -> Array:
         """(6P, 6P): the calibration's covariance, plus for each pair a sway `scale` times the usual."""
         order = np.concatenate([6 * boards.names.index(name) + np.arange(6) for name in names])
         rotation, translation = scale * np.radians(self.rotation_deg), scale * self.shift_mm

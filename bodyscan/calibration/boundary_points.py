@@ -60,22 +60,22 @@ def boundary_points(
     )
 
 
-def join(parts: Sequence[BoundaryPoints]) -> BoundaryPoints:
+def concatenate(parts: Sequence[BoundaryPoints]) -> BoundaryPoints:
     """The boundary points of several shots as one."""
     return BoundaryPoints(
         *(
-            np.concatenate([getattr(part, name) for part in parts])
+            np.concatenate([getattr(select, name) for select in parts])
             for name in ("index", "board", "points", "per_pixel", "sigma_px")
         )
     )
 
 
-def part(data: BoundaryPoints, kept: Mask) -> BoundaryPoints:
+def select(data: BoundaryPoints, kept: Mask) -> BoundaryPoints:
     """The points where `kept` (N,) is true."""
     return BoundaryPoints(*(getattr(data, field.name)[kept] for field in fields(data)))
 
 
-def binned(data: BoundaryPoints, camera: Camera, direction: Axis) -> BoundaryPoints:
+def bin_points(data: BoundaryPoints, camera: Camera, direction: Axis) -> BoundaryPoints:
     """Weighted means over BIN_PX pixels along each boundary: ten times fewer points.
 
     Over so short a piece a boundary is straight: its sagitta is below a thousandth of a pixel.
@@ -113,13 +113,13 @@ def binned(data: BoundaryPoints, camera: Camera, direction: Axis) -> BoundaryPoi
     )
 
 
-def thinned(data: BoundaryPoints, most: int) -> BoundaryPoints:
+def subsample(data: BoundaryPoints, most: int) -> BoundaryPoints:
     """Every n-th boundary only, so that no more than about `most` points are left."""
     every = -(-len(data.index) // most)
     if every <= 1:
         return data
     _, rank = np.unique(data.index, return_inverse=True)
-    return part(data, rank % every == min(every // 2, int(rank.max())))
+    return select(data, rank % every == min(every // 2, int(rank.max())))
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ CELLS = 64
 TOO_LITTLE = 0.2
 
 
-def covered(pixels: Sequence[Array], width: int, height: int) -> float:
+def covered_share(pixels: Sequence[Array], width: int, height: int) -> float:
     """Share of a picture that the hulls of the views' corners cover together; pixels (N, 2) each."""
     mask = np.zeros((CELLS, CELLS), np.uint8)
     scale = np.array([CELLS / width, CELLS / height])
@@ -31,7 +31,7 @@ def coverage_notes(rig: Rig, views: Sequence[BoardView]) -> list[str]:
     notes = []
     for pair in rig.pairs:
         own = [view.pixels for view in views if view.pair == pair.name]
-        share = covered(own, pair.camera.width, pair.camera.height)
+        share = covered_share(own, pair.camera.width, pair.camera.height)
         if own and share < TOO_LITTLE:
             notes.append(
                 f"{pair.name}: in all {len(own)} views together the board covers only "

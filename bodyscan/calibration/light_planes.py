@@ -11,7 +11,7 @@ from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
     board_errors,
     boundary_points,
-    join,
+    concatenate,
     points_on_board,
 )
 from bodyscan.geometry.light_planes import Axis, LightPlanes
@@ -20,8 +20,8 @@ __all__ = [
     "BoundaryPoints",
     "PlaneFit",
     "boundary_points",
+    "concatenate",
     "fit_light_planes",
-    "join",
     "points_on_board",
 ]
 

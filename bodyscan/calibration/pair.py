@@ -9,13 +9,17 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import BoundaryPoints, binned
+from bodyscan.calibration.boundary_points import BoundaryPoints, bin_points
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.joint_refinement import striped_board
-from bodyscan.calibration.light import fit_light
-from bodyscan.calibration.light_choice import HeldOutModel
+from bodyscan.calibration.light_sheets import fit_light_sheets
+from bodyscan.calibration.model_selection import HeldOutModel
 from bodyscan.calibration.refinement_choice import refine_where_better
-from bodyscan.calibration.stripe_agreement import Disagreement, boards_off, find_disagreement
+from bodyscan.calibration.stripe_agreement import (
+    ProjectorMotion,
+    board_offsets,
+    find_projector_motion,
+)
 from bodyscan.calibration.striped_view import StripedView, boundaries_on_boards
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
@@ -98,12 +102,12 @@ def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
     notes: tuple[str, ...] = ()
     shots = pair.shots
     points = boundaries_on_boards(pair.name, camera, projector, shots)
-    disagreement = find_disagreement(points, camera, projector.stripes, projector.direction)
+    disagreement = find_projector_motion(points, camera, projector.stripes, projector.direction)
     if disagreement is not None:
         agreed = drop_disagreeing(pair.name, shots, disagreement)
         shots, notes = agreed.value, agreed.notes
         points = boundaries_on_boards(pair.name, camera, projector, shots)
-    fit = fit_light(points, projector.stripes, projector.direction, camera)
+    fit = fit_light_sheets(points, projector.stripes, projector.direction, camera)
     quality = replace(
         quality,
         planes_rms_mm=fit.rms_mm,
@@ -111,7 +115,7 @@ def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
         stripes_calibrated=fit.stripes_calibrated,
         stripes_projected=projector.stripes - 1,
         held_out=fit.held_out,
-        boards_mm=_mean_and_rms(boards_off(points, fit.sheets)),
+        boards_mm=_mean_and_rms(board_offsets(points, fit.sheets)),
     )
     found = PairCalibration(pair.name, camera, pair.own.covariance, fit.sheets, quality)
     if pair.alone:
@@ -122,7 +126,7 @@ def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
 
 
 def drop_disagreeing(
-    name: str, shots: Sequence[StripedView], found: Disagreement
+    name: str, shots: Sequence[StripedView], found: ProjectorMotion
 ) -> Outcome[tuple[StripedView, ...]]:
     """The shots less the one that fits no other. Raises PairFailed if it is more than one."""
     names = [shot.view.shot for shot in shots]
@@ -150,7 +154,7 @@ def _refined(
 ) -> PairCalibration:
     """Camera, boards and light of a pair by itself in one solve, where held-out boards gain."""
     assert pair.light is not None
-    data = binned(points, pair.camera, pair.light.direction)
+    data = bin_points(points, pair.camera, pair.light.direction)
     boards = [
         striped_board(
             PlanarView(shot.view.shot, shot.view.points, shot.view.pixels), pair.camera, data, k

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyscan.calibration.boundary_points import BoundaryPoints, part
+from bodyscan.calibration.boundary_points import BoundaryPoints, select
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.joint_refinement import (
     JointFit,
@@ -54,7 +54,7 @@ def refine_where_better(
     poses = calibration.camera_from_board
     before, after = [], []
     for held in range(len(boards)):
-        others = fit_sheets(sheets, part(data, data.board != held)).sheets
+        others = fit_sheets(sheets, select(data, data.board != held)).sheets
         before.append(_flatness(calibration.camera, others, boards[held]))
         partly = [
             replace(b, pixels=b.pixels[:0], index=b.index[:0], sigma_px=b.sigma_px[:0])

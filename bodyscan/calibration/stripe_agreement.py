@@ -10,10 +10,10 @@ import numpy as np
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
-    binned,
+    bin_points,
     board_errors,
-    part,
-    thinned,
+    select,
+    subsample,
 )
 from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.sheet_fit import fit_sheets
@@ -31,7 +31,7 @@ CLEARLY = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Disagreement:
+class ProjectorMotion:
     """Boards, told apart so that each group agrees on the light.
 
     kept, others: numbers of the boards in two groups, in the order of the shots; `others` is one
@@ -50,11 +50,11 @@ class Disagreement:
         return len(self.others) == 1
 
 
-def find_disagreement(
+def find_projector_motion(
     data: BoundaryPoints, camera: Camera, stripes: int, direction: Axis
-) -> Disagreement | None:
+) -> ProjectorMotion | None:
     """None if all boards agree, or are fewer than three. `data.board` counts in the order of shots."""
-    few = thinned(binned(data, camera, direction), FEW_POINTS)
+    few = subsample(bin_points(data, camera, direction), FEW_POINTS)
     boards = np.unique(few.board)
     if len(boards) < 3:
         return None
@@ -63,7 +63,7 @@ def find_disagreement(
         return None
     best = min(
         (
-            Disagreement(kept, others, together, _misfit(few, groups, stripes, direction))
+            ProjectorMotion(kept, others, together, _misfit(few, groups, stripes, direction))
             for kept, others, groups in _partitions(boards)
         ),
         key=lambda tried: tried.apart_px,
@@ -71,7 +71,7 @@ def find_disagreement(
     return best if CLEARLY * best.apart_px < together else None
 
 
-def boards_off(data: BoundaryPoints, sheets: LightSheets) -> Array:
+def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
     """(B,) mm: how far from its place, by the corners of all cameras, each board is measured by the
     stripes: median along its normal, positive away from the camera."""
     rays = data.points / data.points[:, 2:]
@@ -100,7 +100,7 @@ def _misfit(data: BoundaryPoints, groups: list[Indices], stripes: int, direction
     sheets. Sheets that may bow, so that no kind of projector is taken for one that moved."""
     medians = []
     for group in groups:
-        own = part(data, np.isin(data.board, group))
+        own = select(data, np.isin(data.board, group))
         plain = fit_pinhole(own.points, own.index.astype(float)).sheets(
             own.points, stripes, direction
         )

@@ -10,7 +10,12 @@ import numpy as np
 from bodyscan.arrays import Array, Indices
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, join, part
+from bodyscan.calibration.boundary_points import (
+    BoundaryPoints,
+    boundary_points,
+    concatenate,
+    select,
+)
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
@@ -78,7 +83,7 @@ def boundaries_on_boards(
             where=f"pair {name}",
             remedy="capture the stripe sequence on the board in three or more poses",
         )
-    return join(parts)
+    return concatenate(parts)
 
 
 def on_board(
@@ -103,4 +108,4 @@ def on_board(
     rim = RIM_SQUARES * board.square_mm
     inside = (x > rim) & (x < board.columns * board.square_mm - rim)
     inside &= (y > rim) & (y < board.rows * board.square_mm - rim) & (carried.points[:, 2] > 0)
-    return part(carried, inside)
+    return select(carried, inside)

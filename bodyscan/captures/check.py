@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from bodyscan.captures.folder import Captures, ImageSequence, join, open_folder, open_scan
+from bodyscan.captures.folder import Captures, ImageSequence, join_captures, open_folder, open_scan
 from bodyscan.captures.image_faults import header_fault
 from bodyscan.captures.unlisted_images import find_unlisted_images
 from bodyscan.errors import CaptureError
@@ -77,7 +77,7 @@ def check(rig_path: Path, scans: Iterable[Path] = ()) -> CheckReport:
     errors: list[str] = []
     parts = [_attempt(errors, open_folder, rig, rig_path, entry) for entry in rig.calibration]
     opened = tuple(part for part in parts if part is not None)
-    calibration = _attempt(errors, join, opened) if opened else None
+    calibration = _attempt(errors, join_captures, opened) if opened else None
     scanned = [_attempt(errors, open_scan, rig, Path(scan)) for scan in scans]
     captures = [part for part in (calibration, *scanned) if part is not None]
 

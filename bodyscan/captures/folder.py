@@ -104,7 +104,7 @@ class Captures:
 def open_captures(rig: Rig, rig_path: Path) -> Captures:
     """The calibration captures that a rig file names, its folders joined.
 
-    Raises CaptureError when it names none, and as `open_folder` and `join` do.
+    Raises CaptureError when it names none, and as `open_folder` and `join_captures` do.
     """
     if not rig.calibration:
         raise CaptureError(
@@ -112,7 +112,7 @@ def open_captures(rig: Rig, rig_path: Path) -> Captures:
             where=str(rig_path),
             remedy="Add `calibration:` with a folder; docs/formats.md shows how.",
         )
-    return join(tuple(open_folder(rig, rig_path, entry) for entry in rig.calibration))
+    return join_captures(tuple(open_folder(rig, rig_path, entry) for entry in rig.calibration))
 
 
 def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
@@ -149,7 +149,7 @@ def open_check(rig: Rig, folder: Path) -> tuple[Kind, Captures]:
     return kind, captures
 
 
-def join(parts: tuple[Captures, ...]) -> Captures:
+def join_captures(parts: tuple[Captures, ...]) -> Captures:
     """Captures of several folders as one; a shot of the same name in two is the same moment.
 
     Raises CaptureError when two folders hold the same shot of the same pair.

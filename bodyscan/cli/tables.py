@@ -8,7 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from bodyscan.fusion.scan import Scan
-from bodyscan.geometry.placing_covariance import position_sigma
+from bodyscan.geometry.pose_covariance import position_sigma
 from bodyscan.registration.rig_calibration import RigCalibration
 
 

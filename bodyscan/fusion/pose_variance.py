@@ -11,7 +11,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 
@@ -22,7 +22,7 @@ FACING = 0.2
 def add_pose_variance(
     cloud: BodyCloud,
     rig_from_camera: Mapping[str, RigidTransform],
-    prior: PlacingCovariance,
+    prior: PoseCovariance,
     *,
     workers: int = 2,
 ) -> BodyCloud:

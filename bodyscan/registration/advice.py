@@ -10,17 +10,17 @@ from itertools import combinations
 import networkx as nx
 import numpy as np
 
-from bodyscan.geometry.placing_covariance import point_covariance, position_sigma
+from bodyscan.geometry.pose_covariance import point_covariance, position_sigma
 from bodyscan.registration.more_shots import (
     MOST_SHOTS,
     BoardPlace,
-    Knowledge,
-    Sharpening,
+    RigInformation,
+    SigmaReduction,
     board_places,
 )
 from bodyscan.registration.normal_equations import normal_equations
 from bodyscan.registration.rig_frame import frame_target
-from bodyscan.registration.rig_solve import PlacedRig
+from bodyscan.registration.rig_solve import RigSolution
 from bodyscan.registration.view_graph import Target, view_graph
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
@@ -98,10 +98,10 @@ class Advice:
         return said + ([_sentence(self.more)] if self.more else [])
 
 
-def advise(rig: Rig, placed: PlacedRig, *, cameras_free: bool = True) -> Advice:
+def advise(rig: Rig, placed: RigSolution, *, cameras_free: bool = True) -> Advice:
     """Links, weak spots and the most useful further shots of a placed rig.
 
-    cameras_free: whether the joint solve refined the cameras (as `place_rig` does by default).
+    cameras_free: whether the joint solve refined the cameras (as `solve_rig` does by default).
     """
     links = links_of(placed)
     graph = view_graph(placed.views, sorted(placed.rig_from_camera))
@@ -125,7 +125,7 @@ def advise(rig: Rig, placed: PlacedRig, *, cameras_free: bool = True) -> Advice:
     )
 
 
-def links_of(placed: PlacedRig) -> tuple[Link, ...]:
+def links_of(placed: RigSolution) -> tuple[Link, ...]:
     """Every two pairs that share a shot, the least known first."""
     found = []
     graph = view_graph(placed.views, sorted(placed.rig_from_camera))
@@ -147,7 +147,7 @@ def best_chain(links: Sequence[Link]) -> tuple[Link, ...]:
     return tuple(sorted((data["link"] for _, _, data in tree), key=lambda link: -link.sigma_mm))
 
 
-def crucial_shots(placed: PlacedRig) -> tuple[Target, ...]:
+def crucial_shots(placed: RigSolution) -> tuple[Target, ...]:
     """Shots whose loss would leave pairs that no shared view ties to the others."""
     graph = nx.Graph()
     graph.add_nodes_from(("pair", name) for name in placed.rig_from_camera)
@@ -156,7 +156,7 @@ def crucial_shots(placed: PlacedRig) -> tuple[Target, ...]:
 
 
 def more_shots(
-    rig: Rig, placed: PlacedRig, pair: str, *, cameras_free: bool = True
+    rig: Rig, placed: RigSolution, pair: str, *, cameras_free: bool = True
 ) -> MoreShots | None:
     """The place for a board where fewest more shots halve the sigma of `pair`'s position.
 
@@ -177,7 +177,7 @@ def more_shots(
         fixed_target=fixed,
         cameras_free=cameras_free and len(placed.rig_from_camera) > 1,
     )
-    knowledge = Knowledge(equations, placed.cameras, placed.rig_from_camera)
+    knowledge = RigInformation(equations, placed.cameras, placed.rig_from_camera)
     tried = [(place, knowledge.after(knowledge.information(place), pair)) for place in places]
     place, best = min(tried, key=lambda item: _preference(item[1]))
     if best.after_mm2[-1] > 0.98 * best.before_mm2:
@@ -194,17 +194,19 @@ def more_shots(
     )
 
 
-def _usual_board(rig: Rig, placed: PlacedRig) -> Board:
+def _usual_board(rig: Rig, placed: RigSolution) -> Board:
     return rig.board(Counter(view.board for view in placed.views).most_common(1)[0][0])
 
 
-def _preference(sharpening: Sharpening) -> tuple[int, float]:
+def _preference(sharpening: SigmaReduction) -> tuple[int, float]:
     """Fewest shots to halve; where that is equal or out of reach, most gained."""
     shots = sharpening.shots_to_halve
     return shots or MOST_SHOTS + 1, float(sharpening.after_mm2[(shots or MOST_SHOTS) - 1])
 
 
-def _between(knowledge: Knowledge, place: BoardPlace, pair: str, shots: int) -> tuple[str, str]:
+def _between(
+    knowledge: RigInformation, place: BoardPlace, pair: str, shots: int
+) -> tuple[str, str]:
     """The two pairs whose views of that board alone would tell most."""
 
     def left(two: tuple[str, str]) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.placing_covariance import PlacingCovariance, point_covariance
+from bodyscan.geometry.pose_covariance import PoseCovariance, point_covariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
 from bodyscan.registration.view_graph import Target
 
@@ -89,7 +89,7 @@ class Drift:
 def find_drift(
     poses: Sequence[SeenPose],
     rig_from_camera: Mapping[str, RigidTransform],
-    prior: PlacingCovariance,
+    prior: PoseCovariance,
     poles: Mapping[str, str],
 ) -> Drift:
     """poles: the pole of each pair that stands on one. Boards that one pair alone sees say nothing."""
@@ -162,7 +162,7 @@ class _State:
         poses: Sequence[SeenPose],
         pairs: tuple[str, ...],
         rig_from_camera: Mapping[str, RigidTransform],
-        prior: PlacingCovariance,
+        prior: PoseCovariance,
     ) -> _State:
         order = np.concatenate(
             [np.zeros(0, int), *(6 * prior.names.index(name) + np.arange(6) for name in pairs)]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
-from bodyscan.registration.rig_solve import PlacedRig, place_rig
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.registration.view_graph import view_graph
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import RigFrame
@@ -67,7 +67,7 @@ class HalvesComparison:
         return [*said, f"differences over expected, RMS: {self.over_expected:.2f}"]
 
 
-def compare_halves(rig: Rig, placed: PlacedRig, *, seed: int = 0) -> HalvesComparison:
+def compare_halves(rig: Rig, placed: RigSolution, *, seed: int = 0) -> HalvesComparison:
     """Place the rig from either half of its shots and compare, pair by pair.
 
     Each half's frame is held by one pair and carried to where `placed` has that pair; the common
@@ -133,12 +133,12 @@ def _connected(views: Sequence[LocatedView], names: Sequence[str], shots: set[st
 
 
 def _placed_by(
-    rig: Rig, placed: PlacedRig, shots: Sequence[str], holder: str
+    rig: Rig, placed: RigSolution, shots: Sequence[str], holder: str
 ) -> tuple[dict[str, RigidTransform], Array]:
     """`rig_from_camera` from these shots alone and its covariance, in the frame of `placed`."""
     held = rig.model_copy(update={"rig_frame": RigFrame(pair=holder)})
     views = [view for view in placed.views if view.shot in shots]
-    half = place_rig(held, views, placed.cameras).value
+    half = solve_rig(held, views, placed.cameras).value
     to_rig = placed.rig_from_camera[holder] @ half.rig_from_camera[holder].inverse()
     carry = np.kron(np.eye(len(half.covariance.names)), adjoint(to_rig))
     placings = {name: to_rig @ t for name, t in half.rig_from_camera.items()}

@@ -97,7 +97,7 @@ def facings(placings: Iterable[RigidTransform], two_faced: bool) -> list[float]:
 
 
 @dataclass(frozen=True, eq=False)
-class Sharpening:
+class SigmaReduction:
     """Variance (mm2, all three axes together) of one pair's place after 1, 2, ... more shots."""
 
     before_mm2: float
@@ -110,7 +110,7 @@ class Sharpening:
         return int(enough[0]) + 1 if enough.size else None
 
 
-class Knowledge:
+class RigInformation:
     """The information that the rig's shots hold, ready to have that of other shots added."""
 
     def __init__(
@@ -150,7 +150,7 @@ class Knowledge:
             total += shot.without_boards()[np.ix_(self._free, self._free)]
         return total * np.outer(self._scale, self._scale) / len(place.views)
 
-    def after(self, information: Array, pair: str, most: int = MOST_SHOTS) -> Sharpening:
+    def after(self, information: Array, pair: str, most: int = MOST_SHOTS) -> SigmaReduction:
         """How a pair's place sharpens with 1 to `most` shots of that information each.
 
         The matrix inversion lemma in the basis in which the added information is diagonal, so that
@@ -170,7 +170,7 @@ class Knowledge:
         drop = np.sum(reach / (1.0 / shots + np.maximum(gain, 0.0)), axis=1)
         before = float(np.trace(jacobian @ self._inverse @ jacobian.T))
         variance = self._equations.variance_px2
-        return Sharpening(variance * before, variance * (before - drop))
+        return SigmaReduction(variance * before, variance * (before - drop))
 
 
 def _tilted(board: Board, centre: Array, ahead: Array) -> Iterator[RigidTransform]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import cauchy_weights, spread
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.view_graph import Target
 
@@ -75,7 +75,7 @@ class NormalEquations:
         step[free] = -scale * np.linalg.solve(reduced, scale * self.gradient[free])
         return step
 
-    def covariance(self) -> PlacingCovariance:
+    def covariance(self) -> PoseCovariance:
         """Of the pairs' motions, the corners' variance taken from the residuals."""
         free = self.free
         full = np.zeros(self.matrix.shape)
@@ -83,7 +83,7 @@ class NormalEquations:
             self.matrix[np.ix_(free, free)]
         )
         pairs = slice(0, self.first_board)
-        return PlacingCovariance(self.names, full[pairs, pairs])
+        return PoseCovariance(self.names, full[pairs, pairs])
 
     def without_boards(self) -> Array:
         """Information on pairs and cameras, the boards eliminated.

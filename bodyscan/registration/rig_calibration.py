@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Floats
 from bodyscan.calibration.pair import PairCalibration
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.rig_solve import PlacedRig, corner_residuals
+from bodyscan.registration.rig_solve import RigSolution, corner_residuals
 from bodyscan.rig.rig import Rig
 
 
@@ -42,7 +42,7 @@ class RigCalibration:
     rig: Rig
     pairs: dict[str, PairCalibration]
     rig_from_camera: dict[str, RigidTransform]
-    covariance: PlacingCovariance
+    covariance: PoseCovariance
     rig_from_board: dict[tuple[str, str], RigidTransform]
     failed: dict[str, str]
     notes: tuple[str, ...]
@@ -50,7 +50,7 @@ class RigCalibration:
     seen: dict[str, SeenCorners] = field(default_factory=dict)
 
 
-def seen_corners(placed: PlacedRig, names: Iterable[str]) -> dict[str, SeenCorners]:
+def seen_corners(placed: RigSolution, names: Iterable[str]) -> dict[str, SeenCorners]:
     """By the pair's name, for those of `names` that were placed."""
     number = {target: k for k, target in enumerate(sorted(placed.rig_from_board))}
     found = {}

@@ -13,7 +13,7 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import cauchy_weights, spread
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.registration.board_shape import BoardShape, ShapedSolution, with_board_shapes
@@ -24,9 +24,9 @@ from bodyscan.registration.normal_equations import normal_equations
 from bodyscan.registration.rig_frame import frame_board_turn, frame_target, rig_from_root
 from bodyscan.registration.view_graph import (
     Target,
+    initial_poses,
     not_together,
     place_boards,
-    placings,
     view_graph,
 )
 from bodyscan.rig.rig import Rig
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedRig:
+class RigSolution:
     """Everything in the rig frame; cameras as the joint solve left them; rms_px of each pair.
 
     views: those used, their points where the boards' corners really lie.  board_shapes: of boards
@@ -51,7 +51,7 @@ class PlacedRig:
     rig_from_camera: dict[str, RigidTransform]
     rig_from_board: dict[Target, RigidTransform]
     cameras: dict[str, Camera]
-    covariance: PlacingCovariance
+    covariance: PoseCovariance
     rms_px: dict[str, float]
     views: tuple[LocatedView, ...]
     board_shapes: dict[str, BoardShape]
@@ -65,13 +65,13 @@ class _Solved:
     notes: list[str]
 
 
-def place_rig(
+def solve_rig(
     rig: Rig,
     views: Sequence[LocatedView],
     cameras: Mapping[str, Camera],
     *,
     refine_cameras: bool = True,
-) -> Outcome[PlacedRig]:
+) -> Outcome[RigSolution]:
     """Join all pairs by their shared board views.
 
     Pairs that agree with the others in too few shots to be placed are failures.
@@ -80,7 +80,7 @@ def place_rig(
     their placing open, or only views that contradict each other; BadInput if nothing fixes the rig
     frame.
     """
-    start, left_out = placings(views, sorted(cameras))
+    start, left_out = initial_poses(views, sorted(cameras))
     while True:
         names = sorted(start)
         own = [view for view in views if view.pair in start]
@@ -156,7 +156,7 @@ def _strangers(solved: _Solved) -> list[str]:
     return sorted(name for name, number in shared.items() if 2 * out[name] > number)
 
 
-def _placed(rig: Rig, solved: ShapedSolution, refine: bool) -> PlacedRig:
+def _placed(rig: Rig, solved: ShapedSolution, refine: bool) -> RigSolution:
     """The solution carried into the rig frame, with its covariance there."""
     solution, kept = _frame_board_turned(rig, solved.solution, solved.views)
     to_rig = rig_from_root(rig, solution.root_from_camera, solution.root_from_board)
@@ -181,7 +181,7 @@ def _placed(rig: Rig, solved: ShapedSolution, refine: bool) -> PlacedRig:
         )
         for name in sorted(rig_from_camera)
     }
-    return PlacedRig(
+    return RigSolution(
         rig_from_camera,
         rig_from_board,
         solution.cameras,

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from bodyscan.calibration.light_choice import HeldOutModel
+from bodyscan.calibration.model_selection import HeldOutModel
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import CalibrationFileError
 from bodyscan.files.atomic import write_json, write_npz
 from bodyscan.files.hashing import file_hash
 from bodyscan.geometry.camera_fields import from_fields, to_fields
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
@@ -148,7 +148,7 @@ def _calibration(content: dict[str, Any], arrays: Any) -> RigCalibration:
         Rig.model_validate(content["rig"]),
         pairs,
         {name: _transform(part["rig_from_camera"]) for name, part in content["pairs"].items()},
-        PlacingCovariance(tuple(content["placing_covariance_order"]), arrays["placing_covariance"]),
+        PoseCovariance(tuple(content["placing_covariance_order"]), arrays["placing_covariance"]),
         {
             (part["shot"], part["board"]): _transform(part["rig_from_board"])
             for part in content["boards"]

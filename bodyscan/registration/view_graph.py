@@ -25,7 +25,7 @@ Group = dict[str, RigidTransform]
 
 
 @dataclass(frozen=True, eq=False)
-class Tie:
+class RelativePose:
     """What the boards shared by two groups of pairs say of their relative placing.
 
     votes: how many shared targets agree with it.  rivals: votes of the best contradicting placing,
@@ -64,7 +64,7 @@ def view_graph(views: Iterable[LocatedView], pairs: Sequence[str]) -> nx.Graph:
     return graph
 
 
-def placings(
+def initial_poses(
     views: Sequence[LocatedView], pairs: Sequence[str]
 ) -> tuple[dict[str, RigidTransform], dict[str, str]]:
     """Placings of the pairs in a frame they share, and pairs left out, each with the reason.
@@ -78,7 +78,7 @@ def placings(
     _refuse_disconnected(view_graph(views, pairs))
     targets = _by_target(views)
     groups: list[Group] = [{name: RigidTransform.identity()} for name in pairs]
-    ties: dict[tuple[int, int], Tie | None] = {}
+    ties: dict[tuple[int, int], RelativePose | None] = {}
     while len(groups) > 1:
         for i, j in combinations(range(len(groups)), 2):
             if (i, j) not in ties:
@@ -111,7 +111,7 @@ def not_together(names: Iterable[str]) -> str:
     )
 
 
-def _most(groups: Sequence[Group], best: Tie) -> tuple[Group, dict[str, str]]:
+def _most(groups: Sequence[Group], best: RelativePose) -> tuple[Group, dict[str, str]]:
     """The group that holds most pairs, if it holds more than half; the others are left out."""
     largest = max(groups, key=len)
     others = sorted(name for group in groups if group is not largest for name in group)
@@ -180,7 +180,9 @@ def _by_target(views: Iterable[LocatedView]) -> dict[Target, list[LocatedView]]:
     return dict(sorted(groups.items()))
 
 
-def _tie(first: Group, second: Group, targets: dict[Target, list[LocatedView]]) -> Tie | None:
+def _tie(
+    first: Group, second: Group, targets: dict[Target, list[LocatedView]]
+) -> RelativePose | None:
     """Let every target that both groups saw propose `first_from_second`; take the most agreed."""
     proposals: dict[Target, list[RigidTransform]] = {}
     corners: dict[Target, int] = {}
@@ -210,7 +212,7 @@ def _tie(first: Group, second: Group, targets: dict[Target, list[LocatedView]]) 
         for count, candidate in zip(votes, candidates, strict=True)
         if apart(candidate, candidates[best], REACH_MM) > 4.0 * AGREEMENT_MM
     ]
-    return Tie(
+    return RelativePose(
         candidates[best],
         tuple(proposals),
         votes[best],
@@ -244,7 +246,7 @@ def _refuse_disconnected(graph: nx.Graph) -> None:
         )
 
 
-def _open_tie(first: Group, second: Group, tie: Tie) -> RigDisconnected:
+def _open_tie(first: Group, second: Group, tie: RelativePose) -> RigDisconnected:
     shots = ", ".join(sorted({shot for shot, _ in tie.targets})[:6])
     return RigDisconnected(
         f"the relative pose of {', '.join(sorted(first))} and {', '.join(sorted(second))} stays open: "

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.calibration.coverage import covered
-from bodyscan.geometry.placing_covariance import position_sigma
+from bodyscan.calibration.coverage import covered_share
+from bodyscan.geometry.pose_covariance import position_sigma
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.verdict import Grade, Verdict
 
@@ -93,7 +93,7 @@ def _figures(calibration: RigCalibration, name: str) -> PairFigures:
     share = None
     if seen is not None:
         views = [seen.pixels[seen.target == k].astype(float) for k in np.unique(seen.target)]
-        share = 100.0 * covered(views, camera.width, camera.height)
+        share = 100.0 * covered_share(views, camera.width, camera.height)
     return PairFigures(
         name,
         quality.corners_rms_px,

@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.visibility import in_image
 from bodyscan.report.canvas import (
@@ -37,7 +37,7 @@ def sigma_at(
     points: Array,
     rig_from_camera: Mapping[str, RigidTransform],
     cameras: Mapping[str, Camera],
-    covariance: PlacingCovariance,
+    covariance: PoseCovariance,
 ) -> tuple[Array, Indices]:
     """Rig points (N, 3) -> sigma (N,) mm, all axes together, and how many pairs see each, (N,).
 
@@ -69,7 +69,7 @@ def draw_sigma_map(
     volume: Volume,
     rig_from_camera: Mapping[str, RigidTransform],
     cameras: Mapping[str, Camera],
-    covariance: PlacingCovariance,
+    covariance: PoseCovariance,
     *,
     height_px: int = 900,
 ) -> bytes:

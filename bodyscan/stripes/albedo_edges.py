@@ -18,21 +18,21 @@ from bodyscan.compiled import compiled
 from bodyscan.geometry.crop import crop_of, ends_of
 from bodyscan.stripes.scan_lines import ScanLines
 
-USUAL_BLUR2 = 0.45  # px^2, of a lens of 0.6 px and a pixel (1/12)
-LARGEST_BLUR2 = 2.0  # px^2: more is no blur of a camera that is in use
-STEEP = 0.5  # of ln(brightness) from pixel to pixel: an edge that tells the blur, not shading
-STEEP_TO_NOISE = 5.0  # sigmas: such an edge is none of noise
-ENOUGH = 100  # edges, for a median that a few odd ones do not move
-UNEXPLAINED = 0.3  # share of the correction that is believed to stay
-SIGNIFICANCE = 2.5  # sigmas at which half of a gradient is believed
-MAX_SLOPE = 1.0  # stripes per px from line to line: steeper is a jump in depth
+USUAL_BLUR2 = 0.45
+LARGEST_BLUR2 = 2.0
+STEEP = 0.5
+STEEP_TO_NOISE = 5.0
+ENOUGH = 100
+UNEXPLAINED = 0.3
+SIGNIFICANCE = 2.5
+MAX_SLOPE = 1.0
 GENTLE_PX = 3
 """Half the window over which shading is taken to change evenly."""
 WINDOW = 2 * GENTLE_PX + 1
-LEAST_PIXELS = np.float32(11.5)  # of WINDOW^2 = 49: a quarter
-LEAST_SPREAD = np.float32(0.5)  # px^4, of the pixels in a window: they lie not on one line
+LEAST_PIXELS = np.float32(11.5)
+LEAST_SPREAD = np.float32(0.5)
 NOTHING, ONE, TWO, THREE, FOUR, NINE = (np.float32(number) for number in (0, 1, 2, 3, 4, 9))
-MAX_SHIFT_PX = 0.6  # what an edge from black to white gives (see above)
+MAX_SHIFT_PX = 0.6
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,12 +16,12 @@ from bodyscan.stripes.bit_words import bit_that_flips
 from bodyscan.stripes.indirect_light import imbalance
 from bodyscan.stripes.scan_lines import ScanLines
 
-MAX_RATIO = 0.98  # of lit minus dark: beyond it noise decides what the error function says
-TABLE_SIZE = 4096  # entries: a step is about a tenth of a grey level
+MAX_RATIO = 0.98
+TABLE_SIZE = 4096
 LEAST_SIGMA_PX = 0.008
 """What blur that is not Gaussian and a sensor that is not quite linear leave, seen in tests."""
 
-MIN_STRIPE_PX = 0.2  # narrower, two boundaries are one, seen twice
+MIN_STRIPE_PX = 0.2
 FARTHEST_PX = 1.0
 """How far a boundary may lie from where the code changes."""
 

@@ -8,10 +8,10 @@ from bodyscan.arrays import Bytes, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.scan_lines import ScanLines
 
-LEVELS = 16  # bands of 16 grey levels each
-ENOUGH_PIXELS = 500  # in a band, which give its variance to 6 %
-LARGEST_DIFFERENCE = 24  # grey levels: more is an edge of the pattern, not noise
-BRIGHTEST = 250  # grey levels: above, saturation cuts the noise off
+LEVELS = 16
+ENOUGH_PIXELS = 500
+LARGEST_DIFFERENCE = 24
+BRIGHTEST = 250
 LEAST_VARIANCE = 0.15
 """Rounding to whole grey levels (1/12), and a little."""
 

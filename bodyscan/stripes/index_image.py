@@ -21,8 +21,8 @@ from bodyscan.stripes.usable_pixels import beside_jumps
 SIGMA = 12.0**-0.5
 """Of a place known to lie within one pixel, or of s within one stripe."""
 
-MAX_SHARE_BEYOND = 0.01  # of the numbered pixels
-NONE = (0, 255)  # luminances that are no stripe (the chapter, 4.1)
+MAX_SHARE_BEYOND = 0.01
+NONE = (0, 255)
 
 
 def decode_index(lit: Bytes, numbers: Bytes, direction: str, stripes: int) -> StripeMap:

@@ -19,9 +19,9 @@ from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.scan_lines import WHOLE_SHARE, ScanLines
 
-LEAST_DIRECT = 0.5  # of the light: a bit is certain where D > I (Xu and Aliaga 2007)
-WIDEST_DIP_PX = 7  # where a bit flips, the difference is small for so many pixels at most
-FINE_BITS = 3  # patterns that may be fine enough, from the finest on
+LEAST_DIRECT = 0.5
+WIDEST_DIP_PX = 7
+FINE_BITS = 3
 BEST, SHARP = 90, 0.8
 """A pattern is sharp if this percentile of the pixels' shares is at least so much."""
 
@@ -30,8 +30,8 @@ BESIDE_PX = (3, 4, 5, 6)
 FEWEST_STRIPES = 2
 """Reach at least that is of use."""
 AT_A_TIME = 1 << 14  # boundaries: their pixels' values fit into a processor's cache
-SIGNIFICANCE = 4.0  # sigmas at which half of an imbalance is believed
-UNEXPLAINED = 0.3  # share of the correction that is believed to stay
+SIGNIFICANCE = 4.0
+UNEXPLAINED = 0.3
 
 
 def mostly_direct(images: ScanLines, usable: Mask, bit: int, variance: Floats) -> Mask:

@@ -32,20 +32,20 @@ from bodyscan.stripes.usable_pixels import (
 )
 
 REACH = 3
-"""Images before and behind the brightest in which its light may be seen."""
+"""Bytes before and behind the brightest in which its light may be seen."""
 
-SAMPLES = 15  # images, of which the median at a pixel shows it without the line
+SAMPLES = 15
 MAX_SECOND = 0.3
 """How bright another peak may be: brighter, the light may have come by way of another surface, or
 the pixel sees two."""
 
-MAX_SHARE = 0.99  # of the light on one side of a boundary: beyond it noise decides
-LEAST_SIGMA = 0.003  # stripes: no pixel is believed to know s better
+MAX_SHARE = 0.99
+LEAST_SIGMA = 0.003
 SIGMA_WITHIN = 12.0**-0.5
 """Of s anywhere in a stripe."""
 
-BANDS = 8  # of brightness, along which the noise is seen to rise
-ENOUGH_PIXELS = 200  # bright ones, for 25 in a band
+BANDS = 8
+ENOUGH_PIXELS = 200
 
 
 def decode_sweep(lit: Bytes, frames: Bytes, direction: str) -> StripeMap:

@@ -26,13 +26,13 @@ from bodyscan.stripes.scan_lines import ScanLines, transpose
 from bodyscan.stripes.stripe_map import StripeMap
 from bodyscan.stripes.usable_pixels import MIN_CONTRAST_TO_NOISE, usable_pixels
 
-MIN_AMPLITUDE = 2.0  # grey levels: less is hard to tell from rounding
+MIN_AMPLITUDE = 2.0
 LEAST_SIGMA = 5e-4
 """Of a period: what light that is not quite a wave, and rounding, leave."""
 
-ALIKE = 0.1  # of how much two neighbouring images differ on average
-MAX_MEAN_ERROR = 0.15  # of the contrast
-MAX_SHARE_AMISS = 0.15  # of the pixels
+ALIKE = 0.1
+MAX_MEAN_ERROR = 0.15
+MAX_SHARE_AMISS = 0.15
 AFAR = 0.3
 """Of a period, between the phase and the middle of its half period; 1/4 if nothing is amiss."""
 

@@ -24,22 +24,22 @@ Codes = NDArray[np.uint16]
 SAMPLES = 50_000
 """About so many pixels are looked at where the whole picture is meant."""
 
-MIN_CONTRAST = 4  # grey levels between lit and dark
-MIN_SHARE_LIT = 1e-3  # of the picture: less is no board and no person
-MAX_SHARE_SATURATED = 0.5  # of the lit pixels
-MIN_DIFFERENCE = 0.06  # of the contrast, between a pattern and its inverse
+MIN_CONTRAST = 4
+MIN_SHARE_LIT = 1e-3
+MAX_SHARE_SATURATED = 0.5
+MIN_DIFFERENCE = 0.06
 MOST_ALIKE = 0.75
 """Of the pixels: a dark frame in place of a pattern looks like the inverse in half of them."""
 
-NOISE_GREY = 4  # grey levels by which a sum may be off without any fault
-MAX_SUM_ERROR = 0.15  # of the contrast, on average
-MAX_SHARE_BEYOND = 0.05  # of the codes
-MIN_FLIPS = 50  # neighbours that differ, for a share of them to mean anything
-WRONG_WAY = 2.0  # times as many changes from line to line as along lines
-MIN_SHARE_IN_STEP = 0.6  # of the places where a bit flips; rims and noise are out of step
-MIN_SHARE_WITHOUT_INVERSES = 0.75  # then nothing else shows that a pattern is missing
-MAX_SHARE_FOLDED = 0.3  # of the steps, that go the other way
-CONVINCING = 0.8  # in step, once a mistake is undone
+NOISE_GREY = 4
+MAX_SUM_ERROR = 0.15
+MAX_SHARE_BEYOND = 0.05
+MIN_FLIPS = 50
+WRONG_WAY = 2.0
+MIN_SHARE_IN_STEP = 0.6
+MIN_SHARE_WITHOUT_INVERSES = 0.75
+MAX_SHARE_FOLDED = 0.3
+CONVINCING = 0.8
 ENOUGH = 200_000
 """Of the pixels lines are taken until there are so many, to look at neighbours along them."""
 

@@ -18,9 +18,9 @@ SMOOTHERS = (
 )
 """Local quadratic fits to 5 and to 7 equally spaced values (Savitzky and Golay 1964)."""
 
-REACH_PX = 6.0  # half the length of a fit: surfaces bend within more
-MAX_STRAY = 4.0  # sigmas by which a fit may move a boundary
-SLACK = 0.15  # stripes by which s may leave its pixel's code, and blur explain it
+REACH_PX = 6.0
+MAX_STRAY = 4.0
+SLACK = 0.15
 BEYOND = 0.4
 """How far s is continued past the last boundary of a run, stripes."""
 BEYOND_DOUBT = 3.0

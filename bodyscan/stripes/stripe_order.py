@@ -13,12 +13,12 @@ from bodyscan.stripes.sequence_checks import check_direction
 
 Numbers = NDArray[np.signedinteger]
 
-ENOUGH = 20  # neighbours, for a share of them to mean anything
-MIN_SHARE_IN_STEP = 0.6  # of neighbours that differ; the rest are rims and jumps in depth
-DOUBTFUL = 0.8  # in step: a stripe with less may be out of place
-OUT = 0.6  # in step: two stripes with less are exchanged, if undoing it helps
-MOST_TRIED = 12  # stripes, and so 66 exchanges
-SELDOM = 0.05  # of how often it is leapt over: an image that does not show its stripe
+ENOUGH = 20
+MIN_SHARE_IN_STEP = 0.6
+DOUBTFUL = 0.8
+OUT = 0.6
+MOST_TRIED = 12
+SELDOM = 0.05
 
 
 def check_order(numbers: Numbers, good: Mask, turned: bool, stripes: int) -> None:

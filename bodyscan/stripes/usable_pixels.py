@@ -13,10 +13,10 @@ from bodyscan.compiled import compiled
 from bodyscan.stripes.indirect_light import mostly_direct
 from bodyscan.stripes.scan_lines import ScanLines
 
-SATURATED = 254  # grey level from which a pixel may have been brighter than it says
-MIN_CONTRAST = 4.0  # grey levels between lit and dark
-MIN_CONTRAST_TO_NOISE = 5.0  # sigmas
-WHOLLY_COVERED = 0.7  # of its brightest neighbour: less, beside a rim, is a pixel half off it
+SATURATED = 254
+MIN_CONTRAST = 4.0
+MIN_CONTRAST_TO_NOISE = 5.0
+WHOLLY_COVERED = 0.7
 
 
 def usable_pixels(

@@ -16,11 +16,11 @@ from bodyscan.errors import BadInput, BodyscanError, FailedWork, plainly
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, threaded
 from bodyscan.registration.advice import advise
-from bodyscan.registration.board_doubts import boards_not_found, size_doubt, what_was_found
+from bodyscan.registration.board_checks import boards_not_found, check_board_size, describe_findings
 from bodyscan.registration.halves import compare_halves
 from bodyscan.registration.rig_calibration import RigCalibration, seen_corners
 from bodyscan.registration.rig_frame import frame_target
-from bodyscan.registration.rig_solve import PlacedRig, place_rig
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.decode import ViewKey, decode_on_boards
 from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards, locate_views
@@ -36,7 +36,7 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
     views = find_all_boards(rig, captures, progress)
     cameras = calibrate_cameras(rig, views.value, progress)
     if not cameras.value:
-        remedy = what_was_found(rig, views.value, len(captures.sequences))
+        remedy = describe_findings(rig, views.value, len(captures.sequences))
         raise _nothing_calibrated(rig, cameras.failures, remedy)
     progress("joining the pairs", 0, 1)
     located = locate_views(rig, views.value, cameras.value)
@@ -57,7 +57,7 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
         *coverage_notes(rig, views.value),
         *boards_not_found(rig, views.value, len(captures.sequences)),
         *located.notes,
-        *size_doubt(rig, placed.rig_from_camera),
+        *check_board_size(rig, placed.rig_from_camera),
         *decoded.notes,
         *fitted.notes,
         *joined.notes,
@@ -85,9 +85,9 @@ def _nothing_calibrated(rig: Rig, failed: Mapping[str, str], remedy: str = "") -
 
 def _join_pairs(
     rig: Rig, views: list[LocatedView], cameras: Outcome[dict[str, CameraCalibration]]
-) -> Outcome[PlacedRig]:
+) -> Outcome[RigSolution]:
     try:
-        return place_rig(rig, views, {name: own.camera for name, own in cameras.value.items()})
+        return solve_rig(rig, views, {name: own.camera for name, own in cameras.value.items()})
     except BadInput as error:
         # The board or pair that fixes the frame may be missing because pairs failed before.
         before = "; ".join(f"{name}: {reason}" for name, reason in cameras.failures.items())
@@ -95,7 +95,7 @@ def _join_pairs(
         raise BadInput(error.what, where=error.where, remedy=remedy) from error
 
 
-def _of_views(placed: PlacedRig, views: list[BoardView]) -> list[BoardView]:
+def _of_views(placed: RigSolution, views: list[BoardView]) -> list[BoardView]:
     """The views that took part in placing the rig."""
     kept = {(view.pair, view.shot, view.board) for view in placed.views}
     return [view for view in views if (view.pair, view.shot, view.board) in kept]
@@ -103,7 +103,7 @@ def _of_views(placed: PlacedRig, views: list[BoardView]) -> list[BoardView]:
 
 def _fit_sheets(
     rig: Rig,
-    placed: PlacedRig,
+    placed: RigSolution,
     cameras: Mapping[str, CameraCalibration],
     decoded: Outcome[dict[ViewKey, BoardBoundaries]],
     progress: Progress,
@@ -128,7 +128,7 @@ def _fit_sheets(
 
 def _placed_pair(
     rig: Rig,
-    placed: PlacedRig,
+    placed: RigSolution,
     name: str,
     own: CameraCalibration,
     boundaries: Mapping[ViewKey, BoardBoundaries],
@@ -156,7 +156,7 @@ def _placed_pair(
     )
 
 
-def update_poses(rig: Rig, placed: PlacedRig, pair: PairCalibration) -> PlacedRig:
+def update_poses(rig: Rig, placed: RigSolution, pair: PairCalibration) -> RigSolution:
     """Where a pair's stripes changed its camera: camera and boards as that camera sees them, the
     board that fixes the rig frame where it lies. Only a pair by itself is refined so."""
     if pair.camera == placed.cameras[pair.name]:
@@ -179,7 +179,7 @@ def update_poses(rig: Rig, placed: PlacedRig, pair: PairCalibration) -> PlacedRi
     )
 
 
-def advice_on(rig: Rig, placed: PlacedRig, progress: Progress = silent) -> tuple[str, ...]:
+def advice_on(rig: Rig, placed: RigSolution, progress: Progress = silent) -> tuple[str, ...]:
     """How well the pairs are tied together, whether halves of the shots agree, and what would help
     most; nothing for one pair."""
     if len(placed.rig_from_camera) < 2:

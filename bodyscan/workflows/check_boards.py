@@ -15,7 +15,7 @@ from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BoardNotFound
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.ray_depths import intersect_rays
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent
@@ -115,7 +115,7 @@ def repaired(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibrati
     return replace(
         calibration,
         rig_from_camera=placing,
-        covariance=PlacingCovariance(names, matrix),
+        covariance=PoseCovariance(names, matrix),
         notes=(*calibration.notes, *said),
     )
 

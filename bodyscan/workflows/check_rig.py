@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bodyscan.captures.folder import Captures, join, open_check
+from bodyscan.captures.folder import Captures, join_captures, open_check
 from bodyscan.errors import BadInput, FailedWork
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -65,7 +65,7 @@ def check_rig(
         )
     if kinds == {"scan"}:
         return _of_scans(check_scans(calibration, [one for _, one in captures], progress))
-    shots = join(tuple(_named_apart([one for _, one in captures])))
+    shots = join_captures(tuple(_named_apart([one for _, one in captures])))
     return _of_boards(check_boards(calibration, shots, progress))
 
 

@@ -75,7 +75,7 @@ def load_truth(folder: Path) -> Truth:
 
 def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
     """Camera centres and rotations against the truth."""
-    from bodyscan.geometry.placing_covariance import position_sigma
+    from bodyscan.geometry.pose_covariance import position_sigma
 
     names = tuple(sorted(calibration.rig_from_camera))
     centres, rotations, sigmas = [], [], []

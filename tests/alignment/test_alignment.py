@@ -12,7 +12,7 @@ from bodyscan.alignment.overlap_equations import OverlapEquations
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.triangulation import grid_normals
@@ -52,12 +52,12 @@ def scanned():
     return images, placings
 
 
-def known_to(names, mm: float, deg: float) -> PlacingCovariance:
+def known_to(names, mm: float, deg: float) -> PoseCovariance:
     """Independent errors of the pairs, about the body's middle."""
     carry = np.eye(6)
     carry[3:, :3] = [[0, 900.0, 0], [-900.0, 0, 0], [0, 0, 0]]
     own = carry @ np.diag([np.radians(deg) ** 2] * 3 + [mm**2] * 3) @ carry.T
-    return PlacingCovariance(tuple(names), np.kron(np.eye(len(names)), own))
+    return PoseCovariance(tuple(names), np.kron(np.eye(len(names)), own))
 
 
 def pushed(placings, mm: float, seed: int = 0):

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from bodyscan.alignment.sway import SwayPrior, bound_motions, centre_shifts
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.settings import BODY_CENTRE_MM
 
 PAIRS = ("p1", "p2")
 PRIOR = SwayPrior(shift_mm=1.0, rotation_deg=0.5, least=0.3, most=4.0)
-EXACT_BOARDS = PlacingCovariance(PAIRS, np.zeros((12, 12)))
+EXACT_BOARDS = PoseCovariance(PAIRS, np.zeros((12, 12)))
 
 
 def shifted(*mm: float) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.coverage import coverage_notes, covered
+from bodyscan.calibration.coverage import coverage_notes, covered_share
 from bodyscan.rig.rig_file import load_rig
 
 
@@ -17,13 +17,15 @@ def corners(left: float, top: float, width: float, height: float) -> np.ndarray:
 def test_the_share_of_the_picture_is_that_of_the_hull(width, height, share):
     # The picture is divided into 64 cells each way: a rim of half a cell is in doubt.
     doubt = (width / 640 + height / 480) / 64 + 0.001
-    assert covered([corners(100, 90, width, height)], 640, 480) == pytest.approx(share, abs=doubt)
+    assert covered_share([corners(100, 90, width, height)], 640, 480) == pytest.approx(
+        share, abs=doubt
+    )
 
 
 def test_views_in_the_same_place_cover_no_more():
     one, beside = corners(0, 0, 320, 240), corners(320, 240, 319, 239)
-    assert covered([one, one], 640, 480) == covered([one], 640, 480)
-    assert covered([one, beside], 640, 480) == pytest.approx(0.5, abs=0.04)
+    assert covered_share([one, one], 640, 480) == covered_share([one], 640, 480)
+    assert covered_share([one, beside], 640, 480) == pytest.approx(0.5, abs=0.04)
 
 
 @pytest.mark.parametrize(("size", "named"), [(0.22, True), (0.6, False)])

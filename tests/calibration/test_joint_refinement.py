@@ -4,10 +4,10 @@ import numpy as np
 from lit_boards import Mirror, Scene
 
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import binned, boundary_points, join
+from bodyscan.calibration.boundary_points import bin_points, boundary_points, concatenate
 from bodyscan.calibration.camera import calibrate_camera
 from bodyscan.calibration.joint_refinement import refine_jointly, striped_board
-from bodyscan.calibration.light import fit_light
+from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
 
@@ -51,8 +51,8 @@ def calibrated(seed):
                 camera.camera, placed, index, pixels, sigma, board=k, direction="vertical"
             )
         )
-    bins = binned(join(parts), camera.camera, "vertical")
-    sheets = fit_light(bins, 254, "vertical", camera.camera).sheets
+    bins = bin_points(concatenate(parts), camera.camera, "vertical")
+    sheets = fit_light_sheets(bins, 254, "vertical", camera.camera).sheets
     return camera, sheets, [striped_board(v, camera.camera, bins, k) for k, v in enumerate(views)]
 
 

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyscan.calibration.boundary_points import boundary_points, join
+from bodyscan.calibration.boundary_points import boundary_points, concatenate
 from bodyscan.calibration.light_planes import fit_light_planes
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
@@ -51,7 +51,7 @@ def seen_on(pose: RigidTransform, planes: np.ndarray, number: int, noise_px: flo
 
 
 def test_planes_are_recovered_from_three_boards():
-    data = join([seen_on(pose, true_planes(), k) for k, pose in enumerate(POSES)])
+    data = concatenate([seen_on(pose, true_planes(), k) for k, pose in enumerate(POSES)])
     fit = fit_light_planes(data, STRIPES, "vertical")
     assert fit.planes.calibrated.all()
     # Newton's undistortion and float64 leave well under a nanometre over half a metre.
@@ -60,7 +60,7 @@ def test_planes_are_recovered_from_three_boards():
 
 
 def test_outliers_lose_their_weight():
-    clean = join([seen_on(pose, true_planes(), k, 0.05) for k, pose in enumerate(POSES)])
+    clean = concatenate([seen_on(pose, true_planes(), k, 0.05) for k, pose in enumerate(POSES)])
     dirty = clean.points.copy()
     dirty[::40] += [3.0, 0.0, 5.0]
     spoilt = type(clean)(clean.index, clean.board, dirty, clean.per_pixel, clean.sigma_px)
@@ -81,7 +81,7 @@ def test_a_stripe_on_one_board_gets_no_plane():
         type(p)(*(getattr(p, n)[k] for n in ("index", "board", "points", "per_pixel", "sigma_px")))
         for p, k in zip(parts, keep, strict=True)
     ]
-    planes = fit_light_planes(join(parts), STRIPES, "vertical").planes
+    planes = fit_light_planes(concatenate(parts), STRIPES, "vertical").planes
     assert not planes.calibrated[5]
     assert planes.calibrated.sum() == STRIPES
 

@@ -5,7 +5,7 @@ import pytest
 
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.pair import drop_disagreeing
-from bodyscan.calibration.stripe_agreement import Disagreement
+from bodyscan.calibration.stripe_agreement import ProjectorMotion
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.transforms import RigidTransform
@@ -25,7 +25,7 @@ SHOTS = [
 
 
 def test_one_shot_that_fits_no_other_is_left_out_and_named():
-    found = Disagreement(np.array([0, 1, 3, 4]), np.array([2]), 2.5, 0.1)
+    found = ProjectorMotion(np.array([0, 1, 3, 4]), np.array([2]), 2.5, 0.1)
     kept = drop_disagreeing("p1-1", SHOTS, found)
     assert [shot.view.shot for shot in kept.value] == ["a", "b", "d", "e"]
     (note,) = kept.notes
@@ -34,7 +34,7 @@ def test_one_shot_that_fits_no_other_is_left_out_and_named():
 
 
 def test_a_projector_that_moved_costs_the_pair_and_the_shots_are_named():
-    found = Disagreement(np.array([0, 1, 2]), np.array([3, 4]), 2.5, 0.1)
+    found = ProjectorMotion(np.array([0, 1, 2]), np.array([3, 4]), 2.5, 0.1)
     with pytest.raises(PairFailed, match="moved between shots c and d") as error:
         drop_disagreeing("p1-1", SHOTS, found)
     assert error.value.where == "pair p1-1"

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from lit_boards import BODY_POSES, CHAPTER_POSES, Scene, Uneven, body_scene, chapter_scene
 
-from bodyscan.calibration.boundary_points import BoundaryPoints, join
-from bodyscan.calibration.light import fit_light
-from bodyscan.calibration.stripe_agreement import Disagreement, boards_off, find_disagreement
+from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
+from bodyscan.calibration.light_sheets import fit_light_sheets
+from bodyscan.calibration.stripe_agreement import (
+    ProjectorMotion,
+    board_offsets,
+    find_projector_motion,
+)
 
 MORE_POSES = (
     *BODY_POSES,
@@ -18,15 +22,17 @@ MORE_POSES = (
 )
 
 
-def disagreement(scene: Scene, poses, moved: Scene | None = None, shots=()) -> Disagreement | None:
+def disagreement(
+    scene: Scene, poses, moved: Scene | None = None, shots=()
+) -> ProjectorMotion | None:
     """Boards of a scene; of the `shots`, as they are once its projector has moved."""
     parts = []
     for number, pose in enumerate(poses):
         of = moved if moved is not None and number in shots else scene
         data = of.boundaries([of.looking_at(*pose)], seed=number)
         parts.append(replace(data, board=np.full_like(data.board, number)))
-    data: BoundaryPoints = join(parts)
-    return find_disagreement(data, scene.camera, scene.projector.stripes, scene.direction)
+    data: BoundaryPoints = concatenate(parts)
+    return find_projector_motion(data, scene.camera, scene.projector.stripes, scene.direction)
 
 
 def pushed(scene: Scene, push) -> Scene:
@@ -90,9 +96,9 @@ def test_a_board_that_stands_elsewhere_is_measured_there():
     scene = body_scene(0.0)
     poses = [scene.looking_at(*pose) for pose in MORE_POSES]
     data = scene.boundaries(poses, corner_px=0.0)
-    fit = fit_light(data, scene.projector.stripes, scene.direction, scene.camera)
+    fit = fit_light_sheets(data, scene.projector.stripes, scene.direction, scene.camera)
     # By its corners, board 2 lies 0.5 mm nearer than it does.
     nearer = np.where(data.board[:, None] == 2, data.points * (1.0 - 0.5 / 1400.0), data.points)
-    off = boards_off(replace(data, points=nearer), fit.sheets)
+    off = board_offsets(replace(data, points=nearer), fit.sheets)
     assert 0.25 < off[2] < 0.55
     assert np.abs(np.delete(off, 2)).max() < 0.05

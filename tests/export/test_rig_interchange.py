@@ -12,7 +12,7 @@ from bodyscan.export.rig import export_rig
 from bodyscan.export.rig_formats.colmap import read_colmap_rig, write_colmap_rig
 from bodyscan.export.rig_formats.opencv import read_opencv_rig, write_opencv_rig
 from bodyscan.geometry.camera_fields import to_fields
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.registration.rig_calibration import RigCalibration
 
 WRITTEN = {
@@ -30,7 +30,7 @@ def calibration():
         )
         for name, camera in cameras.items()
     }
-    covariance = PlacingCovariance(tuple(pairs), np.eye(6 * len(pairs)))
+    covariance = PoseCovariance(tuple(pairs), np.eye(6 * len(pairs)))
     return RigCalibration(ring_rig(placings), pairs, placings, covariance, {}, {}, ())
 
 

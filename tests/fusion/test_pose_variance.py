@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bodyscan.fusion.pose_variance import add_pose_variance
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 
@@ -34,7 +34,7 @@ def placed(*places):
 
 def test_a_pair_that_is_shifted_along_x_errs_where_it_looks_along_x(cloud):
     covariance = np.diag([0.0, 0.0, 0.0, 0.04**2, 0.0, 0.0])
-    prior = PlacingCovariance(("p0",), covariance)
+    prior = PoseCovariance(("p0",), covariance)
     found = add_pose_variance(cloud, placed([1300, 0, 900]), prior)
     front = cloud.normals[:, 0] > 0.999
     assert found.sigma_mm[front] == pytest.approx(0.05, rel=1e-3)
@@ -45,7 +45,7 @@ def test_a_pair_that_is_shifted_along_x_errs_where_it_looks_along_x(cloud):
 def test_draws_of_the_placing_spread_by_the_error_bar(cloud):
     rng = np.random.default_rng(4)
     root = rng.normal(size=(6, 6)) * np.array([1e-5] * 3 + [0.02] * 3)[:, None]
-    prior = PlacingCovariance(("p0",), root @ root.T)
+    prior = PoseCovariance(("p0",), root @ root.T)
     place = placed([1300, 0, 900])
     alone = BodyCloud(
         cloud.points, cloud.normals, 0 * cloud.sigma_mm, cloud.colours, cloud.pairs_seen

@@ -9,7 +9,7 @@ from ray_cast_scan import Truth, cast_scan, load_body, load_rig, looking, withou
 
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.scan import Scan, fuse
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.reconstruction.range_image import RangeImage
@@ -73,7 +73,7 @@ def fused(images, *, placed=None, failed=None, volume: Volume = RIG.volume, empt
     """What `bodyscan scan` makes of range images, with a calibration good to 0.05 mm."""
     placed = placed or placings()
     sigmas = np.tile([2e-5] * 3 + [0.05] * 3, len(placed))
-    covariance = PlacingCovariance(tuple(placed), np.diag(sigmas**2))
+    covariance = PoseCovariance(tuple(placed), np.diag(sigmas**2))
     rig = RIG.model_copy(update={"volume": volume})
     calibration = RigCalibration(rig, {}, placed, covariance, {}, {}, ())
     return fuse(calibration, Outcome(images, failures=failed or {}), SETTINGS, empty=empty)
@@ -194,7 +194,7 @@ def test_a_person_who_stepped_aside(images):
 
 def test_alignment_takes_no_part_if_not_wanted(images):
     placed = placings()
-    known = PlacingCovariance(tuple(placed), np.zeros((6 * len(placed), 6 * len(placed))))
+    known = PoseCovariance(tuple(placed), np.zeros((6 * len(placed), 6 * len(placed))))
     calibration = RigCalibration(RIG, {}, placed, known, {}, {}, ())
     boards_alone = SETTINGS.model_copy(update={"alignment": AlignmentSettings(matching="none")})
     scan = fuse(calibration, Outcome(images), boards_alone)

@@ -4,10 +4,10 @@ from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.geometry.placing_covariance import position_sigma
+from bodyscan.geometry.pose_covariance import position_sigma
 from bodyscan.registration.advice import advise, crucial_shots
 from bodyscan.registration.normal_equations import normal_equations, scaled_inverse
-from bodyscan.registration.rig_solve import place_rig
+from bodyscan.registration.rig_solve import solve_rig
 
 NOISE_PX = 0.03
 
@@ -17,7 +17,7 @@ def ring():
     placings, cameras = ring_of_cameras()
     views, truth = ring_views(placings, cameras, noise_px=NOISE_PX)
     rig = ring_rig(placings)
-    return rig, placings, cameras, views, truth, place_rig(rig, views, cameras).value
+    return rig, placings, cameras, views, truth, solve_rig(rig, views, cameras).value
 
 
 def captured(place, count, placings, cameras, rng):
@@ -43,7 +43,7 @@ def test_shots_as_advised_do_halve_the_sigma(ring):
     assert more.halves
     assert more.after_mm <= more.before_mm / 2
     extra = captured(more.place, more.shots, placings, cameras, np.random.default_rng(5))
-    again = place_rig(rig, [*views, *extra], cameras).value
+    again = solve_rig(rig, [*views, *extra], cameras).value
     centre = again.rig_from_camera[more.pair].translation
     sigma = np.linalg.norm(position_sigma(again.covariance, more.pair, centre))
     # The noise is estimated anew and robust weights shift a little: 10 %.
@@ -81,7 +81,7 @@ def test_links_that_nothing_doubles_are_named():
         or (v.shot != bridge and (v.pair[:2] == "p3") == (int(v.shot[1:]) % 2 == 0))
     ]
     rig = ring_rig(placings)
-    placed = place_rig(rig, kept, cameras).value
+    placed = solve_rig(rig, kept, cameras).value
     advice = advise(rig, placed)
     # p3-1 hangs on p3-2 alone as well, by more shots.
     assert ("p1-2", "p3-2", 1) in [(link.first, link.second, link.shots) for link in advice.bridges]

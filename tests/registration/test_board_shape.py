@@ -10,7 +10,7 @@ from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.camera import locate_board
-from bodyscan.registration.rig_solve import place_rig
+from bodyscan.registration.rig_solve import solve_rig
 
 PLACINGS, CAMERAS = ring_of_cameras(heights=(700, 1200))
 
@@ -42,7 +42,7 @@ def bent_views(shots=30):
 def placed():
     bent, flat = bent_views()
     rig = ring_rig(PLACINGS)
-    return place_rig(rig, bent, CAMERAS), place_rig(rig, flat, CAMERAS)
+    return solve_rig(rig, bent, CAMERAS), solve_rig(rig, flat, CAMERAS)
 
 
 def rms(placed):

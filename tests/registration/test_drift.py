@@ -6,7 +6,7 @@ from ring import ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.drift import find_drift, seen_pose
-from bodyscan.registration.rig_solve import place_rig
+from bodyscan.registration.rig_solve import solve_rig
 
 NOISE_PX = 0.03
 PLACINGS, CAMERAS = ring_of_cameras()
@@ -16,7 +16,7 @@ POLES = {name: name[:2] for name in PLACINGS}
 @pytest.fixture(scope="module")
 def calibrated():
     views, _ = ring_views(PLACINGS, CAMERAS, shots=40, noise_px=NOISE_PX, seed=5)
-    return place_rig(ring_rig(PLACINGS), views, CAMERAS).value
+    return solve_rig(ring_rig(PLACINGS), views, CAMERAS).value
 
 
 def drift_after(calibrated, moved: dict[str, RigidTransform], shots=3, seed=11):

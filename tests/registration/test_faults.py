@@ -12,13 +12,13 @@ from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.camera import locate_board
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.rig_solve import place_rig
+from bodyscan.registration.rig_solve import solve_rig
 
 PLACINGS, CAMERAS = ring_of_cameras()
 
 
 def place(views):
-    return place_rig(ring_rig(PLACINGS), views, CAMERAS)
+    return solve_rig(ring_rig(PLACINGS), views, CAMERAS)
 
 
 def rms(placed):
@@ -70,7 +70,7 @@ def test_a_pair_entirely_absent(seen):
     views, _, clean = seen
     cameras = {name: camera for name, camera in CAMERAS.items() if name != "p3-2"}
     rig = ring_rig(PLACINGS)
-    placed = place_rig(rig, [view for view in views if view.pair != "p3-2"], cameras)
+    placed = solve_rig(rig, [view for view in views if view.pair != "p3-2"], cameras)
     assert sorted(placed.value.rig_from_camera) == sorted(cameras)
     assert rms(placed) < 1.2 * clean
 
@@ -169,7 +169,7 @@ def test_one_of_two_boards_with_other_squares_than_the_rig_file_says(seen):
     ]
     other = CHARUCO.model_copy(update={"name": "other", "first_marker": 200})
     rig = ring_rig(PLACINGS).model_copy(update={"boards": (CHARUCO, other)})
-    placed = place_rig(rig, changed, CAMERAS)
+    placed = solve_rig(rig, changed, CAMERAS)
     (said,) = [note for note in placed.notes if "square_mm" in note]
     assert "board other has squares 1.030 times" in said
     without = place([v for v in views if v.shot not in second])

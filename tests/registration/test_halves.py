@@ -6,7 +6,7 @@ from ring import ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.errors import FailedWork
 from bodyscan.registration.halves import compare_halves, split_shots
-from bodyscan.registration.rig_solve import place_rig
+from bodyscan.registration.rig_solve import solve_rig
 
 
 def placed_ring(seed=0, shots=40, spoil=None):
@@ -14,7 +14,7 @@ def placed_ring(seed=0, shots=40, spoil=None):
     views, _ = ring_views(placings, cameras, shots=shots, seed=seed)
     views = [spoil(view) for view in views] if spoil else views
     rig = ring_rig(placings)
-    return rig, place_rig(rig, views, cameras).value
+    return rig, solve_rig(rig, views, cameras).value
 
 
 def test_honest_halves_differ_by_what_they_promise():

@@ -5,8 +5,8 @@ import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.errors import RigDisconnected
-from bodyscan.geometry.placing_covariance import position_sigma
-from bodyscan.registration.rig_solve import place_rig
+from bodyscan.geometry.pose_covariance import position_sigma
+from bodyscan.registration.rig_solve import solve_rig
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import NominalPose
 from bodyscan.rig.rig_frame import RigFrame
@@ -26,7 +26,7 @@ def rms(errors):
 def test_twelve_cameras_are_placed():
     placings, cameras = ring_of_cameras()
     views, _ = ring_views(placings, cameras)
-    outcome = place_rig(ring_rig(placings), views, cameras)
+    outcome = solve_rig(ring_rig(placings), views, cameras)
     placed = outcome.value
     # Sigmas of the centres that the solve reports are 0.05 to 0.1 mm here.
     assert rms(centre_errors(placed, placings)) < 0.25
@@ -38,7 +38,7 @@ def test_sigmas_of_positions_are_honest():
     normalized = []
     for seed in range(12):
         views, _ = ring_views(placings, cameras, shots=20, seed=seed)
-        placed = place_rig(ring_rig(placings), views, cameras).value
+        placed = solve_rig(ring_rig(placings), views, cameras).value
         for name, error in centre_errors(placed, placings).items():
             if name != "p1-1":
                 sigma = position_sigma(placed.covariance, name, placings[name].translation)
@@ -50,7 +50,7 @@ def test_sigmas_of_positions_are_honest():
 def test_wrong_views_are_found_and_named():
     placings, cameras = ring_of_cameras()
     views, _ = ring_views(placings, cameras)
-    clean = rms(centre_errors(place_rig(ring_rig(placings), views, cameras).value, placings))
+    clean = rms(centre_errors(solve_rig(ring_rig(placings), views, cameras).value, placings))
     number = next(i for i, v in enumerate(views) if v.pair == "p2-2" and len(v.pixels) > 30)
     shuffled = views[number].pixels.copy()
     shuffled[[3, 20]] = shuffled[[20, 3]]
@@ -63,7 +63,7 @@ def test_wrong_views_are_found_and_named():
         shuffled,
         views[number].camera_from_board,
     )
-    outcome = place_rig(ring_rig(placings), views, cameras)
+    outcome = solve_rig(ring_rig(placings), views, cameras)
     assert any("p2-2" in note and views[number].shot in note for note in outcome.notes)
     assert rms(centre_errors(outcome.value, placings)) < 1.2 * clean + 0.02
 
@@ -73,7 +73,7 @@ def test_two_groups_without_a_shared_view_are_named():
     views, _ = ring_views(placings, cameras, shots=20)
     apart = [v for v in views if (v.pair[:2] == "p3") == (int(v.shot[1:]) % 2 == 0)]
     with pytest.raises(RigDisconnected, match="p3-1") as caught:
-        place_rig(ring_rig(placings), apart, cameras)
+        solve_rig(ring_rig(placings), apart, cameras)
     assert "capture shots in which" in str(caught.value)
 
 
@@ -91,7 +91,7 @@ def test_plain_boards_numbered_from_either_end_are_resolved(columns, faces):
     # A one-faced board is seen by two poles at once in few of so many shots.
     views, _ = ring_views(placings, cameras, shots=160 // faces, board=board)
     rig = ring_rig(placings).model_copy(update={"boards": (board,)})
-    placed = place_rig(rig, views, cameras).value
+    placed = solve_rig(rig, views, cameras).value
     # One wrong turn among the tree's edges would show as metres.
     assert rms(centre_errors(placed, placings)) < 0.5
 
@@ -106,7 +106,7 @@ def test_an_ambiguous_board_seen_once_is_not_guessed():
     views = [v for v in views if v.shot == min(shots)]
     rig = ring_rig(placings).model_copy(update={"boards": (board,)})
     with pytest.raises(RigDisconnected, match=min(shots)):
-        place_rig(rig, views, cameras)
+        solve_rig(rig, views, cameras)
 
 
 def test_the_board_can_fix_the_frame():
@@ -127,7 +127,7 @@ def test_the_board_can_fix_the_frame():
             )
         }
     )
-    placed = place_rig(rig, views, cameras).value
+    placed = solve_rig(rig, views, cameras).value
     # One board of 48 corners in a few views holds the frame: its own pose is good to 1e-4 rad.
     assert rms(centre_errors(placed, placings)) < 0.5
 
@@ -140,7 +140,7 @@ def test_a_corner_seen_only_once_does_no_harm():
     for view in views[1:]:
         kept = np.any(view.points != rare, axis=1)
         thinned.append(replace(view, points=view.points[kept], pixels=view.pixels[kept]))
-    placed = place_rig(ring_rig(placings), thinned, cameras).value
+    placed = solve_rig(ring_rig(placings), thinned, cameras).value
     assert rms(centre_errors(placed, placings)) < 0.5
 
 
@@ -164,7 +164,7 @@ def test_a_plain_board_fixes_the_frame_the_way_round_that_the_rig_is_meant():
     rig = ring_rig(placings).model_copy(
         update={"boards": (board,), "rig_frame": frame, "pairs": pairs}
     )
-    placed = place_rig(rig, views, cameras).value
+    placed = solve_rig(rig, views, cameras).value
     # Turned or the other face up it would be metres; one board in a few views is good to 1e-4 rad.
     assert rms(centre_errors(placed, placings)) < 0.5
     found = placed.rig_from_board[shot, board.name]
@@ -188,7 +188,7 @@ def test_skew_and_aspect_that_were_not_known_neither_harm_nor_stay_unsaid():
     errors, normalized = [], []
     for seed in range(4):
         views, _ = ring_views(placings, cameras, shots=20, seed=seed)
-        placed = place_rig(ring_rig(placings), views, given).value
+        placed = solve_rig(ring_rig(placings), views, given).value
         errors.append(rms(centre_errors(placed, placings)))
         for name, error in centre_errors(placed, placings).items():
             if name != "p1-1":

@@ -11,7 +11,7 @@ import pytest
 from ring import ring_of_cameras, ring_rig
 
 from bodyscan.calibration.pair import PairCalibration, PairQuality
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
 from bodyscan.registration.storage import load_calibration, save_calibration
@@ -49,7 +49,7 @@ def calibration() -> RigCalibration:
         for name, camera in cameras.items()
     }
     one = np.diag([0.0, 0.0, 0.0, *SIGMA_MM**2])
-    covariance = PlacingCovariance(tuple(pairs), np.kron(np.eye(len(pairs)), one))
+    covariance = PoseCovariance(tuple(pairs), np.kron(np.eye(len(pairs)), one))
     boards = {target: RigidTransform.identity() for target in SHOTS}
     seen = {
         name: corners(camera, [0, 1] if k else [1, 2])

@@ -5,7 +5,7 @@ from ring import ring_of_cameras
 
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.visibility import in_image
 from bodyscan.report.sigma_map import draw_sigma_map, sigma_at
 from bodyscan.rig.rig import Volume
@@ -16,7 +16,7 @@ MIDDLE = np.array([[0.0, 0.0, 1000.0]])
 def shifts(names, mm):
     """Every pair shifted by itself, `mm` along each axis, not turned."""
     own = np.diag([0.0, 0.0, 0.0, *[mm**2] * 3])
-    return PlacingCovariance(tuple(names), np.kron(np.eye(len(names)), own))
+    return PoseCovariance(tuple(names), np.kron(np.eye(len(names)), own))
 
 
 def test_independent_shifts_average_out():
@@ -29,7 +29,7 @@ def test_independent_shifts_average_out():
 def test_shifts_in_common_do_not():
     placings, cameras = ring_of_cameras(heights=(1000,))
     own = np.diag([0.0, 0.0, 0.0, *[0.3**2] * 3])
-    together = PlacingCovariance(tuple(placings), np.kron(np.ones((3, 3)), own))
+    together = PoseCovariance(tuple(placings), np.kron(np.ones((3, 3)), own))
     sigma, _ = sigma_at(MIDDLE, placings, cameras, together)
     assert sigma[0] == pytest.approx(0.3 * np.sqrt(3))
 
@@ -41,7 +41,7 @@ def test_sigma_is_that_of_drawn_placings():
     # Turns of 1e-4 radians about the rig's origin and shifts of 0.1 mm, all correlated.
     mixing = rng.normal(size=(36, 36)) / 6.0 * np.tile([1e-4] * 3 + [0.1] * 3, 6)[:, None]
     points = rng.uniform([-300, -300, 700], [300, 300, 1500], (20, 3))
-    covariance = PlacingCovariance(names, mixing @ mixing.T)
+    covariance = PoseCovariance(names, mixing @ mixing.T)
     sigma, seen = sigma_at(points, placings, cameras, covariance)
     sights = np.array([in_image(cameras[n], placings[n].inverse().apply(points)) for n in names])
     assert np.array_equal(sights.sum(axis=0), seen)

@@ -10,7 +10,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, join
+from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
 from bodyscan.calibration.camera import locate_board
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import Radial
@@ -184,7 +184,7 @@ class Scene:
                     direction=self.direction,
                 )
             )
-        return join(parts)
+        return concatenate(parts)
 
     def placed(
         self, pose: RigidTransform, corner_px: float, rng: np.random.Generator

@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, join
+from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.chapter import apparatus
@@ -63,7 +63,7 @@ def mirror_points(
         parts.append(
             boundary_points(LENS, place, index, pixels, sigma, board=number, direction="vertical")
         )
-    return join(parts)
+    return concatenate(parts)
 
 
 def systematic_mm(planes, *, spread_mm: float = 60.0) -> float:

@@ -7,7 +7,7 @@ import pytest
 from ring import ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.calibration.pair import PairCalibration, PairQuality
-from bodyscan.registration.rig_solve import place_rig
+from bodyscan.registration.rig_solve import solve_rig
 from bodyscan.workflows.calibrate_rig import update_poses
 
 
@@ -25,7 +25,7 @@ def test_boards_follow_the_camera(change):
     placings, cameras = ring_of_cameras(poles=1, heights=(850,))
     views, _ = ring_views(placings, cameras, shots=8)
     rig = ring_rig(placings, fixed="p1-1")
-    placed = place_rig(rig, views, cameras).value
+    placed = solve_rig(rig, views, cameras).value
     camera = placed.cameras["p1-1"]
     other = replace(camera, alpha=camera.alpha + change, beta=camera.beta + change)
     pair = PairCalibration("p1-1", other, np.eye(len(camera.parameters)), None, PairQuality(0.1, 8))

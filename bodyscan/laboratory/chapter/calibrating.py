@@ -9,14 +9,14 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import PlanarView, planar_view
-from bodyscan.calibration.boundary_points import binned
+from bodyscan.calibration.boundary_points import bin_points
 from bodyscan.calibration.camera import (
     CameraCalibration,
     calibrate_camera,
 )
 from bodyscan.calibration.joint_refinement import striped_board
-from bodyscan.calibration.light import fit_light
 from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
+from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.refinement_choice import refine_where_better
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.laboratory.chapter import apparatus
@@ -87,8 +87,8 @@ def _ours(
     """As `bodyscan calibrate-rig` does a pair by itself: the model of the light that held-out boards
     choose, and one solve for all where they gain by it."""
     projector = TARGET.projector
-    data = binned(boards.points, boards.camera, projector.direction)
-    fit = fit_light(boards.points, projector.stripes, projector.direction, boards.camera)
+    data = bin_points(boards.points, boards.camera, projector.direction)
+    fit = fit_light_sheets(boards.points, projector.stripes, projector.direction, boards.camera)
     striped = [
         striped_board(planar_view(shot.view, TARGET.board), boards.camera, data, number)
         for number, shot in enumerate(captures.boards)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.boundary_points import BoundaryPoints, thinned
+from bodyscan.calibration.boundary_points import BoundaryPoints, subsample
 from bodyscan.calibration.light_planes import fit_light_planes
 from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.geometry.camera import Camera
@@ -73,14 +73,14 @@ MATRIX_POINTS = 20000
 
 def pinhole_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
     """The 2 x 4 matrix of Bolles et al. 1981."""
-    few = thinned(points, MATRIX_POINTS)
+    few = subsample(points, MATRIX_POINTS)
     fitted = fit_pinhole(few.points, few.index.astype(float))
     return fitted.planes(stripes, direction)
 
 
 def remapped_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
     """The 2 x 4 matrix with a re-mapped index."""
-    few = thinned(points, MATRIX_POINTS)
+    few = subsample(points, MATRIX_POINTS)
     return fit_remapped_pinhole(few.points, few.index.astype(float), stripes, direction)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import PlanarView, planar_view
-from bodyscan.calibration.boundary_points import BoundaryPoints, join
+from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
 from bodyscan.calibration.striped_view import boundaries_near, on_board
 from bodyscan.calibration.zhang import homography
@@ -94,7 +94,7 @@ def by_matrix(target: Target, shots: Sequence[StripedShot], readings: Array) -> 
         poses[shot.view.shot] = pose
         view = planar_view(shot.view, target.board)
         parts.append(_by_homography(target, shot, view, camera, pose, number))
-    return LocatedBoards(camera, poses, join(parts))
+    return LocatedBoards(camera, poses, concatenate(parts))
 
 
 def locate_again(target: Target, shots: Sequence[StripedShot], camera: Camera) -> LocatedBoards:
@@ -124,7 +124,7 @@ def locate(
         )
         for number, shot in enumerate(shots)
     ]
-    return LocatedBoards(camera, camera_from_board, join(parts))
+    return LocatedBoards(camera, camera_from_board, concatenate(parts))
 
 
 def stage_points(

@@ -19,7 +19,7 @@ OTHER_SIZE = 0.04
 LEAST_APART_MM = 100.0
 
 
-def described(board: Board) -> str:
+def describe_board(board: Board) -> str:
     """The board as the rig file has it, for a message."""
     marker = f", markers of {board.marker_mm:g} mm, {board.dictionary}" if board.marker_mm else ""
     return (
@@ -32,7 +32,7 @@ def boards_not_found(rig: Rig, views: Sequence[BoardView], images: int) -> list[
     """A line for each board that none of the images shows as the rig file describes it."""
     seen = {view.board for view in views}
     return [
-        f"{described(board)} was found in none of {images} images: check it against the board "
+        f"{describe_board(board)} was found in none of {images} images: check it against the board "
         "itself: kind, columns and rows (they count squares, not corners)"
         + (", dictionary, and square_mm against marker_mm" if board.marker_mm else "")
         for board in rig.boards
@@ -40,7 +40,7 @@ def boards_not_found(rig: Rig, views: Sequence[BoardView], images: int) -> list[
     ]
 
 
-def what_was_found(rig: Rig, views: Sequence[BoardView], images: int) -> str:
+def describe_findings(rig: Rig, views: Sequence[BoardView], images: int) -> str:
     """For when no camera could be calibrated: how much of each board was seen, and what to check."""
     lines = boards_not_found(rig, views, images)
     for board in rig.boards:
@@ -49,7 +49,7 @@ def what_was_found(rig: Rig, views: Sequence[BoardView], images: int) -> str:
         ]
         if own:
             lines.append(
-                f"{described(board)} was found in {len(own)} of {images} images, with "
+                f"{describe_board(board)} was found in {len(own)} of {images} images, with "
                 f"{100 * float(np.median(own)):.0f} % of its corners in the usual one"
                 + (
                     ": its columns, rows or square_mm in the rig file may not be those of the board"
@@ -60,7 +60,7 @@ def what_was_found(rig: Rig, views: Sequence[BoardView], images: int) -> str:
     return "\n  ".join(lines)
 
 
-def size_doubt(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> list[str]:
+def check_board_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> list[str]:
     """A line if the cameras stand much farther apart, or nearer, than they are meant to: all lengths
     of a rig come from the boards' squares."""
     nominal = {p.name: np.array(p.nominal.position_mm) for p in rig.pairs if p.nominal}

@@ -14,8 +14,8 @@ from lit_boards import (
     chapter_scene,
 )
 
-from bodyscan.calibration.boundary_points import BoundaryPoints, join, part
-from bodyscan.calibration.light import LightFit, fit_light
+from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate, select
+from bodyscan.calibration.light_sheets import SheetsFit, fit_light_sheets
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.ray_depths import intersect_rays
@@ -26,15 +26,15 @@ def boards(scene: Scene, poses, corner_px: float = 0.03, seed: int = 1) -> Bound
     return scene.boundaries(placed, corner_px=corner_px, seed=seed)
 
 
-def fitted(scene: Scene, data: BoundaryPoints) -> LightFit:
-    return fit_light(data, scene.projector.stripes, scene.direction, scene.camera)
+def fitted(scene: Scene, data: BoundaryPoints) -> SheetsFit:
+    return fit_light_sheets(data, scene.projector.stripes, scene.direction, scene.camera)
 
 
-def figure(fit: LightFit, model: str) -> float:
+def figure(fit: SheetsFit, model: str) -> float:
     return next(held.mean_mm for held in fit.held_out if held.model == model)
 
 
-def flatness(scene: Scene, fit: LightFit, distance: float) -> float:
+def flatness(scene: Scene, fit: SheetsFit, distance: float) -> float:
     """RMS about the best plane of a board measured without noise: what is left is systematic."""
     pose = scene.looking_at([0.0, 0.0, distance], [0.05, -0.1, 0.0])
     index, pixels = scene.crossings(pose)
@@ -47,7 +47,7 @@ def flatness(scene: Scene, fit: LightFit, distance: float) -> float:
 
 
 @cache
-def mirror() -> tuple[Scene, LightFit]:
+def mirror() -> tuple[Scene, SheetsFit]:
     scene = chapter_scene()
     return scene, fitted(scene, boards(scene, CHAPTER_POSES))
 
@@ -91,7 +91,7 @@ def test_bowed_sheets_of_a_mirror():
 
 
 @cache
-def lens(k1: float = -0.035, k2: float = 0.0, axis: float = 330.0) -> tuple[Scene, LightFit]:
+def lens(k1: float = -0.035, k2: float = 0.0, axis: float = 330.0) -> tuple[Scene, SheetsFit]:
     scene = body_scene(k1, k2, axis)
     return scene, fitted(scene, boards(scene, BODY_POSES, corner_px=0.02))
 
@@ -118,7 +118,7 @@ def body(scene: Scene, noise_px: float) -> tuple[np.ndarray, ...]:
     return rays[lit], points[lit], (s + noise)[lit], normals[lit]
 
 
-def errors_on_body(scene: Scene, fit: LightFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def errors_on_body(scene: Scene, fit: SheetsFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distances from the body as calibrated and as with perfect sheets, and boards at each s."""
     rays, points, s, normals = body(scene, 0.03)
     perfect = scene.true_depth(rays, s, points[:, 2])
@@ -204,7 +204,7 @@ def test_the_order_of_points_does_not_matter_and_nothing_is_drawn():
     data = boards(scene, CHAPTER_POSES)
     again = fitted(scene, data)
     assert np.array_equal(again.sheets.parameters, fit.sheets.parameters)
-    late = join([part(data, data.board == board) for board in (2, 0, 1)])
+    late = concatenate([select(data, data.board == board) for board in (2, 0, 1)])
     shuffled = fitted(scene, late)
     assert shuffled.model == fit.model
     assert np.allclose(shuffled.sheets.parameters, fit.sheets.parameters, rtol=1e-6, atol=1e-9)

@@ -7,9 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Indices
-from bodyscan.calibration.boundary_points import BoundaryPoints, binned, thinned
-from bodyscan.calibration.light_choice import Candidate, HeldOutModel, choose, folds, hold_out
+from bodyscan.calibration.boundary_points import BoundaryPoints, bin_points, subsample
 from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
+from bodyscan.calibration.model_selection import (
+    Candidate,
+    HeldOutModel,
+    folds,
+    hold_out,
+    select_model,
+)
 from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.sheet_fit import SheetFit, fit_sheets
 from bodyscan.errors import PairFailed
@@ -29,7 +35,7 @@ BINS_A_BOARD = 2
 
 
 @dataclass(frozen=True, eq=False)
-class LightFit:
+class SheetsFit:
     """model: its name in `held_out`, the figures of all that were tried, simplest first.
 
     rms_mm: distance of boundary points to their sheets, robustly weighted root mean square.
@@ -53,7 +59,9 @@ class LightFit:
         return int(np.count_nonzero(self.boards_seen[1:-1]))
 
 
-def fit_light(data: BoundaryPoints, stripes: int, direction: Axis, camera: Camera) -> LightFit:
+def fit_light_sheets(
+    data: BoundaryPoints, stripes: int, direction: Axis, camera: Camera
+) -> SheetsFit:
     """Sheets of light from boundaries on two or more boards, camera frame.
 
     With two boards halves of them are held out, with three or more whole boards.  Raises
@@ -66,25 +74,25 @@ def fit_light(data: BoundaryPoints, stripes: int, direction: Axis, camera: Camer
             "sheets of light",
             remedy="capture the stripe sequence on the board in three or more poses",
         )
-    bins = binned(data, camera, direction)
-    few = thinned(bins, CHOICE_BINS)
+    bins = bin_points(data, camera, direction)
+    few = subsample(bins, CHOICE_BINS)
     starts = smooth_models(few, stripes, direction)
     candidates = [_smooth_candidate(name, start) for name, start in starts]
     candidates.append(_planes_candidate(stripes, direction))
     fold = folds(few)
     tried = [hold_out(candidate, few, fold) for candidate in candidates]
-    chosen, figures = choose(candidates, tried, few.board)
+    chosen, figures = select_model(candidates, tried, few.board)
     error = tried[chosen].board_error_mm(few)
     fit: SheetFit[SmoothSheets] | PlaneFit
     sheets: LightSheets
     if chosen < len(starts):
-        fit = fit_sheets(starts[chosen][1], thinned(bins, FIT_BINS), board_error_mm=error)
+        fit = fit_sheets(starts[chosen][1], subsample(bins, FIT_BINS), board_error_mm=error)
         sheets = fit.sheets
     else:
         fit = fit_planes(bins, stripes, direction, error)
         sheets = fit.planes
-    return LightFit(
-        sheets, candidates[chosen].name, figures, fit.rms_mm, error, boards_seen(bins, stripes)
+    return SheetsFit(
+        sheets, candidates[chosen].name, figures, fit.rms_mm, error, count_boards(bins, stripes)
     )
 
 
@@ -92,7 +100,7 @@ def smooth_models(
     data: BoundaryPoints, stripes: int, direction: Axis
 ) -> list[tuple[str, SmoothSheets]]:
     """The models whose sheets change smoothly with s, simplest first, fitted to binned points."""
-    few = thinned(data, START_BINS)
+    few = subsample(data, START_BINS)
     pinhole = fit_pinhole(few.points, few.index.astype(float))
     plain = pinhole.sheets(data.points, stripes, direction)
     lens = _lens_start(plain, few)
@@ -117,7 +125,7 @@ def _lens_start(plain: LensSheets, data: BoundaryPoints) -> LensSheets:
     return min(fits, key=lambda fit: fit.noise).sheets
 
 
-def boards_seen(data: BoundaryPoints, stripes: int) -> Indices:
+def count_boards(data: BoundaryPoints, stripes: int) -> Indices:
     """(S + 1,) on how many boards each boundary was seen."""
     boards = int(data.board.max(initial=0)) + 1
     points = np.bincount(data.index * boards + data.board, minlength=(stripes + 1) * boards)

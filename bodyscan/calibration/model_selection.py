@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.calibration.boundary_points import BoundaryPoints, board_errors, part
+from bodyscan.calibration.boundary_points import BoundaryPoints, board_errors, select
 from bodyscan.geometry.light_planes import LightSheets
 
 Array = NDArray[np.float64]
@@ -103,7 +103,7 @@ def hold_out(candidate: Candidate, data: BoundaryPoints, fold: NDArray[np.int64]
     own = np.sum(errors.effects**2, axis=1)
     for number in np.unique(fold):
         left_out = fold == number
-        sheets = candidate.fit(part(data, ~left_out))
+        sheets = candidate.fit(select(data, ~left_out))
         points, s = data.points[left_out], data.index[left_out].astype(float)
         rays, facing = points / points[:, 2:], errors.facing[left_out]
         depth = sheets.depth(rays, s)
@@ -113,7 +113,7 @@ def hold_out(candidate: Candidate, data: BoundaryPoints, fold: NDArray[np.int64]
     return HeldOutErrors(distances, variance)
 
 
-def choose(
+def select_model(
     candidates: Sequence[Candidate], tried: Sequence[HeldOutErrors], board: NDArray[np.int64]
 ) -> tuple[int, tuple[HeldOutModel, ...]]:
     """The number of the model to use, and the figures of all that measured anything.

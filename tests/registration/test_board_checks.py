@@ -6,7 +6,7 @@ import numpy as np
 
 from bodyscan.boards.view import BoardView
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.board_doubts import boards_not_found, size_doubt, what_was_found
+from bodyscan.registration.board_checks import boards_not_found, check_board_size, describe_findings
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
@@ -40,15 +40,15 @@ def test_a_board_never_found_is_named_with_what_the_rig_file_says():
 
 
 def test_a_board_of_which_little_is_found_is_doubted():
-    assert "may not be those" in what_was_found(RIG, [view(10)], 30)
-    assert "may not be those" not in what_was_found(RIG, [view(45)], 30)
+    assert "may not be those" in describe_findings(RIG, [view(10)], 30)
+    assert "may not be those" not in describe_findings(RIG, [view(45)], 30)
 
 
 def test_squares_of_another_size_show_in_the_size_of_the_rig():
     def placed(factor):
         return {n: RigidTransform(np.eye(3), factor * np.array(p)) for n, p in PLACES.items()}
 
-    (note,) = size_doubt(RIG, placed(1.25))
+    (note,) = check_board_size(RIG, placed(1.25))
     assert "1.250 times" in note
     assert "40.00 would fit" in note
-    assert not size_doubt(RIG, placed(1.01))
+    assert not check_board_size(RIG, placed(1.01))

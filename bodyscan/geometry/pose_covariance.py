@@ -11,7 +11,7 @@ from bodyscan.geometry.transforms import twist_jacobian
 
 
 @dataclass(frozen=True, eq=False)
-class PlacingCovariance:
+class PoseCovariance:
     """Joint covariance (6P, 6P) of small motions of the pairs `names`, rig frame.
 
     A motion is a rotation vector (radians) about the rig's origin, then a translation (mm).
@@ -40,6 +40,6 @@ def point_covariance(motion_covariance: Array, point: Array) -> Array:
     return jacobian @ motion_covariance @ jacobian.T
 
 
-def position_sigma(covariance: PlacingCovariance, name: str, position: Array) -> Array:
+def position_sigma(covariance: PoseCovariance, name: str, position: Array) -> Array:
     """(3,) mm: standard deviation of a pair's camera centre (3,) along the rig's axes."""
     return np.sqrt(np.diag(point_covariance(covariance.of(name), position)))
