@@ -64,7 +64,7 @@ def concatenate(parts: Sequence[BoundaryPoints]) -> BoundaryPoints:
     """The boundary points of several shots as one."""
     return BoundaryPoints(
         *(
-            np.concatenate([getattr(select, name) for select in parts])
+            np.concatenate([getattr(part, name) for part in parts])
             for name in ("index", "board", "points", "per_pixel", "sigma_px")
         )
     )
