@@ -155,10 +155,10 @@ class _Measured:
 
 
 def _measured(pair: PairCalibration, facts: dict[str, Any], pixels: Array, s: Array) -> _Measured:
-    assert pair.light is not None
+    assert pair.sheets is not None
     s = s.astype(float)
     rays = pair.camera.rays(pixels)
-    ours = rays * pair.light.depth(rays, s)[:, None]
+    ours = rays * pair.sheets.depth(rays, s)[:, None]
     true_rays = TrueCamera(**facts["camera"]).directions(pixels)
     true = true_rays * true_depth(true_projector(facts), true_rays, s)[:, None]
     known = np.isfinite(ours[:, 2]) & np.isfinite(true[:, 2])

@@ -1,4 +1,4 @@
-"""The rig's placing refined on a rigid object that its pairs scanned: ICP with the boards as prior."""
+"""The pairs' poses refined on a rigid object that its pairs scanned: ICP with the boards as prior."""
 
 from __future__ import annotations
 

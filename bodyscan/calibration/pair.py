@@ -62,13 +62,13 @@ class PairCalibration:
     """A calibrated pair, camera frame.
 
     camera_covariance: (P, P) of the camera's parameters.
-    light: None for a camera without projector.
+    sheets: None for a camera without projector.
     """
 
     name: str
     camera: Camera
     camera_covariance: Array
-    light: LightSheets | None
+    sheets: LightSheets | None
     quality: PairQuality
 
 
@@ -153,15 +153,15 @@ def _refined(
     points: BoundaryPoints,
 ) -> PairCalibration:
     """Camera, boards and light of a pair by itself in one solve, where held-out boards gain."""
-    assert pair.light is not None
-    data = bin_points(points, pair.camera, pair.light.direction)
+    assert pair.sheets is not None
+    data = bin_points(points, pair.camera, pair.sheets.direction)
     boards = [
         striped_board(
             PlanarView(shot.view.shot, shot.view.points, shot.view.pixels), pair.camera, data, k
         )
         for k, shot in enumerate(shots)
     ]
-    choice = refine_where_better(own, pair.light, boards, data)
+    choice = refine_where_better(own, pair.sheets, boards, data)
     quality = replace(pair.quality, refinement=choice.reason, flatness_mm=choice.flatness_mm)
     if choice.joint is None:
         return replace(pair, quality=quality)
@@ -169,7 +169,7 @@ def _refined(
         pair,
         camera=choice.joint.camera,
         camera_covariance=choice.joint.camera_covariance,
-        light=choice.joint.sheets,
+        sheets=choice.joint.sheets,
         quality=replace(quality, corners_rms_px=choice.joint.corners_rms_px),
     )
 

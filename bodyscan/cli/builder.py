@@ -146,7 +146,7 @@ def sigma_map(
         Path | None, typer.Option(help="Default: `sigma-map.png` beside the calibration.")
     ] = None,
 ) -> None:
-    """Draw how well the rig's placing knows each place of the scan volume, front and side."""
+    """Draw how well each place of the scan volume is known by the poses of the pairs."""
     from bodyscan.workflows.draw_sigma_map import draw_sigma_map
 
     output.made("picture", draw_sigma_map(calibration, out))

@@ -47,7 +47,7 @@ def calibration_table(calibration: RigCalibration) -> Table:
             quality.light_model or "-",
             "-" if quality.planes_rms_mm is None else f"{quality.planes_rms_mm:.3f}",
             f"{quality.stripes_calibrated} of {quality.stripes_projected}"
-            if pair.light is not None
+            if pair.sheets is not None
             else "-",
             " ".join(f"{value:.1f}" for value in place),
             " ".join(f"{value:.3f}" for value in sigma),

@@ -26,7 +26,7 @@ def add_pose_variance(
     *,
     workers: int = 2,
 ) -> BodyCloud:
-    """The cloud with sigmas along the normals that hold the pairs' placing too.
+    """The cloud with sigmas along the normals that allow for the pairs' poses too.
 
     A small motion (w, t) of a pair moves a point p along its normal n by (p x n).w + n.t. The
     variance is the mean over the pairs that face the point: what they share does not average out.
@@ -53,7 +53,7 @@ def _placing(
     covariances: Array,
     placing_mm: Array,
 ) -> None:
-    """Writes standard deviations (N,) along the normals, mm, that come of the placing of the pairs
+    """Writes standard deviations (N,) along the normals, mm, that come of the poses of the pairs
     at `centres` (P, 3) with `covariances` (P, 6, 6)."""
     lever = np.empty(6)
     for n in range(len(points)):

@@ -1,4 +1,4 @@
-"""How well the joint solve knows each placing: the covariance of all pairs in the rig frame."""
+"""How well the joint solve knows each pose: the covariance of all pairs in the rig frame."""
 
 from __future__ import annotations
 

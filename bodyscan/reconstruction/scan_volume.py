@@ -30,17 +30,17 @@ def stripes_in_volume(
     None, that is everything, if the pair has no projector, or if depth does not grow (or fall)
     with s all over the volume: the projector stands in the picture.
     """
-    if pair.light is None:
+    if pair.sheets is None:
         return None
     block_px = max(1, round(pair.camera.width / BLOCKS_ACROSS))
     rays = _corner_rays(pair.camera, block_px)
     near, far = volume_interval(rays, rig_from_camera, volume, raised_mm=0.0)
     standing = volume_interval(rays, rig_from_camera, volume, raised_mm=LAYER_MM)[1]
     standing = np.maximum(np.minimum(standing, far), near)
-    count = round(pair.light.stripes / STEP_STRIPES) + 1
-    s = np.linspace(0.0, pair.light.stripes, count)
+    count = round(pair.sheets.stripes / STEP_STRIPES) + 1
+    s = np.linspace(0.0, pair.sheets.stripes, count)
     along = np.broadcast_to(rays[:, :, None], (*rays.shape[:2], count, 3))
-    found = intersect_rays(pair.light, along, np.broadcast_to(s, along.shape[:-1]))
+    found = intersect_rays(pair.sheets, along, np.broadcast_to(s, along.shape[:-1]))
     within = (found.depth > near[..., None]) & (found.depth < far[..., None])
     growing = found.per_stripe[within if within.any() else np.isfinite(found.per_stripe)] > 0
     if growing.any() != growing.all():

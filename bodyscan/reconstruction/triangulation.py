@@ -24,7 +24,7 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
     Raises BadInput if the pair has no projector or the image size is another.
     """
     camera = pair.camera
-    if pair.light is None:
+    if pair.sheets is None:
         raise BadInput("this pair has no projector, it cannot scan", where=f"pair {pair.name}")
     if stripes.s.shape != (camera.height, camera.width):
         height, width = stripes.s.shape
@@ -34,7 +34,7 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
             where=f"pair {pair.name}",
             remedy="scan with the camera settings of the calibration, or calibrate again",
         )
-    points, sigma_mm = triangulate_image(pair.light, camera, stripes.s, stripes.sigma)
+    points, sigma_mm = triangulate_image(pair.sheets, camera, stripes.s, stripes.sigma)
     normals = grid_normals(points, np.isfinite(sigma_mm))
     return RangeImage(pair.name, camera, points, normals, sigma_mm, stripes.lit, stripes.beyond)
 

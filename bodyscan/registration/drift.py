@@ -267,7 +267,7 @@ def _agreed(
     """Where most views say that a board lies: the view from which the others differ least."""
 
     def off(board: RigidTransform) -> float:
-        """Median distance of all views from a placing, in sigmas squared."""
+        """Median distance of all views from a pose, in sigmas squared."""
         gaps = (_gap(pose, rig_from_camera[pose.pair], board) for pose in poses)
         return float(np.median([twist @ weight @ twist for twist, weight in gaps]))
 

@@ -1,7 +1,7 @@
 """The joint solve's last steps, over all parameters of our own cameras.
 
 COLMAP's cameras have neither skew nor pixels that are not square; what each pair's own calibration
-got wrong of these would go into the placings, unseen by their covariance.
+got wrong of these would go into the poses, unseen by their covariance.
 """
 
 from __future__ import annotations

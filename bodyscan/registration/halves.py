@@ -20,14 +20,14 @@ from bodyscan.rig.rig_frame import RigFrame
 Array = NDArray[np.float64]
 
 REACH_MM = 1300.0
-"""How far ahead of a camera a placing matters: about where the subject stands."""
+"""How far ahead of a camera a pose matters: about where the subject stands."""
 ATTEMPTS = 200
 RANK_SHARE = 1e-9  # eigenvalues below this share of the largest are the frame's, taken out
 
 
 @dataclass(frozen=True, eq=False)
 class HalvesComparison:
-    """Differences between two placings of the rig, second minus first, the common motion taken out.
+    """Differences between two solutions of the rig, second minus first, the common motion taken out.
 
     halves: the shots of each.  shifts_mm: (P, 3) of the camera centres, rig frame.  sigmas_mm:
     (P, 3) expected.  turns_deg: (P,).  turn_sigmas_deg: (P,) expected, about all axes together.
@@ -146,7 +146,7 @@ def _placed_by(
 
 
 def _motion(first: RigidTransform, second: RigidTransform) -> Array:
-    """(6,) twist about the rig's origin that carries the first placing to the second."""
+    """(6,) twist about the rig's origin that carries the first pose to the second."""
     return (second @ first.inverse()).twist
 
 

@@ -22,7 +22,7 @@ WITHOUT_LENS = "SIMPLE_PINHOLE"
 
 @dataclass(frozen=True, eq=False)
 class JointSolution:
-    """All placings in the root camera's frame, mm, and the cameras the solve ended with."""
+    """All poses in the root camera's frame, mm, and the cameras the solve ended with."""
 
     root_from_camera: dict[str, RigidTransform]
     root_from_board: dict[Target, RigidTransform]

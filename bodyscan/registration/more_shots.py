@@ -135,7 +135,7 @@ class RigInformation:
         """What one shot there says, the mean of its tilts; scaled, free unknowns only."""
         total = np.zeros((len(self._free), len(self._free)))
         for pose, views in zip(place.rig_from_board, place.views, strict=True):
-            if len(views) < 2:  # its own pose is unknown: one camera alone learns no placing
+            if len(views) < 2:  # its own pose is unknown: one camera alone learns no pose
                 continue
             shot = normal_equations(
                 views,

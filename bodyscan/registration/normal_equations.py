@@ -1,6 +1,6 @@
 """What all corners say of all unknowns of a rig: the normal equations of the joint solve.
 
-They give the covariance of every placing, what further shots would add, and the last steps of the
+They give the covariance of every pose, what further shots would add, and the last steps of the
 solve itself, with what COLMAP's cameras lack (skew, pixels that are not square).
 """
 

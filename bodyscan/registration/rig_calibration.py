@@ -35,7 +35,7 @@ class RigCalibration:
 
     rig_from_board: by (shot, board).  failed: pairs that could not be calibrated, with the reason.
     notes: views that were dropped and other things a builder should know.  advice: how well the
-    placing of the pairs is known, and what would help most, in words.  seen: the corners that the
+    poses of the pairs are known, and what would help most, in words.  seen: the corners that the
     joint solve used, by the pair's name; empty in calibrations stored before they were kept.
     """
 

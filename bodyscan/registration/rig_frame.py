@@ -1,4 +1,4 @@
-"""How the rig frame is fixed: by a board in one shot, or by one pair at its nominal placing."""
+"""How the rig frame is fixed: by a board in one shot, or by one pair at its nominal pose."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def solve_rig(
     Pairs that agree with the others in too few shots to be placed are failures.
 
     Raises RigDisconnected if groups of pairs share no view, only views whose board numbering leaves
-    their placing open, or only views that contradict each other; BadInput if nothing fixes the rig
+    their poses open, or only views that contradict each other; BadInput if nothing fixes the rig
     frame.
     """
     start, left_out = initial_poses(views, sorted(cameras))

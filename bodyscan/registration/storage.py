@@ -36,8 +36,8 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
     arrays: dict[str, Any] = {"placing_covariance": calibration.covariance.matrix}
     for name, pair in calibration.pairs.items():
         arrays[f"{name}/camera_covariance"] = pair.camera_covariance
-        if pair.light is not None:
-            for key, array in to_arrays(pair.light).items():
+        if pair.sheets is not None:
+            for key, array in to_arrays(pair.sheets).items():
                 arrays[f"{name}/light/{key}"] = array
     for name, seen in calibration.seen.items():
         for part in fields(seen):
@@ -127,8 +127,8 @@ def _pair_content(calibration: RigCalibration, name: str) -> dict[str, Any]:
         "camera": to_fields(pair.camera),
         "rig_from_camera": calibration.rig_from_camera[name].matrix,
         "light": None
-        if pair.light is None
-        else {"kind": pair.light.kind, "direction": pair.light.direction},
+        if pair.sheets is None
+        else {"kind": pair.sheets.kind, "direction": pair.sheets.direction},
         "quality": asdict(pair.quality),
     }
 

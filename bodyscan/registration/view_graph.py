@@ -1,4 +1,4 @@
-"""Who shares which board with whom (networkx), and the starting placing that follows from it."""
+"""Who shares which board with whom (networkx), and the initial poses that follow from it."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ Group = dict[str, RigidTransform]
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """What the boards shared by two groups of pairs say of their relative placing.
+    """What the boards shared by two groups of pairs say of their relative pose.
 
-    votes: how many shared targets agree with it.  rivals: votes of the best contradicting placing,
+    votes: how many shared targets agree with it.  rivals: votes of the best contradicting pose,
     which only boards with an ambiguous numbering (or wrong views) can have.  ambiguous: whether any
     of the boards may be numbered in more than one way.
     """
@@ -43,7 +43,7 @@ class RelativePose:
 
     @property
     def decided(self) -> bool:
-        """Most boards agree on one placing, more than on any other."""
+        """Most boards agree on one pose, more than on any other."""
         return self.votes > self.rivals and 2 * self.votes > len(self.targets)
 
     @property
@@ -152,7 +152,7 @@ def place_boards(
 def _agreed_placing(
     group: Sequence[LocatedView], root_from_camera: Mapping[str, RigidTransform]
 ) -> RigidTransform:
-    """The placing of a board that most corners of its views support."""
+    """The pose of a board that most corners of its views support."""
     candidates = [root_from_camera[view.pair] @ view.camera_from_board for view in group]
 
     def support(placing: RigidTransform) -> float:

@@ -85,9 +85,9 @@ def planes_chart(calibration: RigCalibration) -> bytes:
         figure, axes = plt.subplots(3, 1, figsize=(9.6, 8.4), sharex=True, constrained_layout=True)
         for name, pair in calibration.pairs.items():
             planes = planes_of(pair)
-            if planes is None or pair.light is None:
+            if planes is None or pair.sheets is None:
                 continue
-            length, angle, tilt = baseline_angle_tilt(planes, pair.light.direction)
+            length, angle, tilt = baseline_angle_tilt(planes, pair.sheets.direction)
             s = np.arange(len(planes))
             for axis, values in zip(
                 axes, (length, np.degrees(angle), np.degrees(tilt)), strict=True
@@ -109,10 +109,10 @@ def planes_chart(calibration: RigCalibration) -> bytes:
 
 def planes_of(pair: PairCalibration) -> Array | None:
     """(S + 1, 4) of Eq. 6 at the stripes' boundaries; tangent planes where the sheets are bent."""
-    if isinstance(pair.light, LightPlanes):
-        return pair.light.coefficients
-    if isinstance(pair.light, SmoothSheets):
-        return pair.light.tangent_planes(np.arange(pair.light.stripes + 1.0))
+    if isinstance(pair.sheets, LightPlanes):
+        return pair.sheets.coefficients
+    if isinstance(pair.sheets, SmoothSheets):
+        return pair.sheets.tangent_planes(np.arange(pair.sheets.stripes + 1.0))
     return None
 
 

@@ -167,7 +167,7 @@ def _boards(calibration: RigCalibration) -> Section:
 
 
 def _planes(calibration: RigCalibration) -> Section:
-    if all(pair.light is None for pair in calibration.pairs.values()):
+    if all(pair.sheets is None for pair in calibration.pairs.values()):
         return Section("Light sheets", [Lines(("No pair has a projector.",))])
     return Section(
         "Light sheets",

@@ -89,7 +89,7 @@ def _figures(calibration: RigCalibration, name: str) -> PairFigures:
     pair = calibration.pairs[name]
     quality, camera, seen = pair.quality, pair.camera, calibration.seen.get(name)
     place = calibration.rig_from_camera[name].translation
-    striped = pair.light is not None
+    striped = pair.sheets is not None
     share = None
     if seen is not None:
         views = [seen.pixels[seen.target == k].astype(float) for k in np.unique(seen.target)]

@@ -1,4 +1,4 @@
-"""The rig as it was really built: nominal placings, off by what hands and tape measures are off."""
+"""The rig as it was really built: nominal poses, off by what hands and tape measures are off."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LAMP_STRIPES = 2
 class TruePair:
     """name; its camera, where it stands; its projector in the camera's frame.
 
-    reach_mm: the working distance, from the nominal placing. has_stripes: False for a camera
+    reach_mm: the working distance, from the nominal pose. has_stripes: False for a camera
     alone, which a plain lamp lights.
     """
 
@@ -44,7 +44,7 @@ def build_pairs(
     """Every pair's true parameters, each drawn from its own `stream(number)`.
 
     The pair that fixes the rig frame, if the rig file has one do so, stands where it should.
-    Raises BadInput for a pair without nominal placing.
+    Raises BadInput for a pair without nominal pose.
     """
     fixed = None if rig.rig_frame.shot else (rig.rig_frame.pair or rig.pairs[0].name)
     return {
@@ -116,7 +116,7 @@ def _ends(placing: NominalPose) -> tuple[Array, Array]:
 
 
 def _beside(nominal: RigidTransform, reach: float, horizontal: bool) -> NominalPose:
-    """Where a projector without a placing stands: above the camera, or to its right."""
+    """Where a projector without a pose stands: above the camera, or to its right."""
     axis = -nominal.rotation[:, 1] if horizontal else nominal.rotation[:, 0]
     position = nominal.translation + 0.22 * reach * axis
     target = nominal.translation + reach * nominal.rotation[:, 2]
@@ -126,7 +126,7 @@ def _beside(nominal: RigidTransform, reach: float, horizontal: bool) -> NominalP
 def _perturbed(
     rig_from_device: RigidTransform, optics: Optics, reach: float, rng: np.random.Generator
 ) -> RigidTransform:
-    """A placing off by hand; less so where all is nearer than in a body scanner."""
+    """A pose off by hand; less so where all is nearer than in a body scanner."""
     turn = np.radians(optics.angle_deg) * rng.standard_normal(3)
     shift = optics.position_mm * min(1.0, reach / 1300.0) * rng.standard_normal(3)
     turned = RigidTransform.from_rotation_vector(turn, np.zeros(3)).rotation

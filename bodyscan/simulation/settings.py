@@ -20,7 +20,7 @@ class Optics:
     grows as |working distance / distance - 1|.
     vignetting: 0 none, 1 the full cos^4 law.
     samples: the image is sampled at samples x samples points a pixel.
-    position_mm, angle_deg: standard deviation, for each axis, of the true placing about the
+    position_mm, angle_deg: standard deviation, for each axis, of the true pose about the
     nominal one (projectors too).
     """
 

@@ -71,7 +71,7 @@ def simulate(
     scale: of image size and number of stripes.  board_shots: besides the one that fixes the rig
     frame; 40 for twelve pairs if not given.  workers: pairs at the same time.
     The same arguments give the same bytes. Raises RigFileError, and BadInput for a rig without
-    nominal placings, a stripe code that only its decoder knows, or a subject that cannot be read.
+    nominal poses, a stripe code that only its decoder knows, or a subject that cannot be read.
     """
     settings = settings or SimulationSettings()
     rig = files.scale_rig(load_rig(rig_file), scale, CALIBRATION)

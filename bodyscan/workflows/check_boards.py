@@ -153,7 +153,7 @@ def _stripe_offsets(
     known = {
         (view.pair, view.shot, view.board): view
         for view in located
-        if calibration.pairs[view.pair].light is not None
+        if calibration.pairs[view.pair].sheets is not None
     }
     wanted = [view for view in views if (view.pair, view.shot, view.board) in known]
     decoded = decode_on_boards(calibration.rig, captures, wanted, progress)
@@ -174,13 +174,13 @@ def _off_board(
     rig, pair = calibration.rig, calibration.pairs[view.pair]
     projector = rig.pair(view.pair).projector
     assert projector is not None
-    assert pair.light is not None
+    assert pair.sheets is not None
     shot = StripedView(view, rig.board(view.board), boundaries)
     points = on_board(
         pair.camera, projector, shot.board, shot.camera_from_face, boundaries, number=0
     )
     rays = points.points / points.points[:, 2:]
-    measured = intersect_rays(pair.light, rays, points.index.astype(float))
+    measured = intersect_rays(pair.sheets, rays, points.index.astype(float))
     facing = np.abs(rays @ view.camera_from_board.rotation[:, 2])
     away = (measured.depth - points.points[:, 2]) * facing
     axis = 1 if projector.direction == "horizontal" else 0

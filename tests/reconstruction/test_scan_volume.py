@@ -44,7 +44,7 @@ def calibrated(rising: bool):
     sheets = planes()
     if not rising:
         return pair()
-    return replace(pair(), light=replace(sheets, coefficients=sheets.coefficients[::-1].copy()))
+    return replace(pair(), sheets=replace(sheets, coefficients=sheets.coefficients[::-1].copy()))
 
 
 def some_s(seed: int, rising: bool) -> np.ndarray:
@@ -67,7 +67,7 @@ def test_all_that_lies_in_the_volume_is_wanted(distance_mm, turn, tilt, rising, 
     one, at = calibrated(rising), looking_at_the_middle(distance_mm, turn, tilt)
     wanted = stripes_in_volume(one, at, VOLUME)
     s = some_s(seed, rising)
-    points, _ = triangulate_image(one.light, one.camera, s, np.full_like(s, 0.01))
+    points, _ = triangulate_image(one.sheets, one.camera, s, np.full_like(s, 0.01))
     x, y, z = np.moveaxis(at.apply(points.astype(np.float64)), -1, 0)
     there = (np.hypot(x, y) < VOLUME.radius_mm) & (z > VOLUME.bottom_mm) & (z < VOLUME.top_mm)
     standing = there & (z > VOLUME.bottom_mm + LAYER_MM)
@@ -108,11 +108,11 @@ def test_a_volume_out_of_sight_is_seen_nowhere():
 
 def test_without_a_projector_or_an_order_in_depth_all_stripes_count():
     at = looking_at_the_middle(500.0, 0.0, 0.0)
-    assert stripes_in_volume(replace(pair(), light=None), at, VOLUME) is None
+    assert stripes_in_volume(replace(pair(), sheets=None), at, VOLUME) is None
     # Sheets that fan out from a line in the middle of the picture: nearer above, farther below.
     coefficients = planes().coefficients.copy()
     coefficients[: STRIPES // 2] = coefficients[: STRIPES // 2][::-1]
-    folded = replace(pair(), light=replace(planes(), coefficients=coefficients))
+    folded = replace(pair(), sheets=replace(planes(), coefficients=coefficients))
     assert stripes_in_volume(folded, at, VOLUME) is None
 
 

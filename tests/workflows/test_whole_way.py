@@ -88,7 +88,7 @@ def test_calibration_reads_back_to_the_last_bit(calibration, tmp_path):
         assert np.array_equal(
             again.rig_from_camera[name].matrix, calibration.rig_from_camera[name].matrix
         )
-        stored, original = to_arrays(again.pairs[name].light), to_arrays(pair.light)
+        stored, original = to_arrays(again.pairs[name].sheets), to_arrays(pair.sheets)
         for key, array in original.items():
             assert np.array_equal(stored[key], array, equal_nan=True)
     first = (tmp_path / "calibration.json").read_bytes()
