@@ -49,8 +49,12 @@ def patterns(
     output: Output,
     rig_file: RigFile,
     out: OutFolder,
-    width: Annotated[int, typer.Option(min=1, max=32767, help="Of the projector, px.")] = 1920,
-    height: Annotated[int, typer.Option(min=1, max=32767, help="Of the projector, px.")] = 1080,
+    width: Annotated[
+        int, typer.Option(min=1, max=32767, help="Width of the projector's image, px.")
+    ] = 1920,
+    height: Annotated[
+        int, typer.Option(min=1, max=32767, help="Height of the projector's image, px.")
+    ] = 1080,
 ) -> None:
     """Write the images that a rig's projectors are to show, as PNG, with their order."""
     from bodyscan.captures.pattern_files import uneven_stripes, write_patterns
@@ -100,10 +104,10 @@ def check_calibration(
     calibration: Calibration,
     repair: Annotated[
         Path | None,
-        typer.Option(help="Write a calibration with what moved put right into this folder."),
+        typer.Option(help="Write a calibration with the moves corrected into this folder."),
     ] = None,
 ) -> None:
-    """Say whether the rig still is what it was, and which pair or pole moved by how much."""
+    """Say whether anything in the rig has moved, and if so which pair or pole, and how far."""
     from bodyscan.registration.storage import load_calibration, save_calibration
     from bodyscan.workflows.check_rig import check_rig
 

@@ -29,15 +29,15 @@ def simulate(
         Path | None, typer.Option(help="A body surface (PLY, metres, z up, facing -y).")
     ] = None,
     scale: Annotated[
-        float, typer.Option(min=0.1, max=4.0, help="Of image size and number of stripes.")
+        float, typer.Option(min=0.1, max=4.0, help="Factor on image size and number of stripes.")
     ] = 1.0,
-    seed: Annotated[int, typer.Option(help="Of every random draw.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 0,
     projector: Annotated[
         Literal["mirror", "pinhole"],
         typer.Option(help="A laser and a rotating mirror, or a projector with a lens."),
     ] = "mirror",
     sway_mm: Annotated[
-        float, typer.Option(min=0.0, help="How far the person moves while the pairs capture.")
+        float, typer.Option(min=0.0, help="How far the person moves between the pairs' captures.")
     ] = 0.0,
     board_shots: Annotated[
         int | None, typer.Option(min=3, help="Number of board poses; 40 for twelve pairs.")
@@ -73,7 +73,8 @@ def simulate(
 def evaluate(
     output: Output,
     workspace: Annotated[
-        Path, typer.Argument(metavar="WORKSPACE", help="--out of simulate, calibrated and scanned.")
+        Path,
+        typer.Argument(metavar="WORKSPACE", help="What simulate wrote, calibrated and scanned."),
     ],
 ) -> None:
     """Compare the calibration and scan of a simulated workspace with the truth beside it."""
@@ -91,7 +92,10 @@ def accept(
         typer.Argument(metavar="ARTEFACT.YAML", help="Artefacts as calibrated, and limits."),
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="What calibrate-rig wrote; with --simulate: that beside it.")
+        Path | None,
+        typer.Option(
+            help="What calibrate-rig wrote; with --simulate, by default the one beside the rig."
+        ),
     ] = None,
     spheres: Annotated[
         list[Path] | None,
@@ -107,10 +111,11 @@ def accept(
     ] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Simulated shots of each place.")] = 2,
     places: Annotated[
-        int | None, typer.Option(min=1, help="Simulate only so many of the places.")
+        int | None, typer.Option(min=1, help="Simulate this many of the places only.")
     ] = None,
     limit: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=MM", help="Such as flatness_mm=0.5.")
+        list[str] | None,
+        typer.Option(metavar="NAME=MM", help="A limit, such as flatness_mm=0.5; repeatable."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Default: `acceptance` beside the calibration.")
@@ -155,12 +160,13 @@ def accept(
 def reproduce(
     output: Output,
     out: Annotated[Path, typer.Option(help="Folder for the text and the figures.")],
-    seed: Annotated[int, typer.Option(help="Of all noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of all noise.")] = 0,
     real_light: Annotated[
-        bool, typer.Option("--real-light", help="A bowed board, speckle, jitter, a smile, defocus.")
+        bool,
+        typer.Option("--real-light", help="Add a bowed board, speckle, jitter, a smile, defocus."),
     ] = False,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Coarser rendering and fewer shots.")
+        bool, typer.Option("--quick", help="Render coarsely, with fewer shots.")
     ] = False,
 ) -> None:
     """Simulate the chapter's own set-up: its Tables 1 and 2, its Fig. 6 and 7, and all rivals."""

@@ -39,15 +39,17 @@ def scan(
     calibration: Calibration,
     out: Annotated[Path | None, typer.Option(help="Default: FOLDER-model.")] = None,
     points: Annotated[
-        int, typer.Option(min=1000, help="Size of the body cloud.")
+        int, typer.Option(min=1000, help="Number of points in the body cloud.")
     ] = FusionSettings().points,
     align: Annotated[
         Literal["projected", "nearest", "none"],
-        typer.Option(help="Range images: into each other's pixels, Open3D's ICP, or boards only."),
+        typer.Option(
+            help="How to align range images: by projection, by Open3D's ICP, or not at all."
+        ),
     ] = AlignmentSettings().matching,
     empty: Annotated[
         Path | None,
-        typer.Option(help="Captures of the rig with nobody in it: cut away what they show."),
+        typer.Option(help="Captures of the empty rig: what they show is cut away."),
     ] = None,
     overwrite: Overwrite = False,
     e57: Annotated[
@@ -102,7 +104,7 @@ def report(
         typer.Option(metavar="OTHER", help="Another scan, or a known surface (PLY, mm)."),
     ] = None,
 ) -> None:
-    """Write one HTML file about a calibration or a scan that opens anywhere, and prints."""
+    """Write a report on a calibration or a scan: one HTML file that opens anywhere, and prints."""
     from bodyscan.workflows.write_report import write_report
 
     path, verdict = write_report(result, out, compare)
@@ -115,7 +117,9 @@ def measure(
     result: Result,
     heights: Annotated[
         str | None,
-        typer.Option(help="Of slices over the floor, mm: 800,1050. Default: every 100."),
+        typer.Option(
+            help="Heights of slices above the floor, mm, such as 800,1050. Default: every 100."
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Default: `measurements.json` inside the result.")
@@ -147,9 +151,14 @@ def export(
         ExportSettings().formats
     ),
     deface: Annotated[
-        bool, typer.Option("--deface", help="A plain head for sharing; goes into `shared`.")
+        bool,
+        typer.Option(
+            "--deface", help="Replace the head by a plain one, for sharing; written into `shared`."
+        ),
     ] = False,
-    frame: Annotated[str, typer.Option(help="rig, or body: under it, x the way it faces.")] = "rig",
+    frame: Annotated[
+        str, typer.Option(help="rig, or body: origin under the body, x the way it faces.")
+    ] = "rig",
 ) -> None:
     """Write a scan's mesh as PLY, OBJ, STL and GLB for other programs."""
     from bodyscan.export.scan import export_scan
@@ -167,21 +176,32 @@ def export(
 
 def batch(
     output: Output,
-    pipeline: Annotated[Path, typer.Argument(metavar="PIPELINE.YAML", help="See pipelines/.")],
-    scans: Annotated[str, typer.Option(help="Folder (or URL) of scan folders, or of rigs.")],
-    out: Annotated[str, typer.Option(help="Folder (or URL) for a job folder of each.")],
+    pipeline: Annotated[
+        Path, typer.Argument(metavar="PIPELINE.YAML", help="The pipeline file; see pipelines/.")
+    ],
+    scans: Annotated[str, typer.Option(help="Folder (or URL) that holds scan folders, or rigs.")],
+    out: Annotated[str, typer.Option(help="Folder (or URL) to write a job folder for each into.")],
     calibration: Annotated[
         str | None,
         typer.Option(help="Default: `calibration` in the folder of scans, beside or above it."),
     ] = None,
     changes: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Such as fusion.points=2000000."),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Change a setting, such as fusion.points=2000000; repeatable.",
+        ),
     ] = None,
-    until: Annotated[str | None, typer.Option(metavar="STAGE", help="The last stage.")] = None,
+    until: Annotated[
+        str | None, typer.Option(metavar="STAGE", help="The last stage to run.")
+    ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Jobs at the same time.")] = None,
     cluster: Annotated[
-        str | None, typer.Option(metavar="tcp://HOST:PORT", help="A dask scheduler to send to.")
+        str | None,
+        typer.Option(
+            metavar="tcp://HOST:PORT", help="Address of a dask scheduler to send jobs to."
+        ),
     ] = None,
     explain: Annotated[
         bool, typer.Option("--explain", help="Say why each stage would run; do nothing.")
@@ -282,9 +302,11 @@ def _run(
 
 def verify(
     output: Output,
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="--out of a batch, or a job.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="What batch wrote, or one job's folder in it.")
+    ],
 ) -> None:
-    """Hold images, calibration and results against the manifest; find any byte that changed."""
+    """Compare images, calibration and results with the manifest; find any byte that changed."""
     from bodyscan.jobs.job import printable
     from bodyscan.jobs.verification import verify as look
 
@@ -302,10 +324,10 @@ def verify(
 
 def forget(
     output: Output,
-    subject: Annotated[str, typer.Argument(metavar="SUBJECT", help="The pseudonym.")],
-    workspace: Annotated[Path, typer.Option(help="Folder to look through.")] = Path(),
+    subject: Annotated[str, typer.Argument(metavar="SUBJECT", help="The subject's pseudonym.")],
+    workspace: Annotated[Path, typer.Option(help="Folder to search.")] = Path(),
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would go; remove nothing.")
+        bool, typer.Option("--dry-run", help="Say what would be removed; remove nothing.")
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask first.")] = False,
 ) -> None:
