@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.least_squares import cauchy_weights, spread
 from bodyscan.geometry.transforms import rigid_fit
-from bodyscan.registration.disagreement import fit_board
 from bodyscan.registration.full_solve import solve_fully
+from bodyscan.registration.inconsistent_views import fit_board
 from bodyscan.registration.joint_solve import JointSolution
 
 Array = NDArray[np.float64]
@@ -228,10 +228,8 @@ def _held_out(
             true = [replace(v, points=bent.shapes[v.board].applied(v.points))
                     if v.board in bent.shapes else v for v in own]  # fmt: skip
             placing = solution.root_from_board[target]
-            before = fit_board(own, flat.cameras, flat.root_from_camera, placing).rms_px
-            after = fit_board(
-                true, bent.solution.cameras, bent.solution.root_from_camera, placing
-            ).rms_px
+            before = fit_board(own, flat, placing).rms_px
+            after = fit_board(true, bent.solution, placing).rms_px
             squares += list(zip(before**2, after**2, strict=True))
     before_px, after_px = np.sqrt(np.median(np.array(squares), axis=0))
     return float(before_px), float(after_px)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import networkx as nx
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
@@ -16,8 +16,6 @@ from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.registration.view_graph import view_graph
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import RigFrame
-
-Array = NDArray[np.float64]
 
 REACH_MM = 1300.0
 """How far ahead of a camera a pose matters: about where the subject stands."""

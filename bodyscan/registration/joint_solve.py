@@ -22,7 +22,7 @@ WITHOUT_LENS = "SIMPLE_PINHOLE"
 
 @dataclass(frozen=True, eq=False)
 class JointSolution:
-    """All poses in the root camera's frame, mm, and the cameras the solve ended with."""
+    """All poses in the root camera's frame, mm, and the cameras: what a solve starts from, or found."""
 
     root_from_camera: dict[str, RigidTransform]
     root_from_board: dict[Target, RigidTransform]
@@ -31,9 +31,7 @@ class JointSolution:
 
 def solve_jointly(
     views: Sequence[LocatedView],
-    cameras: dict[str, Camera],
-    root_from_camera: dict[str, RigidTransform],
-    root_from_board: dict[Target, RigidTransform],
+    start: JointSolution,
     *,
     root: str,
     refine_cameras: bool,
@@ -44,17 +42,18 @@ def solve_jointly(
     A world of COLMAP is one board; each (shot, board) is a frame, so `rig_from_world` is
     `root_from_board`.  Raises FailedWork if the solver does not converge.
     """
+    cameras = start.cameras
     names = [root, *sorted(set(cameras) - {root})]
     ids = {name: number for number, name in enumerate(names, start=1)}
     targets = sorted({view.target for view in views})
     model = pycolmap.Reconstruction()
     for name in names:
         model.add_camera(colmap_camera(cameras[name], ids[name]))
-    model.add_rig(_colmap_rig(names, root_from_camera))
+    model.add_rig(_colmap_rig(names, start.root_from_camera))
     points = _add_points(model, views)
     for number, target in enumerate(targets, start=1):
         group = [view for view in views if view.target == target]
-        _add_frame(model, number, group, ids, cameras, points, root_from_board[target])
+        _add_frame(model, number, group, ids, cameras, points, start.root_from_board[target])
     _adjust(model, refine_cameras, loss_px)
     rig = model.rig(1)
     placed = {root: RigidTransform.identity()}

@@ -17,8 +17,12 @@ from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.registration.board_shape import BoardShape, ShapedSolution, with_board_shapes
-from bodyscan.registration.disagreement import error_limit, judge, own_errors
 from bodyscan.registration.full_solve import solve_fully
+from bodyscan.registration.inconsistent_views import (
+    error_limit,
+    find_inconsistent_views,
+    single_view_errors,
+)
 from bodyscan.registration.joint_solve import JointSolution, solve_jointly
 from bodyscan.registration.normal_equations import normal_equations
 from bodyscan.registration.rig_frame import frame_board_turn, frame_target, rig_from_root
@@ -118,20 +122,19 @@ def _solve(
     to_root = start[root].inverse()
     placed = {name: to_root @ placing for name, placing in start.items()}
     kept, boards, doubtful = place_boards(views, placed)
-    gross = judge([v for v in kept if v.target in doubtful], cameras, placed, boards, COARSE_PX)
+    solution = JointSolution(placed, boards, cameras)
+    gross = find_inconsistent_views(
+        [view for view in kept if view.target in doubtful], solution, COARSE_PX
+    )
     notes, dropped = list(gross.notes), list(gross.wrong)
     kept = [view for view in kept if view not in gross.wrong]
-    limit = error_limit(own_errors(kept, cameras))
+    limit = error_limit(single_view_errors(kept, cameras))
     # One camera alone was solved with its skew already; nothing is left to join.
     refine = refine_cameras and len(names) > 1
-    solution = solve_jointly(
-        kept, cameras, placed, boards, root=root, refine_cameras=refine, loss_px=LOSS_PX
-    )
+    solution = solve_jointly(kept, solution, root=root, refine_cameras=refine, loss_px=LOSS_PX)
     for _ in range(ROUNDS):
         solution = solve_fully(kept, solution, root=root, refine_cameras=refine)
-        found = judge(
-            kept, solution.cameras, solution.root_from_camera, solution.root_from_board, limit
-        )
+        found = find_inconsistent_views(kept, solution, limit)
         if not found.wrong:
             break
         notes += found.notes

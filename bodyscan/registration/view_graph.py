@@ -9,8 +9,8 @@ from itertools import combinations
 
 import networkx as nx
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, apart
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
@@ -19,7 +19,6 @@ AGREEMENT_MM = 40.0
 REACH_MM = 1000.0
 MOST_CANDIDATES = 12
 
-Array = NDArray[np.float64]
 Target = tuple[str, str]
 Group = dict[str, RigidTransform]
 

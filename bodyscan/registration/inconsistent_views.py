@@ -16,6 +16,7 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
+from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_graph import Target
 
 TIMES_OWN = 6.0
@@ -28,7 +29,7 @@ CONVERGED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class InconsistentViews:
     """wrong: the views not to be used.  notes: a line for each cause, naming shot and pairs.
 
     sizes: of a board that seems to have larger or smaller squares, by the board's name.
@@ -47,7 +48,7 @@ class BoardFit:
     size: float
 
 
-def own_errors(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> Array:
+def single_view_errors(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> Array:
     """RMS px (V,) of each view about the pose it was located at by itself."""
     return np.array(
         [
@@ -60,34 +61,28 @@ def own_errors(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> A
 
 
 def error_limit(own: Array) -> float:
-    """px: a view farther off than this does not fit the rig. own: (V,) from `own_errors`."""
+    """px: a view farther off than this does not fit the rig. own: (V,) from `single_view_errors`."""
     return max(TIMES_OWN * float(np.median(own)), LEAST_BAD_PX)
 
 
-def judge(
-    views: Sequence[LocatedView],
-    cameras: Mapping[str, Camera],
-    root_from_camera: Mapping[str, RigidTransform],
-    root_from_board: Mapping[Target, RigidTransform],
-    limit_px: float,
-) -> Verdict:
+def find_inconsistent_views(
+    views: Sequence[LocatedView], solution: JointSolution, limit_px: float
+) -> InconsistentViews:
     """Find the wrong views among those of each board at each moment."""
     groups: dict[Target, list[LocatedView]] = defaultdict(list)
     for view in views:
         groups[view.target].append(view)
-    wrong: list[LocatedView] = []
-    notes: list[str] = []
-    sizes: list[tuple[str, float]] = []
-    for target, group in sorted(groups.items()):
-        board = root_from_board[target]
-        errors = [_error(view, cameras, root_from_camera, board) for view in group]
-        if max(errors) <= limit_px:
-            continue
-        found = _judge_one(group, cameras, root_from_camera, board, limit_px)
-        wrong += found.wrong
-        notes += found.notes
-        sizes += found.sizes
-    return Verdict(tuple(wrong), (*_wrong_squares(sizes), *notes), tuple(sizes))
+    found = [
+        _examine_board(group, solution, limit_px)
+        for _, group in sorted(groups.items())
+        if max(_error(view, solution) for view in group) > limit_px
+    ]
+    sizes = tuple(size for one in found for size in one.sizes)
+    return InconsistentViews(
+        tuple(view for one in found for view in one.wrong),
+        (*_wrong_squares(sizes), *(note for one in found for note in one.notes)),
+        sizes,
+    )
 
 
 def _wrong_squares(sizes: Sequence[tuple[str, float]]) -> Iterator[str]:
@@ -102,15 +97,13 @@ def _wrong_squares(sizes: Sequence[tuple[str, float]]) -> Iterator[str]:
             )
 
 
-def _judge_one(
-    group: list[LocatedView],
-    cameras: Mapping[str, Camera],
-    root_from_camera: Mapping[str, RigidTransform],
-    start: RigidTransform,
-    limit_px: float,
-) -> Verdict:
+def _examine_board(
+    group: list[LocatedView], solution: JointSolution, limit_px: float
+) -> InconsistentViews:
+    """Which of one board's views at one moment are wrong, since not all of them can be true."""
     shot, board = group[0].target
-    own = [fit_board([view], cameras, root_from_camera, start).rms_px[0] for view in group]
+    start = solution.root_from_board[group[0].target]
+    own = [fit_board([view], solution, start).rms_px[0] for view in group]
     bad = [view for view, error in zip(group, own, strict=True) if error > limit_px]
     notes = [
         f"{view.pair}: board {board} in shot {shot} fits no pose "
@@ -119,30 +112,29 @@ def _judge_one(
         if error > limit_px
     ]
     kept = [view for view in group if view not in bad]
-    together = fit_board(kept, cameras, root_from_camera, start) if kept else None
+    together = fit_board(kept, solution, start) if kept else None
     if together is None or together.rms_px.max() <= limit_px:
-        return Verdict(tuple(bad), tuple(notes))
-    resized = fit_board(kept, cameras, root_from_camera, start, free_size=True)
+        return InconsistentViews(tuple(bad), tuple(notes))
+    resized = fit_board(kept, solution, start, free_size=True)
     if resized.rms_px.max() <= limit_px and abs(resized.size - 1.0) > OTHER_SIZE:
         said = (
             f"shot {shot}: what {_names(kept)} took for board {board} has squares {resized.size:.3f} "
             "times as large: another board? not used"
         )
-        return Verdict(tuple(group), (*notes, said), ((board, resized.size),))
-    agreeing = _largest_agreement(kept, cameras, root_from_camera, start, limit_px)
+        return InconsistentViews(tuple(group), (*notes, said), ((board, resized.size),))
+    agreeing = _largest_agreement(kept, solution, start, limit_px)
     others = [view for view in kept if view not in agreeing]
     said = (
         f"shot {shot}: board {board} stood elsewhere when {_names(others)} saw it "
         f"({together.rms_px.max():.2f} px off, usual is below {limit_px:.2f}): it moved, or the "
         "pictures were not taken together; not used"
     )
-    return Verdict((*bad, *others), (*notes, said))
+    return InconsistentViews((*bad, *others), (*notes, said))
 
 
 def _largest_agreement(
     views: list[LocatedView],
-    cameras: Mapping[str, Camera],
-    root_from_camera: Mapping[str, RigidTransform],
+    solution: JointSolution,
     start: RigidTransform,
     limit_px: float,
 ) -> list[LocatedView]:
@@ -151,7 +143,7 @@ def _largest_agreement(
     kept = list(views)
     while len(kept) > 2:
         rests = [[view for view in kept if view is not out] for out in kept]
-        fits = [fit_board(rest, cameras, root_from_camera, start).rms_px for rest in rests]
+        fits = [fit_board(rest, solution, start).rms_px for rest in rests]
         best = int(np.argmin([np.sum(rms**2) for rms in fits]))
         kept = rests[best]
         if fits[best].max() <= limit_px:
@@ -161,25 +153,23 @@ def _largest_agreement(
 
 def fit_board(
     views: Sequence[LocatedView],
-    cameras: Mapping[str, Camera],
-    root_from_camera: Mapping[str, RigidTransform],
+    solution: JointSolution,
     start: RigidTransform,
     *,
     free_size: bool = False,
 ) -> BoardFit:
     """The board pose (and size) that fits all views, from the first view's own pose or `start`."""
-    own = root_from_camera[views[0].pair] @ views[0].camera_from_board
-    first = _descend(views, cameras, root_from_camera, own, free_size)
+    own = solution.root_from_camera[views[0].pair] @ views[0].camera_from_board
+    first = _descend(views, solution, own, free_size)
     if len(views) == 1:
         return first
-    second = _descend(views, cameras, root_from_camera, start, free_size)
+    second = _descend(views, solution, start, free_size)
     return min(first, second, key=lambda fit: float(np.sum(fit.rms_px**2)))
 
 
 def _descend(
     views: Sequence[LocatedView],
-    cameras: Mapping[str, Camera],
-    root_from_camera: Mapping[str, RigidTransform],
+    solution: JointSolution,
     placing: RigidTransform,
     free_size: bool,
 ) -> BoardFit:
@@ -188,8 +178,8 @@ def _descend(
     for _ in range(STEPS):
         normal, gradient, errors = np.zeros((7, 7)), np.zeros(7), []
         for view in views:
-            camera = cameras[view.pair]
-            camera_from_root = root_from_camera[view.pair].inverse()
+            camera = solution.cameras[view.pair]
+            camera_from_root = solution.root_from_camera[view.pair].inverse()
             in_root = placing.apply(size * view.points)
             in_camera = camera_from_root.apply(in_root)
             _, by_point = camera.jacobians(in_camera)
@@ -212,14 +202,11 @@ def _descend(
     return BoardFit(rms, size)
 
 
-def _error(
-    view: LocatedView,
-    cameras: Mapping[str, Camera],
-    root_from_camera: Mapping[str, RigidTransform],
-    root_from_board: RigidTransform,
-) -> float:
-    camera_from_board = root_from_camera[view.pair].inverse() @ root_from_board
-    return _rms(cameras[view.pair].project(camera_from_board.apply(view.points)) - view.pixels)
+def _error(view: LocatedView, solution: JointSolution) -> float:
+    camera_from_root = solution.root_from_camera[view.pair].inverse()
+    camera_from_board = camera_from_root @ solution.root_from_board[view.target]
+    seen = solution.cameras[view.pair].project(camera_from_board.apply(view.points))
+    return _rms(seen - view.pixels)
 
 
 def _rms(residuals: Array) -> float:
