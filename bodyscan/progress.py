@@ -7,6 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
+THREADS = 2
+"""Threads that a stage shares its work out to, and cores that a job of a batch takes: all times in
+docs/results.md were measured so; larger machines run more jobs side by side."""
+
 Progress = Callable[[str, int, int], None]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -30,7 +34,7 @@ def threaded(
     *,
     stage: str,
     progress: Progress = silent,
-    workers: int = 2,
+    workers: int = THREADS,
 ) -> list[Result]:
     """`work` on every item in threads, results in the items' order."""
     todo: Sequence[Item] = list(items)

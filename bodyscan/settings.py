@@ -17,6 +17,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from bodyscan.files.model import Model
+from bodyscan.progress import THREADS
 
 Millimetres = Annotated[float, Field(gt=0)]
 MeshVersion = Literal["full", "light", "open"]
@@ -131,8 +132,8 @@ class RigExportSettings(Model):
 class Resources(Model):
     """What one job of a batch takes."""
 
-    threads: int = Field(default=2, ge=1)
-    """cores: more than two wait for each other, more jobs do not."""
+    threads: int = Field(default=THREADS, ge=1)
+    """cores: larger machines run more jobs side by side."""
 
     memory_mb: int = Field(default=4000, ge=100)
     """MB: twice what twelve pairs of 1280 x 1024 were seen to take."""

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from bodyscan import settings
+from bodyscan.progress import THREADS
 
 PACKAGE = Path(settings.__file__).parent
 MODELS = {
@@ -47,6 +48,16 @@ def test_beside_every_value_stand_its_unit_and_its_meaning(name):
     for value, said in zip(body, [*body[1:], None], strict=True):
         if isinstance(value, ast.AnnAssign) and "Settings" not in ast.unparse(value.annotation):
             assert isinstance(said, ast.Expr), f"{name}.{ast.unparse(value.target)} says nothing"
+
+
+def test_how_many_threads_is_said_once():
+    found = [
+        f"{path}:{line}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for line, name, value in defaults(ast.parse(path.read_text("utf-8")))
+        if name == "workers" and value == THREADS
+    ]
+    assert not found
 
 
 def defaults(tree: ast.AST) -> Iterator[tuple[int, str, object]]:

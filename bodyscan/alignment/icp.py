@@ -27,6 +27,7 @@ from bodyscan.alignment.overlap_equations import OverlapEquations, solve_motions
 from bodyscan.alignment.sway import SwayPrior, bound_motions, centre_shifts
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
 
@@ -76,7 +77,7 @@ def align(
     prior: PoseCovariance,
     settings: AlignmentSettings,
     *,
-    workers: int = 2,
+    workers: int = THREADS,
 ) -> Alignment:
     """Small motions of all range images that bring their overlaps together.
 

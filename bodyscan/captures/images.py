@@ -15,6 +15,7 @@ from bodyscan.captures.grey_png import decode_grey_png
 from bodyscan.captures.image_faults import header_fault, image_error
 from bodyscan.captures.image_header import png_damage
 from bodyscan.errors import ImageError
+from bodyscan.progress import THREADS
 from bodyscan.rig.pair import CameraSpec
 
 SHOWS_NOTHING_BELOW = 8
@@ -80,7 +81,9 @@ def read_lit(sequence: ImageSequence, camera: CameraSpec) -> Bytes:
     )
 
 
-def read_sequence(sequence: ImageSequence, camera: CameraSpec, *, workers: int = 2) -> StripeImages:
+def read_sequence(
+    sequence: ImageSequence, camera: CameraSpec, *, workers: int = THREADS
+) -> StripeImages:
     """All images of a stripe sequence.
 
     Raises ImageError as `read_image`, and where the sequence is a lit image alone.

@@ -15,6 +15,7 @@ from bodyscan.fusion.comparing import Evidence, Samples
 from bodyscan.fusion.quadratics import NORMAL_MEDIAN
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.mesh.body import BodyCloud
+from bodyscan.progress import THREADS
 
 AT_A_TIME = 1 << 16  # samples whose sums fit into a processor's cache
 EVERY = 8  # spot of an overlap that is looked at to learn how far two surfaces are apart
@@ -28,7 +29,7 @@ def average(
     surfaces: Sequence[SmoothSurface],
     evidence: Sequence[Evidence],
     gain: Floats,
-    workers: int = 2,
+    workers: int = THREADS,
 ) -> BodyCloud:
     """Weighted means of each sample and what agrees with it; the outvoted are dropped.
 

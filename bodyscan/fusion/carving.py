@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.fusion.free_space import Guess, sees_through
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 
 VOXEL_MM = 5.0
@@ -48,7 +49,7 @@ def poisson_hints(
     rig_from_camera: dict[str, RigidTransform],
     *,
     margin_mm: float = 10.0,
-    workers: int = 2,
+    workers: int = THREADS,
 ) -> tuple[Array, Array]:
     """Points (N, 3) and outward normals (N, 3) of a likely surface where nothing was measured.
 
@@ -104,7 +105,7 @@ def _skin(voxels: Voxels, removed: Mask, measured: cKDTree) -> tuple[Array, Arra
     concerned = ndimage.maximum_filter(removed.view(np.uint8), 2 * REACH_VOXELS + 1) > 0
     index = index[concerned[tuple(np.rint(index).astype(int).T)]]
     places = voxels.origin + VOXEL_MM * index
-    nearby = measured.query(places, distance_upper_bound=CLEARANCE_MM, workers=2)[0] < np.inf
+    nearby = measured.query(places, distance_upper_bound=CLEARANCE_MM, workers=THREADS)[0] < np.inf
     index, places = index[~nearby], places[~nearby]
     normals = -_slopes(soft, index)
     return places, normals / np.linalg.norm(normals, axis=-1, keepdims=True)

@@ -17,6 +17,7 @@ from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
 from bodyscan.geometry.crop import crop_of
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.rig import Volume
 
@@ -38,7 +39,7 @@ def clean(
     *,
     empty: Sequence[RangeImage] = (),
     smallest_patch_mm2: float = 150.0,
-    workers: int = 2,
+    workers: int = THREADS,
 ) -> list[RangeImage]:
     """The same range images with nothing measured where a pixel shows no part of the subject.
 

@@ -17,6 +17,7 @@ from bodyscan.fusion.smoothing import smooth
 from bodyscan.fusion.thinning import take_samples
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
+from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import FusionSettings
 
@@ -34,7 +35,7 @@ def merge(
     rig_from_camera: dict[str, RigidTransform],
     settings: FusionSettings,
     *,
-    workers: int = 2,
+    workers: int = THREADS,
 ) -> MergedCloud:
     """One evenly spread cloud of about `settings.points` points from aligned, cleaned range images.
 

@@ -19,6 +19,7 @@ from bodyscan.mesh.topology import (
     topology,
     vertex_normals,
 )
+from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import MeshSettings
 
@@ -32,7 +33,7 @@ def mesh(
     range_images: Sequence[RangeImage] = (),
     rig_from_camera: dict[str, RigidTransform] | None = None,
     *,
-    workers: int = 2,
+    workers: int = THREADS,
 ) -> BodyMesh:
     """One closed manifold surface around a cloud, faces outward.
 
@@ -103,5 +104,5 @@ def attach_attributes(
 
 def _filled_faces(vertices: Array, faces: Indices, tree: cKDTree, reach_mm: float) -> Mask:
     """(F,) faces with a corner that no point lies near."""
-    distance = np.asarray(tree.query(vertices, distance_upper_bound=reach_mm, workers=2)[0])
+    distance = np.asarray(tree.query(vertices, distance_upper_bound=reach_mm, workers=THREADS)[0])
     return np.any(np.isinf(distance)[faces], axis=1)

@@ -14,6 +14,7 @@ from bodyscan.compiled import compiled
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
+from bodyscan.progress import THREADS
 
 FACING = 0.2
 """Cosine below which a pair sees a surface too flat to have measured it."""
@@ -24,7 +25,7 @@ def add_pose_variance(
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PoseCovariance,
     *,
-    workers: int = 2,
+    workers: int = THREADS,
 ) -> BodyCloud:
     """The cloud with sigmas along the normals that allow for the pairs' poses too.
 

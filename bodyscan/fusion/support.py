@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.mesh.body import BodyCloud
+from bodyscan.progress import THREADS
 
 NEIGHBOURS = 8
 # Shares of the reach: 2, 1 and 0.5 mm of 4.
@@ -59,7 +60,7 @@ def support(
     vertices: Array, normals: Floats, cloud: BodyCloud, tree: cKDTree, reach_mm: float
 ) -> Support:
     """Of vertices (V, 3) with unit normals (V, 3) by a cloud, whose points the tree holds."""
-    found = tree.query(vertices, NEIGHBOURS, distance_upper_bound=reach_mm, workers=2)
+    found = tree.query(vertices, NEIGHBOURS, distance_upper_bound=reach_mm, workers=THREADS)
     distance, near = (np.asarray(part) for part in found)
     weight, shift, spread = _average_planes(
         np.ascontiguousarray(vertices),

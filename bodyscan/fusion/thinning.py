@@ -14,6 +14,7 @@ from bodyscan.arrays import Bytes, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.smoothing import SmoothSurface
+from bodyscan.progress import THREADS
 
 Numbers = NDArray[np.uint32]
 
@@ -93,7 +94,7 @@ def voxel_size_for(points: Floats, wanted: int) -> float:
 
 
 def one_per_voxel(
-    points: Floats, second_rate: Mask, voxel_mm: float, *, workers: int = 2
+    points: Floats, second_rate: Mask, voxel_mm: float, *, workers: int = THREADS
 ) -> NDArray[np.intp]:
     """Indices of one point in each occupied voxel: the nearest to its centre.
 

@@ -15,6 +15,7 @@ from bodyscan.mesh.half_edges import twins
 from bodyscan.mesh.repair import largest_piece
 from bodyscan.mesh.scene import centred_scene
 from bodyscan.mesh.topology import topology, vertex_normals
+from bodyscan.progress import THREADS
 
 SPARE = 0.03  # of the faces are kept for where the decimated mesh strays
 ROUNDS = 12  # of refinement
@@ -48,7 +49,7 @@ def decimate(mesh: BodyMesh, *, faces: int = 50_000, within_mm: float = 0.19) ->
             remedy="Ask for more faces.",
         )
     vertices, corners = refine_to_tolerance(vertices, corners, mesh.vertices, mesh.faces, within_mm)
-    nearest = np.asarray(cKDTree(mesh.vertices).query(vertices, workers=2)[1])
+    nearest = np.asarray(cKDTree(mesh.vertices).query(vertices, workers=THREADS)[1])
     sigma_mm = mesh.sigma_mm[nearest]
     return BodyMesh(
         vertices,

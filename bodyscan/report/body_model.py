@@ -11,6 +11,7 @@ from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.comparison import Comparison
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.decimation import decimate
+from bodyscan.progress import THREADS
 from bodyscan.report.canvas import blue_white_red, turbo
 from bodyscan.report.model import Layer, Shape, css, ramp_legend
 from bodyscan.report.pictures import FILLED_TINT
@@ -52,7 +53,7 @@ def layers(
     made_up[small.faces[small.filled]] = True
     top = _round_up(float(np.nanpercentile(cloud.sigma_mm, 98)))
     sigma = _ramp(np.nan_to_num(small.sigma_mm / top), turbo()[:, ::-1])
-    nearest = np.asarray(cKDTree(cloud.points).query(small.vertices, workers=2)[1])
+    nearest = np.asarray(cKDTree(cloud.points).query(small.vertices, workers=THREADS)[1])
     pairs = np.array(PAIRS, np.uint8)[np.clip(cloud.pairs_seen[nearest], 1, len(PAIRS)) - 1]
     tint = FILLED_TINT[::-1]
     plain = np.full(small.vertices.shape, SKIN, np.uint8)
@@ -90,7 +91,7 @@ def _deviation(
 ) -> Layer:
     """Of the nearest vertex of the full mesh: the light one is a few tenths of a mm off itself."""
     tree = cKDTree(mesh.vertices[comparison.vertices])
-    signed = comparison.signed_mm[np.asarray(tree.query(small.vertices, workers=2)[1])]
+    signed = comparison.signed_mm[np.asarray(tree.query(small.vertices, workers=THREADS)[1])]
     table = blue_white_red()[:, ::-1]
     legend = ramp_legend(
         f"from {comparison.name}, mm (red: outside it)",

@@ -12,7 +12,7 @@ import numpy as np
 
 from bodyscan.files.atomic import write_json
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.progress import Progress, silent
+from bodyscan.progress import THREADS, Progress, silent
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig, write_rig
 from bodyscan.rig.templates import fill
@@ -62,7 +62,7 @@ def simulate(
     seed: int = 0,
     settings: SimulationSettings | None = None,
     board_shots: int | None = None,
-    workers: int = 2,
+    workers: int = THREADS,
     progress: Progress = silent,
 ) -> None:
     """Write captures of the rig in `rig_file`, with known truth, into the folder `out`.
