@@ -14,6 +14,8 @@ import open3d as o3d
 
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
+from bodyscan.geometry.camera_tables import projection_table
+from bodyscan.geometry.quadratic_table import Table, look_up
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -98,13 +100,12 @@ def match_projected(
 ) -> Matches:
     """Each source point against the surface that the target camera saw in its direction."""
     target_from_source = rig_from_target.inverse() @ rig_from_source
-    size, image, camera = len(source.points), target.image, target.image.camera
+    size, image = len(source.points), target.image
     points, normals = np.empty((size, 3)), np.empty((size, 3))
     distances, sigma_mm = np.empty(size), np.empty(size)
     found = _match_projected(
         np.ascontiguousarray(target_from_source.matrix[:3]),
-        camera.parameters[:5],
-        camera.parameters[5:],
+        projection_table(image.camera),
         (source.points, source.normals, source.sigma_mm, source.rim),
         (image.points, image.normals, image.sigma_mm, target.inner),
         reach_mm,
@@ -121,8 +122,7 @@ def match_projected(
 @compiled
 def _match_projected(
     target_from_source: Array,
-    lens: Array,
-    bend: Array,
+    projection: Table,
     source: tuple[Array, Array, Array, Mask],
     target: tuple[Floats, Floats, Floats, Mask],
     reach_mm: float,
@@ -130,9 +130,9 @@ def _match_projected(
 ) -> int:
     """How many of the source's points were matched; what of them `matches` holds, target frame.
 
-    target_from_source: (3, 4).  lens: alpha, beta, gamma, u0, v0.  bend: k1, k2.  source: points
-    (N, 3), normals (N, 3), sigma_mm (N,), rim (N,).  target: points (H, W, 3), normals (H, W, 3),
-    sigma_mm (H, W), inner (H, W).  matches: the arrays of `Matches`, room for N.
+    target_from_source: (3, 4).  source: points (N, 3), normals (N, 3), sigma_mm (N,), rim (N,).
+    target: points (H, W, 3), normals (H, W, 3), sigma_mm (H, W), inner (H, W).
+    matches: the arrays of `Matches`, room for N.
     """
     source_points, source_normals, source_sigma, rim = source
     target_points, target_normals, target_sigma, inner = target
@@ -149,7 +149,7 @@ def _match_projected(
         far = np.sqrt(_dot(point, point))
         if -_dot(point, normal) < EDGE_ON * far:
             continue
-        u, v = _pixel(lens, bend, point)
+        u, v = look_up(projection, point[0] / point[2], point[1] / point[2])
         if not (-0.5 < u < width - 0.5 and -0.5 < v < height - 0.5):
             continue
         row, column = int(np.rint(v)), int(np.rint(u))
@@ -183,16 +183,6 @@ def _carried(a_from_b: Array, vector: Array, moved: float) -> Vector:
         m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] * moved,
         m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] * moved,
     )
-
-
-@compiled
-def _pixel(lens: Array, bend: Array, point: Vector) -> tuple[float, float]:
-    """`Camera.project` of one point."""
-    x, y = point[0] / point[2], point[1] / point[2]
-    r2 = x * x + y * y
-    stretch = 1.0 + r2 * (bend[0] + r2 * bend[1])
-    x, y = x * stretch, y * stretch
-    return lens[0] * x + lens[2] * y + lens[3], lens[1] * y + lens[4]
 
 
 @compiled

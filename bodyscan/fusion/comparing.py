@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
-from bodyscan.fusion.grid import lens_of
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples
+from bodyscan.geometry.camera_tables import projection_table
+from bodyscan.geometry.quadratic_table import Table, look_up
 
 Numbers = NDArray[np.int32]
 
 SAME_WAY = 0.6  # cosine between the normals of what may be one surface
+NEAREST_MM = 1.0  # what is behind the camera is not asked about
 EDGE_ON = 0.1  # a camera that sees a point flatter than this is not asked about it
 
 
@@ -56,7 +58,7 @@ def compare(
         (int(samples.starts[number]), int(samples.starts[number + 1])),
         (surface.points, surface.normals, surface.number),
         surface.corner,
-        lens_of(surface.camera),
+        projection_table(surface.camera),
         (camera_from_rig.rotation, camera_from_rig.translation),
         (agreement_mm, double_mm),
         (index, at, shift, against_index, against_at),
@@ -76,7 +78,7 @@ def _compare(
     own: tuple[int, int],
     surface: tuple[Floats, Floats, Numbers],
     corner: tuple[int, int],
-    lens: Array,
+    projection: Table,
     camera_from_rig: tuple[Array, Array],
     limits_mm: tuple[float, float],
     evidence: tuple[Numbers, Numbers, Floats, Numbers, Numbers],
@@ -95,8 +97,11 @@ def _compare(
     for n in range(len(points)):
         if own[0] <= n < own[1] or not _faces(points[n], normals[n], centre):
             continue
-        pixel = _pixel_of(points[n], camera_from_rig, lens)
-        column, row = pixel[0] - corner[0], pixel[1] - corner[1]
+        x, y, z = _in_camera(points[n], camera_from_rig)
+        if z <= NEAREST_MM:
+            continue
+        u, v = look_up(projection, x / z, y / z)
+        column, row = int(np.rint(u)) - corner[0], int(np.rint(v)) - corner[1]
         if not (0 <= column < numbers.shape[1] and 0 <= row < numbers.shape[0]):
             continue
         there = numbers[row, column]
@@ -132,17 +137,11 @@ def _faces(point: Floats, normal: Floats, centre: Array) -> bool:
 
 
 @compiled
-def _pixel_of(point: Floats, camera_from_rig: tuple[Array, Array], lens: Array) -> tuple[int, int]:
-    """(column, row) of the pixel that shows a point (Eq. 1, 3-5), (-1, -1) if it is behind."""
+def _in_camera(point: Floats, camera_from_rig: tuple[Array, Array]) -> tuple[float, float, float]:
+    """A point of the rig frame in the camera's."""
     r, t = camera_from_rig
-    x = r[0, 0] * point[0] + r[0, 1] * point[1] + r[0, 2] * point[2] + t[0]
-    y = r[1, 0] * point[0] + r[1, 1] * point[1] + r[1, 2] * point[2] + t[1]
-    z = r[2, 0] * point[0] + r[2, 1] * point[1] + r[2, 2] * point[2] + t[2]
-    if z <= 1:
-        return -1, -1
-    x, y = x / z, y / z
-    r2 = x * x + y * y
-    scale = 1.0 + r2 * (lens[5] + r2 * lens[6])
-    x, y = x * scale, y * scale
-    column = lens[0] * x + lens[2] * y + lens[3]
-    return int(np.rint(column)), int(np.rint(lens[1] * y + lens[4]))
+    return (
+        r[0, 0] * point[0] + r[0, 1] * point[1] + r[0, 2] * point[2] + t[0],
+        r[1, 0] * point[0] + r[1, 1] * point[1] + r[1, 2] * point[2] + t[1],
+        r[2, 0] * point[0] + r[2, 1] * point[1] + r[2, 2] * point[2] + t[2],
+    )

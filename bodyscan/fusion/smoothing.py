@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes, Floats, Mask
 from bodyscan.compiled import compiled
-from bodyscan.fusion.grid import lens_of
 from bodyscan.fusion.quadratics import Fit, fit_quadratics
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.camera_tables import projection_table
 from bodyscan.geometry.crop import crop_of, ends_of
+from bodyscan.geometry.quadratic_table import Table, slopes
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -89,7 +90,7 @@ def _surface(
         ends_of(box),
         (fit.value, fit.slope_u, fit.slope_v, fit.sigma),
         fitted,
-        lens_of(image.camera),
+        projection_table(image.camera),
         (rig_from_camera.rotation, rig_from_camera.translation),
         (depth, number),
         (points, normals, sigma),
@@ -146,7 +147,7 @@ def _lay_out(
     ends: tuple[int, int, int, int],
     fit: tuple[Floats, Floats, Floats, Floats],
     fitted: Mask,
-    lens: Array,
+    projection: Table,
     rig_from_camera: tuple[Array, Array],
     images: tuple[Floats, Numbers],
     surface: tuple[Floats, Floats, Floats],
@@ -154,7 +155,7 @@ def _lay_out(
     """Fill in depth and number (h, w), and points, normals and sigmas; how many there are.
 
     seen: (height, width, 3) measured points, camera frame.  fit: value, slopes, sigma of 1/z.
-    lens: see `lens_of`.  rig_from_camera: rotation and translation.
+    rig_from_camera: rotation and translation.
     """
     value, slope_u, slope_v, fit_sigma = fit
     rotation, translation = rig_from_camera
@@ -165,10 +166,9 @@ def _lay_out(
         for column in range(fitted.shape[1]):
             if not fitted[row, column]:
                 continue
-            at = seen[ends[0] + row, ends[2] + column]
-            inverse, slopes = value[row, column], (slope_u[row, column], slope_v[row, column])
-            x, y, z = at[0] / at[2], at[1] / at[2], 1.0 / inverse
-            a, b, c = _normal(x, y, inverse, slopes, lens)
+            i, j, inverse = ends[0] + row, ends[2] + column, value[row, column]
+            x, y, z = seen[i, j, 0] / seen[i, j, 2], seen[i, j, 1] / seen[i, j, 2], 1.0 / inverse
+            a, b, c = _normal(x, y, inverse, slope_u[row, column], slope_v[row, column], projection)
             length = np.sqrt(x * x + y * y + 1.0)
             cosine = -(a * x + b * y + c) / length
             if cosine <= STEEPEST_COSINE:
@@ -186,22 +186,16 @@ def _lay_out(
 
 @compiled
 def _normal(
-    x: float, y: float, inverse: float, slopes: tuple[float, float], lens: Array
+    x: float, y: float, inverse: float, by_u: float, by_v: float, projection: Table
 ) -> tuple[float, float, float]:
     """Unit normal towards the camera, camera frame, from the slopes of 1/z per pixel.
 
     A plane n.P = d has 1/z = n.(x, y, 1) / d in ideal normalized coordinates; the slopes per
-    pixel are carried there by the lens's derivative (Eq. 3-5) times A.
+    pixel are carried there by the derivative of the projection.
     """
-    alpha, beta, gamma, k1, k2 = lens[0], lens[1], lens[2], lens[5], lens[6]
-    r2 = x * x + y * y
-    scale = 1.0 + r2 * (k1 + r2 * k2)
-    growth = 2.0 * k1 + 4.0 * k2 * r2
-    # Slopes per distorted normalized coordinate, then per ideal one.
-    real_x = alpha * slopes[0]
-    real_y = gamma * slopes[0] + beta * slopes[1]
-    outward = growth * (x * real_x + y * real_y)
-    slope_x, slope_y = scale * real_x + outward * x, scale * real_y + outward * y
+    u_by_x, u_by_y, v_by_x, v_by_y = slopes(projection, x, y)
+    slope_x = by_u * u_by_x + by_v * v_by_x
+    slope_y = by_u * u_by_y + by_v * v_by_y
     rest = inverse - x * slope_x - y * slope_y
     # n.P has the sign of d * (1/d), so n looks away from the camera: turn it round.
     shrink = -1.0 / np.sqrt(slope_x * slope_x + slope_y * slope_y + rest * rest)

@@ -11,9 +11,10 @@ from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.camera_tables import ray_table
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.pixel_rays import PixelRays
+from bodyscan.geometry.pixel_rays import rays_through
 from bodyscan.geometry.plane_table import PlaneTable
 
 Way = Callable[[Array, Array], tuple[Array, Array, Array]]
@@ -47,12 +48,12 @@ def triangulate_image(
     """Points (height, width, 3), camera frame, mm, and sigma_mm (height, width) along the viewing
     rays, of stripe coordinates s with standard deviations sigma (height, width); NaN where no depth
     can be trusted."""
-    way, pixels = _way_to_measure(sheets), PixelRays.of(camera)
+    way, pixels = _way_to_measure(sheets), ray_table(camera)
     points, sigma_mm = np.empty((*s.shape, 3), np.float32), np.empty(s.shape, np.float32)
     for first in range(0, len(s), BAND):
         rows = slice(first, first + BAND)
         wanted = np.isfinite(s[rows])
-        rays = pixels.through(wanted, first)
+        rays = rays_through(pixels, wanted, first)
         found = way(rays, s[rows][wanted].astype(np.float64))
         _place(wanted, rays, found, sigma[rows], MOST_SIGMA, points[rows], sigma_mm[rows])
     return points, sigma_mm

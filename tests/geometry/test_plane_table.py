@@ -88,5 +88,6 @@ def test_an_image_is_measured_as_its_rays_are(planes):
     # 3e-9 in 1/z (see above), and what float32 holds of a metre.
     z = points[near][:, 2:].astype(float)
     np.testing.assert_allclose(1.0 / z[:, 0], 1.0 / depth[near], rtol=2e-7, atol=3e-9)
-    np.testing.assert_allclose(points[near], z * rays[near], rtol=1e-6, atol=1e-4)
+    # Rays are tabulated to 1e-4 px, or twice that between nodes: 1.2e-3 mm at 3 m and 500 px.
+    np.testing.assert_allclose(points[near], z * rays[near], rtol=1e-6, atol=1.2e-3)
     np.testing.assert_allclose(sigma_mm[near], along[near], rtol=2e-3)

@@ -1,0 +1,62 @@
+"""A camera as compiled loops see it: two tables, whatever its lens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+
+from bodyscan.arrays import Array
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.quadratic_table import QuadraticTable, Table
+
+TOLERANCE_PX = 1e-4
+"""A five-hundredth of what corners and boundaries are found to."""
+CELLS_PX = (32, 16, 8)
+"""Widths of a cell, the widest first that keeps the tolerance: a scanner's lens does with the
+first; one that nearly folds within its image is held to about 1e-3 px by the last."""
+MARGIN_PX = 1.5
+"""Beyond the image's outermost pixel centres, so that what is outside the table is outside the
+image."""
+OUTSIDE = -2.0
+"""Both values of a table where it has none: no pixel has such a place."""
+CAMERAS = 64  # kept: those of a few rigs
+
+
+@lru_cache(CAMERAS)
+def projection_table(camera: Camera) -> Table:
+    """From ideal normalised (x, y) to the pixel (u, v); OUTSIDE where no ray of the image goes.
+
+    Far outside its image a lens may fold back: such points have no pixel here, though
+    `Camera.project` gives them one.
+    """
+    u, v = (np.linspace(-MARGIN_PX, n - 1.0 + MARGIN_PX, 33) for n in (camera.width, camera.height))
+    ideal = camera.rays(np.stack(np.meshgrid(u, v), axis=-1)).reshape(-1, 3)[:, :2]
+
+    def pixels(normalized: Array) -> Array:
+        return camera.pixels_from_normalized(camera.lens.distort(normalized))
+
+    return _within_tolerance(camera, pixels, ideal.min(axis=0), ideal.max(axis=0), 1.0)
+
+
+@lru_cache(CAMERAS)
+def ray_table(camera: Camera) -> Table:
+    """From a pixel (u, v) of the image to the (x, y) of its ray (x, y, 1)."""
+    last = np.array([camera.width, camera.height]) - 0.5
+
+    def ideal(pixels: Array) -> Array:
+        return camera.rays(pixels)[..., :2]
+
+    return _within_tolerance(camera, ideal, np.full(2, -0.5), last, camera.alpha)
+
+
+def _within_tolerance(
+    camera: Camera, function: Callable[[Array], Array], low: Array, high: Array, px_per_unit: float
+) -> Table:
+    for cell in CELLS_PX:
+        cells = -(-camera.width // cell), -(-camera.height // cell)
+        found = QuadraticTable.of(function, low, high, cells, OUTSIDE)
+        if found.error * px_per_unit < TOLERANCE_PX:
+            break
+    return found.table

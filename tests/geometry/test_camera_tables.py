@@ -1,0 +1,86 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_lenses import cameras, pixels_of
+
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.camera_tables import projection_table, ray_table
+from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.pixel_rays import rays_through
+from bodyscan.geometry.quadratic_table import Table, look_up, slopes
+
+MOST_PX = 1e-3
+SCANNER = Camera(1510.0, 1512.0, -0.5, 645.0, 508.0, Radial(-0.1, 0.05), 1280, 1024)
+WIDE = Camera(1500.0, 1500.0, 0.0, 640.0, 512.0, Radial(-0.4, 0.0), 1280, 1024)
+"""Its rays end 34 degrees from the axis; from 42 degrees on the lens folds back."""
+
+# The first call of a compiled function compiles it.
+patiently = settings(deadline=None, max_examples=40)
+
+
+def pixels_in(table: Table, points: np.ndarray) -> np.ndarray:
+    return np.array([look_up(table, x / z, y / z) for x, y, z in points])
+
+
+@patiently
+@given(cameras, st.integers(0, 2**32 - 1))
+def test_the_table_projects_as_the_camera_does(camera, seed):
+    size = np.array([camera.width, camera.height])
+    pixels = np.random.default_rng(seed).uniform(-0.5, size - 0.5, (60, 2))
+    points = camera.rays(np.concatenate([pixels, pixels_of(camera)])) * 1234.5
+    found = pixels_in(projection_table(camera), points)
+    assert np.abs(found - camera.project(points)).max() < MOST_PX
+
+
+@pytest.mark.parametrize("camera", [SCANNER, WIDE])
+def test_a_scanners_table_is_finer_than_asked(camera):
+    pixels = np.random.default_rng(0).uniform(0.0, [1279.0, 1023.0], (500, 2))
+    found = pixels_in(projection_table(camera), camera.rays(pixels))
+    assert np.abs(found - pixels).max() < 2e-4  # 1e-4 at the places it was fitted to
+
+
+@patiently
+@given(cameras)
+def test_what_lies_beside_the_image_has_no_pixel_in_it(camera):
+    u, v = np.meshgrid([-30.0, 320.0, 670.0], [-30.0, 240.0, 510.0])
+    beside = np.delete(np.stack([u, v], axis=-1).reshape(-1, 2), 4, axis=0)
+    rays = np.concatenate([camera.rays(beside), [[9.0, 0.0, 1.0], [0.0, -1e6, 1.0]]])
+    found = pixels_in(projection_table(camera), rays)
+    inside = (found > -0.5) & (found < np.array([camera.width, camera.height]) - 0.5)
+    assert not inside.all(axis=1).any()
+
+
+def test_where_the_lens_folds_back_nothing_is_seen():
+    ray = np.array([[np.tan(np.radians(60.0)), 0.0, 1.0]])
+    assert 0.0 < WIDE.project(ray)[0, 0] < 1279.0
+    assert np.all(pixels_in(projection_table(WIDE), ray) < -0.5)
+
+
+@patiently
+@given(cameras)
+def test_slopes_are_derivatives_of_the_projection(camera):
+    rays = camera.rays(pixels_of(camera))
+    table = projection_table(camera)
+    found = np.array([slopes(table, x, y) for x, y, _ in rays]).reshape(-1, 2, 2)
+    by_point = camera.jacobians(rays)[1][:, :, :2]
+    # Straight lines for what bends: a normal is turned by as much at most, 0.01 degrees.
+    assert np.abs(found - by_point).max() < 2e-4 * camera.alpha
+
+
+@patiently
+@given(cameras, st.integers(0, 479))
+def test_rays_through_pixels_are_those_of_the_camera(camera, first):
+    wanted = np.random.default_rng(first).random((min(12, 480 - first), 640)) < 0.1
+    rays = rays_through(ray_table(camera), wanted, first)
+    rows, columns = np.nonzero(wanted)
+    pixels = np.stack([columns, rows + first], axis=-1).astype(float)
+    assert np.max(np.abs(camera.project(rays) - pixels), initial=0.0) < MOST_PX
+    assert np.all(rays[:, 2] == 1.0)
+
+
+def test_equal_cameras_share_their_tables():
+    again = Camera(1510.0, 1512.0, -0.5, 645.0, 508.0, Radial(-0.1, 0.05), 1280, 1024)
+    assert projection_table(SCANNER) is projection_table(again)
+    other = SCANNER.moved(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1e-3, 0.0]))
+    assert projection_table(SCANNER) is not projection_table(other)
