@@ -11,17 +11,17 @@ from test_camera_calibration import POINTS, TURNS
 from bodyscan.calibration.camera import PlanarView, calibrate_camera
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput
-from bodyscan.export.rig import write_opencv_rig
+from bodyscan.export.rig_formats.opencv import write_opencv_rig
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import projection_table, ray_table
 from bodyscan.geometry.lenses import LENSES, Radial
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.pixel_rays import rays_through
-from bodyscan.geometry.placing_covariance import PlacingCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.quadratic_table import look_up
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.registration.rig_solve import place_rig
+from bodyscan.registration.rig_solve import solve_rig
 from bodyscan.registration.storage import load_calibration, save_calibration
 
 
@@ -102,7 +102,7 @@ def ring():
 def test_its_pair_is_placed_among_others(ring):
     placings, cameras = ring
     views, _ = ring_views(placings, cameras, shots=20)
-    placed = place_rig(ring_rig(placings), views, cameras)
+    placed = solve_rig(ring_rig(placings), views, cameras).value
     for name, placing in placings.items():
         assert np.linalg.norm(placed.rig_from_camera[name].translation - placing.translation) < 0.7
         assert placed.cameras[name].lens.kind == cameras[name].lens.kind
@@ -116,7 +116,7 @@ def test_its_calibration_is_read_as_it_was_written(ring, tmp_path):
         name: PairCalibration(name, c, np.eye(len(c.parameters)), None, PairQuality(0.1, 9))
         for name, c in cameras.items()
     }
-    covariance = PlacingCovariance(tuple(pairs), np.eye(6 * len(pairs)))
+    covariance = PoseCovariance(tuple(pairs), np.eye(6 * len(pairs)))
     calibration = RigCalibration(ring_rig(placings), pairs, placings, covariance, {}, {}, ())
     found = load_calibration(save_calibration(calibration, tmp_path))
     assert {name: pair.camera for name, pair in found.pairs.items()} == cameras
