@@ -8,9 +8,12 @@ import numpy as np
 
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.least_squares import StackedEquations, minimize_each
+from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import RigidTransform
 
 STEPS = 5
+LEAST_PX = 1e-4  # no corner is seen more finely
 
 
 def triangulate(
@@ -18,23 +21,42 @@ def triangulate(
 ) -> Array:
     """Points (N, 3), rig frame, mm, from pixels (C, N, 2) in C cameras; NaN pixels: not seen.
 
-    Nearest point to all rays, then Gauss-Newton on the reprojection error in px. A point seen by
+    Nearest point to all rays, then least squares on the reprojection error in px. A point seen by
     fewer than two cameras is NaN.
     """
     seen = np.isfinite(pixels[..., 0])
-    points = _nearest_to_rays(cameras, camera_from_rig, pixels, seen)
+    points = np.full((pixels.shape[1], 3), np.nan)
     enough = seen.sum(axis=0) >= 2
-    for _ in range(STEPS):
-        normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-        for camera, transform, seen_at, here in zip(
-            cameras, camera_from_rig, pixels, seen & enough, strict=True
-        ):
-            jacobian, residual = _linearized(camera, transform, points[here], seen_at[here])
-            normal[here] += np.einsum("nij,nik->njk", jacobian, jacobian)
-            right[here] += np.einsum("nij,ni->nj", jacobian, residual)
-        points[enough] -= np.linalg.solve(normal[enough], right[enough][..., None])[..., 0]
-    points[~enough] = np.nan
+    seen, pixels = seen[:, enough], pixels[:, enough]
+    start = _nearest_to_rays(cameras, camera_from_rig, pixels, seen)
+    points[enough] = minimize_each(
+        start,
+        lambda points: _equations(cameras, camera_from_rig, pixels, seen, points),
+        steps=STEPS,
+        damping=0.0,
+        least=LEAST_PX,
+    ).state
     return points
+
+
+def _equations(
+    cameras: Sequence[Camera],
+    camera_from_rig: Sequence[RigidTransform],
+    pixels: Array,
+    seen: Mask,
+    points: Array,
+) -> StackedEquations:
+    """Of points (N, 3), camera by camera: most points are seen by few of them."""
+    normal, gradient = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+    cost = np.zeros(len(points))
+    for camera, transform, seen_at, here in zip(
+        cameras, camera_from_rig, pixels, seen, strict=True
+    ):
+        jacobian, residual = _linearized(camera, transform, points[here], seen_at[here])
+        normal[here] += np.einsum("nij,nik->njk", jacobian, jacobian)
+        gradient[here] += np.einsum("nij,ni->nj", jacobian, residual)
+        cost[here] += np.sum(residual**2, axis=1)
+    return StackedEquations(normal, gradient, cost, np.maximum(2.0 * seen.sum(axis=0) - 3.0, 1.0))
 
 
 def _nearest_to_rays(
@@ -53,9 +75,7 @@ def _nearest_to_rays(
         across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
         normal[here] += across
         right[here] += across @ rig_from_camera.translation
-    few = seen.sum(axis=0) < 2
-    normal[few] = np.eye(3)
-    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], np.float64)
+    return solve_scaled(normal, right)
 
 
 def _linearized(

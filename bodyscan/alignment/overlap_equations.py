@@ -10,6 +10,10 @@ import numpy as np
 from bodyscan.alignment.matching import Matches
 from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
+from bodyscan.geometry.robust import spread
+from bodyscan.geometry.scaled_systems import solve_scaled
+
+LEAST_SPREAD_MM = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,17 +30,17 @@ class OverlapEquations:
         count as one."""
         information, gradient = np.zeros((6, 6)), np.zeros(6)
         distances = matches.distances
-        spread = max(1.4826 * float(np.median(np.abs(distances))), 0.01)
         spots = (matches.points, matches.normals, distances, matches.sigma_mm)
-        _accumulate(*spots, spread, information, gradient)
+        _accumulate(*spots, spread(distances, LEAST_SPREAD_MM), information, gradient)
         return OverlapEquations(information / correlated, gradient / correlated)
 
 
 def solve_motions(
     overlaps: Mapping[tuple[int, int], OverlapEquations], motion: Array, covariance: Array
 ) -> Array:
-    """Motions (P, 6), one Gauss-Newton step: matches pull together, the prior holds near zero."""
-    normal = np.linalg.inv(covariance)
+    """Motions (P, 6): matches pull together, the prior holds near zero. One step, since every round
+    of the alignment matches anew."""
+    normal = np.asarray(np.linalg.inv(covariance), np.float64)
     right = np.zeros(motion.size)
     for (a, b), overlap in overlaps.items():
         i, j = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
@@ -48,7 +52,7 @@ def solve_motions(
         normal[j, i] -= overlap.information
         right[i] += wanted
         right[j] -= wanted
-    return np.linalg.solve(normal, right).reshape(-1, 6)
+    return solve_scaled(normal, right).reshape(-1, 6)
 
 
 @compiled

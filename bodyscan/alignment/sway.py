@@ -13,6 +13,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.settings import BODY_CENTRE_MM
 
@@ -64,7 +65,7 @@ def bound_motions(
     kept, refused = motion.copy(), {}
     for k, name in enumerate(names):
         block = covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
-        sigmas = float(np.sqrt(motion[k] @ np.linalg.solve(block, motion[k]) / 6.0))
+        sigmas = float(np.sqrt(motion[k] @ solve_scaled(block, motion[k]) / 6.0))
         if sigmas > limit_sigmas:
             refused[name] = sigmas
             kept[k] = 0.0

@@ -8,7 +8,7 @@ that may fall off to one side:
 
 with c the corner, n1 and n2 the normals of the two edge lines. Light multiplies: a slope added to the
 squares instead moves all corners of a tilted board alike, by 0.01 px at 70 degrees. All corners of a
-board are fitted at once by Gauss-Newton steps.
+board are fitted at once.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
+
+from bodyscan.geometry.least_squares import StackedEquations, minimize_each
+from bodyscan.geometry.scaled_systems import solve_scaled
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -35,7 +38,7 @@ MIN_CONTRAST = 4.0
 MAX_RESIDUAL = 0.25
 MAX_SIGMA_PX = 0.06
 STEPS = 12
-CONVERGED_PX = 1e-3
+SETTLED = 1e-2  # a tenth of a corner's own sigma, before a last step that makes it far less
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +123,8 @@ def _patches(
 
 
 def _fit(patches: _Patches, start: Array, along: Array) -> tuple[Array, Array, Array]:
-    """Parameters (N, 9), RMS residuals (N,) in grey levels, and the corners' sigmas (N,), px.
+    """Parameters (N, 9), RMS residuals (N,) in grey levels, and sigmas (N,) px of the corners' worse
+    coordinates, from what the fit leaves over.
 
     Parameters: corner (2), the angles of both edges' normals (2), blur, b, a, g (2).
     """
@@ -129,38 +133,23 @@ def _fit(patches: _Patches, start: Array, along: Array) -> tuple[Array, Array, A
         [start, angles, np.full(len(start), BLUR_PX), np.zeros((len(start), 4))]
     )
     state[:, 5:] = _linear(patches, state)
+
+    def within(state: Array) -> Array:
+        state[:, 4] = np.clip(state[:, 4], *BLUR_RANGE_PX)
+        return state
+
+    solution = minimize_each(
+        state,
+        lambda state: StackedEquations.of(*_linearized(patches, state), patches.weight),
+        within=within,
+        steps=STEPS,
+        settled=SETTLED,
+        damping=1e-3,
+    )
     total = np.maximum(patches.weight.sum(axis=1), 1.0)
-    damping = np.full(len(start), 1e-2)
-    residual, jacobian = _linearized(patches, state)
-    cost = np.sum(patches.weight * residual**2, axis=1)
-    for _ in range(STEPS):
-        weighted = np.swapaxes(jacobian * patches.weight[..., None], 1, 2)
-        normal = weighted @ jacobian
-        gradient = (weighted @ residual[..., None])[..., 0]
-        diagonal = np.einsum("nii->ni", normal)
-        damped = normal + (damping[:, None] * diagonal + 1e-9)[:, :, None] * np.eye(9)
-        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
-        trial = state + step
-        trial[:, 4] = np.clip(trial[:, 4], *BLUR_RANGE_PX)
-        new_residual, new_jacobian = _linearized(patches, trial)
-        new_cost = np.sum(patches.weight * new_residual**2, axis=1)
-        better = new_cost < cost
-        state = np.where(better[:, None], trial, state)
-        residual = np.where(better[:, None], new_residual, residual)
-        jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
-        cost = np.where(better, new_cost, cost)
-        damping = np.where(better, damping / 10.0, damping * 10.0)
-        if np.max(np.linalg.norm(step[:, :2], axis=1)) < CONVERGED_PX:
-            break
-    return state, np.sqrt(cost / total), _sigma(patches, jacobian, cost)
-
-
-def _sigma(patches: _Patches, jacobian: Array, cost: Array) -> Array:
-    """Standard deviation (N,) px of the corner's worse coordinate, from what the fit leaves over."""
-    normal = np.swapaxes(jacobian * patches.weight[..., None], 1, 2) @ jacobian
-    left_over = cost / np.maximum(patches.weight.sum(axis=1) - 9.0, 1.0)
-    covariance = np.linalg.pinv(normal, hermitian=True)[:, :2, :2] * left_over[:, None, None]
-    return np.sqrt(np.maximum(np.einsum("nii->ni", covariance).max(axis=1), 0.0))
+    corner = np.einsum("nii->ni", solution.covariance())[:, :2]
+    sigma = np.sqrt(np.maximum(corner.max(axis=1), 0.0))
+    return solution.state, np.sqrt(solution.equations.cost / total), sigma
 
 
 def _linear(patches: _Patches, state: Array) -> Array:
@@ -172,9 +161,7 @@ def _linear(patches: _Patches, state: Array) -> Array:
     )
     weighted = design * patches.weight[..., None]
     normal = np.einsum("npi,npj->nij", weighted, design) + 1e-9 * np.eye(4)
-    return np.linalg.solve(normal, np.einsum("npi,np->ni", weighted, patches.grey)[..., None])[
-        ..., 0
-    ]
+    return solve_scaled(normal, np.einsum("npi,np->ni", weighted, patches.grey))
 
 
 def _edges(patches: _Patches, state: Array) -> tuple[Array, Array, Array, Array]:

@@ -16,13 +16,14 @@ from bodyscan.calibration.zhang import (
 )
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.least_squares import minimize
+from bodyscan.geometry.least_squares import Block, Noise, minimize
 from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 FEWEST_POSES = 3
 CHAPTERS_LENS = Radial()
+CORNERS = Noise("corners", group=2, cauchy=4.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +44,12 @@ class CameraCalibration:
 class _State:
     camera: Camera
     poses: tuple[RigidTransform, ...]
+
+    def moved(self, step: Array) -> _State:
+        size = len(self.camera.parameters)
+        twists = step[size:].reshape(-1, 6)
+        poses = tuple(pose.moved(twist) for pose, twist in zip(self.poses, twists, strict=True))
+        return _State(self.camera.moved(step[:size]), poses)
 
 
 def calibrate_camera(
@@ -65,24 +72,25 @@ def calibrate_camera(
         camera_from_plane(inverse @ h, float(view.points[0, 2]))
         for h, view in zip(homographies, views, strict=True)
     )
-    start = _State(camera, poses)
-    solution = minimize(
-        start,
-        lambda state: _linearize(state, views),
-        lambda state: _residuals(state, views),
-        _retract,
-    )
-    residuals = np.split(
-        solution.residuals.reshape(-1, 2), np.cumsum([len(view.pixels) for view in views])[:-1]
-    )
-    weights = solution.weights[::2]
-    squared = np.sum(solution.residuals.reshape(-1, 2) ** 2, axis=1)
     size = len(camera.parameters)
+    solution = minimize(
+        _State(camera, poses),
+        lambda state: [
+            _corners(state.camera, pose, view, size + 6 * k)
+            for k, (pose, view) in enumerate(zip(state.poses, views, strict=True))
+        ],
+        _State.moved,
+        unknowns=size + 6 * len(views),
+    )
+    residuals = [block.residuals.reshape(-1, 2) for block in solution.blocks]
+    weights = np.concatenate(solution.weights)[::2]
+    squared = np.sum(np.concatenate(residuals) ** 2, axis=1)
+    shots = [view.shot for view in views]
     return CameraCalibration(
         solution.state.camera,
-        solution.covariance[:size, :size],
-        dict(zip((view.shot for view in views), solution.state.poses, strict=True)),
-        dict(zip((view.shot for view in views), residuals, strict=True)),
+        solution.variance * solution.covariance[:size, :size],
+        dict(zip(shots, solution.state.poses, strict=True)),
+        dict(zip(shots, residuals, strict=True)),
         float(np.sqrt(np.sum(weights * squared) / np.sum(weights))),
     )
 
@@ -91,15 +99,14 @@ def locate_board(camera: Camera, view: PlanarView) -> tuple[RigidTransform, Arra
     """`camera_from_board` of one view for a known camera, and its residuals (N, 2) px."""
     normalized = camera.rays(view.pixels)[:, :2]
     h = homography(view.points[:, :2], normalized)
-    start = _State(camera, (camera_from_plane(h, float(view.points[0, 2])),))
     solution = minimize(
-        start,
-        lambda state: _pose_only(state, view),
-        lambda state: _residuals(state, [view]),
-        lambda state, step: _State(camera, (state.poses[0].moved(step),)),
-        iterations=30,
+        camera_from_plane(h, float(view.points[0, 2])),
+        lambda pose: [_corners(camera, pose, view)],
+        RigidTransform.moved,
+        unknowns=6,
+        steps=30,
     )
-    return solution.state.poses[0], solution.residuals.reshape(-1, 2)
+    return solution.state, solution.blocks[0].residuals.reshape(-1, 2)
 
 
 def _camera(matrix: Array, lens: Lens, width: int, height: int) -> Camera:
@@ -115,35 +122,20 @@ def _camera(matrix: Array, lens: Lens, width: int, height: int) -> Camera:
     )
 
 
-def _residuals(state: _State, views: Sequence[PlanarView]) -> Array:
-    parts = [
-        state.camera.project(pose.apply(view.points)) - view.pixels
-        for pose, view in zip(state.poses, views, strict=True)
-    ]
-    return np.concatenate(parts).ravel()
+def _corners(
+    camera: Camera, pose: RigidTransform, view: PlanarView, column: int | None = None
+) -> Block:
+    """One view's reprojection errors, px; by the camera's parameters, which come first, and by its
+    board's pose from `column` on, or by the pose alone.
+    """
+    points = pose.apply(view.points)
 
+    def linearize() -> Array:
+        by_parameter, by_point = camera.jacobians(points)
+        by_pose = by_point @ twist_jacobian(points)
+        every = by_pose if column is None else np.concatenate([by_parameter, by_pose], axis=2)
+        return every.reshape(-1, every.shape[2])
 
-def _linearize(state: _State, views: Sequence[PlanarView]) -> tuple[Array, Array]:
-    count, size = sum(len(view.pixels) for view in views), len(state.camera.parameters)
-    jacobian = np.zeros((count, 2, size + 6 * len(views)))
-    row = 0
-    for k, (pose, view) in enumerate(zip(state.poses, views, strict=True)):
-        points = pose.apply(view.points)
-        rows = slice(row, row + len(points))
-        jacobian[rows, :, :size], by_point = state.camera.jacobians(points)
-        first = size + 6 * k
-        jacobian[rows, :, first : first + 6] = by_point @ twist_jacobian(points)
-        row += len(points)
-    return _residuals(state, views), jacobian.reshape(2 * count, -1)
-
-
-def _pose_only(state: _State, view: PlanarView) -> tuple[Array, Array]:
-    residuals, jacobian = _linearize(state, [view])
-    return residuals, jacobian[:, -6:]
-
-
-def _retract(state: _State, step: Array) -> _State:
-    size = len(state.camera.parameters)
-    twists = step[size:].reshape(-1, 6)
-    poses = tuple(pose.moved(twist) for pose, twist in zip(state.poses, twists, strict=True))
-    return _State(state.camera.moved(step[:size]), poses)
+    own = np.arange(6) + (column or 0)
+    columns = own if column is None else np.append(np.arange(len(camera.parameters)), own)
+    return Block((camera.project(points) - view.pixels).ravel(), linearize, columns, CORNERS)

@@ -15,6 +15,8 @@ from bodyscan.calibration.boundary_points import (
     points_on_board,
 )
 from bodyscan.geometry.light_planes import Axis, LightPlanes
+from bodyscan.geometry.robust import cauchy_weights, spread
+from bodyscan.geometry.scaled_systems import invert_scaled
 
 __all__ = [
     "BoundaryPoints",
@@ -70,9 +72,8 @@ def fit_light_planes(
         leverage = np.abs(np.sum(data.per_pixel * planes[data.index, :3], axis=1))
         spread_mm = np.maximum(leverage, 1e-6) * data.sigma_px
         normalized = distances / spread_mm
-        scale = max(1.4826 * float(np.nanmedian(np.abs(normalized))), 1e-9)
-        robust = 1.0 / (1.0 + (normalized / (CAUCHY_SIGMAS * scale)) ** 2)
-        robust = np.nan_to_num(robust)
+        scale = spread(normalized[np.isfinite(normalized)], 1e-9)
+        robust = np.nan_to_num(cauchy_weights(normalized, 1, CAUCHY_SIGMAS * scale))
     bad = ~enough | (opening < LEAST_OPENING)
     planes = np.where(bad[:, None], np.nan, planes)
     distances = np.where(bad[data.index], np.nan, distances)
@@ -128,7 +129,7 @@ def _covariance(
     basis[:, :3, 0], basis[:, :3, 1] = first, np.cross(normals, first)
     basis[:, 3, 2] = 1.0
     transposed = basis.transpose(0, 2, 1)
-    inverse = basis @ np.linalg.pinv(transposed @ moments[known] @ basis, hermitian=True)
+    inverse = basis @ invert_scaled(transposed @ moments[known] @ basis)
     inverse = inverse @ transposed
     covariance[known] = inverse
     if board_error_mm > 0.0:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bodyscan.calibration.boundary_points import BoundaryPoints, board_errors, select
 from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, spread
 
 Array = NDArray[np.float64]
 
@@ -19,7 +20,7 @@ AS_GOOD = 1.15
 held out differ by as much among themselves."""
 CAP = 30.0
 """No point counts for more than this many times the best model's median."""
-OUTLIER, MAD = 4.0, 1.4826
+OUTLIER = 4.0 * SIGMAS_PER_MEDIAN
 LEAST_SHARE = 0.01
 """Boards are never taken for known so well that less than this share of the squared held-out
 distances is theirs."""
@@ -76,12 +77,12 @@ class HeldOutErrors:
         squared = self.distances[known] ** 2
         if not squared.size:
             return 0.0
-        limit = (OUTLIER * MAD) ** 2 * np.median(squared)
+        limit = OUTLIER**2 * np.median(squared)
         total = np.minimum(squared, limit).mean()
         together = (np.diff(data.index) == 0) & (np.diff(data.board) == 0)
         steps = np.diff(self.distances)[together]
         steps = steps[np.isfinite(steps)]
-        noise = 0.5 * (MAD * np.median(np.abs(steps))) ** 2 if steps.size else 0.0
+        noise = 0.5 * spread(steps) ** 2 if steps.size else 0.0
         left = max(total - noise, LEAST_SHARE * total)
         return float(np.sqrt(left / self.unit_variance[known].mean()))
 
@@ -162,6 +163,6 @@ def _median(distances: Array) -> float:
 
 
 def _rms(distances: Array) -> float:
-    limit = OUTLIER * MAD * _median(distances)
+    limit = OUTLIER * _median(distances)
     kept = distances[distances <= limit]
     return float(np.sqrt(np.mean(kept**2))) if kept.size else np.inf

@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import Axis, LightPlanes
+from bodyscan.geometry.robust import spread
 
 Array = NDArray[np.float64]
 
@@ -60,8 +61,8 @@ def fit_pinhole(points: Array, s: Array) -> PinholeProjector:
     def residuals(flat: Array) -> Array:
         return (scaled @ flat[:4]) / (scaled @ flat[4:]) - t
 
-    spread = 1.4826 * float(np.median(np.abs(residuals(start)))) + 1e-9
-    solved = least_squares(residuals, start, loss="cauchy", f_scale=3.0 * spread).x.reshape(2, 4)
+    scale = 3.0 * spread(residuals(start), 1e-9)
+    solved = least_squares(residuals, start, loss="cauchy", f_scale=scale).x.reshape(2, 4)
     solved[0] = solved[0] * half + middle * solved[1]
     solved[:, :3] /= size
     solved[:, 3] -= solved[:, :3] @ centre

@@ -8,7 +8,7 @@ from bodyscan.arrays import Array
 from bodyscan.errors import FailedWork
 from bodyscan.evaluation.planes import best_plane
 from bodyscan.evaluation.spheres import FEWEST_POINTS, Sphere, fit_sphere
-from bodyscan.geometry.least_squares import spread
+from bodyscan.geometry.robust import spread
 
 VOTE_CELL = 0.2  # radii: size of a cell in which votes for a centre are counted
 TAKEN = 1.15  # radii from a centre within which points are no other sphere's

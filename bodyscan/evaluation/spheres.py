@@ -13,7 +13,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.errors import FailedWork
-from bodyscan.geometry.least_squares import spread
+from bodyscan.geometry.least_squares import Block, Noise, minimize
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +49,8 @@ def mean_square(points: Array, sphere: Sphere) -> float:
 
 
 FEWEST_POINTS = 50
-ROUNDS = 30
-CONVERGED_MM = 1e-7  # a shorter step is the last
-CAUCHY_SIGMAS = 4.0  # scale of the loss
+SETTLED = 1e-8  # a ten-thousandth of the centre's sigma
+SURFACE = Noise("distance from the surface", cauchy=4.0)
 
 
 def fit_sphere(points: Array, radius: float | None = None) -> Sphere:
@@ -64,21 +63,20 @@ def fit_sphere(points: Array, radius: float | None = None) -> Sphere:
     sphere = _fit_algebraically(points)
     if radius is not None:
         sphere = Sphere(sphere.centre, radius)
-    for _ in range(ROUNDS):
-        arm = points - sphere.centre
-        length = np.linalg.norm(arm, axis=1)
-        distance = length - sphere.radius
-        weights = 1.0 / (1.0 + (distance / (CAUCHY_SIGMAS * spread(distance))) ** 2)
-        jacobian = -arm / length[:, None]
-        if radius is None:
-            jacobian = np.column_stack([jacobian, -np.ones(len(points))])
-        weighted = jacobian * weights[:, None]
-        step = -np.linalg.solve(weighted.T @ jacobian, weighted.T @ distance)
-        more = float(step[3]) if radius is None else 0.0
-        sphere = Sphere(sphere.centre + step[:3], sphere.radius + more)
-        if np.linalg.norm(step) < CONVERGED_MM:
-            break
-    return sphere
+    free = 4 if radius is None else 3
+
+    def blocks(sphere: Sphere) -> list[Block]:
+        def jacobian() -> Array:
+            arm = sphere.centre - points
+            arm /= np.linalg.norm(arm, axis=1, keepdims=True)
+            return np.column_stack([arm, -np.ones(len(points))])[:, :free]
+
+        return [Block(sphere.distances(points), jacobian, slice(0, free), SURFACE)]
+
+    def moved(sphere: Sphere, step: Array) -> Sphere:
+        return Sphere(sphere.centre + step[:3], sphere.radius + float(np.sum(step[3:])))
+
+    return minimize(sphere, blocks, moved, unknowns=free, settled=SETTLED).state
 
 
 def measure_sphere(points: Array, radius: float) -> SphereAccuracy:

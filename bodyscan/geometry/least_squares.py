@@ -1,100 +1,330 @@
-"""Robust non-linear least squares: Levenberg-Marquardt with iteratively reweighted groups."""
+"""Non-linear least squares, damped and robust: the one solver under all fits of the package.
+
+`minimize` takes one problem of any kind of unknowns, its residuals in blocks that each touch a few
+columns; `minimize_each` takes many small problems of one kind at once (the corners of a board, points
+to triangulate), their normal equations stacked.
+
+Both stop by one rule. Costs are counted in variances of a residual, so a problem is SETTLED when the
+last step lowered its cost, or the next one can lower it, by less than `settled` variances: no
+combination of unknowns is then farther from the minimum than about the square root of `settled` of
+its own standard deviations.
+
+Source: Madsen, Nielsen, Tingleff, Methods for Non-Linear Least Squares Problems, 2004; the robust
+weights: Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, 3.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from functools import cached_property
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, spread
+from bodyscan.geometry.scaled_systems import gram, invert_scaled, solve_scaled
+
+Columns = Indices | slice
 State = TypeVar("State")
 
-CONVERGED = 1e-9  # relative decrease of the cost
-TINY = 1e-12  # keeps the normal equations regular where a parameter has no influence at all
+TRIES = 10
+"""Damping grows so often before a step is given up; it then stops all motion."""
+FASTER, SLOWER = 10.0, 10.0
+"""A step that lowers the cost divides the damping, one that does not multiplies it."""
+LEAST_DAMPING, FELT = 1e-12, 1e-4
+"""Share of a scaled diagonal: below the first rounding rules; below the second none is felt, so a
+step refused raises it there at once."""
+
+Ending = Literal["settled", "out of steps", "stuck"]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """How residuals of one kind err; blocks of equal `Noise` share one spread.
+
+    group: so many neighbouring residuals (u and v of a corner) share one weight.  cauchy: beyond so
+    many spreads they count less and less (Cauchy loss); None: all count alike.  least: the spread
+    is never taken to be smaller.  known: the spread, where it need not be estimated.
+    """
+
+    kind: str
+    group: int = 1
+    cauchy: float | None = None
+    least: float = 1e-12
+    known: float | None = None
+
+    def spread_of(self, residuals: Array) -> float:
+        return spread(residuals, self.least) if self.known is None else self.known
+
+    def cost(self, residuals: Array) -> float:
+        """Of residuals (N,) over their spread."""
+        if self.cauchy is None:
+            return float(residuals @ residuals)
+        return cauchy_cost(residuals, self.group, self.cauchy)
+
+    def weights(self, residuals: Array) -> Array:
+        """(N,) in [0, 1] of residuals (N,) over their spread."""
+        if self.cauchy is None:
+            return np.ones(len(residuals))
+        return cauchy_weights(residuals, self.group, self.cauchy)
+
+
+EXACT = Noise("in standard deviations", known=1.0)
+"""Of priors, and of all that is given in its own standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Residuals (N,) that depend on the unknowns `columns` (C,) alone.
+
+    linearize: gives the Jacobian (N, C); asked once, and never at a step that is tried and refused.
+    sigma: of each residual (N,), or of all; held while steps from here are tried.
+    A prior is a block too: of what is known, in standard deviations (`EXACT`).
+    """
+
+    residuals: Array
+    linearize: Callable[[], Array]
+    columns: Columns
+    noise: Noise
+    sigma: Array | float = 1.0
+
+    @cached_property
+    def jacobian(self) -> Array:
+        return self.linearize()
+
+
+@dataclass(frozen=True)
+class Report:
+    """steps: taken.  cost_before, cost_after: variances, both by the noise found at the end.
+
+    ending: `settled` (see above), `out of steps`: cut short, or `stuck`: no step lowers the cost
+    although the equations promise one (a wrong Jacobian, a kink).
+    """
+
+    steps: int
+    cost_before: float
+    cost_after: float
+    ending: Ending
+
+    @property
+    def converged(self) -> bool:
+        return self.ending == "settled"
 
 
 @dataclass(frozen=True, eq=False)
 class Solution(Generic[State]):
-    """state: the minimum.  covariance: (P, P) of the parameters, scaled by the residuals' own size.
-
-    residuals: (N,) at the minimum.  weights: (N,) robust weights in [0, 1].
+    """state: the minimum.  blocks: there.  weights: (N,) of each block, robust, in [0, 1].
+    spreads: of each block, in its residuals' sigmas.  unknowns: P.
     """
 
     state: State
-    covariance: Array
-    residuals: Array
-    weights: Array
+    blocks: tuple[Block, ...]
+    weights: tuple[Array, ...]
+    spreads: tuple[float, ...]
+    unknowns: int
+    report: Report
 
+    @cached_property
+    def covariance(self) -> Array:
+        """(P, P) of the unknowns, the residuals' spread taken for their noise."""
+        normal, _ = _equations(self.blocks, self.weights, self.spreads, self.unknowns)
+        return invert_scaled(normal)
 
-def cauchy_weights(residuals: Array, group: int, scale: float) -> Array:
-    """Weights (N,) of the Cauchy loss; `group` neighbouring residuals (u, v) share one weight."""
-    squared = np.sum(residuals.reshape(-1, group) ** 2, axis=1) / scale**2
-    return np.repeat(1.0 / (1.0 + squared), group)
-
-
-def cauchy_cost(residuals: Array, group: int, scale: float) -> float:
-    """Sum of the Cauchy loss over the groups."""
-    squared = np.sum(residuals.reshape(-1, group) ** 2, axis=1) / scale**2
-    return float(np.sum(np.log1p(squared)) * scale**2)
-
-
-def spread(residuals: Array) -> float:
-    """Robust standard deviation, from the median absolute value; never zero."""
-    return float(max(1.4826 * np.median(np.abs(residuals)), 1e-12))
+    @property
+    def variance(self) -> float:
+        """Weighted mean square of what is left over, per degree of freedom, in squared spreads: the
+        factor for a covariance that takes the residuals' own size instead of their spread's."""
+        squares, total = 0.0, 0.0
+        for block, weights, size in zip(self.blocks, self.weights, self.spreads, strict=True):
+            squares += float(weights @ (block.residuals / (block.sigma * size)) ** 2)
+            total += float(np.sum(weights))
+        return squares / max(total - self.unknowns, 1.0)
 
 
 def minimize(
     start: State,
-    linearize: Callable[[State], tuple[Array, Array]],
-    residuals_of: Callable[[State], Array],
-    retract: Callable[[State, Array], State],
+    blocks_at: Callable[[State], Iterable[Block]],
+    moved: Callable[[State, Array], State],
     *,
-    group: int = 2,
-    robust: float = 4.0,
-    iterations: int = 60,
+    unknowns: int,
+    steps: int = 60,
+    settled: float = 1e-6,
+    damping: float = 1e-3,
 ) -> Solution[State]:
-    """Minimise a Cauchy loss whose scale is `robust` times the residuals' own robust spread.
+    """Levenberg-Marquardt; each step's robust weights are those of the residuals before it.
 
-    linearize gives residuals (N,) and their Jacobian (N, P); retract applies a step (P,).
-    Source: Madsen, Nielsen, Tingleff, Methods for Non-Linear Least Squares Problems, 2004.
+    blocks_at: the same blocks in the same order at any state; residuals that are not finite refuse
+    a state.  moved: applies a step (P,).  damping: of the first step, share of a unit diagonal.
     """
-    state, damping = start, 1e-3
-    for _ in range(iterations):
-        residuals, jacobian = linearize(state)
-        scale = robust * spread(residuals)
-        weights = cauchy_weights(residuals, group, scale)
-        normal = jacobian.T @ (jacobian * weights[:, None])
-        gradient = jacobian.T @ (weights * residuals)
-        cost = cauchy_cost(residuals, group, scale)
-        for _ in range(12):
-            damped = normal + damping * np.diag(np.diag(normal) + TINY)
-            step = -np.asarray(np.linalg.solve(damped, gradient), np.float64)
-            candidate = retract(state, step)
-            new_cost = cauchy_cost(residuals_of(candidate), group, scale)
-            if np.isfinite(new_cost) and new_cost < cost:
+    state, blocks = start, tuple(blocks_at(start))
+    first, taken = blocks, 0
+    ending: Ending = "out of steps"
+    weights, spreads = _weigh(blocks)
+    while taken < steps:
+        cost = _cost(blocks, blocks, spreads)
+        normal, gradient = _equations(blocks, weights, spreads, unknowns)
+        promised = 0.0
+        for attempt in range(TRIES):
+            step = -solve_scaled(normal, gradient, damping)
+            promised = promised if attempt else -float(step @ gradient)
+            candidate = moved(state, step)
+            tried = tuple(blocks_at(candidate))
+            gained = cost - _cost(tried, blocks, spreads)
+            if gained > 0.0 or promised < settled:
                 break
-            damping *= 8.0
-        else:
+            damping = max(SLOWER * damping, FELT)
+        if not gained > 0.0:
+            ending = "settled" if promised < settled else "stuck"
             break
-        state, damping = candidate, max(damping / 10.0, 1e-12)
-        if cost - new_cost < CONVERGED * cost:
+        state, blocks, taken = candidate, tried, taken + 1
+        damping = max(damping / FASTER, LEAST_DAMPING)
+        weights, spreads = _weigh(blocks)
+        if gained < settled:
+            ending = "settled"
             break
-    residuals, jacobian = linearize(state)
-    weights = cauchy_weights(residuals, group, robust * spread(residuals))
-    return Solution(state, covariance(jacobian, residuals, weights), residuals, weights)
+    before, after = (_cost(own, blocks, spreads) for own in (first, blocks))
+    report = Report(taken, before, after, ending)
+    return Solution(state, blocks, weights, spreads, unknowns, report)
 
 
-def covariance(jacobian: Array, residuals: Array, weights: Array) -> Array:
-    """(P, P) covariance of the parameters; the noise is taken from the weighted residuals.
+@dataclass(frozen=True, eq=False)
+class StackedEquations:
+    """Normal equations of N small problems: normal (N, P, P) = J^T W J, gradient (N, P) = J^T W r,
+    cost (N,) = r^T W r, freedoms (N,): residuals less unknowns, at least 1."""
 
-    Parameters are scaled to unit diagonal before inverting, since they mix pixels and radians.
+    normal: Array
+    gradient: Array
+    cost: Array
+    freedoms: Array
+
+    @staticmethod
+    def of(residuals: Array, jacobian: Array, weights: Array) -> StackedEquations:
+        """From residuals (N, M), their Jacobian (N, M, P) and weights (N, M)."""
+        weighted = np.swapaxes(jacobian * weights[..., None], 1, 2)
+        return StackedEquations(
+            weighted @ jacobian,
+            (weighted @ residuals[..., None])[..., 0],
+            np.sum(weights * residuals**2, axis=1),
+            np.maximum(np.sum(weights, axis=1) - jacobian.shape[2], 1.0),
+        )
+
+    def where(self, chosen: Mask, others: StackedEquations) -> StackedEquations:
+        """Problems chosen (N,) as they are here, the rest as in `others`."""
+        return StackedEquations(
+            np.where(chosen[:, None, None], self.normal, others.normal),
+            np.where(chosen[:, None], self.gradient, others.gradient),
+            np.where(chosen, self.cost, others.cost),
+            np.where(chosen, self.freedoms, others.freedoms),
+        )
+
+    @property
+    def variance(self) -> Array:
+        """(N,) of a residual, from what is left over."""
+        return np.asarray(self.cost / self.freedoms, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class StackedSolution:
+    """state: (N, P).  equations: there.  converged: (N,) those that settled.  steps: taken."""
+
+    state: Array
+    equations: StackedEquations
+    converged: Mask
+    steps: int
+
+    def covariance(self) -> Array:
+        """(N, P, P), noise taken from what each problem leaves over."""
+        return invert_scaled(self.equations.normal) * self.equations.variance[:, None, None]
+
+
+def minimize_each(
+    start: Array,
+    equations_at: Callable[[Array], StackedEquations],
+    *,
+    within: Callable[[Array], Array] = lambda state: state,
+    steps: int = 12,
+    settled: float = 1e-6,
+    damping: float = 1e-3,
+    least: float = 1e-12,
+) -> StackedSolution:
+    """Levenberg-Marquardt on N problems (N, P) of a few unknowns each, every one damped by itself.
+
+    within: brings a state back to where it may be.  least: a residual's standard deviation is never
+    taken to be smaller, so that residuals of nearly 0 settle too.
     """
-    normal = jacobian.T @ (jacobian * weights[:, None])
-    degrees = max(float(np.sum(weights)) - jacobian.shape[1], 1.0)
-    variance = float(np.sum(weights * residuals**2)) / degrees
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    inverse = np.linalg.pinv(normal / np.outer(size, size), rcond=1e-15, hermitian=True)
-    return variance * inverse / np.outer(size, size)
+    state, at = start, equations_at(start)
+    strength, converged = np.full(len(start), damping), np.zeros(len(start), bool)
+    for taken in range(steps):
+        step = -solve_scaled(at.normal, at.gradient, strength)
+        enough = settled * np.maximum(at.variance, least**2)
+        promised = -np.sum(step * at.gradient, axis=1)
+        trial = within(state + step)
+        tried = equations_at(trial)
+        better = tried.cost < at.cost
+        gained = at.cost - tried.cost
+        # A promise made small by damping alone says nothing.
+        converged |= (better & (gained < enough)) | ((promised < enough) & (strength <= FELT))
+        state = np.where(better[:, None], trial, state)
+        at = tried.where(better, at)
+        eased, raised = np.maximum(strength / FASTER, LEAST_DAMPING), SLOWER * strength
+        strength = np.where(better, eased, np.maximum(raised, FELT))
+        if converged.all():
+            return StackedSolution(state, at, converged, taken + 1)
+    return StackedSolution(state, at, converged, steps)
+
+
+def _weigh(blocks: Sequence[Block]) -> tuple[tuple[Array, ...], tuple[float, ...]]:
+    """Robust weights and spread of each block, one spread for all residuals of a kind."""
+    weights: list[Array] = [np.empty(0)] * len(blocks)
+    spreads = [0.0] * len(blocks)
+    for noise, numbers in _kinds(blocks).items():
+        scaled = _scaled(blocks, blocks, numbers)
+        size = noise.spread_of(scaled)
+        cuts = np.cumsum([len(blocks[k].residuals) for k in numbers])[:-1]
+        own = np.split(noise.weights(scaled / size), cuts)
+        for k, part in zip(numbers, own, strict=True):
+            weights[k], spreads[k] = part, size
+    return tuple(weights), tuple(spreads)
+
+
+def _cost(blocks: Sequence[Block], there: Sequence[Block], spreads: Sequence[float]) -> float:
+    """Of blocks, with sigmas and spreads as they were `there`."""
+    total = 0.0
+    with np.errstate(all="ignore"):
+        for noise, numbers in _kinds(blocks).items():
+            total += noise.cost(_scaled(blocks, there, numbers) / spreads[numbers[0]])
+    return total
+
+
+def _kinds(blocks: Sequence[Block]) -> dict[Noise, list[int]]:
+    kinds: dict[Noise, list[int]] = {}
+    for number, block in enumerate(blocks):
+        kinds.setdefault(block.noise, []).append(number)
+    return kinds
+
+
+def _scaled(blocks: Sequence[Block], there: Sequence[Block], numbers: Sequence[int]) -> Array:
+    return np.concatenate([blocks[k].residuals / there[k].sigma for k in numbers])
+
+
+def _equations(
+    blocks: Sequence[Block], weights: Sequence[Array], spreads: Sequence[float], unknowns: int
+) -> tuple[Array, Array]:
+    """Normal matrix (P, P) and gradient (P,) of half the cost."""
+    normal, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    for block, weight, size in zip(blocks, weights, spreads, strict=True):
+        if not len(block.residuals):
+            continue
+        weighted = block.jacobian * (weight / (block.sigma * size) ** 2)[:, None]
+        square = _square(block.columns)
+        normal[square] += gram(weighted, block.jacobian)
+        gradient[block.columns] += weighted.T @ block.residuals
+    return normal, gradient
+
+
+def _square(columns: Columns) -> tuple[Columns, Columns] | tuple[Indices, ...]:
+    if isinstance(columns, slice):
+        return columns, columns
+    return np.ix_(columns, columns)

@@ -12,6 +12,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.geometry.light_planes import Axis, baseline_angle_tilt
+from bodyscan.geometry.robust import spread
 from bodyscan.report.canvas import round_up
 
 matplotlib.use("Agg")
@@ -98,13 +99,13 @@ def _explicit(curve: PlaneCurve, direction: Axis) -> tuple[Array, Array, Array]:
 
 def _distribution(axis: Axes, residuals_mm: Array) -> None:
     """Of what noise leaves, against a normal curve of the same middle half."""
-    spread = 1.4826 * float(np.median(np.abs(residuals_mm))) + 1e-12
-    edges = np.linspace(-8.0 * spread, 8.0 * spread, 161)
+    sigma_mm = spread(residuals_mm)
+    edges = np.linspace(-8.0 * sigma_mm, 8.0 * sigma_mm, 161)
     density, _ = np.histogram(residuals_mm, edges)
     density = density / (len(residuals_mm) * np.diff(edges))
     axis.stairs(density, edges, fill=True, color=COLOURS[0], alpha=0.6)
-    normal = np.exp(-0.5 * (edges / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
-    axis.plot(edges, normal, color=INK, linewidth=1.0, label=f"normal, sigma {spread:.4f} mm")
+    normal = np.exp(-0.5 * (edges / sigma_mm) ** 2) / (sigma_mm * np.sqrt(2.0 * np.pi))
+    axis.plot(edges, normal, color=INK, linewidth=1.0, label=f"normal, sigma {sigma_mm:.4f} mm")
     axis.set_yscale("log")
     axis.set_ylim(normal.max() * 1e-4, normal.max() * 3.0)
     axis.set_xlabel("distance of a boundary point from its plane, mm")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.geometry.least_squares import cauchy_weights, spread
+from bodyscan.geometry.robust import cauchy_weights, spread
 from bodyscan.geometry.transforms import rigid_fit
 from bodyscan.registration.full_solve import solve_fully
 from bodyscan.registration.inconsistent_views import fit_board

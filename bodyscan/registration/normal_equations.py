@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.least_squares import cauchy_weights, spread
 from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.robust import cauchy_weights, spread
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.view_graph import Target
 

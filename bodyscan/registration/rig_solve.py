@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.least_squares import cauchy_weights, spread
 from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.robust import cauchy_weights, spread
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.registration.board_shape import BoardShape, ShapedSolution, with_board_shapes

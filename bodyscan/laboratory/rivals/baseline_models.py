@@ -14,6 +14,7 @@ import numpy as np
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints
 from bodyscan.geometry.light_planes import Axis, LightPlanes
+from bodyscan.geometry.robust import cauchy_weights, spread
 
 FEWEST_POINTS = 12
 REWEIGHTINGS = 4
@@ -57,8 +58,7 @@ def _fit(
         each, all_ = _solve(own, common, x, weights, data.index, stripes + 1)
         residuals = x - np.sum(own * each[data.index], axis=1) - common @ all_
         scaled = residuals / sigma
-        scale = max(1.4826 * float(np.median(np.abs(scaled))), 1e-12)
-        robust = 1.0 / (1.0 + (scaled / (CAUCHY_SIGMAS * scale)) ** 2)
+        robust = cauchy_weights(scaled, 1, CAUCHY_SIGMAS * spread(scaled))
     seen = np.bincount(data.index, minlength=stripes + 1) >= FEWEST_POINTS
     baseline = each[:, 1] if own_baseline else np.full(stripes + 1, all_[0])
     tilt = all_[-1] if fit_tilt else 0.0

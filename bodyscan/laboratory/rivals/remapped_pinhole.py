@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from bodyscan.arrays import Array
 from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.geometry.light_planes import Axis, LightPlanes
+from bodyscan.geometry.robust import spread
 
 POWERS = (3, 4, 5)
 """The matrix has a scale, a shift and a perspective of the index itself: powers 0 to 2."""
@@ -39,8 +40,8 @@ def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis)
         return np.asarray(above / below - index - powers @ values[8:], np.float64)
 
     flat = np.concatenate([matrix.ravel(), np.zeros(len(POWERS))])
-    spread = 1.4826 * float(np.median(np.abs(residuals(flat)))) + 1e-12
-    solved = least_squares(residuals, flat, loss="cauchy", f_scale=spread, x_scale="jac").x
+    noise = spread(residuals(flat))
+    solved = least_squares(residuals, flat, loss="cauchy", f_scale=noise, x_scale="jac").x
     u = np.arange(stripes + 1.0) / half - 1.0
     remapped = u + _powers(u) @ solved[8:]
     rows = solved[:4] - remapped[:, None] * solved[4:8]

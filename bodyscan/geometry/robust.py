@@ -1,0 +1,31 @@
+"""How far residuals spread where some are wrong, and how little the wrong ones then count."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodyscan.arrays import Array
+
+SIGMAS_PER_MEDIAN = 1.4826
+"""Standard deviation over median absolute value of normally distributed residuals, 1 / 0.6745."""
+
+
+def spread(residuals: Array, least: float = 1e-12) -> float:
+    """Robust standard deviation, from the median absolute value; at least `least`."""
+    return max(SIGMAS_PER_MEDIAN * float(np.median(np.abs(residuals))), least)
+
+
+def cauchy_weights(residuals: Array, group: int, scale: float) -> Array:
+    """Weights (N,) of the Cauchy loss; `group` neighbouring residuals (u, v) share one weight."""
+    weights = 1.0 / (1.0 + _squared(residuals, group) / scale**2)
+    return np.repeat(weights, group) if group > 1 else weights
+
+
+def cauchy_cost(residuals: Array, group: int, scale: float) -> float:
+    """Sum of the Cauchy loss over the groups; of small residuals, the sum of their squares."""
+    return float(np.sum(np.log1p(_squared(residuals, group) / scale**2)) * scale**2)
+
+
+def _squared(residuals: Array, group: int) -> Array:
+    squared = residuals**2
+    return squared.reshape(-1, group).sum(axis=1) if group > 1 else squared
