@@ -34,7 +34,7 @@ check: setup
 # The site, in build/site: a dead link or a reference to what is not there fails it.
 .PHONY: docs
 docs: setup
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench: setup
 	$(BIN)/python -m benchmarks

@@ -21,7 +21,7 @@ from benchmarks.free_triangulation import (
 )
 from benchmarks.rivals import RIVALS, run_rival, without_skew
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.board_views import apart
+from bodyscan.calibration.board_views import greatest_displacement
 from bodyscan.registration.rig_solve import solve_rig
 from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import find_all_boards
@@ -101,7 +101,9 @@ def same_places(rig: Rig, found: Sequence[BoardView]) -> list[tuple[str, ...]]:
     groups: dict[str, list[str]] = {}
     for target in targets:
         first = next(
-            t for t in targets if apart(board[target], board[t], BOARD_REACH_MM) < SAME_PLACE_MM
+            t
+            for t in targets
+            if greatest_displacement(board[target], board[t], BOARD_REACH_MM) < SAME_PLACE_MM
         )
         groups.setdefault(first[0], []).append(target[0])
     return [tuple(group) for group in groups.values()]

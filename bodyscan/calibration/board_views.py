@@ -29,7 +29,7 @@ def planar_view(view: BoardView, board: Board) -> PlanarView:
     return PlanarView(view.shot, corner_points(board)[view.corner_ids], view.pixels)
 
 
-def usable(view: BoardView, board: Board) -> bool:
+def has_enough_corners(view: BoardView, board: Board) -> bool:
     """Enough corners, not all along one line of the board."""
     grid = view.corner_ids % corners_per_face(board)
     columns, rows = grid % (board.columns - 1), grid // (board.columns - 1)
@@ -71,7 +71,7 @@ class LocatedView:
         )
 
 
-def apart(a: RigidTransform, b: RigidTransform, reach_mm: float) -> float:
+def greatest_displacement(a: RigidTransform, b: RigidTransform, reach_mm: float) -> float:
     """How far two transforms differ, mm: translation, plus rotation acting at `reach_mm`."""
     difference = a.inverse() @ b
     return float(np.linalg.norm(difference.translation) + difference.angle * reach_mm)

@@ -11,7 +11,7 @@ import networkx as nx
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.board_views import LocatedView, apart
+from bodyscan.calibration.board_views import LocatedView, greatest_displacement
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
 
@@ -139,10 +139,14 @@ def place_boards(
         for view in group:
             resolved = min(
                 (view.resolved(choice) for choice in view.alternatives),
-                key=lambda r: apart(root_from_camera[r.pair] @ r.camera_from_board, placing, 300.0),
+                key=lambda r: greatest_displacement(
+                    root_from_camera[r.pair] @ r.camera_from_board, placing, 300.0
+                ),
             )
             kept.append(resolved)
-            gap = apart(root_from_camera[view.pair] @ resolved.camera_from_board, placing, 300.0)
+            gap = greatest_displacement(
+                root_from_camera[view.pair] @ resolved.camera_from_board, placing, 300.0
+            )
             if gap > 2.0 * AGREEMENT_MM:
                 doubtful.add(target)
     return kept, boards, doubtful
@@ -159,7 +163,7 @@ def _agreed_placing(
             len(view.pixels)
             for view in group
             if any(
-                apart(
+                greatest_displacement(
                     root_from_camera[view.pair] @ view.resolved(choice).camera_from_board,
                     placing,
                     300.0,
@@ -209,7 +213,7 @@ def _tie(
     rivals = [
         count
         for count, candidate in zip(votes, candidates, strict=True)
-        if apart(candidate, candidates[best], REACH_MM) > 4.0 * AGREEMENT_MM
+        if greatest_displacement(candidate, candidates[best], REACH_MM) > 4.0 * AGREEMENT_MM
     ]
     return RelativePose(
         candidates[best],
@@ -226,7 +230,7 @@ def _size(view: LocatedView) -> int:
 
 
 def _gaps(candidate: RigidTransform, others: Sequence[RigidTransform]) -> Array:
-    """`apart` of one transform and many, (N,) mm."""
+    """`greatest_displacement` of one transform and many, (N,) mm."""
     rotations = np.array([other.rotation for other in others])
     shifts = np.array([other.translation for other in others]) - candidate.translation
     cosines = (np.einsum("ij,nij->n", candidate.rotation, rotations) - 1.0) / 2.0

@@ -7,7 +7,12 @@ from collections.abc import Mapping, Sequence
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.board_views import LocatedView, board_symmetries, planar_view, usable
+from bodyscan.calibration.board_views import (
+    LocatedView,
+    board_symmetries,
+    has_enough_corners,
+    planar_view,
+)
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_lit
@@ -50,7 +55,7 @@ def calibrate_cameras(
 
     def calibrate(name: str) -> CameraCalibration | str:
         spec = rig.pair(name).camera
-        own = [v for v in views if v.pair == name and usable(v, rig.board(v.board))]
+        own = [v for v in views if v.pair == name and has_enough_corners(v, rig.board(v.board))]
         try:
             return calibrate_camera(
                 [planar_view(view, rig.board(view.board)) for view in own], spec.width, spec.height
@@ -74,7 +79,7 @@ def locate_views(
     located, notes = [], []
     for view in views:
         board = rig.board(view.board)
-        if view.pair not in cameras or not usable(view, board):
+        if view.pair not in cameras or not has_enough_corners(view, board):
             continue
         pose, residuals = locate_board(cameras[view.pair].camera, planar_view(view, board))
         rms = float((residuals**2).sum(axis=1).mean() ** 0.5)
