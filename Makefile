@@ -1,7 +1,10 @@
-# make demo   set up, simulate a rig, calibrate it, scan a person, export the mesh
-# make test   set up, run the tests
-# make bench  speed and accuracy at full size, written to docs/results.md
-# make check  format, lint and types
+# make demo         set up, simulate a rig, calibrate it, scan a person, export the mesh
+# make test         set up, run all tests on all cores
+# make test-quick   those that answer within seconds, for the loop of everyday work
+# make coverage     all tests again, with the lines of the package that they run
+# make wheel        build the wheel, install it into an empty environment, scan something small there
+# make check        format, lint, types and the directions of imports
+# make bench        speed and accuracy at full size, written to docs/results.md
 
 PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 	"$$p" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' 2>/dev/null \
@@ -9,8 +12,10 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= demo
+# A file's tests stay in one worker, which makes what they share once; the longest come first.
+PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test check bench setup clean
+.PHONY: demo test test-quick coverage wheel check bench setup clean
 .DELETE_ON_ERROR:
 
 demo: setup
@@ -24,12 +29,22 @@ demo: setup
 	$(BIN)/bodyscan evaluate $(OUT)
 
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL)
+
+test-quick: setup
+	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
+
+coverage: setup
+	$(BIN)/python -m pytest $(PARALLEL) --cov --cov-report=term:skip-covered
+
+wheel: setup
+	sh tests/wheel/try-wheel.sh "$(BIN)/python"
 
 check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 # The site, in build/site: a dead link or a reference to what is not there fails it.
 .PHONY: docs

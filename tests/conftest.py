@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from made_once import value_made_once
 from ray_cast_scan import Scan, cast_scan, load_body, load_rig
+from required import IN_CI, missing
 
 from bodyscan.fusion.cleaning import clean
 from bodyscan.fusion.merging import merge
@@ -20,25 +22,56 @@ from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import FusionSettings, MeshSettings
 
-# What is compiled is compiled at its first call, and machines may be loaded.
-settings.register_profile("bodyscan", deadline=None)
+# What is compiled is compiled at its first call, and machines may be loaded. In CI the same examples
+# are tried every time, so that a change is judged by itself; elsewhere new ones are looked for.
+settings.register_profile("bodyscan", deadline=None, derandomize=IN_CI)
 settings.load_profile("bodyscan")
 
 PROJECT = Path(__file__).parents[1]
 
+# First the files that take longest, those that need the simulated workspace next to those that do
+# not, so that no worker makes the other wait: neither for the workspace nor at the end.
+LONGEST = (
+    "workflows/test_reports.py",
+    "workflows/test_real_captures.py",
+    "workflows/test_light_chosen.py",
+    "workflows/test_codes_calibrated.py",
+    "workflows/test_bad_input.py",
+    "workflows/test_batch.py",
+    "laboratory/test_reproduce.py",
+    "workflows/test_check_calibration.py",
+    "workflows/test_whole_way.py",
+    "jobs/",
+    "fusion/",
+    "boards/",
+    "calibration/",
+    "registration/",
+    "simulation/",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    def place(item: pytest.Item) -> int:
+        path = item.path.relative_to(Path(__file__).parent).as_posix()
+        return next((n for n, start in enumerate(LONGEST) if path.startswith(start)), len(LONGEST))
+
+    items.sort(key=place)
+
 
 @pytest.fixture(scope="session")
 def captures() -> Path:
-    """The folder of real captures; tests that need it say so when it is not there."""
+    """The folder of real captures; without it, tests that need it are skipped, in CI failed."""
     folder = Path(os.environ.get("BODYSCAN_CAPTURES", PROJECT.parent / "shared" / "captures"))
     if not folder.is_dir():
-        pytest.skip(f"real captures not found at {folder} (set BODYSCAN_CAPTURES)")
+        missing(f"real captures not found at {folder} (set BODYSCAN_CAPTURES)")
     return folder
 
 
 @pytest.fixture(scope="session")
-def scan() -> Scan:
-    return cast_scan(load_body(), load_rig(), scale=0.5)
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    return value_made_once(
+        tmp_path_factory, "scan", lambda: cast_scan(load_body(), load_rig(), scale=0.5)
+    )
 
 
 @pytest.fixture(scope="session")

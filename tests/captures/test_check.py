@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from real_captures import real_rig_file
 from small_captures import FRAMES, RIG, encoded, picture, write, write_small_captures
 
 from bodyscan.captures.check import check, report_lines
@@ -175,12 +176,13 @@ def test_checking_decodes_nothing_and_imports_nothing_heavy(rig_path: Path) -> N
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize(("rig", "images"), [("procam-board", 88), ("charuco-ring", 48)])
-def test_real_captures_are_read_where_they_lie(rig: str, images: int) -> None:
-    path = Path(__file__).parents[2] / "rigs" / f"{rig}.yaml"
-    if not (path.parent / "../../shared/captures" / rig).is_dir():
-        pytest.skip("the shared captures are not on this machine")
-    report = check(path)
+@pytest.mark.parametrize(
+    ("rig", "images"), [("procam-board", 4 * (20 + 2)), ("charuco-ring", 4 * 17)]
+)
+def test_real_captures_are_read_where_they_lie(
+    captures: Path, tmp_path: Path, rig: str, images: int
+) -> None:
+    report = check(real_rig_file(rig, captures, tmp_path))
     assert report.ok, report_lines(report)
     assert report.images == images
 

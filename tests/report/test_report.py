@@ -14,6 +14,7 @@ import open3d as o3d
 import pytest
 from browser import browser_page, find_browser
 from made_scan import MIDDLE_MM, SEMI_AXES_MM, MadeScan, egg, make_scan
+from required import missing
 from typer.testing import CliRunner
 
 from bodyscan.cli.main import app
@@ -189,7 +190,7 @@ def test_limits_are_kept_or_not():
 def executable() -> str:
     found = find_browser()
     if found is None:
-        pytest.skip("no chromium here (apt-get install chromium)")
+        missing("no chromium here (apt-get install chromium)")
     return found
 
 

@@ -2,43 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import pytest
-from small_workspace import PROJECT, Workspace, run, small_rig
+from made_once import folder_made_once
+from small_workspace import Workspace, make_workspace
 
 
 @pytest.fixture(scope="session")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    base = tmp_path_factory.mktemp("workspace")
-    folder = base / "small rig"
-    commands = {
-        "simulate": (
-            small_rig(base),
-            "--out",
-            folder,
-            "--scale",
-            0.5,
-            "--board-shots",
-            10,
-            "--subject",
-            PROJECT / "data" / "subjects" / "woman_average.ply",
-        ),
-        "check": (folder / "rig.yaml",),
-        "calibrate-rig": (folder / "rig.yaml",),
-        "scan": (
-            folder / "captures" / "person",
-            "--calibration",
-            folder / "calibration",
-            "--out",
-            folder / "scan",
-            "--points",
-            200_000,
-        ),
-        "export": (folder / "scan", "--out", folder / "export"),
-        "evaluate": (folder,),
-    }
-    outputs = {}
-    for name, arguments in commands.items():
-        result = run(name, *arguments)
-        assert result.exit_code == 0, f"{name}: {result.output}\n{result.exception!r}"
-        outputs[name] = result.output
-    return Workspace(folder, outputs)
+    def make(base: Path) -> None:
+        outputs = make_workspace(base / "small rig")
+        (base / "outputs.json").write_text(json.dumps(outputs), "utf-8")
+
+    base = folder_made_once(tmp_path_factory, "workspace", make)
+    outputs = json.loads((base / "outputs.json").read_text("utf-8"))
+    return Workspace(base / "small rig", outputs)

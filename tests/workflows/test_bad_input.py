@@ -42,7 +42,7 @@ def test_bad_images_cost_only_themselves(copy):
     resized = image(copy, with_pair[2], "p1-2", "lit")
     cv2.imwrite(str(resized), np.full((100, 100), 128, np.uint8))
     black = image(copy, with_pair[3], "p1-2", "lit")
-    cv2.imwrite(str(black), np.zeros((512, 640), np.uint8))
+    cv2.imwrite(str(black), np.zeros_like(cv2.imread(str(black), 0)))
     result = run("calibrate-rig", copy / "rig.yaml")
     assert result.exit_code == 0, result.output
     said = " ".join(result.output.split())
@@ -69,7 +69,7 @@ def test_an_image_without_a_board_is_named(copy):
     path = next(
         image(copy, s, "p1-3", "lit") for s in shots if image(copy, s, "p1-3", "lit").exists()
     )
-    cv2.imwrite(str(path), np.full((512, 640), 90, np.uint8))
+    cv2.imwrite(str(path), np.full_like(cv2.imread(str(path), 0), 90))
     rig = load_rig(copy / "rig.yaml")
     notes = find_all_boards(rig, open_captures(rig, copy / "rig.yaml")).notes
     assert any(str(path) in note and "no board found" in note for note in notes)
@@ -127,7 +127,7 @@ def test_a_scan_with_one_pair_missing_goes_on_and_says_so(workspace, copy):
 def test_a_scan_of_nobody_ends_in_a_verdict(workspace, copy):
     """All images black but for the lit ones' noise: no pair can be read, and the JSON says so."""
     for path in (copy / "captures" / "person").rglob("*.png"):
-        cv2.imwrite(str(path), np.full((512, 640), 12, np.uint8))
+        cv2.imwrite(str(path), np.full_like(cv2.imread(str(path), 0), 12))
     arguments = (copy / "captures" / "person", "--calibration", workspace.folder / "calibration")
     result = run("scan", *arguments, "--out", copy / "scan")
     assert result.exit_code == 1
