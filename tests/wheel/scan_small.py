@@ -1,0 +1,52 @@
+"""Run by try-wheel.sh in an environment that holds the wheel and what it asks for, nothing else."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import yaml
+
+import bodyscan
+
+RIG, SUBJECT = Path("three-pole-12.yaml"), Path("woman_average.ply")
+PAIRS = ("p1-2", "p1-3", "p2-2", "p2-3")
+
+
+def run(*arguments: object) -> None:
+    """The command as a user types it: the entry point that the wheel brings."""
+    print("bodyscan", *arguments, flush=True)
+    subprocess.run([Path(sys.prefix) / "bin" / "bodyscan", *map(str, arguments)], check=True)
+
+
+def small_rig(path: Path) -> Path:
+    """Two poles of three, two pairs each."""
+    rig = yaml.safe_load(RIG.read_text("utf-8"))
+    rig["pairs"] = [pair for pair in rig["pairs"] if pair["name"] in PAIRS]
+    rig["rig_frame"] = {"pair": PAIRS[0]}
+    path.write_text(yaml.safe_dump(rig, sort_keys=False), "utf-8")
+    return path
+
+
+def main() -> None:
+    installed = Path(bodyscan.__file__).resolve()
+    if not installed.is_relative_to(Path(sys.prefix).resolve()):
+        sys.exit(f"this is no wheel: bodyscan comes from {installed}")
+    size = ("--scale", 0.25, "--board-shots", 6)
+    run("simulate", small_rig(Path("rig.yaml")), "--out", "work", *size, "--subject", SUBJECT)
+    run("calibrate-rig", "work/rig.yaml")
+    scan = ("--calibration", "work/calibration", "--out", "work/scan", "--points", 20_000)
+    run("scan", "work/captures/person", *scan)
+    run("export", "work/scan", "--out", "work/export")
+    for result in ("calibration", "scan"):
+        page = Path(f"{result}.html")
+        run("report", f"work/{result}", "--out", page)
+        text = page.read_text("utf-8")
+        if "Verdict" not in text or "<style>" not in text or "<script" not in text:
+            sys.exit(f"the report of the {result} lacks its verdict, its style or its viewer")
+    print(f"the wheel works: {installed.parent}")
+
+
+if __name__ == "__main__":
+    main()
