@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from bodyscan.arrays import Array
@@ -52,6 +53,8 @@ def stripes_in_volume(
     limits = np.full((3, *near.shape), np.nan)
     for limit, z in zip(limits, (near, far, standing), strict=True):
         _reach(inverse, depth, 1.0 / z, limit)
+    near_by, far_by = _bulges(rays, rig_from_camera, volume, (near, far), limits)
+    limits += np.stack([-near_by, far_by, np.zeros_like(far)])
     limits += np.array([-MARGIN_STRIPES, MARGIN_STRIPES, 0.0])[:, None, None]
     unknown = np.array([-ANYTHING, ANYTHING, ANYTHING])[:, None, None]
     limits = np.where(np.isnan(limits), unknown, limits).astype(np.float32)
@@ -83,6 +86,39 @@ def volume_interval(
     leave = np.minimum(nearest + half, np.maximum(floor, ceiling))
     # Behind the camera, a ray leaves before it enters.
     return enter.clip(NEAREST_MM, FARTHEST_MM), leave.clip(NEAREST_MM / 2.0, FARTHEST_MM)
+
+
+def _bulges(
+    rays: Array,
+    rig_from_camera: RigidTransform,
+    volume: Volume,
+    ends: tuple[Array, Array],
+    limits: Array,
+) -> tuple[Array, Array]:
+    """By how many stripes near and far (rows, columns) at blocks' corners have to give way so that
+    what is linear between them cuts nothing off.
+
+    ends: depths at which the rays enter and leave.  They do so by the volume's wall or its bottom;
+    where one gives way to the other inside of a block, the limits bend. The margin covers that, but
+    not before a camera so low that it looks along the bottom. A block's middle, where inverse depth
+    is nearly linear in s, tells at least half of it.
+    """
+    near, far = ends
+    stripes = np.where(near < far, limits[1] - limits[0], 0.0)
+    per_inverse = np.nan_to_num(stripes / np.where(near < far, 1.0 / near - 1.0 / far, np.inf))
+    middle = volume_interval(_block_means(rays), rig_from_camera, volume, raised_mm=0.0)
+    bent = 1.0 / middle[0] - _block_means(1.0 / near), _block_means(1.0 / far) - 1.0 / middle[1]
+    around = np.ones((3, 3), np.uint8)
+    most = cv2.dilate(per_inverse, around)
+    grown = (2.0 * most * cv2.dilate(np.pad(one, 1), around[:2, :2])[1:, 1:] for one in bent)
+    near_by, far_by = (np.where(by > MARGIN_STRIPES, by, 0.0) for by in grown)
+    return near_by, far_by
+
+
+def _block_means(corners: Array) -> Array:
+    """(rows - 1, columns - 1, ...): of each block's four corners."""
+    rows = corners[1:] + corners[:-1]
+    return 0.25 * (rows[:, 1:] + rows[:, :-1])
 
 
 def _corner_rays(camera: Camera, block_px: int) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from test_triangulation import CAMERA, STRIPES, pair, planes, stripe_map
 
@@ -63,6 +63,8 @@ def some_s(seed: int, rising: bool) -> np.ndarray:
     st.booleans(),
     st.integers(0, 99),
 )
+@example(788.0, 0.0, -0.125, True, 0)  # a camera at the height of the volume's bottom
+@example(789.3, -2.444, -0.1453, True, 12)  # and one a little below it
 def test_all_that_lies_in_the_volume_is_wanted(distance_mm, turn, tilt, rising, seed):
     one, at = calibrated(rising), looking_at_the_middle(distance_mm, turn, tilt)
     wanted = stripes_in_volume(one, at, VOLUME)
