@@ -29,9 +29,10 @@ settings.load_profile("bodyscan")
 
 PROJECT = Path(__file__).parents[1]
 
-# First the files that take longest, those that need the simulated workspace next to those that do
-# not, so that no worker makes the other wait: neither for the workspace nor at the end.
-LONGEST = (
+# Files whose tests take seconds each, the longest first: `make test-quick` leaves them out. Whole runs
+# begin with them, and those that need the simulated workspace stand next to those that do not, so
+# that no worker makes another wait: neither for the workspace nor at the end.
+SLOW = (
     "workflows/test_reports.py",
     "workflows/test_real_captures.py",
     "workflows/test_light_chosen.py",
@@ -41,20 +42,36 @@ LONGEST = (
     "laboratory/test_reproduce.py",
     "workflows/test_check_calibration.py",
     "workflows/test_whole_way.py",
-    "jobs/",
-    "fusion/",
-    "boards/",
-    "calibration/",
-    "registration/",
-    "simulation/",
+    "jobs/test_resuming.py",
+    "jobs/test_cluster.py",
+    "jobs/test_isolation.py",
+    "jobs/test_full_disk.py",
+    "fusion/test_scan_verdict.py",
+    "fusion/test_merging.py",
+    "fusion/test_meshing.py",
+    "fusion/test_brightness.py",
+    "fusion/test_smoothing.py",
+    "fusion/test_support.py",
+    "mesh/test_versions.py",
+    "boards/test_detection.py",
+    "calibration/test_joint_refinement.py",
+    "calibration/test_light.py",
+    "registration/test_faults.py",
+    "registration/test_advice.py",
+    "registration/test_halves.py",
+    "stripes/test_code_sequences.py",
+    "simulation/test_simulated_captures.py",
 )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     def place(item: pytest.Item) -> int:
         path = item.path.relative_to(Path(__file__).parent).as_posix()
-        return next((n for n, start in enumerate(LONGEST) if path.startswith(start)), len(LONGEST))
+        return SLOW.index(path) if path in SLOW else len(SLOW)
 
+    for item in items:
+        if place(item) < len(SLOW):
+            item.add_marker(pytest.mark.slow)
     items.sort(key=place)
 
 

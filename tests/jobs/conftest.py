@@ -1,4 +1,4 @@
-"""A folder of cheap scans."""
+"""A folder of cheap scans, and one with what a batch made of them."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from cheap_batch import run_cheap, write_scans
 
 
 @pytest.fixture
 def make_scans(tmp_path: Path) -> Callable[..., Path]:
     """Writes scans; each keyword is a scan's name and what its stage is to do."""
+    return lambda **todo: write_scans(tmp_path / "scans", **todo)
 
-    def make(**todo: str) -> Path:
-        for name, what in todo.items():
-            folder = tmp_path / "scans" / name
-            folder.mkdir(parents=True)
-            (folder / "do.txt").write_text(what)
-            (folder / "image.txt").write_text(f"image of {name}")
-        return tmp_path / "scans"
 
-    return make
+@pytest.fixture(scope="session")
+def batched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Anna's and Bert's scans, and in `out` what a batch made of them: to be copied, not changed."""
+    day = tmp_path_factory.mktemp("batched")
+    scans = write_scans(day / "scans", anna="nothing", bert="nothing")
+    assert run_cheap(scans, day / "out").code == 0
+    return day

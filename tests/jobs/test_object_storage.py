@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import cheap_job
 import pytest
-from cheap_batch import results, run_cheap
+from cheap_batch import results
 from typer.testing import CliRunner
 
 from bodyscan.cli.main import app
@@ -30,15 +33,14 @@ STORE = Store("memory://day/scans", "memory://day/out", "memory://day/calibratio
 
 
 @pytest.fixture
-def memory(make_scans, tmp_path):
-    """Two scans in the store, and what a batch over the same scans in folders makes of them."""
+def memory(batched: Path) -> Iterator[Any]:
+    """The file system of a store that holds two scans."""
     system = fsspec.filesystem("memory")
     system.store.clear()
-    scans = make_scans(anna="nothing", bert="nothing")
+    scans = batched / "scans"
     for path in scans.glob("*/*"):
         system.pipe_file(f"/day/scans/{path.relative_to(scans)}", path.read_bytes())
     system.pipe_file("/day/calibration/calibration.json", b"{}")
-    assert run_cheap(scans, tmp_path / "in folders").code == 0
     yield system
     system.store.clear()
 
@@ -57,11 +59,11 @@ def batch(tmp_path, name):
     return {outcome.job: outcome for outcome in outcomes}
 
 
-def test_the_same_bytes_as_in_folders_and_nothing_twice(memory, tmp_path):
+def test_the_same_bytes_as_in_folders_and_nothing_twice(memory, batched, tmp_path):
     first = batch(tmp_path, "first")
     assert {outcome.state for outcome in first.values()} == {"done"}, first
     memory.get("/day/out", str(tmp_path / "fetched"), recursive=True)
-    assert results(tmp_path / "fetched") == results(tmp_path / "in folders")
+    assert results(tmp_path / "fetched") == results(batched / "out")
     assert (tmp_path / "fetched" / "summary.csv").exists()
     again = batch(tmp_path, "again")
     assert all(outcome.stages == () for outcome in again.values())

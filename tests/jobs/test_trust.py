@@ -5,10 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from pathlib import Path
 
 import cheap_job
 import pytest
-from cheap_batch import jobs_of, run_cheap
+from cheap_batch import jobs_of, run_cheap, write_scans
 
 from bodyscan.errors import BadInput
 from bodyscan.files.hashing import files_below
@@ -17,19 +18,26 @@ from bodyscan.jobs.forgetting import find_subject, forget_subject
 from bodyscan.jobs.verification import verify
 
 
-@pytest.fixture
-def day(make_scans, tmp_path):
-    """A workspace: scans of two subjects, what a batch made of them, and an export elsewhere."""
-    scans = make_scans(m1="nothing", m2="nothing", e1="nothing", bad="raise")
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    day = tmp_path_factory.mktemp("made")
+    todo = dict.fromkeys(("m1", "m2", "e1"), "nothing")
+    scans = write_scans(day / "scans", **todo, bad="raise")
     for name, subject in {"m1": "mallow", "m2": "mallow", "e1": "elder", "bad": "mallow"}.items():
         text = f"kind: scan\nsubject: {subject}\n"
         (scans / name / "captures.yaml").write_text(text)
-    assert run_cheap(scans, tmp_path / "out").code == 1
+    assert run_cheap(scans, day / "out").code == 1
     for subject in ("mallow", "elder"):
-        (tmp_path / f"{subject}.obj").write_text("o")
+        (day / f"{subject}.obj").write_text("o")
         side = {"file": f"{subject}.obj", "subject": subject}
-        (tmp_path / f"{subject}.obj.json").write_text(json.dumps(side))
-    return tmp_path
+        (day / f"{subject}.obj.json").write_text(json.dumps(side))
+    return day
+
+
+@pytest.fixture
+def day(made: Path, tmp_path: Path) -> Path:
+    """A workspace: scans of two subjects, what a batch made of them, and an export elsewhere."""
+    return shutil.copytree(made, tmp_path, dirs_exist_ok=True)
 
 
 def test_any_byte_that_changed_is_found(day):

@@ -31,6 +31,16 @@ class Done:
         return {event["job"]: event for event in ends}
 
 
+def write_scans(folder: Path, **todo: str) -> Path:
+    """Scans in `folder`, which is returned: by a scan's name, what its stage is to do."""
+    for name, what in todo.items():
+        scan = folder / name
+        scan.mkdir(parents=True)
+        (scan / "do.txt").write_text(what)
+        (scan / "image.txt").write_text(f"image of {name}")
+    return folder
+
+
 def batch_command(scans: Path, out: Path, workers: int = 2) -> list[str]:
     return [sys.executable, cheap_job.__file__, "batch", str(scans), str(out), str(workers)]
 
