@@ -92,7 +92,11 @@ class Camera:
         by_parameter[:, 0, 0], by_parameter[:, 1, 1] = real[:, 0], real[:, 1]
         by_parameter[:, 0, 2] = real[:, 1]
         by_parameter[:, 0, 3] = by_parameter[:, 1, 4] = 1.0
-        by_parameter[:, :, len(MATRIX) :] = a @ self.lens.by_coefficients(ideal)
+        by_coefficient = self.lens.by_coefficients(ideal)
+        by_parameter[:, 0, len(MATRIX) :] = (
+            self.alpha * by_coefficient[:, 0] + self.gamma * by_coefficient[:, 1]
+        )
+        by_parameter[:, 1, len(MATRIX) :] = self.beta * by_coefficient[:, 1]
         perspective = np.zeros((len(points), 2, 3))
         perspective[:, 0, 0] = perspective[:, 1, 1] = 1.0 / z
         perspective[:, :, 2] = -ideal / z[:, None]
