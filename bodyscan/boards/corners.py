@@ -16,14 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erf
 
+from bodyscan.arrays import Array, Bytes, Indices, Mask
 from bodyscan.geometry.least_squares import StackedEquations, minimize_each
 from bodyscan.geometry.scaled_systems import solve_scaled
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MAX_MOVE_PX = 1.5
 MAX_RADIUS_PX = 9.0
@@ -48,7 +45,7 @@ class SightedCorners:
     ids: (N,) int64.  pixels: (N, 2) px.  printed_count: how many corners the face has.
     """
 
-    ids: NDArray[np.int64]
+    ids: Indices
     pixels: Array
     printed_count: int
 
@@ -63,7 +60,7 @@ class _Patches:
 
 
 def refine_corners(
-    image: NDArray[np.uint8],
+    image: Bytes,
     start: Array,
     along: Array,
     bright_diagonal: Mask,
@@ -94,7 +91,7 @@ def refine_corners(
 
 
 def _patches(
-    image: NDArray[np.uint8],
+    image: Bytes,
     start: Array,
     along: Array,
     bright_diagonal: Mask,

@@ -13,8 +13,8 @@ from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import BoundaryPoints, points_on_board
 from bodyscan.geometry.camera import Camera
@@ -22,7 +22,6 @@ from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
-Array = NDArray[np.float64]
 Sheets = TypeVar("Sheets", bound=SmoothSheets)
 
 STEPS = 20

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
     board_errors,
@@ -27,7 +27,6 @@ __all__ = [
     "points_on_board",
 ]
 
-Array = NDArray[np.float64]
 
 FEWEST_POINTS = 12
 LEAST_OPENING = 1e-4
@@ -85,7 +84,7 @@ def fit_light_planes(
     return PlaneFit(LightPlanes(planes, covariance, direction), distances, rms)
 
 
-def _boards_seen(data: BoundaryPoints, count: int, fewest: int) -> NDArray[np.int64]:
+def _boards_seen(data: BoundaryPoints, count: int, fewest: int) -> Indices:
     boards = int(data.board.max()) + 1 if len(data.board) else 1
     points = np.bincount(data.index * boards + data.board, minlength=count * boards)
     return np.sum(points.reshape(count, boards) >= fewest, axis=1)

@@ -6,13 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.calibration.boundary_points import BoundaryPoints, board_errors, select
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, spread
-
-Array = NDArray[np.float64]
 
 MOST_FOLDS = 6
 AS_GOOD = 1.15
@@ -87,7 +85,7 @@ class HeldOutErrors:
         return float(np.sqrt(left / self.unit_variance[known].mean()))
 
 
-def folds(data: BoundaryPoints) -> NDArray[np.int64]:
+def folds(data: BoundaryPoints) -> Indices:
     """(N,) number of the group in which each point is held out: its board, or one of MOST_FOLDS
     groups of boards; with only two boards, a half of one."""
     boards, number = np.unique(data.board, return_inverse=True)
@@ -97,7 +95,7 @@ def folds(data: BoundaryPoints) -> NDArray[np.int64]:
     return 2 * number + half
 
 
-def hold_out(candidate: Candidate, data: BoundaryPoints, fold: NDArray[np.int64]) -> HeldOutErrors:
+def hold_out(candidate: Candidate, data: BoundaryPoints, fold: Indices) -> HeldOutErrors:
     """Fit without each fold in turn, and measure what was left out."""
     distances, variance = np.full((2, len(fold)), np.nan)
     errors = board_errors(data)
@@ -115,7 +113,7 @@ def hold_out(candidate: Candidate, data: BoundaryPoints, fold: NDArray[np.int64]
 
 
 def select_model(
-    candidates: Sequence[Candidate], tried: Sequence[HeldOutErrors], board: NDArray[np.int64]
+    candidates: Sequence[Candidate], tried: Sequence[HeldOutErrors], board: Indices
 ) -> tuple[int, tuple[HeldOutModel, ...]]:
     """The number of the model to use, and the figures of all that measured anything.
 
@@ -152,7 +150,7 @@ def select_model(
     return chosen, figures
 
 
-def _mean_of_boards(values: Array, board: NDArray[np.int64], known: NDArray[np.bool_]) -> float:
+def _mean_of_boards(values: Array, board: Indices, known: Mask) -> float:
     """Every board counts the same, however many points it has."""
     count, total = np.bincount(board[known]), np.bincount(board[known], values[known])
     return float(np.mean(total[count > 0] / count[count > 0])) if known.any() else np.inf

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import Axis, LightPlanes
 from bodyscan.geometry.robust import spread
-
-Array = NDArray[np.float64]
 
 MOST_POINTS = 20000
 

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.boundary_points import BoundaryPoints, board_errors
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
 from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
 
-Array = NDArray[np.float64]
 Sheets = TypeVar("Sheets", bound=SmoothSheets)
 
 MOST_STEPS = 25
