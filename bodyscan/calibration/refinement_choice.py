@@ -17,6 +17,7 @@ from bodyscan.calibration.joint_refinement import (
 from bodyscan.calibration.sheet_fit import fit_sheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 FEWEST_BOARDS = 3
@@ -91,6 +92,4 @@ def _flatness(camera: Camera, sheets: LightSheets, board: StripedBoard) -> float
 def _drift(calibration: CameraCalibration, camera: Camera) -> float:
     """Squared distance of the refined intrinsics in the covariance that the corners gave them."""
     change = camera.parameters - calibration.camera.parameters
-    size = np.sqrt(np.diag(calibration.covariance))
-    correlation = calibration.covariance / np.outer(size, size)
-    return float((change / size) @ np.linalg.solve(correlation, change / size))
+    return float(change @ solve_scaled(calibration.covariance, change))

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.geometry.robust import cauchy_weights, spread
+from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import rigid_fit
 from bodyscan.registration.full_solve import solve_fully
 from bodyscan.registration.inconsistent_views import fit_board
 from bodyscan.registration.joint_solve import JointSolution
+from bodyscan.registration.normal_equations import CORNERS
 
 Array = NDArray[np.float64]
 
@@ -157,7 +158,7 @@ def _corner_steps(
     for name, shape in shapes.items():
         matrix = information[name] + held * np.eye(3)
         right = pull[name] + held * shape.offsets
-        steps[name] = -np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0], np.float64)
+        steps[name] = -solve_scaled(matrix, right)
     return steps
 
 
@@ -194,7 +195,7 @@ def _corner_equations(
         _, by_point = camera.jacobians(points)
         parts.append((by_point @ camera_from_board.rotation, camera.project(points) - view.pixels))
     residuals = np.concatenate([r.ravel() for _, r in parts])
-    weights = cauchy_weights(residuals, 2, 4.0 * spread(residuals))
+    weights = CORNERS.weights(residuals / CORNERS.spread_of(residuals))
     variance = float(np.sum(weights * residuals**2) / np.sum(weights))
     information = {name: np.zeros((len(s.points), 3, 3)) for name, s in shapes.items()}
     pull = {name: np.zeros((len(s.points), 3)) for name, s in shapes.items()}

@@ -7,14 +7,16 @@ after the other is let go, the one first that explains most, until all that is l
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.least_squares import EXACT, Block, minimize
 from bodyscan.geometry.pose_covariance import PoseCovariance, point_covariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
 from bodyscan.registration.view_graph import Target
@@ -26,7 +28,8 @@ SIGNIFICANT = 45.0
 """Chi-squared of six freedoms exceeded once in twenty million: nothing moves by chance."""
 LEAST_MM, LEAST_DEG = 0.1, 0.005
 """Smaller moves, however surely seen, harm no scan."""
-ROUNDS = 4
+MOST_STEPS = 10
+SETTLED = 1e-3  # of chi-squared, beside SIGNIFICANT
 CORRELATED = 3.0
 """Corners of one view share what lens and detector do to them: so many count as one."""
 
@@ -40,6 +43,10 @@ class SeenPose:
     target: Target
     camera_from_board: RigidTransform
     covariance: Array
+
+    @cached_property
+    def whitener(self) -> Array:
+        return _whitener(self.covariance)
 
 
 def seen_pose(view: LocatedView, camera: Camera, sigma_px: float) -> SeenPose:
@@ -150,11 +157,32 @@ class _Fit:
 
 
 @dataclass(frozen=True, eq=False)
+class _Placings:
+    """Unknowns: small twists (P, 6) of the pairs, motions of the groups, the boards."""
+
+    small: Array
+    motions: list[RigidTransform]
+    boards: dict[Target, RigidTransform]
+
+    def moved(self, step: Array) -> _Placings:
+        twists, count = step.reshape(-1, 6), len(self.small)
+        of_groups, of_boards = np.split(twists[count:], [len(self.motions)])
+        boards = zip(self.boards.items(), of_boards, strict=True)
+        return _Placings(
+            self.small + twists[:count],
+            [motion.moved(twist) for motion, twist in zip(self.motions, of_groups, strict=True)],
+            {target: board.moved(twist) for (target, board), twist in boards},
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class _State:
+    """prior_root: (6P, 6P), its square is the information on the pairs' twists."""
+
     poses: tuple[SeenPose, ...]
     pairs: tuple[str, ...]
     rig_from_camera: Mapping[str, RigidTransform]
-    prior: Array
+    prior_root: Array
     start_boards: dict[Target, RigidTransform]
 
     @staticmethod
@@ -174,64 +202,50 @@ class _State:
             target: _agreed([p for p in poses if p.target == target], rig_from_camera)
             for target in sorted({pose.target for pose in poses})
         }
-        return _State(tuple(poses), pairs, rig_from_camera, np.linalg.inv(covariance), boards)
+        return _State(tuple(poses), pairs, rig_from_camera, _whitener(covariance), boards)
 
     def solved(self, groups: Sequence[Group]) -> _Fit:
         """Small motions of all pairs as far as the calibration allows, of the groups without limit,
-        and of the boards; Gauss-Newton on twists in the rig frame."""
+        and of the boards, as twists in the rig frame."""
         first_group = 6 * len(self.pairs)
         first_board = first_group + 6 * len(groups)
-        boards = dict(self.start_boards)
-        motions = [RigidTransform.identity()] * len(groups)
-        small = np.zeros((len(self.pairs), 6))
-        for _ in range(ROUNDS):
-            normal, right, cost = self._equations(groups, small, motions, boards)
-            step = np.linalg.lstsq(normal, right, rcond=1e-14)[0].reshape(-1, 6)
-            small = small + step[: len(self.pairs)]
-            of_groups = step[len(self.pairs) : len(self.pairs) + len(groups)]
-            of_boards = step[len(self.pairs) + len(groups) :]
-            motions = [m.moved(twist) for m, twist in zip(motions, of_groups, strict=True)]
-            boards = {
-                target: board.moved(twist)
-                for (target, board), twist in zip(boards.items(), of_boards, strict=True)
-            }
-        own = slice(first_group, first_board)
-        covariance = np.linalg.pinv(normal, hermitian=True)[own, own]
-        return _Fit(cost, motions, np.asarray(covariance, np.float64), boards)
+        start = _Placings(
+            np.zeros((len(self.pairs), 6)),
+            [RigidTransform.identity()] * len(groups),
+            self.start_boards,
+        )
+        solution = minimize(
+            start,
+            lambda placings: self._blocks(groups, placings),
+            _Placings.moved,
+            unknowns=first_board + 6 * len(start.boards),
+            steps=MOST_STEPS,
+            settled=SETTLED,
+            damping=1e-9,
+        )
+        own, found = slice(first_group, first_board), solution.state
+        return _Fit(
+            solution.report.cost_after, found.motions, solution.covariance[own, own], found.boards
+        )
 
-    def _equations(
-        self,
-        groups: Sequence[Group],
-        small: Array,
-        motions: Sequence[RigidTransform],
-        boards: Mapping[Target, RigidTransform],
-    ) -> tuple[Array, Array, float]:
-        """Normal matrix, right side, and chi-squared before the step. Unknown twists: of the pairs,
-        of the groups, of the boards."""
-        pairs, targets = list(self.pairs), list(boards)
+    def _blocks(self, groups: Sequence[Group], placings: _Placings) -> Iterator[Block]:
+        """Of each view how far it puts its board from where it is; first what is known of pairs."""
+        pairs, targets = list(self.pairs), list(placings.boards)
         of_group = {name: g for g, (_, own) in enumerate(groups) for name in own}
-        size = 6 * (len(pairs) + len(groups) + len(targets))
-        held = small.ravel()
-        normal, right = np.zeros((size, size)), np.zeros(size)
-        normal[: held.size, : held.size] = self.prior
-        right[: held.size] = -self.prior @ held
-        cost = float(held @ self.prior @ held)
+        held = placings.small.ravel()
+        yield Block(self.prior_root @ held, lambda: self.prior_root, slice(0, held.size), EXACT)
         for pose in self.poses:
             pair, group = pairs.index(pose.pair), of_group.get(pose.pair)
-            camera = self.rig_from_camera[pose.pair].moved(small[pair])
-            unknowns = [(pair, 1.0)]
+            camera = self.rig_from_camera[pose.pair].moved(placings.small[pair])
+            board = len(pairs) + len(groups) + targets.index(pose.target)
+            touched = [pair, board]
             if group is not None:
-                camera = motions[group] @ camera
-                unknowns.append((len(pairs) + group, 1.0))
-            unknowns.append((len(pairs) + len(groups) + targets.index(pose.target), -1.0))
-            twist, weight = _gap(pose, camera, boards[pose.target])
-            cost += float(twist @ weight @ twist)
-            for row, sign in unknowns:
-                right[6 * row : 6 * row + 6] -= sign * weight @ twist
-                for column, other in unknowns:
-                    block = np.s_[6 * row : 6 * row + 6, 6 * column : 6 * column + 6]
-                    normal[block] += sign * other * weight
-        return normal, right, cost
+                camera = placings.motions[group] @ camera
+                touched.append(len(pairs) + group)
+            residuals, root = _gap(pose, camera, placings.boards[pose.target])
+            signs = np.array([1.0, -1.0, 1.0])[: len(touched)]
+            columns = (6 * np.array(touched)[:, None] + np.arange(6)).ravel()
+            yield Block(residuals, partial(_side_by_side, signs, root), columns, EXACT)
 
     def move(self, group: Group, fit: _Fit, number: int) -> Move:
         name, pairs = group
@@ -254,11 +268,23 @@ class _State:
 def _gap(
     pose: SeenPose, rig_from_camera: RigidTransform, rig_from_board: RigidTransform
 ) -> tuple[Array, Array]:
-    """How far (twist in the rig frame) a view puts its board from where it is, and the weight."""
+    """How far (twist in the rig frame) a view puts its board from where it is, (6,) in standard
+    deviations, and the matrix (6, 6) that brings twists to those."""
     gap = rig_from_camera @ pose.camera_from_board @ rig_from_board.inverse()
-    carry = adjoint(rig_from_camera)
-    weight = np.linalg.inv(carry @ pose.covariance @ carry.T)
-    return gap.twist, np.asarray(weight, np.float64)
+    root = pose.whitener @ adjoint(rig_from_camera.inverse())
+    return root @ gap.twist, root
+
+
+def _side_by_side(signs: Array, root: Array) -> Array:
+    """The matrix (6, 6) once for each sign, (6, 6 S)."""
+    return np.concatenate([sign * root for sign in signs], axis=1)
+
+
+def _whitener(covariance: Array) -> Array:
+    """The matrix that brings what has this covariance to independent standard deviations."""
+    if not len(covariance):
+        return covariance
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
 
 
 def _agreed(
@@ -269,6 +295,6 @@ def _agreed(
     def off(board: RigidTransform) -> float:
         """Median distance of all views from a pose, in sigmas squared."""
         gaps = (_gap(pose, rig_from_camera[pose.pair], board) for pose in poses)
-        return float(np.median([twist @ weight @ twist for twist, weight in gaps]))
+        return float(np.median([sigmas @ sigmas for sigmas, _ in gaps]))
 
     return min((rig_from_camera[pose.pair] @ pose.camera_from_board for pose in poses), key=off)

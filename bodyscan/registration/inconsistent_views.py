@@ -15,6 +15,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.least_squares import Block, Noise, minimize
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_graph import Target
@@ -25,7 +26,8 @@ OTHER_SIZE = 0.005
 """A board whose squares seem to differ by this share is another board."""
 SAME_SIZE_SHOTS = 3
 STEPS = 15
-CONVERGED = 1e-3
+SETTLED = 1e-2  # variances: far less than tells a wrong view from a right one
+CORNERS = Noise("corners", group=2, least=0.1 * LEAST_BAD_PX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,33 +175,37 @@ def _descend(
     placing: RigidTransform,
     free_size: bool,
 ) -> BoardFit:
-    size, unknowns = 1.0, 7 if free_size else 6
-    rms = np.full(len(views), np.inf)
-    for _ in range(STEPS):
-        normal, gradient, errors = np.zeros((7, 7)), np.zeros(7), []
-        for view in views:
-            camera = solution.cameras[view.pair]
-            camera_from_root = solution.root_from_camera[view.pair].inverse()
-            in_root = placing.apply(size * view.points)
-            in_camera = camera_from_root.apply(in_root)
-            _, by_point = camera.jacobians(in_camera)
-            by_root = by_point @ camera_from_root.rotation
-            by_size = by_root @ placing.rotate(view.points)[..., None]
-            jacobian = np.concatenate([by_root @ twist_jacobian(in_root), by_size], axis=2)
-            residuals = camera.project(in_camera) - view.pixels
-            errors.append(_rms(residuals))
-            flat = jacobian.reshape(-1, 7)
-            normal += flat.T @ flat
-            gradient += flat.T @ residuals.ravel()
-        rms = np.array(errors)
-        scale = 1.0 / np.sqrt(np.diag(normal)[:unknowns])
-        reduced = normal[:unknowns, :unknowns] * np.outer(scale, scale) + 1e-9 * np.eye(unknowns)
-        step = -scale * np.linalg.solve(reduced, scale * gradient[:unknowns])
-        placing = placing.moved(step[:6])
-        size += float(step[6]) if free_size else 0.0
-        if np.linalg.norm(step / scale) < CONVERGED * max(float(np.linalg.norm(rms)), LEAST_BAD_PX):
-            break
-    return BoardFit(rms, size)
+    unknowns = 7 if free_size else 6
+    fitted = minimize(
+        (placing, 1.0),
+        lambda state: [_corners(view, solution, state, unknowns) for view in views],
+        lambda state, step: (state[0].moved(step[:6]), state[1] + float(np.sum(step[6:]))),
+        unknowns=unknowns,
+        steps=STEPS,
+        settled=SETTLED,
+        damping=1e-9,
+    )
+    rms = [_rms(block.residuals.reshape(-1, 2)) for block in fitted.blocks]
+    return BoardFit(np.array(rms), fitted.state[1])
+
+
+def _corners(
+    view: LocatedView, solution: JointSolution, state: tuple[RigidTransform, float], unknowns: int
+) -> Block:
+    """Reprojection errors, px, by the board's motion and its size."""
+    (placing, size), camera = state, solution.cameras[view.pair]
+    camera_from_root = solution.root_from_camera[view.pair].inverse()
+    in_root = placing.apply(size * view.points)
+    in_camera = camera_from_root.apply(in_root)
+
+    def linearize() -> Array:
+        by_root = camera.jacobians(in_camera)[1] @ camera_from_root.rotation
+        by_size = by_root @ placing.rotate(view.points)[..., None]
+        jacobian = np.concatenate([by_root @ twist_jacobian(in_root), by_size], axis=2)
+        return jacobian.reshape(-1, 7)[:, :unknowns]
+
+    residuals = (camera.project(in_camera) - view.pixels).ravel()
+    return Block(residuals, linearize, slice(0, unknowns), CORNERS)
 
 
 def _error(view: LocatedView, solution: JointSolution) -> float:

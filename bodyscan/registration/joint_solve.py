@@ -1,4 +1,8 @@
-"""The rig in one solve (pycolmap): cameras are sensors of one rig, shots are frames, corners known."""
+"""The rig in one solve (pycolmap): cameras are sensors of one rig, shots are frames, corners known.
+
+Ceres, behind pycolmap, does what it is best at: thousands of corners, a start that may be centimetres
+off, sparse. It knows neither skew nor pixels that are not square, so `full_solve` follows it.
+"""
 
 from __future__ import annotations
 

@@ -13,12 +13,12 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.visibility import in_image
 from bodyscan.registration.normal_equations import (
     NormalEquations,
     normal_equations,
-    scaled_inverse,
 )
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Volume
@@ -129,7 +129,7 @@ class RigInformation:
         information = information[np.ix_(self._free, self._free)]
         self._scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
         scaled = information * np.outer(self._scale, self._scale)
-        self._inverse = scaled_inverse(scaled)
+        self._inverse = invert_scaled(scaled)
 
     def information(self, place: BoardPlace) -> Array:
         """What one shot there says, the mean of its tilts; scaled, free unknowns only."""

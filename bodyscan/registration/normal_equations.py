@@ -6,7 +6,7 @@ solve itself, with what COLMAP's cameras lack (skew, pixels that are not square)
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.least_squares import Noise
 from bodyscan.geometry.pose_covariance import PoseCovariance
-from bodyscan.geometry.robust import cauchy_weights, spread
+from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.view_graph import Target
 
 Array = NDArray[np.float64]
 Columns = NDArray[np.int64]
 
-ROBUST_SPREADS = 4.0
-TINY = 1e-12  # keeps a step finite where an unknown has no influence
+CORNERS = Noise("corners", group=2, cauchy=4.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,21 +65,11 @@ class NormalEquations:
     def free(self) -> Columns:
         return np.setdiff1d(np.arange(len(self.matrix)), self.held)
 
-    def step(self) -> Array:
-        """The Gauss-Newton step of all unknowns; 0 for those held."""
-        free = self.free
-        matrix = self.matrix[np.ix_(free, free)]
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-        reduced = matrix * np.outer(scale, scale) + TINY * np.eye(len(free))
-        step = np.zeros(len(self.matrix))
-        step[free] = -scale * np.linalg.solve(reduced, scale * self.gradient[free])
-        return step
-
     def covariance(self) -> PoseCovariance:
         """Of the pairs' motions, the corners' variance taken from the residuals."""
         free = self.free
         full = np.zeros(self.matrix.shape)
-        full[np.ix_(free, free)] = self.variance_px2 * scaled_inverse(
+        full[np.ix_(free, free)] = self.variance_px2 * invert_scaled(
             self.matrix[np.ix_(free, free)]
         )
         pairs = slice(0, self.first_board)
@@ -96,16 +86,8 @@ class NormalEquations:
         rest = np.setdiff1d(np.arange(size), boards)
         boards = np.setdiff1d(boards, self.held)
         cross = self.matrix[np.ix_(rest, boards)]
-        inverse = scaled_inverse(self.matrix[np.ix_(boards, boards)])
+        inverse = invert_scaled(self.matrix[np.ix_(boards, boards)])
         return self.matrix[np.ix_(rest, rest)] - cross @ inverse @ cross.T
-
-
-def scaled_inverse(matrix: Array) -> Array:
-    """Pseudo-inverse of a symmetric matrix whose unknowns have units of very different size."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    reduced = matrix * np.outer(scale, scale)
-    inverse = np.linalg.pinv(reduced, rcond=1e-14, hermitian=True)
-    return np.asarray(inverse * np.outer(scale, scale))
 
 
 def normal_equations(
@@ -133,13 +115,16 @@ def normal_equations(
     camera_columns = _runs(first_camera, parameters)
     size = first_camera + sum(parameters)
     normal, gradient = np.zeros((size, size)), np.zeros(size)
-    parts = [_view_jacobian(view, cameras, rig_from_camera, rig_from_board) for view in views]
-    residuals = np.concatenate([residual for _, residual in parts])
-    weights = cauchy_weights(residuals, 2, ROBUST_SPREADS * spread(residuals))
+    parts = [
+        corners_seen(view, cameras, rig_from_camera, rig_from_board, cameras_free=cameras_free)
+        for view in views
+    ]
+    residuals = np.concatenate([residual for residual, _ in parts])
+    weights = CORNERS.weights(residuals / CORNERS.spread_of(residuals))
     number_of = {name: number for number, name in enumerate(names)}
     board_of = {target: number for number, target in enumerate(targets)}
-    cuts = np.cumsum([len(residual) for _, residual in parts])[:-1]
-    for view, (jacobian, residual), weight in zip(
+    cuts = np.cumsum([len(residual) for residual, _ in parts])[:-1]
+    for view, (residual, linearize), weight in zip(
         views, parts, np.split(weights, cuts), strict=True
     ):
         number = number_of[view.pair]
@@ -150,9 +135,9 @@ def normal_equations(
                 camera_columns[number],
             ]
         )
-        block = jacobian[:, : len(columns)]
-        weighted = block * weight[:, None]
-        normal[np.ix_(columns, columns)] += block.T @ weighted
+        jacobian = linearize()
+        weighted = jacobian * weight[:, None]
+        normal[np.ix_(columns, columns)] += jacobian.T @ weighted
         gradient[columns] += weighted.T @ residual
     held = _held(names, targets, first_board, fixed_pair, fixed_target)
     degrees = max(float(np.sum(weights)) - (size - len(held)), 1.0)
@@ -183,19 +168,26 @@ def _held(
     return np.arange(start, start + 6)
 
 
-def _view_jacobian(
+def corners_seen(
     view: LocatedView,
     cameras: Mapping[str, Camera],
     rig_from_camera: Mapping[str, RigidTransform],
     rig_from_board: Mapping[Target, RigidTransform],
-) -> tuple[Array, Array]:
-    """d(pixels) (2N, 12 + P) by camera motion, board motion, camera; residuals (2N,)."""
+    *,
+    cameras_free: bool,
+) -> tuple[Array, Callable[[], Array]]:
+    """Reprojection errors (2N,) px, and what gives their Jacobian (2N, 12 + P): by the camera's
+    motion, the board's motion, and the camera's parameters if free."""
     camera = cameras[view.pair]
     in_rig = rig_from_board[view.target].apply(view.points)
     camera_from_rig = rig_from_camera[view.pair].inverse()
     points = camera_from_rig.apply(in_rig)
-    by_parameter, by_point = camera.jacobians(points)
-    by_motion = by_point @ camera_from_rig.rotation @ twist_jacobian(in_rig)
-    jacobian = np.concatenate([-by_motion, by_motion, by_parameter], axis=2)
-    residuals = camera.project(points) - view.pixels
-    return jacobian.reshape(-1, jacobian.shape[2]), residuals.ravel()
+
+    def linearize() -> Array:
+        by_parameter, by_point = camera.jacobians(points)
+        by_motion = by_point @ camera_from_rig.rotation @ twist_jacobian(in_rig)
+        parts = [-by_motion, by_motion, *([by_parameter] if cameras_free else [])]
+        jacobian = np.concatenate(parts, axis=2)
+        return jacobian.reshape(-1, jacobian.shape[2])
+
+    return (camera.project(points) - view.pixels).ravel(), linearize

@@ -1,4 +1,9 @@
-"""From board views of many pairs to one placed rig: graph, joint solve, bad views out, rig frame."""
+"""From board views of many pairs to one placed rig: graph, joint solve, bad views out, rig frame.
+
+Two solvers follow each other: pycolmap's bundle adjustment (`joint_solve`) brings everything together
+from the graph's rough start; our own least squares (`full_solve`) ends it with every parameter of our
+cameras, and is what is repeated when views are taken out or boards turn out bent.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +18,6 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.pose_covariance import PoseCovariance
-from bodyscan.geometry.robust import cauchy_weights, spread
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.registration.board_shape import BoardShape, ShapedSolution, with_board_shapes
@@ -24,7 +28,7 @@ from bodyscan.registration.inconsistent_views import (
     single_view_errors,
 )
 from bodyscan.registration.joint_solve import JointSolution, solve_jointly
-from bodyscan.registration.normal_equations import normal_equations
+from bodyscan.registration.normal_equations import CORNERS, normal_equations
 from bodyscan.registration.rig_frame import frame_board_turn, frame_target, rig_from_root
 from bodyscan.registration.view_graph import (
     Target,
@@ -38,7 +42,6 @@ from bodyscan.rig.rig import Rig
 LOSS_PX = 0.3
 COARSE_PX = 30.0
 """What a view may be off where only the graph has placed the pairs."""
-ROBUST_SIGMAS = 4.0
 ROUNDS = 3
 
 Array = NDArray[np.float64]
@@ -224,5 +227,5 @@ def _robust_rms(parts: Sequence[Array]) -> float:
     if not parts:
         return float("nan")
     residuals = np.concatenate(parts).ravel()
-    weights = cauchy_weights(residuals, 2, ROBUST_SIGMAS * spread(residuals))
+    weights = CORNERS.weights(residuals / CORNERS.spread_of(residuals))
     return float(np.sqrt(2.0 * np.sum(weights * residuals**2) / np.sum(weights)))

@@ -5,8 +5,9 @@ from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.pose_covariance import position_sigma
+from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.registration.advice import advise, crucial_shots
-from bodyscan.registration.normal_equations import normal_equations, scaled_inverse
+from bodyscan.registration.normal_equations import normal_equations
 from bodyscan.registration.rig_solve import solve_rig
 
 NOISE_PX = 0.03
@@ -113,7 +114,7 @@ def test_eliminating_boards_keeps_the_covariance(ring, by_board):
     held = equations.held[equations.held < equations.first_board]
     information = equations.without_boards()
     free = np.setdiff1d(np.arange(len(information)), held)
-    inverse = equations.variance_px2 * scaled_inverse(information[np.ix_(free, free)])
+    inverse = equations.variance_px2 * invert_scaled(information[np.ix_(free, free)])
     moving = free[free < equations.first_board]
     expected = equations.covariance().matrix[np.ix_(moving, moving)]
     scale = np.sqrt(np.diag(expected))
