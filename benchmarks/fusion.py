@@ -326,7 +326,7 @@ def _open3d_poisson(depth: int) -> Callable[[Path, Path], Step]:
         from bodyscan.fusion.meshing import poisson
 
         points, normals = _kept(folder / "open3d")
-        return lambda: poisson(points, normals, depth), lambda mesh: _near(workspace, *mesh, points)
+        return lambda: poisson(points, normals, depth), lambda mesh: _near(workspace, points, *mesh)
 
     return step
 
@@ -343,7 +343,7 @@ def _pymeshlab(workspace: Path, folder: Path) -> Step:
         made = meshes.current_mesh()
         return made.vertex_matrix(), made.face_matrix()
 
-    return work, lambda mesh: _near(workspace, *mesh, points)
+    return work, lambda mesh: _near(workspace, points, *mesh)
 
 
 _STEPS: dict[str, Callable[[Path, Path], Step]] = {
@@ -372,7 +372,7 @@ def _spacing(cloud: BodyCloud) -> float:
     return voxel_size_for(cloud.points.astype(np.float32), len(cloud.points))
 
 
-def _near(workspace: Path, vertices: Any, faces: Any, points: Any) -> Figures:
+def _near(workspace: Path, points: Any, vertices: Any, faces: Any) -> Figures:
     from scipy.spatial import cKDTree
 
     near = cKDTree(points).query(vertices, distance_upper_bound=MEASURED_MM)[0] < np.inf

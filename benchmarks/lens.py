@@ -113,7 +113,9 @@ def pair_rows(workspace: Path, calibration_folder: Path) -> list[str]:
         pair, facts = calibration.pairs[sequence.pair], truth.facts["pairs"][sequence.pair]
         stripes = decode_sequence(sequence, calibration.rig.pair(sequence.pair))
         v, u = np.nonzero(np.isfinite(stripes.s))
-        found = _measured(pair, facts, np.column_stack([u, v]).astype(float), stripes.s[v, u])
+        found = _measured(
+            pair, facts, np.column_stack([u, v]).astype(float), stripes.s[v, u].astype(float)
+        )
         body_from_camera = RigidTransform.from_matrix(facts["rig_from_camera"])
         found = found.on_body(body, body_from_camera)
         few = boards_reached(rig, truth.facts, sequence.pair, shots, found.s) <= FEW_BOARDS
@@ -156,7 +158,6 @@ class _Measured:
 
 def _measured(pair: PairCalibration, facts: dict[str, Any], pixels: Array, s: Array) -> _Measured:
     assert pair.sheets is not None
-    s = s.astype(float)
     rays = pair.camera.rays(pixels)
     ours = rays * pair.sheets.depth(rays, s)[:, None]
     true_rays = TrueCamera(**facts["camera"]).directions(pixels)

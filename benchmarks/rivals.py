@@ -17,7 +17,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 

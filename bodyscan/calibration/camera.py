@@ -17,8 +17,8 @@ from bodyscan.calibration.zhang import (
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import Block, Noise, minimize
-from bodyscan.geometry.lenses import Radial
 from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 FEWEST_POSES = 3

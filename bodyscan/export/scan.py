@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from bodyscan.settings import ExportSettings
 
 FRAMES = ("rig", "body")
 
-VERSIONS = {
+VERSIONS: dict[str, tuple[str, Callable[[BodyMesh], BodyMesh]]] = {
     "full": ("body", lambda mesh: mesh),
     "light": ("body-light", decimate),
     "open": ("body-open", BodyMesh.measured_part),

@@ -31,7 +31,7 @@ _KINDS = {"str": yaml.ScalarNode, "seq": yaml.SequenceNode, "map": yaml.MappingN
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-class _PlainLoader(_Loader):
+class _PlainLoader(_Loader):  # type: ignore[misc]  # the stubs know no CSafeLoader
     """Resolves nothing by itself: what a plain scalar means is decided in `_scalar`."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 (PyYAML's own name and type)

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.compiled import compiled
-from bodyscan.fusion.comparing import Evidence, Samples
+from bodyscan.fusion.comparing import Evidence
 from bodyscan.fusion.quadratics import NORMAL_MEDIAN
 from bodyscan.fusion.smoothing import SmoothSurface
+from bodyscan.fusion.thinning import Samples
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.progress import THREADS
 

@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from bodyscan.geometry.camera import MATRIX, Camera
-from bodyscan.geometry.lenses import LENSES, Radial
+from bodyscan.geometry.lenses import LENSES
+from bodyscan.geometry.lenses.radial import Radial
 
 SIZE = ("width", "height")
 

@@ -7,6 +7,8 @@ from itertools import combinations
 import cv2
 import matplotlib
 import numpy as np
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 
 from bodyscan.arrays import Array
@@ -16,7 +18,7 @@ from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
 from bodyscan.report.canvas import round_down
-from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, plt, style, svg
+from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, style, svg
 
 COLUMNS = 4
 CELLS = (10, 8)
@@ -216,7 +218,7 @@ def _residual_map(seen: SeenCorners, camera: Camera) -> tuple[Array, Array, Arra
     )
 
 
-def _picture_frame(axis: plt.Axes, camera: Camera) -> None:
+def _picture_frame(axis: Axes, camera: Camera) -> None:
     axis.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5), aspect="equal")
     axis.set_xticks([])
     axis.set_yticks([])

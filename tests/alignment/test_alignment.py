@@ -11,7 +11,7 @@ from bodyscan.alignment.object_refinement import refine_on_object
 from bodyscan.alignment.overlap_equations import OverlapEquations
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage

@@ -9,7 +9,7 @@ from bodyscan.calibration.camera import (
 from bodyscan.calibration.zhang import homography, matrix_from_homographies
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 
 # Table 1 of the chapter, and its 48 calibration points at 20 mm.

@@ -9,7 +9,7 @@ from bodyscan.calibration.camera import calibrate_camera
 from bodyscan.calibration.joint_refinement import refine_jointly, striped_board
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 
 CAMERA = Camera(
     1061.71, 1064.09, -0.562002, 350.08, 286.547, Radial(-0.140279, -0.0916363), 640, 480

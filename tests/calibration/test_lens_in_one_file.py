@@ -14,8 +14,9 @@ from bodyscan.errors import BadInput
 from bodyscan.export.rig_formats.opencv import write_opencv_rig
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import projection_table, ray_table
-from bodyscan.geometry.lenses import LENSES, Radial
+from bodyscan.geometry.lenses import LENSES
 from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.pixel_rays import rays_through
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.quadratic_table import look_up

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from bodyscan.calibration.boundary_points import boundary_points, concatenate
 from bodyscan.calibration.light_planes import fit_light_planes
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
 from bodyscan.geometry.transforms import RigidTransform
 

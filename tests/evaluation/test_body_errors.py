@@ -10,7 +10,7 @@ from made_bodies import mesh_of
 from bodyscan.evaluation.body import coverage_of_seen, girth_errors, sway_residual
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_fields import to_fields
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import vertex_normals

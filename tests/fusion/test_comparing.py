@@ -10,7 +10,7 @@ from bodyscan.fusion.comparing import Evidence, compare
 from bodyscan.fusion.smoothing import SmoothSurface, smooth
 from bodyscan.fusion.thinning import Samples, take_samples
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 
 cameras = st.builds(
     Camera,

@@ -6,7 +6,7 @@ from test_lenses import cameras, pixels_of
 
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import projection_table, ray_table
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.pixel_rays import rays_through
 from bodyscan.geometry.quadratic_table import Table, look_up, slopes
 

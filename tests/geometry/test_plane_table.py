@@ -7,7 +7,7 @@ import pytest
 from test_light_sheets import MIDDLE, STRIPES, models
 
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.plane_table import PlaneTable
 from bodyscan.geometry.ray_depths import MOST_SIGMA, intersect_rays, triangulate_image
 

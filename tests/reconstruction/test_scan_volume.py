@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from test_triangulation import CAMERA, STRIPES, pair, planes, stripe_map
 
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.ray_depths import triangulate_image
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.scan_volume import (

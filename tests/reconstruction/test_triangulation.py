@@ -4,7 +4,7 @@ import pytest
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.reconstruction.triangulation import grid_normals, reconstruct_range_image
 from bodyscan.stripes.stripe_map import StripeMap

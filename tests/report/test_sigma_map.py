@@ -4,7 +4,7 @@ import pytest
 from ring import ring_of_cameras
 
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.visibility import in_image
 from bodyscan.report.sigma_map import draw_sigma_map, sigma_at

@@ -8,7 +8,7 @@ from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import LocatedView, PlanarView, board_symmetries
 from bodyscan.calibration.camera import locate_board
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig

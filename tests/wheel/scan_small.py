@@ -14,10 +14,12 @@ RIG, SUBJECT = Path("three-pole-12.yaml"), Path("woman_average.ply")
 PAIRS = ("p1-2", "p1-3", "p2-2", "p2-3")
 
 
-def run(*arguments: object) -> None:
+def run(*arguments: object, or_code: int = 0) -> None:
     """The command as a user types it: the entry point that the wheel brings."""
     print("bodyscan", *arguments, flush=True)
-    subprocess.run([Path(sys.prefix) / "bin" / "bodyscan", *map(str, arguments)], check=True)
+    command = [Path(sys.prefix) / "bin" / "bodyscan", *map(str, arguments)]
+    if (code := subprocess.run(command, check=False).returncode) not in (0, or_code):
+        sys.exit(f"bodyscan {arguments[0]} ended with {code}")
 
 
 def small_rig(path: Path) -> Path:
@@ -37,7 +39,8 @@ def main() -> None:
     run("simulate", small_rig(Path("rig.yaml")), "--out", "work", *size, "--subject", SUBJECT)
     run("calibrate-rig", "work/rig.yaml")
     scan = ("--calibration", "work/calibration", "--out", "work/scan", "--points", 20_000)
-    run("scan", "work/captures/person", *scan)
+    # So few pixels on two poles are half a body, which the verdict may find too little: code 1.
+    run("scan", "work/captures/person", *scan, or_code=1)
     run("export", "work/scan", "--out", "work/export")
     for result in ("calibration", "scan"):
         page = Path(f"{result}.html")

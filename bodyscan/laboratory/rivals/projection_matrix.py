@@ -7,7 +7,7 @@ from scipy.linalg import rq
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import Radial
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 
 
