@@ -27,14 +27,14 @@ def atomic_replacement(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(6)}.tmp{path.suffix}")
     try:
         yield temporary
-        _flush(temporary, os.O_RDWR)
+        flush(temporary, os.O_RDWR)
         os.replace(temporary, path)
     except BaseException:
         with suppress(FileNotFoundError):
             temporary.unlink()
         raise
     if os.name == "posix":  # the rename itself must survive a power cut too
-        _flush(path.parent, os.O_RDONLY)
+        flush(path.parent)
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -80,7 +80,8 @@ def write_npz(path: Path, /, **arrays: Any) -> None:
                 np.lib.format.write_array(stream, np.asanyarray(arrays[name]), allow_pickle=False)
 
 
-def _flush(path: Path, flags: int) -> None:
+def flush(path: Path, flags: int = os.O_RDONLY) -> None:
+    """A file, or the names in a folder, to the disk itself."""
     handle = os.open(path, flags)
     try:
         os.fsync(handle)

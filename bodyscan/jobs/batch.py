@@ -92,19 +92,8 @@ def run_locally(
     def run(jobs: Sequence[Job]) -> Iterator[JobResult]:
         pool = ThreadPoolExecutor(shares.workers)
         try:
-            futures = [
-                pool.submit(
-                    work,
-                    job,
-                    JobProcess(
-                        shares.threads,
-                        60.0 * job.pipeline.resources.limit_minutes,
-                        tuple(command),
-                    ),
-                    listen,
-                )
-                for job in jobs
-            ]
+            process = JobProcess(shares.threads, tuple(command))
+            futures = [pool.submit(work, job, process, listen) for job in jobs]
             for future in as_completed(futures):
                 yield future.result()
         finally:

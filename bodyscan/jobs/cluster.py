@@ -50,17 +50,10 @@ def run_on_cluster(
                 where=address,
                 remedy="start one with `dask scheduler`, and `dask worker ADDRESS` on each machine",
             ) from error
+        process = JobProcess(threads, tuple(command))
         with client:
             futures = {
-                client.submit(
-                    run_on_worker,
-                    work,
-                    job,
-                    JobProcess(
-                        threads, 60.0 * job.pipeline.resources.limit_minutes, tuple(command)
-                    ),
-                    pure=False,
-                ): job.name
+                client.submit(run_on_worker, work, job, process, pure=False): job.name
                 for job in jobs
             }
             for future in futures:

@@ -8,6 +8,7 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from bodyscan.errors import BadInput, ResultError
 from bodyscan.files.atomic import write_json
@@ -98,6 +99,15 @@ def read_job(folder: Path) -> Job:
             where=str(folder / JOB),
             remedy="start the batch again: it rewrites this file",
         ) from error
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The JSON object in a file; empty if there is none that can be read."""
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _there(folder: Path, relative: str) -> Path:

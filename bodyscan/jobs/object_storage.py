@@ -152,9 +152,6 @@ class _Files:
         names = [PurePosixPath(e["name"]).name for e in listed if e["type"] == "directory"]
         return sorted(names)
 
-    def has(self, name: str) -> bool:
-        return bool(self._system.exists(f"{self._root}/{name}"))
-
     def fetch(self, folder: Path) -> None:
         """Every file, to its place below `folder`."""
         folder.mkdir(parents=True, exist_ok=True)
@@ -172,7 +169,7 @@ class _Files:
         self._system.put_file(str(path), f"{self._root}/{name}")
 
     def remove(self, name: str) -> None:
-        if self.has(name):
+        if self._system.exists(f"{self._root}/{name}"):
             self._system.rm(f"{self._root}/{name}", recursive=True)
 
     def _names(self) -> list[str]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from bodyscan.errors import BodyscanError
 from bodyscan.files.hashing import file_hashes, files_below
-from bodyscan.jobs.job import STAGE, STATE, Job
+from bodyscan.jobs.job import STAGE, STATE, Job, read_record
 from bodyscan.jobs.stages import Stage
 
 SCHEMA, VERSION = "bodyscan-stage", 1
@@ -28,15 +28,8 @@ class Origin:
 
     def record(self, outputs: Mapping[str, str]) -> dict[str, Any]:
         """What stage.json says: no time, no place, so that the same work gives the same bytes."""
-        return {
-            "schema": SCHEMA,
-            "version": VERSION,
-            "stage": self.stage,
-            "stage_version": self.stage_version,
-            "settings": self.settings,
-            "inputs": self.inputs,
-            "outputs": dict(outputs),
-        }
+        heading = {"schema": SCHEMA, "version": VERSION}
+        return heading | asdict(self) | {"outputs": dict(outputs)}
 
 
 @dataclass(frozen=True)
@@ -125,8 +118,5 @@ def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _last_failure(job: Job) -> str:
-    try:
-        state = json.loads((job.folder / STATE).read_text("utf-8"))
-        return f"it failed last time: {state['reason']}" if state.get("reason") else ""
-    except (OSError, ValueError, AttributeError):
-        return ""
+    reason = read_record(job.folder / STATE).get("reason")
+    return f"it failed last time: {reason}" if reason else ""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.files.atomic import write_json, write_text
 from bodyscan.files.hashing import file_hash
-from bodyscan.jobs.job import MANIFEST, SUMMARY, Job
+from bodyscan.jobs.job import MANIFEST, SUMMARY, Job, read_record
 from bodyscan.jobs.supervision import JobResult
 from bodyscan.settings import BODY_CENTRE_MM
 
@@ -67,25 +67,23 @@ def write_out_manifest(out: Path) -> None:
 
 def to_repeat(jobs: Sequence[Job]) -> list[str]:
     """Names of the jobs whose scan was fused, but is no good: its verdict is `repeat`."""
-    verdicts = {job.name: _read(job.folder / "scan" / "scan.json").get("verdict") for job in jobs}
+    verdicts = {
+        job.name: read_record(job.folder / "scan" / "scan.json").get("verdict") for job in jobs
+    }
     return [name for name, verdict in verdicts.items() if verdict and verdict["grade"] == "repeat"]
 
 
 def _row(job: Job, outcome: JobResult) -> dict[str, Any]:
-    row: dict[str, Any] = {
-        "job": outcome.job,
+    row = asdict(outcome) | {
         "subject": job.subject,
-        "state": outcome.state,
-        "attempts": outcome.attempts,
-        "seconds": outcome.seconds,
         "stages": " ".join(outcome.stages),
         "reason": " ".join(outcome.reason.split()),
     }
     if outcome.state != "done":
         return row
     if job.pipeline.kind == "calibrate":
-        return row | _rig_figures(_read(job.folder / "calibration" / "calibration.json"))
-    return row | _scan_figures(_read(job.folder / "scan" / "scan.json"))
+        return row | _rig_figures(read_record(job.folder / "calibration" / "calibration.json"))
+    return row | _scan_figures(read_record(job.folder / "scan" / "scan.json"))
 
 
 def _scan_figures(facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -154,10 +152,10 @@ def _add_drift(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> None:
 
 def _motions(job: Job) -> Motions:
     """(3,) mm of every pair at the body's centre: from where the calibration put it to this scan."""
-    alignment = _read(job.folder / "scan" / "scan.json").get("alignment")
+    alignment = read_record(job.folder / "scan" / "scan.json").get("alignment")
     if not alignment or job.calibration is None:
         return {}
-    calibrated = _read(job.calibration / "calibration.json").get("pairs", {})
+    calibrated = read_record(job.calibration / "calibration.json").get("pairs", {})
     return {
         pair: _centre_motion(matrix, calibrated[pair]["rig_from_camera"])
         for pair, matrix in alignment["rig_from_camera"].items()
@@ -168,14 +166,6 @@ def _motions(job: Job) -> Motions:
 def _centre_motion(now: Any, calibrated: Any) -> Array:
     change = np.asarray(now, float) @ np.linalg.inv(np.asarray(calibrated, float))
     return np.asarray(change[:3, :3] @ BODY_CENTRE_MM + change[:3, 3] - BODY_CENTRE_MM)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
 
 
 def _round(value: float | None, digits: int = 4) -> float | None:

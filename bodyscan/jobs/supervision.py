@@ -39,11 +39,10 @@ class JobResult:
 
 @dataclass(frozen=True)
 class JobProcess:
-    """How a job's process is run.  threads: of the libraries in it.  limit_s: after so many seconds
-    it counts as stuck.  command: what follows the name of this Python."""
+    """How a job's process is run.  threads: of the libraries in it.  command: what follows the name
+    of this Python."""
 
     threads: int
-    limit_s: float
     command: tuple[str, ...] = COMMAND
 
 
@@ -60,7 +59,7 @@ def supervise_job(job: Job, process: JobProcess, listen: Listen = ignore_events)
     for attempt in range(1, ATTEMPTS + 1):
         listen({"event": "job", "job": path.name, "state": "running", "attempt": attempt})
         _note(path, {"state": "running", "attempts": attempt, "reason": reason})
-        reason, ran = _attempt(path, process, listen)
+        reason, ran = _attempt(job, process, listen)
         stages += ran
         if not reason:
             break
@@ -76,8 +75,9 @@ def supervise_job(job: Job, process: JobProcess, listen: Listen = ignore_events)
     return outcome
 
 
-def _attempt(folder: Path, how: JobProcess, listen: Listen) -> tuple[str, tuple[str, ...]]:
+def _attempt(job: Job, how: JobProcess, listen: Listen) -> tuple[str, tuple[str, ...]]:
     """Why it failed, "" if it did not; and the stages that ran."""
+    folder, minutes = job.folder, job.pipeline.resources.limit_minutes
     try:
         log = _open_log(folder / LOG)
     except OSError as error:
@@ -94,7 +94,7 @@ def _attempt(folder: Path, how: JobProcess, listen: Listen) -> tuple[str, tuple[
             )
         except OSError as error:
             return f"its process cannot be started: {error.strerror}", ()
-        stuck = threading.Timer(how.limit_s, process.kill)
+        stuck = threading.Timer(60.0 * minutes, process.kill)
         stuck.start()
         try:
             said, ran = _listen_to(process, folder.name, listen)
@@ -109,7 +109,7 @@ def _attempt(folder: Path, how: JobProcess, listen: Listen) -> tuple[str, tuple[
     if said:
         return said, ran
     if not in_time:
-        return f"was stuck: it took longer than {how.limit_s / 60.0:g} minutes", ran
+        return f"was stuck: it took longer than {minutes:g} minutes", ran
     return _how_it_died(status, folder / LOG), ran
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from bodyscan.errors import BadInput, BodyscanError
 from bodyscan.files.hashing import content_hash, file_hash, files_below
-from bodyscan.jobs.job import MANIFEST, Job, read_job
+from bodyscan.jobs.job import MANIFEST, read_job, read_record
 from bodyscan.jobs.stages import KINDS, Kinds
 
 
@@ -42,8 +40,7 @@ def verify(folder: Path, kinds: Kinds = KINDS) -> Verification:
 
 
 def _all(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
-    content = _load(folder / MANIFEST)
-    jobs = content.get("jobs") if content else None
+    jobs = read_record(folder / MANIFEST).get("jobs")
     if not isinstance(jobs, dict):
         yield from _job(folder, kinds)
         return
@@ -58,11 +55,11 @@ def _all(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
 
 def _job(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
     path = folder / MANIFEST
-    content = _load(path)
+    content = read_record(path)
     try:
         own = content.pop("own_sha256")
         inputs, outputs = dict(content["inputs"]), dict(content["outputs"])
-    except (KeyError, TypeError, ValueError, AttributeError):
+    except (KeyError, TypeError, ValueError):
         yield path, "is not a manifest"
         return
     yield path, "" if content_hash(content) == own else "was changed"
@@ -79,7 +76,7 @@ def _inputs(folder: Path, inputs: Mapping[str, str], kinds: Kinds) -> Iterator[t
     """What the job read, where it lies now."""
     try:
         job = read_job(folder)
-        there = _places(job, kinds)
+        there = kinds[job.pipeline.kind][0].inputs(job)
     except BodyscanError as error:
         yield folder, f"its inputs cannot be looked at: {error}"
         return
@@ -89,12 +86,6 @@ def _inputs(folder: Path, inputs: Mapping[str, str], kinds: Kinds) -> Iterator[t
         yield there[name], "is new: the job did not read it"
 
 
-def _places(job: Job, kinds: Kinds) -> dict[str, Path]:
-    """Where the inputs from outside the job's folder lie now."""
-    first = kinds[job.pipeline.kind][0]
-    return first.inputs(job)
-
-
 def _held(path: Path, digest: str) -> tuple[Path, str]:
     try:
         return path, "" if file_hash(path) == digest else "was changed"
@@ -102,10 +93,3 @@ def _held(path: Path, digest: str) -> tuple[Path, str]:
         return path, "is gone"
     except (OSError, BodyscanError) as error:
         return path, f"cannot be read: {error}"
-
-
-def _load(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError):
-        return None

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from bodyscan.errors import BodyscanError, CaptureError
-from bodyscan.files.atomic import json_text, write_json
+from bodyscan.files.atomic import flush, json_text, write_json
 from bodyscan.files.hashing import content_hash, file_hash, file_hashes, files_below
 from bodyscan.files.locking import file_lock, for_owner_only
 from bodyscan.jobs.job import LOCK, MANIFEST, STAGE, Job, read_job
@@ -91,7 +91,7 @@ def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
                 remedy="start the batch again when the folder is complete",
             )
         write_json(made / STAGE, before.record(result_hashes(made)))
-        _flush(made)
+        _flush_all(made)
     except BaseException:
         shutil.rmtree(made, ignore_errors=True)
         raise
@@ -104,7 +104,7 @@ def _put_in_place(made: Path, place: Path) -> None:
     with suppress(FileNotFoundError):
         place.rename(old)
     made.rename(place)
-    _flush_one(place.parent)
+    flush(place.parent)
     _remove(old)
 
 
@@ -157,19 +157,10 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _flush(folder: Path) -> None:
+def _flush_all(folder: Path) -> None:
     """To the disk, before a name says that it is there."""
-    for path in files_below(folder):
-        _flush_one(path)
-    _flush_one(folder)
-
-
-def _flush_one(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    for path in (*files_below(folder), folder):
+        flush(path)
 
 
 def _take_over_output() -> Tell:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import os
 import stat
+from dataclasses import replace
 
 import cheap_job
 from cheap_batch import jobs_of, results, run_cheap
 
 from bodyscan.jobs.job import write_job
 from bodyscan.jobs.supervision import JobProcess, supervise_job
+from bodyscan.settings import Resources
 
 
 def test_crashes_and_errors_take_nobody_with_them(make_scans, tmp_path):
@@ -40,8 +42,9 @@ def test_crashes_and_errors_take_nobody_with_them(make_scans, tmp_path):
 
 def test_a_job_that_is_stuck_is_ended(make_scans, tmp_path):
     (job,) = jobs_of(make_scans(a="sleep 60"), tmp_path)
+    soon = job.pipeline.model_copy(update={"resources": Resources(limit_minutes=0.025)})
     write_job(job)
-    outcome = supervise_job(job, JobProcess(1, 1.5, tuple(cheap_job.COMMAND)))
+    outcome = supervise_job(replace(job, pipeline=soon), JobProcess(1, tuple(cheap_job.COMMAND)))
     assert outcome.state == "set aside"
     assert "was stuck" in outcome.reason
 
