@@ -14,6 +14,7 @@ docs/results.md were measured so; larger machines run more jobs side by side."""
 Progress = Callable[[str, int, int], None]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Error = TypeVar("Error", bound=Exception)
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -45,3 +46,28 @@ def threaded(
             results.append(result)
             progress(stage, done, len(todo))
     return results
+
+
+def attempt_each(
+    work: Callable[[Item], Result],
+    items: Iterable[Item],
+    error: type[Error],
+    *,
+    stage: str,
+    progress: Progress = silent,
+) -> tuple[dict[Item, Result], dict[Item, Error]]:
+    """`work` on every item in threads: what came of it, and the errors of that kind, by item."""
+
+    todo = list(items)
+    good: dict[Item, Result] = {}
+    bad: dict[Item, Error] = {}
+
+    def attempt(item: Item) -> None:
+        try:
+            good[item] = work(item)
+        except error as found:
+            bad[item] = found
+
+    threaded(attempt, todo, stage=stage, progress=progress)
+    # In the items' order, whichever ended first.
+    return {i: good[i] for i in todo if i in good}, {i: bad[i] for i in todo if i in bad}

@@ -14,7 +14,7 @@ from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BadInput, BodyscanError, FailedWork, plainly
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, silent, threaded
+from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.registration.advice import advise
 from bodyscan.registration.board_checks import boards_not_found, check_board_size, describe_findings
 from bodyscan.registration.halves import compare_halves
@@ -111,18 +111,16 @@ def _fit_sheets(
     """Light sheets of every pair that was placed and decoded."""
     names = sorted(set(placed.rig_from_camera) - set(decoded.failures))
 
-    def fit(name: str) -> Outcome[PairCalibration] | str:
-        try:
-            return calibrate_pair(_placed_pair(rig, placed, name, cameras[name], decoded.value))
-        except BodyscanError as error:
-            return plainly(error)
+    def fit(name: str) -> Outcome[PairCalibration]:
+        return calibrate_pair(_placed_pair(rig, placed, name, cameras[name], decoded.value))
 
-    results = threaded(fit, names, stage="fitting light sheets", progress=progress)
-    both = list(zip(names, results, strict=True))
+    fitted, errors = attempt_each(
+        fit, names, BodyscanError, stage="fitting light sheets", progress=progress
+    )
     return Outcome(
-        {name: found.value for name, found in both if isinstance(found, Outcome)},
-        tuple(note for _, found in both if isinstance(found, Outcome) for note in found.notes),
-        {name: found for name, found in both if isinstance(found, str)},
+        {name: found.value for name, found in fitted.items()},
+        tuple(note for found in fitted.values() for note in found.notes),
+        {name: plainly(error) for name, error in errors.items()},
     )
 
 

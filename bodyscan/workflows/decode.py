@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_near
@@ -11,7 +11,7 @@ from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import BodyscanError, DecodingFailed, plainly
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, silent, threaded
+from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.stripes.decoding import decode_stripes
@@ -54,34 +54,22 @@ def decode_on_boards(
     for view in views:
         wanted[view.pair, view.shot].append(view)
     sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
-    boundaries, failures = _decode(rig, sequences, wanted, progress)
-    failed = failed_pairs(failures, {pair for pair, _, _ in boundaries})
-    kept = [failure for failure in failures if failure[0].pair not in failed]
-    return Outcome(boundaries, tuple(failure_notes(kept)), failed)
 
-
-def _decode(
-    rig: Rig,
-    sequences: Sequence[ImageSequence],
-    wanted: Mapping[tuple[str, str], Sequence[BoardView]],
-    progress: Progress,
-) -> tuple[dict[ViewKey, BoardBoundaries], list[Failure]]:
-    def decode(sequence: ImageSequence) -> dict[ViewKey, BoardBoundaries] | Failure:
-        try:
-            stripes = decode_sequence(sequence, rig.pair(sequence.pair))
-        except BodyscanError as error:
-            return sequence, error
+    def decode(sequence: ImageSequence) -> dict[ViewKey, BoardBoundaries]:
+        stripes = decode_sequence(sequence, rig.pair(sequence.pair))
         return {
             (view.pair, view.shot, view.board): boundaries_near(stripes, view)
             for view in wanted[sequence.pair, sequence.shot]
         }
 
-    results = threaded(decode, sequences, stage="decoding stripes", progress=progress)
-    boundaries: dict[ViewKey, BoardBoundaries] = {}
-    for result in results:
-        if isinstance(result, dict):
-            boundaries |= result
-    return boundaries, [result for result in results if not isinstance(result, dict)]
+    decoded, errors = attempt_each(
+        decode, sequences, BodyscanError, stage="decoding stripes", progress=progress
+    )
+    boundaries = {key: near for found in decoded.values() for key, near in found.items()}
+    failures = list(errors.items())
+    failed = failed_pairs(failures, {pair for pair, _, _ in boundaries})
+    kept = [failure for failure in failures if failure[0].pair not in failed]
+    return Outcome(boundaries, tuple(failure_notes(kept)), failed)
 
 
 def failed_pairs(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:

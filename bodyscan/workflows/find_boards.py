@@ -18,7 +18,7 @@ from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_lit
 from bodyscan.errors import BodyscanError
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, silent, threaded
+from bodyscan.progress import Progress, attempt_each, silent, threaded
 from bodyscan.rig.rig import Rig
 
 NO_POSE_PX = 1.0
@@ -53,23 +53,17 @@ def calibrate_cameras(
 ) -> Outcome[dict[str, CameraCalibration]]:
     """Every pair's camera by itself; those that cannot be calibrated are failures."""
 
-    def calibrate(name: str) -> CameraCalibration | str:
+    def calibrate(name: str) -> CameraCalibration:
         spec = rig.pair(name).camera
         own = [v for v in views if v.pair == name and has_enough_corners(v, rig.board(v.board))]
-        try:
-            return calibrate_camera(
-                [planar_view(view, rig.board(view.board)) for view in own], spec.width, spec.height
-            )
-        except BodyscanError as error:
-            return str(error)
+        planar = [planar_view(view, rig.board(view.board)) for view in own]
+        return calibrate_camera(planar, spec.width, spec.height)
 
     names = [pair.name for pair in rig.pairs]
-    results = threaded(calibrate, names, stage="calibrating cameras", progress=progress)
-    both = list(zip(names, results, strict=True))
-    return Outcome(
-        {name: found for name, found in both if isinstance(found, CameraCalibration)},
-        failures={name: found for name, found in both if isinstance(found, str)},
+    cameras, errors = attempt_each(
+        calibrate, names, BodyscanError, stage="calibrating cameras", progress=progress
     )
+    return Outcome(cameras, failures={name: str(error) for name, error in errors.items()})
 
 
 def locate_views(

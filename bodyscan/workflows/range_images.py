@@ -5,7 +5,7 @@ from __future__ import annotations
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.errors import BodyscanError, ScanFailed
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, silent, threaded
+from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.scan_volume import stripes_in_volume
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
@@ -34,19 +34,17 @@ def reconstruct_range_images(
     }
     sequences = [s for s in captures.sequences if s.has_stripes and s.pair not in failed]
 
-    def reconstruct(sequence: ImageSequence) -> RangeImage | tuple[str, str]:
-        try:
-            pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
-            limits = stripes_in_volume(pair, at, calibration.rig.volume)
-            spec = calibration.rig.pair(sequence.pair)
-            return reconstruct_range_image(pair, decode_sequence(sequence, spec, limits=limits))
-        except BodyscanError as error:
-            return sequence.pair, str(error)
+    def reconstruct(sequence: ImageSequence) -> RangeImage:
+        pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
+        limits = stripes_in_volume(pair, at, calibration.rig.volume)
+        spec = calibration.rig.pair(sequence.pair)
+        return reconstruct_range_image(pair, decode_sequence(sequence, spec, limits=limits))
 
-    results = threaded(reconstruct, sequences, stage="range images", progress=progress)
-    failed |= dict(result for result in results if not isinstance(result, RangeImage))
-    images = [result for result in results if isinstance(result, RangeImage)]
+    images, errors = attempt_each(
+        reconstruct, sequences, BodyscanError, stage="range images", progress=progress
+    )
+    failed |= {sequence.pair: str(error) for sequence, error in errors.items()}
     if not images:
         reasons = "\n".join(f"  {name}: {reason}" for name, reason in failed.items())
         raise ScanFailed(f"no pair gave a range image:\n{reasons}")
-    return Outcome(images, failures=failed)
+    return Outcome(list(images.values()), failures=failed)
