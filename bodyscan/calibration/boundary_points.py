@@ -64,8 +64,8 @@ def concatenate(parts: Sequence[BoundaryPoints]) -> BoundaryPoints:
     """The boundary points of several shots as one."""
     return BoundaryPoints(
         *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("index", "board", "points", "per_pixel", "sigma_px")
+            np.concatenate([getattr(part, field.name) for part in parts])
+            for field in fields(BoundaryPoints)
         )
     )
 

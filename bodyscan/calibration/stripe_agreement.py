@@ -77,13 +77,9 @@ def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
     rays = data.points / data.points[:, 2:]
     depth = intersect_rays(sheets, rays, data.index.astype(float)).depth
     off = (depth - data.points[:, 2]) * board_errors(data).facing
-    medians = [np.nanmedian(own) for own in _by_board(off, data.board) if np.isfinite(own).any()]
-    return np.array(medians, np.float64)
-
-
-def _by_board(values: Array, board: Indices) -> Iterator[Array]:
-    for number in np.unique(board):
-        yield values[board == number]
+    known = np.isfinite(off)
+    off, board = off[known], data.board[known]
+    return np.array([np.median(off[board == k]) for k in np.unique(board)], np.float64)
 
 
 def _partitions(boards: Indices) -> Iterator[tuple[Indices, Indices, list[Indices]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from bodyscan.evaluation.acceptance_file import AcceptanceFile
@@ -59,12 +59,7 @@ class Readings:
     problems: tuple[str, ...] = ()
 
     def __add__(self, other: Readings) -> Readings:
-        return Readings(
-            self.spheres + other.spheres,
-            self.spacings + other.spacings,
-            self.plates + other.plates,
-            self.problems + other.problems,
-        )
+        return Readings(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
 
 @dataclass(frozen=True)

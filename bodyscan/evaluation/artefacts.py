@@ -12,6 +12,7 @@ from itertools import permutations
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import ConvexHull
+from scipy.spatial.distance import pdist
 
 from bodyscan.arrays import Array, Mask
 from bodyscan.errors import FailedWork
@@ -66,11 +67,11 @@ def locate_spheres(
     Raises FailedWork if not all are found.
     """
     found = find_spheres(points[None], normals[None], radius_mm, len(centres_mm))
-    wanted = _distances(centres_mm)
+    wanted = pdist(centres_mm)
     places = np.stack([sphere.centre for sphere in found])
     order = min(
         permutations(range(len(found))),
-        key=lambda some: float(np.sum((_distances(places[list(some)]) - wanted) ** 2)),
+        key=lambda some: float(np.sum((pdist(places[list(some)]) - wanted) ** 2)),
     )
     return [found[k] for k in order]
 
@@ -97,15 +98,15 @@ def read_sphere(points: Array, normals: Array, near: Sphere, radius_mm: float) -
 
 def spacing_errors(readings: list[SphereReading], centres_mm: Array) -> Array:
     """(K,) mm: distances of the spheres' centres less the calibrated ones, for every two."""
-    return _distances(np.stack([one.fitted.centre for one in readings])) - _distances(centres_mm)
+    return pdist(np.stack([one.fitted.centre for one in readings])) - pdist(centres_mm)
 
 
-def read_plate(points: Array, normals: Array, seed: int = 0) -> PlateReading:
+def read_plate(points: Array, normals: Array) -> PlateReading:
     """The largest plane among points (N, 3) with normals, either way, its rim and all that is not
     joined to it left out. Raises FailedWork if there is none."""
     if len(points) < FEWEST_ON_PLATE:
         raise FailedWork(f"{len(points)} points are too few for a plate")
-    normal, offset = _largest_plane(points, np.random.default_rng(seed))
+    normal, offset = _largest_plane(points, np.random.default_rng(0))
     for _ in range(3):
         near = np.abs(points @ normal - offset) < NEAR_PLATE_MM
         near &= np.abs(normals @ normal) > FACING
@@ -124,11 +125,6 @@ def read_plate(points: Array, normals: Array, seed: int = 0) -> PlateReading:
     return PlateReading(
         len(kept), float(np.ptp(_drop_farthest(off))), float(np.sqrt(np.mean(off**2))), area
     )
-
-
-def _distances(centres: Array) -> Array:
-    first, second = np.triu_indices(len(centres), 1)
-    return np.linalg.norm(centres[first] - centres[second], axis=1)
 
 
 def _drop_farthest(off: Array) -> Array:

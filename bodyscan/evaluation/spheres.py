@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from bodyscan.arrays import Array
 from bodyscan.errors import FailedWork
@@ -98,9 +99,7 @@ class CentreDistances:
 
 def centre_distances(measured: Array, true: Array) -> CentreDistances:
     """From centres (N, 3) as measured and as they are, in any two frames."""
-    first, second = np.triu_indices(len(true), 1)
-    found = np.linalg.norm(measured[first] - measured[second], axis=1)
-    wanted = np.linalg.norm(true[first] - true[second], axis=1)
+    found, wanted = pdist(measured), pdist(true)
     scale = float(found @ wanted / (wanted @ wanted)) - 1.0
     return CentreDistances(float(np.sqrt(np.mean((found - wanted) ** 2))), 1e6 * scale)
 

@@ -22,7 +22,6 @@ from bodyscan.registration.normal_equations import normal_equations
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import RigSolution
 from bodyscan.registration.view_graph import Target, view_graph
-from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
 WORTH = 0.8
@@ -98,11 +97,8 @@ class Advice:
         return said + ([_sentence(self.more)] if self.more else [])
 
 
-def advise(rig: Rig, placed: RigSolution, *, cameras_free: bool = True) -> Advice:
-    """Links, weak spots and the most useful further shots of a placed rig.
-
-    cameras_free: whether the joint solve refined the cameras (as `solve_rig` does by default).
-    """
+def advise(rig: Rig, placed: RigSolution) -> Advice:
+    """Links, weak spots and the most useful further shots of a placed rig."""
     links = links_of(placed)
     graph = view_graph(placed.views, sorted(placed.rig_from_camera))
     bridging = {frozenset(edge) for edge in nx.bridges(graph)}
@@ -121,7 +117,7 @@ def advise(rig: Rig, placed: RigSolution, *, cameras_free: bool = True) -> Advic
         crucial_shots(placed),
         worst,
         sigmas[worst],
-        more_shots(rig, placed, worst, cameras_free=cameras_free),
+        more_shots(rig, placed, worst),
     )
 
 
@@ -155,27 +151,23 @@ def crucial_shots(placed: RigSolution) -> tuple[Target, ...]:
     return tuple(sorted(what for kind, what in nx.articulation_points(graph) if kind == "shot"))
 
 
-def more_shots(
-    rig: Rig, placed: RigSolution, pair: str, *, cameras_free: bool = True
-) -> MoreShots | None:
+def more_shots(rig: Rig, placed: RigSolution, pair: str) -> MoreShots | None:
     """The place for a board where fewest more shots halve the sigma of `pair`'s position.
 
     None where no place in the scan volume is seen by two pairs, or no shot would tell anything new.
     """
-    places = board_places(
-        _usual_board(rig, placed), rig.volume, placed.cameras, placed.rig_from_camera
-    )
+    usual, _ = Counter(view.board for view in placed.views).most_common(1)[0]
+    places = board_places(rig.board(usual), rig.volume, placed.cameras, placed.rig_from_camera)
     if not places:
         return None
-    fixed = frame_target(rig)
     equations = normal_equations(
         placed.views,
         placed.cameras,
         placed.rig_from_camera,
         placed.rig_from_board,
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
-        fixed_target=fixed,
-        cameras_free=cameras_free and len(placed.rig_from_camera) > 1,
+        fixed_target=frame_target(rig),
+        cameras_free=len(placed.rig_from_camera) > 1,
     )
     knowledge = RigInformation(equations, placed.cameras, placed.rig_from_camera)
     tried = [(place, knowledge.after(knowledge.information(place), pair)) for place in places]
@@ -192,10 +184,6 @@ def more_shots(
         float(np.sqrt(best.after_mm2[shots - 1])),
         best.shots_to_halve is not None,
     )
-
-
-def _usual_board(rig: Rig, placed: RigSolution) -> Board:
-    return rig.board(Counter(view.board for view in placed.views).most_common(1)[0][0])
 
 
 def _preference(sharpening: SigmaReduction) -> tuple[int, float]:

@@ -28,7 +28,7 @@ class HalvesComparison:
     """Differences between two solutions of the rig, second minus first, the common motion taken out.
 
     halves: the shots of each.  shifts_mm: (P, 3) of the camera centres, rig frame.  sigmas_mm:
-    (P, 3) expected.  turns_deg: (P,).  turn_sigmas_deg: (P,) expected, about all axes together.
+    (P, 3) expected.
     over_expected: RMS of all differences over what the covariances promise; 1 is honest.
     """
 
@@ -36,8 +36,6 @@ class HalvesComparison:
     halves: tuple[tuple[str, ...], tuple[str, ...]]
     shifts_mm: Array
     sigmas_mm: Array
-    turns_deg: Array
-    turn_sigmas_deg: Array
     over_expected: float
 
     @property
@@ -51,18 +49,6 @@ class HalvesComparison:
             f"({sigma:.3f} expected); all differences are {self.over_expected:.2f} times what is "
             "expected"
         )
-
-    @property
-    def lines(self) -> list[str]:
-        """A table as text, one line a pair."""
-        said = ["pair: shift (expected) mm, turn (expected) degrees, between halves of the shots"]
-        for k, name in enumerate(self.names):
-            shift, sigma = np.linalg.norm(self.shifts_mm[k]), np.linalg.norm(self.sigmas_mm[k])
-            said.append(
-                f"{name}: {shift:.3f} ({sigma:.3f}) mm, "
-                f"{self.turns_deg[k]:.4f} ({self.turn_sigmas_deg[k]:.4f}) degrees"
-            )
-        return [*said, f"differences over expected, RMS: {self.over_expected:.2f}"]
 
 
 def compare_halves(rig: Rig, placed: RigSolution, *, seed: int = 0) -> HalvesComparison:
@@ -86,20 +72,15 @@ def compare_halves(rig: Rig, placed: RigSolution, *, seed: int = 0) -> HalvesCom
     ahead = np.array([placed.rig_from_camera[name].rotation[:, 2] for name in names])
     keep = _without_common_motion(centres, ahead)
     differences, covariance = keep @ differences, keep @ covariance @ keep.T
-    shown = np.concatenate(
-        [np.broadcast_to(np.eye(3, 6), (len(names), 3, 6)), twist_jacobian(centres)], axis=1
-    )
-    motions = differences.reshape(-1, 6)
+    shown = twist_jacobian(centres)
     own = covariance.reshape(len(names), 6, len(names), 6)[range(len(names)), :, range(len(names))]
-    values = np.einsum("pij,pj->pi", shown, motions)
+    shifts = np.einsum("pij,pj->pi", shown, differences.reshape(-1, 6))
     spread = np.einsum("pii->pi", shown @ own @ shown.transpose(0, 2, 1))
     return HalvesComparison(
         names,
         halves,
-        values[:, 3:],
-        np.sqrt(np.maximum(spread[:, 3:], 0.0)),
-        np.degrees(np.linalg.norm(values[:, :3], axis=1)),
-        np.degrees(np.sqrt(np.maximum(spread[:, :3].sum(axis=1), 0.0))),
+        shifts,
+        np.sqrt(np.maximum(spread, 0.0)),
         _over_expected(differences, covariance),
     )
 

@@ -76,8 +76,6 @@ def solve_rig(
     rig: Rig,
     views: Sequence[LocatedView],
     cameras: Mapping[str, Camera],
-    *,
-    refine_cameras: bool = True,
 ) -> Outcome[RigSolution]:
     """Join all pairs by their shared board views.
 
@@ -91,7 +89,7 @@ def solve_rig(
     while True:
         names = sorted(start)
         own = [view for view in views if view.pair in start]
-        solved = _solve(own, {n: cameras[n] for n in names}, start, refine_cameras)
+        solved = _solve(own, {n: cameras[n] for n in names}, start)
         strangers = _strangers(solved)
         if not strangers:
             break
@@ -103,7 +101,7 @@ def solve_rig(
             )
         left_out |= {name: not_together([name]) for name in strangers}
         start = {name: placing for name, placing in start.items() if name not in strangers}
-    refine = refine_cameras and len(start) > 1
+    refine = len(start) > 1
     shaped = ShapedSolution(solved.solution, solved.views, {}, ())
     if refine:
         root = min(start)
@@ -116,7 +114,6 @@ def _solve(
     views: Sequence[LocatedView],
     cameras: dict[str, Camera],
     start: Mapping[str, RigidTransform],
-    refine_cameras: bool,
 ) -> _Solved:
     """Solve, take out what cannot be true, solve again."""
     names = sorted(start)
@@ -133,7 +130,7 @@ def _solve(
     kept = [view for view in kept if view not in gross.wrong]
     limit = error_limit(single_view_errors(kept, cameras))
     # One camera alone was solved with its skew already; nothing is left to join.
-    refine = refine_cameras and len(names) > 1
+    refine = len(names) > 1
     solution = solve_jointly(kept, solution, root=root, refine_cameras=refine, loss_px=LOSS_PX)
     for _ in range(ROUNDS):
         solution = solve_fully(kept, solution, root=root, refine_cameras=refine)

@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from operator import itemgetter
 
 import networkx as nx
 import numpy as np
@@ -137,19 +138,23 @@ def place_boards(
         placing = _agreed_placing(group, root_from_camera)
         boards[target] = placing
         for view in group:
-            resolved = min(
-                (view.resolved(choice) for choice in view.alternatives),
-                key=lambda r: greatest_displacement(
-                    root_from_camera[r.pair] @ r.camera_from_board, placing, 300.0
-                ),
-            )
+            gap, resolved = min(_readings(view, root_from_camera, placing), key=itemgetter(0))
             kept.append(resolved)
-            gap = greatest_displacement(
-                root_from_camera[view.pair] @ resolved.camera_from_board, placing, 300.0
-            )
             if gap > 2.0 * AGREEMENT_MM:
                 doubtful.add(target)
     return kept, boards, doubtful
+
+
+def _readings(
+    view: LocatedView, root_from_camera: Mapping[str, RigidTransform], placing: RigidTransform
+) -> list[tuple[float, LocatedView]]:
+    """The ways to number a view's board, each with how far (mm) it puts it from a placing."""
+    readings = [view.resolved(choice) for choice in view.alternatives]
+    root = root_from_camera[view.pair]
+    return [
+        (greatest_displacement(root @ one.camera_from_board, placing, 300.0), one)
+        for one in readings
+    ]
 
 
 def _agreed_placing(
@@ -158,20 +163,12 @@ def _agreed_placing(
     """The pose of a board that most corners of its views support."""
     candidates = [root_from_camera[view.pair] @ view.camera_from_board for view in group]
 
-    def support(placing: RigidTransform) -> float:
+    def support(placing: RigidTransform) -> int:
         return sum(
             len(view.pixels)
             for view in group
-            if any(
-                greatest_displacement(
-                    root_from_camera[view.pair] @ view.resolved(choice).camera_from_board,
-                    placing,
-                    300.0,
-                )
-                < AGREEMENT_MM
-                for choice in view.alternatives
-            )
-        ) + 1e-3 * max(len(view.pixels) for view in group)
+            if min(gap for gap, _ in _readings(view, root_from_camera, placing)) < AGREEMENT_MM
+        )
 
     return max(candidates, key=support)
 
