@@ -43,6 +43,10 @@ class LightSheets(Protocol):
         """Variance of z (...) that comes from how well the sheets themselves are known, mm^2."""
         ...
 
+    def tangent_planes(self, s: Array) -> Array:
+        """(..., 4): a, b, c (unit), d >= 0 of Eq. 6 that touch the sheets at s (...)."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class LightPlanes:
@@ -78,6 +82,10 @@ class LightPlanes:
         lower = np.where(share < 1.0, self.coefficients[below], 0.0)
         upper = np.where(share > 0.0, self.coefficients[below + 1], 0.0)
         return (1.0 - share) * lower + share * upper
+
+    def tangent_planes(self, s: Array) -> Array:
+        """The planes themselves."""
+        return self.at(s)
 
     def depth(self, rays: Array, s: Array) -> Array:
         """Eq. 13: z = -d / (a x/z + b y/z + c)."""

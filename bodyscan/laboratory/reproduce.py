@@ -8,10 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bodyscan.arrays import Array
 from bodyscan.files.atomic import write_text
-from bodyscan.geometry.light_planes import LightPlanes
-from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import rigid_fit
 from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.calibrating import Calibrations, calibrate_all, sigma_trial
@@ -101,13 +98,9 @@ def _measure_all(
         by_stage=results[2],
         by_reference=results[3],
         noise=noise_bound(captures),
-        sigmas=tuple(point_sigma(approach, captures) for approach in _with_sigmas(shown)),
+        # Of those whose sheets know their covariance.
+        sigmas=tuple(point_sigma(one, captures) for one in shown if one.name in ("(iii)", "ours")),
     )
-
-
-def _with_sigmas(approaches: Sequence[Approach]) -> list[Approach]:
-    """Those whose sheets know their covariance."""
-    return [approach for approach in approaches if approach.name in ("(iii)", "ours")]
 
 
 def draw(captures: ChapterCaptures, calibrated: Calibrations, out: Path) -> None:
@@ -117,7 +110,10 @@ def draw(captures: ChapterCaptures, calibrated: Calibrations, out: Path) -> None
 
     by_name = {approach.name: approach for approach in calibrated.approaches}
     s = np.arange(apparatus.PROJECTOR.stripes + 1.0)
-    curves = [PlaneCurve(name, s, _planes(by_name[name], s)) for name in ("(iii)", "ours", "(i)")]
+    curves = [
+        PlaneCurve(name, s, by_name[name].sheets.tangent_planes(s))
+        for name in ("(iii)", "ours", "(i)")
+    ]
     true = PlaneCurve("true", s, apparatus.true_planes(captures.setup))
     distances = calibrated.planes.distances_mm
     draw_projector(
@@ -129,16 +125,6 @@ def draw(captures: ChapterCaptures, calibrated: Calibrations, out: Path) -> None
     )
     wanted = [by_name[name] for name in ("(i)", "(ii)", "(iii)", "ours")]
     draw_range_data([_range_data(approach, captures) for approach in wanted], out / FIGURES[1])
-
-
-def _planes(approach: Approach, s: Array) -> Array:
-    """(N, 4) at stripe coordinates s; for bent sheets the planes that touch them."""
-    sheets = approach.sheets
-    if isinstance(sheets, LightPlanes):
-        return sheets.at(s)
-    if isinstance(sheets, SmoothSheets):
-        return sheets.tangent_planes(s)
-    raise TypeError(f"no planes of {type(sheets).__name__}")
 
 
 def _range_data(approach: Approach, captures: ChapterCaptures) -> RangeData:

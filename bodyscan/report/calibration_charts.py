@@ -12,10 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.pair import PairCalibration
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
-from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.light_planes import baseline_angle_tilt
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
 from bodyscan.report.canvas import round_down
 from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, style, svg
@@ -86,11 +84,11 @@ def planes_chart(calibration: RigCalibration) -> bytes:
     with style():
         figure, axes = plt.subplots(3, 1, figsize=(9.6, 8.4), sharex=True, constrained_layout=True)
         for name, pair in calibration.pairs.items():
-            planes = planes_of(pair)
-            if planes is None or pair.sheets is None:
+            if pair.sheets is None:
                 continue
+            s = np.arange(pair.sheets.stripes + 1.0)
+            planes = pair.sheets.tangent_planes(s)
             length, angle, tilt = baseline_angle_tilt(planes, pair.sheets.direction)
-            s = np.arange(len(planes))
             for axis, values in zip(
                 axes, (length, np.degrees(angle), np.degrees(tilt)), strict=True
             ):
@@ -107,15 +105,6 @@ def planes_chart(calibration: RigCalibration) -> bytes:
         if handles:
             figure.legend(handles, labels, loc="outside right upper", frameon=False)
     return svg(figure)
-
-
-def planes_of(pair: PairCalibration) -> Array | None:
-    """(S + 1, 4) of Eq. 6 at the stripes' boundaries; tangent planes where the sheets are bent."""
-    if isinstance(pair.sheets, LightPlanes):
-        return pair.sheets.coefficients
-    if isinstance(pair.sheets, SmoothSheets):
-        return pair.sheets.tangent_planes(np.arange(pair.sheets.stripes + 1.0))
-    return None
 
 
 def held_out_chart(calibration: RigCalibration) -> bytes:

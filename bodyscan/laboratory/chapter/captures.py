@@ -16,8 +16,8 @@ from bodyscan.laboratory.chapter import apparatus, scenes
 from bodyscan.laboratory.chapter.apparatus import ChapterSetup
 from bodyscan.laboratory.rivals.targets import StripedShot, Target
 from bodyscan.progress import Progress, silent
-from bodyscan.simulation.render import PixelTruth
-from bodyscan.simulation.scene import Surface
+from bodyscan.simulation.render import PixelTruth, pixel_truth
+from bodyscan.simulation.scene import Scene, Surface
 from bodyscan.stripes.stripe_map import StripeMap
 
 TARGET = Target(apparatus.BOARD, apparatus.PROJECTOR)
@@ -87,7 +87,7 @@ def take_captures(
 
 
 def _board_shot(setup: ChapterSetup, place: RigidTransform, shot: str, number: int) -> StripedShot:
-    taken = scenes.expose_scene(setup, scenes.board_scene(setup, place), number)
+    (taken,) = scenes.expose_scene(setup, scenes.board_scene(setup, place), number)
     views = find_boards(taken.lit, [apparatus.BOARD], pair="chapter", shot=shot)
     if not views:
         raise BoardNotFound("the simulated board was not found", where=f"shot {shot}")
@@ -95,10 +95,9 @@ def _board_shot(setup: ChapterSetup, place: RigidTransform, shot: str, number: i
 
 
 def _expose(setup: ChapterSetup, surfaces: Sequence[Surface], number: int) -> SceneCapture:
-    first, second = scenes.expose_twice(setup, surfaces, number)
-    return SceneCapture(
-        first.lit, first.stripes, second.stripes, scenes.scene_truth(setup, surfaces)
-    )
+    first, second = scenes.expose_scene(setup, surfaces, number, times=2)
+    truth = pixel_truth(Scene(surfaces), apparatus.CAMERA, setup.projector)
+    return SceneCapture(first.lit, first.stripes, second.stripes, truth)
 
 
 def _owners(setup: ChapterSetup, truth: PixelTruth) -> Indices:

@@ -24,6 +24,7 @@ from bodyscan.laboratory.chapter.captures import ChapterCaptures
 from bodyscan.laboratory.rivals.approaches import Approach
 
 Stripes = NDArray[np.floating[Any]]
+BEST_SHARE = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ def whole_stripes(s: Stripes) -> Stripes:
 
 
 def measure_artefacts(
-    approach: Approach, captures: ChapterCaptures, *, whole: bool = False, name: str | None = None
+    approach: Approach, captures: ChapterCaptures, *, whole: bool = False
 ) -> ApproachAccuracy:
     """whole: the stripe number of each pixel only, no fraction."""
     maps = [captures.spheres.stripes.s, captures.plate.stripes.s]
@@ -84,7 +85,7 @@ def measure_artefacts(
         covered.append(len(measured) / int(own.sum()))
     centres = np.stack([sphere.given.centre for sphere in found])
     return ApproachAccuracy(
-        name or approach.name,
+        approach.name,
         tuple(found),
         tuple(covered),
         centre_distances(centres, apparatus.CENTRES),
@@ -95,12 +96,12 @@ def measure_artefacts(
     )
 
 
-def true_approach(setup: ChapterSetup, name: str = "true calibration") -> Approach:
+def true_approach(setup: ChapterSetup) -> Approach:
     """What nothing can calibrate better: the simulator's own camera and planes."""
     planes = apparatus.true_planes(setup)
     unknown = np.zeros((len(planes), 4, 4))
     return Approach(
-        name,
+        "true calibration",
         from_fields(asdict(apparatus.CAMERA)),
         LightPlanes(planes, unknown, apparatus.PROJECTOR.direction),
     )
@@ -119,7 +120,7 @@ class NoiseBound:
     best_share: tuple[float, ...]
 
 
-def noise_bound(captures: ChapterCaptures, share: float = 0.9) -> NoiseBound:
+def noise_bound(captures: ChapterCaptures) -> NoiseBound:
     truth = true_approach(captures.setup)
     seen = captures.spheres
     everything, best = [], []
@@ -129,7 +130,9 @@ def noise_bound(captures: ChapterCaptures, share: float = 0.9) -> NoiseBound:
         distance = [np.linalg.norm(points - centre, axis=1) for points in both]
         half = 0.5 * (distance[0] - distance[1]) ** 2
         sigma = seen.stripes.sigma[own]
-        order = np.argsort(np.where(np.isfinite(half), sigma, np.inf))[: int(share * own.sum())]
+        order = np.argsort(np.where(np.isfinite(half), sigma, np.inf))[
+            : int(BEST_SHARE * own.sum())
+        ]
         everything.append(float(np.nanmean(half)))
         best.append(float(np.nanmean(half[order])))
     return NoiseBound(tuple(everything), tuple(best))

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import open3d as o3d
 
-from bodyscan.arrays import Array, Bytes
+from bodyscan.arrays import Bytes
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.apparatus import ChapterSetup
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.lamps import Lamps
-from bodyscan.simulation.render import PixelTruth, pixel_truth, render_pair
+from bodyscan.simulation.render import render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.sensor import expose
 from bodyscan.stripes.decoding import decode_stripes
@@ -57,32 +57,23 @@ def plate_scene() -> list[Surface]:
     return [replace(plate, open_to_light=True).moved(place), _wall()]
 
 
-def expose_scene(setup: ChapterSetup, surfaces: Sequence[Surface], number: int) -> Exposure:
-    """Render the sequence, expose it and read the stripes; `number` tells one shot's noise from
-    another's."""
-    return expose_twice(setup, surfaces, number)[0]
+def expose_scene(
+    setup: ChapterSetup, surfaces: Sequence[Surface], number: int, times: int = 1
+) -> list[Exposure]:
+    """Render the sequence and read its stripes; `number` tells one shot's noise from another's.
 
-
-def expose_twice(
-    setup: ChapterSetup, surfaces: Sequence[Surface], number: int
-) -> tuple[Exposure, Exposure]:
-    """The same light (jitter and speckle too) with the sensor's noise drawn twice."""
+    times: the sensor's noise is drawn anew on the same light (jitter and speckle too).
+    """
     rng = np.random.default_rng([setup.seed, apparatus.NOISE, number])
     settings = setup.settings
     lamps = Lamps(LAMP_GREY, AMBIENT_GREY, apparatus.DISTANCE_MM * 1.05, apparatus.DISTANCE_MM)
     images = render_pair(
         Scene(surfaces), setup.view, setup.projector, lamps, settings.projection, rng
     )
-    first, second = (
-        {name: expose(image, settings.noise, rng) for name, image in images.items()}
-        for _ in range(2)
-    )
-    return _read(first), _read(second)
-
-
-def scene_truth(setup: ChapterSetup, surfaces: Sequence[Surface]) -> PixelTruth:
-    """Depth and stripe coordinate at every pixel's centre."""
-    return pixel_truth(Scene(surfaces), apparatus.CAMERA, setup.projector)
+    return [
+        _read({name: expose(image, settings.noise, rng) for name, image in images.items()})
+        for _ in range(times)
+    ]
 
 
 def _read(frames: dict[str, Bytes]) -> Exposure:
@@ -104,8 +95,5 @@ def _ground() -> Surface:
 
 def _wall() -> Surface:
     corner = np.array([-1500.0, -1500.0, 2.0 * apparatus.DISTANCE_MM])
-    return grid_surface(corner, *_sides(3000.0), albedo=WALL, encloses=True)
-
-
-def _sides(size: float) -> tuple[Array, Array]:
-    return np.array([size, 0.0, 0.0]), np.array([0.0, size, 0.0])
+    across, down = np.array([3000.0, 0.0, 0.0]), np.array([0.0, 3000.0, 0.0])
+    return grid_surface(corner, across, down, albedo=WALL, encloses=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.boundary_points import BoundaryPoints, subsample
@@ -34,29 +35,25 @@ class Approach:
     sheets: LightSheets
 
 
-def pinhole_by_stage(
-    target: Target, shots: Sequence[StripedShot], readings: Array, name: str = "(i)"
-) -> Approach:
+def pinhole_by_stage(target: Target, shots: Sequence[StripedShot], readings: Array) -> Approach:
     """Approach (i) as the chapter has it: a 3 x 4 and a 2 x 4 matrix from a slide stage, no lens,
     and the index taken for a place on the projector's slide."""
-    return _fit(name, by_matrix(target, shots, readings), target, pinhole_planes)
+    return _fit("(i)", by_matrix(target, shots, readings), target, pinhole_planes)
 
 
-def mended_pinhole_by_stage(
-    target: Target, stage: LocatedBoards, name: str = "(i) mended"
-) -> Approach:
+def mended_pinhole_by_stage(target: Target, stage: LocatedBoards) -> Approach:
     """Approach (i) with what it lacks: Tsai's camera with its lens, and a re-mapped index."""
-    return _fit(name, stage, target, remapped_planes)
+    return _fit("(i) mended", stage, target, remapped_planes)
 
 
 def planes_by_stage_camera(
-    target: Target, stage: LocatedBoards, shots: Sequence[StripedShot], name: str = "(ii)"
+    target: Target, stage: LocatedBoards, shots: Sequence[StripedShot]
 ) -> Approach:
     """Approach (ii): Tsai's camera from the slide stage, planes from the reference plane.
 
     So the chapter's text has it, though it is headed `calibrated by slide stage`.
     """
-    return _fit(name, locate_again(target, shots, stage.camera), target, free_planes)
+    return _fit("(ii)", locate_again(target, shots, stage.camera), target, free_planes)
 
 
 Model = Callable[[BoundaryPoints, int, Axis], LightPlanes]
@@ -84,20 +81,12 @@ def remapped_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> Li
     return fit_remapped_pinhole(few.points, few.index.astype(float), stripes, direction)
 
 
-def _invariable(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
-    return fit_invariable_baseline(points, stripes, direction, fit_tilt=False)
-
-
-def _variable(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
-    return fit_variable_baseline(points, stripes, direction, fit_tilt=False)
-
-
 PROJECTORS: dict[str, Model] = {
     "2 x 4 matrix": pinhole_planes,
     "2 x 4 matrix, index re-mapped": remapped_planes,
-    "invariable baseline": _invariable,
+    "invariable baseline": partial(fit_invariable_baseline, fit_tilt=False),
     "invariable baseline, tilted": fit_invariable_baseline,
-    "variable baseline": _variable,
+    "variable baseline": partial(fit_variable_baseline, fit_tilt=False),
     "variable baseline, tilted": fit_variable_baseline,
     "free planes": free_planes,
 }
