@@ -14,7 +14,7 @@ import open3d as o3d
 from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.progress import THREADS, Progress, silent, threaded
+from bodyscan.progress import Progress, silent, threaded
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation import files
@@ -90,7 +90,6 @@ def capture_artefact(
     *,
     shots: int = 1,
     number: int = 0,
-    workers: int = THREADS,
     progress: Progress = silent,
 ) -> Path:
     """Write a scan folder `out` of the artefact at one place, taken `shots` times over.
@@ -117,7 +116,7 @@ def capture_artefact(
             noise = np.random.default_rng(seed)
             render_task(rig, pair, view, room, task, settings, out.parent, noise)
 
-    threaded(work, taking, stage=f"simulating {out.name}", progress=progress, workers=workers)
+    threaded(work, taking, stage=f"simulating {out.name}", progress=progress)
     striped = [pair.name for pair in taking]
     files.write_captures(out, "scan", [(name, striped, []) for name in names], "sim-artefact")
     return out

@@ -11,7 +11,7 @@ cast once for each two facets, since a place sees nearly what the facet around i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,9 +134,8 @@ def _samples(scene: Scene, facet_mm: float) -> tuple[Hits, Array]:
         uv = np.where(uv.sum(axis=1, keepdims=True) > 1.0, 1.0 - uv, uv)
         parts.append(scene.places(number, triangles, uv.astype(np.float32)))
         shares.append(np.full(count, total / count))
-    fields = ("depth", "points", "normals", "albedo", "surface")
-    hits = Hits(*(np.concatenate([getattr(part, name) for part in parts]) for name in fields))
-    return hits, np.concatenate(shares)
+    joined = (np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Hits))
+    return Hits(*joined), np.concatenate(shares)
 
 
 def _sums(group: Indices, values: NDArray[np.floating]) -> Array:

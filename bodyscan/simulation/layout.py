@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,11 +73,12 @@ def _build(
     rig_from_projector = _perturbed(rig_from_view(placing), optics, reach, rng)
     stripes = pair.projector.stripes if pair.projector else _LAMP_STRIPES
     builder = build_mirror if settings.projection.kind == "mirror" else build_pinhole
+    depths = reach * np.linspace(settings.projection.near, settings.projection.far, 5)
     projector = builder(
         rig_from_camera.inverse() @ rig_from_projector,
         stripes,
         horizontal,
-        _seen_points(camera, settings.projection, reach),
+        seen_points(camera, depths),
         settings.projection,
         rng,
     )
@@ -133,12 +134,11 @@ def _perturbed(
     return RigidTransform(rig_from_device.rotation @ turned, rig_from_device.translation + shift)
 
 
-def _seen_points(camera: TrueCamera, projection: Projection, reach: float) -> Array:
-    """Points (N, 3) all over what the camera sees, its corners among them, near to far."""
+def seen_points(camera: TrueCamera, depths: Sequence[float] | Array) -> Array:
+    """Points (N, 3) at some depths, all over what the camera sees, its corners among them."""
     u, v = np.linspace(-0.5, camera.width - 0.5, 9), np.linspace(-0.5, camera.height - 0.5, 9)
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    depths = reach * np.linspace(projection.near, projection.far, 5)
-    return (camera.directions(grid)[:, None, :] * depths[:, None]).reshape(-1, 3)
+    return (camera.directions(grid)[:, None, :] * np.reshape(depths, (-1, 1))).reshape(-1, 3)
 
 
 def build_mirror(
@@ -172,7 +172,7 @@ def build_mirror(
     )
     theta = wide.angle(seen)
     fan = float(1.05 * np.abs(wide.across(seen, theta)).max())
-    first, last = _sweep(theta, projection.margin, _downwards(seen, theta, horizontal))
+    first, last = _sweep(seen, theta, horizontal, projection.margin)
     return replace(
         wide,
         first_angle=first,
@@ -198,19 +198,16 @@ def build_pinhole(
     centre = camera_from_projector.translation
     wide = PinholeProjector(stripes, rows, centre, 0.0, 1.0, 1e9, k1, k2)
     along, across = wide.slide(seen)
-    first, last = _sweep(across, projection.margin, _downwards(seen, across, horizontal))
+    first, last = _sweep(seen, across, horizontal, projection.margin)
     half = float(1.05 * np.abs(along).max())
     bow = projection.smile_stripes
     return replace(wide, first=first, last=last, half=half, smile_stripes=bow)
 
 
-def _downwards(seen: Array, sweep: Array, horizontal: bool) -> bool:
-    """Whether the sweep's coordinate grows down (or to the right of) the image."""
-    image = seen[:, 1 if horizontal else 0] / seen[:, 2]
-    return float(np.corrcoef(image, sweep)[0, 1]) > 0
-
-
-def _sweep(values: Array, margin: float, forward: bool) -> tuple[float, float]:
+def _sweep(seen: Array, values: Array, horizontal: bool, margin: float) -> tuple[float, float]:
+    """First and last of a sweep over values (N,) at points seen (N, 3), down the image or to its
+    right."""
     low, high = float(values.min()), float(values.max())
     low, high = low - margin * (high - low), high + margin * (high - low)
-    return (low, high) if forward else (high, low)
+    image = seen[:, 1 if horizontal else 0] / seen[:, 2]
+    return (low, high) if np.corrcoef(image, values)[0, 1] > 0 else (high, low)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -12,7 +11,7 @@ import numpy as np
 
 from bodyscan.files.atomic import write_json
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.progress import THREADS, Progress, silent
+from bodyscan.progress import THREADS, Progress, silent, threaded
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig, write_rig
 from bodyscan.rig.templates import fill
@@ -152,7 +151,8 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
     tell = _counter("simulate", sum(map(len, tasks.values())), progress)
     room = build_room(truth.pairs.values(), truth.settings.room)
 
-    def work(number: int, pair: TruePair) -> None:
+    def work(numbered: tuple[int, TruePair]) -> None:
+        number, pair = numbered
         rays = np.random.default_rng([truth.seed, _RAYS, number])
         view = View.of(pair.camera, truth.settings.optics, rays)
         for task in tasks[pair.name]:
@@ -160,14 +160,7 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
             render_task(rig, pair, view, room, task, truth.settings, out, noise)
             tell()
 
-    with ThreadPoolExecutor(workers) as pool:
-        futures = [pool.submit(work, i, pair) for i, pair in enumerate(truth.pairs.values())]
-        try:
-            for future in futures:
-                future.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    threaded(work, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
 
 
 def _counter(stage: str, total: int, progress: Progress) -> Callable[[], None]:

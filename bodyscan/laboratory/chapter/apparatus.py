@@ -15,7 +15,7 @@ from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.simulation.board import MadeBoard, make_board
-from bodyscan.simulation.layout import build_mirror
+from bodyscan.simulation.layout import build_mirror, seen_points
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector
 from bodyscan.simulation.render import View
@@ -103,13 +103,11 @@ def chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
     """The set-up; its projector is the same whatever the seed."""
     x, _, z = PROJECTOR_AT
     turn = [0.0, float(np.arctan2(-x, DISTANCE_MM - z)), 0.0]
-    u, v = np.linspace(-0.5, CAMERA.width - 0.5, 9), np.linspace(-0.5, CAMERA.height - 0.5, 9)
-    rays = CAMERA.directions(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
     projector = build_mirror(
         RigidTransform.from_rotation_vector(turn, PROJECTOR_AT),
         PROJECTOR.stripes,
         False,
-        np.concatenate([rays * depth for depth in SWEPT_MM]),
+        seen_points(CAMERA, SWEPT_MM),
         settings.projection,
         np.random.default_rng(_PROJECTOR_SEED),
     )
