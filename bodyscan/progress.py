@@ -57,7 +57,6 @@ def attempt_each(
     progress: Progress = silent,
 ) -> tuple[dict[Item, Result], dict[Item, Error]]:
     """`work` on every item in threads: what came of it, and the errors of that kind, by item."""
-
     todo = list(items)
     good: dict[Item, Result] = {}
     bad: dict[Item, Error] = {}

@@ -64,9 +64,10 @@ def compare_halves(rig: Rig, placed: RigSolution, *, seed: int = 0) -> HalvesCom
     halves = split_shots(placed.views, names, seed=seed)
     holder = rig.frame_pair.name if rig.frame_pair else names[0]
     first, second = (_placed_by(rig, placed, shots, holder) for shots in halves)
+    # (6P,): twists about the rig's origin that carry each first pose to the second.
     differences = np.concatenate(
-        [_motion(first[0][name], second[0][name]) for name in names]
-    )  # (6P,)
+        [(second[0][name] @ first[0][name].inverse()).twist for name in names]
+    )
     covariance = first[1] + second[1]
     centres = np.array([placed.rig_from_camera[name].translation for name in names])
     ahead = np.array([placed.rig_from_camera[name].rotation[:, 2] for name in names])
@@ -122,11 +123,6 @@ def _placed_by(
     carry = np.kron(np.eye(len(half.covariance.names)), adjoint(to_rig))
     placings = {name: to_rig @ t for name, t in half.rig_from_camera.items()}
     return placings, carry @ half.covariance.matrix @ carry.T
-
-
-def _motion(first: RigidTransform, second: RigidTransform) -> Array:
-    """(6,) twist about the rig's origin that carries the first pose to the second."""
-    return (second @ first.inverse()).twist
 
 
 def _without_common_motion(centres: Array, ahead: Array) -> Array:

@@ -27,8 +27,8 @@ from bodyscan.evaluation.artefacts import (
     spacing_errors,
 )
 from bodyscan.evaluation.spheres import Sphere
+from bodyscan.laboratory.simulated_acceptance import plates_at, spheres_at
 from bodyscan.rig.rig import Volume
-from bodyscan.simulation.acceptance_places import plates_at, spheres_at
 
 RADIUS = 60.0
 CENTRES = np.array([[0.0, 0.0, 0.0], [400.0, 0.0, 0.0], [0.0, 250.0, 150.0]])

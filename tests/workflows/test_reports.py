@@ -11,8 +11,8 @@ from small_workspace import run
 
 from bodyscan.evaluation.acceptance_file import load_acceptance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.laboratory.simulated_acceptance import spheres_at
 from bodyscan.registration.storage import load_calibration, save_calibration
-from bodyscan.simulation.acceptance_places import spheres_at
 from bodyscan.simulation.artefact import capture_artefact, open_workspace, sphere_surfaces
 
 
