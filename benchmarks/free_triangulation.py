@@ -11,13 +11,12 @@ from benchmarks.triangulation import triangulate
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.captures.folder import Captures
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
 from bodyscan.registration.board_shape import BoardShape
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
-from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards, locate_views
+from bodyscan.workflows.find_boards import calibrate_cameras, locate_views
 
 
 @dataclass(frozen=True)
@@ -122,19 +121,6 @@ def triangulate_shots(
         for seen in by_shot.values()
         if len(seen) >= 2
     ]
-
-
-def leave_shots_out(rig: Rig, captures: Captures) -> list[FreeTriangulation]:
-    """Each shot in turn left out of the joint solve, then its board triangulated by that rig."""
-    found = find_all_boards(rig, captures).value
-    results = []
-    for shot in captures.shots:
-        held = without_shots(rig, found, [shot])
-        placed = held.placed
-        results += triangulate_shots(
-            held.left_out, placed.cameras, placed.rig_from_camera, placed.board_shapes
-        )
-    return results
 
 
 def pooled(results: Sequence[FreeTriangulation]) -> tuple[float, float, float]:

@@ -68,7 +68,7 @@ def left_out(
         "charuco-ring", captures, folder, shots=[shot for place in PLACES for shot in place]
     )
     rig, shots = opened(path)
-    found = find_all_boards(rig, shots, [])
+    found = find_all_boards(rig, shots).value
     results = {}
     for some in (*PLACES, ["04"]):
         held = without_shots(rig, found, some)
