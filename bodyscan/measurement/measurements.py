@@ -68,7 +68,7 @@ class Measurements:
 
 
 def measure(mesh: BodyMesh, heights_mm: Sequence[float] | None = None) -> Measurements:
-    """Stature, volume, area, and the slices at heights (every 100 mm if none are given).
+    """Stature, volume, area, and the slices at heights (every 100 mm of the body if none are given).
 
     Raises BadInput for a height at which there is no body.
     """
@@ -76,7 +76,18 @@ def measure(mesh: BodyMesh, heights_mm: Sequence[float] | None = None) -> Measur
     frame = rig_from_body(mesh.vertices)
     vertices = frame.inverse().apply(mesh.vertices)
     if heights_mm is None:
-        heights_mm = np.arange(STEP_MM, stature, STEP_MM).tolist()
+        # Of a body seen in part, what there is of it.
+        every = np.arange(STEP_MM, stature, STEP_MM).tolist()
+        slices = [_slice(vertices, mesh, height) for height in every]
+    else:
+        slices = [_slice(vertices, mesh, float(height)) for height in heights_mm]
+        for height, found in zip(heights_mm, slices, strict=True):
+            if found is None:
+                low, high = vertices[:, 2].min(), vertices[:, 2].max()
+                raise BadInput(
+                    f"there is no body at a height of {height:g} mm",
+                    remedy=f"Give heights between {low:.0f} and {high:.0f} mm.",
+                )
     areas = face_areas(mesh.vertices, mesh.faces)
     crown = mesh.vertices[mesh.faces, 2].max(axis=1) > stature - CROWN_MM
     return Measurements(
@@ -85,7 +96,7 @@ def measure(mesh: BodyMesh, heights_mm: Sequence[float] | None = None) -> Measur
         signed_volume(mesh.vertices, mesh.faces) / 1e6,
         float(areas.sum()) / 1e6,
         _share(areas, ~mesh.filled, np.ones_like(crown)),
-        tuple(_slice(vertices, mesh, float(height)) for height in heights_mm),
+        tuple(found for found in slices if found is not None),
         frame,
     )
 
@@ -104,15 +115,12 @@ def _share(areas: Array, which: Mask, among: Mask) -> float:
     return float(areas[which & among].sum() / max(areas[among].sum(), 1e-12))
 
 
-def _slice(vertices: Array, mesh: BodyMesh, height_mm: float) -> Slice:
+def _slice(vertices: Array, mesh: BodyMesh, height_mm: float) -> Slice | None:
+    """None where there is no body."""
     loops = loops_at(vertices, mesh.faces, height_mm, mesh.filled)
     loops = tuple(loop for loop in loops if loop.area_mm2 > SPECK_MM2)
     if not loops:
-        low, high = vertices[:, 2].min(), vertices[:, 2].max()
-        raise BadInput(
-            f"there is no body at a height of {height_mm:g} mm",
-            remedy=f"Give heights between {low:.0f} and {high:.0f} mm.",
-        )
+        return None
     girths = [_girth(part, loop) for part, loop in zip(name_parts(loops), loops, strict=True)]
     return Slice(height_mm, tuple(sorted(girths, key=lambda girth: (girth.part, -girth.area_mm2))))
 

@@ -107,3 +107,14 @@ def test_table_and_document_say_the_same(subject):
     assert said["stature_mm"] == found.stature_mm
     assert said["slices"][0]["girths"][-1]["tape_mm"] == found.slices[0].of("trunk").tape_mm
     assert [table.row_count for table in tables(found)] == [4, 3]
+
+
+def test_of_a_body_seen_from_the_knees_up_the_slices_there_are_are_given(subject):
+    upper = mesh_of(subject.vertices, subject.faces)
+    low = upper.vertices[:, 2].copy()
+    upper.vertices[:, 2] = np.maximum(low, 430.0)
+    heights = [one.height_mm for one in measure(upper).slices]
+    assert heights[0] == 500.0
+    assert heights[-1] == 1600.0
+    with pytest.raises(BadInput, match="no body at a height of 100 mm"):
+        measure(upper, [100.0])
