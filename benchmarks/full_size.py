@@ -115,7 +115,7 @@ def run_commands(
         if name == "simulate" and (workspace / "truth" / "truth.json").exists():
             continue  # the same rig gives the same bytes
         started = time.perf_counter()
-        outputs[name], memory[name] = _run([name, *map(_from_project, arguments)])
+        outputs[name], memory[name] = _run([name, *map(_from_project, arguments), "--verbose"])
         seconds[name] = time.perf_counter() - started
     return outputs, seconds, memory
 

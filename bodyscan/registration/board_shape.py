@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import rigid_fit
@@ -19,8 +19,6 @@ from bodyscan.registration.full_solve import solve_fully
 from bodyscan.registration.inconsistent_views import fit_board
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.normal_equations import CORNERS
-
-Array = NDArray[np.float64]
 
 ROUNDS = 15
 HASTE = 1.6

@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import Noise
@@ -19,9 +19,6 @@ from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.view_graph import Target
-
-Array = NDArray[np.float64]
-Columns = NDArray[np.int64]
 
 CORNERS = Noise("corners", group=2, cauchy=4.0)
 
@@ -41,7 +38,7 @@ class NormalEquations:
     parameters: tuple[int, ...]
     matrix: Array
     gradient: Array
-    held: Columns
+    held: Indices
     variance_px2: float
 
     @property
@@ -53,7 +50,7 @@ class NormalEquations:
         return self.first_board + 6 * len(self.targets)
 
     @property
-    def camera_columns(self) -> list[Columns]:
+    def camera_columns(self) -> list[Indices]:
         """Which unknowns are the parameters of each pair's camera."""
         return _runs(self.first_camera, self.parameters)
 
@@ -62,7 +59,7 @@ class NormalEquations:
         return any(self.parameters)
 
     @property
-    def free(self) -> Columns:
+    def free(self) -> Indices:
         return np.setdiff1d(np.arange(len(self.matrix)), self.held)
 
     def covariance(self) -> PoseCovariance:
@@ -149,7 +146,7 @@ def normal_equations(
     return NormalEquations(names, tuple(targets), parameters, normal, gradient, held, variance)
 
 
-def _runs(first: int, sizes: Sequence[int]) -> list[Columns]:
+def _runs(first: int, sizes: Sequence[int]) -> list[Indices]:
     """Consecutive numbers from `first`, as many in each run as `sizes` says."""
     return np.split(np.arange(first, first + sum(sizes)), np.cumsum(sizes)[:-1])
 
@@ -160,7 +157,7 @@ def _held(
     first_board: int,
     fixed_pair: str | None,
     fixed_target: Target | None,
-) -> Columns:
+) -> Indices:
     if fixed_target is not None:
         start = first_board + 6 * targets.index(fixed_target)
     else:

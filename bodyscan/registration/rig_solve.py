@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
@@ -43,8 +43,6 @@ LOSS_PX = 0.3
 COARSE_PX = 30.0
 """What a view may be off where only the graph has placed the pairs."""
 ROUNDS = 3
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

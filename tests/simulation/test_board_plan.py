@@ -148,5 +148,5 @@ def test_the_pair_that_fixes_the_rig_frame_stands_where_it_should() -> None:
 def test_a_rig_without_placings_is_refused() -> None:
     rig = load_rig(RIGS / "one-pair.yaml")
     bare = rig.model_copy(update={"pairs": (rig.pairs[0].model_copy(update={"nominal": None}),)})
-    with pytest.raises(BadInput, match="nominal placing"):
+    with pytest.raises(BadInput, match="nominal pose"):
         build_pairs(bare, SimulationSettings(), lambda n: np.random.default_rng(n))
