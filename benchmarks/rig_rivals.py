@@ -18,10 +18,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from bodyscan.arrays import Array, Mask
-
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Corners = dict[str, Any]
 Found = tuple[Array, Array, Array]
 """camera_from_first (C, 4, 4), matrices (C, 3, 3), lenses (C, 5)."""

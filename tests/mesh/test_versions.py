@@ -36,8 +36,10 @@ def test_the_light_version_is_close_and_closed(body: BodyMesh):
     back = signed_distances(body.vertices, lean.vertices, lean.faces)
     assert np.abs(back).max() <= 0.5 + 1e-3
     # A vertex set beside an edge may fold a face there, at fingers as thick as one face: 0.2 % of
-    # 30,000 edges. (At full size, with 50,000 faces, there are next to none: docs/results.md.)
-    assert len(self_intersections(lean.vertices, lean.faces)) <= 60
+    # 30,000 edges (35 here, some through several faces). At full size, with 50,000 faces, there are
+    # next to none: docs/results.md.
+    pierced = self_intersections(lean.vertices, lean.faces)
+    assert len(np.unique(pierced[:, :2], axis=0)) <= 60
     # Of the area: the light mesh has its faces where the body is curved, at fingers and toes.
     assert filled_share(lean) == pytest.approx(filled_share(body), abs=0.05)
     np.testing.assert_array_equal(lean.filled, np.isnan(lean.sigma_mm)[lean.faces].any(axis=1))
