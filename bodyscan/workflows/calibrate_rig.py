@@ -14,7 +14,7 @@ from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BadInput, BodyscanError, FailedWork, plainly
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, attempt_each, silent
+from bodyscan.progress import Progress, attempt_each, silent, step
 from bodyscan.registration.advice import advise
 from bodyscan.registration.board_checks import boards_not_found, check_board_size, describe_findings
 from bodyscan.registration.halves import compare_halves
@@ -38,11 +38,10 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
     if not cameras.value:
         remedy = describe_findings(rig, views.value, len(captures.sequences))
         raise _nothing_calibrated(rig, cameras.failures, remedy)
-    progress("joining the pairs", 0, 1)
-    located = locate_views(rig, views.value, cameras.value)
-    joined = _join_pairs(rig, located.value, cameras)
+    with step(progress, "joining the pairs"):
+        located = locate_views(rig, views.value, cameras.value)
+        joined = _join_pairs(rig, located.value, cameras)
     placed = joined.value
-    progress("joining the pairs", 1, 1)
     decoded = decode_on_boards(rig, captures, _of_views(placed, views.value), progress)
     lost = {**cameras.failures, **joined.failures, **decoded.failures}
     fitted = _fit_sheets(rig, placed, cameras.value, decoded, progress)
@@ -182,13 +181,12 @@ def advice_on(rig: Rig, placed: RigSolution, progress: Progress = silent) -> tup
     most; nothing for one pair."""
     if len(placed.rig_from_camera) < 2:
         return ()
-    progress("advice", 0, 1)
-    said = advise(rig, placed).lines
-    try:
-        said.append(compare_halves(rig, placed).summary)
-    except FailedWork as error:
-        said.append(f"the rig cannot be placed from halves of its shots: {error.what}")
-    progress("advice", 1, 1)
+    with step(progress, "advice"):
+        said = advise(rig, placed).lines
+        try:
+            said.append(compare_halves(rig, placed).summary)
+        except FailedWork as error:
+            said.append(f"the rig cannot be placed from halves of its shots: {error.what}")
     return tuple(said)
 
 
