@@ -76,22 +76,17 @@ def calibrate_rig(
     ] = None,
 ) -> None:
     """Calibrate every pair of a rig and join them in one frame."""
-    from bodyscan.captures.folder import open_captures
     from bodyscan.cli import tables
-    from bodyscan.registration.storage import save_calibration
-    from bodyscan.rig.rig_file import load_rig
-    from bodyscan.workflows.calibrate_rig import calibrate_rig as calibrate
+    from bodyscan.workflows.calibrate_rig import calibrate_folder
 
     refuse_file(out)
-    rig = load_rig(rig_file)
-    captures = open_captures(rig, rig_file)
     with output.stages() as progress:
-        found = calibrate(rig, captures, progress)
-    saved = save_calibration(found, out or rig_file.parent / "calibration")
+        found, saved = calibrate_folder(rig_file, out or rig_file.parent / "calibration", progress)
     output.notes(found.notes)
     output.failures(found.failed)
-    output.show(tables.calibration_table(found))
-    output.figures(**tables.calibration_figures(found))
+    with output.optional("table"):
+        output.show(tables.calibration_table(found))
+        output.figures(**tables.calibration_figures(found))
     output.say(*found.advice)
     output.made("calibration", saved)
 
@@ -138,9 +133,10 @@ def refine_rig(
     rig = load_calibration(calibration)
     with output.stages() as progress:
         found = refine(rig, open_scan(rig.rig, folder), folder.name, progress)
+    saved = save_calibration(found.value, out)
     output.failures(found.failures, "left out")
     output.say(*found.notes)
-    output.made("calibration", save_calibration(found.value, out))
+    output.made("calibration", saved)
 
 
 def sigma_map(

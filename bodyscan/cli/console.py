@@ -12,7 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import wraps
 from pathlib import Path
@@ -24,6 +24,7 @@ from rich.console import Console, RenderableType
 
 from bodyscan.cli.options import SHARED
 from bodyscan.errors import BodyscanError
+from bodyscan.optional import optional
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
@@ -100,6 +101,10 @@ class Output:
         self._failures |= failures
         for name, reason in failures.items():
             self._print(f"{what}: {name}: {reason}", style="red")
+
+    def optional(self, what: str) -> AbstractContextManager[None]:
+        """For what the command's result stands without: a block that fails is a note."""
+        return optional(what, lambda line: self.notes([line]))
 
     def told(self, outcome: Outcome[Any], what: str = "left out") -> None:
         """Notes and failures of a step."""

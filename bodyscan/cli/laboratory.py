@@ -148,12 +148,15 @@ def accept(
     synthetic = simulate is not None or any(map(is_synthetic, captured))
     folder = out or (place if place.is_dir() else place.parent).parent / "acceptance"
     found = judge_readings(readings, file, rig, place, folder, synthetic=synthetic)
-    output.show(screen_table(found.figures, synthetic))
+    with output.optional("table"):
+        output.show(screen_table(found.figures, synthetic))
     output.figures(**{one.name: one.value_mm for one in found.figures})
-    output.notes([NO_STANDARD])
+    output.notes([NO_STANDARD, *found.notes])
     output.notes(readings.problems, "problem")
     output.verdict(found.verdict)
-    output.made("report", found.page)
+    output.made("figures", found.file)
+    if found.page is not None:
+        output.made("report", found.page)
     output.exit_code = 1 if found.verdict.grade == "not accepted" else 0
 
 

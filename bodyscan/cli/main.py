@@ -6,6 +6,7 @@ at once.
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from typing import Annotated
@@ -38,6 +39,9 @@ def main() -> None:
     os.umask(0o077)  # images and models of people are for their owner alone
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
+    if debug:
+        logging.basicConfig(format="%(message)s")
+        logging.getLogger("bodyscan").setLevel(logging.DEBUG)
     try:
         app(args=arguments)
     except BodyscanError as error:

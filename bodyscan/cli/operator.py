@@ -71,10 +71,14 @@ def scan(
         found, saved, pictures = scan_folder(
             folder, calibration, out, settings, progress, empty=empty
         )
-    output.show(tables.scan_table(found))
-    output.figures(**tables.scan_figures(found))
+    with output.optional("table"):
+        output.show(tables.scan_table(found))
+        output.figures(**tables.scan_figures(found))
     output.made("result", saved)
-    output.made("pictures", *pictures)
+    output.notes(pictures.notes)
+    output.made("pictures", *pictures.value)
+    output.verdict(found.verdict)
+    output.exit_code = 1 if found.verdict.grade == "repeat" else 0
     if e57:
         from bodyscan.export.e57 import export_raw_clouds
         from bodyscan.fusion.storage import load_scan
@@ -87,8 +91,6 @@ def scan(
             calibration_id=facts["calibration_id"],
         )
         output.made("raw clouds", out / "raw.e57")
-    output.verdict(found.verdict)
-    output.exit_code = 1 if found.verdict.grade == "repeat" else 0
 
 
 def report(

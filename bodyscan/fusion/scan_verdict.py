@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from scipy import ndimage
@@ -12,6 +12,7 @@ from bodyscan.alignment.icp import Alignment
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.rings import rings
 from bodyscan.mesh.topology import face_areas
+from bodyscan.optional import optional
 from bodyscan.rig.rig import Volume
 from bodyscan.verdict import Grade, Verdict
 
@@ -41,17 +42,26 @@ def grade_scan(
     volume: Volume,
     contradicted: float = 0.0,
 ) -> Verdict:
-    """The worst of all findings decides; the reasons come worst first. contradicted: see `merge`."""
-    findings = [
-        *_pairs(failed, alignment),
-        *_motion(alignment),
-        *_contradictions(contradicted),
-        *_company(cloud),
-        *_cuts(cloud, volume),
-        *_omissions(cloud, mesh),
-        *_contacts(mesh),
-        *_gaps(mesh),
-    ]
+    """The worst of all findings decides; the reasons come worst first. contradicted: see `merge`.
+
+    A check that fails by itself leaves the scan usable at best, and says so.
+    """
+    checks: dict[str, Callable[[], Iterator[Finding]]] = {
+        "pairs": lambda: _pairs(failed, alignment),
+        "motion": lambda: _motion(alignment),
+        "contradictions": lambda: _contradictions(contradicted),
+        "pieces": lambda: _company(cloud),
+        "cuts": lambda: _cuts(cloud, volume),
+        "omissions": lambda: _omissions(cloud, mesh),
+        "contacts": lambda: _contacts(mesh),
+        "gaps": lambda: _gaps(mesh),
+    }
+    findings: list[Finding] = []
+    failures: list[str] = []
+    for what, check in checks.items():
+        with optional(f"verdict on {what}", failures.append):
+            findings += check()
+    findings += [("usable", line) for line in failures]
     worst_first = sorted(findings, key=lambda finding: -GRADES.index(finding[0]))
     grade = worst_first[0][0] if worst_first else "good"
     return Verdict(grade, tuple(reason for _, reason in worst_first))

@@ -88,7 +88,7 @@ def save_scan(
                 "filled_faces": int(np.count_nonzero(scan.mesh.filled)),
                 "filled_share": scan.mesh.filled_share,
             },
-            "median_sigma_mm": float(np.nanmedian(scan.cloud.sigma_mm)),
+            "median_sigma_mm": _number(float(np.nanmedian(scan.cloud.sigma_mm))),
             "verdict": asdict(scan.verdict),
             "measured": scan.measured,
             "failed": scan.failed,

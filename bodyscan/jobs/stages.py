@@ -67,7 +67,10 @@ def run_scan(job: Job, out: Path, progress: Progress) -> None:
     """As `bodyscan scan` does: cloud, mesh, what they are, pictures."""
     from bodyscan.workflows.scan_folder import scan_folder
 
-    scan_folder(job.source, _calibration(job), out, job.pipeline.scan, progress)
+    settings = job.pipeline.scan
+    *_, pictures = scan_folder(job.source, _calibration(job), out, settings, progress)
+    for note in pictures.notes:
+        print(note, flush=True)  # into the job's log
 
 
 def run_export(job: Job, out: Path, progress: Progress) -> None:
@@ -101,12 +104,9 @@ def rig_inputs(job: Job) -> dict[str, Path]:
 
 def run_calibrate(job: Job, out: Path, progress: Progress) -> None:
     """As `bodyscan calibrate-rig` does."""
-    from bodyscan.registration.storage import save_calibration
-    from bodyscan.workflows.calibrate_rig import calibrate_rig
+    from bodyscan.workflows.calibrate_rig import calibrate_folder
 
-    rig_file = job.source / RIG_FILE
-    rig = load_rig(rig_file)
-    save_calibration(calibrate_rig(rig, open_captures(rig, rig_file), progress), out)
+    calibrate_folder(job.source / RIG_FILE, out, progress)
 
 
 def run_rig_export(job: Job, out: Path, progress: Progress) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import os
 import secrets
 import shutil
@@ -38,6 +39,8 @@ _BEING_MADE, _TAKEN_AWAY = ".making-", ".old-"
 def main(kinds: Kinds = KINDS) -> int:
     """Work on the job of the folder on the command line; 0: done, 2: bad input, 1: failed."""
     keep_freed_memory()
+    logging.basicConfig(format="%(message)s")  # on standard error, which is the job's log
+    logging.getLogger("bodyscan").setLevel(logging.DEBUG)
     tell = _take_over_output()
     _end_with_parent()
     _be_the_first_to_go()

@@ -25,6 +25,7 @@ from bodyscan.report.page import (
     Table,
     Viewer,
     is_synthetic,
+    sections_of,
 )
 from bodyscan.report.rig_model import rig_model
 from bodyscan.report.sigma_map import draw_sigma_map
@@ -49,16 +50,18 @@ def calibration_page(folder: Path) -> Page:
             ("calibration", calibration_id(folder)[:12]),
             ("made by", str(json.loads((folder / FILE_NAME).read_text("utf-8"))["software"])),
         ),
-        [
-            _rig(calibration),
-            _pairs(figures_of(calibration), calibration),
-            _advice(calibration),
-            _boards(calibration),
-            _planes(calibration),
-            _view_graph(calibration),
-            _sigma(calibration),
-            _notes(calibration),
-        ],
+        sections_of(
+            {
+                "The rig": lambda: _rig(calibration),
+                "Pairs": lambda: _pairs(figures_of(calibration), calibration),
+                "Advice": lambda: _advice(calibration),
+                "Boards in the pictures": lambda: _boards(calibration),
+                "Light sheets": lambda: _planes(calibration),
+                "Who shares boards with whom": lambda: _view_graph(calibration),
+                "How well each place is known": lambda: _sigma(calibration),
+                "Notes": lambda: _notes(calibration),
+            }
+        ),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any, Literal
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from bodyscan.optional import optional
 from bodyscan.verdict import Verdict
 from bodyscan.version import __version__
 
@@ -140,6 +141,17 @@ class Section:
     title: str
     blocks: Sequence[Block]
     intro: str = ""
+
+
+def sections_of(parts: Mapping[str, Callable[[], Section]]) -> list[Section]:
+    """Every section of a report, by its title; one that cannot be made says so in its place."""
+    made: list[Section] = []
+    for title, make in parts.items():
+        notes: list[str] = []
+        with optional(title, notes.append):
+            made.append(make())
+        made += [Section(title, [Lines((note,))]) for note in notes]
+    return made
 
 
 @dataclass(frozen=True, eq=False)

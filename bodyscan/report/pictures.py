@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from bodyscan.arrays import Array, Bytes
 from bodyscan.files.atomic import write_bytes
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.scene import centred_scene
+from bodyscan.optional import optional
+from bodyscan.outcome import Outcome
 from bodyscan.report.canvas import (
     BACKGROUND,
     Scale,
@@ -34,18 +37,22 @@ AZIMUTHS_DEG = {"front": 0.0, "side": 90.0, "back": 180.0}
 """Where the viewer of each view stands, from the subject's front towards its left."""
 
 
-def draw_scan(cloud: BodyCloud, mesh: BodyMesh, folder: Path) -> list[Path]:
+def draw_scan(cloud: BodyCloud, mesh: BodyMesh, folder: Path) -> Outcome[list[Path]]:
     """The pictures that a scan leaves beside its result: the cloud by photo, sigma and number of
-    pairs, and the mesh with its filled faces marked."""
+    pairs, and the mesh with its filled faces marked. One that cannot be drawn is noted."""
     pictures = {
-        folder / "cloud.png": draw_cloud(cloud, colour="photo"),
-        folder / "sigma.png": draw_cloud(cloud, colour="sigma"),
-        folder / "pairs.png": draw_cloud(cloud, colour="pairs_seen"),
-        folder / "mesh.png": draw_mesh(mesh),
+        "cloud.png": partial(draw_cloud, cloud, colour="photo"),
+        "sigma.png": partial(draw_cloud, cloud, colour="sigma"),
+        "pairs.png": partial(draw_cloud, cloud, colour="pairs_seen"),
+        "mesh.png": partial(draw_mesh, mesh),
     }
-    for path, picture in pictures.items():
-        write_bytes(path, picture)
-    return list(pictures)
+    drawn: list[Path] = []
+    notes: list[str] = []
+    for name, draw in pictures.items():
+        with optional(name, notes.append):
+            write_bytes(folder / name, draw())
+            drawn.append(folder / name)
+    return Outcome(drawn, tuple(notes))
 
 
 def draw_mesh(

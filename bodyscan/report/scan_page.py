@@ -31,6 +31,7 @@ from bodyscan.report.page import (
     Table,
     Viewer,
     is_synthetic,
+    sections_of,
 )
 from bodyscan.report.pictures import draw_cloud, draw_mesh
 from bodyscan.verdict import Verdict
@@ -91,14 +92,20 @@ def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
     # A person stands elsewhere in each scan, but a truth stands where it is true.
     shown = next((one for one in found if one.fitted == one.is_scan), None)
     limit = map_limit(shown) if shown else 1.0
-    sections = [
-        Section("The body", [_viewer(scan, shown, limit)]),
-        Section("Figures", [_numbers(scan)]),
-    ]
+    parts = {
+        "The body": lambda: Section("The body", [_viewer(scan, shown, limit)]),
+        "Figures": lambda: Section("Figures", [_numbers(scan)]),
+    }
     if shown:
-        sections.append(comparison_section(scan.mesh, found, shown, limit))
-    sections += [_pictures(scan), _pairs(scan.facts), _holes(scan)]
-    return sections
+        parts["Comparison"] = lambda: comparison_section(scan.mesh, found, shown, limit)
+    return sections_of(
+        parts
+        | {
+            "Pictures": lambda: _pictures(scan),
+            "Pairs and their overlaps": lambda: _pairs(scan.facts),
+            "Holes": lambda: _holes(scan),
+        }
+    )
 
 
 def _viewer(scan: StoredScan, shown: Comparison | None, limit: float) -> Viewer | Lines:

@@ -16,6 +16,7 @@ from bodyscan.evaluation.acceptance_readings import (
     grade_acceptance,
 )
 from bodyscan.files.atomic import write_json, write_text
+from bodyscan.optional import optional
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import calibration_id
@@ -27,11 +28,14 @@ from bodyscan.workflows.accept import read_plates, read_spheres
 
 @dataclass(frozen=True)
 class Acceptance:
-    """figures: the worst of all places, with their limits.  page: the report, where it lies."""
+    """figures: the worst of all places, with their limits.  file: where they lie; page: the report,
+    None where it could not be made, as `notes` say."""
 
     figures: tuple[Figure, ...]
     verdict: Verdict
-    page: Path
+    file: Path
+    page: Path | None
+    notes: tuple[str, ...]
 
 
 def read_captures(
@@ -42,11 +46,15 @@ def read_captures(
     progress: Progress = silent,
 ) -> Readings:
     """Readings of captured artefacts, a folder a place."""
+    # All are opened before the first is read: a folder that is none costs no work.
+    places = [
+        (folder, open_scan(calibration.rig, folder), read)
+        for folders, read in ((spheres, read_spheres), (plates, read_plates))
+        for folder in folders
+    ]
     total = Readings()
-    for folders, read in ((spheres, read_spheres), (plates, read_plates)):
-        for folder in folders:
-            captures = open_scan(calibration.rig, folder)
-            total += read(calibration, captures, folder.name, file, progress)
+    for folder, captures, read in places:
+        total += read(calibration, captures, folder.name, file, progress)
     return total
 
 
@@ -66,7 +74,17 @@ def judge_readings(
     found = figures(readings, file)
     origin = calibration_id(stored)
     content = acceptance_document(readings, found, file, synthetic=synthetic, calibration_id=origin)
-    write_json(out / "acceptance.json", content)
-    page = acceptance_page(found, readings, calibration.rig.name, origin, synthetic)
-    write_text(out / "acceptance.html", render(page))
-    return Acceptance(tuple(found), grade_acceptance(found, readings), out / "acceptance.html")
+    file_path, page_path = out / "acceptance.json", out / "acceptance.html"
+    write_json(file_path, content)
+    notes: list[str] = []
+    page_path.unlink(missing_ok=True)  # one of an earlier test
+    with optional("report", notes.append):
+        page = acceptance_page(found, readings, calibration.rig.name, origin, synthetic)
+        write_text(page_path, render(page))
+    return Acceptance(
+        tuple(found),
+        grade_acceptance(found, readings),
+        file_path,
+        page_path if page_path.exists() else None,
+        tuple(notes),
+    )

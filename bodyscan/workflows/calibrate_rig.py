@@ -2,47 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import CameraCalibration, locate_board
-from bodyscan.calibration.coverage import coverage_notes
 from bodyscan.calibration.pair import PairCalibration, PlacedPair, calibrate_pair
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
-from bodyscan.captures.folder import Captures
+from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.errors import BadInput, BodyscanError, FailedWork, plainly
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, step
-from bodyscan.registration.advice import advise
-from bodyscan.registration.board_checks import boards_not_found, check_board_size, describe_findings
-from bodyscan.registration.halves import compare_halves
+from bodyscan.registration.board_checks import describe_findings
 from bodyscan.registration.rig_calibration import RigCalibration, seen_corners
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
+from bodyscan.registration.storage import save_calibration
 from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig
 from bodyscan.workflows.decode import ViewKey, decode_on_boards
 from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards, locate_views
+from bodyscan.workflows.rig_remarks import JoinedRig, remarked
 
 
 def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> RigCalibration:
-    """Board images in, calibrated rig out.
+    """Board images in, calibrated rig out, with advice on it.
 
     A bad image or pair costs that image or pair and is named in `failed` or `notes`.  Raises
     FailedWork if no pair is left, RigDisconnected if the pairs do not hang together, BadInput if
     nothing fixes the rig frame.
     """
-    views = find_all_boards(rig, captures, progress)
-    cameras = calibrate_cameras(rig, views.value, progress)
+    boards = find_all_boards(rig, captures, progress)
+    return remarked(join_rig(rig, captures, boards, progress), progress)
+
+
+def calibrate_folder(
+    rig_file: Path, folder: Path, progress: Progress = silent
+) -> tuple[RigCalibration, Path]:
+    """As `calibrate_rig`, kept in `folder` as soon as it stands and again with what is said of it;
+    and the path of its JSON. Raises RigFileError and CaptureError besides."""
+    rig = load_rig(rig_file)
+    captures = open_captures(rig, rig_file)
+    found = join_rig(rig, captures, find_all_boards(rig, captures, progress), progress)
+    save_calibration(found.calibration, folder)
+    calibration = remarked(found, progress)
+    return calibration, save_calibration(calibration, folder)
+
+
+def join_rig(
+    rig: Rig, captures: Captures, boards: Outcome[list[BoardView]], progress: Progress = silent
+) -> JoinedRig:
+    """From boards found in images to the calibration, with nothing in it that it stands without."""
+    cameras = calibrate_cameras(rig, boards.value, progress)
     if not cameras.value:
-        remedy = describe_findings(rig, views.value, len(captures.sequences))
+        remedy = describe_findings(rig, boards.value, len(captures.sequences))
         raise _nothing_calibrated(rig, cameras.failures, remedy)
     with step(progress, "joining the pairs"):
-        located = locate_views(rig, views.value, cameras.value)
+        located = locate_views(rig, boards.value, cameras.value)
         joined = _join_pairs(rig, located.value, cameras)
     placed = joined.value
-    decoded = decode_on_boards(rig, captures, _of_views(placed, views.value), progress)
+    decoded = decode_on_boards(rig, captures, _of_views(placed, boards.value), progress)
     lost = {**cameras.failures, **joined.failures, **decoded.failures}
     fitted = _fit_sheets(rig, placed, cameras.value, decoded, progress)
     failed = lost | dict(fitted.failures)
@@ -51,28 +72,17 @@ def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> 
         raise _nothing_calibrated(rig, failed)
     for pair in pairs.values():
         placed = update_poses(rig, placed, pair)
-    notes = (
-        *views.notes,
-        *coverage_notes(rig, views.value),
-        *boards_not_found(rig, views.value, len(captures.sequences)),
-        *located.notes,
-        *check_board_size(rig, placed.rig_from_camera),
-        *decoded.notes,
-        *fitted.notes,
-        *joined.notes,
-    )
-    advice = advice_on(rig, placed, progress) if not failed else ()
-    return RigCalibration(
+    calibration = RigCalibration(
         rig,
         pairs,
         {name: placed.rig_from_camera[name] for name in pairs},
         placed.covariance,
         placed.rig_from_board,
         failed,
-        notes,
-        (*advice, *stripe_board_notes(pairs)),
-        seen_corners(placed, pairs),
+        (*boards.notes, *located.notes, *decoded.notes, *fitted.notes, *joined.notes),
+        seen=seen_corners(placed, pairs),
     )
+    return JoinedRig(calibration, placed, boards.value, len(captures.sequences))
 
 
 def _nothing_calibrated(rig: Rig, failed: Mapping[str, str], remedy: str = "") -> FailedWork:
@@ -174,30 +184,3 @@ def update_poses(rig: Rig, placed: RigSolution, pair: PairCalibration) -> RigSol
         rig_from_camera={pair.name: rig_from_camera},
         rig_from_board={target: rig_from_camera @ board for target, board in seen.items()},
     )
-
-
-def advice_on(rig: Rig, placed: RigSolution, progress: Progress = silent) -> tuple[str, ...]:
-    """How well the pairs are tied together, whether halves of the shots agree, and what would help
-    most; nothing for one pair."""
-    if len(placed.rig_from_camera) < 2:
-        return ()
-    with step(progress, "advice"):
-        said = advise(rig, placed).lines
-        try:
-            said.append(compare_halves(rig, placed).summary)
-        except FailedWork as error:
-            said.append(f"the rig cannot be placed from halves of its shots: {error.what}")
-    return tuple(said)
-
-
-def stripe_board_notes(pairs: Mapping[str, PairCalibration]) -> Iterator[str]:
-    """A line on whether stripes measure the boards where the corners put them."""
-    boards = {n: p.quality.boards_mm for n, p in pairs.items() if p.quality.boards_mm is not None}
-    if boards:
-        worst = max(sorted(boards), key=lambda name: boards[name][1])
-        mean = sum(mean for mean, _ in boards.values()) / len(boards)
-        rms = (sum(rms**2 for _, rms in boards.values()) / len(boards)) ** 0.5
-        yield (
-            f"measured by the stripes, boards lie {mean:+.3f} mm (mean) and {rms:.3f} mm (RMS) from "
-            f"where the corners put them; worst: {worst}, {boards[worst][1]:.3f} mm"
-        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from bodyscan.files.atomic import write_bytes
 from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.topology import topology
+from bodyscan.optional import optional
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
 from bodyscan.report.pictures import draw_deviation
@@ -74,10 +76,17 @@ def load_truth(folder: Path) -> Truth:
 
 
 def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
-    """Camera centres and rotations against the truth."""
+    """Camera centres and rotations against the truth. Raises BadInput for a rig it does not know."""
     from bodyscan.geometry.pose_covariance import position_sigma
 
     names = tuple(sorted(calibration.rig_from_camera))
+    unknown = [name for name in names if name not in truth.facts["pairs"]]
+    if unknown:
+        raise BadInput(
+            f"the truth knows no pair {', '.join(unknown)}",
+            where=f"calibration of rig {calibration.rig.name}",
+            remedy="calibrate the rig file that `bodyscan simulate` wrote into this workspace",
+        )
     centres, rotations, sigmas = [], [], []
     for name in names:
         found = calibration.rig_from_camera[name]
@@ -89,7 +98,11 @@ def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
 
 
 def evaluate_workspace(workspace: Path) -> str:
-    """A text with every figure, and deviation pictures beside the scan."""
+    """A text with every figure, and deviation pictures beside the scan.
+
+    Raises BadInput without truth, CalibrationFileError, ResultError; a figure that cannot be had is
+    a line that says so.
+    """
     truth = load_truth(workspace / "truth")
     calibration = load_calibration(workspace / "calibration")
     rig = compare_rig(calibration, truth)
@@ -101,41 +114,8 @@ def evaluate_workspace(workspace: Path) -> str:
     folder = workspace / "scan"
     if not (folder / "scan.json").exists() or truth.vertices is None or truth.faces is None:
         return "\n".join([*lines, "  no scan to compare yet"])
-    stored = load_scan(folder)
-    pairs = truth.facts["pairs"]
-    place = sway_residual(_placings(stored, calibration), pairs, truth.vertices)
-    still_from_rig = RigidTransform.identity()
-    if truth.facts["settings"]["person"]["sway_mm"]:
-        still_from_rig = place.rig_from_still.inverse()  # who sways stands nowhere in particular
-    body = transform_mesh(stored.mesh, still_from_rig)
-    points = still_from_rig.apply(stored.cloud.points)
-    cloud = signed_distances(points, truth.vertices, truth.faces)
-    measured = np.unique(body.faces[~body.filled])
-    mesh = signed_distances(body.vertices[measured], truth.vertices, truth.faces)
-    girths = girth_errors(body, truth.vertices, truth.faces)
-    seen, covered = coverage_of_seen(points, truth.vertices, truth.faces, pairs)
-    spread, beyond = normalized_errors(cloud, stored.cloud.sigma_mm)
-    shape = topology(stored.mesh.vertices, stored.mesh.faces)
-    drawn = draw_deviation(stored.cloud.points, stored.cloud.normals, cloud)
-    write_bytes(folder / "cloud-deviation.png", drawn)
-    own = stored.mesh
-    drawn = draw_deviation(own.vertices[measured], own.normals[measured], mesh)
-    write_bytes(folder / "mesh-deviation.png", drawn)
+    lines += _scan_lines(load_scan(folder), folder, calibration, truth)
     lines += [
-        f"  cloud, {len(stored.cloud.points):,} points   {_figures(deviation(cloud))}",
-        f"  error over sigma        {spread:.2f} (robust; 1 is honest), {100.0 * beyond:.2f} % of the "
-        "points beyond three sigmas",
-        f"  mesh, measured vertices {_figures(deviation(mesh))}",
-        f"  mesh: {'closed' if shape.closed else 'open'}, "
-        f"{'manifold' if shape.manifold else 'not manifold'}, {shape.components} piece(s), "
-        f"{'outward' if shape.volume_mm3 > 0 else 'inward'} faces, "
-        f"{shape.volume_mm3 / 1e6:.2f} litres",
-        f"  torso girths (tape)     RMS {girths.rms_mm:.2f}, worst {girths.worst_mm:.2f} mm at "
-        f"{girths.worst_at_mm:.0f} mm, {girths.heights} heights; stature "
-        f"{girths.stature_mm:+.2f} mm",
-        f"  covered within 1 mm     {100.0 * covered:.1f} % of the {100.0 * seen:.1f} % of the "
-        "surface that a camera and its projector see",
-        f"  pairs to each other     {place.apart_mm:.3f} mm RMS over the body, along and across",
         "results:",
         f"  calibration {workspace / 'calibration' / 'calibration.json'}",
         f"  cloud       {folder / 'cloud.ply'}",
@@ -144,6 +124,68 @@ def evaluate_workspace(workspace: Path) -> str:
         f"  pictures    {', '.join(str(path) for path in sorted(folder.glob('*.png')))}",
     ]
     return "\n".join(lines)
+
+
+def _scan_lines(
+    stored: StoredScan, folder: Path, calibration: RigCalibration, truth: Truth
+) -> list[str]:
+    """Figures of a scan, one after the other; pictures into its folder."""
+    assert truth.vertices is not None
+    assert truth.faces is not None
+    surface, pairs = (truth.vertices, truth.faces), truth.facts["pairs"]
+    place = sway_residual(_placings(stored, calibration), pairs, truth.vertices)
+    still_from_rig = RigidTransform.identity()
+    if truth.facts["settings"]["person"]["sway_mm"]:
+        still_from_rig = place.rig_from_still.inverse()  # who sways stands nowhere in particular
+    own, body = stored.mesh, transform_mesh(stored.mesh, still_from_rig)
+    points = still_from_rig.apply(stored.cloud.points)
+    cloud = signed_distances(points, *surface)
+    measured = np.unique(body.faces[~body.filled])
+    mesh = signed_distances(body.vertices[measured], *surface)
+    lines: list[str] = []
+
+    def part(what: str) -> AbstractContextManager[None]:
+        return optional(what, lambda line: lines.append(f"  {line}"))
+
+    with part("cloud"):
+        spread, beyond = normalized_errors(cloud, stored.cloud.sigma_mm)
+        lines += [
+            f"  cloud, {len(points):,} points   {_figures(deviation(cloud))}",
+            f"  error over sigma        {spread:.2f} (robust; 1 is honest), {100.0 * beyond:.2f} % "
+            "of the points beyond three sigmas",
+        ]
+    with part("mesh"):
+        lines.append(f"  mesh, measured vertices {_figures(deviation(mesh))}")
+        shape = topology(own.vertices, own.faces)
+        lines.append(
+            f"  mesh: {'closed' if shape.closed else 'open'}, "
+            f"{'manifold' if shape.manifold else 'not manifold'}, {shape.components} piece(s), "
+            f"{'outward' if shape.volume_mm3 > 0 else 'inward'} faces, "
+            f"{shape.volume_mm3 / 1e6:.2f} litres"
+        )
+    with part("torso girths"):
+        girths = girth_errors(body, *surface)
+        lines.append(
+            f"  torso girths (tape)     RMS {girths.rms_mm:.2f}, worst {girths.worst_mm:.2f} mm at "
+            f"{girths.worst_at_mm:.0f} mm, {girths.heights} heights; stature "
+            f"{girths.stature_mm:+.2f} mm"
+        )
+    with part("coverage"):
+        seen, covered = coverage_of_seen(points, *surface, pairs)
+        lines.append(
+            f"  covered within 1 mm     {100.0 * covered:.1f} % of the {100.0 * seen:.1f} % of the "
+            "surface that a camera and its projector see"
+        )
+    lines.append(
+        f"  pairs to each other     {place.apart_mm:.3f} mm RMS over the body, along and across"
+    )
+    with part("cloud-deviation.png"):
+        drawn = draw_deviation(stored.cloud.points, stored.cloud.normals, cloud)
+        write_bytes(folder / "cloud-deviation.png", drawn)
+    with part("mesh-deviation.png"):
+        drawn = draw_deviation(own.vertices[measured], own.normals[measured], mesh)
+        write_bytes(folder / "mesh-deviation.png", drawn)
+    return lines
 
 
 def _placings(stored: StoredScan, calibration: RigCalibration) -> dict[str, RigidTransform]:

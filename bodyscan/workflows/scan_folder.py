@@ -8,6 +8,7 @@ from bodyscan.captures.folder import open_scan
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.scan import Scan
 from bodyscan.fusion.storage import clear, save_failure, save_scan
+from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, step
 from bodyscan.registration.storage import calibration_id, load_calibration
 from bodyscan.report.pictures import draw_scan
@@ -23,8 +24,9 @@ def scan_folder(
     progress: Progress = silent,
     *,
     empty: Path | None = None,
-) -> tuple[Scan, Path, list[Path]]:
-    """The scan, its scan.json in `out`, and the pictures beside it. A result that lay there goes.
+) -> tuple[Scan, Path, Outcome[list[Path]]]:
+    """The scan, its scan.json in `out`, and the pictures beside it, drawn once the result is kept.
+    A result that lay there goes.
 
     empty: captures of the rig with nobody in it. Raises ScanFailed after saying so in scan.json.
     """

@@ -1,0 +1,110 @@
+"""What a result stands without fails after the result is written, and costs itself alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+from made_scan import make_scan
+from seen_boards import SeenBoards, seen_boards
+
+from bodyscan.files.hashing import file_hash
+from bodyscan.fusion.scan_verdict import grade_scan
+from bodyscan.fusion.storage import load_scan
+from bodyscan.registration.storage import load_calibration
+from bodyscan.report import calibration_page, pictures
+from bodyscan.report.page import render
+from bodyscan.rig.rig import Volume
+from bodyscan.workflows import calibrate_rig, rig_remarks
+from bodyscan.workflows.write_report import write_report
+
+
+def broken(*_: object, **__: object) -> NoReturn:
+    raise KeyError("p2-2")
+
+
+@pytest.fixture(scope="module")
+def ring() -> SeenBoards:
+    return seen_boards()
+
+
+@pytest.fixture
+def calibrated(ring: SeenBoards, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a calibration whose remarks all failed, each after it was written."""
+    folder = tmp_path / "calibration"
+
+    def broken_later(*_: object, **__: object) -> NoReturn:
+        assert load_calibration(folder).pairs
+        raise KeyError("p2-2")
+
+    monkeypatch.setattr(calibrate_rig, "load_rig", lambda _: ring.rig)
+    monkeypatch.setattr(calibrate_rig, "open_captures", lambda *_: ring.captures(ring.views))
+    monkeypatch.setattr(calibrate_rig, "find_all_boards", lambda *_: ring.found(ring.views))
+    for name in (
+        *("coverage_notes", "boards_not_found", "check_board_size"),
+        *("advise", "compare_halves", "stripe_board_notes"),
+    ):
+        monkeypatch.setattr(rig_remarks, name, broken_later)
+    calibrate_rig.calibrate_folder(tmp_path / "rig.yaml", folder)
+    return folder
+
+
+def test_a_calibration_is_written_before_anything_is_said_of_it(
+    ring: SeenBoards, calibrated: Path
+) -> None:
+    found = load_calibration(calibrated)
+    assert sorted(found.pairs) == sorted(ring.placings)
+    failures = [note.partition(":")[0] for note in found.notes if "KeyError" in note]
+    assert failures == [
+        *("coverage of the pictures", "boards that were not found", "size of the boards"),
+        *("advice", "halves of the shots", "boards by the stripes"),
+    ]
+
+
+def test_a_report_goes_on_after_a_section_that_fails(
+    calibrated: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibration_page, "rig_model", broken)
+    monkeypatch.setattr(calibration_page, "draw_sigma_map", broken)
+    page = calibration_page.calibration_page(calibrated)
+    told = {section.title: str(section.blocks) for section in page.sections}
+    assert "KeyError" in told["The rig"]
+    assert "KeyError" in told["How well each place is known"]
+    assert sum("KeyError: 'p2-2'" in blocks for blocks in told.values()) == 3  # and in the notes
+    assert "p1-1" in told["Pairs"]
+    render(page)
+
+
+def test_a_scans_report_goes_on_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scan = make_scan(tmp_path / "scan")
+    monkeypatch.setattr("bodyscan.report.scan_page.draw_cloud", broken)
+    path, _ = write_report(scan.folder)
+    assert path.read_text("utf-8").count("failed with KeyError") == 1
+
+
+def test_a_picture_that_cannot_be_drawn_costs_itself_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scan = make_scan(tmp_path / "scan")
+    before = {name: file_hash(scan.folder / name) for name in ("cloud.ply", "mesh.ply")}
+    monkeypatch.setattr(pictures, "draw_mesh", broken)
+    drawn = pictures.draw_scan(scan.cloud, scan.mesh, scan.folder)
+    assert [path.name for path in drawn.value] == ["cloud.png", "sigma.png", "pairs.png"]
+    assert all(path.exists() for path in drawn.value)
+    (note,) = drawn.notes
+    assert note.startswith("mesh.png: left out")
+    assert before == load_scan(scan.folder).facts["sha256"]
+
+
+def test_a_verdict_that_misses_a_check_is_not_good(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scan = make_scan(tmp_path / "scan")
+    whole = grade_scan(scan.cloud, scan.mesh, None, {}, Volume())
+    monkeypatch.setattr("bodyscan.fusion.scan_verdict.rings", broken)
+    missed = grade_scan(scan.cloud, scan.mesh, None, {}, Volume())
+    said = set(missed.reasons) - set(whole.reasons)
+    assert len(said) == 1
+    assert "verdict on contacts" in said.pop()
+    assert missed.grade == "usable"
