@@ -97,7 +97,9 @@ def calibrate_camera(
 
 def locate_board(camera: Camera, view: PlanarView) -> tuple[RigidTransform, Array]:
     """`camera_from_board` of one view for a known camera, and its residuals (N, 2) px."""
-    normalized = camera.rays(view.pixels)[:, :2]
+    # A start only: where the lens folds, the pixel without its lens has to do.
+    seen = camera.rays(view.pixels)[:, :2]
+    normalized = np.where(np.isfinite(seen), seen, camera.normalized_from_pixels(view.pixels))
     h = homography(view.points[:, :2], normalized)
     solution = minimize(
         camera_from_plane(h, float(view.points[0, 2])),

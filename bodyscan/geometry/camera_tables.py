@@ -20,7 +20,7 @@ MARGIN_PX = 1.5
 """Beyond the image's outermost pixel centres, so that what is outside the table is outside the
 image."""
 OUTSIDE = -2.0
-"""Both values of a table where it has none: no pixel has such a place."""
+"""Both values of the first table where it has none: no pixel has such a place."""
 CAMERAS = 64  # kept: those of a few rigs
 
 
@@ -33,30 +33,39 @@ def projection_table(camera: Camera) -> Table:
     """
     u, v = (np.linspace(-MARGIN_PX, n - 1.0 + MARGIN_PX, 33) for n in (camera.width, camera.height))
     ideal = camera.rays(np.stack(np.meshgrid(u, v), axis=-1)).reshape(-1, 3)[:, :2]
+    reach = camera.lens.reach
 
     def pixels(normalized: Array) -> Array:
-        return camera.pixels_from_normalized(camera.lens.distort(normalized))
+        found = camera.pixels_from_normalized(camera.lens.distort(normalized))
+        one_to_one = np.linalg.norm(normalized, axis=-1, keepdims=True) < reach
+        return np.where(one_to_one, found, np.nan)
 
-    return _within_tolerance(camera, pixels, ideal.min(axis=0), ideal.max(axis=0), 1.0)
+    low, high = np.nanmin(ideal, axis=0), np.nanmax(ideal, axis=0)
+    return _within_tolerance(camera, pixels, low, high, 1.0, OUTSIDE)
 
 
 @lru_cache(CAMERAS)
 def ray_table(camera: Camera) -> Table:
-    """From a pixel (u, v) of the image to the (x, y) of its ray (x, y, 1)."""
+    """From a pixel (u, v) of the image to the (x, y) of its ray (x, y, 1); NaN where the lens folds."""
     last = np.array([camera.width, camera.height]) - 0.5
 
     def ideal(pixels: Array) -> Array:
         return camera.rays(pixels)[..., :2]
 
-    return _within_tolerance(camera, ideal, np.full(2, -0.5), last, camera.alpha)
+    return _within_tolerance(camera, ideal, np.full(2, -0.5), last, camera.alpha, np.nan)
 
 
 def _within_tolerance(
-    camera: Camera, function: Callable[[Array], Array], low: Array, high: Array, px_per_unit: float
+    camera: Camera,
+    function: Callable[[Array], Array],
+    low: Array,
+    high: Array,
+    px_per_unit: float,
+    outside: float,
 ) -> Table:
     for cell in CELLS_PX:
         cells = -(-camera.width // cell), -(-camera.height // cell)
-        found = QuadraticTable.of(function, low, high, cells, OUTSIDE)
+        found = QuadraticTable.of(function, low, high, cells, outside)
         if found.error * px_per_unit < TOLERANCE_PX:
             break
     return found.table

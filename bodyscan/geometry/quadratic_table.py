@@ -48,19 +48,21 @@ class QuadraticTable:
         outside: float,
     ) -> QuadraticTable:
         """`function` takes places (..., 2) to values (..., 2); tabulated from `low` to `high` (2,)
-        in cells (columns, rows), by least squares at 3 x 3 nodes of each.  Elsewhere both values
-        are `outside`."""
+        in cells (columns, rows), by least squares at 3 x 3 nodes of each.  Elsewhere, and in cells
+        where the function has no value (NaN) at some node, both values are `outside`."""
         size = (high - low) / cells
         x, y = (grid.ravel() for grid in np.meshgrid(NODES, NODES))
         corner = np.stack(np.meshgrid(np.arange(cells[0]), np.arange(cells[1])), axis=-1)
         values = function(low + size * (corner[:, :, None] + np.stack([x, y], axis=-1)))
         monomials = np.stack([x**i * y**j for i, j in POWERS], axis=-1)
         coefficients = np.swapaxes(np.linalg.pinv(monomials) @ values, -1, -2)
-        error = np.abs(coefficients @ monomials.T - np.swapaxes(values, -1, -2)).max()
+        error = np.abs(coefficients @ monomials.T - np.swapaxes(values, -1, -2))
         ringed = np.zeros((cells[1] + 2, cells[0] + 2, 2, len(POWERS)))
         ringed[..., 0] = outside
-        ringed[1:-1, 1:-1] = coefficients
-        return QuadraticTable(ringed, np.concatenate([low - size, 1.0 / size]), float(error))
+        known = np.isfinite(coefficients).all(axis=(2, 3))
+        ringed[1:-1, 1:-1][known] = coefficients[known]
+        worst = float(error[known].max(initial=0.0))
+        return QuadraticTable(ringed, np.concatenate([low - size, 1.0 / size]), worst)
 
 
 @compiled

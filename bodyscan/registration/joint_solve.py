@@ -173,16 +173,17 @@ def _add_frame(
     frame.rig_from_world = _rigid3d(root_from_board)
     model.add_frame(frame)
     for image_id, view in enumerate(group, start=first_image):
+        pixels = colmap_pixels(cameras[view.pair], view.pixels)
         image = pycolmap.Image(
             name=f"{view.shot}/{view.board}/{view.pair}",
-            keypoints=colmap_pixels(cameras[view.pair], view.pixels),
+            keypoints=pixels,
             camera_id=ids[view.pair],
             image_id=image_id,
         )
         image.frame_id = number
         model.add_image(image)
         for k, key in enumerate(_point_keys(view)):
-            if key in points:
+            if key in points and np.isfinite(pixels[k]).all():
                 model.add_observation(points[key], pycolmap.TrackElement(image_id, k))
     model.register_frame(number)
 

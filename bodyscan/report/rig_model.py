@@ -96,7 +96,7 @@ def _strokes(calibration: RigCalibration) -> Strokes:
         camera = calibration.pairs[name].camera
         right, bottom = camera.width - 0.5, camera.height - 0.5
         corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
-        far = placing.apply(FRUSTUM_MM * camera.rays(corners))
+        far = placing.apply(FRUSTUM_MM * np.nan_to_num(camera.rays(corners)))
         sides = np.stack([np.broadcast_to(placing.translation, far.shape), far], axis=1)
         parts.append((np.concatenate([sides, _close(far)]), _rgb(colours[name])))
     for (_, board_name), rig_from_board in calibration.rig_from_board.items():

@@ -57,6 +57,28 @@ def test_where_the_lens_folds_back_nothing_is_seen():
     assert np.all(pixels_in(projection_table(WIDE), ray) < -0.5)
 
 
+def test_a_lens_that_folds_within_the_picture_has_no_rays_beyond_and_shows_nothing_there() -> None:
+    camera = Camera(900.0, 900.0, 0.0, 640.0, 512.0, Radial(-0.6, 0.0), 1280, 1024)
+    wanted = np.zeros((1024, 1280), bool)
+    wanted[::16, ::16] = True
+    rays = rays_through(ray_table(camera), wanted)
+    rows, columns = np.nonzero(wanted)
+    pixels = np.stack([columns, rows], axis=-1).astype(float)
+    known = np.isfinite(rays).all(axis=1)
+    assert 0.4 < known.mean() < 0.9
+    # The shown radius ends at 0.497 of the focal length; a cell, 16 px at least, that holds the rim
+    # is left out whole, and just before it rays change endlessly fast.
+    radius = np.linalg.norm(pixels - [640.0, 512.0], axis=1)
+    assert known[radius < 400.0].all()
+    assert not known[radius > 448.0].any()
+    inner = radius < 380.0
+    assert np.abs(camera.project(rays[inner]) - pixels[inner]).max() < 2e-2
+    beyond = np.array(
+        [[r * np.cos(a), r * np.sin(a), 1.0] for r in (0.8, 1.0, 1.2) for a in range(6)]
+    )
+    assert np.all(pixels_in(projection_table(camera), beyond) < -0.5)
+
+
 @patiently
 @given(cameras)
 def test_slopes_are_derivatives_of_the_projection(camera):

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +10,10 @@ from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_fields import from_fields, to_fields
 from bodyscan.geometry.lenses import LENSES, lens_from_opencv
+from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.rational import Rational
 
 # The least and longest lenses that scanners have: 35 and 12 degrees from the axis to the corner.
 FOCAL_PX = st.floats(600.0, 2000.0)
@@ -55,6 +59,65 @@ def test_projecting_and_looking_back_undo_each_other(camera):
 def test_newtons_method_in_the_plane_serves_every_lens(lens):
     ideal = np.random.default_rng(0).uniform(-0.4, 0.4, (40, 2))
     assert np.allclose(Lens.undistort(lens, lens.distort(ideal)), ideal, rtol=0.0, atol=1e-12)
+
+
+FOLDING = (
+    Radial(-0.6, 0.0),
+    Radial(-0.6, 0.05),
+    Brown(-0.5, 0.1, 2e-3, -1e-3, -0.1),
+    Brown(0.1, -0.4, 0.0, 0.0, 0.0),
+    Rational(0.2, 0.0, 1e-3, 0.0, -0.3, 0.1, 0.0, 0.1),
+    Rational(0.0, 0.0, 0.0, 0.0, 0.0, -0.8, 0.0, 0.0),  # a pole at 1.12
+)
+
+
+@pytest.mark.parametrize("lens", FOLDING)
+def test_no_ray_is_better_than_a_wrong_one(lens: Lens) -> None:
+    """Beyond the fold there is no answer; before it, all around, the very point."""
+    reach = lens.reach
+    turns = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    around = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    # Towards the fold a point is known less and less by where it is shown: 0.98 has 1e-12 left.
+    for share in (0.0, 0.3, 0.6, 0.9, 0.98):
+        ideal = share * reach * around
+        assert np.allclose(lens.undistort(lens.distort(ideal)), ideal, rtol=0.0, atol=1e-9)
+    real = np.random.default_rng(0).uniform(-4.0, 4.0, (500, 2))
+    found = lens.undistort(real)
+    known = np.isfinite(found).all(axis=1)
+    # A pincushion lens shows all of the plane before its pole.
+    assert (0 < known.sum() < len(real)) or lens.coefficients[5] == -0.8
+    assert np.allclose(lens.distort(found[known]), real[known], rtol=0.0, atol=1e-9)
+    assert np.linalg.norm(found[known], axis=1).max() < reach
+
+
+@pytest.mark.parametrize("lens", FOLDING)
+def test_the_reach_ends_where_the_lens_folds(lens: Lens) -> None:
+    def turned_over(radius: float) -> bool:
+        turns = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+        points = radius * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+        return bool(np.any(np.linalg.det(lens.by_point(points)) <= 0.0))
+
+    assert not any(turned_over(share * lens.reach) for share in np.linspace(0.01, 0.995, 40))
+    assert turned_over(1.01 * lens.reach)
+
+
+@given(st.floats(-0.2, 0.2), st.floats(-0.1, 0.1))
+def test_the_chapters_lens_is_browns_without_the_rest(k1: float, k2: float) -> None:
+    """The general scan finds the fold that the closed form has, and both bend alike."""
+    radial, brown, rational = Radial(k1, k2), Brown(k1, k2), Rational(k1, k2)
+    ideal = np.random.default_rng(0).uniform(-0.4, 0.4, (40, 2))
+    for other in (brown, rational):
+        assert np.allclose(other.distort(ideal), radial.distort(ideal), rtol=0.0, atol=1e-15)
+        assert other.reach == pytest.approx(radial.reach, rel=2e-3) or radial.reach > 20.0
+
+
+@pytest.mark.parametrize("lens", [Brown(-0.2, 0.1, 2e-3, -1e-3, 0.05),
+                                  Rational(0.3, -0.1, 1e-3, 2e-3, 0.05, 0.4, 0.1, -0.05)])  # fmt: skip
+def test_opencv_projects_alike(lens: Lens) -> None:
+    camera = Camera(900.0, 905.0, 0.0, 330.0, 235.0, lens, 640, 480)
+    points = np.random.default_rng(0).uniform([-0.4, -0.3, 1.0], [0.4, 0.3, 1.0], (50, 3))
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, lens.opencv())
+    assert np.allclose(camera.project(points), expected.reshape(-1, 2), rtol=0.0, atol=1e-9)
 
 
 @given(cameras)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from bodyscan.arrays import Array
+from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.rational import Rational
 
-LENSES: dict[str, type[Lens]] = {lens.kind: lens for lens in (Radial,)}
-"""By their names in files; of those that have given coefficients of OpenCV's the first is taken."""
+LENSES: dict[str, type[Lens]] = {lens.kind: lens for lens in (Radial, Brown, Rational)}
+"""By their names in files, the simplest first; of those that have given coefficients of OpenCV's the
+first is taken."""
 
 
 def lens_from_opencv(coefficients: Array) -> Lens:

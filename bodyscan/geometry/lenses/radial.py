@@ -8,7 +8,8 @@ from typing import ClassVar, Self
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.geometry.lenses.lens import NEWTON_STEPS, Lens
+from bodyscan.geometry.lenses.lens import NEWTON_STEPS, Lens, settled
+from bodyscan.geometry.lenses.polynomials import scaled_by_point
 
 
 @dataclass(frozen=True)
@@ -41,26 +42,31 @@ class Radial(Lens):
         return np.stack([ideal * r2, ideal * r2**2], axis=-1)
 
     def by_point(self, ideal: Array) -> Array:
-        x, y = ideal[..., 0], ideal[..., 1]
-        r2 = x * x + y * y
+        r2 = np.sum(ideal**2, axis=-1)
         factor = 1.0 + r2 * (self.k1 + r2 * self.k2)
-        slope = 2.0 * (self.k1 + 2.0 * r2 * self.k2)
-        derivatives = np.empty((*r2.shape, 2, 2))
-        derivatives[..., 0, 0] = factor + slope * x * x
-        derivatives[..., 1, 1] = factor + slope * y * y
-        derivatives[..., 0, 1] = derivatives[..., 1, 0] = slope * x * y
-        return derivatives
+        return scaled_by_point(ideal, factor, self.k1 + 2.0 * r2 * self.k2)
+
+    @property
+    def reach(self) -> float:
+        """As `Lens.reach`: the least r > 0 with 1 + 3 k1 r^2 + 5 k2 r^4 = 0."""
+        bend = 9.0 * self.k1**2 - 20.0 * self.k2
+        per_r2 = 0.5 * (np.sqrt(bend) - 3.0 * self.k1) if bend >= 0.0 else 0.0
+        return float(1.0 / np.sqrt(per_r2)) if per_r2 > 0.0 else np.inf
 
     def undistort(self, real: Array) -> Array:
         """As `Lens.undistort`, by Newton's method on the radius alone."""
         radius = np.linalg.norm(real, axis=-1, keepdims=True)
         ideal = radius.copy()
-        for _ in range(NEWTON_STEPS):
-            r2 = ideal**2
-            value = ideal * (1.0 + r2 * (self.k1 + r2 * self.k2)) - radius
-            slope = 1.0 + r2 * (3.0 * self.k1 + 5.0 * r2 * self.k2)
-            ideal -= value / slope
-        return real * np.divide(ideal, radius, out=np.ones_like(radius), where=radius > 0)
+        with np.errstate(all="ignore"):
+            for _ in range(NEWTON_STEPS):
+                r2 = ideal**2
+                value = ideal * (1.0 + r2 * (self.k1 + r2 * self.k2)) - radius
+                step = value / (1.0 + r2 * (3.0 * self.k1 + 5.0 * r2 * self.k2))
+                ideal -= step
+                if settled(step):
+                    break
+            scale = np.divide(ideal, radius, out=np.ones_like(radius), where=radius > 0)
+            return self.within_reach(real * scale, real)
 
     def opencv(self) -> Array:
         return np.array([self.k1, self.k2, 0.0, 0.0, 0.0])

@@ -1,0 +1,61 @@
+"""Brown's lens as OpenCV has it: three radial coefficients and a decentred axis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+
+from bodyscan.arrays import Array
+from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.lenses.polynomials import decentring, decentring_by_point, scaled_by_point
+
+
+@dataclass(frozen=True)
+class Brown(Lens):
+    """real = ideal (1 + k1 r^2 + k2 r^4 + k3 r^6) + (2 p1 x y + p2 (r^2 + 2 x^2),
+    p1 (r^2 + 2 y^2) + 2 p2 x y).
+
+    Source: D. C. Brown, Decentering Distortion of Lenses, 1966; p1 and p2 numbered as in OpenCV.
+    """
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    kind: ClassVar[str] = "brown"
+
+    @property
+    def prior_sigmas(self) -> Array:
+        return np.array([0.5, 0.5, 0.02, 0.02, 0.5])
+
+    @property
+    def difference_steps(self) -> Array:
+        return np.array([*[1e-5] * 4, 1e-4])
+
+    def distort(self, ideal: Array) -> Array:
+        r2 = np.sum(ideal**2, axis=-1, keepdims=True)
+        factor = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        return ideal * factor + decentring(ideal) @ np.array([self.p1, self.p2])
+
+    def by_coefficients(self, ideal: Array) -> Array:
+        r2 = np.sum(ideal**2, axis=-1)[..., None, None]
+        point = ideal[..., None]
+        parts = [point * r2, point * r2**2, decentring(ideal), point * r2**3]
+        return np.concatenate(parts, axis=-1)
+
+    def by_point(self, ideal: Array) -> Array:
+        r2 = np.sum(ideal**2, axis=-1)
+        factor = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        slope = self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3)
+        return scaled_by_point(ideal, factor, slope) + decentring_by_point(ideal, self.p1, self.p2)
+
+    def opencv(self) -> Array:
+        return self.coefficients
+
+    @classmethod
+    def from_opencv(cls, coefficients: Array) -> Self | None:
+        return None if np.any(coefficients[5:]) else cls(*coefficients[:5].tolist())

@@ -1,0 +1,40 @@
+"""What lenses of OpenCV's family are made of: a factor that changes with the radius, and decentring."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodyscan.arrays import Array
+
+
+def scaled_by_point(ideal: Array, factor: Array, slope: Array) -> Array:
+    """Derivatives (..., 2, 2) of `ideal` times a factor of r^2, by the ideal points (..., 2).
+
+    factor: (...), at each.  slope: (...), its derivative by r^2.
+    """
+    x, y = ideal[..., 0], ideal[..., 1]
+    derivatives = np.empty((*x.shape, 2, 2))
+    derivatives[..., 0, 0] = factor + 2.0 * slope * x * x
+    derivatives[..., 1, 1] = factor + 2.0 * slope * y * y
+    derivatives[..., 0, 1] = derivatives[..., 1, 0] = 2.0 * slope * x * y
+    return derivatives
+
+
+def decentring(ideal: Array) -> Array:
+    """(..., 2, 2): where p1 and p2 move the points (..., 2), per unit of each (OpenCV's signs)."""
+    x, y = ideal[..., 0], ideal[..., 1]
+    derivatives = np.empty((*x.shape, 2, 2))
+    derivatives[..., 0, 0] = derivatives[..., 1, 1] = 2.0 * x * y
+    derivatives[..., 0, 1] = 3.0 * x * x + y * y
+    derivatives[..., 1, 0] = x * x + 3.0 * y * y
+    return derivatives
+
+
+def decentring_by_point(ideal: Array, p1: float, p2: float) -> Array:
+    """Derivatives (..., 2, 2) of `decentring(ideal) @ (p1, p2)` by the points (..., 2)."""
+    x, y = ideal[..., 0], ideal[..., 1]
+    derivatives = np.empty((*x.shape, 2, 2))
+    derivatives[..., 0, 0] = 2.0 * p1 * y + 6.0 * p2 * x
+    derivatives[..., 0, 1] = derivatives[..., 1, 0] = 2.0 * p1 * x + 2.0 * p2 * y
+    derivatives[..., 1, 1] = 6.0 * p1 * y + 2.0 * p2 * x
+    return derivatives
