@@ -1,6 +1,7 @@
 """A projector with a lens, point by point: what `LensSheets` does for arrays of them.
 
-frame: (3, 4) of projector_from_camera.  lens: (6,) f, c, k1, k2, p1, p2, as in `LensSheets`.
+frame: (3, 4) of projector_from_camera.  lens: (10,) f, c, k1, k2, p1, p2, k3, k4, k5, k6, as in
+`LensSheets`.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def measure_rays(
 ) -> None:
     """found (3, N): depth z, dz/ds and the variance of z, for rays (N, 3) at s (N,); NaN where none.
 
-    covariance: (P, P) of the freedoms of a fit.  distance: of the boards, where the search starts.
+    covariance: (P, P) of the freedoms of a fit.  distance: of the boards, mm.
     """
     jacobian = np.empty(len(covariance))
     for n in range(len(s)):
@@ -79,19 +80,26 @@ def measure_rays(
 @compiled
 def _depth(frame: Array, lens: Array, distance: float, x: float, y: float, s: float) -> float:
     """z where the ray (x, y, 1) meets the sheet at s, by Newton's method on the offset times the
-    reach, which without a lens is linear along a ray; NaN where there is none."""
+    reach, which without a lens is linear along a ray; NaN where there is none, or only where the
+    lens folds back, far outside of its picture.
+
+    It starts where the ray met the sheet if there were no lens, or at the distance (mm) if nowhere.
+    """
     forward = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2]
-    depth = (distance - frame[2, 3]) / forward
-    step = reach = np.nan
+    across, slope = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2], (s - lens[1]) / lens[0]
+    depth = (slope * frame[2, 3] - frame[1, 3]) / (across - slope * forward)
+    if not 0.0 < depth < np.inf:
+        depth = (distance - frame[2, 3]) / forward
+    step = reach = rise = np.nan
     for _ in range(NEWTON_STEPS):
         seen = _seen(frame, x * depth, y * depth, depth)
         bent = _bent(lens, seen[0], seen[1])
-        reach, off = seen[2], lens[0] * bent[0] + lens[1] - s
+        reach, rise, off = seen[2], bent[2], lens[0] * bent[0] + lens[1] - s
         step = off * reach / (_slope_times_reach(frame, seen, bent, x, y) + off * forward)
         depth -= step
         if not abs(step) > EXACT * abs(depth):
             break
-    return depth if abs(step) < CONVERGED * depth and reach > 0.0 else np.nan
+    return depth if abs(step) < CONVERGED * depth and reach > 0.0 and rise > 0.0 else np.nan
 
 
 @compiled
@@ -108,12 +116,26 @@ def _seen(frame: Array, x: float, y: float, z: float) -> Vector:
 @compiled
 def _bent(lens: Array, x: float, y: float) -> Vector:
     """(s - c) / f at x = X/Z, y = Y/Z, and the derivatives of s by x and by y."""
-    focal, k1, k2, p1, p2 = lens[0], lens[2], lens[3], lens[4], lens[5]
+    focal, p1, p2 = lens[0], lens[4], lens[5]
     r2 = x * x + y * y
-    radial, slope = 1.0 + r2 * (k1 + r2 * k2), k1 + 2.0 * k2 * r2
+    radial, slope, _ = _radial(lens, r2)
     by_x = focal * (2.0 * x * (y * slope + p1) + 2.0 * p2 * y)
     by_y = focal * (radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x)
     return y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y, by_x, by_y
+
+
+@compiled
+def _radial(lens: Array, r2: float) -> Vector:
+    """By what the lens multiplies a distance from its axis of which r2 is the square; the derivative
+    of that by r2; and 1 / (1 + k4 r2 + ...)."""
+    k1, k2, k3 = lens[2], lens[3], lens[6]
+    above, rise = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3)
+    k4, k5, k6 = lens[7], lens[8], lens[9]
+    if k4 == 0.0 and k5 == 0.0 and k6 == 0.0:  # as with nearly all: no division
+        return above, rise, 1.0
+    share = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    radial = above * share
+    return radial, (rise - radial * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))) * share, share
 
 
 @compiled
@@ -127,13 +149,17 @@ def _slope_times_reach(frame: Array, seen: Vector, bent: Vector, x: float, y: fl
 
 @compiled
 def _by_freedom(lens: Array, seen: Vector, bent: Vector, jacobian: Array) -> None:
-    """ds (P,) by a small motion of the frame, f, c, and as many of k1, k2, p1, p2 as there are."""
+    """ds (P,) by a small motion of the frame, f, c, and as many of k1, k2, p1, ... as there are."""
     (x, y, reach), (slide, by_x, by_y) = seen, bent
     by_z, r2 = -(by_x * x + by_y * y), x * x + y * y
     jacobian[0], jacobian[1] = y * by_z - by_y, by_x - x * by_z
     jacobian[2], jacobian[3] = x * by_y - y * by_x, by_x / reach
     jacobian[4], jacobian[5] = by_y / reach, by_z / reach
     jacobian[6], jacobian[7] = slide, 1.0
-    terms = (y * r2, y * r2 * r2, r2 + 2.0 * y * y, 2.0 * x * y)
-    for k in range(len(jacobian) - 8):
+    radial, _, share = _radial(lens, r2)
+    r4, above, below = r2 * r2, y * share, -y * radial * share
+    terms = (above * r2, above * r4, r2 + 2.0 * y * y, 2.0 * x * y, above * r2 * r4)
+    for k in range(min(len(jacobian) - 8, 5)):
         jacobian[8 + k] = lens[0] * terms[k]
+    for k in range(13, len(jacobian)):
+        jacobian[k] = lens[0] * below * r2 ** (k - 12)

@@ -2,9 +2,11 @@
 
 In the projector's frame x = X/Z along the stripes, y = Y/Z across them, r^2 = x^2 + y^2 and
 
-    s = c + f (y (1 + k1 r^2 + k2 r^4) + p1 (r^2 + 2 y^2) + 2 p2 x y),
+    s = c + f (y (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+               + p1 (r^2 + 2 y^2) + 2 p2 x y),
 
-OpenCV's lens (Brown 1966) for the one coordinate that stripes carry. Without k and p this is the
+OpenCV's lens (Brown 1966; its rational one) for the one coordinate that stripes carry. Our fits use
+k1, k2, p1, p2; the others are those of projectors calibrated elsewhere. Without k and p this is the
 2 x 4 matrix of Bolles 1981, and where the centre lies along the stripes is then unknown.
 """
 
@@ -21,15 +23,15 @@ from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, cross_matrix
 
 FRAME, SCALE = 6, 2
-LENS_SPREAD = (0.3, 0.3, 0.03, 0.03)
-"""Standard deviations of k1, k2, p1, p2 before any data."""
+LENS_SPREAD = (0.3, 0.3, 0.03, 0.03, 0.3, 0.3, 0.3, 0.3)
+"""Standard deviations of k1, k2, p1, p2, k3, k4, k5, k6 before any data."""
 ASIDE = 0.3
 """Standard deviation of where the boards' middle lies along the stripes, in distances."""
 
 
 @dataclass(frozen=True, eq=False)
 class LensSheets(SmoothSheets):
-    """parameters: f, c (stripes), then as many of k1, k2, p1, p2 as the lens has.
+    """parameters: f, c (stripes), then as many of k1, k2, p1, p2, k3, k4, k5, k6 as the lens has.
 
     The freedoms of a fit: a small motion of the projector's frame (rotation vector, translation in
     mm, put before it), then the parameters.
@@ -50,7 +52,7 @@ class LensSheets(SmoothSheets):
         return "lens"
 
     def with_lens(self, terms: int) -> LensSheets:
-        """With that many of k1, k2, p1, p2; those that are new start at 0."""
+        """With that many of k1, k2, p1, p2, ...; those that are new start at 0."""
         parameters = np.zeros(SCALE + terms)
         kept = min(len(parameters), len(self.parameters))
         parameters[:kept] = self.parameters[:kept]
@@ -117,7 +119,7 @@ class LensSheets(SmoothSheets):
         return found[0], found[1], found[2]
 
     def _frame_and_lens(self) -> tuple[Array, Array]:
-        """projector_from_camera (3, 4), and f, c, k1, k2, p1, p2; 0 for what the lens lacks."""
+        """projector_from_camera (3, 4), and f, c, k1, ..., k6 (10,); 0 for what the lens lacks."""
         lens = np.zeros(SCALE + len(LENS_SPREAD))
         lens[: len(self.parameters)] = self.parameters
         return np.ascontiguousarray(self.projector_from_camera.matrix[:3]), lens

@@ -1,0 +1,107 @@
+"""Sheets of light of a projector that OpenCV describes as a camera, against OpenCV itself."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from bodyscan.arrays import Array
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.light_planes import Axis
+from bodyscan.geometry.projector_sheets import looked_at, sheets_of_projector
+from bodyscan.geometry.transforms import RigidTransform
+
+CAMERA = Camera(2800.0, 2790.0, 0.0, 1300.0, 970.0, Radial(-0.1, 0.05), 2592, 1944)
+SIZE = {"vertical": 1280, "horizontal": 800}
+LENSES = {
+    "none": np.zeros(5),
+    "radial": np.array([-0.05, 0.3, 0.0, 0.0, 0.0]),
+    "Brown": np.array([-0.05, 1.4, -7.5e-3, -2e-3, -7.3]),
+    "rational": np.array([0.4, 0.2, 2e-3, -1e-3, 0.05, 0.45, 0.3, 0.02]),
+}
+PLACE = RigidTransform.from_rotation_vector([0.05, 0.4, -0.1], [-180.0, -25.0, -60.0])
+
+
+class OpenCVs(Radial):
+    """Stands for any lens that has OpenCV's coefficients: nothing else is asked of a projector's."""
+
+    def __init__(self, coefficients: Array) -> None:
+        object.__setattr__(self, "given", coefficients)
+
+    def opencv(self) -> Array:
+        given: Array = vars(self)["given"]
+        return given
+
+
+def projector(lens: Lens, skew: float = 0.0) -> Camera:
+    return Camera(1650.0, 1720.0, skew, 622.0, 363.0, lens, SIZE["vertical"], SIZE["horizontal"])
+
+
+@pytest.mark.parametrize("kind", LENSES)
+@pytest.mark.parametrize("direction", ["vertical", "horizontal"])
+def test_its_sheets_lie_where_opencv_projects_them(kind: str, direction: Axis) -> None:
+    light = projector(OpenCVs(LENSES[kind]))
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-150.0, -120.0, 550.0], [120.0, 120.0, 850.0], (400, 3))
+    seen, _ = cv2.projectPoints(
+        points, PLACE.rotation_vector, PLACE.translation, light.matrix, LENSES[kind]
+    )
+    s = seen[:, 0, 0 if direction == "vertical" else 1] + 0.5
+    shown = (s > 0.0) & (s < SIZE[direction])
+    assert shown.sum() > 250
+    for halves in (1, 2):  # two pixels a stripe: half as many stripes
+        stripes = SIZE[direction] // halves
+        # Where the search starts must not matter: nobody says how far away the subject stands.
+        for middle in ([0.0, 0.0, 300.0], [0.0, 0.0, 3000.0]):
+            sheets = sheets_of_projector(light, PLACE, np.array(middle), stripes, direction)
+            depth, per_stripe, variance = sheets.measure(
+                points[shown] / points[shown, 2:], s[shown] / halves
+            )
+            if direction == "vertical":  # along the baseline, so that depth is well told
+                np.testing.assert_allclose(depth, points[shown, 2], rtol=0, atol=1e-6)
+            np.testing.assert_allclose(sheets.stripe(points) * halves, s, rtol=0, atol=1e-9)
+            assert np.all(variance == 0.0)
+            assert np.all(np.abs(per_stripe) > 0.0)
+
+
+def test_skew_turns_the_sheets_of_columns_alone() -> None:
+    light = projector(OpenCVs(LENSES["Brown"]), skew=4.0)
+    points = np.random.default_rng(4).uniform([-100, -100, 600], [100, 100, 800], (50, 3))
+    inside = PLACE.apply(points)
+    bent, _ = cv2.projectPoints(inside, np.zeros(3), np.zeros(3), np.eye(3), LENSES["Brown"])
+    u, v = np.moveaxis(light.pixels_from_normalized(bent[:, 0]), -1, 0)
+    for direction, expected in (("vertical", u), ("horizontal", v)):
+        sheets = sheets_of_projector(light, PLACE, points[0], SIZE[direction], direction)
+        np.testing.assert_allclose(sheets.stripe(points), expected + 0.5, rtol=0, atol=1e-9)
+
+
+def test_sigma_moves_all_sheets_together() -> None:
+    light = projector(OpenCVs(LENSES["Brown"]))
+    sheets = sheets_of_projector(light, PLACE, np.array([0, 0, 700.0]), 640, "vertical", 0.5)
+    rays = np.array([[0.0, 0.0, 1.0], [0.1, 0.05, 1.0]])
+    depth, per_stripe, variance = sheets.measure(rays, np.array([200.0, 300.0]))
+    assert np.all(np.isfinite(depth))
+    # half a projector pixel is a quarter of a stripe of two pixels
+    np.testing.assert_allclose(np.sqrt(variance), 0.25 * np.abs(per_stripe), rtol=1e-12)
+
+
+def test_what_is_looked_at_lies_where_the_axes_meet() -> None:
+    light = projector(Radial())
+    target = np.array([0.0, 0.0, 700.0])
+    camera_middle = CAMERA.rays(np.array([1295.5, 971.5])) * 700.0
+    middle = light.rays(np.array([639.5, 399.5]))
+    # Turn the projector so that the middle of its picture falls on that point.
+    position = np.array([200.0, 0.0, 0.0])
+    z = (camera_middle - position) / np.linalg.norm(camera_middle - position)
+    x = np.cross([0.0, 1.0, 0.0], z) / np.linalg.norm(np.cross([0.0, 1.0, 0.0], z))
+    looks = np.stack([x, np.cross(z, x), z])
+    wanted = middle / np.linalg.norm(middle)
+    correct, _ = cv2.Rodrigues(np.cross([0.0, 0.0, 1.0], wanted))
+    place = RigidTransform(correct @ looks, -correct @ looks @ position)
+    found = looked_at(CAMERA, light, place)
+    assert np.linalg.norm(found - target) < 15.0
+    parallel = RigidTransform(np.eye(3), np.array([-200.0, 0.0, 0.0]))
+    assert looked_at(CAMERA, light, parallel)[2] == pytest.approx(1000.0, rel=0.3)
