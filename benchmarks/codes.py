@@ -124,12 +124,12 @@ def _row(
         code=spec,
         inter_reflection=settings.inter_reflection,
     )
-    length = exposure(images[frames.lit], light.board_grey, light)
+    length = exposure(images["lit"], light.board_grey, light)
     seen = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}
     if not spec.is_projected:
         seen = instrument_images(seen, spec, frames)
     coded = np.stack([seen[name] for name in frames.of_code(spec)])
-    found = decode_stripes(spec, seen[frames.lit], seen.get(frames.dark or ""), coded)
+    found = decode_stripes(spec, seen["lit"], seen.get(frames.dark or ""), coded)
     lit = np.isfinite(truth.s)
     known = lit & np.isfinite(found.s)
     error = np.abs(found.s - truth.s)[known]

@@ -30,7 +30,7 @@ def report(workspace: Path | None = None) -> str:
     workspace = workspace or Path(os.environ.get("BODYSCAN_BENCH", full_size.WORKSPACE))
     calibration = load_calibration(workspace / "calibration")
     first = open_scan(calibration.rig, workspace / "captures" / "person").sequences[0]
-    files = [Path(path).read_bytes() for path in (first.lit, *first.coded)]
+    files = [Path(path).read_bytes() for path in (first.seen_in, *first.coded)]
     height, width = cv2.imdecode(np.frombuffer(files[0], np.uint8), cv2.IMREAD_GRAYSCALE).shape
     rows = []
     for name, of in READERS.items():

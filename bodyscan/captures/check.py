@@ -9,7 +9,7 @@ from itertools import groupby
 from pathlib import Path
 
 from bodyscan.captures.folder import Captures, ImageSequence, join_captures, open_folder, open_scan
-from bodyscan.captures.image_faults import header_fault
+from bodyscan.captures.image_faults import absence, header_fault
 from bodyscan.captures.unlisted_images import find_unlisted_images
 from bodyscan.errors import CaptureError
 from bodyscan.files.model import did_you_mean
@@ -146,7 +146,10 @@ def _bad_images(rig: Rig, sequence: ImageSequence) -> tuple[BadImage, ...]:
     camera = rig.pair(sequence.pair).camera
     missing = set(sequence.missing)
     faults = (
-        (path, "is missing" if path in missing else header_fault(path, camera.width, camera.height))
+        (
+            path,
+            absence(path) if path in missing else header_fault(path, camera.width, camera.height),
+        )
         for path in sequence.paths
     )
     return tuple(

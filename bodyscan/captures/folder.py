@@ -27,16 +27,17 @@ class ImageSequence:
     """The images that one pair took, or should have taken, in one shot.
 
     coded: the images of the stripe code, in the order of `FrameNames.of_code`; () where only the
-    lit image was taken. dark: None where there is no such image. missing: those of the paths that
-    are not there.
+    lit image, or that of the board, was taken. lit, dark, board: None where there is no such image.
+    missing: those of the paths that are not there.
     """
 
     pair: str
     shot: str
-    lit: Path
+    lit: Path | None
     dark: Path | None
     coded: tuple[Path, ...]
     missing: tuple[Path, ...]
+    board: Path | None = None
 
     @property
     def has_stripes(self) -> bool:
@@ -45,9 +46,14 @@ class ImageSequence:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Lit, dark, then those of the code."""
-        dark = () if self.dark is None else (self.dark,)
-        return (self.lit, *dark, *self.coded)
+        """Lit, dark and that of the board, if there are such, then those of the code."""
+        single = (self.lit, self.dark, self.board)
+        return (*(path for path in single if path is not None), *self.coded)
+
+    @property
+    def seen_in(self) -> Path:
+        """The image in which boards are looked for; the first of the code if it has to be made."""
+        return self.board or self.lit or self.coded[0]
 
 
 @dataclass(frozen=True)
@@ -197,7 +203,7 @@ def _open(
         sequence for shot in shots for sequence in _sequences(rig, listing, template, shot)
     )
     if not sequences:
-        example = fill(template, shot="SHOT", pair=rig.pairs[0].name, frame=rig.frames.lit)
+        example = fill(template, shot="SHOT", pair=rig.pairs[0].name, frame=_some_frame(rig))
         raise CaptureError(
             f"holds no image of rig {rig.name} by the template {template}",
             where=str(folder),
@@ -205,6 +211,12 @@ def _open(
         )
     when, subject = (file.when, file.subject) if file else (None, None)
     return Captures(rig, (folder,), names, sequences, when, subject)
+
+
+def _some_frame(rig: Rig) -> str:
+    """The name of an image that there should be of every pair."""
+    code = rig.pairs[0].projector
+    return rig.frames.board_image or (rig.frames.of_code(code)[0] if code else "")
 
 
 def _discover(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
@@ -220,10 +232,10 @@ def _discover(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
         )
     found: set[str] = set()
     for pair in rig.pairs:
-        frames = [rig.frames.lit]
+        frames = {rig.frames.lit, rig.frames.board} - {None}
         if pair.projector:
-            frames += rig.frames.of_code(pair.projector)[:1]
-        for frame in frames:
+            frames |= set(rig.frames.of_code(pair.projector)[:1])
+        for frame in filter(None, frames):
             found |= _shots_matching(listing, shot_pattern(template, pair.name, frame), "", None)
     return tuple(sorted((name for name in found if len(name) <= 64), key=_natural))
 
@@ -258,12 +270,12 @@ def _sequences(
 ) -> Iterator[ImageSequence]:
     look = shot.stripes is None and shot.lit is None
     for pair in rig.pairs:
-        whole = _sequence(rig, listing, template, shot.name, pair, stripes=True)
-        alone = _sequence(rig, listing, template, shot.name, pair, stripes=False)
+        whole = _sequence(rig, listing, template, shot.name, pair)
+        alone = _view_alone(rig, listing, template, shot.name, pair)
         if look:
             if set(whole.coded) - set(whole.missing):
                 yield whole
-            elif not alone.missing:
+            elif alone is not None and not alone.missing:
                 yield alone
         elif pair.name in (shot.stripes or ()):
             if not has_field(template, "frame"):
@@ -275,29 +287,54 @@ def _sequences(
                 )
             yield whole
         elif pair.name in (shot.lit or ()):
+            if alone is None:
+                raise CaptureError(
+                    f"says that pair {pair.name} took the lit image alone in shot {shot.name}, but"
+                    " the rig file has `lit: null`",
+                    where=str(listing.root / FILE_NAME),
+                    remedy="List the pair in `stripes`, or name the image in `frames`.",
+                )
             yield alone
 
 
-def _sequence(
-    rig: Rig, listing: Listing, template: str, shot: str, pair: Pair, *, stripes: bool
-) -> ImageSequence:
+def _sequence(rig: Rig, listing: Listing, template: str, shot: str, pair: Pair) -> ImageSequence:
+    """The whole sequence; of a camera without projector, nothing."""
     frames = rig.frames
-    projector = pair.projector if stripes and has_field(template, "frame") else None
+    code = pair.projector if has_field(template, "frame") else None
+    if code is None:
+        return ImageSequence(pair.name, shot, None, None, (), ())
+    files = _Files(listing, template, shot, pair.name)
+    dark_name = frames.dark if any(way.uses_dark for way in code.directions) else None
+    lit, dark, board = map(files.path, (frames.lit, dark_name, frames.board))
+    coded = tuple(filter(None, map(files.path, frames.of_code(code))))
+    return ImageSequence(pair.name, shot, lit, dark, coded, tuple(files.missing), board)
 
-    def files(*names: str) -> tuple[str, ...]:
-        return tuple(fill(template, shot=shot, pair=pair.name, frame=name) for name in names)
 
-    lit = files(frames.lit)
-    dark_name = frames.dark if projector and projector.uses_dark else None
-    dark = files(dark_name) if dark_name is not None else ()
-    coded = files(*frames.of_code(projector)) if projector else ()
-    missing = [name for name in (*lit, *dark, *coded) if not listing.has(name)]
-    root = listing.root
-    return ImageSequence(
-        pair=pair.name,
-        shot=shot,
-        lit=root / lit[0],
-        dark=root / dark[0] if dark else None,
-        coded=tuple(root / name for name in coded),
-        missing=tuple(root / name for name in missing),
-    )
+def _view_alone(
+    rig: Rig, listing: Listing, template: str, shot: str, pair: Pair
+) -> ImageSequence | None:
+    """The image of the board by itself; None if none is taken."""
+    frames, files = rig.frames, _Files(listing, template, shot, pair.name)
+    path = files.path(frames.board_image if has_field(template, "frame") else "")
+    if path is None:
+        return None
+    return ImageSequence(pair.name, shot, path, None, (), tuple(files.missing))
+
+
+class _Files:
+    """Paths of one pair's images in one shot; `missing` grows by those that are not there."""
+
+    def __init__(self, listing: Listing, template: str, shot: str, pair: str) -> None:
+        self.listing, self.template, self.shot, self.pair = listing, template, shot, pair
+        self.missing: list[Path] = []
+
+    def path(self, frame: str | None) -> Path | None:
+        """None for no frame."""
+        if frame is None:
+            return None
+        wanted = fill(self.template, shot=self.shot, pair=self.pair, frame=frame)
+        name = self.listing.find(wanted)
+        path = self.listing.root / name
+        if not self.listing.has(name):
+            self.missing.append(path)
+        return path

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from bodyscan.captures.image_header import NoImage, read_header
 from bodyscan.errors import ImageError
+from bodyscan.rig.templates import ANYTHING
 
 
 def header_fault(path: Path, width: int, height: int) -> str | None:
@@ -13,7 +14,7 @@ def header_fault(path: Path, width: int, height: int) -> str | None:
     try:
         header = read_header(path)
     except FileNotFoundError:
-        return "is missing"
+        return absence(path)
     except NoImage as error:
         return str(error)
     except OSError as error:
@@ -26,6 +27,19 @@ def header_fault(path: Path, width: int, height: int) -> str | None:
     return None if header.complete else "is cut short"
 
 
+def absence(path: Path) -> str:
+    """Why there is no such file: it is missing, or `*` in its name fits several."""
+    fitting = sorted(found.name for found in path.parent.glob(_plain(path.name)))
+    if ANYTHING in path.name and len(fitting) > 1:
+        return f"fits {len(fitting)} files, {fitting[0]} and {fitting[1]} among them"
+    return "is missing"
+
+
+def _plain(name: str) -> str:
+    """A pattern for glob, in which `*` alone has a meaning."""
+    return name.replace("[", "[[]").replace("?", "[?]")
+
+
 def image_error(what: str, path: Path, pair: str, shot: str, *, remedy: str = "") -> ImageError:
     """An ImageError that names file, pair and shot, and what to do."""
     taken = ", ".join(f"{kind} {name}" for kind, name in (("pair", pair), ("shot", shot)) if name)
@@ -34,6 +48,8 @@ def image_error(what: str, path: Path, pair: str, shot: str, *, remedy: str = ""
 
 
 def _remedy(what: str) -> str:
+    if what.startswith("fits "):
+        return "Keep one of them, or say more of the name in `files` or `frames` of the rig file."
     if what == "is missing":
         return "Copy it here, take the shot again, or leave it out of captures.yaml."
     if "the rig file says" in what:

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from bodyscan.errors import CaptureError
+from bodyscan.rig.templates import ANYTHING, names_pattern
 
 
 class Listing:
@@ -32,6 +33,22 @@ class Listing:
         path = self.root / relative
         self._refuse_if_outside(path)
         return path.exists()
+
+    def find(self, relative: str) -> str:
+        """The path itself; of one with `*` in it the only one that fits, if there is just one."""
+        if ANYTHING not in relative:
+            return relative
+        fitting = [""]
+        for part in relative.split("/"):
+            wanted = names_pattern(part)
+            fitting = [
+                f"{folder}/{name}".lstrip("/")
+                for folder in fitting
+                for name in (self.names(folder) if ANYTHING in part else (part,))
+                if wanted.fullmatch(name)
+            ]
+        there = [path for path in fitting if self.has(path)]
+        return there[0] if len(there) == 1 else relative
 
     def names(self, relative: str) -> tuple[str, ...]:
         """Names of what a folder holds, () if there is no such folder. "" is the root."""

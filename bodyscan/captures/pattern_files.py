@@ -27,7 +27,7 @@ def uneven_stripes(rig: Rig, width: int, height: int) -> tuple[str, ...]:
     planes take that as it is, models that are smooth in s do not. Waves of light need no whole
     pixels.
     """
-    kinds = {pair.projector for pair in rig.pairs if pair.projector}
+    kinds = {way for pair in rig.pairs if pair.projector for way in pair.projector.directions}
     counts = {
         (kind.stripes, height if kind.direction == "horizontal" else width)
         for kind in kinds
@@ -101,9 +101,10 @@ def _write_kind(
 
 
 def _in_order(frames: FrameNames, kind: StripeCode, coded: Bytes) -> Iterator[tuple[str, Bytes]]:
-    """Name and image (H, W): lit, dark if it is taken, then those of the code."""
+    """Name and image (H, W): lit and dark if they are taken, then those of the code."""
     blank = np.zeros(coded.shape[1:], np.uint8)
-    yield frames.lit, blank + 255
-    if frames.dark is not None and kind.uses_dark:
+    if frames.lit is not None:
+        yield frames.lit, blank + 255
+    if frames.dark is not None and any(way.uses_dark for way in kind.directions):
         yield frames.dark, blank
     yield from zip(frames.of_code(kind), coded, strict=True)

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from bodyscan.files.model import Problem, did_you_mean, duplicates
 from bodyscan.rig.board import Board, family
 from bodyscan.rig.capture_folder import CaptureFolder
-from bodyscan.rig.frame_names import FrameNames
+from bodyscan.rig.frame_names import FrameNames, ImageNames
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig_frame import RigFrame
 from bodyscan.rig.templates import template_faults
 from bodyscan.stripes.codes import image_kinds
+from bodyscan.stripes.stripe_code import StripeCode
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ def rig_problems(parts: RigParts) -> Iterator[Problem]:
     for key, names in (("boards", parts.board_names), ("pairs", parts.pair_names)):
         for index, name in duplicates(names):
             yield (key, index, "name"), f"is given to two {key}: every name once (got {name!r})"
+    if parts.folders and not parts.boards:
+        yield ("boards",), "is missing: calibration captures show a board"
     yield from _marker_overlaps(parts.boards)
     yield from _wrong_frames(parts)
     yield from _template_problems(parts)
@@ -59,29 +62,54 @@ def _marker_overlaps(boards: Sequence[Board | None]) -> Iterator[Problem]:
 
 
 def _wrong_frames(parts: RigParts) -> Iterator[Problem]:
-    projectors = [(pair.name, pair.projector) for pair in parts.pairs if pair and pair.projector]
-    if parts.frames is None:
+    pairs = [pair for pair in parts.pairs if pair]
+    codes = [(pair.name, pair.projector) for pair in pairs if pair.projector]
+    frames = parts.frames
+    if frames is None:
         return
+    yield from _wrong_counts(frames, ("frames",), codes)
+    across = [(name, code.crossing) for name, code in codes if code.crossing]
+    yield from _wrong_counts(frames.crossing, ("frames", "crossing"), across)
+    if frames.crossing.model_extra and not across and len(pairs) == len(parts.pairs):
+        yield ("frames", "crossing"), "is for a projector with `crossing`: no pair has one"
+    ways = [(name, way) for name, code in codes for way in code.directions]
+    if frames.dark is None:
+        lacking = next((name for name, way in ways if way.needs_dark), None)
+        if lacking:
+            wrong = f"is needed: pair {lacking} takes no inverses, so only it shows what black is"
+            yield ("frames", "dark"), wrong
+    if frames.lit is None:
+        lacking = next((name for name, way in ways if way.needs_lit), None)
+        if lacking:
+            wrong = (
+                f"is needed: the images of pair {lacking} do not show the scene under full light"
+            )
+            yield ("frames", "lit"), wrong
+        alone = next((pair.name for pair in pairs if not pair.projector), None)
+        if alone and frames.board is None and "{frame}" in (parts.files or "{frame}"):
+            wrong = f"or board is needed: pair {alone}, a camera alone, takes no other image"
+            yield ("frames", "lit"), wrong
+
+
+def _wrong_counts(
+    names: ImageNames, where: tuple[str, ...], codes: Sequence[tuple[str, StripeCode]]
+) -> Iterator[Problem]:
+    """Lists of names that are longer or shorter than what a pair's code takes."""
     for kind in image_kinds():
-        names = parts.frames.given(kind)
-        if isinstance(names, str):
+        given = names.given(kind)
+        if isinstance(given, str):
             continue
-        for pair, code in projectors:
-            count = code.image_counts.get(kind, len(names))
-            if count != len(names):
+        for pair, code in codes:
+            count = code.image_counts.get(kind, len(given))
+            if count != len(given):
+                first = getattr(code, "first_code", 0)
+                since = f" from {first}" if first else ""
                 yield (
-                    ("frames", kind.name),
-                    f"has {len(names)} names, but the {code.stripes} stripes of pair"
-                    f" {pair} take {count} {kind.number}s",
+                    (*where, kind.name),
+                    f"has {len(given)} names, but the {code.stripes} stripes of pair"
+                    f" {pair}{since} take {count} {kind.number}s",
                 )
                 break
-    if parts.frames.dark is not None:
-        return
-    for pair, code in projectors:
-        if code.needs_dark:
-            wrong = f"is needed: pair {pair} takes no inverses, so only it shows what black is"
-            yield ("frames", "dark"), wrong
-            break
 
 
 def _template_problems(parts: RigParts) -> Iterator[Problem]:

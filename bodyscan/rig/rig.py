@@ -36,7 +36,7 @@ class Rig(Model):
 
     version: Literal[1] = 1
     name: Name
-    boards: tuple[Board, ...] = Field(min_length=1)
+    boards: tuple[Board, ...] = ()
     pairs: tuple[Pair, ...] = Field(min_length=1)
     calibration: tuple[CaptureFolder, ...] = ()
     files: str = "{shot}/{pair}/{frame}.png"

@@ -1,4 +1,7 @@
-"""File-name templates such as `{shot}/{pair}/{frame}.png`: checked, filled in, read backwards."""
+"""File-name templates such as `{shot}/{pair}/{frame}.png`: checked, filled in, read backwards.
+
+`*` stands for whatever a name has there, such as the time: a path with it is a pattern of names.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +22,14 @@ def fill(template: str, *, shot: str, pair: str, frame: str) -> str:
 
 def has_field(template: str, field: str) -> bool:
     return field in _fields(template)
+
+
+ANYTHING = "*"
+
+
+def names_pattern(name: str) -> re.Pattern[str]:
+    """Which names a part of a path, with ANYTHING in it, stands for."""
+    return re.compile(_anything(re.escape(name)))
 
 
 @lru_cache(maxsize=4096)
@@ -86,7 +97,11 @@ def _fields(template: str) -> set[str]:
 
 
 def _shot_group(part: str) -> re.Pattern[str]:
-    first, *others = part.split(re.escape("\0"))
+    first, *others = _anything(part).split(re.escape("\0"))
     if not others:
         return re.compile(first)
     return re.compile(first + f"(?P<shot>{SHOT})" + "(?P=shot)".join(others))
+
+
+def _anything(escaped: str) -> str:
+    return escaped.replace(re.escape(ANYTHING), ".*")

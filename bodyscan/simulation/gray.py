@@ -25,11 +25,14 @@ def bit_count(stripes: int) -> int:
     return int(np.ceil(np.log2(stripes)))
 
 
-def code_bits(stripes: int) -> Mask:
-    """(bits, stripes): whether stripe i is lit in pattern k, 0 the most significant."""
-    index = np.arange(stripes)
+def code_bits(stripes: int, first: int = 0) -> Mask:
+    """(bits, stripes): whether stripe i is lit in pattern k, 0 the most significant.
+
+    first: what stripe 0 counts as.
+    """
+    index = np.arange(first, first + stripes)
     code = index ^ (index >> 1)
-    places = np.arange(bit_count(stripes))[::-1]
+    places = np.arange(bit_count(first + stripes))[::-1]
     return (code >> places[:, None] & 1).astype(bool)
 
 

@@ -21,8 +21,9 @@ def instrument_images(
 
     images: by the names of `patterns.projected_patterns`, with lit and a dark one named "".
     """
-    lit, dark = images[frames.lit], images[""]
-    seen = [name for name in images if name not in (frames.lit, "")]
+    shown = frames.lit or "lit"
+    lit, dark = images[shown], images[""]
+    seen = [name for name in images if name not in (shown, "")]
     bits = bit_count(code.stripes)
     words = sum(
         (images[pattern] > images[inverse]).astype(int) << (bits - 1 - bit)
@@ -34,4 +35,4 @@ def instrument_images(
     index[lit.astype(int) - dark < _LEAST_LIGHT] = _NONE
     index[lit == _TOO_BRIGHT] = _TOO_BRIGHT
     (name,) = frames.of_kind(INDEX, 1)
-    return {frames.lit: lit, name: index}
+    return {shown: lit, name: index}

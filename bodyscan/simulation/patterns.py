@@ -11,6 +11,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
 from bodyscan.rig.frame_names import FrameNames
+from bodyscan.rig.rig import Rig
 from bodyscan.simulation.gray import bit_count, code_bits
 from bodyscan.stripes.codes.gray import INVERSE, PATTERN, Binary, Gray
 from bodyscan.stripes.codes.light_section import STRIPE, LightSection
@@ -35,6 +36,24 @@ def refuse_unknown_code(code: StripeCode, pair: str) -> None:
         )
 
 
+def refuse_unknown_frames(rig: Rig) -> None:
+    """Raises BadInput for images of kinds that are not rendered here."""
+    crossed = next((p.name for p in rig.pairs if p.projector and p.projector.crossing), None)
+    wrong = {
+        "it projects stripes one way only": crossed is not None,
+        "it takes a lit image, and looks for boards there": rig.frames.lit != rig.frames.board_image
+        or rig.frames.lit is None,
+        "it cannot tell what `*` in file names stands for": "*" in rig.files,
+    }
+    for what, refused in wrong.items():
+        if refused:
+            raise BadInput(
+                f"the simulator cannot make such captures: {what}",
+                where=f"rig {rig.name}",
+                remedy="describe the rig for the simulator without that",
+            )
+
+
 def projected_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]:
     """By name of the image, its light (stripes * k,), 0 to 1, at evenly spaced places of the sweep.
 
@@ -51,11 +70,12 @@ def projected_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]
         )
         return _bit_images(frames, bits, code.inverses) | _named(frames, PHASE, waves)
     if isinstance(code, Binary):
-        shifts = np.arange(bit_count(code.stripes))[::-1]
-        bits = (np.arange(code.stripes) >> shifts[:, None] & 1).astype(float)
+        last = code.first_code + code.stripes
+        shifts = np.arange(bit_count(last))[::-1]
+        bits = (np.arange(code.first_code, last) >> shifts[:, None] & 1).astype(float)
         return _bit_images(frames, bits, code.inverses)
-    inverses = code.inverses if isinstance(code, Gray) else True
-    return _bit_images(frames, code_bits(code.stripes).astype(float), inverses)
+    inverses, first = (code.inverses, code.first_code) if isinstance(code, Gray) else (True, 0)
+    return _bit_images(frames, code_bits(code.stripes, first).astype(float), inverses)
 
 
 def _bit_images(frames: FrameNames, bits: Array, inverses: bool) -> dict[str, Array]:

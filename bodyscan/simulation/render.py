@@ -195,7 +195,7 @@ def _steady_tables(
 
 def _lights(code: StripeCode, frames: FrameNames) -> list[tuple[str, Array]]:
     """Lit and the code's images: name, and light along the sweep."""
-    return [(frames.lit, np.ones(code.stripes)), *projected_patterns(code, frames).items()]
+    return [(frames.lit or "lit", np.ones(code.stripes)), *projected_patterns(code, frames).items()]
 
 
 def _blurs(projection: Projection) -> Array:

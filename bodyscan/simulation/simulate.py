@@ -20,7 +20,7 @@ from bodyscan.simulation.board import make_board
 from bodyscan.simulation.instrument import instrument_images
 from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import TruePair, build_pairs
-from bodyscan.simulation.patterns import refuse_unknown_code
+from bodyscan.simulation.patterns import refuse_unknown_code, refuse_unknown_frames
 from bodyscan.simulation.plan import default_shots, plan_boards
 from bodyscan.simulation.render import View, render_pair
 from bodyscan.simulation.room import build_room
@@ -74,6 +74,7 @@ def simulate(
     """
     settings = settings or SimulationSettings()
     rig = files.scale_rig(load_rig(rig_file), scale, CALIBRATION)
+    refuse_unknown_frames(rig)
     for pair in rig.pairs:
         if pair.projector is not None:
             refuse_unknown_code(pair.projector, pair.name)
@@ -209,7 +210,7 @@ def render_task(
         sequence=task.sequence,
         inter_reflection=settings.inter_reflection,
     )
-    length = exposure(images[rig.frames.lit], task.bright_grey, light)
+    length = exposure(images[rig.frames.lit or "lit"], task.bright_grey, light)
     exposed = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}
     if code and not code.is_projected and task.sequence:
         exposed = instrument_images(exposed, code, rig.frames)

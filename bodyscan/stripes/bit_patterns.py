@@ -37,7 +37,9 @@ def decode_bits(
     if limits is not None:
         usable, beyond = limits.split(codes, usable, turned=images.turned)
     brightness = Brightness.of(images, variance, usable)
-    boundaries = find_boundaries(images, brightness, codes, usable, variance, code.finest_run)
+    boundaries = find_boundaries(
+        images, brightness, codes, usable, variance, code.finest_run, code.first
+    )
     sigma_px = np.hypot(boundaries.sigma_px, code.doubt_px)
     boundaries = replace(boundaries, sigma_px=sigma_px)
     s, sigma = interpolate_stripes(boundaries, codes, usable)

@@ -30,7 +30,7 @@ def stripe_from_gray(gray: NDArray[np.uint16]) -> NDArray[np.int32]:
 
 
 def bit_that_flips(boundary: Indices, bits: int) -> Indices:
-    """Which bit (0 the most significant) flips at boundary i > 0, between stripes i - 1 and i.
+    """Which bit (0 the most significant) flips at boundary i > 0, between numbers i - 1 and i.
 
     Of the plain code, in which several do, it is the coarsest.
     """
@@ -42,19 +42,26 @@ def bit_that_flips(boundary: Indices, bits: int) -> Indices:
 class WordCode:
     """How stripes are written in words, and words read.
 
-    single: neighbours differ in one bit.  doubt_px: added to the sigma of boundaries, where the
-    finest pattern's stripes are one wide and not two, and blur into each other (seen in tests).
+    encode, decode: numbers to words and back.  single: neighbours differ in one bit.  doubt_px:
+    added to the sigma of boundaries, where the finest pattern's stripes are one wide and not two,
+    and blur into each other (seen in tests).  first: the number of stripe 0.
     """
 
-    words: Callable[[NDArray[Any]], NDArray[Any]]
-    stripes: Callable[[NDArray[np.uint16]], NDArray[np.int32]]
+    encode: Callable[[NDArray[Any]], NDArray[Any]]
+    decode: Callable[[NDArray[np.uint16]], NDArray[np.int32]]
     single: bool
     doubt_px: float
+    first: int = 0
+
+    def stripes(self, words: NDArray[np.uint16]) -> NDArray[np.int32]:
+        """Stripes of code words; below 0 of words before the first."""
+        numbers = self.decode(words)
+        return numbers - np.int32(self.first) if self.first else numbers
 
     def bits(self, stripes: Indices, count: int) -> Array:
         """(count, N): 1 or 0 for each bit of stripes (N,), the most significant first."""
         shift = np.arange(count)[::-1, None]
-        return np.asarray(self.words(stripes) >> shift & 1, float)
+        return np.asarray(self.encode(stripes + self.first) >> shift & 1, float)
 
     @property
     def finest_run(self) -> int:

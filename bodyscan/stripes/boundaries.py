@@ -58,20 +58,25 @@ def find_boundaries(
     usable: Mask,
     variance: Floats,
     finest_run: int = 2,
+    first: int = 0,
 ) -> Boundaries:
     """All places where the code changes by one between two usable pixels of a line.
 
     Only one bit flips there. Its pattern minus its inverse, divided by lit minus dark (which takes
     out most of the surface's own black and white) and less its `imbalance`, is an error function of
     the distance from the boundary whatever the blur; the inverse error function makes it a straight
-    line, whose zero is the boundary. variance: (256,) of each grey level.  finest_run: see `WordCode`.
+    line, whose zero is the boundary. variance: (256,) of each grey level.  finest_run, first: see
+    `WordCode`.
     """
     at = _crossings(codes, usable)
     line, before = np.divmod(at, codes.shape[1])
     index = np.maximum(codes.ravel()[at], codes.ravel()[at + 1]).astype(np.int64)
-    bit = bit_that_flips(index, len(images.patterns))
+    number = index + first
+    bit = bit_that_flips(number, len(images.patterns))
     edges = brightness.at(at)
-    clear = (index & -index) * finest_run // 2  # stripes: half the way to where the bit flips again
+    clear = (
+        (number & -number) * finest_run // 2
+    )  # stripes: half the way to where the bit flips again
     middle = imbalance(images, codes, usable, variance, bit, index, at, clear)
     beside = np.stack([at, at + 1], axis=-1)
     fraction, sigma = _zeros(

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from bodyscan.arrays import Bytes
 from bodyscan.errors import DecodingFailed
-from bodyscan.stripes.stripe_code import SequenceImages, StripeCode
+from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap
 
 
 def decode_stripes(
     code: StripeCode,
-    lit: Bytes,
+    lit: Bytes | None,
     dark: Bytes | None,
     coded: Bytes,
     *,
@@ -24,17 +25,39 @@ def decode_stripes(
 ) -> StripeMap:
     """The stripe coordinate of every pixel, from one pair's images of one shot.
 
-    lit, dark: (H, W); dark may be None if the code can do without (see docs/formats.md).
-    coded: (F, H, W), the images of the code in the order of its `image_counts`.
+    lit, dark: (H, W); None if the code can do without (see docs/formats.md).
+    coded: (F, H, W), the images of the code in the order of its `image_counts`, then those of the
+    stripes that cross, which give the map's `crossing`.
     limits: the stripes that matter; others get no s.
 
     Raises DecodingFailed, naming the image where it can be told, if they do not add up.
     """
     try:
-        images = _by_kind(code, lit, dark, coded)
-        found = code.decode(images, limits)
+        maps = [
+            _decode(way, lit, dark, images, limits if way is code else None)
+            for way, images in zip(code.directions, images_by_kind(code, coded), strict=True)
+        ]
     except DecodingFailed as error:
         raise DecodingFailed(error.what, where=where, remedy=error.remedy) from error
+    return maps[0] if len(maps) == 1 else replace(maps[0], crossing=maps[1])
+
+
+def _decode(
+    way: StripeCode,
+    lit: Bytes | None,
+    dark: Bytes | None,
+    coded: Mapping[ImageKind, Bytes],
+    limits: StripeLimits | None,
+) -> StripeMap:
+    """The map of stripes that run one way."""
+    shape = next(iter(coded.values())).shape[1:]
+    if lit is None:
+        lit = way.lit_from(coded)
+    if lit.shape != shape:
+        raise DecodingFailed(f"images of {shape} px, lit frame of {lit.shape} px")
+    if dark is not None and dark.shape != shape:
+        raise DecodingFailed(f"dark frame of {dark.shape} px, lit frame of {lit.shape} px")
+    found = way.decode(SequenceImages(lit, dark, coded), limits)
     if limits is None or found.beyond is not None:
         return found
     return restrict(found, limits)
@@ -48,17 +71,17 @@ def restrict(found: StripeMap, limits: StripeLimits) -> StripeMap:
     return replace(found, s=s, sigma=sigma, beyond=beyond)
 
 
-def _by_kind(code: StripeCode, lit: Bytes, dark: Bytes | None, coded: Bytes) -> SequenceImages:
-    """Raises DecodingFailed if there are too few or too many frames, or of different sizes."""
-    counts = code.image_counts
-    ends = np.cumsum(list(counts.values()))
+def images_by_kind(code: StripeCode, coded: Bytes) -> list[dict[ImageKind, Bytes]]:
+    """The images (F, H, W) of a code, and of the stripes that cross, by their kinds.
+
+    Raises DecodingFailed if there are too few or too many.
+    """
+    counts = [way.image_counts for way in code.directions]
+    ends = np.cumsum([number for each in counts for number in each.values()])
     if len(coded) != ends[-1]:
         raise DecodingFailed(
             f"{len(coded)} images of the code, but it has {ends[-1]}",
             remedy="give every image of the code, or correct `code` and `stripes`",
         )
-    if coded.shape[1:] != lit.shape:
-        raise DecodingFailed(f"images of {coded.shape[1:]} px, lit frame of {lit.shape} px")
-    if dark is not None and dark.shape != lit.shape:
-        raise DecodingFailed(f"dark frame of {dark.shape} px, lit frame of {lit.shape} px")
-    return SequenceImages(lit, dark, dict(zip(counts, np.split(coded, ends[:-1]), strict=True)))
+    parts = iter(np.split(coded, ends[:-1]))
+    return [{kind: next(parts) for kind in each} for each in counts]

@@ -243,7 +243,10 @@ def _in_step(one: Codes, other: Codes, code: WordCode, bits: int) -> dict[int, f
 
 def _beyond(words: Codes, code: WordCode, stripes: int) -> float:
     """Share of code words that no stripe has."""
-    return float(np.mean(code.stripes(words) >= stripes)) if words.size else 0.0
+    if not words.size:
+        return 0.0
+    found = code.stripes(words)
+    return float(np.mean((found < 0) | (found >= stripes)))
 
 
 def _causes(

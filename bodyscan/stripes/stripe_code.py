@@ -7,13 +7,19 @@ what is heavy (numpy, numba, OpenCV) is imported inside `intensity` and `decode`
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, SerializationInfo, SerializerFunctionWrapHandler, model_serializer
+from pydantic import (
+    Field,
+    SerializationInfo,
+    SerializeAsAny,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
 
-from bodyscan.files.model import Model
+from bodyscan.files.model import Model, Problem
 
 if TYPE_CHECKING:
     from bodyscan.arrays import Array, Bytes
@@ -59,6 +65,7 @@ class StripeCode(Model):
     image without the projector's light.  is_projected: False where an instrument projects stripes
     of its own and hands out what it read.  has_edges: whether its light changes at boundaries of
     stripes, which then lie best on whole projector pixels.
+    crossing: stripes that the same projector shows the other way after these, if it does.
     """
 
     kinds: ClassVar[tuple[ImageKind, ...]]
@@ -69,6 +76,27 @@ class StripeCode(Model):
     code: str
     stripes: Annotated[int, Field(ge=2, le=65535)]
     direction: Literal["horizontal", "vertical"]
+    crossing: SerializeAsAny[StripeCode] | None = None
+
+    @property
+    def directions(self) -> tuple[StripeCode, ...]:
+        """Itself, and the stripes that cross them if there are any."""
+        return (self,) if self.crossing is None else (self, self.crossing)
+
+    def problems(self) -> Iterator[Problem]:
+        if self.crossing is None:
+            return
+        if self.crossing.direction == self.direction:
+            yield ("crossing", "direction"), f"must not be {self.direction} as well: leave it out"
+        if self.crossing.crossing is not None:
+            yield ("crossing", "crossing"), "is not a key known here: stripes run two ways"
+        if not (self.is_projected and self.crossing.is_projected):
+            yield ("crossing",), "is for projectors that show images"
+
+    @property
+    def needs_lit(self) -> bool:
+        """Whether it cannot be read without a lit image."""
+        return not self.is_projected
 
     @property
     def needs_dark(self) -> bool:
@@ -78,11 +106,20 @@ class StripeCode(Model):
     @property
     @abstractmethod
     def image_counts(self) -> Mapping[ImageKind, int]:
-        """How many images of each kind are shown, in their order, besides lit and dark."""
+        """How many images of each kind are shown, in their order, besides lit and dark; those of
+        `crossing`, which follow, left out."""
 
     @abstractmethod
     def intensity(self, kind: ImageKind, s: Array) -> Array:
         """Of the images of one kind at stripe coordinates s (N,): (images, N), 0 to 1."""
+
+    def lit_from(self, coded: Mapping[ImageKind, Bytes]) -> Bytes:
+        """(H, W) uint8: the scene under all of the projector's light, from images (n, H, W) that each
+        show a part of it; for a code that does not need a lit image."""
+        import numpy as np
+
+        brightest = [images.max(axis=0) for images in coded.values()]
+        return np.asarray(np.max(brightest, axis=0), np.uint8)
 
     @abstractmethod
     def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:

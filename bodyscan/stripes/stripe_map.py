@@ -25,6 +25,7 @@ class StripeMap:
     stripes: S, the number of stripes projected.
     beyond: (height, width) bool, lit by a stripe that lies deeper than wanted; None where all stripes
     were wanted. s is NaN there (see `StripeLimits`).
+    crossing: the map of the stripes that run the other way, where such were projected.
     """
 
     s: Floats
@@ -35,6 +36,7 @@ class StripeMap:
     boundary_sigma_px: Floats
     stripes: int
     beyond: Mask | None = None
+    crossing: StripeMap | None = None
 
 
 def stripe_map(

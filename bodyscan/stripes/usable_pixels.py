@@ -38,7 +38,7 @@ def usable_pixels(
     least = np.minimum(np.ceil(least), 255).astype(np.uint8)
     bright = contrast >= cv2.LUT(cv2.max(images.lit, images.dark), least)
     bright &= ~half_covered_pixels(contrast, bright)
-    usable = bright & (images.lit < SATURATED) & (codes < stripes)
+    usable = bright & (images.lit < SATURATED) & (codes >= 0) & (codes < stripes)
     usable &= ~beside_jumps(codes, usable)
     return usable & mostly_direct(images, usable, fine_bit, variance)
 

@@ -15,7 +15,7 @@ from bodyscan.calibration.board_views import (
 )
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
 from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.captures.images import read_lit
+from bodyscan.captures.images import read_board_image
 from bodyscan.errors import BodyscanError
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, threaded
@@ -30,12 +30,13 @@ NO_POSE_TIMES = 6.0
 def find_all_boards(
     rig: Rig, captures: Captures, progress: Progress = silent
 ) -> Outcome[list[BoardView]]:
-    """Boards in all lit images; images that cannot be read, or show no board, are noted."""
+    """Boards in all lit images, or those taken for the board; images that cannot be read, or show no
+    board, are noted."""
 
     def find(sequence: ImageSequence) -> tuple[list[BoardView], str | None]:
-        where = f"{sequence.lit} (pair {sequence.pair}, shot {sequence.shot})"
+        where = f"{sequence.seen_in} (pair {sequence.pair}, shot {sequence.shot})"
         try:
-            image = read_lit(sequence, rig.pair(sequence.pair).camera)
+            image = read_board_image(sequence, rig.pair(sequence.pair))
             found = find_boards(image, rig.boards, pair=sequence.pair, shot=sequence.shot)
         except BodyscanError as error:
             return [], str(error)

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from small_captures import BITS, HEIGHT, STRIPES, WIDTH, encoded, picture, write
+from small_captures import BITS, FRAMES, HEIGHT, STRIPES, WIDTH, encoded, picture, write
 from small_captures import write_small_captures as small
 
 from bodyscan.captures.folder import ImageSequence, open_captures
 from bodyscan.captures.image_header import NoImage, png_damage, read_header
-from bodyscan.captures.images import read_image, read_lit, read_sequence
+from bodyscan.captures.images import read_board_image, read_image, read_sequence
 from bodyscan.errors import ImageError
 from bodyscan.rig.pair import CameraSpec
 from bodyscan.rig.rig_file import load_rig
@@ -205,11 +205,83 @@ def test_a_bad_image_of_a_sequence_is_named(tmp_path: Path, frame: str) -> None:
 
 def test_a_black_sequence_is_refused_and_a_lit_image_is_no_sequence(tmp_path: Path) -> None:
     sequence = first_sequence(tmp_path)
-    np.testing.assert_array_equal(read_lit(sequence, CAMERA), picture("lit"))
-    write(sequence.lit, picture("dark"))
-    for work in (read_sequence, read_lit):
-        with pytest.raises(ImageError, match="shows nothing"):
-            work(sequence, CAMERA)
+    pair = load_rig(tmp_path / "rig.yaml").pair("p1")
+    np.testing.assert_array_equal(read_board_image(sequence, pair), picture("lit"))
+    write(sequence.seen_in, picture("dark"))
+    with pytest.raises(ImageError, match="shows nothing"):
+        read_sequence(sequence, CAMERA)
+    with pytest.raises(ImageError, match="shows nothing"):
+        read_board_image(sequence, pair)
     alone = ImageSequence("p1", "b1", sequence.lit, None, (), ())
     with pytest.raises(ImageError, match="there is no stripe sequence"):
         read_sequence(alone, CAMERA)
+
+
+def test_boards_are_looked_for_in_the_image_taken_for_them(tmp_path: Path) -> None:
+    """Under room light: the lit image, whose light a projector's picture cuts, is decoded with."""
+    rig_path = small(tmp_path, shots=1)
+    rig_path.write_text(rig_path.read_text() + "frames: {board: room}\n")
+    for name in ("p1", "p2", "cam"):
+        write(
+            tmp_path / "captures" / "b1" / name / "room.png", np.full((HEIGHT, WIDTH), 90, np.uint8)
+        )
+    rig = load_rig(rig_path)
+    captures = open_captures(rig, rig_path)
+    assert captures.missing() == ()
+    for name, frames in (("p1", len(FRAMES) + 1), ("cam", 1)):
+        sequence = captures.sequence(name, "b1")
+        assert sequence is not None
+        assert len(sequence.paths) == frames
+        assert sequence.seen_in.name == "room.png"
+        assert read_board_image(sequence, rig.pair(name)).max() == 90
+    sequence = captures.sequence("p1", "b1")
+    assert sequence is not None
+    lit = read_sequence(sequence, CAMERA).lit
+    assert lit is not None
+    assert lit.max() == 200
+
+
+def test_the_lit_image_is_made_where_none_was_taken(tmp_path: Path) -> None:
+    rig_path = small(tmp_path, shots=1)
+    text = rig_path.read_text().replace("  - name: cam\n    camera: *camera\n", "")
+    rig_path.write_text(text + "frames: {lit: null, dark: null}\n")
+    for path in tmp_path.glob("captures/b1/*/*t.png"):
+        path.unlink()
+    rig = load_rig(rig_path)
+    captures = open_captures(rig, rig_path)
+    assert captures.shots == ("b1",)
+    assert captures.missing() == ()
+    sequence = captures.sequence("p1", "b1")
+    assert sequence is not None
+    assert sequence.lit is None
+    assert sequence.seen_in.name == "bit00.png"
+    assert read_sequence(sequence, CAMERA).lit is None
+    # Every pixel is bright, 200, in one of a pattern and its inverse.
+    np.testing.assert_array_equal(read_board_image(sequence, rig.pair("p1")), picture("lit"))
+
+
+def test_a_star_in_a_name_stands_for_what_differs(tmp_path: Path) -> None:
+    rig_path = small(tmp_path, shots=1)
+    rig_path.write_text(rig_path.read_text() + 'files: "{shot}/{pair}/*_[{frame}]_*.png"\n')
+    for number, path in enumerate(sorted(tmp_path.glob("captures/b1/*/*.png"))):
+        path.rename(path.with_name(f"{1481302049.5 + number}_[{path.stem}]_{number}.png"))
+    rig = load_rig(rig_path)
+    captures = open_captures(rig, rig_path)
+    assert captures.shots == ("b1",)
+    assert captures.missing() == ()
+    sequence = captures.sequence("p2", "b1")
+    assert sequence is not None
+    np.testing.assert_array_equal(read_sequence(sequence, CAMERA).lit, picture("lit"))
+    lit = sequence.seen_in
+    write(lit.with_name("1_[lit]_again.png"), picture("lit"))
+    again = open_captures(rig, rig_path).sequence("p2", "b1")
+    assert again is not None
+    with pytest.raises(ImageError, match=r"fits 2 files, 1481.*lit.*_again\.png") as caught:
+        read_sequence(again, CAMERA)
+    assert caught.value.where.endswith("*_[lit]_*.png (pair p2, shot b1)")
+    lit.unlink()
+    (lit.parent / "1_[lit]_again.png").unlink()
+    gone = open_captures(rig, rig_path).sequence("p2", "b1")
+    assert gone is not None
+    with pytest.raises(ImageError, match="is missing"):
+        read_sequence(gone, CAMERA)

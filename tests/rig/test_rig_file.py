@@ -358,3 +358,77 @@ def test_a_rig_made_in_python_is_checked_too(tmp_path: Path) -> None:
     rig = load_rig(write(tmp_path / "rig.yaml", RIG))
     with pytest.raises(ValueError, match="names no pair"):
         Rig.model_validate({**rig.model_dump(), "rig_frame": {"pair": "p9"}})
+
+
+CROSSED = changed(
+    "code: gray, stripes: 12, direction: horizontal",
+    "code: gray, stripes: 12, direction: horizontal, first_code: 2, crossing: {stripes: 20}",
+)
+
+
+def test_crossing_stripes_are_of_the_same_code_unless_said(tmp_path: Path) -> None:
+    rig = load_rig(write(tmp_path / "rig.yaml", CROSSED))
+    first = rig.pair("p1").projector
+    assert first is not None
+    assert first.crossing == Gray(stripes=20, direction="vertical")
+    assert first.directions == (first, first.crossing)
+    names = rig.frames.of_code(first)
+    assert len(names) == 2 * 4 + 2 * 5
+    assert (names[0], names[8], names[-1]) == ("bit00", "crossing-bit00", "crossing-bit04-inverse")
+    write_rig(tmp_path / "again.yaml", rig)
+    assert load_rig(tmp_path / "again.yaml") == rig
+    waves = CROSSED.replace("{stripes: 20}", "{stripes: 20, code: phase-shift, steps: 3}")
+    second = load_rig(write(tmp_path / "rig.yaml", waves)).pairs[0].projector
+    assert second is not None
+    assert second.crossing == stripe_code(
+        {"code": "phase-shift", "stripes": 20, "direction": "vertical", "steps": 3}
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("{stripes: 20}", "{}", "projector.crossing.stripes: is missing"),
+        ("{stripes: 20}", "20", "projector.crossing: must be a mapping"),
+        ("{stripes: 20}", "{stripes: 20, direction: horizontal}",
+         "crossing.direction: must not be horizontal as well"),
+        ("{stripes: 20}", "{stripes: 20, bits: 5}", "projector.crossing.bits: is not a key"),
+        ("{stripes: 20}", "{stripes: 20, crossing: {stripes: 4}}", "stripes run two ways"),
+        ("first_code: 2", "first_code: 65530", "first_code: must be 65524 or less: 12 stripes"),
+        ("first_code: 2", "first_code: -1", "first_code: must be 0 or more"),
+        ("version: 1", "version: 1\nframes: {pattern: [a, b, c, d, e]}",
+         "12 stripes of pair p1 from 2 take 4 bits"),
+        ("version: 1", "version: 1\nframes: {crossing: {pattern: [a, b]}}",
+         "frames.crossing.pattern: has 2 names, but the 20 stripes of pair p1 take 5 bits"),
+        ("version: 1", "version: 1\nframes: {crossing: {lit: a}}", "crossing.lit: is not a key"),
+        ("version: 1", "version: 1\nframes: {crossing: {pattern: 'bit{bit:02d}'}}",
+         "gives two images the same name ('bit00')"),
+        ("version: 1", "version: 1\nframes: {lit: null}", "frames.lit: or board is needed: pair cam"),
+        ("version: 1", "version: 1\nframes: {board: dark}", "the same name ('dark')"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_crossing_stripes_is_one_line(
+    tmp_path: Path, old: str, new: str, line: str
+) -> None:
+    assert old in CROSSED
+    told = refused(tmp_path, CROSSED.replace(old, new, 1))
+    assert len(told) == 1, told
+    assert line in told[0]
+
+
+def test_lit_or_crossing_that_no_pair_can_do_with_is_named(tmp_path: Path) -> None:
+    (line,) = refused(tmp_path, RIG + "frames: {crossing: {pattern: 'c{bit}'}}\n")
+    assert "frames.crossing: is for a projector with `crossing`" in line
+    text = changed("code: gray", "code: gray, inverses: false")
+    (line,) = refused(tmp_path, text + "frames: {lit: null, board: room}\n")
+    assert "frames.lit: is needed: the images of pair p1 do not show the scene" in line
+
+
+def test_boards_are_needed_for_calibration_captures_only(tmp_path: Path) -> None:
+    text = changed("boards:\n  - {name: board, columns: 5, rows: 4, square_mm: 30}\n", "")
+    (line,) = refused(tmp_path, text)
+    assert "boards: is missing: calibration captures show a board" in line
+    rig = load_rig(
+        write(tmp_path / "r.yaml", text.replace("calibration:\n  - folder: captures", ""))
+    )
+    assert rig.boards == ()

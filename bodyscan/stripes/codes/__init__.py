@@ -22,6 +22,9 @@ from bodyscan.files.model import (
 )
 from bodyscan.stripes.stripe_code import DEFAULT_CODE, ImageKind, StripeCode
 
+NOT_SHARED = ("stripes", "direction", "first_code")
+"""Keys that stripes and those that cross them do not have in common."""
+
 _CODES: dict[str, type[StripeCode]] = {}
 
 
@@ -60,6 +63,8 @@ def stripe_code(keys: Any) -> Any:
     errors = [] if code else [choice_error("code", str(name), _CODES)]
     fields = (code or StripeCode).model_fields
     common = StripeCode.model_fields
+    keys, crossing, amiss = _with_crossing(keys)
+    errors += amiss
     for key, value in keys.items():
         if key not in fields and value is not None:
             errors += _key_errors(key, code, fields)
@@ -72,11 +77,40 @@ def stripe_code(keys: Any) -> Any:
         code, own["code"] = _CODES[DEFAULT_CODE], DEFAULT_CODE
     try:
         found = code.model_validate_json(json.dumps(own), strict=True)
+        if crossing is not None:
+            found = code.model_validate({**dict(found), "crossing": crossing})
     except ValidationError as refused:
         errors += repeated_errors(refused)
     if errors:
         raise ValidationError.from_exception_data(code.__name__, errors)
     return found
+
+
+def _with_crossing(
+    keys: dict[str, Any],
+) -> tuple[dict[str, Any], StripeCode | None, list[InitErrorDetails]]:
+    """A projector's keys without `crossing`, what that describes, and what is wrong with it.
+
+    Crossing stripes of the same code share its keys, but for those of their own.
+    """
+    own = {key: value for key, value in keys.items() if key != "crossing"}
+    given = keys.get("crossing")
+    if given is None or isinstance(given, StripeCode):
+        return own, given, []
+    if not isinstance(given, dict):
+        wrong = "must be a mapping (key: value): those of the projector's keys that are others"
+        return own, None, [problem_error((("crossing",), wrong))]
+    name = own.get("code", DEFAULT_CODE)
+    alike = given.get("code", name) == name
+    shared = {key: value for key, value in own.items() if key not in NOT_SHARED} if alike else {}
+    across = "vertical" if own.get("direction") == "horizontal" else "horizontal"
+    try:
+        return own, stripe_code({"direction": across, **shared, **given}), []
+    except ValidationError as refused:
+        errors = repeated_errors(refused)
+        its_own = [error for error in errors if error["loc"][:1] not in [(k,) for k in shared]]
+        told = its_own or errors  # what is wrong with both is told of the first
+        return own, None, [{**error, "loc": ("crossing", *error["loc"])} for error in told]
 
 
 def _key_errors(

@@ -7,9 +7,13 @@ without it, black must be known from a dark image.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar, Literal
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
+from pydantic import Field
+
+from bodyscan.files.model import Problem
 from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
 
 if TYPE_CHECKING:
@@ -20,6 +24,7 @@ if TYPE_CHECKING:
 
 PATTERN = ImageKind("pattern", "bit{bit:02d}", "bit", most=16)
 INVERSE = ImageKind("inverse", "bit{bit:02d}-inverse", "bit", most=16)
+MOST_CODES = 1 << PATTERN.most
 
 
 def bits_needed(words: int) -> int:
@@ -28,21 +33,36 @@ def bits_needed(words: int) -> int:
 
 
 class _NumberedStripes(StripeCode):
-    """inverses: whether each pattern is projected inverted as well."""
+    """inverses: whether each pattern is projected inverted as well.  first_code: the number that
+    stripe 0 has; the others count up from it."""
 
     kinds: ClassVar = (PATTERN, INVERSE)
 
     inverses: bool = True
+    first_code: Annotated[int, Field(ge=0, lt=MOST_CODES)] = 0
+
+    def problems(self) -> Iterator[Problem]:
+        yield from super().problems()
+        if self.first_code + self.stripes > MOST_CODES:
+            most = MOST_CODES - self.stripes
+            wrong = (
+                f"must be {most} or less: {self.stripes} stripes from there take more than 16 bits"
+            )
+            yield ("first_code",), f"{wrong} (got {self.first_code})"
 
     @property
     def bits(self) -> int:
         """Number of patterns."""
-        return bits_needed(self.stripes)
+        return bits_needed(self.first_code + self.stripes)
 
     @property
     @abstractmethod
     def word_code(self) -> WordCode:
         """How stripes are written in bits."""
+
+    @property
+    def needs_lit(self) -> bool:
+        return not self.inverses
 
     @property
     def needs_dark(self) -> bool:
@@ -76,7 +96,7 @@ class Gray(_NumberedStripes):
     def word_code(self) -> WordCode:
         from bodyscan.stripes.bit_words import GRAY
 
-        return GRAY
+        return replace(GRAY, first=self.first_code)
 
 
 class Binary(_NumberedStripes):
@@ -88,7 +108,7 @@ class Binary(_NumberedStripes):
     def word_code(self) -> WordCode:
         from bodyscan.stripes.bit_words import BINARY
 
-        return BINARY
+        return replace(BINARY, first=self.first_code)
 
 
 CODES = (Gray, Binary)

@@ -34,6 +34,7 @@ class PhaseShift(StripeCode):
     period: Annotated[int, Field(ge=2, le=65535)] = 8
 
     def problems(self) -> Iterator[Problem]:
+        yield from super().problems()
         if self.period > self.stripes:
             wrong = f"must be {self.stripes} (stripes) or less (got {self.period})"
             yield ("period",), wrong
@@ -42,6 +43,10 @@ class PhaseShift(StripeCode):
     def half_periods(self) -> int:
         """How many the stripes make, the last one perhaps in part."""
         return -(-2 * self.stripes // self.period)
+
+    @property
+    def needs_lit(self) -> bool:
+        return not self.inverses
 
     @property
     def needs_dark(self) -> bool:

@@ -32,6 +32,7 @@ class StripeIndex(StripeCode):
     code: Literal["stripe-index"] = "stripe-index"
 
     def problems(self) -> Iterator[Problem]:
+        yield from super().problems()
         if self.stripes > LARGEST_NUMBER:
             wrong = f"must be {LARGEST_NUMBER} or less for stripe-index (got {self.stripes})"
             yield ("stripes",), wrong
