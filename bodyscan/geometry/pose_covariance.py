@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,11 @@ class PoseCovariance:
         """(6, 6) of one pair's motion."""
         k = 6 * self.names.index(name)
         return self.matrix[k : k + 6, k : k + 6]
+
+    def among(self, names: Sequence[str]) -> Array:
+        """(6N, 6N) of these pairs' motions, in their order."""
+        rows = np.concatenate([6 * self.names.index(name) + np.arange(6) for name in names])
+        return self.matrix[np.ix_(rows, rows)]
 
     def between(self, a: str, b: str) -> Array:
         """(6, 6) of the motion of b relative to a."""

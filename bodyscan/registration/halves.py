@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +11,8 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.errors import FailedWork
+from bodyscan.errors import BadInput, FailedWork
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.registration.view_graph import view_graph
@@ -20,6 +22,12 @@ from bodyscan.rig.rig_frame import RigFrame
 REACH_MM = 1300.0
 """How far ahead of a camera a pose matters: about where the subject stands."""
 ATTEMPTS = 200
+FEWEST_BOARDS = 3
+"""Of a camera in a half: from fewer its lens and focal length do not follow."""
+TIMES_WHOLE = 5.0
+"""Two halves should differ by twice the sigma of the whole: either knows the rig from half as much,
+and both err. Beyond this a half lacks something that holds the rig, not only shots, and says nothing
+of the whole."""
 RANK_SHARE = 1e-9  # eigenvalues below this share of the largest are the frame's, taken out
 
 
@@ -27,12 +35,14 @@ RANK_SHARE = 1e-9  # eigenvalues below this share of the largest are the frame's
 class HalvesComparison:
     """Differences between two solutions of the rig, second minus first, the common motion taken out.
 
-    halves: the shots of each.  shifts_mm: (P, 3) of the camera centres, rig frame.  sigmas_mm:
-    (P, 3) expected.
+    names: the pairs compared.  apart: those that are not, which saw too few boards in a half or could
+    not be placed from it.  halves: the shots of each.  shifts_mm: (P, 3) of the camera centres, rig
+    frame.  sigmas_mm: (P, 3) expected.
     over_expected: RMS of all differences over what the covariances promise; 1 is honest.
     """
 
     names: tuple[str, ...]
+    apart: tuple[str, ...]
     halves: tuple[tuple[str, ...], tuple[str, ...]]
     shifts_mm: Array
     sigmas_mm: Array
@@ -41,11 +51,10 @@ class HalvesComparison:
     @property
     def summary(self) -> str:
         """One line."""
-        shift, sigma = (
-            np.sqrt((values**2).sum(axis=1).mean()) for values in (self.shifts_mm, self.sigmas_mm)
-        )
+        shift, sigma = _rms_length(self.shifts_mm), _rms_length(self.sigmas_mm)
+        without = f" (without {', '.join(self.apart)}, not known from a half)" if self.apart else ""
         return (
-            f"solved from either half of the shots, cameras differ by {shift:.3f} mm RMS "
+            f"solved from either half of the shots, cameras{without} differ by {shift:.3f} mm RMS "
             f"({sigma:.3f} expected); all differences are {self.over_expected:.2f} times what is "
             "expected"
         )
@@ -56,73 +65,120 @@ def compare_halves(rig: Rig, placed: RigSolution, *, seed: int = 0) -> HalvesCom
 
     Each half's frame is held by one pair and carried to where `placed` has that pair; the common
     motion that remains is the frame's own and is taken out.  Raises FailedWork if there are fewer
-    than two pairs or no way to halve the shots leaves both halves connected.
+    than two pairs, if no halves tie two of them together with boards enough for their cameras, or if
+    halves know the rig so much worse than all shots do that nothing follows; RigDisconnected as
+    `solve_rig`.
     """
-    names = tuple(sorted(placed.rig_from_camera))
-    if len(names) < 2:
+    everyone = tuple(sorted(placed.rig_from_camera))
+    if len(everyone) < 2:
         raise FailedWork("one pair alone has no pose to compare", where=f"rig {rig.name}")
-    halves = split_shots(placed.views, names, seed=seed)
-    holder = rig.frame_pair.name if rig.frame_pair else names[0]
-    first, second = (_placed_by(rig, placed, shots, holder) for shots in halves)
+    tied, *halves = split_shots(placed.views, everyone, seed=seed)
+    holder = rig.frame_pair.name if rig.frame_pair and rig.frame_pair.name in tied else tied[0]
+    first, second = (_placed_by(rig, placed, tied, shots, holder) for shots in halves)
+    names = tuple(name for name in tied if name in first[0] and name in second[0])
+    if len(names) < 2:
+        raise _not_halved(len({view.shot for view in placed.views}))
     # (6P,): twists about the rig's origin that carry each first pose to the second.
     differences = np.concatenate(
         [(second[0][name] @ first[0][name].inverse()).twist for name in names]
     )
-    covariance = first[1] + second[1]
     centres = np.array([placed.rig_from_camera[name].translation for name in names])
     ahead = np.array([placed.rig_from_camera[name].rotation[:, 2] for name in names])
     keep = _without_common_motion(centres, ahead)
-    differences, covariance = keep @ differences, keep @ covariance @ keep.T
-    shown = twist_jacobian(centres)
-    own = covariance.reshape(len(names), 6, len(names), 6)[range(len(names)), :, range(len(names))]
-    shifts = np.einsum("pij,pj->pi", shown, differences.reshape(-1, 6))
-    spread = np.einsum("pii->pi", shown @ own @ shown.transpose(0, 2, 1))
-    return HalvesComparison(
-        names,
-        halves,
-        shifts,
-        np.sqrt(np.maximum(spread, 0.0)),
-        _over_expected(differences, covariance),
-    )
+    differences = keep @ differences
+    covariance = keep @ (first[1].among(names) + second[1].among(names)) @ keep.T
+    known = keep @ placed.covariance.among(names) @ keep.T
+    shifts = np.einsum("pij,pj->pi", twist_jacobian(centres), differences.reshape(-1, 6))
+    sigmas = _centre_sigmas(covariance, centres)
+    expected, whole = _rms_length(sigmas), _rms_length(_centre_sigmas(known, centres))
+    if expected > TIMES_WHOLE * whole:
+        raise FailedWork(
+            f"halves of the shots should differ by {expected:.2g} mm where all shots know the rig to "
+            f"{whole:.2g} mm: too few boards, or too much alike, in a half",
+            remedy="capture more shots that all pairs see, differently tilted",
+        )
+    apart = tuple(name for name in everyone if name not in names)
+    over = _over_expected(differences, covariance)
+    return HalvesComparison(names, apart, (halves[0], halves[1]), shifts, sigmas, over)
 
 
 def split_shots(
     views: Sequence[LocatedView], names: Sequence[str], *, seed: int = 0
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Two halves of the shots, by chance, in each of which shared views tie all pairs together.
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """The pairs that two halves of the shots, drawn by chance, both tie together with boards enough
+    for each; and the halves: of many draws those in which most pairs are.
 
-    Raises FailedWork if none of many draws does.
+    Raises FailedWork if in none two are.
     """
     shots = sorted({view.shot for view in views})
     rng = np.random.default_rng(seed)
+    best: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]] = ((), (), ())
     for _ in range(ATTEMPTS):
         order = [shots[k] for k in rng.permutation(len(shots))]
-        halves = order[: len(order) // 2], order[len(order) // 2 :]
-        if all(_connected(views, names, set(half)) for half in halves):
-            return tuple(sorted(halves[0])), tuple(sorted(halves[1]))
-    raise FailedWork(
-        f"{len(shots)} shots cannot be halved so that both halves tie all pairs together "
-        f"({ATTEMPTS} draws)",
+        halves = set(order[: len(order) // 2]), set(order[len(order) // 2 :])
+        tied = _tied([[v for v in views if v.shot in half] for half in halves], names)
+        if len(tied) > len(best[0]):
+            best = tied, tuple(sorted(halves[0])), tuple(sorted(halves[1]))
+        if len(tied) == len(names):
+            break
+    if len(best[0]) < 2:
+        raise _not_halved(len(shots))
+    return best
+
+
+def _not_halved(shots: int) -> FailedWork:
+    return FailedWork(
+        f"{shots} shots cannot be halved so that both halves tie pairs together and show each "
+        f"{FEWEST_BOARDS} boards",
         remedy="capture more shots that pairs of different poles see at the same moment",
     )
 
 
-def _connected(views: Sequence[LocatedView], names: Sequence[str], shots: set[str]) -> bool:
-    own = [view for view in views if view.shot in shots]
-    return bool(own) and nx.is_connected(view_graph(own, names))
+def _tied(halves: Sequence[Sequence[LocatedView]], names: Sequence[str]) -> tuple[str, ...]:
+    """The largest group of pairs that every half ties together, with boards enough for each."""
+    group = set(names)
+    while True:
+        left = set(group)
+        for half in halves:
+            boards = Counter(view.pair for view in half)
+            left = {name for name in left if boards[name] >= FEWEST_BOARDS}
+            graph = view_graph([view for view in half if view.pair in left], sorted(left))
+            left = max(nx.connected_components(graph), key=len, default=set())
+        if left == group:
+            return tuple(sorted(group))
+        group = left
 
 
 def _placed_by(
-    rig: Rig, placed: RigSolution, shots: Sequence[str], holder: str
-) -> tuple[dict[str, RigidTransform], Array]:
-    """`rig_from_camera` from these shots alone and its covariance, in the frame of `placed`."""
+    rig: Rig, placed: RigSolution, names: Sequence[str], shots: Sequence[str], holder: str
+) -> tuple[dict[str, RigidTransform], PoseCovariance]:
+    """`rig_from_camera` of these pairs from these shots alone, and its covariance, in the frame of
+    `placed`; without those that disagree with the others there.
+
+    Raises FailedWork if the holder does."""
     held = rig.model_copy(update={"rig_frame": RigFrame(pair=holder)})
-    views = [view for view in placed.views if view.shot in shots]
-    half = solve_rig(held, views, placed.cameras).value
+    views = [view for view in placed.views if view.shot in shots and view.pair in names]
+    try:
+        half = solve_rig(held, views, {name: placed.cameras[name] for name in names}).value
+    except BadInput as error:
+        raise FailedWork(f"{holder} does not fit the others in a half of the shots") from error
     to_rig = placed.rig_from_camera[holder] @ half.rig_from_camera[holder].inverse()
     carry = np.kron(np.eye(len(half.covariance.names)), adjoint(to_rig))
     placings = {name: to_rig @ t for name, t in half.rig_from_camera.items()}
-    return placings, carry @ half.covariance.matrix @ carry.T
+    matrix = carry @ half.covariance.matrix @ carry.T
+    return placings, PoseCovariance(half.covariance.names, matrix)
+
+
+def _centre_sigmas(covariance: Array, centres: Array) -> Array:
+    """(P, 3) mm of the camera centres (P, 3), from the covariance (6P, 6P) of the pairs' motions."""
+    count, shown = len(centres), twist_jacobian(centres)
+    own = covariance.reshape(count, 6, count, 6)[range(count), :, range(count)]
+    variance = np.einsum("pii->pi", shown @ own @ shown.transpose(0, 2, 1))
+    return np.sqrt(np.maximum(variance, 0.0))
+
+
+def _rms_length(vectors: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
 def _without_common_motion(centres: Array, ahead: Array) -> Array:

@@ -1,14 +1,19 @@
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from ring import ring_of_cameras, ring_rig, ring_views
+from seen_boards import seen_boards
 
 from bodyscan.errors import FailedWork
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.halves import compare_halves, split_shots
 from bodyscan.registration.rig_solve import solve_rig
+from bodyscan.workflows.find_boards import calibrate_cameras, locate_views
 
 
+@cache
 def placed_ring(seed=0, shots=40, spoil=None):
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     views, _ = ring_views(placings, cameras, shots=shots, seed=seed)
@@ -53,17 +58,70 @@ def test_errors_that_the_covariance_does_not_know_show():
 def test_halves_are_seeded_disjoint_and_whole():
     _, placed = placed_ring()
     names = sorted(placed.rig_from_camera)
-    first, second = split_shots(placed.views, names, seed=4)
-    assert (first, second) == split_shots(placed.views, names, seed=4)
-    assert (first, second) != split_shots(placed.views, names, seed=5)
+    tied, first, second = split_shots(placed.views, names, seed=4)
+    assert (tied, first, second) == split_shots(placed.views, names, seed=4)
+    assert (first, second) != split_shots(placed.views, names, seed=5)[1:]
+    assert list(tied) == names
     assert not set(first) & set(second)
     assert set(first) | set(second) == {view.shot for view in placed.views}
     assert abs(len(first) - len(second)) <= 1
 
 
-def test_shots_that_cannot_be_halved_are_refused():
+def test_a_pair_that_a_half_does_not_tell_of_is_left_out_and_named():
+    rig, placed = placed_ring()
+    own = sorted({view.shot for view in placed.views if view.pair == "p3-1"})
+    few = tuple(v for v in placed.views if v.pair != "p3-1" or v.shot in own[:5])
+    found = compare_halves(rig, replace(placed, views=few))
+    assert found.apart == ("p3-1",)
+    assert "p3-1" not in found.names
+    assert len(found.names) == 5
+    assert "without p3-1, not known from a half" in found.summary
+
+
+def test_a_pair_that_does_not_fit_in_a_half_is_left_out_and_named():
+    """Moved in most of one half's shots: the half's solve drops it, where all shots may keep it."""
+    rig, placed = placed_ring()
+    _, first, _ = split_shots(placed.views, sorted(placed.rig_from_camera))
+    rng = np.random.default_rng(3)
+
+    def moved(view):
+        shift = RigidTransform.from_rotation_vector(np.zeros(3), rng.normal(0.0, 20.0, 3))
+        pixels = placed.cameras[view.pair].project(
+            (shift @ view.camera_from_board).apply(view.points)
+        )
+        return replace(view, pixels=pixels, camera_from_board=shift @ view.camera_from_board)
+
+    views = tuple(
+        moved(view) if view.pair == "p2-2" and view.shot in first else view for view in placed.views
+    )
+    found = compare_halves(rig, replace(placed, views=views))
+    assert found.apart == ("p2-2",)
+    assert 0.5 < found.over_expected < 2.0
+
+
+@pytest.mark.parametrize("shots", [2, 3, 5])
+def test_so_few_shots_are_not_halved(shots: int):
+    rig, placed = placed_ring()
+    usual = sorted({view.shot for view in placed.views})[:shots]
+    with pytest.raises(FailedWork, match=f"{shots} shots cannot be halved"):
+        compare_halves(rig, replace(placed, views=[v for v in placed.views if v.shot in usual]))
+
+
+def test_halves_that_know_far_less_than_the_whole_say_nothing():
+    """All boards but one parallel to each other: the half without that one knows no focal length."""
+    seen = seen_boards(3, shots=9, tilted=1)
+    rig = seen.rig
+    cameras = calibrate_cameras(rig, seen.views).value
+    located = locate_views(rig, seen.views, cameras).value
+    placed = solve_rig(rig, located, {name: one.camera for name, one in cameras.items()}).value
+    with pytest.raises(FailedWork, match="too few boards, or too much alike"):
+        compare_halves(rig, placed)
+
+
+def test_no_two_pairs_that_both_halves_tie_together_are_refused():
     rig, placed = placed_ring()
     only = min(view.shot for view in placed.views if view.pair == "p3-1")
-    lonely = tuple(v for v in placed.views if v.pair != "p3-1" or v.shot == only)
+    views = [v for v in placed.views if v.pair in ("p3-1", "p1-1")]
+    lonely = tuple(v for v in views if v.pair != "p3-1" or v.shot == only)
     with pytest.raises(FailedWork, match="halved"):
         compare_halves(rig, replace(placed, views=lonely))

@@ -1,4 +1,4 @@
-"""What a ring of cameras sees of a board, as boards found in images: the real solve without images."""
+"""What a few cameras see of a board, as if found in images: the real solve without images."""
 
 from __future__ import annotations
 
@@ -7,14 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
+from ring import CHARUCO, looking_at, ring_rig
 
-from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.boards.view import BoardView
 from bodyscan.captures.folder import Captures, ImageSequence
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.rig.rig import Rig
+
+CAMERA = Camera(1510.0, 1512.0, -0.5, 645.0, 508.0, Radial(-0.1, 0.05), 1280, 1024)
+NOISE_PX = 0.03
 
 
 @dataclass(frozen=True)
@@ -40,25 +45,29 @@ class SeenBoards:
 
 
 def seen_boards(
-    poles: int = 2,
-    heights: tuple[float, ...] = (700.0, 1200.0),
-    *,
-    shots: int = 12,
-    seed: int = 0,
-    noise_px: float = 0.03,
+    cameras: int = 4, *, shots: int = 10, tilted: int = 99, seed: int = 0
 ) -> SeenBoards:
-    """A few cameras around a ChArUco board of two faces: each sees it in most of the shots."""
-    placings, cameras = ring_of_cameras(poles, heights)
-    located, _ = ring_views(placings, cameras, shots=shots, seed=seed, noise_px=noise_px)
-    number = {tuple(point): k for k, point in enumerate(corner_points(CHARUCO).tolist())}
-    views = tuple(
-        BoardView(
-            view.pair,
-            view.shot,
-            view.board,
-            np.array([number[tuple(point)] for point in view.points.tolist()]),
-            view.pixels,
-        )
-        for view in located
-    )
-    return SeenBoards(ring_rig(placings), views, placings)
+    """Cameras side by side on an arc, a board before them: every camera sees it in every shot.
+
+    tilted: in so many shots it is tilted, in the others it faces the middle of the arc.
+    """
+    rng = np.random.default_rng(seed)
+    placings, views = {}, []
+    for k in range(cameras):
+        angle = np.radians(12.0 * (k - 0.5 * (cameras - 1)))
+        position = [1300.0 * np.cos(angle), 1300.0 * np.sin(angle), 1000.0 + 150.0 * (k % 2)]
+        placings[f"c{k + 1}"] = looking_at(position, [0.0, 0.0, 1000.0])
+    corners = corner_points(CHARUCO)[: corners_per_face(CHARUCO)]
+    to_middle = RigidTransform(np.eye(3), -corners.mean(axis=0))
+    upright = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    for number in range(shots):
+        turn = rng.normal(0.0, 0.35 if number < tilted else 0.01, 3)
+        tilt = RigidTransform.from_rotation_vector(turn, np.zeros(3))
+        place = np.array([0.0, 0.0, 1050.0]) + rng.uniform(-120.0, 120.0, 3)
+        rig_from_board = RigidTransform(upright @ tilt.rotation, place) @ to_middle
+        for name, placing in placings.items():
+            pixels = CAMERA.project((placing.inverse() @ rig_from_board).apply(corners))
+            pixels += rng.normal(0.0, NOISE_PX, pixels.shape)
+            seen = np.flatnonzero(np.all((pixels > 5.0) & (pixels < [1275.0, 1019.0]), axis=1))
+            views.append(BoardView(name, f"s{number:02d}", CHARUCO.name, seen, pixels[seen]))
+    return SeenBoards(ring_rig(placings, fixed="c1"), tuple(views), placings)
