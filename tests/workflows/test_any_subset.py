@@ -1,0 +1,161 @@
+"""Whatever is taken away of a rig's boards: a calibration, or a refusal that says why; no traceback."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from seen_boards import SeenBoards, seen_boards
+
+from bodyscan.arrays import Array
+from bodyscan.boards.view import BoardView
+from bodyscan.errors import BodyscanError, FailedWork, RigDisconnected
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.registration.storage import load_calibration, save_calibration
+from bodyscan.rig.rig_frame import RigFrame
+from bodyscan.workflows.calibrate_rig import join_rig
+from bodyscan.workflows.rig_remarks import remarked
+
+Views = Sequence[BoardView]
+Spoiling = Callable[[Views, np.random.Generator], Views]
+seen = cache(seen_boards)
+
+
+def calibrated(boards: SeenBoards, views: Views) -> RigCalibration:
+    """The real way from boards found in images to a calibration with all that is said of it, none of
+    which may fail but for a reason."""
+    found = remarked(join_rig(boards.rig, boards.captures(views), boards.found(views)))
+    assert not [note for note in found.notes if "failed with" in note]
+    return found
+
+
+def as_they_are(views: Views, _: np.random.Generator) -> Views:
+    return views
+
+
+def mixed_up(views: Views, rng: np.random.Generator) -> Views:
+    """The corners of every fifth view in another order."""
+    return [
+        replace(v, pixels=rng.permutation(v.pixels)) if rng.random() < 0.2 else v for v in views
+    ]
+
+
+def moved(views: Views, rng: np.random.Generator) -> Views:
+    """The first camera's board elsewhere in half of the shots."""
+    name = min((view.pair for view in views), default="")
+    return [
+        replace(v, pixels=v.pixels + rng.normal(0.0, 40.0, 2))
+        if v.pair == name and rng.random() < 0.5
+        else v
+        for v in views
+    ]
+
+
+def bent(views: Views, _: np.random.Generator) -> Views:
+    """A lens that the model does not have."""
+
+    def through(pixels: Array) -> Array:
+        out = (pixels - [640.0, 512.0]) / 640.0
+        return pixels + 6.0 * out * np.sum(out**2, axis=1, keepdims=True) ** 2
+
+    return [replace(view, pixels=through(view.pixels)) for view in views]
+
+
+def cut(views: Views, rng: np.random.Generator) -> Views:
+    """Of every third view only some of the corners."""
+
+    def part(view: BoardView) -> BoardView:
+        kept = np.sort(rng.permutation(len(view.pixels))[: rng.integers(1, len(view.pixels) + 1)])
+        return replace(view, corner_ids=view.corner_ids[kept], pixels=view.pixels[kept])
+
+    return [part(view) if rng.random() < 0.3 else view for view in views]
+
+
+@given(data=st.data())
+@settings(max_examples=30)
+def test_any_subset_gives_a_calibration_or_a_refusal(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    boards = seen(data.draw(st.integers(3, 6), "cameras"), shots=8)
+    shots = sorted({view.shot for view in boards.views})
+    pairs = data.draw(st.sets(st.sampled_from(sorted(boards.placings)), min_size=1), "pairs")
+    kept = data.draw(st.sets(st.sampled_from(shots), min_size=1), "shots")
+    share = data.draw(st.sampled_from([1.0, 0.8, 0.5, 0.3]), "share of the views")
+    spoil: Spoiling = data.draw(st.sampled_from([as_they_are, mixed_up, moved, bent, cut]))
+    by_board = data.draw(st.booleans(), "a board holds the frame")
+    rng = np.random.default_rng(data.draw(st.integers(0, 99), "seed"))
+    views = [v for v in boards.views if v.pair in pairs and v.shot in kept and rng.random() < share]
+    if by_board:
+        frame = RigFrame(shot=min(kept), board=boards.rig.boards[0].name)
+        boards = replace(boards, rig=boards.rig.model_copy(update={"rig_frame": frame}))
+    try:
+        found = calibrated(boards, spoil(views, rng))
+    except BodyscanError:
+        return
+    assert set(found.pairs) <= pairs
+    assert set(found.pairs) | set(found.failed) == set(boards.placings)
+    folder = tmp_path_factory.mktemp("stored")
+    save_calibration(found, folder)
+    assert sorted(load_calibration(folder).pairs) == sorted(found.pairs)
+
+
+def test_a_loosely_tied_camera_costs_nothing_but_its_own_sigma() -> None:
+    """It shares one shot with the others and saw the board by itself in four."""
+    boards = seen(4, shots=10)
+    alone = {"s06", "s07", "s08", "s09"}
+    views = [
+        view
+        for view in boards.views
+        if (view.pair == "c4" and view.shot in alone | {"s00"})
+        or (view.pair != "c4" and view.shot not in alone)
+    ]
+    found = calibrated(boards, views)
+    assert sorted(found.pairs) == ["c1", "c2", "c3", "c4"]
+    assert any(line.endswith("the rig would fall apart: s00 (board)") for line in found.advice)
+    assert any("c4" in line and "known least" in line for line in found.advice)
+
+
+def test_a_camera_with_one_view_is_left_out_and_named() -> None:
+    boards = seen(4, shots=10)
+    found = calibrated(boards, [v for v in boards.views if v.pair != "c3" or v.shot == "s02"])
+    assert sorted(found.pairs) == ["c1", "c2", "c4"]
+    assert "at least 3" in found.failed["c3"]
+
+
+def test_shots_that_one_camera_saw_tie_nothing_together() -> None:
+    boards = seen(4, shots=10)
+    names = sorted(boards.placings)
+    shared = [
+        v for v in boards.views if int(v.shot[1:]) < 5 or v.pair == names[int(v.shot[1:]) % 4]
+    ]
+    assert sorted(calibrated(boards, shared).pairs) == names
+    # Three shots of each camera, none of them with another.
+    more = seen(3, shots=9)
+    single = [v for v in more.views if v.pair == f"c{1 + int(v.shot[1:]) % 3}"]
+    with pytest.raises(RigDisconnected, match="no shared board view ties"):
+        calibrated(more, single)
+
+
+def test_halves_of_the_rig_that_share_nothing_are_named() -> None:
+    boards = seen(4, shots=10)
+    apart = [v for v in boards.views if (v.pair in ("c1", "c2")) == (int(v.shot[1:]) % 2 == 0)]
+    with pytest.raises(RigDisconnected, match="c1, c2 to c3, c4"):
+        calibrated(boards, apart)
+
+
+@pytest.mark.parametrize(("shots", "said"), [(2, None), (4, "4 shots"), (5, "5 shots")])
+def test_too_few_shots_for_halves_are_said_to_be_so(shots: int, said: str | None) -> None:
+    boards = seen(4, shots=10)
+    views = [view for view in boards.views if int(view.shot[1:]) < shots]
+    if said is None:
+        with pytest.raises(FailedWork, match="at least 3"):
+            calibrated(boards, views)
+        return
+    found = calibrated(boards, views)
+    assert not [line for line in found.advice if "half" in line and "differ" in line]
+    assert any(f"{said} cannot be halved" in note for note in found.notes)
