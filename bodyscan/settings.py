@@ -125,7 +125,7 @@ class RigExportSettings(Model):
     """A calibrated rig for other programs (`export.rig`)."""
 
     formats: tuple[str, ...] = Field(default=("colmap", "opencv"), min_length=1)
-    """of those in bodyscan/export/rig_formats; colmap: a text model with its rig; opencv: YAML, an
+    """of those in bodyscan/interchange/formats; colmap: a text model with its rig; opencv: YAML, an
     entry a pair."""
 
 

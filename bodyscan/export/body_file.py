@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from bodyscan.export.body_format import BODY_FORMATS, BodyFormat
-from bodyscan.export.registry import unknown_format
 from bodyscan.files.atomic import write_json
+from bodyscan.files.registry import unknown_format
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.topology import face_areas

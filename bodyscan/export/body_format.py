@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from bodyscan.export.registry import Registry
+from bodyscan.files.registry import Registry
 
 Content = Literal["mesh", "cloud", "colours", "normals", "sigma", "filled"]
 

@@ -18,9 +18,9 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.interchange.formats.colmap import PIXEL_CENTRE as COLMAP_PIXEL_CENTRE
 from bodyscan.registration.view_graph import Target
 
-COLMAP_PIXEL_CENTRE = 0.5
 WITHOUT_LENS = "SIMPLE_PINHOLE"
 
 

@@ -11,7 +11,7 @@ from test_camera_calibration import POINTS, TURNS
 from bodyscan.calibration.camera import PlanarView, calibrate_camera
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput
-from bodyscan.export.rig_formats.opencv import write_opencv_rig
+from bodyscan.export.rig import export_rig
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import projection_table, ray_table
 from bodyscan.geometry.lenses import LENSES
@@ -123,4 +123,4 @@ def test_its_calibration_is_read_as_it_was_written(ring, tmp_path):
     assert {name: pair.camera for name, pair in found.pairs.items()} == cameras
     assert {type(pair.camera.lens) for pair in found.pairs.values()} == {Leaning, Radial}
     with pytest.raises(BadInput, match="no lens like 'leaning'"):
-        write_opencv_rig(calibration, tmp_path / "rig.yaml")
+        export_rig(calibration, tmp_path, ["opencv"])

@@ -22,9 +22,9 @@ from bodyscan.cli.main import app
 from bodyscan.errors import BadInput
 from bodyscan.export.body_file import Provenance, write_body
 from bodyscan.export.body_format import BODY_FORMATS
-from bodyscan.export.rig_format import RIG_FORMATS
 from bodyscan.export.scan import export_scan
 from bodyscan.fusion.storage import StoredScan
+from bodyscan.interchange.rig_format import RIG_FORMATS
 from bodyscan.jobs.pipeline import Pipeline
 
 SCAN = StoredScan(points(), ball(), {"subject": None, "calibration_id": "3f2a"})

@@ -1,1 +1,0 @@
-"""The formats in which a calibrated rig is written: one file each, named so, that has FORMAT."""

@@ -1,0 +1,49 @@
+"""caliscope's camera_array.toml: tables cameras.0, cameras.1, ...; metres."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from bodyscan.files.atomic import write_text
+from bodyscan.interchange.foreign_file import ForeignFile
+from bodyscan.interchange.found_camera import FoundCamera
+from bodyscan.interchange.rig_format import RigCameras, RigFormat
+from bodyscan.interchange.toml_cameras import NOTE, camera_of_table, read_toml, table_of_camera
+
+
+def write_caliscope(cameras: RigCameras, path: Path) -> Path:
+    """Cameras have numbers there, in the order of the pairs, whose names stand beside them.
+
+    Returns `path`.  Raises BadInput for a lens that OpenCV does not have.
+    """
+    text = "# Lengths in metres.\n" + NOTE
+    for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
+        text += f"\n[cameras.{number}]\ncam_id = {number}\nname = {json.dumps(name)}\n"
+        text += "rotation_count = 0\nfisheye = false\n"
+        text += table_of_camera(name, camera, rig_from_camera.inverse(), 1000.0)
+    write_text(Path(path), text)
+    return Path(path)
+
+
+def read_caliscope(path: Path) -> dict[str, FoundCamera]:
+    """By the cameras' numbers, and by the pair's name where bodyscan wrote it."""
+    file = ForeignFile.read(path)
+    tables = read_toml(file).get("cameras")
+    if not isinstance(tables, dict) or not tables:
+        raise file.error("holds no cameras: it is no camera_array.toml of caliscope's")
+    found: dict[str, FoundCamera] = {}
+    for key, own in tables.items():
+        if not isinstance(own, dict):
+            raise file.error("is no camera as caliscope writes it", f"cameras.{key}")
+        if own.get("rotation_count", 0):
+            raise file.error(
+                "turns the pictures before they are used; bodyscan takes them as they are",
+                "rotation_count", "turn the pictures, or calibrate without", after=f"cameras.{key}",
+            )  # fmt: skip
+        found[key] = camera_of_table(file, own, f"cameras.{key}")
+    named = {str(own["name"]): found[key] for key, own in tables.items() if "name" in own}
+    return found | named
+
+
+FORMAT = RigFormat("camera_array.toml", "m", write_caliscope, read_caliscope)

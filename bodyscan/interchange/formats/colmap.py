@@ -1,0 +1,197 @@
+"""A COLMAP model: its cameras, and where its images or the sensors of its rig stand.
+
+COLMAP's cameras have no skew, so what bodyscan writes says it beside them.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from bodyscan.errors import CalibrationFileError
+from bodyscan.files.atomic import write_bytes, write_json
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.interchange.foreign_file import ForeignFile
+from bodyscan.interchange.found_camera import FoundCamera
+from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
+
+PIXEL_CENTRE = 0.5
+"""COLMAP's pixels have their centres there, ours at whole numbers."""
+SKEW_FILE = "bodyscan.json"
+NO_SKEW = (
+    "Cameras here have no skew. Shear an image point (u, v) of the pair (pixel centres at whole "
+    "numbers, v0 = cy - 0.5) to (u - gamma / beta * (v - v0), v) before using it with them."
+)
+# Where each model has fx, fy, cx, cy, and its lens as k1, k2, p1, p2, ... of OpenCV's.
+LENSES: dict[str, tuple[int, ...]] = {
+    "SIMPLE_PINHOLE": (0, 0, 1, 2),
+    "PINHOLE": (0, 1, 2, 3),
+    "SIMPLE_RADIAL": (0, 0, 1, 2),
+    "RADIAL": (0, 0, 1, 2),
+    "OPENCV": (0, 1, 2, 3),
+    "FULL_OPENCV": (0, 1, 2, 3),
+}
+
+
+def write_colmap(cameras: RigCameras, folder: Path) -> Path:
+    """COLMAP's text model: one rig whose sensors are the cameras, and one frame of one empty image
+    a pair, which puts them where they stand: COLMAP's world is the rig frame, mm.
+
+    `bodyscan.json` beside it holds what COLMAP has no place for: each camera's gamma.  Returns
+    `folder`.  Raises BadInput for a lens that COLMAP does not have.
+    """
+    model = _colmap_model(cameras)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".colmap-", dir=folder) as temporary:
+        model.write_text(temporary)
+        for file in sorted(Path(temporary).iterdir()):
+            write_bytes(folder / file.name, file.read_bytes())
+    pairs = {
+        name: {"gamma": camera.gamma, "rig_from_camera": rig_from_camera.matrix}
+        for name, (camera, rig_from_camera) in cameras.items()
+    }
+    write_json(folder / SKEW_FILE, {"units": "mm", "skew": NO_SKEW, "pairs": pairs})
+    return folder
+
+
+def read_colmap(folder: Path) -> dict[str, FoundCamera]:
+    """Every image by its name; and every camera that has several images by the folder that they lie
+    in, or by its number: with its place in its rig, or without a pose if it has none.
+
+    The skew comes from `bodyscan.json` where there is one.
+    """
+    folder, model = Path(folder), pycolmap.Reconstruction()
+    try:
+        model.read(folder)
+    except (OSError, ValueError, RuntimeError, IndexError) as error:
+        said = str(error).strip().splitlines() or [type(error).__name__]
+        raise CalibrationFileError(
+            f"is no COLMAP model ({said[-1]})",
+            where=str(folder),
+            remedy="give the folder that holds cameras, images and points3D, .bin or .txt",
+        ) from error
+    gammas = _gammas(folder)
+    found: dict[str, FoundCamera] = {}
+    images = sorted(model.images.values(), key=lambda image: image.image_id)
+    for number, camera in sorted(model.cameras.items()):
+        own = [image for image in images if image.camera_id == number]
+        names = {str(number), *_common_folder([image.name for image in own])}
+        rig_pose = _place_in_rig(model, number)
+        for name in names - {image.name for image in own}:
+            found[name] = _found(folder, camera, 0.0, rig_pose)
+        for image in own:
+            pose = _transform(image.cam_from_world()) if image.has_pose else None
+            found[image.name] = _found(folder, camera, gammas.get(image.name, 0.0), pose)
+    for name in gammas:
+        if name not in found:
+            raise CalibrationFileError(
+                f"tells of a pair {name!r} that the model does not have",
+                where=str(folder / SKEW_FILE),
+                remedy="give both as `bodyscan export-rig --format colmap` wrote them",
+            )
+    return found
+
+
+def _gammas(folder: Path) -> dict[str, float]:
+    file = folder / SKEW_FILE
+    if not file.is_file():
+        return {}
+    try:
+        pairs = json.loads(file.read_text("utf-8"))["pairs"]
+        return {name: float(pair["gamma"]) for name, pair in pairs.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CalibrationFileError(
+            f"is not what bodyscan writes beside a COLMAP model ({type(error).__name__}: {error})",
+            where=str(file),
+            remedy="write it again with `bodyscan export-rig --format colmap`, or take it away",
+        ) from error
+
+
+def _common_folder(names: list[str]) -> set[str]:
+    folders = Counter(name.rpartition("/")[0] for name in names)
+    return set(folders) - {""} if len(folders) == 1 else set()
+
+
+def _place_in_rig(model: Any, number: int) -> RigidTransform | None:
+    sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number)
+    for rig in model.rigs.values():
+        if rig.num_sensors() > 1 and rig.has_sensor(sensor):
+            if rig.is_ref_sensor(sensor):
+                return RigidTransform.identity()
+            return _transform(rig.sensor_from_rig(sensor))
+    return None
+
+
+def _found(folder: Path, camera: Any, gamma: float, pose: RigidTransform | None) -> FoundCamera:
+    file = ForeignFile(folder)
+    model = camera.model.name
+    if model not in LENSES:
+        raise file.error(
+            f"has a camera of COLMAP's model {model}, which there is not here",
+            remedy=f"calibrate it with one of {', '.join(LENSES)}",
+        )
+    params = [float(value) for value in camera.params]
+    fx, fy, cx, cy = (params[k] for k in LENSES[model])
+    four = [fx, fy, cx - PIXEL_CENTRE, cy - PIXEL_CENTRE]
+    matrix = file.four(four, f"camera {camera.camera_id}")
+    matrix[0, 1] = gamma
+    lens = file.lens(params[max(LENSES[model]) + 1 :], f"camera {camera.camera_id}")
+    return FoundCamera(matrix, lens, (camera.width, camera.height), pose, str(folder))
+
+
+def _colmap_model(cameras: Mapping[str, tuple[Camera, RigidTransform]]) -> pycolmap.Reconstruction:
+    """The first pair is the reference sensor, whose frame COLMAP takes for the rig's own."""
+    model, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1)
+    frame = pycolmap.Frame(frame_id=1, rig_id=1)
+    reference = next(iter(cameras.values()))[1]
+    for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items(), start=1):
+        model.add_camera(_colmap_camera(name, camera, number))
+        sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number)
+        if number == 1:
+            rig.add_ref_sensor(sensor)
+        else:
+            rig.add_sensor(sensor, _rigid3d(rig_from_camera.inverse() @ reference))
+        frame.add_data_id(pycolmap.data_t(sensor, number))
+    model.add_rig(rig)
+    frame.rig_from_world = _rigid3d(reference.inverse())
+    model.add_frame(frame)
+    for number, name in enumerate(cameras, start=1):
+        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
+        image.frame_id = 1
+        model.add_image(image)
+    model.register_frame(1)
+    return model
+
+
+def _colmap_camera(name: str, camera: Camera, camera_id: int) -> pycolmap.Camera:
+    centre = [camera.u0 + PIXEL_CENTRE, camera.v0 + PIXEL_CENTRE]
+    # COLMAP's OPENCV is a prefix of its FULL_OPENCV, which has OpenCV's first eight coefficients.
+    lens = np.append(opencv_lens(name, camera), np.zeros(8))[:8]
+    model = "FULL_OPENCV" if lens[4:].any() else "OPENCV"
+    return pycolmap.Camera(
+        model=model,
+        width=camera.width,
+        height=camera.height,
+        params=[camera.alpha, camera.beta, *centre, *lens[: 4 if model == "OPENCV" else 8]],
+        camera_id=camera_id,
+    )
+
+
+def _rigid3d(transform: RigidTransform) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(transform.matrix[:3])
+
+
+def _transform(pose: Any) -> RigidTransform:
+    return RigidTransform.from_matrix(pose.matrix())
+
+
+FORMAT = RigFormat("colmap", None, write_colmap, read_colmap)

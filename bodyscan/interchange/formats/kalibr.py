@@ -1,0 +1,131 @@
+"""Kalibr's camchain.yaml: cameras in a chain, each placed in the frame of the one before it.
+
+Metres, as Kalibr's targets are. It has no frame of its own: the first camera's is the world.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bodyscan.errors import BadInput
+from bodyscan.files.atomic import write_text
+from bodyscan.files.yaml_file import YamlError, dump_yaml, read_yaml
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.interchange.foreign_file import ForeignFile
+from bodyscan.interchange.found_camera import FoundCamera
+from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
+
+NOTE = """\
+# Metres. Pixel centres at whole numbers. `name` is the pair's. Kalibr's cameras have no skew: shear
+# a point (u, v) of the pair to (u - skew / fv * (v - pv), v) before using it with them.
+"""
+
+
+def write_kalibr(cameras: RigCameras, path: Path) -> Path:
+    """cam0, cam1, ... in the order of the pairs. Returns `path`.
+
+    Raises BadInput for a lens with more than k1, k2, p1, p2, which Kalibr's radtan has.
+    """
+    content: dict[str, Any] = {}
+    before: RigidTransform | None = None
+    for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
+        coefficients = opencv_lens(name, camera)
+        if np.any(coefficients[4:]):
+            raise BadInput(
+                f"Kalibr has no lens like {camera.lens.kind!r}: its radtan ends with k1, k2, p1, p2",
+                where=f"pair {name}",
+                remedy="choose another format, such as opencv, colmap or mrcal",
+            )
+        own: dict[str, Any] = {
+            "camera_model": "pinhole",
+            "intrinsics": [camera.alpha, camera.beta, camera.u0, camera.v0],
+            "distortion_model": "radtan",
+            "distortion_coeffs": coefficients[:4].tolist(),
+            "resolution": [camera.width, camera.height],
+            "rostopic": f"/{name}/image_raw",
+            "name": name,
+            "skew": camera.gamma,
+        }
+        if before is not None:
+            chain = (rig_from_camera.inverse() @ before).matrix
+            chain[:3, 3] /= 1000.0
+            own["T_cn_cnm1"] = chain.tolist()
+        before = rig_from_camera
+        content[f"cam{number}"] = own
+    write_text(Path(path), NOTE + dump_yaml(content))
+    return Path(path)
+
+
+def read_kalibr(path: Path) -> dict[str, FoundCamera]:
+    """By cam0, cam1, ..., and by the pair's name where bodyscan wrote it."""
+    file = ForeignFile.read(path)
+    try:
+        data = read_yaml(path).data
+    except YamlError as error:
+        raise file.error(error.problem.text) from None
+    chain = data if isinstance(data, dict) else {}
+    cameras = {key: own for key, own in chain.items() if isinstance(own, dict)}
+    if "cam0" not in cameras:
+        raise file.error(
+            "is no camchain of Kalibr's: it has no cam0",
+            remedy="give camchain-....yaml, which kalibr_calibrate_cameras wrote",
+        )
+    found: dict[str, FoundCamera] = {}
+    pose: RigidTransform | None = RigidTransform.identity()
+    for number in range(len(cameras)):
+        key = f"cam{number}"
+        if key not in cameras:
+            break
+        own = cameras[key]
+        if number > 0:
+            pose = _next_pose(file, key, own, pose)
+        one = _camera(file, key, own, pose)
+        found[key] = one
+        if isinstance(own.get("name"), str):
+            found[own["name"]] = one
+    return found
+
+
+def _next_pose(
+    file: ForeignFile, key: str, own: dict[str, Any], before: RigidTransform | None
+) -> RigidTransform | None:
+    """A chain that is broken leaves the cameras behind the gap without a pose."""
+    if "T_cn_cnm1" not in own or before is None:
+        return None
+    matrix = file.numbers(own["T_cn_cnm1"], "T_cn_cnm1", (16,), after=key).reshape(4, 4)
+    step = file.pose(matrix[:3, :3], matrix[:3, 3], ("T_cn_cnm1", "T_cn_cnm1"), after=key)
+    return step @ before
+
+
+def _camera(
+    file: ForeignFile, key: str, own: dict[str, Any], pose: RigidTransform | None
+) -> FoundCamera:
+    for word in ("camera_model", "intrinsics", "distortion_model", "resolution"):
+        if word not in own:
+            raise file.error(f"has no {word}", key, f"it has {', '.join(own)}")
+    if own["camera_model"] != "pinhole":
+        raise file.error(
+            f"{own['camera_model']!r} is a model that there is not here, pinhole is",
+            "camera_model", "calibrate it with pinhole-radtan", after=key,
+        )  # fmt: skip
+    if own["distortion_model"] not in ("radtan", "none"):
+        raise file.error(
+            f"{own['distortion_model']!r} is a lens that there is not here, radtan is",
+            "distortion_model", "calibrate it with pinhole-radtan", after=key,
+        )  # fmt: skip
+    lens = own.get("distortion_coeffs", []) if own["distortion_model"] == "radtan" else []
+    matrix = file.four(own["intrinsics"], "intrinsics", after=key)
+    matrix[0, 1] = file.numbers(own.get("skew", 0.0), "skew", (1,), after=key)[0]
+    return FoundCamera(
+        matrix,
+        file.lens(lens, "distortion_coeffs", after=key),
+        file.size(own["resolution"], "resolution", after=key),
+        pose,
+        file.where(key),
+    )
+
+
+FORMAT = RigFormat("camchain.yaml", "m", write_kalibr, read_kalibr)

@@ -1,0 +1,157 @@
+"""OpenCV's FileStorage: YAML, XML or JSON.
+
+What bodyscan writes has an entry for each pair. What others wrote has nodes of any name, which the
+rig file says; a node inside of others is named with their names before it: `stereo/K1`.
+
+OpenCV's camera functions know no skew, so the file says what to do about it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from bodyscan.errors import CalibrationFileError
+from bodyscan.files.atomic import write_text
+from bodyscan.files.model import did_you_mean
+from bodyscan.interchange.foreign_file import ForeignFile
+from bodyscan.interchange.found_camera import FoundCamera
+from bodyscan.interchange.rig_format import Nodes, RigCameras, RigFormat, opencv_lens
+
+NOTE = (
+    "Lengths in mm. x_camera = R x_rig + T. Pixel centres at whole numbers. camera_matrix holds the "
+    "skew, but OpenCV's functions ignore it: use it with pixels sheared to "
+    "u - skew / fy * (v - cy), v, which a camera without skew would have seen."
+)
+HEADER = "%YAML:1.0\n---\n"
+"""OpenCV reads no YAML without it, such as ROS writes."""
+
+
+def write_opencv(cameras: RigCameras, path: Path) -> Path:
+    """A sequence `pairs` as cv2.FileStorage reads it: name, image size, camera_matrix (with its
+    skew), distortion_coefficients (OpenCV's, in its order), R and T of `camera_from_rig`.
+
+    Returns `path`.  Raises BadInput for a lens that OpenCV does not have.
+    """
+    memory = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
+    store = cv2.FileStorage("rig.yaml", memory)
+    store.writeComment(NOTE, False)
+    store.startWriteStruct("pairs", cv2.FILE_NODE_SEQ)
+    for name, (camera, rig_from_camera) in cameras.items():
+        camera_from_rig = rig_from_camera.inverse()
+        store.startWriteStruct("", cv2.FILE_NODE_MAP)
+        store.write("name", name)
+        store.write("image_width", camera.width)
+        store.write("image_height", camera.height)
+        store.write("camera_matrix", camera.matrix)
+        store.write("skew", camera.gamma)
+        store.write("distortion_coefficients", opencv_lens(name, camera)[None])
+        store.write("R", camera_from_rig.rotation)
+        store.write("T", camera_from_rig.translation.reshape(3, 1))
+        store.endWriteStruct()
+    store.endWriteStruct()
+    write_text(Path(path), store.releaseAndGetString())
+    return Path(path)
+
+
+def read_opencv(path: Path) -> dict[str, FoundCamera]:
+    """The cameras of a file that `write_opencv` wrote."""
+    file = ForeignFile.read(path)
+    store = _opened(file)
+    pairs = store.getNode("pairs")
+    if not pairs.isSeq():
+        raise file.error(
+            "has no list of pairs as bodyscan writes it",
+            remedy="say which of its nodes are meant, such as camera: {matrix: K, distortion: D}; "
+            f"it has {', '.join(store.root().keys())}",
+        )
+    found = {}
+    for k in range(int(pairs.size())):
+        entry, name = pairs.at(k), f"pairs/{k}"
+
+        def numbers(key: str, entry: Any = entry, name: str = name) -> Any:
+            return _values(file, _below(file, entry, key, name), f"{name}/{key}")
+
+        label = _below(file, entry, "name", name).string()
+        size = [numbers("image_width"), numbers("image_height")]
+        found[label] = FoundCamera(
+            file.matrix(numbers("camera_matrix"), "camera_matrix", after=label),
+            file.lens(numbers("distortion_coefficients"), "distortion_coefficients", after=label),
+            file.size(size, "image_width", after=label),
+            file.pose(numbers("R"), numbers("T"), ("R", "T"), after=label),
+            file.where("camera_matrix", label),
+        )
+    return found
+
+
+def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
+    """The camera whose numbers stand in these nodes: matrix; distortion, size, rotation and
+    translation if they are given."""
+    file = ForeignFile.read(path)
+    store = _opened(file)
+
+    def values(what: str) -> Any:
+        return _values(file, _node(file, store, nodes[what]), nodes[what])
+
+    size = file.size(values("size"), nodes["size"]) if "size" in nodes else None
+    pose = None
+    if "rotation" in nodes:
+        words = nodes["rotation"], nodes["translation"]
+        pose = file.pose(values("rotation"), values("translation"), words)
+    lens = file.lens(
+        values("distortion") if "distortion" in nodes else [],
+        nodes.get("distortion", nodes["matrix"]),
+    )
+    matrix = file.matrix(values("matrix"), nodes["matrix"])
+    return FoundCamera(matrix, lens, size, pose, file.where(nodes["matrix"].split("/")[-1]))
+
+
+def _opened(file: ForeignFile) -> Any:
+    """The storage; its nodes live only as long as it does."""
+    text = file.text.lstrip()
+    if not text.startswith(("%YAML", "<?xml", "{")):
+        text = HEADER + text
+    read = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
+    try:
+        store = cv2.FileStorage(text, read)
+        if store.isOpened() and store.root().isMap():
+            return store
+    except (SystemError, cv2.error):
+        pass
+    raise file.error("is neither YAML, XML nor JSON as OpenCV's FileStorage reads them")
+
+
+def _node(file: ForeignFile, store: Any, name: str) -> Any:
+    node, passed = store.root(), ""
+    for part in name.split("/"):
+        node = _below(file, node, part, passed)
+        passed = f"{passed}/{part}" if passed else part
+    return node
+
+
+def _below(file: ForeignFile, node: Any, name: str, passed: str) -> Any:
+    keys = list(node.keys()) if node.isMap() else []
+    if name not in keys:
+        place = f"below {passed}" if passed else "in it"
+        raise CalibrationFileError(
+            f"has no node {name!r} {place}{did_you_mean(name, keys)}",
+            where=file.where(passed.split("/")[-1]) if passed else str(file.path),
+            remedy=f"there is {', '.join(keys) or 'none'}",
+        )
+    return node.getNode(name)
+
+
+def _values(file: ForeignFile, node: Any, name: str) -> Any:
+    """A number, or a list of what is in it; of a matrix its numbers row by row."""
+    if node.isMap() and "data" in node.keys():  # noqa: SIM118 (it is no dict)
+        return _values(file, node.getNode("data"), name)
+    if node.isSeq():
+        return [_values(file, node.at(k), name) for k in range(int(node.size()))]
+    if node.isInt() or node.isReal():
+        return float(node.real())
+    raise file.error("holds what is no number", name.split("/")[-1])
+
+
+FORMAT = RigFormat("rig-opencv.yaml", "mm", write_opencv, read_opencv, read_nodes)

@@ -1,0 +1,55 @@
+"""How the cameras of a calibrated rig are written for another program, and what it wrote is read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+from bodyscan.errors import BadInput
+from bodyscan.files.registry import Registry
+
+if TYPE_CHECKING:
+    from bodyscan.arrays import Array
+    from bodyscan.geometry.camera import Camera
+    from bodyscan.geometry.transforms import RigidTransform
+    from bodyscan.interchange.found_camera import FoundCamera
+
+RigCameras: TypeAlias = "Mapping[str, tuple[Camera, RigidTransform]]"
+"""Camera and `rig_from_camera` by the pair's name."""
+Unit = Literal["mm", "cm", "m"]
+MILLIMETRES: dict[Unit, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+"""In one of a unit."""
+Nodes: TypeAlias = Mapping[str, str]
+"""Names of a file's nodes, by what they hold: matrix, distortion, size, rotation, translation."""
+
+
+@dataclass(frozen=True)
+class RigFormat:
+    """path: of what is written, a file or a folder, below the folder that the user chose.
+
+    unit: of lengths in such files; None where the format leaves it open.
+    write: cameras to that path, which it returns; raises BadInput for a lens that it cannot express.
+    read: every camera of such a file or folder, by name.  read_nodes: one camera of a file whose
+    nodes may be called anything; None where the format says how they are called.  Both raise
+    CalibrationFileError.
+    """
+
+    path: str
+    unit: Unit | None
+    write: Callable[[RigCameras, Path], Path]
+    read: Callable[[Path], dict[str, FoundCamera]]
+    read_nodes: Callable[[Path, Nodes], FoundCamera] | None = None
+
+
+def opencv_lens(name: str, camera: Camera) -> Array:
+    """Of a pair's camera, OpenCV's coefficients (5,) or more. Raises BadInput that names the pair
+    for a lens that OpenCV does not have."""
+    try:
+        return camera.lens.opencv()
+    except BadInput as error:
+        raise BadInput(error.what, where=f"pair {name}", remedy=error.remedy) from None
+
+
+RIG_FORMATS: Registry[RigFormat] = Registry("bodyscan.interchange.formats", "a rig")

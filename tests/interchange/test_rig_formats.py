@@ -1,0 +1,421 @@
+"""Every format written, read back, and read by the program whose it is where that is installed."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import yaml
+from ring import ring_of_cameras
+
+from bodyscan.arrays import Array
+from bodyscan.errors import BadInput, CalibrationFileError
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import lens_from_opencv
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.interchange.formats.opencv import read_nodes
+from bodyscan.interchange.rig_format import MILLIMETRES, RIG_FORMATS, RigCameras
+
+WORLDS = {"opencv", "colmap", "mrcal", "aniposelib", "caliscope"}  # Kalibr's is its first camera
+
+
+def ring() -> RigCameras:
+    placings, cameras = ring_of_cameras(heights=(700, 1200))
+    return {name: (cameras[name], placings[name]) for name in cameras}
+
+
+@pytest.fixture
+def points() -> Array:
+    """Points of the scan volume, rig frame."""
+    points: Array = np.random.default_rng(2).uniform([-300, -300, 600], [300, 300, 1300], (50, 3))
+    return points
+
+
+@pytest.mark.parametrize("kind", RIG_FORMATS.names())
+def test_the_same_cameras_are_read_back(tmp_path: Path, kind: str) -> None:
+    form, cameras = RIG_FORMATS.find(kind), ring()
+    found = form.read(form.write(cameras, tmp_path / form.path))
+    scale = MILLIMETRES[form.unit or "mm"]
+    first = next(iter(cameras.values()))[1]
+    for name, (camera, rig_from_camera) in cameras.items():
+        own = found[name].camera(camera.width, camera.height)
+        np.testing.assert_allclose(own.parameters, camera.parameters, rtol=0, atol=1e-9)
+        pose = found[name].camera_from_world
+        assert pose is not None
+        world = rig_from_camera if kind in WORLDS else first.inverse() @ rig_from_camera
+        read = RigidTransform(pose.rotation, pose.translation * scale).inverse()
+        np.testing.assert_allclose(read.matrix, world.matrix, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", RIG_FORMATS.names())
+def test_the_same_cameras_give_the_same_bytes(tmp_path: Path, kind: str) -> None:
+    form = RIG_FORMATS.find(kind)
+    for folder in ("a", "b"):
+        assert form.write(ring(), tmp_path / folder / form.path) == tmp_path / folder / form.path
+    files = [p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file()]
+    assert files
+    assert not [file for file in files if file.name.startswith(".")]
+    for file in files:
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_colmap_itself_sees_the_cameras_where_they_stand(points: Array, tmp_path: Path) -> None:
+    cameras, model = ring(), pycolmap.Reconstruction()
+    model.read_text(RIG_FORMATS.find("colmap").write(cameras, tmp_path / "model"))
+    assert model.num_rigs() == 1
+    assert model.rig(1).num_sensors() == len(cameras)
+    for image in model.images.values():
+        own, rig_from_camera = cameras[image.name]
+        pixels = [image.project_point(point) for point in points]
+        # COLMAP's pixel centres are at +0.5, its cameras without skew.
+        expected = own.without_skew(own.project(rig_from_camera.inverse().apply(points))) + 0.5
+        np.testing.assert_allclose(pixels, expected, rtol=0, atol=1e-8)
+        assert own.gamma != 0
+
+
+def test_opencv_itself_projects_the_same(points: Array, tmp_path: Path) -> None:
+    path = RIG_FORMATS.find("opencv").write(ring(), tmp_path / "rig.yaml")
+    store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    pairs = store.getNode("pairs")
+    for k, (name, (camera, rig_from_camera)) in enumerate(ring().items()):
+        node = pairs.at(k)
+        assert node.getNode("name").string() == name
+        matrix = node.getNode("camera_matrix").mat()
+        assert matrix[0, 1] == node.getNode("skew").real() == camera.gamma
+        rotation, translation = node.getNode("R").mat(), node.getNode("T").mat()
+        lens = node.getNode("distortion_coefficients").mat()
+        pixels, _ = cv2.projectPoints(points, cv2.Rodrigues(rotation)[0], translation, matrix, lens)
+        expected = camera.without_skew(camera.project(rig_from_camera.inverse().apply(points)))
+        np.testing.assert_allclose(pixels.reshape(-1, 2), expected, rtol=0, atol=1e-7)
+
+
+def test_what_python_programs_read_projects_the_same(points: Array, tmp_path: Path) -> None:
+    """Kalibr's YAML, mrcal's literal and the TOMLs by what their own programs parse them with,
+    projected by OpenCV as they do."""
+    cameras = ring()
+    files = {kind: RIG_FORMATS.find(kind).write(cameras, tmp_path / kind) for kind in WORLDS}
+    files["kalibr"] = RIG_FORMATS.find("kalibr").write(cameras, tmp_path / "kalibr")
+    anipose = tomllib.loads(files["aniposelib"].read_text("utf-8"))
+    caliscope = tomllib.loads(files["caliscope"].read_text("utf-8"))["cameras"]
+    kalibr = yaml.safe_load(files["kalibr"].read_text("utf-8"))
+    chain = np.eye(4)
+    first = next(iter(cameras.values()))[1]
+    for k, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
+        seen = rig_from_camera.inverse().apply(points)
+        expected = camera.without_skew(camera.project(seen))
+        model = ast.literal_eval((files["mrcal"] / f"{name}.cameramodel").read_text("utf-8"))
+        fx, fy, cx, cy, *lens = model["intrinsics"]
+        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        rotation, shift = np.split(np.array(model["extrinsics"]), 2)
+        told = [(rotation, shift, matrix, np.array(lens), points)]
+        for table, metres in ((anipose[f"cam_{k}"], 1.0), (caliscope[str(k)], 1000.0)):
+            told.append(
+                (
+                    np.array(table["rotation"]),
+                    metres * np.array(table["translation"]),
+                    np.array(table["matrix"]),
+                    np.array(table["distortions"]),
+                    points,
+                )
+            )
+        own = kalibr[f"cam{k}"]
+        chain = np.array(own.get("T_cn_cnm1", np.eye(4))) @ chain
+        fx, fy, cx, cy = own["intrinsics"]
+        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        rotation = cv2.Rodrigues(chain[:3, :3])[0]
+        in_first = first.inverse().apply(points)
+        told.append(
+            (rotation, 1000.0 * chain[:3, 3], matrix, np.array(own["distortion_coeffs"]), in_first)
+        )
+        for *numbers, where in told:
+            pixels, _ = cv2.projectPoints(where, *numbers)
+            np.testing.assert_allclose(pixels[:, 0], expected, rtol=0, atol=1e-6)
+
+
+WRITTEN_BY_OTHERS = {
+    "kalibr": (
+        "camchain.yaml",
+        "cam0:\n"
+        "  camera_model: pinhole\n"
+        "  distortion_coeffs: [-0.2, 0.05]\n"
+        "  distortion_model: none\n"
+        "  intrinsics: [1000.0, 1010.0, 640.0, 360.0]\n"
+        "  resolution: [1280, 720]\n"
+        "right:\n  note: no camera\n"
+        "cam1:\n"
+        "  camera_model: pinhole\n"
+        "  distortion_coeffs: [-0.2, 0.05, 0.0, 0.0]\n"
+        "  distortion_model: radtan\n"
+        "  intrinsics: [1000.0, 1010.0, 640.0, 360.0]\n"
+        "  resolution: [1280, 720]\n"
+        "  T_cn_cnm1:\n"
+        "  - [1.0, 0.0, 0.0, -0.2]\n  - [0.0, 1.0, 0.0, 0.0]\n"
+        "  - [0.0, 0.0, 1.0, 0.0]\n  - [0.0, 0.0, 0.0, 1.0]\n",
+        "cam1",
+    ),
+    "mrcal": (
+        "left.cameramodel",
+        "# made on some day\n{\n"
+        "    'lensmodel':  'LENSMODEL_OPENCV8',\n\n"
+        "    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....\n"
+        "    'intrinsics': [ 1000, 1010, 640, 360, -0.2, 0.05, 0, 0, 0, 0, 0, 0,],\n"
+        "    'extrinsics': [ 0, 0, 0, -0.2, 0., 0., ],\n"
+        "    'imagersize': [ 1280, 720,],\n"
+        "    'icam_intrinsics': 0,\n    'optimization_inputs': b'P)h>@6aWAK',\n}\n",
+        "left",
+    ),
+    "aniposelib": (
+        "calibration.toml",
+        '[cam_0]\nname = "A"\nsize = [ 1280, 720,]\n'
+        "matrix = [ [ 1000.0, 0.0, 640.0,], [ 0.0, 1010.0, 360.0,], [ 0.0, 0.0, 1.0,],]\n"
+        "distortions = [ -0.2, 0.05, 0.0, 0.0, 0.0,]\n"
+        "rotation = [ 0.0, 0.0, 0.0,]\ntranslation = [ -0.2, 0.0, 0.0,]\n\n"
+        "[metadata]\nadjusted = false\nerror = 0.3\n",
+        "A",
+    ),
+    "caliscope": (
+        "camera_array.toml",
+        "[cameras.3]\ncam_id = 3\nsize = [1280, 720]\nrotation_count = 0\nerror = 0.4\n"
+        "matrix = [[1000.0, 0.0, 640.0], [0.0, 1010.0, 360.0], [0.0, 0.0, 1.0]]\n"
+        "distortions = [-0.2, 0.05, 0.0, 0.0, 0.0]\n"
+        "translation = [-0.2, 0.0, 0.0]\nrotation = [0.0, 0.0, 0.0]\n"
+        "grid_count = 20\nfisheye = false\n",
+        "3",
+    ),
+}
+"""Made up here after the descriptions of each format; all say the same camera."""
+
+
+@pytest.mark.parametrize("kind", WRITTEN_BY_OTHERS)
+def test_what_others_write_is_read(tmp_path: Path, kind: str) -> None:
+    file, text, name = WRITTEN_BY_OTHERS[kind]
+    (tmp_path / file).write_text(text)
+    found = RIG_FORMATS.find(kind).read(tmp_path / file)[name]
+    assert found.camera(1280, 720) == Camera(
+        1000.0, 1010.0, 0.0, 640.0, 360.0,
+        lens_from_opencv(np.array([-0.2, 0.05, 0.0, 0.0, 0.0])), 1280, 720,
+    )  # fmt: skip
+    assert found.camera_from_world is not None
+    np.testing.assert_array_equal(found.camera_from_world.rotation, np.eye(3))
+    np.testing.assert_array_equal(found.camera_from_world.translation, [-0.2, 0.0, 0.0])
+
+
+def spoilt(kind: str, old: str, new: str) -> str:
+    text = WRITTEN_BY_OTHERS[kind][1]
+    assert old in text
+    return text.replace(old, new)
+
+
+WRONG = [
+    ("kalibr", "radtan", "equidistant", r":12: cam1.distortion_model: 'equidistant' is a lens"),
+    ("kalibr", "pinhole", "ds", r":2: cam0.camera_model: 'ds' is a model that there is not here"),
+    ("kalibr", "cam0", "camera0", r"it has no cam0"),
+    ("kalibr", "[1.0, 0.0, 0.0, -0.2]", "[-1.0, 0.0, 0.0, -0.2]", r"T_cn_cnm1: is mirrored"),
+    ("kalibr", "[1.0, 0.0, 0.0, -0.2]", "[1.1, 0.0, 0.0, -0.2]", r"T_cn_cnm1: is no rotation"),
+    ("kalibr", "1280, 720", "1280", r":6: cam0.resolution: holds 1 numbers, not 2"),
+    ("kalibr", "  intrinsics", "\tintrinsics", r"is not YAML"),
+    ("mrcal", "OPENCV8", "CAHVOR", r":3: lensmodel: 'LENSMODEL_CAHVOR' is a lens"),
+    ("mrcal", "1000, 1010", "1000", r":6: intrinsics: holds 11 numbers, not 12"),
+    ("mrcal", "1000, 1010", "1000, -1010", r":6: intrinsics: has focal lengths 1000 and -1010"),
+    ("mrcal", "1000, 1010", "1e999, 1010", r":6: intrinsics: holds a number that is not finite"),
+    ("mrcal", "'imagersize'", "'size'", r"has no 'imagersize'"),
+    ("mrcal", "[ 1280, 720,]", "[ 1280, 720", r":\d+: is no cameramodel of mrcal's"),
+    ("aniposelib", "-0.2, 0.05, 0.0, 0.0, 0.0", "-0.2, nan, 0, 0, 0", r":5: cam_0.distortions: .*f"),
+    ("aniposelib", "size", "sizes", r":1: cam_0: has no size"),
+    ("aniposelib", "[metadata]", "fisheye = true\n[metadata]", r":9: cam_0.fisheye: is OpenCV's f"),
+    ("aniposelib", "0.05, 0.0", "0.05, 0, 0.0", r":5: cam_0.distortions: holds 6 numbers, not"),
+    ("caliscope", "rotation_count = 0", "rotation_count = 1", r":4: cameras.3.rotation_count: turns"),
+    ("caliscope", "[cameras.3]", "[camera.3]", r"holds no cameras"),
+    ("caliscope", "1280, 720]", "1280, 720", r"is not TOML: .*line"),
+    ("caliscope", "0.0, 0.0, 1.0", "0.0, 1.0, 0.0", r":6: cameras.3.matrix: is no camera matrix"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "old", "new", "said"), WRONG)
+def test_what_is_wrong_is_named_with_its_line(
+    tmp_path: Path, kind: str, old: str, new: str, said: str
+) -> None:
+    path = tmp_path / WRITTEN_BY_OTHERS[kind][0]
+    path.write_text(spoilt(kind, old, new))
+    with pytest.raises(CalibrationFileError, match=said) as caught:
+        RIG_FORMATS.find(kind).read(path)
+    assert str(path) in caught.value.where
+    assert caught.value.remedy
+
+
+NODES = {"matrix": "cam/K", "distortion": "kc", "size": "size", "rotation": "R", "translation": "T"}
+NUMBERS = {
+    "K": [1000.0, 0.0, 640.0, 0.0, 1010.0, 360.0, 0.0, 0.0, 1.0],
+    "kc": [-0.2, 0.05, 0.0, 0.0, 0.0],
+    "R": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+    "T": [-0.2, 0.0, 0.0],
+}
+
+
+def storage(kind: str) -> str:
+    """What cv2.FileStorage writes: a matrix in a node of its own, others at the root."""
+    flags = {
+        "yaml": cv2.FILE_STORAGE_FORMAT_YAML,
+        "xml": cv2.FILE_STORAGE_FORMAT_XML,
+        "json": cv2.FILE_STORAGE_FORMAT_JSON,
+    }
+    store = cv2.FileStorage(
+        f"any.{kind}", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | flags[kind]
+    )
+    store.startWriteStruct("cam", cv2.FILE_NODE_MAP)
+    store.write("K", np.array(NUMBERS["K"]).reshape(3, 3))
+    store.endWriteStruct()
+    store.write("kc", np.array(NUMBERS["kc"])[:, None])
+    store.write("R", np.array(NUMBERS["R"]).reshape(3, 3))
+    store.write("T", np.array(NUMBERS["T"])[:, None])
+    store.write("size", np.array([[1280, 720]]))
+    text: str = store.releaseAndGetString()
+    return text
+
+
+ROS = """\
+cam:
+  K: {rows: 3, cols: 3, data: [1000.0, 0, 640, 0, 1010, 360, 0, 0, 1]}
+kc: {rows: 1, cols: 5, data: [-0.2, 0.05, 0, 0, 0]}
+size: [1280, 720]
+R: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+T: [-0.2, 0, 0]
+"""
+
+
+@pytest.mark.parametrize("kind", ["yaml", "xml", "json", "ros"])
+def test_nodes_of_any_name_are_read(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"any.{kind}"
+    path.write_text(ROS if kind == "ros" else storage(kind))
+    found = read_nodes(path, NODES)
+    lens = lens_from_opencv(np.array(NUMBERS["kc"]))
+    assert found.camera(1280, 720) == Camera(1000, 1010, 0, 640, 360, lens, 1280, 720)
+    assert found.camera_from_world is not None
+    np.testing.assert_array_equal(found.camera_from_world.matrix[:3, 3], NUMBERS["T"])
+    turned = read_nodes(path, NODES | {"rotation": "T"})
+    assert turned.camera_from_world is not None
+    np.testing.assert_allclose(turned.camera_from_world.rotation_vector, NUMBERS["T"], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said", "remedy"),
+    [
+        ({"matrix": "cam/k"}, r"any.yaml:3: has no node 'k' below cam", "there is K"),
+        ({"distortion": "kcc"}, r"has no node 'kcc' in it \(did you mean 'kc'\?\)", "cam, kc, R"),
+        ({"matrix": "kc"}, r"any.yaml:9: kc: holds 5 numbers, not 9", ""),
+        ({"rotation": "cam/K"}, r"K: is no rotation", ""),
+        ({"size": "T"}, r"T: holds 3 numbers, not 2", ""),
+        ({"translation": "size"}, r"size: holds 2 numbers, not 3", ""),
+    ],
+)
+def test_nodes_that_do_not_fit_are_named(
+    tmp_path: Path, wrong: dict[str, str], said: str, remedy: str
+) -> None:
+    path = tmp_path / "any.yaml"
+    path.write_text(storage("yaml"))
+    with pytest.raises(CalibrationFileError, match=said) as caught:
+        read_nodes(path, NODES | wrong)
+    assert remedy in caught.value.remedy
+
+
+def test_numbers_that_cannot_be_are_named(tmp_path: Path) -> None:
+    path, text = tmp_path / "any.yaml", storage("yaml")
+    path.write_text(re.sub(r"data: \[ -[^,]*", "data: [ .Nan", text, count=1))
+    with pytest.raises(CalibrationFileError, match=r"any.yaml:9: kc: holds a number that is not"):
+        read_nodes(path, NODES)
+    for spoilt_text in ("", "words", text.replace("data: [", "data: ", 1)):
+        path.write_text(spoilt_text)
+        with pytest.raises(
+            CalibrationFileError, match=r"neither YAML, XML nor JSON|no number|no node"
+        ):
+            read_nodes(path, NODES)
+    with pytest.raises(CalibrationFileError, match="there is no such file"):
+        read_nodes(tmp_path / "nowhere.yaml", NODES)
+
+
+def test_a_file_of_another_camera_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "any.yaml"
+    path.write_text(storage("yaml"))
+    with pytest.raises(CalibrationFileError, match=r"1280 x 720 px, the rig file says 640 x 360"):
+        read_nodes(path, NODES).camera(640, 360)
+    unsaid = read_nodes(path, {k: v for k, v in NODES.items() if k != "size"})
+    with pytest.raises(CalibrationFileError, match=r"principal point at \(640.0, 360.0\), outside"):
+        unsaid.camera(640, 360)
+    assert unsaid.camera(1920, 1080).width == 1920
+
+
+def test_what_is_no_rig_is_refused(tmp_path: Path) -> None:
+    colmap, opencv = RIG_FORMATS.find("colmap"), RIG_FORMATS.find("opencv")
+    with pytest.raises(BadInput, match="is no COLMAP model"):
+        colmap.read(tmp_path / "nothing")
+    torn = tmp_path / "torn.yaml"
+    torn.write_text("%YAML 1.2\n---\npairs:\n   -\n      name: a\n")
+    with pytest.raises(BadInput, match="has no node 'image_width' below pairs/0"):
+        opencv.read(torn)
+    torn.write_text(storage("yaml"))
+    with pytest.raises(BadInput, match="no list of pairs") as caught:
+        opencv.read(torn)
+    assert "cam, kc, R, T, size" in caught.value.remedy
+    folder = colmap.write(ring(), tmp_path / "model")
+    content = json.loads((folder / "bodyscan.json").read_text())
+    content["pairs"]["stranger"] = content["pairs"].pop("p1-1")
+    (folder / "bodyscan.json").write_text(json.dumps(content))
+    with pytest.raises(BadInput, match="stranger"):
+        colmap.read(folder)
+
+
+def test_a_colmap_model_of_others(tmp_path: Path) -> None:
+    """Two cameras in a rig that was seen in two frames: placed by the rig, named by their folders."""
+    model = pycolmap.Reconstruction()
+    rig = pycolmap.Rig(rig_id=1)
+    for number, (name, params) in enumerate(
+        (("SIMPLE_RADIAL", [1000.0, 640.5, 360.5, -0.2]), ("PINHOLE", [900.0, 910.0, 600, 350])), 1
+    ):
+        model.add_camera(
+            pycolmap.Camera(model=name, width=1280, height=720, params=params, camera_id=number)
+        )
+    sensors = [pycolmap.sensor_t(pycolmap.SensorType.CAMERA, k) for k in (1, 2)]
+    rig.add_ref_sensor(sensors[0])
+    shifted = np.eye(4)[:3]
+    shifted[0, 3] = -0.2
+    rig.add_sensor(sensors[1], pycolmap.Rigid3d(shifted))
+    model.add_rig(rig)
+    for number in (1, 2):
+        frame = pycolmap.Frame(frame_id=number, rig_id=1)
+        for k, sensor in enumerate(sensors, 1):
+            frame.add_data_id(pycolmap.data_t(sensor, 10 * number + k))
+        frame.rig_from_world = pycolmap.Rigid3d(np.eye(4)[:3])
+        model.add_frame(frame)
+        for k in (1, 2):
+            image = pycolmap.Image(
+                name=f"cam{k}/{number}.jpg", camera_id=k, image_id=10 * number + k
+            )
+            image.frame_id = number
+            model.add_image(image)
+        model.register_frame(number)
+    (tmp_path / "sparse").mkdir()
+    model.write(tmp_path / "sparse")
+    found = RIG_FORMATS.find("colmap").read(tmp_path / "sparse")
+    assert {"1", "2", "cam1", "cam2", "cam1/1.jpg", "cam2/2.jpg"} < set(found)
+    lens = lens_from_opencv(np.array([-0.2, 0, 0, 0, 0]))
+    assert found["cam1"].camera(1280, 720) == Camera(1000, 1000, 0, 640, 360, lens, 1280, 720)
+    pose = found["cam2"].camera_from_world
+    assert pose is not None
+    np.testing.assert_allclose(pose.matrix[:3, 3], [-0.2, 0.0, 0.0])
+    fisheye = pycolmap.Camera(
+        model="OPENCV_FISHEYE", width=1280, height=720, params=[900, 900, 640, 360, 0, 0, 0, 0],
+        camera_id=1,
+    )  # fmt: skip
+    strange = pycolmap.Reconstruction()
+    strange.add_camera(fisheye)
+    (tmp_path / "fisheye").mkdir()
+    strange.write(tmp_path / "fisheye")
+    with pytest.raises(CalibrationFileError, match="OPENCV_FISHEYE, which there is not here"):
+        RIG_FORMATS.find("colmap").read(tmp_path / "fisheye")
