@@ -160,7 +160,7 @@ def export_rig(
         RigExportSettings().formats
     ),
 ) -> None:
-    """Write a calibrated rig for other programs: a COLMAP model with rig, OpenCV's YAML."""
+    """Write a calibrated rig as colmap, opencv, kalibr, mrcal, caliscope or aniposelib read it."""
     from bodyscan.export.rig import export_rig as write
     from bodyscan.registration.storage import load_calibration
 

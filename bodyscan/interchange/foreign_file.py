@@ -33,7 +33,7 @@ class ForeignFile:
 
     @staticmethod
     def read(path: Path) -> ForeignFile:
-        """Raises CalibrationFileError for what is no text file."""
+        """Raises CalibrationFileError for what is not a text file."""
         empty = ForeignFile(path)
         try:
             if path.stat().st_size > MOST_BYTES:
@@ -80,7 +80,7 @@ class ForeignFile:
             array: Array = np.asarray(value, np.float64).ravel()
         except (TypeError, ValueError):
             raise self.error(
-                f"holds what is no number ({value!r:.60})", word, after=after
+                f"holds what is not a number ({value!r:.60})", word, after=after
             ) from None
         if counts and len(array) not in counts:
             wanted = " or ".join(map(str, counts))
@@ -100,7 +100,7 @@ class ForeignFile:
             )
         if matrix[1, 0] != 0.0 or not np.array_equal(matrix[2], [0.0, 0.0, 1.0]):
             raise self.error(
-                "is no camera matrix: below its diagonal stand zeros, and 1 at its end", word,
+                "is not a camera matrix: below its diagonal stand zeros, and 1 at its end", word,
                 "is it transposed, or a projection of three by four?", after=after,
             )  # fmt: skip
         return matrix
@@ -126,7 +126,9 @@ class ForeignFile:
         """Width and height of a picture, px."""
         width, height = self.numbers(value, word, (2,), after=after)
         if width != int(width) or height != int(height) or width < 1 or height < 1:
-            raise self.error(f"is no size of a picture ({width:g} x {height:g})", word, after=after)
+            raise self.error(
+                f"is not the size of a picture ({width:g} x {height:g})", word, after=after
+            )
         return int(width), int(height)
 
     def pose(
@@ -141,7 +143,7 @@ class ForeignFile:
         off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
         if off > ROTATION_TOLERANCE:
             raise self.error(
-                f"is no rotation: R times its transpose is off the identity by {off:.2g}",
+                f"is not a rotation: R times its transpose is off the identity by {off:.2g}",
                 words[0],
                 after=after,
             )

@@ -19,7 +19,7 @@ NOTE = (
 
 
 def read_toml(file: ForeignFile) -> dict[str, Any]:
-    """Raises CalibrationFileError for what is no TOML, with the line."""
+    """Raises CalibrationFileError for what is not TOML, with the line."""
     try:
         return tomllib.loads(file.text)
     except tomllib.TOMLDecodeError as error:

@@ -218,7 +218,7 @@ WRONG = [
     ("kalibr", "pinhole", "ds", r":2: cam0.camera_model: 'ds' is a model that there is not here"),
     ("kalibr", "cam0", "camera0", r"it has no cam0"),
     ("kalibr", "[1.0, 0.0, 0.0, -0.2]", "[-1.0, 0.0, 0.0, -0.2]", r"T_cn_cnm1: is mirrored"),
-    ("kalibr", "[1.0, 0.0, 0.0, -0.2]", "[1.1, 0.0, 0.0, -0.2]", r"T_cn_cnm1: is no rotation"),
+    ("kalibr", "[1.0, 0.0, 0.0, -0.2]", "[1.1, 0.0, 0.0, -0.2]", r"T_cn_cnm1: is not a rotation"),
     ("kalibr", "1280, 720", "1280", r":6: cam0.resolution: holds 1 numbers, not 2"),
     ("kalibr", "  intrinsics", "\tintrinsics", r"is not YAML"),
     ("mrcal", "OPENCV8", "CAHVOR", r":3: lensmodel: 'LENSMODEL_CAHVOR' is a lens"),
@@ -226,7 +226,7 @@ WRONG = [
     ("mrcal", "1000, 1010", "1000, -1010", r":6: intrinsics: has focal lengths 1000 and -1010"),
     ("mrcal", "1000, 1010", "1e999, 1010", r":6: intrinsics: holds a number that is not finite"),
     ("mrcal", "'imagersize'", "'size'", r"has no 'imagersize'"),
-    ("mrcal", "[ 1280, 720,]", "[ 1280, 720", r":\d+: is no cameramodel of mrcal's"),
+    ("mrcal", "[ 1280, 720,]", "[ 1280, 720", r":\d+: is not a cameramodel of mrcal's"),
     ("aniposelib", "-0.2, 0.05, 0.0, 0.0, 0.0", "-0.2, nan, 0, 0, 0", r":5: cam_0.distortions: .*f"),
     ("aniposelib", "size", "sizes", r":1: cam_0: has no size"),
     ("aniposelib", "[metadata]", "fisheye = true\n[metadata]", r":9: cam_0.fisheye: is OpenCV's f"),
@@ -234,7 +234,7 @@ WRONG = [
     ("caliscope", "rotation_count = 0", "rotation_count = 1", r":4: cameras.3.rotation_count: turns"),
     ("caliscope", "[cameras.3]", "[camera.3]", r"holds no cameras"),
     ("caliscope", "1280, 720]", "1280, 720", r"is not TOML: .*line"),
-    ("caliscope", "0.0, 0.0, 1.0", "0.0, 1.0, 0.0", r":6: cameras.3.matrix: is no camera matrix"),
+    ("caliscope", "0.0, 0.0, 1.0", "0.0, 1.0, 0.0", r":6: cameras.3.matrix: is not a camera matrix"),
 ]  # fmt: skip
 
 
@@ -310,7 +310,7 @@ def test_nodes_of_any_name_are_read(tmp_path: Path, kind: str) -> None:
         ({"matrix": "cam/k"}, r"any.yaml:3: has no node 'k' below cam", "there is K"),
         ({"distortion": "kcc"}, r"has no node 'kcc' in it \(did you mean 'kc'\?\)", "cam, kc, R"),
         ({"matrix": "kc"}, r"any.yaml:9: kc: holds 5 numbers, not 9", ""),
-        ({"rotation": "cam/K"}, r"K: is no rotation", ""),
+        ({"rotation": "cam/K"}, r"K: is not a rotation", ""),
         ({"size": "T"}, r"T: holds 3 numbers, not 2", ""),
         ({"translation": "size"}, r"size: holds 2 numbers, not 3", ""),
     ],
@@ -333,7 +333,7 @@ def test_numbers_that_cannot_be_are_named(tmp_path: Path) -> None:
     for spoilt_text in ("", "words", text.replace("data: [", "data: ", 1)):
         path.write_text(spoilt_text)
         with pytest.raises(
-            CalibrationFileError, match=r"neither YAML, XML nor JSON|no number|no node"
+            CalibrationFileError, match=r"neither YAML, XML nor JSON|not a number|no node"
         ):
             read_nodes(path, NODES)
     with pytest.raises(CalibrationFileError, match="there is no such file"):
@@ -353,7 +353,7 @@ def test_a_file_of_another_camera_is_refused(tmp_path: Path) -> None:
 
 def test_what_is_no_rig_is_refused(tmp_path: Path) -> None:
     colmap, opencv = RIG_FORMATS.find("colmap"), RIG_FORMATS.find("opencv")
-    with pytest.raises(BadInput, match="is no COLMAP model"):
+    with pytest.raises(BadInput, match="is not a COLMAP model"):
         colmap.read(tmp_path / "nothing")
     torn = tmp_path / "torn.yaml"
     torn.write_text("%YAML 1.2\n---\npairs:\n   -\n      name: a\n")

@@ -32,7 +32,7 @@ def read_aniposelib(path: Path) -> dict[str, FoundCamera]:
     found: dict[str, FoundCamera] = {}
     for key, own in tables.items():
         if not isinstance(own, dict) or "matrix" not in own:
-            raise file.error("is no camera as aniposelib writes it", key)
+            raise file.error("is not a camera as aniposelib writes it", key)
         found[key] = camera_of_table(file, own, key)
     named = {str(own["name"]): found[key] for key, own in tables.items() if "name" in own}
     if not found:

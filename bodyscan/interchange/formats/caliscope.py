@@ -31,11 +31,11 @@ def read_caliscope(path: Path) -> dict[str, FoundCamera]:
     file = ForeignFile.read(path)
     tables = read_toml(file).get("cameras")
     if not isinstance(tables, dict) or not tables:
-        raise file.error("holds no cameras: it is no camera_array.toml of caliscope's")
+        raise file.error("holds no cameras: it is not a camera_array.toml of caliscope's")
     found: dict[str, FoundCamera] = {}
     for key, own in tables.items():
         if not isinstance(own, dict):
-            raise file.error("is no camera as caliscope writes it", f"cameras.{key}")
+            raise file.error("is not a camera as caliscope writes it", f"cameras.{key}")
         if own.get("rotation_count", 0):
             raise file.error(
                 "turns the pictures before they are used; bodyscan takes them as they are",

@@ -75,7 +75,7 @@ def read_colmap(folder: Path) -> dict[str, FoundCamera]:
     except (OSError, ValueError, RuntimeError, IndexError) as error:
         said = str(error).strip().splitlines() or [type(error).__name__]
         raise CalibrationFileError(
-            f"is no COLMAP model ({said[-1]})",
+            f"is not a COLMAP model ({said[-1]})",
             where=str(folder),
             remedy="give the folder that holds cameras, images and points3D, .bin or .txt",
         ) from error

@@ -70,7 +70,7 @@ def read_kalibr(path: Path) -> dict[str, FoundCamera]:
     cameras = {key: own for key, own in chain.items() if isinstance(own, dict)}
     if "cam0" not in cameras:
         raise file.error(
-            "is no camchain of Kalibr's: it has no cam0",
+            "is not a camchain of Kalibr's: it has no cam0",
             remedy="give camchain-....yaml, which kalibr_calibrate_cameras wrote",
         )
     found: dict[str, FoundCamera] = {}

@@ -151,7 +151,7 @@ def _values(file: ForeignFile, node: Any, name: str) -> Any:
         return [_values(file, node.at(k), name) for k in range(int(node.size()))]
     if node.isInt() or node.isReal():
         return float(node.real())
-    raise file.error("holds what is no number", name.split("/")[-1])
+    raise file.error("holds what is not a number", name.split("/")[-1])
 
 
 FORMAT = RigFormat("rig-opencv.yaml", "mm", write_opencv, read_opencv, read_nodes)
