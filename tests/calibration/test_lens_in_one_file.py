@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from ring import ring_of_cameras, ring_rig, ring_views
-from test_camera_calibration import POINTS, TURNS
+from table_one import POINTS, TURNS
 
 from bodyscan.calibration.camera import PlanarView, calibrate_camera
 from bodyscan.calibration.pair import PairCalibration, PairQuality

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xyz_format
+from copied_package import run_with_file
 from made_scan import make_scan
 from small_bodies import ball, points
 from typer.testing import CliRunner
 
-import bodyscan
 from bodyscan.cli.main import app
 from bodyscan.errors import BadInput
 from bodyscan.export.body_file import Provenance, write_body
@@ -78,19 +76,9 @@ def test_names_are_known_without_importing_what_writes_them():
 
 
 def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path):
-    copy = tmp_path / "bodyscan"
-    package = Path(bodyscan.__file__).parent
-    shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(xyz_format.__file__, copy / "export" / "formats" / "xyz.py")
     make_scan(tmp_path / "scan")
-    done = subprocess.run(
-        [sys.executable, "-m", "bodyscan", "export", "scan", "--format", "xyz"],
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    call = ("export", "scan", "--format", "xyz")
+    done = run_with_file(tmp_path, xyz_format, "export/formats/xyz.py", *call)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "scan" / "export" / "body.xyz").is_file()
 

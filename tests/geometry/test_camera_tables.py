@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
+from any_camera import cameras, pixels_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_lenses import cameras, pixels_of
 
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import projection_table, ray_table

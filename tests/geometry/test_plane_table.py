@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_light_sheets import MIDDLE, STRIPES, models
+from sheet_models import MIDDLE, STRIPES, models
 
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from test_triangulation import CAMERA, STRIPES, pair, planes, stripe_map
+from small_pair import CAMERA, STRIPES, pair, planes, stripe_map
 
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 import pytest
-from test_rendering import CRISP, LAMPS, projector, view, wall
+from small_view import CRISP, LAMPS, projector, view, wall
 
 from bodyscan.simulation.inter_reflection import light_facets
 from bodyscan.simulation.lamps import Lamps

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import shifted_binary
+from copied_package import run_with_file
 from shifted_binary import ShiftedBinary
 from small_captures import RIG, write
 
-import bodyscan
 from bodyscan.captures.check import check
 from bodyscan.captures.folder import open_captures
 from bodyscan.captures.pattern_files import write_patterns
@@ -93,20 +89,9 @@ def test_its_keys_are_checked_as_all_are(tmp_path: Path, old: str, new: str, lin
 
 
 def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path):
-    package = Path(bodyscan.__file__).parent
-    copy = tmp_path / "bodyscan"
-    shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(shifted_binary.__file__, copy / "stripes" / "codes")
     rig = write(tmp_path / "rig.yaml", ITS_RIG)
-    call = ("patterns", str(rig), "--out", "out", "--width", "40", "--height", "30")
-    done = subprocess.run(
-        [sys.executable, "-m", "bodyscan", *call],
-        env={**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_DISABLE_JIT": "1"},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    call = ("patterns", rig, "--out", "out", "--width", 40, "--height", 30)
+    done = run_with_file(tmp_path, shifted_binary, "stripes/codes/shifted_binary.py", *call)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "shifted-binary-12-horizontal" / "digit04.png").is_file()
 
