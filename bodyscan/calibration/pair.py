@@ -30,17 +30,20 @@ from bodyscan.stripes.stripe_code import StripeCode
 
 @dataclass(frozen=True)
 class PairQuality:
-    """Figures of one pair: corners' RMS (px) over `poses` board poses; distances of boundary points
-    to their sheets, RMS (mm), over `stripe_shots` boards; boundaries with a sheet, of those thrown.
+    """Figures of one pair: corners' RMS (px) over `poses` board poses, None if none was seen;
+    distances of boundary points to their sheets, RMS (mm), over `stripe_shots` boards; boundaries
+    with a sheet, of those thrown.
 
     held_out: every model of the light tried on boards it was not fitted to, simplest first.
     refinement: of a pair by itself, whether camera, boards and light were refined together and why;
     flatness_mm: RMS of held-out boards about their own planes, before and after.
     boards_mm: mean and RMS over the boards of how far the stripes measure them from where the
     corners of all cameras put them.
+    imported: where another program's calibration was taken from, "" if it is our own; with
+    imported_sigma_px by how much its pixels may be off, None if that is not known.
     """
 
-    corners_rms_px: float
+    corners_rms_px: float | None
     poses: int
     planes_rms_mm: float | None = None
     stripe_shots: int = 0
@@ -50,10 +53,19 @@ class PairQuality:
     refinement: str = ""
     flatness_mm: tuple[float, float] | None = None
     boards_mm: tuple[float, float] | None = None
+    imported: str = ""
+    imported_sigma_px: float | None = None
+
+    @property
+    def unjudged(self) -> bool:
+        """Whether nothing is known of how exact it is."""
+        return bool(self.imported) and self.imported_sigma_px is None
 
     @property
     def light_model(self) -> str | None:
         """The model of the light that held-out boards chose."""
+        if self.imported and self.stripes_projected:
+            return "imported"
         return next((tried.model for tried in self.held_out if tried.chosen), None)
 
 
@@ -62,7 +74,8 @@ class PairCalibration:
     """A calibrated pair, camera frame.
 
     camera_covariance: (P, P) of the camera's parameters.
-    sheets: None for a camera without projector.
+    sheets: None for a camera without projector.  crossing: those of the stripes that cross them, if
+    there are any and they are known.
     """
 
     name: str
@@ -70,6 +83,7 @@ class PairCalibration:
     camera_covariance: Array
     sheets: LightSheets | None
     quality: PairQuality
+    crossing: LightSheets | None = None
 
 
 @dataclass(frozen=True, eq=False)

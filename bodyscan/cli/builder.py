@@ -26,6 +26,7 @@ def register(app: typer.Typer) -> None:
         check,
         patterns,
         calibrate_rig,
+        import_,
         check_calibration,
         refine_rig,
         sigma_map,
@@ -88,6 +89,33 @@ def calibrate_rig(
         output.show(tables.calibration_table(found))
         output.figures(**tables.calibration_figures(found))
     output.say(*found.advice)
+    output.made("calibration", saved)
+
+
+def import_(
+    output: Output,
+    rig_file: RigFile,
+    out: Annotated[
+        Path | None, typer.Option(help="Default: `calibration` beside the rig file.")
+    ] = None,
+    sigma_px: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-6,
+            help="By how many pixels it may be off, 1 sigma. Default: as the rig file says.",
+        ),
+    ] = None,
+) -> None:
+    """Take over calibrations made elsewhere, from the files that the rig file names as `known`."""
+    from bodyscan.cli import tables
+    from bodyscan.workflows.import_rig import import_folder
+
+    refuse_file(out)
+    found, saved = import_folder(rig_file, out or rig_file.parent / "calibration", sigma_px)
+    output.notes(found.notes)
+    output.failures(found.failed)
+    output.show(tables.calibration_table(found))
+    output.figures(**tables.calibration_figures(found))
     output.made("calibration", saved)
 
 

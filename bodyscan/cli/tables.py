@@ -42,15 +42,15 @@ def calibration_table(calibration: RigCalibration) -> Table:
         sigma = position_sigma(calibration.covariance, name, place)
         table.add_row(
             name,
-            f"{quality.corners_rms_px:.3f}",
-            str(quality.poses),
+            "-" if quality.corners_rms_px is None else f"{quality.corners_rms_px:.3f}",
+            "-" if quality.imported else str(quality.poses),
             quality.light_model or "-",
             "-" if quality.planes_rms_mm is None else f"{quality.planes_rms_mm:.3f}",
             f"{quality.stripes_calibrated} of {quality.stripes_projected}"
             if pair.sheets is not None
             else "-",
             " ".join(f"{value:.1f}" for value in place),
-            " ".join(f"{value:.3f}" for value in sigma),
+            "not known" if quality.unjudged else " ".join(f"{value:.3f}" for value in sigma),
         )
     for name in calibration.failed:
         table.add_row(name, "failed", *["-"] * 6, style="red")
@@ -66,6 +66,7 @@ def calibration_figures(calibration: RigCalibration) -> dict[str, Any]:
             "light_model": pair.quality.light_model,
             "sheets_rms_mm": pair.quality.planes_rms_mm,
             "stripes_calibrated": pair.quality.stripes_calibrated,
+            "imported": pair.quality.imported or None,
             "position_mm": calibration.rig_from_camera[name].translation.tolist(),
         }
         for name, pair in calibration.pairs.items()

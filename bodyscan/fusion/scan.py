@@ -70,6 +70,12 @@ def fuse(
     points = {image.pair: int(image.valid.sum()) for image in cleaned}
     failed = dict(measured.failures)
     verdict = grade_scan(
-        cloud, surface, alignment, failed, calibration.rig.volume, fused.contradicted
+        cloud,
+        surface,
+        alignment,
+        failed,
+        calibration.rig.volume,
+        fused.contradicted,
+        unjudged=[name for name, pair in calibration.pairs.items() if pair.quality.unjudged],
     )
     return Scan(cloud, surface, alignment, points, failed, verdict, tuple(seen), placing)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -41,13 +41,17 @@ def grade_scan(
     failed: Mapping[str, str],
     volume: Volume,
     contradicted: float = 0.0,
+    unjudged: Sequence[str] = (),
 ) -> Verdict:
     """The worst of all findings decides; the reasons come worst first. contradicted: see `merge`.
+
+    unjudged: pairs whose calibration was imported and says nothing of how exact it is.
 
     A check that fails by itself leaves the scan usable at best, and says so.
     """
     checks: dict[str, Callable[[], Iterator[Finding]]] = {
         "pairs": lambda: _pairs(failed, alignment),
+        "calibration": lambda: _calibration(unjudged),
         "motion": lambda: _motion(alignment),
         "contradictions": lambda: _contradictions(contradicted),
         "pieces": lambda: _company(cloud),
@@ -75,6 +79,15 @@ def _pairs(failed: Mapping[str, str], alignment: Alignment | None) -> Iterator[F
             "repeat",
             f"pair {name} does not fit the others: it was moved since the calibration, or the "
             "person moved far",
+        )
+
+
+def _calibration(unjudged: Sequence[str]) -> Iterator[Finding]:
+    if unjudged:
+        yield (
+            "usable",
+            f"the calibration of {', '.join(unjudged)} was made elsewhere and does not say how exact "
+            "it is: sigmas hold the decoding alone",
         )
 
 

@@ -23,6 +23,8 @@ from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, cross_matrix
 
 FRAME, SCALE = 6, 2
+CENTRE = FRAME + 1
+"""Of the freedoms: c."""
 LENS_SPREAD = (0.3, 0.3, 0.03, 0.03, 0.3, 0.3, 0.3, 0.3)
 """Standard deviations of k1, k2, p1, p2, k3, k4, k5, k6 before any data."""
 ASIDE = 0.3
@@ -50,6 +52,13 @@ class LensSheets(SmoothSheets):
     @property
     def kind(self) -> str:
         return "lens"
+
+    @property
+    def uncertain_alike(self) -> bool:
+        """Whether all that is uncertain is c, which moves all sheets together: those of a projector
+        that was calibrated elsewhere and not fitted to boards, beyond which it would be a guess."""
+        others = np.delete(np.delete(self.covariance, CENTRE, 0), CENTRE, 1)
+        return not others.any()
 
     def with_lens(self, terms: int) -> LensSheets:
         """With that many of k1, k2, p1, p2, ...; those that are new start at 0."""

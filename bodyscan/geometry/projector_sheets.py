@@ -10,12 +10,10 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lens_sheets import FRAME, SCALE, LensSheets
+from bodyscan.geometry.lens_sheets import CENTRE, FRAME, SCALE, LensSheets
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 
-CENTRE = FRAME + 1
-"""Of the freedoms of `LensSheets`: c."""
 DISTANCE = 5.0
 """In baselines, where a camera and a projector whose axes do not meet are taken to look."""
 

@@ -38,7 +38,7 @@ class RayDepths:
 def intersect_rays(sheets: LightSheets, rays: Array, s: Array) -> RayDepths:
     """Rays (..., 3) with z = 1, camera frame, at real stripe coordinates s (...)."""
     found = _way_to_measure(sheets)(rays.reshape(-1, 3), np.ravel(s))
-    unsure = found[2] > (MOST_SIGMA * found[0]) ** 2
+    unsure = found[2] > (_most_sigma(sheets) * found[0]) ** 2
     return RayDepths(*(np.where(unsure, np.nan, some).reshape(np.shape(s)) for some in found))
 
 
@@ -50,13 +50,21 @@ def triangulate_image(
     can be trusted."""
     way, pixels = _way_to_measure(sheets), ray_table(camera)
     points, sigma_mm = np.empty((*s.shape, 3), np.float32), np.empty(s.shape, np.float32)
+    most_sigma = _most_sigma(sheets)
     for first in range(0, len(s), BAND):
         rows = slice(first, first + BAND)
         wanted = np.isfinite(s[rows])
         rays = rays_through(pixels, wanted, first)
         found = way(rays, s[rows][wanted].astype(np.float64))
-        _place(wanted, rays, found, sigma[rows], MOST_SIGMA, points[rows], sigma_mm[rows])
+        _place(wanted, rays, found, sigma[rows], most_sigma, points[rows], sigma_mm[rows])
     return points, sigma_mm
+
+
+def _most_sigma(sheets: LightSheets) -> float:
+    """MOST_SIGMA where sheets were fitted to boards; a projector that was calibrated elsewhere is
+    nowhere a guess, however roughly it may be known."""
+    alike = isinstance(sheets, LensSheets) and sheets.uncertain_alike
+    return np.inf if alike else MOST_SIGMA
 
 
 def _way_to_measure(sheets: LightSheets) -> Way:

@@ -117,11 +117,12 @@ def _rig_figures(content: Mapping[str, Any]) -> dict[str, Any]:
     if not content:
         return {}
     qualities = [pair["quality"] for pair in content["pairs"].values()]
+    corners = [q["corners_rms_px"] for q in qualities if q["corners_rms_px"] is not None]
     sheets = [q["planes_rms_mm"] for q in qualities if q["planes_rms_mm"] is not None]
     return {
         "pairs": len(qualities),
         "pairs_failed": " ".join(sorted(content["failed"])),
-        "corners_rms_px": _round(max(q["corners_rms_px"] for q in qualities)),
+        "corners_rms_px": _round(max(corners)) if corners else None,
         "sheets_rms_mm": _round(max(sheets)) if sheets else None,
     }
 

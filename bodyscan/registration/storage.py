@@ -39,6 +39,9 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
         if pair.sheets is not None:
             for key, array in to_arrays(pair.sheets).items():
                 arrays[f"{name}/light/{key}"] = array
+        if pair.crossing is not None:
+            for key, array in to_arrays(pair.crossing).items():
+                arrays[f"{name}/crossing/{key}"] = array
     for name, seen in calibration.seen.items():
         for part in fields(seen):
             arrays[f"{name}/seen/{part.name}"] = getattr(seen, part.name)
@@ -123,14 +126,17 @@ def calibration_id(path: Path) -> str:
 
 def _pair_content(calibration: RigCalibration, name: str) -> dict[str, Any]:
     pair = calibration.pairs[name]
+    crossing = {} if pair.crossing is None else {"crossing": _light_content(pair.crossing)}
     return {
         "camera": to_fields(pair.camera),
         "rig_from_camera": calibration.rig_from_camera[name].matrix,
-        "light": None
-        if pair.sheets is None
-        else {"kind": pair.sheets.kind, "direction": pair.sheets.direction},
+        "light": None if pair.sheets is None else _light_content(pair.sheets),
         "quality": asdict(pair.quality),
-    }
+    } | crossing
+
+
+def _light_content(sheets: LightSheets) -> dict[str, Any]:
+    return {"kind": sheets.kind, "direction": sheets.direction}
 
 
 def _calibration(content: dict[str, Any], arrays: Any) -> RigCalibration:
@@ -139,8 +145,9 @@ def _calibration(content: dict[str, Any], arrays: Any) -> RigCalibration:
             name,
             from_fields(part["camera"]),
             arrays[f"{name}/camera_covariance"],
-            None if part["light"] is None else _light(part["light"], name, arrays),
+            None if part["light"] is None else _light(part["light"], f"{name}/light/", arrays),
             _quality(part["quality"]),
+            _light(part["crossing"], f"{name}/crossing/", arrays) if "crossing" in part else None,
         )
         for name, part in content["pairs"].items()
     }
@@ -164,8 +171,8 @@ def _calibration(content: dict[str, Any], arrays: Any) -> RigCalibration:
     )
 
 
-def _light(content: dict[str, Any], name: str, arrays: Any) -> LightSheets:
-    return from_arrays(content["kind"], _under(f"{name}/light/", arrays), content["direction"])
+def _light(content: dict[str, Any], prefix: str, arrays: Any) -> LightSheets:
+    return from_arrays(content["kind"], _under(prefix, arrays), content["direction"])
 
 
 def _under(prefix: str, arrays: Any) -> dict[str, Any]:

@@ -31,14 +31,14 @@ class PairFigures:
     not apply or was not stored."""
 
     name: str
-    corners_rms_px: float
-    poses: int
+    corners_rms_px: float | None
+    poses: int | None
     covered_percent: float | None
     sheets_rms_mm: float | None
     held_out_mm: float | None
     stripe_shots: int | None
     stripes_percent: float | None
-    sigma_mm: float
+    sigma_mm: float | None
 
     def beyond(self) -> Iterator[tuple[float, str]]:
         """(how many times beyond, in words) of each limit that is not kept."""
@@ -81,15 +81,24 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
             findings.append((times, f"{'recalibrate: ' if far else ''}pair {pair.name}: {words}"))
     findings.sort(key=lambda finding: -finding[0])
     worst = findings[0][0] if findings else 0.0
+    unjudged = [
+        f"pair {name}: imported from {pair.quality.imported}, how exact it is is not known: show it a "
+        "board (check-calibration), or say what it is good to (import --sigma-px)"
+        for name, pair in calibration.pairs.items()
+        if pair.quality.unjudged
+    ]
     grade: Grade = "recalibrate" if worst > FAR_BEYOND else "usable" if findings else "good"
-    return Verdict(grade, tuple(words for _, words in findings))
+    if unjudged and grade != "recalibrate":
+        grade = "not judged"
+    return Verdict(grade, (*(words for _, words in findings), *unjudged))
 
 
 def _figures(calibration: RigCalibration, name: str) -> PairFigures:
     pair = calibration.pairs[name]
     quality, camera, seen = pair.quality, pair.camera, calibration.seen.get(name)
     place = calibration.rig_from_camera[name].translation
-    striped = pair.sheets is not None
+    striped, ours = pair.sheets is not None, not quality.imported
+    sigma = position_sigma(calibration.covariance, name, place)
     share = None
     if seen is not None:
         views = [seen.pixels[seen.target == k].astype(float) for k in np.unique(seen.target)]
@@ -97,11 +106,11 @@ def _figures(calibration: RigCalibration, name: str) -> PairFigures:
     return PairFigures(
         name,
         quality.corners_rms_px,
-        quality.poses,
+        quality.poses if ours else None,
         share,
         quality.planes_rms_mm,
         next((tried.mean_mm for tried in quality.held_out if tried.chosen), None),
-        quality.stripe_shots if striped else None,
+        quality.stripe_shots if striped and ours else None,
         100.0 * quality.stripes_calibrated / max(quality.stripes_projected, 1) if striped else None,
-        float(np.linalg.norm(position_sigma(calibration.covariance, name, place))),
+        None if quality.unjudged else float(np.linalg.norm(sigma)),
     )

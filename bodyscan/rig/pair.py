@@ -8,6 +8,7 @@ from typing import Annotated
 from pydantic import Field
 
 from bodyscan.files.model import Model, Name, Problem
+from bodyscan.rig.known import Known
 from bodyscan.rig.rig_frame import Vector
 from bodyscan.stripes.codes import AnyStripeCode
 
@@ -33,7 +34,10 @@ class NominalPose(Model):
 
 
 class Pair(Model):
-    """One camera and one projector (or a camera alone)."""
+    """One camera and one projector (or a camera alone).
+
+    known: what another program has calibrated of it.
+    """
 
     name: Name
     pole: Name | None = None
@@ -41,7 +45,10 @@ class Pair(Model):
     projector: AnyStripeCode | None = None
     nominal: NominalPose | None = None
     projector_nominal: NominalPose | None = None
+    known: Known | None = None
 
     def problems(self) -> Iterator[Problem]:
         if self.projector_nominal and not self.projector:
             yield ("projector_nominal",), "needs a projector: this pair is a camera alone"
+        if self.known and self.known.projector and not self.projector:
+            yield ("known", "projector"), "needs a projector: this pair is a camera alone"

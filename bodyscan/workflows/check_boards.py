@@ -12,6 +12,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.camera import CameraCalibration
+from bodyscan.calibration.pair import PairCalibration
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BoardNotFound
@@ -25,6 +26,8 @@ from bodyscan.workflows.decode import decode_on_boards
 from bodyscan.workflows.find_boards import find_all_boards, locate_views
 
 LEAST_NOISE_PX = 0.02
+IMPORTED_PX = 0.5
+"""RMS of corners that OpenCV's users commonly end with."""
 STRIPE_SIGMAS, STRIPE_MM = 5.0, 0.25
 """Stripes are off a board by so many sigmas, and by so much, before a projector is blamed."""
 
@@ -129,15 +132,18 @@ def move_line(move: Move) -> str:
 
 def _noise_px(calibration: RigCalibration, pair: str) -> float:
     """Of one coordinate of a corner, as the calibration saw it."""
-    both = calibration.pairs[pair].quality.corners_rms_px
-    return max(both / np.sqrt(2.0), LEAST_NOISE_PX)
+    return max(_corners_px(calibration.pairs[pair]) / np.sqrt(2.0), LEAST_NOISE_PX)
+
+
+def _corners_px(pair: PairCalibration) -> float:
+    """RMS of its corners; of a pair that was imported what such calibrations reach."""
+    known = pair.quality.corners_rms_px
+    return known if known is not None else pair.quality.imported_sigma_px or IMPORTED_PX
 
 
 def _cameras(calibration: RigCalibration) -> Mapping[str, CameraCalibration]:
     return {
-        name: CameraCalibration(
-            pair.camera, pair.camera_covariance, {}, {}, pair.quality.corners_rms_px
-        )
+        name: CameraCalibration(pair.camera, pair.camera_covariance, {}, {}, _corners_px(pair))
         for name, pair in calibration.pairs.items()
     }
 

@@ -1,0 +1,152 @@
+"""A pair as another program calibrated it: read from its files, brought to our terms and checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bodyscan.arrays import Array
+from bodyscan.errors import BadInput, CalibrationFileError
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.projector_sheets import looked_at, sheets_of_projector
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.interchange.found_camera import FoundCamera, camera_named
+from bodyscan.interchange.rig_format import MILLIMETRES, RIG_FORMATS
+from bodyscan.rig.known import Known, KnownCamera
+from bodyscan.rig.pair import Pair
+from bodyscan.stripes.stripe_code import StripeCode
+
+GRID = 9
+"""Places of a picture, each way, at which a parameter's effect on its pixels is looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPair:
+    """camera_from_world: mm, None if the file does not say.  projector: as a camera, with
+    `projector_from_camera`, mm; both None where nothing is known of it.
+
+    sigma_px: see `Known`.  source: the file and its format.
+    """
+
+    camera: Camera
+    camera_from_world: RigidTransform | None
+    projector: Camera | None
+    projector_from_camera: RigidTransform | None
+    sigma_px: float | None
+    source: str
+
+    def sheets(self, code: StripeCode) -> LightSheets:
+        """Of the stripes that the projector shows."""
+        assert self.projector is not None
+        assert self.projector_from_camera is not None
+        middle = looked_at(self.camera, self.projector, self.projector_from_camera)
+        return sheets_of_projector(
+            self.projector,
+            self.projector_from_camera,
+            middle,
+            code.stripes,
+            code.direction,
+            self.sigma_px or 0.0,
+        )
+
+
+def read_known_camera(pair: Pair, folder: Path) -> Camera:
+    """The camera of a pair with `known`, whose file lies relative to `folder`.
+
+    Raises CalibrationFileError for a file that is wrong or of another camera.
+    """
+    assert pair.known is not None
+    return _find(pair.known, pair.known.camera, pair.name, folder).camera(
+        pair.camera.width, pair.camera.height
+    )
+
+
+def read_known_pair(pair: Pair, folder: Path) -> KnownPair:
+    """All that is known of a pair with `known`. Raises as `read_known_camera`, and where lengths
+    lack a unit or the projector has no place."""
+    known = pair.known
+    assert known is not None
+    found = _find(known, known.camera, pair.name, folder)
+    camera = found.camera(pair.camera.width, pair.camera.height)
+    camera_from_world = _pose(known, known.camera, found, pair.name)
+    projector, projector_from_camera = None, None
+    if known.projector is not None and pair.projector is not None:
+        light = _find(known, known.projector, pair.name, folder)
+        projector = _projector(light, pair.projector)
+        from_world = _pose(known, known.projector, light, pair.name)
+        if from_world is None:
+            raise CalibrationFileError(
+                f"does not say where the projector of pair {pair.name} stands",
+                where=light.where,
+                remedy="give rotation and translation below `known.projector` in the rig file",
+            )
+        world_from_camera = (camera_from_world or RigidTransform.identity()).inverse()
+        projector_from_camera = from_world @ world_from_camera
+    source = f"{known.file} ({known.format})"
+    return KnownPair(
+        camera, camera_from_world, projector, projector_from_camera, known.sigma_px, source
+    )
+
+
+def parameter_sigmas(camera: Camera, sigma_px: float) -> Array:
+    """(P,) standard deviations of a camera's parameters: each by itself moves no pixel of the
+    picture by more than sigma_px, and one by just that."""
+    u, v = (np.linspace(0.0, size - 1.0, GRID) for size in (camera.width, camera.height))
+    rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1)).reshape(-1, 3)
+    by_parameter, _ = camera.jacobians(rays[np.isfinite(rays).all(axis=1)])
+    most: Array = np.linalg.norm(by_parameter, axis=1).max(axis=0)
+    return sigma_px / most
+
+
+def _find(known: Known, device: KnownCamera, name: str, folder: Path) -> FoundCamera:
+    path = Path(folder) / (device.file or known.file)
+    form = RIG_FORMATS.find(known.format)
+    if device.nodes and form.read_nodes:
+        return form.read_nodes(path, device.nodes)
+    cameras = form.read(path)
+    if device.name is None and device.file is not None and len(cameras) == 1:
+        return next(iter(cameras.values()))
+    if device.name is None and len(cameras) == 1 and device is known.camera:
+        return next(iter(cameras.values()))
+    return camera_named(cameras, device.name or name, str(path))
+
+
+def _pose(
+    known: Known, device: KnownCamera, found: FoundCamera, name: str
+) -> RigidTransform | None:
+    """`camera_from_world`, mm."""
+    pose = found.camera_from_world
+    if pose is None:
+        return None
+    unit = known.units or (None if device.nodes else RIG_FORMATS.find(known.format).unit)
+    if unit is None:
+        raise CalibrationFileError(
+            "does not say in which unit its lengths are",
+            where=found.where,
+            remedy=f"add `units: mm` (or cm, or m) to `known` of pair {name} in the rig file",
+        )
+    placed = RigidTransform(pose.rotation, pose.translation * MILLIMETRES[unit])
+    return placed.inverse() if device.inverse else placed
+
+
+def _projector(found: FoundCamera, code: StripeCode) -> Camera:
+    """Where the file does not say how large the projector's picture is, a stripe is a pixel."""
+    stripes = {way.direction: way.stripes for way in code.directions}
+    if found.size is None:
+        u0, v0 = float(found.matrix[0, 2]), float(found.matrix[1, 2])
+        width = stripes.get("vertical", max(round(2.0 * u0), 1))
+        return found.projector(width, stripes.get("horizontal", max(round(2.0 * v0), 1)))
+    for direction, count in stripes.items():
+        size = found.size[0 if direction == "vertical" else 1]
+        if count > size:
+            raise BadInput(
+                f"has a projector of {found.size[0]} x {found.size[1]} px, across which there are "
+                f"no {count} {direction} stripes",
+                where=found.where,
+                remedy="correct `stripes` or `direction` in the rig file, or give the file of this "
+                "projector",
+            )
+    return found.projector(*found.size)

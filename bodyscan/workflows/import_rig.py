@@ -1,0 +1,156 @@
+"""A calibration made elsewhere as one of ours: what the rig file says is known, and nothing solved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bodyscan.arrays import Array
+from bodyscan.calibration.known_pair import KnownPair, parameter_sigmas, read_known_pair
+from bodyscan.calibration.pair import PairCalibration, PairQuality
+from bodyscan.errors import BadInput, BodyscanError, CalibrationFileError
+from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.transforms import RigidTransform, adjoint
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.registration.rig_frame import nominal_pose
+from bodyscan.registration.storage import save_calibration
+from bodyscan.rig.pair import Pair
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig
+
+USUAL_PX = 1.0
+"""Of pixels whose calibration says nothing of itself, where alignment must be told how far pairs may
+be off each other: what people take for good."""
+USUAL_DISTANCE_MM = 1300.0
+"""Of what is scanned, where that is."""
+
+
+def import_folder(
+    rig_file: Path, folder: Path, sigma_px: float | None = None
+) -> tuple[RigCalibration, Path]:
+    """As `import_rig`, of a rig file and kept in `folder`; and the path of its JSON."""
+    rig = load_rig(rig_file)
+    found = import_rig(rig, Path(rig_file).parent, sigma_px)
+    return found, save_calibration(found, folder)
+
+
+def import_rig(rig: Rig, folder: Path, sigma_px: float | None = None) -> RigCalibration:
+    """The pairs of which the rig file says where they are calibrated, files relative to `folder`.
+
+    The rig frame is where `rig_frame` puts its pair, or the first pair's `nominal` that pair;
+    without either it is the world of the files.  sigma_px: of all pairs, instead of the rig file's.
+    A pair whose file is wrong is in `failed`.  Raises BadInput if no pair is left or a board is to
+    fix the rig frame.
+    """
+    if rig.rig_frame.shot is not None:
+        raise BadInput(
+            "a board is to fix the rig frame, but an import looks at no images",
+            where=f"rig {rig.name}",
+            remedy="name a pair in `rig_frame`, or leave it out to take the frame of the files",
+        )
+    known: dict[str, KnownPair] = {}
+    failed: dict[str, BodyscanError] = {}
+    for pair in rig.pairs:
+        try:
+            known[pair.name] = _read(pair, folder, several=len(rig.pairs) > 1)
+        except BodyscanError as error:
+            failed[pair.name] = error
+    if not known:
+        raise next(iter(failed.values()))
+    if sigma_px is not None:
+        known = {name: replace(own, sigma_px=sigma_px) for name, own in known.items()}
+    rig_from_camera = _placed(rig, known)
+    return RigCalibration(
+        rig,
+        {name: _calibrated(rig.pair(name), own) for name, own in known.items()},
+        rig_from_camera,
+        _covariance(known, rig_from_camera),
+        {},
+        {name: str(error) for name, error in failed.items()},
+        tuple(_note(name, own) for name, own in known.items()),
+    )
+
+
+def _read(pair: Pair, folder: Path, *, several: bool) -> KnownPair:
+    if pair.known is None:
+        raise CalibrationFileError(
+            "the rig file does not say where this pair is calibrated",
+            where=f"pair {pair.name}",
+            remedy="add `known` with its file and format; docs/formats.md shows how",
+        )
+    if pair.projector is not None and pair.known.projector is None:
+        raise CalibrationFileError(
+            "the rig file does not say where its projector is calibrated",
+            where=f"pair {pair.name}",
+            remedy="add `projector` to its `known`; calibrate-rig measures one that is not known",
+        )
+    known = read_known_pair(pair, folder)
+    if several and known.camera_from_world is None:
+        raise CalibrationFileError(
+            "does not say where the camera stands, which a rig of several pairs needs",
+            where=f"pair {pair.name}: {known.source}",
+            remedy="give rotation and translation below `known.camera` in the rig file, or another "
+            "format",
+        )
+    return known
+
+
+def _placed(rig: Rig, known: dict[str, KnownPair]) -> dict[str, RigidTransform]:
+    """`rig_from_camera` of each pair."""
+    world_from_camera = {
+        name: (own.camera_from_world or RigidTransform.identity()).inverse()
+        for name, own in known.items()
+    }
+    fixed = rig.frame_pair
+    if fixed is None or (rig.rig_frame.pair is None and fixed.nominal is None):
+        return world_from_camera
+    if fixed.name not in known:
+        raise BadInput(
+            f"the rig frame is fixed by pair {fixed.name}, which could not be imported",
+            where=f"rig {rig.name}",
+            remedy="correct its `known`, or name another pair in rig_frame",
+        )
+    placed = nominal_pose(fixed.nominal) if fixed.nominal else RigidTransform.identity()
+    rig_from_world = placed @ world_from_camera[fixed.name].inverse()
+    return {name: rig_from_world @ pose for name, pose in world_from_camera.items()}
+
+
+def _calibrated(pair: Pair, known: KnownPair) -> PairCalibration:
+    camera, code = known.camera, pair.projector
+    covariance = np.zeros((len(camera.parameters),) * 2)
+    if known.sigma_px is not None:
+        covariance = np.diag(parameter_sigmas(camera, known.sigma_px) ** 2)
+    quality = PairQuality(None, 0, imported=known.source, imported_sigma_px=known.sigma_px)
+    if code is None:
+        return PairCalibration(pair.name, camera, covariance, None, quality)
+    boundaries = code.stripes - 1
+    quality = replace(quality, stripes_calibrated=boundaries, stripes_projected=boundaries)
+    crossing = known.sheets(code.crossing) if code.crossing else None
+    return PairCalibration(pair.name, camera, covariance, known.sheets(code), quality, crossing)
+
+
+def _covariance(
+    known: dict[str, KnownPair], rig_from_camera: dict[str, RigidTransform]
+) -> PoseCovariance:
+    """Each pair by itself as far off as its pixels, at the distance of what is scanned; nothing to
+    be off from if there is only one."""
+    names = tuple(sorted(known))
+    matrix = np.zeros((6 * len(names),) * 2)
+    for k, name in enumerate(names if len(names) > 1 else ()):
+        own = known[name]
+        turn = (own.sigma_px or USUAL_PX) / own.camera.alpha
+        sigmas = np.repeat([turn, turn * USUAL_DISTANCE_MM], 3)
+        to_rig: Array = adjoint(rig_from_camera[name])
+        matrix[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = to_rig @ np.diag(sigmas**2) @ to_rig.T
+    return PoseCovariance(names, matrix)
+
+
+def _note(name: str, known: KnownPair) -> str:
+    exact = (
+        "how exact it is is not known: sigmas of what is scanned hold the decoding alone"
+        if known.sigma_px is None
+        else f"taken to be right to {known.sigma_px:g} px"
+    )
+    return f"{name}: imported from {known.source}; {exact}"
