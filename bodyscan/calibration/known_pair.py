@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.errors import BadInput, CalibrationFileError
+from bodyscan.errors import CalibrationFileError
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.projector_sheets import looked_at, sheets_of_projector
@@ -142,7 +142,7 @@ def _projector(found: FoundCamera, code: StripeCode) -> Camera:
     for direction, count in stripes.items():
         size = found.size[0 if direction == "vertical" else 1]
         if count > size:
-            raise BadInput(
+            raise CalibrationFileError(
                 f"has a projector of {found.size[0]} x {found.size[1]} px, across which there are "
                 f"no {count} {direction} stripes",
                 where=found.where,

@@ -73,7 +73,8 @@ def test_skew_turns_the_sheets_of_columns_alone() -> None:
     inside = PLACE.apply(points)
     bent, _ = cv2.projectPoints(inside, np.zeros(3), np.zeros(3), np.eye(3), LENSES["Brown"])
     u, v = np.moveaxis(light.pixels_from_normalized(bent[:, 0]), -1, 0)
-    for direction, expected in (("vertical", u), ("horizontal", v)):
+    expected_of: dict[Axis, Array] = {"vertical": u, "horizontal": v}
+    for direction, expected in expected_of.items():
         sheets = sheets_of_projector(light, PLACE, points[0], SIZE[direction], direction)
         np.testing.assert_allclose(sheets.stripe(points), expected + 0.5, rtol=0, atol=1e-9)
 
