@@ -21,12 +21,12 @@ def python(program: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(line, capture_output=True, text=True, check=True, cwd=PROJECT)
 
 
-def test_importing_it_costs_nothing():
+def test_importing_it_costs_nothing() -> None:
     said = python(f"import bodyscan, sys; print([m for m in {HEAVY} if m in sys.modules])")
     assert said.stdout == "[]\n"
 
 
-def test_a_rig_is_loaded_without_what_fuses():
+def test_a_rig_is_loaded_without_what_fuses() -> None:
     said = python(
         "import bodyscan, sys; bodyscan.load_rig('rigs/one-pair.yaml')\n"
         "print([m for m in ('open3d', 'pycolmap', 'cv2', 'numba') if m in sys.modules])"
@@ -35,45 +35,45 @@ def test_a_rig_is_loaded_without_what_fuses():
 
 
 @pytest.mark.parametrize("name", api.__all__)
-def test_every_name_is_there_and_says_what_it_is(name):
+def test_every_name_is_there_and_says_what_it_is(name: str) -> None:
     assert getattr(bodyscan, name) is getattr(api, name)
     assert getattr(bodyscan, name).__doc__
     assert name in dir(bodyscan)
 
 
-def test_no_name_is_that_of_a_room():
+def test_no_name_is_that_of_a_room() -> None:
     """Once a room is imported it would stand before the name of the same word."""
     rooms = {path.stem for path in Path(bodyscan.__file__).parent.iterdir()}
     assert not rooms & set(api.__all__)
 
 
-def test_the_list_is_sorted_and_short():
+def test_the_list_is_sorted_and_short() -> None:
     assert api.__all__ == sorted(api.__all__)
     assert len(api.__all__) < 32
 
 
-def test_a_word_that_is_no_name_is_refused():
+def test_a_word_that_is_no_name_is_refused() -> None:
     with pytest.raises(AttributeError, match="scann"):
         bodyscan.scann  # noqa: B018
 
 
-def test_star_gives_the_list():
+def test_star_gives_the_list() -> None:
     given: dict[str, object] = {}
     exec("from bodyscan import *", given)
     assert set(api.__all__) <= set(given)
 
 
-def test_the_examples_run(monkeypatch):
+def test_the_examples_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(PROJECT)
     found = doctest.testmod(api)
     assert found.attempted >= 5
     assert found.failed == 0
 
 
-def test_the_page_names_every_name():
+def test_the_page_names_every_name() -> None:
     page = (PROJECT / "docs" / "api.md").read_text("utf-8")
     assert [name for name in api.__all__ if f"`{name}`" not in page] == []
 
 
-def test_the_package_says_that_it_is_typed():
+def test_the_package_says_that_it_is_typed() -> None:
     assert (Path(bodyscan.__file__).parent / "py.typed").is_file()

@@ -24,7 +24,7 @@ def bodyscan(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(line, capture_output=True, text=True, check=False, timeout=120)
 
 
-def test_bad_input_exits_with_2_and_no_traceback(tmp_path):
+def test_bad_input_exits_with_2_and_no_traceback(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     rig.write_text("version: 1\nname: x\nboards: []\npears: []\n")
     done = bodyscan("calibrate-rig", rig)
@@ -34,20 +34,20 @@ def test_bad_input_exits_with_2_and_no_traceback(tmp_path):
     assert "pairs" in done.stderr
 
 
-def test_debug_shows_the_traceback(tmp_path):
+def test_debug_shows_the_traceback(tmp_path: Path) -> None:
     done = bodyscan("calibrate-rig", tmp_path / "missing.yaml", "--debug")
     assert done.returncode != 0
     assert "Traceback" in done.stderr
 
 
-def test_a_missing_calibration_is_bad_input(tmp_path):
+def test_a_missing_calibration_is_bad_input(tmp_path: Path) -> None:
     done = bodyscan("scan", tmp_path, "--calibration", tmp_path)
     assert done.returncode == 2
     assert "calibration.json" in done.stderr
     assert "calibrate-rig" in done.stderr
 
 
-def test_check_and_help_import_nothing_heavy():
+def test_check_and_help_import_nothing_heavy() -> None:
     for arguments in (["--help"], ["check", str(RIGS / "three-pole-12.yaml")]):
         program = (
             f"import sys; sys.argv = ['bodyscan', *{arguments!r}]\n"
@@ -61,13 +61,13 @@ def test_check_and_help_import_nothing_heavy():
         assert done.stdout.rstrip().endswith("heavy: []"), done.stdout
 
 
-def test_no_captures_is_named():
+def test_no_captures_is_named() -> None:
     done = bodyscan("check", RIGS / "three-pole-12.yaml")
     assert done.returncode == 2
     assert "captures/calibration" in done.stdout
 
 
-def test_the_version_needs_no_command():
+def test_the_version_needs_no_command() -> None:
     done = bodyscan("--version")
     assert done.returncode == 0
     assert done.stdout.startswith("bodyscan ")
@@ -80,7 +80,7 @@ def parameters(name: str) -> dict[str, inspect.Parameter]:
     return dict(inspect.signature(COMMANDS[name].callback).parameters)
 
 
-def test_commands_stand_in_three_groups():
+def test_commands_stand_in_three_groups() -> None:
     said = bodyscan("--help").stdout
     places = [said.index(group) for group in ("Builder", "Operator", "Laboratory")]
     assert places == sorted(places)
@@ -88,12 +88,12 @@ def test_commands_stand_in_three_groups():
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_takes_the_shared_options(name):
+def test_every_command_takes_the_shared_options(name: str) -> None:
     own = parameters(name)
     assert [own[shared.name] for shared in SHARED] == SHARED
 
 
-def test_defaults_are_those_of_the_settings():
+def test_defaults_are_those_of_the_settings() -> None:
     scan = ScanSettings()
     assert parameters("scan")["points"].default == scan.fusion.points
     assert parameters("scan")["align"].default == scan.alignment.matching
@@ -101,13 +101,13 @@ def test_defaults_are_those_of_the_settings():
     assert parameters("export-rig")["formats"].default == ",".join(RigExportSettings().formats)
 
 
-def test_the_page_of_commands_is_as_the_commands_are():
+def test_the_page_of_commands_is_as_the_commands_are() -> None:
     docs = RIGS.parent / "docs"
     page = runpy.run_path(str(docs / "write_commands.py"))["page"]
     assert page() == (docs / "commands.md").read_text("utf-8"), "run docs/write_commands.py"
 
 
-def test_json_is_one_document_that_says_what_was_made(tmp_path):
+def test_json_is_one_document_that_says_what_was_made(tmp_path: Path) -> None:
     done = bodyscan("patterns", RIGS / "one-pair.yaml", "--out", tmp_path, "--width", 300,
                     "--height", 48, "--json")  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -120,7 +120,7 @@ def test_json_is_one_document_that_says_what_was_made(tmp_path):
     assert document["notes"]  # stripes that cannot be equally wide on so few pixels
 
 
-def test_json_says_what_went_wrong_too(tmp_path):
+def test_json_says_what_went_wrong_too(tmp_path: Path) -> None:
     done = bodyscan("scan", tmp_path, "--calibration", tmp_path, "--json")
     assert done.returncode == 2
     document = json.loads(done.stdout)
@@ -129,7 +129,7 @@ def test_json_says_what_went_wrong_too(tmp_path):
     assert "calibrate-rig" in document["error"]["remedy"]
 
 
-def test_quiet_says_nothing_but_errors(tmp_path):
+def test_quiet_says_nothing_but_errors(tmp_path: Path) -> None:
     done = bodyscan("patterns", RIGS / "one-pair.yaml", "--out", tmp_path, "--width", 300,
                     "--height", 48, "--quiet")  # fmt: skip
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
@@ -138,7 +138,7 @@ def test_quiet_says_nothing_but_errors(tmp_path):
     assert "captures/calibration" in wrong.stderr
 
 
-def test_libraries_that_print_do_not_spoil_the_document(capfd):
+def test_libraries_that_print_do_not_spoil_the_document(capfd: pytest.CaptureFixture[str]) -> None:
     from bodyscan.cli.console import Output
 
     with Output("x", json=True):

@@ -25,11 +25,11 @@ ROOMS = ("alignment", "fusion", "export", "workflows", "jobs", "cli", "api.py")
 """Where settings are obeyed or handed on; elsewhere words such as `rounds` are other rounds."""
 
 
-def test_the_examples_run():
+def test_the_examples_run() -> None:
     assert doctest.testmod(settings).failed == 0
 
 
-def test_no_default_is_stated_twice():
+def test_no_default_is_stated_twice() -> None:
     """A parameter or field that has a setting's name takes its value from there."""
     found = [
         f"{path}:{line}: {name} = {value!r}"
@@ -42,7 +42,7 @@ def test_no_default_is_stated_twice():
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_beside_every_value_stand_its_unit_and_its_meaning(name):
+def test_beside_every_value_stand_its_unit_and_its_meaning(name: str) -> None:
     tree = ast.parse(Path(settings.__file__).read_text("utf-8"))
     body = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == name).body
     for value, said in zip(body, [*body[1:], None], strict=True):
@@ -50,7 +50,7 @@ def test_beside_every_value_stand_its_unit_and_its_meaning(name):
             assert isinstance(said, ast.Expr), f"{name}.{ast.unparse(value.target)} says nothing"
 
 
-def test_how_many_threads_is_said_once():
+def test_how_many_threads_is_said_once() -> None:
     found = [
         f"{path}:{line}"
         for path in sorted(PACKAGE.rglob("*.py"))

@@ -19,11 +19,11 @@ from bodyscan.verdict import Verdict
         ("not accepted", "bad"),
     ],
 )
-def test_every_grade_is_good_usable_or_bad(grade, mark):
+def test_every_grade_is_good_usable_or_bad(grade: str, mark: str) -> None:
     assert Verdict(grade).mark == mark
 
 
-def test_reasons_follow_the_grade_line_by_line():
+def test_reasons_follow_the_grade_line_by_line() -> None:
     assert str(Verdict("usable", ("dark hair", "a hand on the hip"))) == (
         "verdict: usable\n  dark hair\n  a hand on the hip"
     )

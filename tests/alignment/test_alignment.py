@@ -23,7 +23,7 @@ NOISE_MM = 0.2
 
 
 @pytest.fixture(scope="module")
-def scanned():
+def scanned() -> tuple[list[RangeImage], dict[str, RigidTransform]]:
     """Four cameras at 90 degrees around a lumpy body (two ellipsoids), and their true placings."""
     body = o3d.geometry.TriangleMesh.create_sphere(1.0, resolution=120)
     points = np.asarray(body.vertices) * [110.0, 170.0, 300.0]
@@ -52,7 +52,7 @@ def scanned():
     return images, placings
 
 
-def known_to(names, mm: float, deg: float) -> PoseCovariance:
+def known_to(names: dict[str, RigidTransform], mm: float, deg: float) -> PoseCovariance:
     """Independent errors of the pairs, about the body's middle."""
     carry = np.eye(6)
     carry[3:, :3] = [[0, 900.0, 0], [-900.0, 0, 0], [0, 0, 0]]
@@ -60,7 +60,9 @@ def known_to(names, mm: float, deg: float) -> PoseCovariance:
     return PoseCovariance(tuple(names), np.kron(np.eye(len(names)), own))
 
 
-def pushed(placings, mm: float, seed: int = 0):
+def pushed(
+    placings: dict[str, RigidTransform], mm: float, seed: int = 0
+) -> dict[str, RigidTransform]:
     rng = np.random.default_rng(seed)
     away = {}
     for name, placing in placings.items():
@@ -69,7 +71,7 @@ def pushed(placings, mm: float, seed: int = 0):
     return away
 
 
-def disagreement_mm(placings, truth) -> float:
+def disagreement_mm(placings: dict[str, RigidTransform], truth: dict[str, RigidTransform]) -> float:
     """RMS distance between where pairs put a point of the body, the common motion taken out."""
     point = np.array([0.0, 0.0, 900.0])
     moved = [(placings[n] @ truth[n].inverse()).apply(point) - point for n in placings]
@@ -77,7 +79,9 @@ def disagreement_mm(placings, truth) -> float:
 
 
 @pytest.mark.parametrize("matching", ["projected", "nearest"])
-def test_pairs_come_together(scanned, matching):
+def test_pairs_come_together(
+    scanned: tuple[list[RangeImage], dict[str, RigidTransform]], matching: str
+) -> None:
     images, truth = scanned
     start = pushed(truth, 1.5)
     settings = AlignmentSettings(matching=matching, sway_mm=0.0, sway_deg=0.0)
@@ -88,14 +92,18 @@ def test_pairs_come_together(scanned, matching):
     assert found.rms_after_mm < found.rms_before_mm
 
 
-def test_a_firm_prior_is_not_moved(scanned):
+def test_a_firm_prior_is_not_moved(
+    scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
+) -> None:
     images, truth = scanned
     settings = AlignmentSettings(sway_mm=0.0, sway_deg=0.0)
     found = align(images, truth, known_to(truth, 0.01, 0.001), settings)
     assert max(found.motion_mm.values()) < 0.1
 
 
-def test_a_pair_that_asks_for_too_much_stays(scanned):
+def test_a_pair_that_asks_for_too_much_stays(
+    scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
+) -> None:
     images, truth = scanned
     start = dict(truth)
     start["p2"] = RigidTransform(
@@ -107,7 +115,9 @@ def test_a_pair_that_asks_for_too_much_stays(scanned):
     assert np.allclose(found.rig_from_camera["p2"].matrix, start["p2"].matrix)
 
 
-def test_a_pair_without_overlap_stays(scanned):
+def test_a_pair_without_overlap_stays(
+    scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
+) -> None:
     images, truth = scanned
     alone = [image for image in images if image.pair in ("p0", "p2")]
     two = {name: truth[name] for name in ("p0", "p2")}
@@ -117,7 +127,9 @@ def test_a_pair_without_overlap_stays(scanned):
 
 
 @pytest.mark.parametrize("sway_mm", [0.0, 1.0, 3.0])
-def test_sway_is_found_whatever_its_size(scanned, sway_mm):
+def test_sway_is_found_whatever_its_size(
+    scanned: tuple[list[RangeImage], dict[str, RigidTransform]], sway_mm: float
+) -> None:
     """The settings know of 1 mm; a person who stands still or sways by far more is as well aligned."""
     images, truth = scanned
     rng = np.random.default_rng(7)
@@ -135,7 +147,9 @@ def test_sway_is_found_whatever_its_size(scanned, sway_mm):
         assert max(found.motion_mm.values()) < 0.3
 
 
-def test_a_rig_is_refined_on_a_still_object(scanned):
+def test_a_rig_is_refined_on_a_still_object(
+    scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
+) -> None:
     images, truth = scanned
     start = pushed(truth, 0.8, seed=2) | {"unseen": truth["p0"]}
     prior = known_to(start, 0.8, 0.02)
@@ -149,7 +163,9 @@ def test_a_rig_is_refined_on_a_still_object(scanned):
 
 
 @pytest.mark.parametrize("matching", ["projected", "nearest"])
-def test_threads_change_nothing(scanned, matching):
+def test_threads_change_nothing(
+    scanned: tuple[list[RangeImage], dict[str, RigidTransform]], matching: str
+) -> None:
     images, truth = scanned
     start, prior = pushed(truth, 1.5), known_to(truth, 1.5, 0.02)
     settings = AlignmentSettings(matching=matching)
@@ -161,7 +177,7 @@ def test_threads_change_nothing(scanned, matching):
     assert one.overlaps == many.overlaps
 
 
-def test_the_normal_equations_are_those_of_the_distances_jacobian():
+def test_the_normal_equations_are_those_of_the_distances_jacobian() -> None:
     """By numerical derivative: a small motion of the source changes distances along the normals."""
     rng = np.random.default_rng(5)
     points, normals = rng.uniform(-300.0, 300.0, (200, 3)), rng.standard_normal((200, 3))

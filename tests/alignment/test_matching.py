@@ -1,5 +1,8 @@
 """Spots that two cameras see of one wavy surface, whose shape and place are known."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from ring import looking_at
@@ -49,7 +52,7 @@ def two() -> list[tuple[AlignmentPoints, RigidTransform]]:
     return [(alignment_points(seen(f"p{k}", t), 5.0), t) for k, t in enumerate(places)]
 
 
-def test_a_patch_is_about_evenly_spread(two):
+def test_a_patch_is_about_evenly_spread(two: list[tuple[AlignmentPoints, RigidTransform]]) -> None:
     for part, _ in two:
         # 1050 mm away a pixel is 2.6 mm: every second one is the nearest to 5 mm.
         gaps = np.linalg.norm(np.diff(part.points, axis=0), axis=1)
@@ -62,7 +65,9 @@ def test_a_patch_is_about_evenly_spread(two):
 
 
 @pytest.mark.parametrize("match", [match_projected, match_nearest])
-def test_matches_lie_on_the_surface(two, match):
+def test_matches_lie_on_the_surface(
+    two: list[tuple[AlignmentPoints, RigidTransform]], match: Callable[..., Any]
+) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     found = match(a, b, rig_from_a, rig_from_b, 6.0)
     assert len(found.distances) > 500
@@ -75,7 +80,9 @@ def test_matches_lie_on_the_surface(two, match):
     assert np.all((found.sigma_mm > 0.3 * SIGMA_MM) & (found.sigma_mm < 1.5 * SIGMA_MM))
 
 
-def test_projected_points_are_those_that_the_camera_saw(two):
+def test_projected_points_are_those_that_the_camera_saw(
+    two: list[tuple[AlignmentPoints, RigidTransform]],
+) -> None:
     """Each matched point lands, lens and all, on a pixel away from rims and the hole."""
     (a, rig_from_a), (b, rig_from_b) = two
     found = match_projected(a, b, rig_from_a, rig_from_b, 6.0)
@@ -96,7 +103,9 @@ def test_projected_points_are_those_that_the_camera_saw(two):
     np.testing.assert_allclose(found.points, rig[expected], atol=1e-9)
 
 
-def test_a_shift_is_measured_along_the_normals(two):
+def test_a_shift_is_measured_along_the_normals(
+    two: list[tuple[AlignmentPoints, RigidTransform]],
+) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     shift = np.array([0.4, -0.3, 0.5])
     away = RigidTransform(rig_from_a.rotation, rig_from_a.translation + shift)
@@ -106,7 +115,7 @@ def test_a_shift_is_measured_along_the_normals(two):
     np.testing.assert_allclose(found.distances, found.normals @ shift, atol=5e-3)
 
 
-def test_nothing_farther_than_the_reach(two):
+def test_nothing_farther_than_the_reach(two: list[tuple[AlignmentPoints, RigidTransform]]) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     inward = 8.0 * rig_from_a.rotation[:, 2]
     away = RigidTransform(rig_from_a.rotation, rig_from_a.translation + inward)
@@ -116,7 +125,9 @@ def test_nothing_farther_than_the_reach(two):
     assert len(near.distances) < len(far.distances)
 
 
-def test_cameras_on_opposite_sides_share_nothing(two):
+def test_cameras_on_opposite_sides_share_nothing(
+    two: list[tuple[AlignmentPoints, RigidTransform]],
+) -> None:
     (a, rig_from_a), _ = two
     opposite = looking_at(2.0 * CENTRE - rig_from_a.translation, CENTRE)
     other = alignment_points(seen("p2", opposite), 5.0)

@@ -20,14 +20,14 @@ def shifted(*mm: float) -> np.ndarray:
     return np.array([[0.0, 0.0, 0.0, x, 0.0, 0.0] for x in mm])
 
 
-def test_what_is_found_is_believed_within_bounds():
+def test_what_is_found_is_believed_within_bounds() -> None:
     assert PRIOR.scale(shifted(0.0, 0.0)) == 0.3
     assert PRIOR.scale(shifted(2.0, -2.0)) == pytest.approx(1.5 * 2.0 / np.sqrt(3.0))
     assert PRIOR.scale(shifted(90.0, -90.0)) == 4.0
     assert SwayPrior(0.0, 0.0, 0.3, 4.0).scale(shifted(5.0, -5.0)) == 1.0
 
 
-def test_a_turn_about_the_bodys_centre_leaves_the_centre_where_it_is():
+def test_a_turn_about_the_bodys_centre_leaves_the_centre_where_it_is() -> None:
     turn = RigidTransform.from_rotation_vector([0.0, 0.1, 0.0], np.zeros(3))
     centre = np.array(BODY_CENTRE_MM)
     about_centre = np.concatenate([[0.0, 0.1, 0.0], -np.cross([0.0, 0.1, 0.0], centre)])
@@ -39,13 +39,13 @@ def test_a_turn_about_the_bodys_centre_leaves_the_centre_where_it_is():
     assert sigmas == pytest.approx(0.1 / np.radians(0.5), rel=1e-6)
 
 
-def test_pairs_are_independent_and_scale_with_what_was_found():
+def test_pairs_are_independent_and_scale_with_what_was_found() -> None:
     once, twice = (PRIOR.covariance(PAIRS, EXACT_BOARDS, scale) for scale in (1.0, 2.0))
     assert not once[:6, 6:].any()
     np.testing.assert_allclose(twice, 4.0 * once)
 
 
-def test_a_pair_that_wants_too_far_stays_where_it_was():
+def test_a_pair_that_wants_too_far_stays_where_it_was() -> None:
     covariance = np.eye(12)
     kept, refused = bound_motions(PAIRS, shifted(3.0, 30.0), covariance, limit_sigmas=5.0)
     np.testing.assert_array_equal(kept, shifted(3.0, 0.0))

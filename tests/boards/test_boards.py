@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,7 +17,9 @@ sizes = st.integers(3, 30)
 
 
 @given(sizes, sizes, st.floats(1, 200), st.floats(0, 20))
-def test_corner_ids_count_along_columns_and_back_follows_front(columns, rows, square, thickness):
+def test_corner_ids_count_along_columns_and_back_follows_front(
+    columns: int, rows: int, square: float, thickness: float
+) -> None:
     board = Board(
         name="b", columns=columns, rows=rows, square_mm=square, faces=2, thickness_mm=thickness
     )
@@ -30,7 +34,9 @@ def test_corner_ids_count_along_columns_and_back_follows_front(columns, rows, sq
 
 
 @given(sizes, sizes, st.floats(0, 50))
-def test_rim_runs_clockwise_for_whoever_looks_at_that_face(columns, rows, margin):
+def test_rim_runs_clockwise_for_whoever_looks_at_that_face(
+    columns: int, rows: int, margin: float
+) -> None:
     board = Board(
         name="b",
         columns=columns,
@@ -52,7 +58,7 @@ def test_rim_runs_clockwise_for_whoever_looks_at_that_face(columns, rows, margin
 
 @pytest.mark.parametrize("legacy", [False, True])
 @pytest.mark.parametrize("size", [(9, 7), (8, 10), (8, 11), (9, 8)])
-def test_markers_stand_in_the_white_squares(size, legacy):
+def test_markers_stand_in_the_white_squares(size: tuple[int, int], legacy: bool) -> None:
     columns, rows = size
     board = Board(
         name="b", kind="charuco", columns=columns, rows=rows, square_mm=10, marker_mm=8,
@@ -78,7 +84,7 @@ def test_markers_stand_in_the_white_squares(size, legacy):
         ({"marker_mm": None}, "marker_mm"),
     ],
 )
-def test_boards_that_cannot_be_printed_are_refused(changes, said):
+def test_boards_that_cannot_be_printed_are_refused(changes: dict[str, Any], said: str) -> None:
     board = Board(name="b", kind="charuco", columns=9, rows=7, square_mm=10, marker_mm=8)
     with pytest.raises(BadInput, match=said):
         marker_corners(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from board_rendering import render, true_corners, view_of
 from edge_lines import refine_by_lines
 
+from bodyscan.arrays import Array, Bytes
 from bodyscan.boards.board_map import fit_board_map
 from bodyscan.boards.corners import refine_corners
 from bodyscan.rig.board import Board
@@ -17,7 +20,9 @@ BRIGHT_DIAGONAL = (ROW + COLUMN) % 2 == 1
 """The first square is black, so the squares diagonally at corner (0, 0) are too."""
 
 
-def picture(slant_deg, *, fill=0.75, seed=0, **rendering):
+def picture(
+    slant_deg: int, *, fill: float = 0.75, seed: int = 0, **rendering: Any
+) -> tuple[Bytes, Array, Array, Array]:
     """Image, true corners, starts up to 0.6 px off, and one square along x and y in px."""
     view = view_of(BOARD, slant_deg, 35, 12, width=400, height=320, fill=fill)
     image = render([(BOARD, view)], seed=seed, **rendering)
@@ -29,7 +34,7 @@ def picture(slant_deg, *, fill=0.75, seed=0, **rendering):
 
 @pytest.mark.parametrize("blur_px", [0.6, 0.8])
 @pytest.mark.parametrize("slant_deg", [0, 45, 60])
-def test_both_ways_find_corners_to_a_hundredth_of_a_pixel(slant_deg, blur_px):
+def test_both_ways_find_corners_to_a_hundredth_of_a_pixel(slant_deg: int, blur_px: float) -> None:
     image, true, start, along = picture(slant_deg, blur_px=blur_px)
     fitted, good = refine_corners(image, start, along, BRIGHT_DIAGONAL)
     assert good.all()
@@ -40,7 +45,7 @@ def test_both_ways_find_corners_to_a_hundredth_of_a_pixel(slant_deg, blur_px):
     assert np.sqrt(np.mean((crossing - true) ** 2)) < 0.015
 
 
-def test_neighbouring_edges_stay_out_of_the_windows_of_a_fine_board():
+def test_neighbouring_edges_stay_out_of_the_windows_of_a_fine_board() -> None:
     image, true, start, along = picture(50, fill=0.3)
     assert np.linalg.norm(along, axis=1).min() < 10
     fitted, good = refine_corners(image, start, along, BRIGHT_DIAGONAL)
@@ -49,14 +54,14 @@ def test_neighbouring_edges_stay_out_of_the_windows_of_a_fine_board():
     assert np.sqrt(np.mean((fitted - true)[good] ** 2)) < 0.03
 
 
-def test_uneven_light_does_not_move_corners():
+def test_uneven_light_does_not_move_corners() -> None:
     image, true, start, along = picture(30, light_falloff=0.7)
     fitted, good = refine_corners(image, start, along, BRIGHT_DIAGONAL)
     assert good.all()
     assert np.sqrt(np.mean((fitted - true) ** 2)) < 0.01
 
 
-def test_what_is_not_the_corner_asked_for_is_refused():
+def test_what_is_not_the_corner_asked_for_is_refused() -> None:
     image, true, start, along = picture(20)
     _, good = refine_corners(image, start, along, ~BRIGHT_DIAGONAL)
     assert not good.any(), "black and white exchanged"
@@ -68,7 +73,7 @@ def test_what_is_not_the_corner_asked_for_is_refused():
     assert not good.any(), "nothing there"
 
 
-def test_a_corner_cut_by_the_rim_of_the_picture_is_refused():
+def test_a_corner_cut_by_the_rim_of_the_picture_is_refused() -> None:
     image, true, start, along = picture(0)
     cut = int(true[20, 0]) + 3
     fitted, good = refine_corners(image[:, :cut], start, along, BRIGHT_DIAGONAL)
@@ -77,7 +82,7 @@ def test_a_corner_cut_by_the_rim_of_the_picture_is_refused():
     assert np.all(np.abs(fitted - true)[good] < 0.05)
 
 
-def test_light_that_falls_off_over_a_tilted_board_moves_no_corner():
+def test_light_that_falls_off_over_a_tilted_board_moves_no_corner() -> None:
     shifts = []
     for seed in range(4):
         image, true, start, along = picture(30, light_falloff=0.9, noise=0.3, seed=seed)

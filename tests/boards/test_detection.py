@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from board_rendering import render, true_corners, view_of
 
+from bodyscan.arrays import Array, Bytes
 from bodyscan.boards import checkerboard
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.board_map import fit_board_map
 from bodyscan.boards.detection import find_boards
+from bodyscan.boards.view import BoardView
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 
@@ -25,16 +28,16 @@ MARKED = Board(
 SMALL = {"width": 512, "height": 410}
 
 
-def found(image, *boards):
+def found(image: Bytes, *boards: Any) -> list[BoardView]:
     return find_boards(image, boards, pair="p1-1", shot="b01")
 
 
-def errors(view, true):
+def errors(view: BoardView, true: Array) -> Array:
     return view.pixels - true[view.corner_ids]
 
 
 @pytest.mark.parametrize("spin_deg", [0, 75, 180, -100])
-def test_a_plain_board_is_numbered_from_its_black_square(spin_deg):
+def test_a_plain_board_is_numbered_from_its_black_square(spin_deg: int) -> None:
     place = view_of(PLAIN, 35, 60, spin_deg, fill=0.55, **SMALL)
     (view,) = found(render([(PLAIN, place)]), PLAIN)
     assert (view.pair, view.shot, view.board) == ("p1-1", "b01", "plain")
@@ -45,7 +48,7 @@ def test_a_plain_board_is_numbered_from_its_black_square(spin_deg):
 
 
 @pytest.mark.parametrize("spin_deg", [10, 170])
-def test_a_board_that_looks_the_same_from_both_ends_is_said_to_be_turnable(spin_deg):
+def test_a_board_that_looks_the_same_from_both_ends_is_said_to_be_turnable(spin_deg: int) -> None:
     board = Board(name="even", columns=8, rows=6, square_mm=30, margin_mm=20)
     place = view_of(board, 30, 20, spin_deg, fill=0.6, **SMALL)
     (view,) = found(render([(board, place)]), board)
@@ -56,7 +59,9 @@ def test_a_board_that_looks_the_same_from_both_ends_is_said_to_be_turnable(spin_
 
 
 @pytest.mark.parametrize("order", [np.s_[:, ::-1], np.s_[::-1], np.s_[::-1, ::-1], np.s_[:]])
-def test_whatever_way_a_detector_counts_the_numbering_is_the_same(monkeypatch, order):
+def test_whatever_way_a_detector_counts_the_numbering_is_the_same(
+    monkeypatch: pytest.MonkeyPatch, order: slice | tuple[slice, slice]
+) -> None:
     place = view_of(PLAIN, 35, 60, 20, fill=0.55)
     true = true_corners(PLAIN, place)
     counted = true.reshape(6, 9, 2)[order].reshape(-1, 2).astype(np.float32)
@@ -65,7 +70,7 @@ def test_whatever_way_a_detector_counts_the_numbering_is_the_same(monkeypatch, o
     assert np.abs(errors(view, true)).max() < 0.1
 
 
-def test_corners_that_make_no_board_are_not_believed(monkeypatch):
+def test_corners_that_make_no_board_are_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     place = view_of(PLAIN, 35, 60, 20, fill=0.55)
     # Every one of them is a corner of the right colours, but two rows are exchanged.
     rows = true_corners(PLAIN, place).astype(np.float32).reshape(6, 9, 2)
@@ -108,7 +113,7 @@ def test_before_tiles_of_another_size_a_board_is_found() -> None:
     assert np.abs(errors(view, true_corners(PLAIN, place))).max() < 0.1
 
 
-def test_a_plain_board_with_two_faces_is_turnable():
+def test_a_plain_board_with_two_faces_is_turnable() -> None:
     board = PLAIN.model_copy(update={"faces": 2, "thickness_mm": 5.0})
     place = view_of(board, 20, 20, 10, fill=0.6, **SMALL)
     (view,) = found(render([(board, place)]), board)
@@ -116,14 +121,14 @@ def test_a_plain_board_with_two_faces_is_turnable():
     assert view.corner_ids.max() < 54, "numbered as a front"
 
 
-def test_a_square_plain_board_is_refused():
+def test_a_square_plain_board_is_refused() -> None:
     with pytest.raises(BadInput, match="quarter"):
         found(np.zeros((60, 80), np.uint8), PLAIN.model_copy(update={"rows": 10}))
 
 
 @pytest.mark.parametrize("back", [False, True])
 @pytest.mark.parametrize("slant_deg", [0, 45, 60])
-def test_a_marked_board_is_found_from_either_face(slant_deg, back):
+def test_a_marked_board_is_found_from_either_face(slant_deg: int, back: bool) -> None:
     place = view_of(MARKED, slant_deg, 60, 20, fill=0.8, back=back)
     (view,) = found(render([(MARKED, place)], blur_px=0.8), MARKED)
     true = np.concatenate([true_corners(MARKED, place, face) for face in (0, 1)])
@@ -134,7 +139,7 @@ def test_a_marked_board_is_found_from_either_face(slant_deg, back):
     assert np.sqrt(np.mean(errors(view, true) ** 2)) < 0.012
 
 
-def test_a_marked_board_may_be_seen_in_part():
+def test_a_marked_board_may_be_seen_in_part() -> None:
     place = view_of(MARKED, 30, 60, 20, fill=1.5, shift=(190, 120))
     (view,) = found(render([(MARKED, place)]), MARKED)
     true = true_corners(MARKED, place)
@@ -144,7 +149,7 @@ def test_a_marked_board_may_be_seen_in_part():
     assert np.abs(errors(view, true)).max() < 0.1
 
 
-def test_a_covered_part_costs_only_the_corners_there():
+def test_a_covered_part_costs_only_the_corners_there() -> None:
     place = view_of(MARKED, 30, 60, 5, fill=0.9)
     image = render([(MARKED, place)])
     image[150:330, 250:420] = 90
@@ -156,12 +161,12 @@ def test_a_covered_part_costs_only_the_corners_there():
     assert np.abs(errors(view, true)).max() < 0.1
 
 
-def test_too_little_of_a_board_is_no_view():
+def test_too_little_of_a_board_is_no_view() -> None:
     place = view_of(MARKED, 0, 0, 0, fill=3.0, shift=(700, 400))
     assert found(render([(MARKED, place)]), MARKED) == []
 
 
-def test_two_boards_in_one_picture():
+def test_two_boards_in_one_picture() -> None:
     other = MARKED.model_copy(update={"name": "other", "first_marker": 200, "faces": 1})
     left = view_of(MARKED, 30, 60, 10, fill=0.5, shift=(-140, -60))
     right = view_of(other, 25, 10, -20, fill=0.5, shift=(150, 60))
@@ -172,7 +177,7 @@ def test_two_boards_in_one_picture():
         assert np.abs(errors(view, true_corners(board, place))).max() < 0.1
 
 
-def test_no_board_is_an_empty_list_within_a_second():
+def test_no_board_is_an_empty_list_within_a_second() -> None:
     rng = np.random.default_rng(3)
     clouds = cv2.GaussianBlur(rng.normal(size=(1024, 1280)).astype(np.float32), (0, 0), 8)
     clouds = cv2.normalize(clouds, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
@@ -184,7 +189,7 @@ def test_no_board_is_an_empty_list_within_a_second():
         assert time.process_time() - began < 3.0
 
 
-def planar_error_px(board, view):
+def planar_error_px(board: Board, view: BoardView) -> float:
     """How far corners stray from a homography with a gentle lens, RMS px."""
     printed = corner_points(board)[view.corner_ids, :2]
     stray = fit_board_map(printed, view.pixels).apply(printed) - view.pixels
@@ -192,7 +197,7 @@ def planar_error_px(board, view):
 
 
 @pytest.mark.parametrize("pose", [0, 1, 2, 4])
-def test_real_checkerboard(captures, pose):
+def test_real_checkerboard(captures: Path, pose: int) -> None:
     board = Board(name="procam", columns=10, rows=8, square_mm=75)
     image = cv2.imread(str(captures / "procam-board" / f"capture_{pose}" / "graycode_40.png"), 0)
     (view,) = found(image, board)
@@ -226,7 +231,7 @@ def test_a_real_board_under_fringes_is_found_in_their_mean(captures: Path, frame
 @pytest.mark.parametrize(
     ("camera", "at_least"), [("back", 70), ("mid", 70), ("side", 50), ("top", 70)]
 )
-def test_real_charuco_board(captures, camera, at_least):
+def test_real_charuco_board(captures: Path, camera: str, at_least: int) -> None:
     board = Board(name="ring", kind="charuco", columns=8, rows=11, square_mm=24, marker_mm=18.75)
     objects, pixels = [], []
     for shot in ("00", "05", "08", "11"):

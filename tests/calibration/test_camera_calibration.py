@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from table_one import CAMERA, POINTS, TURNS
@@ -14,7 +16,7 @@ from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 
 
-def views(turns, noise_px=0.0, seed=0):
+def views(turns: Any, noise_px: float = 0.0, seed: int = 0) -> list[PlanarView]:
     rng = np.random.default_rng(seed)
     found = []
     for k, turn in enumerate(turns):
@@ -24,13 +26,13 @@ def views(turns, noise_px=0.0, seed=0):
     return found
 
 
-def test_three_noiseless_poses_give_table_1_back():
+def test_three_noiseless_poses_give_table_1_back() -> None:
     found = calibrate_camera(views(TURNS), 640, 480).camera
     # Without noise only rounding is left: 1e-5 px, 1e-7 in k.
     assert found.parameters == pytest.approx(CAMERA.parameters, rel=1e-6, abs=1e-5)
 
 
-def test_sigmas_are_honest():
+def test_sigmas_are_honest() -> None:
     # 40 draws of 0.03 px noise: errors over sigmas have a spread of 1 +- 0.11 (1 / sqrt(2 * 40)),
     # and the estimate of the noise itself adds a few percent: 0.7 to 1.3 is three sigmas.
     errors = []
@@ -42,7 +44,7 @@ def test_sigmas_are_honest():
     assert np.all((spread > 0.7) & (spread < 1.3)), spread
 
 
-def test_an_outlier_corner_does_no_harm():
+def test_an_outlier_corner_does_no_harm() -> None:
     disturbed = views(TURNS, 0.03)
     disturbed[1].pixels[10] += [5.0, -4.0]
     found = calibrate_camera(disturbed, 640, 480).camera
@@ -51,17 +53,17 @@ def test_an_outlier_corner_does_no_harm():
     assert abs(found.alpha - clean.alpha) < 0.5
 
 
-def test_two_poses_are_refused():
+def test_two_poses_are_refused() -> None:
     with pytest.raises(DegeneratePoses, match="2 usable board poses"):
         calibrate_camera(views(TURNS[:2]), 640, 480)
 
 
-def test_pure_translation_is_refused():
+def test_pure_translation_is_refused() -> None:
     with pytest.raises(DegeneratePoses, match="translation only"):
         calibrate_camera(views([TURNS[0]] * 4, 0.03), 640, 480)
 
 
-def test_zhangs_closed_form_has_the_skew():
+def test_zhangs_closed_form_has_the_skew() -> None:
     straight = Camera(1000.0, 990.0, 12.0, 330.0, 250.0, Radial(), 640, 480)
     homographies = []
     for turn in TURNS:
@@ -72,7 +74,7 @@ def test_zhangs_closed_form_has_the_skew():
 
 
 @pytest.mark.parametrize("plane_z", [0.0, 6.0])
-def test_a_board_is_located_from_either_face(plane_z):
+def test_a_board_is_located_from_either_face(plane_z: float) -> None:
     points = POINTS + np.array([0.0, 0.0, plane_z])
     pose = RigidTransform.from_rotation_vector([0.3, np.pi * (plane_z > 0), 0.1], [60, -70, 420.0])
     view = PlanarView("s", points, CAMERA.project(pose.apply(points)))

@@ -1,5 +1,7 @@
 """A camera whose boards fill too little of its picture is named."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,9 @@ def corners(left: float, top: float, width: float, height: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("width", "height", "share"), [(320, 240, 0.25), (143, 107, 0.05)])
-def test_the_share_of_the_picture_is_that_of_the_hull(width, height, share):
+def test_the_share_of_the_picture_is_that_of_the_hull(
+    width: int, height: int, share: float
+) -> None:
     # The picture is divided into 64 cells each way: a rim of half a cell is in doubt.
     doubt = (width / 640 + height / 480) / 64 + 0.001
     assert covered_share([corners(100, 90, width, height)], 640, 480) == pytest.approx(
@@ -22,14 +26,14 @@ def test_the_share_of_the_picture_is_that_of_the_hull(width, height, share):
     )
 
 
-def test_views_in_the_same_place_cover_no_more():
+def test_views_in_the_same_place_cover_no_more() -> None:
     one, beside = corners(0, 0, 320, 240), corners(320, 240, 319, 239)
     assert covered_share([one, one], 640, 480) == covered_share([one], 640, 480)
     assert covered_share([one, beside], 640, 480) == pytest.approx(0.5, abs=0.04)
 
 
 @pytest.mark.parametrize(("size", "named"), [(0.22, True), (0.6, False)])
-def test_only_a_small_board_is_noted(tmp_path, size, named):
+def test_only_a_small_board_is_noted(tmp_path: Path, size: float, named: bool) -> None:
     rig = load_rig("rigs/one-pair.yaml")
     (pair,) = rig.pairs
     width, height = pair.camera.width, pair.camera.height

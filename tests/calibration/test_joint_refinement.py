@@ -1,5 +1,7 @@
 """Corners and stripes in one solve: what it must better, on the chapter's own camera."""
 
+from typing import Any
+
 import numpy as np
 from lit_boards import Mirror, Scene
 
@@ -28,7 +30,7 @@ POSES = [
 ]
 
 
-def calibrated(seed):
+def calibrated(seed: int) -> Any:
     """Camera, sheets and striped boards found one after the other, from noisy measurements."""
     rng = np.random.default_rng(seed)
     column, row = np.meshgrid(np.arange(1, 9), np.arange(1, 7))
@@ -56,7 +58,7 @@ def calibrated(seed):
     return camera, sheets, [striped_board(v, camera.camera, bins, k) for k, v in enumerate(views)]
 
 
-def flatness_rms_mm(camera, sheets):
+def flatness_rms_mm(camera: Any, sheets: Any) -> Any:
     """Of a flat plane 405 mm away, measured without noise: what is left is systematic."""
     u, v = np.meshgrid(np.arange(180.0, 520.0, 10.0), np.arange(150.0, 430.0, 10.0))
     pixels = np.column_stack([u.ravel(), v.ravel()])
@@ -67,7 +69,7 @@ def flatness_rms_mm(camera, sheets):
     return float(np.sqrt(np.linalg.eigvalsh(centred.T @ centred / len(centred))[0]))
 
 
-def test_a_plane_becomes_flatter():
+def test_a_plane_becomes_flatter() -> None:
     before, after = [], []
     for seed in range(3):
         camera, sheets, boards = calibrated(seed)

@@ -1,13 +1,15 @@
 """A lens is one class in one file: everything a rig does with cameras goes through with a new one."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from ring import ring_of_cameras, ring_rig, ring_views
 from table_one import POINTS, TURNS
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.camera import PlanarView, calibrate_camera
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput
@@ -35,21 +37,21 @@ class Leaning(Lens):
     kind: ClassVar[str] = "leaning"
 
     @property
-    def prior_sigmas(self):
+    def prior_sigmas(self) -> Array:
         return np.array([0.05])
 
     @property
-    def difference_steps(self):
+    def difference_steps(self) -> Any:
         return np.array([1e-5])
 
-    def distort(self, ideal):
+    def distort(self, ideal: Array) -> Array:
         return ideal + self.t * self.by_coefficients(ideal)[..., 0]
 
-    def by_coefficients(self, ideal):
+    def by_coefficients(self, ideal: Array) -> Array:
         x, y = ideal[..., 0], ideal[..., 1]
         return np.stack([2.0 * x * y, x * x + 3.0 * y * y], axis=-1)[..., None]
 
-    def by_point(self, ideal):
+    def by_point(self, ideal: Array) -> Array:
         x, y = ideal[..., 0], ideal[..., 1]
         rows = [1.0 + 2.0 * self.t * y, 2.0 * self.t * x, 2.0 * self.t * x, 1.0 + 6.0 * self.t * y]
         return np.stack(rows, axis=-1).reshape(*x.shape, 2, 2)
@@ -59,7 +61,7 @@ CAMERA = Camera(1061.7, 1064.1, -0.6, 330.0, 250.0, Leaning(0.02), 640, 480)
 
 
 @pytest.fixture(autouse=True)
-def registered(monkeypatch):
+def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(LENSES, Leaning.kind, Leaning)
 
 
@@ -70,7 +72,7 @@ def views() -> list[PlanarView]:
     ]
 
 
-def test_its_camera_is_calibrated():
+def test_its_camera_is_calibrated() -> None:
     found = calibrate_camera(views(), 640, 480, Leaning())
     assert found.camera.parameter_names[5:] == ("t",)
     assert found.camera.parameters == pytest.approx(CAMERA.parameters, rel=1e-6, abs=1e-5)
@@ -79,7 +81,7 @@ def test_its_camera_is_calibrated():
     assert calibrate_camera(views(), 640, 480).rms_px > 0.2
 
 
-def test_its_rays_are_tabulated():
+def test_its_rays_are_tabulated() -> None:
     wanted = np.zeros((480, 640), bool)
     wanted[::40, ::40] = True
     rows, columns = np.nonzero(wanted)
@@ -91,7 +93,7 @@ def test_its_rays_are_tabulated():
 
 
 @pytest.fixture(scope="module")
-def ring():
+def ring() -> tuple[dict[str, RigidTransform], dict[str, Camera]]:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     first = next(iter(cameras))
     c = cameras[first]
@@ -100,7 +102,9 @@ def ring():
     return placings, cameras | {first: own}
 
 
-def test_its_pair_is_placed_among_others(ring):
+def test_its_pair_is_placed_among_others(
+    ring: tuple[dict[str, RigidTransform], dict[str, Camera]],
+) -> None:
     placings, cameras = ring
     views, _ = ring_views(placings, cameras, shots=20)
     placed = solve_rig(ring_rig(placings), views, cameras).value
@@ -111,7 +115,9 @@ def test_its_pair_is_placed_among_others(ring):
     assert placed.cameras[first].lens.t == pytest.approx(0.01, abs=2e-4)
 
 
-def test_its_calibration_is_read_as_it_was_written(ring, tmp_path):
+def test_its_calibration_is_read_as_it_was_written(
+    ring: tuple[dict[str, RigidTransform], dict[str, Camera]], tmp_path: Path
+) -> None:
     placings, cameras = ring
     pairs = {
         name: PairCalibration(name, c, np.eye(len(c.parameters)), None, PairQuality(0.1, 9))

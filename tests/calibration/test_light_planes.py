@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyscan.calibration.boundary_points import boundary_points, concatenate
+from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
 from bodyscan.calibration.light_planes import fit_light_planes
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
@@ -32,7 +32,9 @@ def true_planes() -> np.ndarray:
     return np.column_stack([normals, normals[:, 0] * (200.0 - 0.5 * i)])
 
 
-def seen_on(pose: RigidTransform, planes: np.ndarray, number: int, noise_px: float = 0.0):
+def seen_on(
+    pose: RigidTransform, planes: np.ndarray, number: int, noise_px: float = 0.0
+) -> BoundaryPoints:
     """Boundary pixels of every plane on one board, by intersecting planes with the board's."""
     index = np.repeat(np.arange(STRIPES + 1), 60)
     v = np.tile(np.linspace(40.0, 440.0, 60), STRIPES + 1)
@@ -50,7 +52,7 @@ def seen_on(pose: RigidTransform, planes: np.ndarray, number: int, noise_px: flo
     )
 
 
-def test_planes_are_recovered_from_three_boards():
+def test_planes_are_recovered_from_three_boards() -> None:
     data = concatenate([seen_on(pose, true_planes(), k) for k, pose in enumerate(POSES)])
     fit = fit_light_planes(data, STRIPES, "vertical")
     assert fit.planes.calibrated.all()
@@ -59,7 +61,7 @@ def test_planes_are_recovered_from_three_boards():
     assert fit.rms_mm < 1e-6
 
 
-def test_outliers_lose_their_weight():
+def test_outliers_lose_their_weight() -> None:
     clean = concatenate([seen_on(pose, true_planes(), k, 0.05) for k, pose in enumerate(POSES)])
     dirty = clean.points.copy()
     dirty[::40] += [3.0, 0.0, 5.0]
@@ -73,7 +75,7 @@ def test_outliers_lose_their_weight():
     assert np.median(offsets) < 0.04
 
 
-def test_a_stripe_on_one_board_gets_no_plane():
+def test_a_stripe_on_one_board_gets_no_plane() -> None:
     parts = [seen_on(pose, true_planes(), k) for k, pose in enumerate(POSES)]
     keep = [part.index != 5 for part in parts]
     keep[0][:] = True
@@ -86,7 +88,7 @@ def test_a_stripe_on_one_board_gets_no_plane():
     assert planes.calibrated.sum() == STRIPES
 
 
-def test_depth_is_nan_beside_a_missing_plane():
+def test_depth_is_nan_beside_a_missing_plane() -> None:
     coefficients = true_planes()
     coefficients[5] = np.nan
     planes = LightPlanes(coefficients, np.zeros((STRIPES + 1, 4, 4)), "vertical")
@@ -96,7 +98,7 @@ def test_depth_is_nan_beside_a_missing_plane():
 
 
 @given(st.floats(20.0, 600.0), st.floats(20.0, 460.0), st.integers(0, STRIPES))
-def test_equation_13_equals_equation_14(u, v, i):
+def test_equation_13_equals_equation_14(u: float, v: float, i: int) -> None:
     planes = LightPlanes(true_planes(), np.zeros((STRIPES + 1, 4, 4)), "vertical")
     ray = CAMERA.rays(np.array([[u, v]]))
     baseline, angle, tilt = baseline_angle_tilt(planes.coefficients[i], "vertical")

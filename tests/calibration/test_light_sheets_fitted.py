@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from lit_boards import (
     chapter_scene,
 )
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate, select
 from bodyscan.calibration.light_sheets import SheetsFit, fit_light_sheets
 from bodyscan.errors import PairFailed
@@ -21,7 +23,7 @@ from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.ray_depths import intersect_rays
 
 
-def boards(scene: Scene, poses, corner_px: float = 0.03, seed: int = 1) -> BoundaryPoints:
+def boards(scene: Scene, poses: Any, corner_px: float = 0.03, seed: int = 1) -> BoundaryPoints:
     placed = [scene.looking_at(*pose) for pose in poses]
     return scene.boundaries(placed, corner_px=corner_px, seed=seed)
 
@@ -52,7 +54,7 @@ def mirror() -> tuple[Scene, SheetsFit]:
     return scene, fitted(scene, boards(scene, CHAPTER_POSES))
 
 
-def test_planes_win_for_a_rotating_mirror():
+def test_planes_win_for_a_rotating_mirror() -> None:
     scene, fit = mirror()
     assert fit.sheets.kind in ("planes", "smooth-planes")
     planes = min(figure(fit, "smooth planes"), figure(fit, "free planes"))
@@ -63,14 +65,14 @@ def test_planes_win_for_a_rotating_mirror():
     assert flatness(scene, fit, 400.0) < 0.008
 
 
-def test_a_mirror_is_known_to_microns_on_boards_that_are():
+def test_a_mirror_is_known_to_microns_on_boards_that_are() -> None:
     scene = chapter_scene()
     fit = fitted(scene, boards(scene, CHAPTER_POSES, corner_px=0.0))
     # 20,000 boundary points of 0.05 px (0.06 mm each) determine some twenty numbers.
     assert flatness(scene, fit, 400.0) < 0.002
 
 
-def test_stripes_out_of_step_keep_their_own_planes():
+def test_stripes_out_of_step_keep_their_own_planes() -> None:
     even = chapter_scene()
     scene = replace(even, projector=Uneven(even.projector, 0.4))
     fit = fitted(scene, boards(scene, CHAPTER_POSES))
@@ -81,7 +83,7 @@ def test_stripes_out_of_step_keep_their_own_planes():
     assert figure(fit, "smooth planes") > 3.0 * figure(fit, "free planes")
 
 
-def test_bowed_sheets_of_a_mirror():
+def test_bowed_sheets_of_a_mirror() -> None:
     scene = chapter_scene(smile=1.5)
     fit = fitted(scene, boards(scene, CHAPTER_POSES))
     assert fit.sheets.kind == "bowed"
@@ -101,7 +103,7 @@ def body(scene: Scene, noise_px: float) -> tuple[np.ndarray, ...]:
     u, v = np.meshgrid(np.arange(300.0, 980.0, 6.0), np.arange(20.0, 1010.0, 6.0))
     pixels = np.column_stack([u.ravel(), v.ravel()])
 
-    def hit(pixels):
+    def hit(pixels: Array) -> tuple[Array, Array]:
         rays = scene.camera.rays(pixels)
         square = rays[:, 0] ** 2 + 1.0
         root = np.sqrt(np.maximum(1300.0**2 - square * (1300.0**2 - 170.0**2), 0.0))
@@ -129,7 +131,7 @@ def errors_on_body(scene: Scene, fit: SheetsFit) -> tuple[np.ndarray, np.ndarray
 
 
 @pytest.mark.parametrize(("k1", "k2", "axis"), [(-0.035, 0.0, 330.0), (-0.12, 0.05, 800.0)])
-def test_a_lens_measures_as_well_as_perfect_sheets(k1, k2, axis):
+def test_a_lens_measures_as_well_as_perfect_sheets(k1: float, k2: float, axis: float) -> None:
     scene, fit = lens(k1, k2, axis)
     assert fit.sheets.kind == "lens"
     assert figure(fit, "smooth planes") > 2.0 * figure(fit, fit.model)
@@ -144,13 +146,13 @@ def test_a_lens_measures_as_well_as_perfect_sheets(k1, k2, axis):
         assert np.sqrt(np.mean(known**2)) < 1.1 * np.sqrt(np.mean(true[boards_seen] ** 2))
 
 
-def test_the_lens_axis_is_found_outside_the_image():
+def test_the_lens_axis_is_found_outside_the_image() -> None:
     scene, fit = lens(-0.12, 0.05, 800.0)
     # Planes alone hardly tell the axis; 4 boards and the bow do, to a hundredth of the image.
     assert abs(fit.sheets.parameters[1] - scene.projector.centre) < 20.0
 
 
-def test_bowed_sheets_come_near_where_boards_were():
+def test_bowed_sheets_come_near_where_boards_were() -> None:
     _, fit = lens()
     bowed = next(held for held in fit.held_out if held.model == "bowed sheets")
     best = next(held for held in fit.held_out if held.chosen)
@@ -160,7 +162,7 @@ def test_bowed_sheets_come_near_where_boards_were():
         assert held.median_mm > 1.5 * best.median_mm
 
 
-def test_sigma_tells_how_far_off_the_sheets_are():
+def test_sigma_tells_how_far_off_the_sheets_are() -> None:
     pulls = []
     for seed in range(2, 6):
         scene = chapter_scene()
@@ -175,20 +177,20 @@ def test_sigma_tells_how_far_off_the_sheets_are():
     assert 0.5 < np.sqrt(np.mean(np.square(pulls))) < 2.0
 
 
-def test_two_boards_are_enough():
+def test_two_boards_are_enough() -> None:
     scene = body_scene(-0.035)
     fit = fitted(scene, boards(scene, BODY_POSES[1:3]))
     assert fit.sheets.kind in ("lens", "bowed")
     assert flatness(scene, fit, 1300.0) < 0.1
 
 
-def test_one_board_is_refused():
+def test_one_board_is_refused() -> None:
     scene = chapter_scene()
     with pytest.raises(PairFailed, match="1 boards"):
         fitted(scene, boards(scene, CHAPTER_POSES[:1]))
 
 
-def test_outliers_do_not_matter():
+def test_outliers_do_not_matter() -> None:
     scene, clean = mirror()
     data = boards(scene, CHAPTER_POSES)
     spoilt = data.points.copy()
@@ -199,7 +201,7 @@ def test_outliers_do_not_matter():
     assert flatness(scene, fit, 400.0) < flatness(scene, clean, 400.0) + 0.004
 
 
-def test_the_order_of_points_does_not_matter_and_nothing_is_drawn():
+def test_the_order_of_points_does_not_matter_and_nothing_is_drawn() -> None:
     scene, fit = mirror()
     data = boards(scene, CHAPTER_POSES)
     again = fitted(scene, data)

@@ -24,7 +24,7 @@ SHOTS = [
 ]
 
 
-def test_one_shot_that_fits_no_other_is_left_out_and_named():
+def test_one_shot_that_fits_no_other_is_left_out_and_named() -> None:
     found = ProjectorMotion(np.array([0, 1, 3, 4]), np.array([2]), 2.5, 0.1)
     kept = drop_disagreeing("p1-1", SHOTS, found)
     assert [shot.view.shot for shot in kept.value] == ["a", "b", "d", "e"]
@@ -33,7 +33,7 @@ def test_one_shot_that_fits_no_other_is_left_out_and_named():
     assert "2.5 px" in note
 
 
-def test_a_projector_that_moved_costs_the_pair_and_the_shots_are_named():
+def test_a_projector_that_moved_costs_the_pair_and_the_shots_are_named() -> None:
     found = ProjectorMotion(np.array([0, 1, 2]), np.array([3, 4]), 2.5, 0.1)
     with pytest.raises(PairFailed, match="moved between shots c and d") as error:
         drop_disagreeing("p1-1", SHOTS, found)

@@ -1,6 +1,7 @@
 """A projector that moves between the shots of a calibration is noticed, and its shots named."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ MORE_POSES = (
 
 
 def disagreement(
-    scene: Scene, poses, moved: Scene | None = None, shots=()
+    scene: Scene, poses: Any, moved: Scene | None = None, shots: Any = ()
 ) -> ProjectorMotion | None:
     """Boards of a scene; of the `shots`, as they are once its projector has moved."""
     parts = []
@@ -35,7 +36,7 @@ def disagreement(
     return find_projector_motion(data, scene.camera, scene.projector.stripes, scene.direction)
 
 
-def pushed(scene: Scene, push) -> Scene:
+def pushed(scene: Scene, push: tuple[float, float, float]) -> Scene:
     projector = scene.projector
     centre = projector.centre + np.array(push)
     return replace(scene, projector=replace(projector, centre=centre))
@@ -48,21 +49,21 @@ def turned(scene: Scene, degrees: float) -> Scene:
 
 
 @pytest.mark.parametrize("scene", [body_scene(0.0), body_scene(-0.12, 0.05)])
-def test_a_projector_that_stays_is_not_suspected(scene):
+def test_a_projector_that_stays_is_not_suspected(scene: Scene) -> None:
     assert disagreement(scene, MORE_POSES) is None
 
 
-def test_a_mirror_that_stays_is_not_suspected():
+def test_a_mirror_that_stays_is_not_suspected() -> None:
     assert disagreement(chapter_scene(smile=0.5), CHAPTER_POSES) is None
 
 
-def test_uneven_stripes_are_no_move():
+def test_uneven_stripes_are_no_move() -> None:
     scene = chapter_scene()
     uneven = replace(scene, projector=Uneven(scene.projector, 0.3))
     assert disagreement(uneven, CHAPTER_POSES) is None
 
 
-def test_a_move_between_shots_tells_those_before_from_those_after():
+def test_a_move_between_shots_tells_those_before_from_those_after() -> None:
     scene = body_scene(-0.05)
     found = disagreement(scene, MORE_POSES, turned(scene, 0.1), shots=(3, 4, 5, 6))
     assert found is not None
@@ -73,7 +74,7 @@ def test_a_move_between_shots_tells_those_before_from_those_after():
 
 
 @pytest.mark.parametrize("shot", [0, 2, 6])
-def test_a_shot_of_its_own_is_named(shot):
+def test_a_shot_of_its_own_is_named(shot: int) -> None:
     scene = body_scene(-0.05)
     found = disagreement(scene, MORE_POSES, turned(scene, -0.1), shots=(shot,))
     assert found is not None
@@ -81,18 +82,18 @@ def test_a_shot_of_its_own_is_named(shot):
     assert found.others == [shot]
 
 
-def test_of_three_poses_something_is_noticed():
+def test_of_three_poses_something_is_noticed() -> None:
     scene = chapter_scene()
     found = disagreement(scene, CHAPTER_POSES, pushed(scene, (0.0, 0.0, 3.0)), shots=(2,))
     assert found is not None
 
 
-def test_two_boards_say_nothing():
+def test_two_boards_say_nothing() -> None:
     scene = chapter_scene()
     assert disagreement(scene, CHAPTER_POSES[:2], pushed(scene, (3.0, 0.0, 0.0)), (1,)) is None
 
 
-def test_a_board_that_stands_elsewhere_is_measured_there():
+def test_a_board_that_stands_elsewhere_is_measured_there() -> None:
     scene = body_scene(0.0)
     poses = [scene.looking_at(*pose) for pose in MORE_POSES]
     data = scene.boundaries(poses, corner_px=0.0)

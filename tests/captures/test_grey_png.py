@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.strategies._internal.core import DataObject
 
 from bodyscan.captures.grey_png import decode_grey_png
 
@@ -22,7 +23,9 @@ def chunk(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
 
 
-def png(size: tuple[int, int], packed: bytes, *, parts: int = 1, kind: tuple[int, ...] = (8, 0, 0)):
+def png(
+    size: tuple[int, int], packed: bytes, *, parts: int = 1, kind: tuple[int, ...] = (8, 0, 0)
+) -> bytes:
     """A PNG file of width and height; kind: bits, colour type, interlace."""
     bits, colour, interlace = kind
     header = struct.pack(">IIBBBBB", *size, bits, colour, 0, 0, interlace)
@@ -47,7 +50,9 @@ def filtered(image: np.ndarray, kinds: list[int]) -> bytes:
 
 
 @given(st.data(), st.integers(1, 40), st.integers(1, 12), st.integers(1, 3), st.booleans())
-def test_any_grey_image_in_any_filters_is_read(data, width, height, parts, smooth):
+def test_any_grey_image_in_any_filters_is_read(
+    data: DataObject, width: int, height: int, parts: int, smooth: bool
+) -> None:
     image = np.random.default_rng(width * height).integers(0, 256, (height, width), dtype=np.uint8)
     image = image // 64 + 100 if smooth else image
     kinds = data.draw(st.lists(st.integers(0, 4), min_size=height, max_size=height))
@@ -57,13 +62,13 @@ def test_any_grey_image_in_any_filters_is_read(data, width, height, parts, smoot
 
 
 @pytest.mark.parametrize("level", range(10))
-def test_what_opencv_writes_is_read(level):
+def test_what_opencv_writes_is_read(level: int) -> None:
     image = np.random.default_rng(level).normal(90, 20, (50, 70)).clip(0, 255).astype(np.uint8)
     file = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, level])[1].tobytes()
     np.testing.assert_array_equal(decode_grey_png(file, 70, 50), image)
 
 
-def test_all_else_is_left_to_opencv():
+def test_all_else_is_left_to_opencv() -> None:
     image = np.arange(12, dtype=np.uint8).reshape(3, 4)
     rows = filtered(image, [0, 1, 2])
     whole = zlib.compress(rows)
@@ -78,7 +83,7 @@ def test_all_else_is_left_to_opencv():
     assert decode_grey_png(png((4, 3), unknown), 4, 3) is None
 
 
-def test_a_file_that_holds_far_more_than_its_image_is_inflated_no_further():
+def test_a_file_that_holds_far_more_than_its_image_is_inflated_no_further() -> None:
     image = np.zeros((3, 4), np.uint8)
     bomb = zlib.compress(filtered(image, [0, 0, 0]) + bytes(10_000_000))
     found = decode_grey_png(png((4, 3), bomb), 4, 3)

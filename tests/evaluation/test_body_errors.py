@@ -24,7 +24,7 @@ def column(radius: float, height: float = 1700.0) -> tuple[np.ndarray, np.ndarra
     return vertices, np.asarray(made.triangles).astype(np.int64)
 
 
-def test_a_body_half_a_millimetre_too_thick():
+def test_a_body_half_a_millimetre_too_thick() -> None:
     vertices, faces = column(150.0)
     found = girth_errors(mesh_of(*column(150.5, 1701.0)), vertices, faces)
     assert found.heights > 30
@@ -33,7 +33,7 @@ def test_a_body_half_a_millimetre_too_thick():
     assert found.stature_mm == pytest.approx(1.0)
 
 
-def test_what_was_filled_is_not_judged():
+def test_what_was_filled_is_not_judged() -> None:
     vertices, faces = column(150.0)
     thick, _ = column(160.0)
     filled = np.ones(len(faces), bool)
@@ -63,7 +63,7 @@ def pairs(sways: list[RigidTransform]) -> dict[str, dict]:
     }
 
 
-def test_sway_left_in_is_told_and_a_common_motion_is_not():
+def test_sway_left_in_is_told_and_a_common_motion_is_not() -> None:
     vertices, _ = column(150.0)
     common = RigidTransform.from_rotation_vector([0.0, 0.0, 0.01], [5.0, -2.0, 0.0])
     aside = RigidTransform(np.eye(3), np.array([0.0, 0.6, 0.0]))
@@ -76,7 +76,7 @@ def test_sway_left_in_is_told_and_a_common_motion_is_not():
     assert apart.apart_mm == pytest.approx(0.3)
 
 
-def test_only_what_camera_and_projector_see_counts():
+def test_only_what_camera_and_projector_see_counts() -> None:
     vertices, faces = column(150.0)
     seen, covered = coverage_of_seen(vertices, vertices, faces, pairs([RigidTransform.identity()]))
     # Less than the half that faces the camera; of 0.85 m x 1.1 m at 1.35 m.

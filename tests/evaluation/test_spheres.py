@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bodyscan.arrays import Array
 from bodyscan.errors import FailedWork
 from bodyscan.evaluation.sphere_search import find_spheres
 from bodyscan.evaluation.spheres import (
@@ -21,7 +22,9 @@ CENTRES = np.array(
 )
 
 
-def cap(centre, radius: float, count: int = 2000, noise: float = 0.0, seed: int = 0) -> np.ndarray:
+def cap(
+    centre: Array, radius: float, count: int = 2000, noise: float = 0.0, seed: int = 0
+) -> np.ndarray:
     """Points on the side that faces the camera, within 60 degrees of the way to it."""
     rng = np.random.default_rng(seed)
     height, turn = rng.uniform(0.5, 1.0, count), rng.uniform(0.0, 2.0 * np.pi, count)
@@ -37,7 +40,7 @@ def cap(centre, radius: float, count: int = 2000, noise: float = 0.0, seed: int 
     radius=st.floats(5.0, 200.0),
     seed=st.integers(0, 1000),
 )
-def test_an_exact_cap_gives_its_sphere(x, z, radius, seed):
+def test_an_exact_cap_gives_its_sphere(x: float, z: float, radius: float, seed: int) -> None:
     centre = np.array([x, -30.0, z])
     points = cap(centre, radius, seed=seed)
     free, held = fit_sphere(points), fit_sphere(points, radius)
@@ -49,7 +52,7 @@ def test_an_exact_cap_gives_its_sphere(x, z, radius, seed):
     assert mean_square(points, free) < 1e-9
 
 
-def test_eq_19_is_the_noise_squared():
+def test_eq_19_is_the_noise_squared() -> None:
     noise = 0.02
     found = measure_sphere(cap(CENTRES[0], 25.0, 20000, noise), 25.0)
     # Variance of 20000 draws: 1 percent; the fits take up 4 of 20000 freedoms.
@@ -59,7 +62,7 @@ def test_eq_19_is_the_noise_squared():
     assert found.fitted.radius == pytest.approx(25.0, abs=0.005)
 
 
-def test_a_given_radius_shows_what_a_fitted_one_hides():
+def test_a_given_radius_shows_what_a_fitted_one_hides() -> None:
     found = measure_sphere(cap(CENTRES[0], 25.5), 25.0)
     assert found.fitted.radius == pytest.approx(25.5, abs=1e-5)
     assert found.e_fitted < 1e-9
@@ -67,7 +70,7 @@ def test_a_given_radius_shows_what_a_fitted_one_hides():
     assert 1e-3 < found.e_given < 0.25
 
 
-def test_outliers_do_not_pull_the_fit_but_count_in_e():
+def test_outliers_do_not_pull_the_fit_but_count_in_e() -> None:
     points = cap(CENTRES[0], 25.0, 5000, 0.01)
     points[::100, 2] += 5.0
     found = measure_sphere(points, 25.0)
@@ -76,7 +79,7 @@ def test_outliers_do_not_pull_the_fit_but_count_in_e():
     assert 0.05 < found.e_given < 0.3
 
 
-def test_too_few_points_are_refused():
+def test_too_few_points_are_refused() -> None:
     with pytest.raises(FailedWork, match="too few"):
         fit_sphere(cap(CENTRES[0], 25.0, 20))
 
@@ -97,7 +100,7 @@ def range_image(noise: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])
-def test_spheres_are_found_in_reading_order(noise):
+def test_spheres_are_found_in_reading_order(noise: float) -> None:
     points = range_image(noise)
     normals = grid_normals(points.astype(np.float32)).astype(float)
     found = find_spheres(points, normals, 25.0, 5)
@@ -105,14 +108,14 @@ def test_spheres_are_found_in_reading_order(noise):
     assert np.allclose(np.stack([s.centre for s in found]), CENTRES, atol=0.05)
 
 
-def test_missing_spheres_are_missed():
+def test_missing_spheres_are_missed() -> None:
     points = range_image()
     normals = grid_normals(points.astype(np.float32)).astype(float)
     with pytest.raises(FailedWork, match="2 spheres"):
         find_spheres(points[:, :100], normals[:, :100], 25.0, 5)
 
 
-def test_scale_and_distances():
+def test_scale_and_distances() -> None:
     turned = CENTRES[:, [2, 0, 1]] * (1.0 + 200e-6) + 7.0
     found = centre_distances(turned, CENTRES)
     assert found.scale_ppm == pytest.approx(200.0, abs=1e-6)
@@ -120,7 +123,7 @@ def test_scale_and_distances():
     assert 0.012 < found.rms_mm < 0.025
 
 
-def test_distances_have_a_sign():
+def test_distances_have_a_sign() -> None:
     sphere = Sphere(np.array([0.0, 0.0, 400.0]), 25.0)
     assert sphere.distances(np.array([[0.0, 0.0, 374.0], [0.0, 0.0, 376.0]])) == pytest.approx(
         [1.0, -1.0]

@@ -25,7 +25,7 @@ def box_distance(points: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_distances_to_a_box(seed: int):
+def test_distances_to_a_box(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(LOW - 150.0, HIGH + 150.0, (200, 3))
     found = signed_distances(points, VERTICES, FACES)
@@ -33,7 +33,7 @@ def test_distances_to_a_box(seed: int):
     np.testing.assert_allclose(found, box_distance(points), atol=1e-4)
 
 
-def test_small_distances_keep_their_sign():
+def test_small_distances_keep_their_sign() -> None:
     points, normals = sample_surface(VERTICES, FACES, 2000)
     step = np.random.default_rng(1).uniform(0.001, 0.5, len(points)) * np.tile([1, -1], 1000)
     found = signed_distances(points + step[:, None] * normals, VERTICES, FACES)
@@ -42,7 +42,7 @@ def test_small_distances_keep_their_sign():
     assert np.mean(np.abs(found - step) < 1e-4) > 0.98
 
 
-def test_statistics():
+def test_statistics() -> None:
     found = deviation(np.array([0.0, 1.0, -1.0, 2.0]))
     assert found.count == 4
     assert found.bias_mm == pytest.approx(0.5)
@@ -51,7 +51,7 @@ def test_statistics():
     assert found.worst_mm == 2.0
 
 
-def test_samples_are_uniform_in_area():
+def test_samples_are_uniform_in_area() -> None:
     points, normals = sample_surface(VERTICES, FACES, 50_000)
     np.testing.assert_allclose(box_distance(points), 0.0, atol=1e-9)
     ends = np.mean(np.abs(normals[:, 2]) > 0.5)
@@ -59,7 +59,7 @@ def test_samples_are_uniform_in_area():
     assert ends == pytest.approx(40.0 / 220.0, abs=0.007)
 
 
-def test_coverage_needs_points_near_along_the_normal():
+def test_coverage_needs_points_near_along_the_normal() -> None:
     points, normals = sample_surface(VERTICES, FACES, 300_000, seed=5)
     assert coverage(points, VERTICES, FACES, samples=5000, spacing_mm=4.0) > 0.99
     lifted = points + 1.5 * normals

@@ -15,7 +15,7 @@ from bodyscan.export.body_format import BODY_FORMATS
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def test_a_new_exporter(tmp_path: Path):
+def test_a_new_exporter(tmp_path: Path) -> None:
     scan = make_scan(tmp_path / "scan")
     try:
         runpy.run_path(str(EXAMPLES / "new_exporter.py"))["main"](scan.folder, tmp_path / "out")
@@ -27,7 +27,9 @@ def test_a_new_exporter(tmp_path: Path):
     assert json.loads((tmp_path / "out" / "body.off.json").read_text())["units"] == "mm"
 
 
-def test_one_pair_triangulated(monkeypatch, capsys):
+def test_one_pair_triangulated(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.delenv("BODYSCAN_CAPTURES", raising=False)
     found = runpy.run_path(str(EXAMPLES / "triangulate_pair.py"))
     assert "mm off the board" in capsys.readouterr().out
@@ -39,7 +41,7 @@ def test_one_pair_triangulated(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
-def test_an_example_is_short_and_says_how_it_is_run(path: Path):
+def test_an_example_is_short_and_says_how_it_is_run(path: Path) -> None:
     text = path.read_text("utf-8")
     assert len(text.splitlines()) < 62
     assert text.startswith('"""')

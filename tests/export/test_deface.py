@@ -22,7 +22,7 @@ SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
 
 
 @pytest.fixture(scope="module")
-def body():
+def body() -> BodyMesh:
     """The free subject in the rig frame, 1633 mm tall; soles and a patch of the face not measured."""
     read = o3d.io.read_triangle_mesh(str(SUBJECT))
     vertices = np.asarray(read.vertices) * 1000.0 @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
@@ -41,30 +41,30 @@ def body():
 
 
 @pytest.fixture(scope="module")
-def neck(body):
+def neck(body: BodyMesh) -> Neck:
     return find_neck(body.vertices, body.faces)
 
 
-def records(mesh):
+def records(mesh: BodyMesh) -> list[bytes]:
     """Every vertex with all that it carries, as bytes."""
     parts = (mesh.vertices, mesh.normals, mesh.colours, mesh.sigma_mm)
     return [b"".join(part[k].tobytes() for part in parts) for k in range(len(mesh.vertices))]
 
 
-def below(mesh, height):
+def below(mesh: BodyMesh, height: float) -> list[tuple[bytes, bytes, bytes]]:
     """Records of the three corners of every face that lies below a height, in order."""
     every = records(mesh)
     faces = mesh.faces[(mesh.vertices[mesh.faces][..., 2] <= height).all(axis=1)]
     return [tuple(every[corner] for corner in face) for face in faces]
 
 
-def test_the_neck_is_between_chin_and_shoulders(body, neck):
+def test_the_neck_is_between_chin_and_shoulders(body: BodyMesh, neck: Neck) -> None:
     """Looked up on the subject: the chin's underside is near 1420 mm, the shoulders near 1350."""
     assert 1370.0 < neck.height_mm < 1425.0
     assert np.linalg.norm(neck.axis - np.median(body.vertices[:, :2], axis=0)) < 60.0
 
 
-def test_below_the_neck_every_bit_stays_and_above_nothing_does(body, neck):
+def test_below_the_neck_every_bit_stays_and_above_nothing_does(body: BodyMesh, neck: Neck) -> None:
     shared = deface(body, neck)
     kept = below(body, neck.height_mm)
     assert below(shared, neck.height_mm)[: len(kept)] == kept
@@ -79,7 +79,7 @@ def test_below_the_neck_every_bit_stays_and_above_nothing_does(body, neck):
     assert shape.volume_mm3 > 0
 
 
-def test_two_faces_give_one_head(body, neck):
+def test_two_faces_give_one_head(body: BodyMesh, neck: Neck) -> None:
     """Whoever the subject is, the head is the same: nothing of the face is left in it."""
     other = body.vertices.copy()
     face = (other[:, 2] > 1430.0) & (other[:, 0] > 60.0) & (np.abs(other[:, 1]) < 60.0)
@@ -89,7 +89,7 @@ def test_two_faces_give_one_head(body, neck):
     np.testing.assert_array_equal(deface(changed, neck).vertices, deface(body, neck).vertices)
 
 
-def test_the_head_is_smooth_and_faces_outwards(body, neck):
+def test_the_head_is_smooth_and_faces_outwards(body: BodyMesh, neck: Neck) -> None:
     shared = deface(body, neck)
     corners = shared.vertices[shared.faces]
     head = (corners[..., 2] > neck.height_mm + 20.0).all(axis=1)
@@ -99,7 +99,7 @@ def test_the_head_is_smooth_and_faces_outwards(body, neck):
     assert np.all(np.einsum("fc,fc->f", normals, outwards) > 0)
 
 
-def test_raised_hands_stay(body, neck):
+def test_raised_hands_stay(body: BodyMesh, neck: Neck) -> None:
     """A pillar beside the head, a separate piece above the neck, keeps every bit."""
     box = o3d.geometry.TriangleMesh.create_box(40.0, 40.0, 900.0)
     box.translate([0.0, 250.0, 900.0])
@@ -118,13 +118,13 @@ def test_raised_hands_stay(body, neck):
     assert set(records(both)[-size:]) <= set(records(deface(both, found)))
 
 
-def test_an_open_mesh_ends_at_the_neck(body, neck):
+def test_an_open_mesh_ends_at_the_neck(body: BodyMesh, neck: Neck) -> None:
     shared = deface(body.measured_part(), neck)
     assert shared.vertices[:, 2].max() <= neck.height_mm
     assert below(shared, neck.height_mm) == below(body.measured_part(), neck.height_mm)
 
 
-def test_arms_overhead_are_refused_and_not_taken_for_a_neck(body):
+def test_arms_overhead_are_refused_and_not_taken_for_a_neck(body: BodyMesh) -> None:
     """Two cylinders of a forearm's girth over the head: their narrowest is no neck."""
     parts = [(body.vertices, body.faces)]
     for side in (-60.0, 60.0):
@@ -140,7 +140,7 @@ def test_arms_overhead_are_refused_and_not_taken_for_a_neck(body):
         find_neck(np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces))
 
 
-def test_no_neck_no_export(body):
+def test_no_neck_no_export(body: BodyMesh) -> None:
     ball = o3d.geometry.TriangleMesh.create_sphere(500.0, 40)
     with pytest.raises(FailedWork, match="no neck"):
         find_neck(np.asarray(ball.vertices), np.asarray(ball.triangles).astype(np.int64))
@@ -148,7 +148,7 @@ def test_no_neck_no_export(body):
         deface(body, Neck(3000.0, np.zeros(2)))
 
 
-def test_exports_say_so(body, tmp_path):
+def test_exports_say_so(body: BodyMesh, tmp_path: Path) -> None:
     empty = BodyCloud(*(np.zeros((0, 3)) for _ in range(2)), *(np.zeros(0) for _ in range(3)))
     scan = StoredScan(empty, body, {"subject": "s", "calibration_id": "c"})
     export_scan(scan, tmp_path, ["ply"], ["full", "light", "open"], deface=True)

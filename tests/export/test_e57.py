@@ -32,7 +32,7 @@ def image(pair: str, seen: bool = True) -> RangeImage:
     return RangeImage(pair, CAMERA, points, grid_normals(points), sigma, grey)
 
 
-def test_points_pose_and_colour_come_back(tmp_path: Path):
+def test_points_pose_and_colour_come_back(tmp_path: Path) -> None:
     pye57 = pytest.importorskip("pye57")
     path = tmp_path / "raw.e57"
     one = image("p1-1")
@@ -52,7 +52,9 @@ def test_points_pose_and_colour_come_back(tmp_path: Path):
     assert file.get_header(0)["name"].value() == "p1-1"
 
 
-def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch):
+def test_without_the_library_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "pye57", None)
     with pytest.raises(BadInput, match=r"bodyscan\[e57\]"):
         write_e57(tmp_path / "raw.e57", [], {})

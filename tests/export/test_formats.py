@@ -23,6 +23,7 @@ from bodyscan.export.formats.stl import write_stl
 from bodyscan.export.scan import export_scan
 from bodyscan.fusion.storage import StoredScan
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_mesh
 from bodyscan.version import __version__
 
@@ -32,7 +33,7 @@ ORIGIN = Provenance("S-0042", "3f2a")
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20), st.integers(0, 6))
-def test_fixed_writes_what_python_writes(values: list[float], decimals: int):
+def test_fixed_writes_what_python_writes(values: list[float], decimals: int) -> None:
     text = join_columns([format_decimals(np.array(values), decimals), "\n"]).decode().split()
     assert len(text) == len(values)
     for mine, value in zip(text, values, strict=True):
@@ -46,13 +47,13 @@ def test_fixed_writes_what_python_writes(values: list[float], decimals: int):
 
 
 @given(st.lists(st.integers(0, 10**7), min_size=1, max_size=20))
-def test_whole_writes_what_python_writes(values: list[int]):
+def test_whole_writes_what_python_writes(values: list[int]) -> None:
     assert join_columns(["f ", format_integers(np.array(values)), "\n"]).decode() == "".join(
         f"f {value}\n" for value in values
     )
 
 
-def test_obj(tmp_path: Path):
+def test_obj(tmp_path: Path) -> None:
     mesh = ball()
     write_obj(tmp_path / "body.obj", mesh)
     rows = [line.split() for line in (tmp_path / "body.obj").read_text().splitlines()]
@@ -75,7 +76,7 @@ def test_obj(tmp_path: Path):
     np.testing.assert_allclose(colours, mesh.colours[order], atol=0.02)
 
 
-def test_stl(tmp_path: Path):
+def test_stl(tmp_path: Path) -> None:
     mesh = ball()
     write_stl(tmp_path / "body.stl", mesh)
     size = (tmp_path / "body.stl").stat().st_size
@@ -116,7 +117,7 @@ def accessor(document: dict, binary: bytes, number: int) -> np.ndarray:
     return values.reshape(-1, width)
 
 
-def test_glb_mesh(tmp_path: Path):
+def test_glb_mesh(tmp_path: Path) -> None:
     mesh = ball()
     write_glb(tmp_path / "body.glb", mesh)
     document, binary = glb_parts(tmp_path / "body.glb")
@@ -143,7 +144,7 @@ def test_glb_mesh(tmp_path: Path):
     assert seen.get_volume() > 0
 
 
-def test_glb_cloud(tmp_path: Path):
+def test_glb_cloud(tmp_path: Path) -> None:
     cloud = points()
     write_glb(tmp_path / "cloud.glb", cloud)
     document, binary = glb_parts(tmp_path / "cloud.glb")
@@ -155,7 +156,7 @@ def test_glb_cloud(tmp_path: Path):
 
 
 @pytest.mark.parametrize("suffix", [f".{name}" for name in MESH_FORMATS])
-def test_beside_each_mesh_stands_what_it_is(tmp_path: Path, suffix: str):
+def test_beside_each_mesh_stands_what_it_is(tmp_path: Path, suffix: str) -> None:
     mesh = ball()
     write_body(tmp_path / f"body{suffix}", mesh, ORIGIN)
     told = json.loads((tmp_path / f"body{suffix}.json").read_text())
@@ -172,7 +173,7 @@ def test_beside_each_mesh_stands_what_it_is(tmp_path: Path, suffix: str):
 
 
 @pytest.mark.parametrize("suffix", [f".{name}" for name in CLOUD_FORMATS])
-def test_beside_each_cloud_too(tmp_path: Path, suffix: str):
+def test_beside_each_cloud_too(tmp_path: Path, suffix: str) -> None:
     write_body(tmp_path / f"cloud{suffix}", points(), ORIGIN)
     told = json.loads((tmp_path / f"cloud{suffix}.json").read_text())
     assert told["kind"] == "cloud"
@@ -182,13 +183,15 @@ def test_beside_each_cloud_too(tmp_path: Path, suffix: str):
 @pytest.mark.parametrize(
     ("name", "body"), [("body.fbx", ball()), ("c.stl", points()), ("c", ball())]
 )
-def test_an_unknown_format_is_refused(tmp_path: Path, name: str, body):
+def test_an_unknown_format_is_refused(
+    tmp_path: Path, name: str, body: BodyCloud | BodyMesh
+) -> None:
     with pytest.raises(BadInput, match="cannot be written"):
         write_body(tmp_path / name, body, ORIGIN)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_same_body_gives_the_same_bytes(tmp_path: Path):
+def test_the_same_body_gives_the_same_bytes(tmp_path: Path) -> None:
     for folder in ("one", "other"):
         for name in MESH_FORMATS:
             write_body(tmp_path / folder / f"body.{name}", ball(), ORIGIN)
@@ -196,7 +199,7 @@ def test_the_same_body_gives_the_same_bytes(tmp_path: Path):
         assert path.read_bytes() == (tmp_path / "other" / path.name).read_bytes()
 
 
-def test_a_scan_in_several_versions(tmp_path: Path):
+def test_a_scan_in_several_versions(tmp_path: Path) -> None:
     scan = StoredScan(points(), ball(), {"subject": None, "calibration_id": "3f2a"})
     written = export_scan(scan, tmp_path, ["ply", "STL"], ["full", "open"])
     names = ["body.ply", "body.stl", "body-open.ply", "body-open.stl"]
@@ -211,7 +214,7 @@ def test_a_scan_in_several_versions(tmp_path: Path):
         export_scan(scan, tmp_path, ["ply"], ["heavy"])
 
 
-def test_in_the_body_frame_the_body_faces_x_over_the_origin(tmp_path: Path):
+def test_in_the_body_frame_the_body_faces_x_over_the_origin(tmp_path: Path) -> None:
     """A flat upright body, turned by 30 degrees and put aside: in its own frame it stands straight."""
     flat = ball()
     straight = flat.vertices * [1.0, 3.0, 1.0]

@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -29,14 +30,14 @@ SCAN = StoredScan(points(), ball(), {"subject": None, "calibration_id": "3f2a"})
 
 
 @pytest.fixture
-def registered():
+def registered() -> Iterator[None]:
     BODY_FORMATS.register("xyz", xyz_format.FORMAT)
     yield
     del BODY_FORMATS.registered["xyz"]
 
 
 @pytest.mark.usefixtures("registered")
-def test_it_is_exported_as_all_are(tmp_path: Path):
+def test_it_is_exported_as_all_are(tmp_path: Path) -> None:
     (written,) = export_scan(SCAN, tmp_path, ["XYZ"], ["full"])
     assert written == tmp_path / "body.xyz"
     np.testing.assert_allclose(np.loadtxt(written)[:, :3], ball().vertices, atol=6e-4)
@@ -49,13 +50,13 @@ def test_it_is_exported_as_all_are(tmp_path: Path):
 
 
 @pytest.mark.usefixtures("registered")
-def test_a_name_that_is_taken_is_refused():
+def test_a_name_that_is_taken_is_refused() -> None:
     for name in ("xyz", "ply"):
         with pytest.raises(ValueError, match=f"there is a format '{name}' already"):
             BODY_FORMATS.register(name, xyz_format.FORMAT)
 
 
-def test_a_format_that_there_is_not_is_named_with_those_there_are(tmp_path: Path):
+def test_a_format_that_there_is_not_is_named_with_those_there_are(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"'xyz'") as caught:
         export_scan(SCAN, tmp_path, ["xyz"])
     assert caught.value.remedy == "choose from glb, obj, ply, stl"
@@ -66,7 +67,7 @@ def test_a_format_that_there_is_not_is_named_with_those_there_are(tmp_path: Path
     assert not list(tmp_path.iterdir())
 
 
-def test_names_are_known_without_importing_what_writes_them():
+def test_names_are_known_without_importing_what_writes_them() -> None:
     code = (
         "import sys, bodyscan.jobs.pipeline as p; p.Pipeline(name='p', kind='fuse')\n"
         "print([m for m in ('numpy', 'cv2', 'pycolmap') if m in sys.modules])"
@@ -75,7 +76,7 @@ def test_names_are_known_without_importing_what_writes_them():
     assert done.stdout.strip() == "[]"
 
 
-def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path):
+def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path) -> None:
     make_scan(tmp_path / "scan")
     call = ("export", "scan", "--format", "xyz")
     done = run_with_file(tmp_path, xyz_format, "export/formats/xyz.py", *call)
@@ -84,14 +85,14 @@ def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path):
 
 
 @pytest.mark.usefixtures("registered")
-def test_the_command_says_which_formats_there_are(tmp_path: Path):
+def test_the_command_says_which_formats_there_are(tmp_path: Path) -> None:
     make_scan(tmp_path / "scan")
     done = CliRunner().invoke(app, ["export", str(tmp_path / "scan"), "--format", "xyzz"])
     assert "did you mean 'xyz'?" in str(done.exception)
     assert "glb, obj, ply, stl, xyz" in str(done.exception)
 
 
-def test_the_docs_have_every_format_with_what_it_holds():
+def test_the_docs_have_every_format_with_what_it_holds() -> None:
     text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
     rows = dict(re.findall(r"^\| `\.(\w+)` \| (.*?) \|", text, re.MULTILINE))
     assert set(rows) == set(BODY_FORMATS.names())

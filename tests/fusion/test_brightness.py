@@ -14,7 +14,7 @@ from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import FusionSettings
 
 
-def test_gains_undo_known_exposures():
+def test_gains_undo_known_exposures() -> None:
     true = np.array([1.0, 1.3, 0.7, 0.9])
     true /= np.exp(np.log(true).mean())
     ring = [
@@ -23,17 +23,17 @@ def test_gains_undo_known_exposures():
     np.testing.assert_allclose(gains(ring, 4) * true, 1.0, rtol=0.01)  # held back by a thousandth
 
 
-def test_a_pair_without_overlap_keeps_its_brightness():
+def test_a_pair_without_overlap_keeps_its_brightness() -> None:
     assert gains([], 3) == pytest.approx(np.ones(3))
 
 
-def test_a_ratio_of_too_few_spots_counts_for_nothing():
+def test_a_ratio_of_too_few_spots_counts_for_nothing() -> None:
     assert log_ratio(np.full(50, 100, np.uint8), np.full(50, 50.0, np.float32)) == (0.0, 0)
     ratio, spots = log_ratio(np.full(500, 100, np.uint8), np.full(500, 50.0, np.float32))
     assert (ratio, spots) == (pytest.approx(np.log(0.5)), 500)
 
 
-def test_no_seams_between_exposures(scan: Scan, cleaned: list[RangeImage]):
+def test_no_seams_between_exposures(scan: Scan, cleaned: list[RangeImage]) -> None:
     """A grey body whose pairs were exposed 0.6 to 1.4 times as long: one grey all over."""
     factors = np.linspace(0.6, 1.4, len(cleaned))
     images = [

@@ -22,7 +22,9 @@ def distances(scan: Scan, images: list[RangeImage]) -> np.ndarray:
     return np.abs(signed_distances(np.concatenate(points), scan.truth.vertices, scan.truth.faces))
 
 
-def test_floor_and_flying_pixels_go_and_the_body_stays(scan: Scan, cleaned: list[RangeImage]):
+def test_floor_and_flying_pixels_go_and_the_body_stays(
+    scan: Scan, cleaned: list[RangeImage]
+) -> None:
     before, after = distances(scan, scan.range_images), distances(scan, cleaned)
     body, kept = before < 6 * NOISE_MM, after < 6 * NOISE_MM
     # The scene holds a floor and about 1 % flying pixels.
@@ -34,7 +36,7 @@ def test_floor_and_flying_pixels_go_and_the_body_stays(scan: Scan, cleaned: list
     assert kept.sum() > 0.95 * body.sum()
 
 
-def test_only_the_scan_volume_is_kept(scan: Scan, cleaned: list[RangeImage]):
+def test_only_the_scan_volume_is_kept(scan: Scan, cleaned: list[RangeImage]) -> None:
     volume = load_rig().volume
     for image in cleaned:
         x, y, z = scan.rig_from_camera[image.pair].apply(image.points[image.valid].astype(float)).T
@@ -42,7 +44,7 @@ def test_only_the_scan_volume_is_kept(scan: Scan, cleaned: list[RangeImage]):
         assert z.min() >= volume.bottom_mm - 1e-2
 
 
-def test_inside_is_what_lies_in_the_cylinder(scan: Scan):
+def test_inside_is_what_lies_in_the_cylinder(scan: Scan) -> None:
     image, volume = scan.range_images[3], load_rig().volume
     placing = scan.rig_from_camera[image.pair]
     x, y, z = np.moveaxis(placing.apply(image.points.astype(float)), -1, 0)
@@ -54,7 +56,7 @@ def test_inside_is_what_lies_in_the_cylinder(scan: Scan):
     assert np.count_nonzero(found != expected) <= 2  # rounding, right at the boundary
 
 
-def test_pixels_stay_that_neighbours_agree_with():
+def test_pixels_stay_that_neighbours_agree_with() -> None:
     """Against a count of the neighbours of one pixel after the other."""
     rng = np.random.default_rng(8)
     depth = (1000.0 + 12.0 * rng.random((40, 50))).astype(np.float32)
@@ -74,7 +76,7 @@ def test_pixels_stay_that_neighbours_agree_with():
     np.testing.assert_array_equal(found, expected)
 
 
-def test_a_speckle_in_the_air_goes(scan: Scan, cleaned: list[RangeImage]):
+def test_a_speckle_in_the_air_goes(scan: Scan, cleaned: list[RangeImage]) -> None:
     image = cleaned[6]
     rows, columns = slice(100, 106), slice(40, 46)
     assert not image.valid[rows, columns].any()
@@ -90,7 +92,7 @@ def test_a_speckle_in_the_air_goes(scan: Scan, cleaned: list[RangeImage]):
     assert lenient.valid[rows, columns].sum() >= 12
 
 
-def test_the_images_given_are_not_changed(scan: Scan, cleaned: list[RangeImage]):
+def test_the_images_given_are_not_changed(scan: Scan, cleaned: list[RangeImage]) -> None:
     for before, after in zip(scan.range_images, cleaned, strict=True):
         assert before.pair == after.pair
         assert before.valid.sum() > after.valid.sum()
@@ -100,7 +102,7 @@ def test_the_images_given_are_not_changed(scan: Scan, cleaned: list[RangeImage])
         assert np.isnan(after.sigma_mm[~kept]).all()
 
 
-def test_an_image_of_nothing_stays_one(scan: Scan):
+def test_an_image_of_nothing_stays_one(scan: Scan) -> None:
     image = scan.range_images[0]
     nothing = np.full_like(image.sigma_mm, np.nan)
     empty = replace(image, sigma_mm=nothing, points=np.full_like(image.points, np.nan))
@@ -109,7 +111,7 @@ def test_an_image_of_nothing_stays_one(scan: Scan):
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-def test_threads_change_nothing(scan: Scan, cleaned: list[RangeImage], workers: int):
+def test_threads_change_nothing(scan: Scan, cleaned: list[RangeImage], workers: int) -> None:
     again = clean(scan.range_images[:4], scan.rig_from_camera, load_rig().volume, workers=workers)
     for one, other in zip(again, cleaned, strict=False):
         np.testing.assert_array_equal(one.points, other.points)

@@ -40,7 +40,7 @@ def seen_beside(further_mm: float) -> tuple[Samples, list[SmoothSurface], Eviden
 
 
 @pytest.mark.parametrize("further_mm", [-1.2, 0.0, 0.8])
-def test_near_walls_agree(further_mm: float):
+def test_near_walls_agree(further_mm: float) -> None:
     samples, surfaces, evidence = seen_beside(further_mm)
     own = np.arange(samples.starts[1])
     assert np.isin(evidence.index, own).all()
@@ -55,20 +55,20 @@ def test_near_walls_agree(further_mm: float):
 
 
 @pytest.mark.parametrize("further_mm", [3.0, -3.0, 40.0])
-def test_second_skins_and_what_is_seen_through_contradict(further_mm: float):
+def test_second_skins_and_what_is_seen_through_contradict(further_mm: float) -> None:
     samples, _, evidence = seen_beside(further_mm)
     assert not evidence.index.size
     assert len(evidence.against_index) > 0.6 * samples.starts[1]
 
 
-def test_a_wall_in_front_says_nothing():
+def test_a_wall_in_front_says_nothing() -> None:
     """Only that the second camera does not see what lies behind."""
     _, _, evidence = seen_beside(-40.0)
     assert not evidence.index.size
     assert not evidence.against_index.size
 
 
-def test_means_by_weight():
+def test_means_by_weight() -> None:
     samples, surfaces, evidence = seen_beside(0.8)
     nothing = compare(samples, surfaces[0], 0, 0.0, 0.0)
     cloud = average(samples, surfaces, [nothing, evidence], np.ones(2, np.float32))

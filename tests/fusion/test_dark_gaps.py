@@ -27,7 +27,7 @@ def skin_with_a_band(width: int, level: int = DARK) -> np.ndarray:
 
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("width", [2, 3, 5])
-def test_a_narrow_gap_is_found(width: int, turned: bool):
+def test_a_narrow_gap_is_found(width: int, turned: bool) -> None:
     grey = skin_with_a_band(width)
     found = dark_gaps(photographed(grey.T if turned else grey))
     found = found.T if turned else found
@@ -38,19 +38,19 @@ def test_a_narrow_gap_is_found(width: int, turned: bool):
 
 
 @pytest.mark.parametrize("width", [12, 30])
-def test_something_dark_and_wide_stays(width: int):
+def test_something_dark_and_wide_stays(width: int) -> None:
     assert not dark_gaps(photographed(skin_with_a_band(width))).any()
 
 
-def test_a_silhouette_before_a_dark_room_stays():
+def test_a_silhouette_before_a_dark_room_stays() -> None:
     grey = np.full((60, 80), DARK)
     grey[:, 30:] = SKIN
     assert not dark_gaps(photographed(grey)).any()
 
 
-def test_a_faint_line_stays():
+def test_a_faint_line_stays() -> None:
     assert not dark_gaps(photographed(skin_with_a_band(3, SKIN // 2 + 10))).any()
 
 
-def test_noise_on_something_dark_stays():
+def test_noise_on_something_dark_stays() -> None:
     assert not dark_gaps(photographed(np.full((200, 200), DARK), noise=5.0)).any()

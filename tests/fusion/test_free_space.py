@@ -23,7 +23,7 @@ def seen(depth: np.ndarray) -> RangeImage:
     return RangeImage("p", CAMERA, points, points, sigma, np.zeros(depth.shape, np.uint8))
 
 
-def test_a_wall_and_something_beyond_the_volume_are_seen_through_alike():
+def test_a_wall_and_something_beyond_the_volume_are_seen_through_alike() -> None:
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     body = abs(u - 160) < 60
     nothing = (v > 100) & (v < 120)

@@ -19,7 +19,7 @@ from bodyscan.settings import FusionSettings
 SETTINGS = FusionSettings(points=250_000)
 
 
-def test_the_cloud_lies_on_the_body(scan: Scan, cloud: BodyCloud):
+def test_the_cloud_lies_on_the_body(scan: Scan, cloud: BodyCloud) -> None:
     """The targets for full-size images; here there are four times fewer pixels to average."""
     found = deviation(signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces))
     assert abs(found.bias_mm) < 0.03
@@ -29,7 +29,7 @@ def test_the_cloud_lies_on_the_body(scan: Scan, cloud: BodyCloud):
     assert found.worst_mm < 5.0
 
 
-def test_as_many_points_as_asked_for(cloud: BodyCloud):
+def test_as_many_points_as_asked_for(cloud: BodyCloud) -> None:
     assert 0.9 * 250_000 < len(cloud.points) < 1.1 * 250_000
     spacing, _ = cKDTree(cloud.points).query(cloud.points[::7], k=2)
     # Even: voxels of 2.6 mm; the mean nearest neighbour of random points would be 1.3 mm with as
@@ -40,7 +40,7 @@ def test_as_many_points_as_asked_for(cloud: BodyCloud):
     assert high < 1.8 * middle
 
 
-def test_normals_look_outward(scan: Scan, cloud: BodyCloud):
+def test_normals_look_outward(scan: Scan, cloud: BodyCloud) -> None:
     np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1.0, atol=1e-5)
     nearest = scene_of(scan.truth).compute_closest_points(cloud.points.astype(np.float32))
     cosine = np.sum(nearest["primitive_normals"].numpy() * cloud.normals, axis=1)
@@ -49,7 +49,7 @@ def test_normals_look_outward(scan: Scan, cloud: BodyCloud):
     assert np.mean(cosine < 0.0) < 1e-4
 
 
-def test_what_the_pairs_could_see_is_covered(scan: Scan, cloud: BodyCloud):
+def test_what_the_pairs_could_see_is_covered(scan: Scan, cloud: BodyCloud) -> None:
     """Against what is left when each pair's exact, uncleaned points are asked for."""
     exact = np.concatenate(
         [
@@ -66,7 +66,7 @@ def test_what_the_pairs_could_see_is_covered(scan: Scan, cloud: BodyCloud):
     assert found > 0.9
 
 
-def test_sigma_is_honest(scan: Scan, cloud: BodyCloud):
+def test_sigma_is_honest(scan: Scan, cloud: BodyCloud) -> None:
     off = signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
     ratio = np.abs(off) / cloud.sigma_mm
     # The median of a standard normal's size is 0.67; what the window flattens adds to it.
@@ -74,7 +74,7 @@ def test_sigma_is_honest(scan: Scan, cloud: BodyCloud):
     assert np.median(cloud.sigma_mm) < 0.1
 
 
-def test_more_pairs_are_better(scan: Scan, cloud: BodyCloud):
+def test_more_pairs_are_better(scan: Scan, cloud: BodyCloud) -> None:
     off = signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
     assert cloud.pairs_seen.min() >= 1
     assert 3 <= cloud.pairs_seen.max() <= 12
@@ -84,13 +84,13 @@ def test_more_pairs_are_better(scan: Scan, cloud: BodyCloud):
 
 def test_the_same_images_give_the_same_bytes(
     scan: Scan, cleaned: list[RangeImage], cloud: BodyCloud
-):
+) -> None:
     again = merge(cleaned, scan.rig_from_camera, SETTINGS, workers=3).cloud
     for name in BodyCloud.__dataclass_fields__:
         assert getattr(again, name).tobytes() == getattr(cloud, name).tobytes()
 
 
-def test_small_misalignments_are_averaged(scan: Scan, cleaned: list[RangeImage]):
+def test_small_misalignments_are_averaged(scan: Scan, cleaned: list[RangeImage]) -> None:
     """Pairs off by 0.2 mm and 0.1 mrad, as calibration leaves them: no double surface."""
     rng = np.random.default_rng(5)
     moved = {
@@ -107,7 +107,7 @@ def test_small_misalignments_are_averaged(scan: Scan, cleaned: list[RangeImage])
     assert _share_of_doubles(cloud, off, 0.6) < 0.01
 
 
-def test_a_misplaced_pair_leaves_no_double_surface(scan: Scan, cleaned: list[RangeImage]):
+def test_a_misplaced_pair_leaves_no_double_surface(scan: Scan, cleaned: list[RangeImage]) -> None:
     """One pair 3 mm too far: where others see the same, one of the surfaces has to go."""
     shift = RigidTransform(np.eye(3), np.array([0.0, 0.0, 3.0]))
     moved = {**scan.rig_from_camera, "p1-2": scan.rig_from_camera["p1-2"] @ shift}
@@ -124,7 +124,7 @@ def _share_of_doubles(cloud: BodyCloud, off: np.ndarray, apart_mm: float) -> flo
     return float(np.sum(distance[:, -1] < 3.0) / len(cloud.points))
 
 
-def test_points_in_front_of_what_others_see_go(scan: Scan, cleaned: list[RangeImage]):
+def test_points_in_front_of_what_others_see_go(scan: Scan, cleaned: list[RangeImage]) -> None:
     """A patch that one pair puts 40 mm in front of the chest while others see the chest."""
     number = next(k for k, image in enumerate(cleaned) if image.pair == "p1-3")
     image = cleaned[number]
@@ -148,7 +148,7 @@ def test_points_in_front_of_what_others_see_go(scan: Scan, cleaned: list[RangeIm
     assert np.mean(distance < 3.0) < 0.05
 
 
-def test_nothing_to_merge_is_an_error(scan: Scan, cleaned: list[RangeImage]):
+def test_nothing_to_merge_is_an_error(scan: Scan, cleaned: list[RangeImage]) -> None:
     nothing = np.full_like(cleaned[0].sigma_mm, np.nan)
     image = RangeImage(
         "p1-1",
@@ -163,14 +163,14 @@ def test_nothing_to_merge_is_an_error(scan: Scan, cleaned: list[RangeImage]):
             merge(images, scan.rig_from_camera, SETTINGS)
 
 
-def test_few_points_are_all_kept(scan: Scan, cleaned: list[RangeImage]):
+def test_few_points_are_all_kept(scan: Scan, cleaned: list[RangeImage]) -> None:
     image = cleaned[3]
     cloud = merge([image], scan.rig_from_camera, FusionSettings(points=10_000_000)).cloud
     assert 0.9 * image.valid.sum() < len(cloud.points) <= image.valid.sum()
     assert (cloud.pairs_seen == 1).all()
 
 
-def test_coverage_of_the_truth_by_itself(scan: Scan):
+def test_coverage_of_the_truth_by_itself(scan: Scan) -> None:
     """The measure itself: a surface's own samples cover it, one half of them half of it."""
     points, _ = sample_surface(scan.truth.vertices, scan.truth.faces, 400_000, seed=3)
     args = scan.truth.vertices, scan.truth.faces

@@ -35,7 +35,7 @@ def between_the_thighs() -> tuple[np.ndarray, np.ndarray]:
     return np.stack([np.full_like(z, 500.0), np.zeros_like(z), z], axis=1), np.array([-1.0, 0, 0])
 
 
-def test_closed_manifold_one_piece_outward(scan: Scan, body: BodyMesh):
+def test_closed_manifold_one_piece_outward(scan: Scan, body: BodyMesh) -> None:
     found = topology(body.vertices, body.faces)
     assert found.closed
     assert found.manifold
@@ -51,7 +51,7 @@ def test_closed_manifold_one_piece_outward(scan: Scan, body: BodyMesh):
     assert len(self_intersections(body.vertices, body.faces)) <= 28
 
 
-def test_measured_vertices_lie_on_the_body(scan: Scan, body: BodyMesh):
+def test_measured_vertices_lie_on_the_body(scan: Scan, body: BodyMesh) -> None:
     measured = np.unique(body.faces[~body.filled])
     assert np.isfinite(body.sigma_mm[measured]).all()
     found = deviation(
@@ -63,7 +63,7 @@ def test_measured_vertices_lie_on_the_body(scan: Scan, body: BodyMesh):
     assert found.p95_mm < 1.0
 
 
-def test_normals_and_colours_belong_to_the_vertices(body: BodyMesh, cloud: BodyCloud):
+def test_normals_and_colours_belong_to_the_vertices(body: BodyMesh, cloud: BodyCloud) -> None:
     a, b, c = (body.vertices[body.faces[:, k]] for k in range(3))
     face_normals = np.cross(b - a, c - a)
     along = np.sum(face_normals[:, None] * body.normals[body.faces], axis=-1)
@@ -71,7 +71,7 @@ def test_normals_and_colours_belong_to_the_vertices(body: BodyMesh, cloud: BodyC
     assert abs(float(np.mean(body.colours)) - float(np.mean(cloud.colours))) < 20.0
 
 
-def test_made_up_faces_are_marked(scan: Scan, body: BodyMesh):
+def test_made_up_faces_are_marked(scan: Scan, body: BodyMesh) -> None:
     centres = body.vertices[body.faces].mean(axis=1)
     off = np.abs(signed_distances(centres, scan.truth.vertices, scan.truth.faces))
     assert 0.01 < body.filled.mean() < 0.15
@@ -81,7 +81,7 @@ def test_made_up_faces_are_marked(scan: Scan, body: BodyMesh):
     assert np.isnan(body.sigma_mm).any()
 
 
-def test_no_web_between_the_legs(scan: Scan, cloud: BodyCloud, body: BodyMesh):
+def test_no_web_between_the_legs(scan: Scan, cloud: BodyCloud, body: BodyMesh) -> None:
     start, way = between_the_thighs()
     without = mesh(cloud, MeshSettings(depth=7))
     # Poisson alone closes the gap, which no camera sees from the front; the back pole sees
@@ -90,7 +90,7 @@ def test_no_web_between_the_legs(scan: Scan, cloud: BodyCloud, body: BodyMesh):
     assert crossings(body, start, way).max() == 0
 
 
-def test_feet_stand_on_the_floor(cloud: BodyCloud, body: BodyMesh):
+def test_feet_stand_on_the_floor(cloud: BodyCloud, body: BodyMesh) -> None:
     """Nobody sees the soles; a surface that is only smooth bulges far into the floor."""
     some = slice(None, None, 4)
     smooth, _ = poisson(cloud.points[some], cloud.normals[some].astype(float), 8)
@@ -98,7 +98,7 @@ def test_feet_stand_on_the_floor(cloud: BodyCloud, body: BodyMesh):
     assert body.vertices[:, 2].min() > -4.0  # a cell of the octree is 7 mm
 
 
-def test_the_same_cloud_gives_the_same_bytes(scan: Scan, cloud: BodyCloud):
+def test_the_same_cloud_gives_the_same_bytes(scan: Scan, cloud: BodyCloud) -> None:
     some = BodyCloud(*(getattr(cloud, name)[::4] for name in BodyCloud.__dataclass_fields__))
     one, other = (
         mesh(
@@ -114,14 +114,14 @@ def test_the_same_cloud_gives_the_same_bytes(scan: Scan, cloud: BodyCloud):
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
 
 
-def test_a_body_clear_of_the_floor_needs_no_hints(cloud: BodyCloud):
+def test_a_body_clear_of_the_floor_needs_no_hints(cloud: BodyCloud) -> None:
     lifted = replace(cloud, points=cloud.points + np.array([0.0, 0.0, 200.0]))
     found = mesh(lifted, MeshSettings(depth=6))
     assert topology(found.vertices, found.faces).manifold
     assert found.vertices[:, 2].min() > 100.0
 
 
-def test_a_handful_of_points_is_an_error(cloud: BodyCloud):
+def test_a_handful_of_points_is_an_error(cloud: BodyCloud) -> None:
     few = BodyCloud(*(getattr(cloud, name)[:50] for name in BodyCloud.__dataclass_fields__))
     with pytest.raises(ScanFailed, match="too small"):
         mesh(few, MeshSettings())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import open3d as o3d
 import pytest
@@ -24,7 +26,7 @@ SETTINGS = ScanSettings(
 )
 
 
-def moved(truth: Truth, shift) -> Truth:
+def moved(truth: Truth, shift: list[float]) -> Truth:
     return Truth(truth.vertices + np.asarray(shift), truth.faces)
 
 
@@ -36,7 +38,7 @@ def joined(*truths: Truth) -> Truth:
     )
 
 
-def bar(start, end, radius: float) -> Truth:
+def bar(start: list[float], end: list[float], radius: float) -> Truth:
     """A round bar between two places."""
     made = o3d.geometry.TriangleMesh.create_cylinder(radius, 1.0, resolution=40)
     start, way = np.asarray(start, float), np.subtract(end, start)
@@ -46,7 +48,7 @@ def bar(start, end, radius: float) -> Truth:
     return Truth(vertices @ turn.T + start + way / 2, np.asarray(made.triangles).astype(np.int64))
 
 
-def ball(centre, radius: float) -> Truth:
+def ball(centre: list[float], radius: float) -> Truth:
     made = o3d.geometry.TriangleMesh.create_sphere(radius, resolution=40)
     return Truth(np.asarray(made.vertices) + centre, np.asarray(made.triangles).astype(np.int64))
 
@@ -69,7 +71,14 @@ def placings() -> dict[str, RigidTransform]:
     return {pair.name: looking(pair.nominal) for pair in RIG.pairs}
 
 
-def fused(images, *, placed=None, failed=None, volume: Volume = RIG.volume, empty=()) -> Scan:
+def fused(
+    images: list[RangeImage],
+    *,
+    placed: dict[str, RigidTransform] | None = None,
+    failed: dict[str, str] | None = None,
+    volume: Volume = RIG.volume,
+    empty: Sequence[RangeImage] = (),
+) -> Scan:
     """What `bodyscan scan` makes of range images, with a calibration good to 0.05 mm."""
     placed = placed or placings()
     sigmas = np.tile([2e-5] * 3 + [0.05] * 3, len(placed))
@@ -83,25 +92,25 @@ def said(scan: Scan) -> str:
     return " | ".join(scan.verdict.reasons)
 
 
-def test_a_good_scan(images):
+def test_a_good_scan(images: list[RangeImage]) -> None:
     verdict = fused(images).verdict
     assert (verdict.grade, verdict.reasons) == ("good", ())
 
 
-def test_nobody_in_the_volume(person):
+def test_nobody_in_the_volume(person: Truth) -> None:
     empty = photographed(moved(person, [5000.0, 0.0, 0.0]))
     with pytest.raises(ScanFailed, match="nobody stands in the scan volume"):
         fused(empty)
 
 
-def test_two_people(person):
+def test_two_people(person: Truth) -> None:
     both = joined(moved(person, [-230.0, 0.0, 0.0]), moved(person, [230.0, 0.0, 0.0]))
     scan = fused(photographed(both))
     assert scan.verdict.grade == "repeat"
     assert "two bodies" in said(scan)
 
 
-def test_what_always_stands_there_is_cut_away_by_an_empty_scan(person):
+def test_what_always_stands_there_is_cut_away_by_an_empty_scan(person: Truth) -> None:
     """A post beside the person: part of the model, unless a scan of the empty rig shows it."""
     post = ball([-350.0, 350.0, 1000.0], 120.0)
     with_post = photographed(joined(person, post))
@@ -114,14 +123,14 @@ def test_what_always_stands_there_is_cut_away_by_an_empty_scan(person):
     assert len(cut.cloud.points) > 0.9 * len(taken.cloud.points) - 3000
 
 
-def test_a_failed_pair_is_named(images):
+def test_a_failed_pair_is_named(images: list[RangeImage]) -> None:
     without_one = [image for image in images if image.pair != "p2-3"]
     scan = fused(without_one, failed={"p2-3": "bit03.png is missing"})
     assert scan.verdict.grade == "usable"
     assert "p2-3: bit03.png is missing" in said(scan)
 
 
-def test_half_the_pairs_give_half_a_body(images):
+def test_half_the_pairs_give_half_a_body(images: list[RangeImage]) -> None:
     """One pole of three: the other side is all filled, and the verdict says so."""
     one_pole = [image for image in images if image.pair in ("p2-2", "p2-3")]
     scan = fused(one_pole, failed={"p1-2": "is missing", "p3-2": "is missing"})
@@ -129,21 +138,21 @@ def test_half_the_pairs_give_half_a_body(images):
     assert "of the surface is filled" in said(scan)
 
 
-def test_cut_off_at_the_top_of_the_volume(images):
+def test_cut_off_at_the_top_of_the_volume(images: list[RangeImage]) -> None:
     low = RIG.volume.model_copy(update={"top_mm": 1500.0})
     scan = fused(images, volume=low)
     assert scan.verdict.grade == "usable"
     assert "cut off at the scan volume's top, 1500 mm" in said(scan)
 
 
-def test_hair_that_gives_no_data(images):
+def test_hair_that_gives_no_data(images: list[RangeImage]) -> None:
     placed = placings()
     scan = fused([without(image, placed[image.pair], 1500.0, 2000.0) for image in images])
     assert scan.verdict.grade == "usable"
     assert "the stature is a guess" in said(scan)
 
 
-def test_black_trousers(images):
+def test_black_trousers(images: list[RangeImage]) -> None:
     placed = placings()
     scan = fused([without(image, placed[image.pair], 350.0, 780.0) for image in images])
     assert scan.verdict.grade == "usable"
@@ -151,7 +160,7 @@ def test_black_trousers(images):
     assert "not in the mesh" in said(scan)  # shins and feet: no surface leads there
 
 
-def test_a_hand_that_touches_the_hip(person):
+def test_a_hand_that_touches_the_hip(person: Truth) -> None:
     touching = joined(person, bar([-10.0, 120.0, 850.0], [-10.0, 400.0, 850.0], 25.0))
     scan = fused(photographed(touching))
     assert scan.verdict.grade == "usable"
@@ -159,7 +168,7 @@ def test_a_hand_that_touches_the_hip(person):
     assert "on the right" not in said(scan)
 
 
-def test_the_calibration_of_another_rig(images):
+def test_the_calibration_of_another_rig(images: list[RangeImage]) -> None:
     rng = np.random.default_rng(3)
     other = {
         name: placing
@@ -171,7 +180,7 @@ def test_the_calibration_of_another_rig(images):
     assert "calibration" in said(scan)
 
 
-def test_two_pairs_exchanged(images):
+def test_two_pairs_exchanged(images: list[RangeImage]) -> None:
     """Their cables, or their folders: hardly anything overlaps, and what does overlaps well."""
     placed = placings()
     placed["p2-2"], placed["p2-3"] = placed["p2-3"], placed["p2-2"]
@@ -181,7 +190,7 @@ def test_two_pairs_exchanged(images):
     assert "exchanged" in said(scan)
 
 
-def test_a_person_who_stepped_aside(images):
+def test_a_person_who_stepped_aside(images: list[RangeImage]) -> None:
     """Twelve millimetres between one pole's turn and the next."""
     away = {
         name: RigidTransform(t.rotation, t.translation + [0.0, 12.0 * name.startswith("p3"), 0.0])
@@ -192,7 +201,7 @@ def test_a_person_who_stepped_aside(images):
     assert "moved" in said(scan)
 
 
-def test_alignment_takes_no_part_if_not_wanted(images):
+def test_alignment_takes_no_part_if_not_wanted(images: list[RangeImage]) -> None:
     placed = placings()
     known = PoseCovariance(tuple(placed), np.zeros((6 * len(placed), 6 * len(placed))))
     calibration = RigCalibration(RIG, {}, placed, known, {}, {}, ())

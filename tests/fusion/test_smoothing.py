@@ -72,7 +72,7 @@ def on_pixels(surface: SmoothSurface, values: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=10, deadline=None)
 @given(tilt_x=st.floats(-1.0, 1.0), tilt_y=st.floats(-1.0, 1.0))
-def test_a_plane_stays_exactly_itself(tilt_x: float, tilt_y: float):
+def test_a_plane_stays_exactly_itself(tilt_x: float, tilt_y: float) -> None:
     """Through lens distortion and skew: the inverse depth of a plane is what the fit is made for.
 
     Not quite affine in pixels, since the lens bends them; the quadratic takes up most of that.
@@ -85,7 +85,7 @@ def test_a_plane_stays_exactly_itself(tilt_x: float, tilt_y: float):
 
 
 @pytest.mark.parametrize(("radius", "bias_mm"), [(150.0, 0.003), (50.0, 0.006), (15.0, 0.065)])
-def test_curved_surfaces_are_not_flattened(radius: float, bias_mm: float):
+def test_curved_surfaces_are_not_flattened(radius: float, bias_mm: float) -> None:
     """A plane fit over 7 mm would be 4 mm^2 / radius off: 0.03, 0.08 and 0.3 mm."""
     _, points, normals = smoothed(image_of(sphere_depth(radius)))
     outward = points - [0.0, 0.0, DISTANCE + radius]
@@ -100,7 +100,7 @@ def test_curved_surfaces_are_not_flattened(radius: float, bias_mm: float):
     assert angle.max() < 150.0 * (3.5 / radius) ** 2 + 0.1
 
 
-def test_noise_goes_down_as_sigma_says():
+def test_noise_goes_down_as_sigma_says() -> None:
     noise_mm, normal = 0.3, np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
     surface, points, _ = smoothed(image_of(plane_depth(normal), noise_mm))
     distance = (points - [0.0, 0.0, DISTANCE]) @ normal
@@ -112,7 +112,7 @@ def test_noise_goes_down_as_sigma_says():
     assert 0.9 < np.std(distance / sigma) < 1.15
 
 
-def test_sigmas_that_promise_too_much_are_corrected():
+def test_sigmas_that_promise_too_much_are_corrected() -> None:
     depth = plane_depth(np.array([0.0, 0.0, 1.0]))
     honest, boastful = image_of(depth, 0.3), image_of(depth, 0.3)
     boastful.sigma_mm[:] /= 4.0
@@ -122,7 +122,7 @@ def test_sigmas_that_promise_too_much_are_corrected():
     np.testing.assert_allclose(np.median(other.sigma_mm), np.median(one.sigma_mm), rtol=0.03)
 
 
-def test_a_step_stays_sharp():
+def test_a_step_stays_sharp() -> None:
     """Two planes 12 mm apart meet along a column: neither bends towards the other."""
     depth = np.full(CAMERA.pixel_rays().shape[:2], DISTANCE)
     depth[:, 160:] += 12.0
@@ -137,7 +137,7 @@ def test_a_step_stays_sharp():
     assert weight[160] < 0.4 * weight[220]
 
 
-def test_wild_points_are_left_out():
+def test_wild_points_are_left_out() -> None:
     depth = plane_depth(np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0]))
     rng = np.random.default_rng(3)
     wild = rng.random(depth.shape) < 0.02
@@ -149,7 +149,7 @@ def test_wild_points_are_left_out():
     assert np.isnan(off[wild]).mean() > 0.9
 
 
-def test_small_holes_do_no_harm():
+def test_small_holes_do_no_harm() -> None:
     depth = sphere_depth(60.0)
     holes = np.random.default_rng(4).random(depth.shape) < 0.03
     surface, points, _ = smoothed(image_of(np.where(holes, np.nan, depth)))
@@ -161,7 +161,7 @@ def test_small_holes_do_no_harm():
     assert np.isnan(on_pixels(surface, surface.weight)[holes]).all()
 
 
-def test_points_are_numbered_row_by_row():
+def test_points_are_numbered_row_by_row() -> None:
     surface, points, _ = smoothed(image_of(sphere_depth(60.0)))
     there = surface.number >= 0
     assert (surface.number[there] == np.arange(len(points))).all()
@@ -171,7 +171,7 @@ def test_points_are_numbered_row_by_row():
     np.testing.assert_allclose(seen, np.stack([columns, rows], axis=-1), atol=1e-3)
 
 
-def test_a_window_cut_by_a_rim_is_fitted_exactly():
+def test_a_window_cut_by_a_rim_is_fitted_exactly() -> None:
     """A quadratic in the pixels fits a quadratic exactly, however much of the window is missing."""
     v, u = np.mgrid[:60, :60].astype(np.float32)
     truth = 3e-3 + 2e-6 * u - 3e-6 * v + 1e-8 * u * u - 2e-8 * u * v + 1.5e-8 * v * v
@@ -191,5 +191,5 @@ def test_a_window_cut_by_a_rim_is_fitted_exactly():
     assert np.median(rim) > 1.5 * inside.max()
 
 
-def test_an_image_of_nothing_gives_nothing():
+def test_an_image_of_nothing_gives_nothing() -> None:
     assert smooth(image_of(np.full((240, 320), np.nan)), POSE, WINDOW_MM) is None

@@ -1,5 +1,7 @@
 """Results in a folder: none is mixed with another, nothing else is touched."""
 
+from pathlib import Path
+
 import pytest
 
 from bodyscan.errors import ResultError
@@ -7,7 +9,7 @@ from bodyscan.fusion.storage import clear, make_room
 
 
 @pytest.fixture
-def result(tmp_path):
+def result(tmp_path: Path) -> Path:
     for name in ("scan.json", "cloud.ply", "mesh.ply", "mesh.png", "report.html", "notes.txt"):
         (tmp_path / name).write_text("somebody's")
     (tmp_path / "export").mkdir()
@@ -16,7 +18,7 @@ def result(tmp_path):
     return tmp_path
 
 
-def test_a_result_is_not_replaced_unasked(result, tmp_path):
+def test_a_result_is_not_replaced_unasked(result: Path, tmp_path: Path) -> None:
     with pytest.raises(ResultError, match="lies here already"):
         make_room(result, overwrite=False)
     make_room(result, overwrite=True)
@@ -25,12 +27,12 @@ def test_a_result_is_not_replaced_unasked(result, tmp_path):
     make_room(result, overwrite=False)
 
 
-def test_nothing_of_one_person_stays_beside_anothers(result):
+def test_nothing_of_one_person_stays_beside_anothers(result: Path) -> None:
     clear(result)
     assert sorted(path.name for path in result.iterdir()) == ["holiday.png", "notes.txt"]
 
 
-def test_a_folder_without_a_result_is_left_as_it_is(result):
+def test_a_folder_without_a_result_is_left_as_it_is(result: Path) -> None:
     (result / "scan.json").unlink()
     before = sorted(result.iterdir())
     clear(result)

@@ -39,7 +39,7 @@ def asked(cloud: BodyCloud, vertices: list[list[float]]) -> Support:
     return support(places, normals, cloud, cKDTree(cloud.points), REACH_MM)
 
 
-def test_a_vertex_over_a_plane_knows_how_far():
+def test_a_vertex_over_a_plane_knows_how_far() -> None:
     found = asked(cloud_of(sheet(), UP), [[-10.0, 0.0, 0.3], [-10.4, 2.0, -0.5], [-8.0, 1.0, 0.0]])
     np.testing.assert_allclose(found.shift_mm, [-0.3, 0.5, 0.0], atol=1e-6)
     np.testing.assert_allclose(found.spread_mm, 0.0, atol=1e-6)
@@ -47,12 +47,12 @@ def test_a_vertex_over_a_plane_knows_how_far():
 
 
 @pytest.mark.parametrize(("height", "measured"), [(0.9, True), (1.1, False), (-1.1, False)])
-def test_what_is_lifted_off_the_points_is_not_measured(height: float, measured: bool):
+def test_what_is_lifted_off_the_points_is_not_measured(height: float, measured: bool) -> None:
     # A quarter of the reach is the limit.
     assert asked(cloud_of(sheet(), UP), [[-10.0, 0.0, height]]).measured == [measured]
 
 
-def test_the_surface_ends_a_little_after_the_points():
+def test_the_surface_ends_a_little_after_the_points() -> None:
     beyond = np.arange(0.0, 5.1, 0.5)
     found = asked(cloud_of(sheet(), UP), [[x, 0.2, 0.0] for x in beyond])
     assert found.measured[beyond <= 2.0].all()
@@ -61,7 +61,7 @@ def test_the_surface_ends_a_little_after_the_points():
     assert found.shift_mm[-1] == 0.0
 
 
-def test_a_thin_cloud_still_measures_what_lies_between_its_points():
+def test_a_thin_cloud_still_measures_what_lies_between_its_points() -> None:
     cloud = cloud_of(sheet(spacing=3.5, size=40), UP)
     rng = np.random.default_rng(0)
     vertices = np.column_stack(
@@ -70,7 +70,7 @@ def test_a_thin_cloud_still_measures_what_lies_between_its_points():
     assert asked(cloud, vertices.tolist()).measured.all()
 
 
-def test_between_two_surfaces_that_disagree_nothing_is_measured():
+def test_between_two_surfaces_that_disagree_nothing_is_measured() -> None:
     """Two toes seen from above end in a gap; the mesh dips into it, near to points of both."""
     left = sheet()
     right = np.array([2.0, 0.0, 2.2]) + left * [-1.0, 1.0, 1.0]
@@ -79,7 +79,7 @@ def test_between_two_surfaces_that_disagree_nothing_is_measured():
     np.testing.assert_array_equal(found.measured, [False, True, True])
 
 
-def test_noise_that_the_sigmas_know_of_is_no_contradiction():
+def test_noise_that_the_sigmas_know_of_is_no_contradiction() -> None:
     rng = np.random.default_rng(0)
     noisy = sheet(spacing=0.7)
     noisy[:, 2] = rng.normal(0.0, 1.5, len(noisy))
@@ -89,7 +89,7 @@ def test_noise_that_the_sigmas_know_of_is_no_contradiction():
     assert asked(cloud_of(noisy, UP, sigma_mm=0.05), vertices.tolist()).measured.mean() < 0.3
 
 
-def test_a_point_that_faces_away_has_no_say_in_the_shift():
+def test_a_point_that_faces_away_has_no_say_in_the_shift() -> None:
     """The other side of a thin fold: only what faces as the vertex does can be its surface."""
     front, back = sheet(), sheet() - [0.0, 0.0, 2.0]
     normals = np.concatenate([np.tile(UP, (len(front), 1)), np.tile(-UP, (len(back), 1))])
@@ -102,7 +102,7 @@ def ball(radius: float) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(sphere.vertices), np.asarray(sphere.triangles).astype(np.int64)
 
 
-def test_a_surface_settles_on_its_points():
+def test_a_surface_settles_on_its_points() -> None:
     vertices, faces = ball(50.0)
     rng = np.random.default_rng(0)
     ways = rng.normal(size=(60_000, 3))
@@ -118,7 +118,7 @@ def test_a_surface_settles_on_its_points():
     assert np.abs(np.linalg.norm(moved, axis=1) - 50.0).max() < 0.03
 
 
-def test_no_face_folds_over():
+def test_no_face_folds_over() -> None:
     """Slivers are narrower than the moves of their corners."""
     vertices, faces = ball(50.0)
     rng = np.random.default_rng(0)

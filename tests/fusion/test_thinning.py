@@ -20,7 +20,7 @@ def cells(points: np.ndarray, voxel_mm: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("wanted", [20_000, 100_000])
-def test_as_many_as_wanted(wanted: int):
+def test_as_many_as_wanted(wanted: int) -> None:
     points = sphere(600_000)
     size = voxel_size_for(points, wanted)
     chosen = one_per_voxel(points, np.zeros(len(points), bool), size)
@@ -34,7 +34,7 @@ def test_as_many_as_wanted(wanted: int):
     size=st.floats(0.5, 50.0),
     seed=st.integers(0, 1000),
 )
-def test_one_from_each_voxel_and_the_best(count: int, size: float, seed: int):
+def test_one_from_each_voxel_and_the_best(count: int, size: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-40.0, 40.0, (count, 3)).astype(np.float32)
     poor = rng.random(count) < 0.5
@@ -48,14 +48,14 @@ def test_one_from_each_voxel_and_the_best(count: int, size: float, seed: int):
         assert poor[(where == where[index]).all(axis=1)].all()
 
 
-def test_small_voxels_in_a_large_box():
+def test_small_voxels_in_a_large_box() -> None:
     """More blocks of voxels than a table holds: they become larger, and the choice stays."""
     points = np.concatenate([sphere(2000), sphere(2000, seed=1) + np.float32(3000.0)])
     chosen = one_per_voxel(points, np.zeros(len(points), bool), 1.0)
     assert len(chosen) == len(np.unique(cells(points, 1.0), axis=0))
 
 
-def test_evenly_spread():
+def test_evenly_spread() -> None:
     points = sphere(600_000)
     size = voxel_size_for(points, 40_000)
     thin = points[one_per_voxel(points, np.zeros(len(points), bool), size)]

@@ -26,7 +26,7 @@ def pixels_of(camera: Camera) -> np.ndarray:
 
 
 @given(cameras)
-def test_projecting_a_ray_gives_its_pixel_back(camera):
+def test_projecting_a_ray_gives_its_pixel_back(camera: Camera) -> None:
     pixels = pixels_of(camera)
     again = camera.project(camera.rays(pixels) * 1234.5)
     # Newton's method has converged to rounding: 1e-8 px is far below any corner's noise.
@@ -34,7 +34,7 @@ def test_projecting_a_ray_gives_its_pixel_back(camera):
 
 
 @given(cameras)
-def test_distortion_is_that_of_equations_3_to_5(camera):
+def test_distortion_is_that_of_equations_3_to_5(camera: Camera) -> None:
     points = camera.rays(pixels_of(camera)).reshape(-1, 3) * 700.0
     ideal = points @ camera.matrix.T
     u, v = (ideal[:, :2] / ideal[:, 2:]).T
@@ -47,7 +47,7 @@ def test_distortion_is_that_of_equations_3_to_5(camera):
 
 
 @given(cameras)
-def test_shearing_makes_it_opencvs_camera(camera):
+def test_shearing_makes_it_opencvs_camera(camera: Camera) -> None:
     points = camera.rays(pixels_of(camera)).reshape(-1, 3) * 700.0
     matrix = camera.matrix
     matrix[0, 1] = 0.0

@@ -25,7 +25,7 @@ def pixels_in(table: Table, points: np.ndarray) -> np.ndarray:
 
 @patiently
 @given(cameras, st.integers(0, 2**32 - 1))
-def test_the_table_projects_as_the_camera_does(camera, seed):
+def test_the_table_projects_as_the_camera_does(camera: Camera, seed: int) -> None:
     size = np.array([camera.width, camera.height])
     pixels = np.random.default_rng(seed).uniform(-0.5, size - 0.5, (60, 2))
     points = camera.rays(np.concatenate([pixels, pixels_of(camera)])) * 1234.5
@@ -34,7 +34,7 @@ def test_the_table_projects_as_the_camera_does(camera, seed):
 
 
 @pytest.mark.parametrize("camera", [SCANNER, WIDE])
-def test_a_scanners_table_is_finer_than_asked(camera):
+def test_a_scanners_table_is_finer_than_asked(camera: Camera) -> None:
     pixels = np.random.default_rng(0).uniform(0.0, [1279.0, 1023.0], (500, 2))
     found = pixels_in(projection_table(camera), camera.rays(pixels))
     assert np.abs(found - pixels).max() < 2e-4  # 1e-4 at the places it was fitted to
@@ -42,7 +42,7 @@ def test_a_scanners_table_is_finer_than_asked(camera):
 
 @patiently
 @given(cameras)
-def test_what_lies_beside_the_image_has_no_pixel_in_it(camera):
+def test_what_lies_beside_the_image_has_no_pixel_in_it(camera: Camera) -> None:
     u, v = np.meshgrid([-30.0, 320.0, 670.0], [-30.0, 240.0, 510.0])
     beside = np.delete(np.stack([u, v], axis=-1).reshape(-1, 2), 4, axis=0)
     rays = np.concatenate([camera.rays(beside), [[9.0, 0.0, 1.0], [0.0, -1e6, 1.0]]])
@@ -51,7 +51,7 @@ def test_what_lies_beside_the_image_has_no_pixel_in_it(camera):
     assert not inside.all(axis=1).any()
 
 
-def test_where_the_lens_folds_back_nothing_is_seen():
+def test_where_the_lens_folds_back_nothing_is_seen() -> None:
     ray = np.array([[np.tan(np.radians(60.0)), 0.0, 1.0]])
     assert 0.0 < WIDE.project(ray)[0, 0] < 1279.0
     assert np.all(pixels_in(projection_table(WIDE), ray) < -0.5)
@@ -81,7 +81,7 @@ def test_a_lens_that_folds_within_the_picture_has_no_rays_beyond_and_shows_nothi
 
 @patiently
 @given(cameras)
-def test_slopes_are_derivatives_of_the_projection(camera):
+def test_slopes_are_derivatives_of_the_projection(camera: Camera) -> None:
     rays = camera.rays(pixels_of(camera))
     table = projection_table(camera)
     found = np.array([slopes(table, x, y) for x, y, _ in rays]).reshape(-1, 2, 2)
@@ -92,7 +92,7 @@ def test_slopes_are_derivatives_of_the_projection(camera):
 
 @patiently
 @given(cameras, st.integers(0, 479))
-def test_rays_through_pixels_are_those_of_the_camera(camera, first):
+def test_rays_through_pixels_are_those_of_the_camera(camera: Camera, first: int) -> None:
     wanted = np.random.default_rng(first).random((min(12, 480 - first), 640)) < 0.1
     rays = rays_through(ray_table(camera), wanted, first)
     rows, columns = np.nonzero(wanted)
@@ -101,7 +101,7 @@ def test_rays_through_pixels_are_those_of_the_camera(camera, first):
     assert np.all(rays[:, 2] == 1.0)
 
 
-def test_equal_cameras_share_their_tables():
+def test_equal_cameras_share_their_tables() -> None:
     again = Camera(1510.0, 1512.0, -0.5, 645.0, 508.0, Radial(-0.1, 0.05), 1280, 1024)
     assert projection_table(SCANNER) is projection_table(again)
     other = SCANNER.moved(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1e-3, 0.0]))

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.least_squares import (
     EXACT,
     Block,
     Noise,
+    Solution,
     StackedEquations,
     minimize,
     minimize_each,
@@ -24,40 +28,46 @@ PLAIN = Noise("measured")
 ROBUST = Noise("measured", cauchy=3.0)
 
 
-def decay(state):
+def decay(state: Array) -> Array:
     """a exp(-b t) + c."""
     with np.errstate(over="ignore"):
         return state[0] * np.exp(-state[1] * TIME) + state[2]
 
 
-def decay_jacobian(state):
+def decay_jacobian(state: Array) -> Array:
     fall = np.exp(-state[1] * TIME)
     return np.column_stack([fall, -state[0] * TIME * fall, np.ones_like(TIME)])
 
 
-def add(state, step):
+def add(state: Array, step: Array) -> Array:
     return state + step
 
 
-def fit(measured, start, noise=PLAIN, jacobian=decay_jacobian, **options):
-    def blocks(state):
+def fit(
+    measured: Array,
+    start: Array | list[float],
+    noise: Noise = PLAIN,
+    jacobian: Callable[..., Any] = decay_jacobian,
+    **options: Any,
+) -> Solution:
+    def blocks(state: Array) -> list[Block]:
         return [Block(decay(state) - measured, lambda: jacobian(state), slice(0, 3), noise)]
 
     return minimize(np.asarray(start, float), blocks, add, unknowns=3, **options)
 
 
-def noisy(seed, sigma=0.01):
+def noisy(seed: int, sigma: float = 0.01) -> Array:
     return decay(TRUE) + np.random.default_rng(seed).normal(0.0, sigma, len(TIME))
 
 
-def test_the_minimum_of_exact_data_is_the_truth():
+def test_the_minimum_of_exact_data_is_the_truth() -> None:
     solution = fit(decay(TRUE), [1.0, 1.5, 0.0])
     assert np.allclose(solution.state, TRUE, atol=1e-9)
     assert solution.report.converged
 
 
-def test_rosenbrocks_valley_is_followed_to_its_end():
-    def blocks(state):
+def test_rosenbrocks_valley_is_followed_to_its_end() -> None:
+    def blocks(state: Array) -> list[Block]:
         x, y = state
         residuals = np.array([10.0 * (y - x * x), 1.0 - x])
         jacobian = np.array([[-20.0 * x, 10.0], [-1.0, 0.0]])
@@ -68,10 +78,10 @@ def test_rosenbrocks_valley_is_followed_to_its_end():
     assert solution.report.cost_before == pytest.approx(24.2)
 
 
-def test_a_start_from_which_undamped_steps_run_away_is_recovered():
+def test_a_start_from_which_undamped_steps_run_away_is_recovered() -> None:
     """arctan: Newton's steps from |x| > 1.39 grow without limit."""
 
-    def blocks(state):
+    def blocks(state: Array) -> list[Block]:
         slope = 1.0 / (1.0 + state**2)
         return [Block(np.arctan(state), lambda: slope[:, None], slice(0, 1), EXACT)]
 
@@ -80,10 +90,10 @@ def test_a_start_from_which_undamped_steps_run_away_is_recovered():
     assert solution.report.converged
 
 
-def test_states_without_finite_residuals_are_stepped_back_from():
+def test_states_without_finite_residuals_are_stepped_back_from() -> None:
     """log x, minimum at x = 1: an undamped step from 5 goes to a negative x."""
 
-    def blocks(state):
+    def blocks(state: Array) -> list[Block]:
         with np.errstate(invalid="ignore"):
             value = np.log(state)
         return [Block(value, lambda: 1.0 / state[:, None], slice(0, 1), EXACT)]
@@ -92,7 +102,7 @@ def test_states_without_finite_residuals_are_stepped_back_from():
     assert solution.state[0] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_the_covariance_is_what_many_repetitions_scatter_by():
+def test_the_covariance_is_what_many_repetitions_scatter_by() -> None:
     fits = [fit(noisy(seed), TRUE) for seed in range(400)]
     scatter = np.cov(np.stack([one.state for one in fits]).T)
     said = np.mean([one.variance * one.covariance for one in fits], axis=0)
@@ -103,7 +113,7 @@ def test_the_covariance_is_what_many_repetitions_scatter_by():
     )
 
 
-def test_outliers_lose_their_weight_and_do_not_move_the_fit():
+def test_outliers_lose_their_weight_and_do_not_move_the_fit() -> None:
     measured = noisy(1)
     measured[::10] += 1.0
     plain, robust = fit(measured, TRUE), fit(measured, TRUE, ROBUST)
@@ -115,19 +125,19 @@ def test_outliers_lose_their_weight_and_do_not_move_the_fit():
     assert np.median(weights) > 0.8
 
 
-def test_neighbouring_residuals_of_a_group_share_one_weight():
+def test_neighbouring_residuals_of_a_group_share_one_weight() -> None:
     residuals = np.array([0.1, 5.0, 0.1, -0.1])
     weights = Noise("corners", group=2, cauchy=2.0).weights(residuals)
     assert weights[0] == weights[1] < 0.2
     assert weights[2] == weights[3] > 0.9
 
 
-def test_kinds_of_residuals_are_each_weighed_by_their_own_spread():
+def test_kinds_of_residuals_are_each_weighed_by_their_own_spread() -> None:
     """One coarse and one fine instrument for one number: the mean goes by the fine one."""
     rng = np.random.default_rng(4)
     coarse, fine = 5.0 + rng.normal(0, 1.0, 200), 5.0 + rng.normal(0, 0.01, 200)
 
-    def blocks(state):
+    def blocks(state: Array) -> list[Block]:
         ones = np.ones((200, 1))
         return [
             Block(state - coarse, lambda: ones, slice(0, 1), Noise("coarse", cauchy=4.0)),
@@ -140,10 +150,10 @@ def test_kinds_of_residuals_are_each_weighed_by_their_own_spread():
     assert np.sqrt(solution.covariance[0, 0]) == pytest.approx(0.01 / np.sqrt(200), rel=0.3)
 
 
-def test_a_prior_holds_what_the_data_leave_open():
+def test_a_prior_holds_what_the_data_leave_open() -> None:
     """Two unknowns of which only the sum is measured."""
 
-    def blocks(state):
+    def blocks(state: Array) -> list[Block]:
         return [
             Block(state.sum() - np.array([3.0]), lambda: np.ones((1, 2)), slice(0, 2), EXACT, 0.01),
             Block((state - [1.0, 1.0]) / 0.5, lambda: np.eye(2) / 0.5, slice(0, 2), EXACT),
@@ -156,7 +166,7 @@ def test_a_prior_holds_what_the_data_leave_open():
     assert across @ solution.covariance @ across == pytest.approx(2 * 0.5**2, rel=0.01)
 
 
-def test_blocks_that_touch_few_columns_give_what_one_dense_block_gives():
+def test_blocks_that_touch_few_columns_give_what_one_dense_block_gives() -> None:
     rng = np.random.default_rng(0)
     shared, own = rng.normal(size=(4, 20, 2)), rng.normal(size=(4, 20, 3))
     measured = rng.normal(size=(4, 20))
@@ -166,12 +176,12 @@ def test_blocks_that_touch_few_columns_give_what_one_dense_block_gives():
     for k, jacobian in enumerate(jacobians):
         dense[20 * k : 20 * k + 20, columns[k]] = jacobian
 
-    def sparse(state):
+    def sparse(state: Array) -> Iterator[Block]:
         for k, jacobian in enumerate(jacobians):
             residuals = jacobian @ state[columns[k]] - measured[k]
             yield Block(residuals, lambda j=jacobian: j, columns[k], ROBUST)
 
-    def whole(state):
+    def whole(state: Array) -> list[Block]:
         return [Block(dense @ state - measured.ravel(), lambda: dense, slice(0, 14), ROBUST)]
 
     by_blocks, at_once = (minimize(np.zeros(14), f, add, unknowns=14) for f in (sparse, whole))
@@ -179,21 +189,21 @@ def test_blocks_that_touch_few_columns_give_what_one_dense_block_gives():
     assert np.allclose(by_blocks.covariance, at_once.covariance, atol=1e-12)
 
 
-def test_a_fit_cut_short_says_so():
+def test_a_fit_cut_short_says_so() -> None:
     report = fit(noisy(2), [0.5, 3.0, 1.0], steps=2).report
     assert (report.ending, report.steps, report.converged) == ("out of steps", 2, False)
     assert report.cost_after < report.cost_before
 
 
-def test_a_wrong_jacobian_is_reported_as_stuck():
+def test_a_wrong_jacobian_is_reported_as_stuck() -> None:
     report = fit(noisy(3), [1.0, 1.5, 0.0], jacobian=lambda state: -decay_jacobian(state)).report
     assert report.ending == "stuck"
 
 
-def test_steps_that_are_refused_ask_for_no_jacobian():
+def test_steps_that_are_refused_ask_for_no_jacobian() -> None:
     asked = []
 
-    def jacobian(state):
+    def jacobian(state: Array) -> Array:
         asked.append(state)
         return decay_jacobian(state)
 
@@ -201,7 +211,7 @@ def test_steps_that_are_refused_ask_for_no_jacobian():
     assert len(asked) <= solution.report.steps + 1
 
 
-def test_the_jacobian_of_these_tests_is_that_of_their_residuals():
+def test_the_jacobian_of_these_tests_is_that_of_their_residuals() -> None:
     state, step = np.array([1.3, 0.9, 0.2]), 1e-6
     differences = [
         (decay(state + step * unit) - decay(state - step * unit)) / (2 * step) for unit in np.eye(3)
@@ -216,19 +226,19 @@ class Many:
     measured: np.ndarray
     weights: np.ndarray
 
-    def equations(self, states):
+    def equations(self, states: Array) -> StackedEquations:
         residuals = np.stack([decay(state) for state in states]) - self.measured
         jacobians = np.stack([decay_jacobian(state) for state in states])
         return StackedEquations.of(residuals, jacobians, self.weights)
 
 
-def many(count=5):
+def many(count: int = 5) -> Many:
     rng = np.random.default_rng(6)
     measured = np.stack([noisy(seed, 0.003 * (1 + seed)) for seed in range(count)])
     return Many(measured, (rng.random(measured.shape) < 0.8).astype(float))
 
 
-def test_many_problems_at_once_come_out_as_one_by_one():
+def test_many_problems_at_once_come_out_as_one_by_one() -> None:
     problems, start = many(), np.tile([1.0, 1.5, 0.0], (5, 1))
     together = minimize_each(start, problems.equations, steps=40)
     assert together.converged.all()
@@ -238,7 +248,7 @@ def test_many_problems_at_once_come_out_as_one_by_one():
         assert np.allclose(together.state[k], single.state[0], atol=1e-6)
         seen = problems.weights[k] > 0.0
 
-        def blocks(state, k=k, seen=seen):
+        def blocks(state: Array, k: int = k, seen: Mask = seen) -> Iterator[Block]:
             residuals = (decay(state) - problems.measured[k])[seen]
             yield Block(residuals, lambda: decay_jacobian(state)[seen], slice(0, 3), PLAIN)
 
@@ -247,7 +257,7 @@ def test_many_problems_at_once_come_out_as_one_by_one():
         assert np.allclose(together.covariance()[k], whole.variance * whole.covariance, rtol=1e-3)
 
 
-def test_of_many_problems_those_cut_short_are_named():
+def test_of_many_problems_those_cut_short_are_named() -> None:
     problems = many()
     start = np.tile(TRUE, (5, 1))
     start[3] = [1.0, 2.0, 0.5]
@@ -255,7 +265,7 @@ def test_of_many_problems_those_cut_short_are_named():
     assert solution.converged.tolist() == [True, True, True, False, True]
 
 
-def test_unknowns_of_very_different_size_are_solved_and_inverted_alike():
+def test_unknowns_of_very_different_size_are_solved_and_inverted_alike() -> None:
     rng = np.random.default_rng(7)
     jacobian = rng.normal(size=(30, 4)) * [1e9, 1.0, 1e-4, 1e-8]
     matrix, truth = jacobian.T @ jacobian, np.array([1e-9, 1.0, 1e4, 1e8])
@@ -266,18 +276,18 @@ def test_unknowns_of_very_different_size_are_solved_and_inverted_alike():
     assert np.allclose((invert_scaled(matrix) * outer) @ (matrix / outer), np.eye(4), atol=1e-9)
 
 
-def test_what_nothing_ties_gets_the_shortest_solution_and_no_infinite_covariance():
+def test_what_nothing_ties_gets_the_shortest_solution_and_no_infinite_covariance() -> None:
     matrix = np.array([[4.0, 4.0], [4.0, 4.0]])
     assert np.allclose(solve_scaled(matrix, np.array([8.0, 8.0])), [1.0, 1.0])
     assert np.allclose(invert_scaled(matrix), np.full((2, 2), 1.0 / 16.0))
 
 
-def test_a_tall_product_in_small_blocks_is_the_product():
+def test_a_tall_product_in_small_blocks_is_the_product() -> None:
     left, right = np.random.default_rng(8).normal(size=(2, 1000, 5))
     assert np.allclose(gram(left, right), left.T @ right)
 
 
-def test_the_spread_is_a_standard_deviation_that_outliers_do_not_sway():
+def test_the_spread_is_a_standard_deviation_that_outliers_do_not_sway() -> None:
     values = np.random.default_rng(9).normal(0.0, 2.0, 20000)
     assert spread(values) == pytest.approx(2.0, rel=0.02)
     values[:2000] = 1e6

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from bodyscan.geometry.lenses.rational import Rational
 
 
 @given(cameras)
-def test_projecting_and_looking_back_undo_each_other(camera):
+def test_projecting_and_looking_back_undo_each_other(camera: Camera) -> None:
     pixels = pixels_of(camera)
     rays = camera.rays(pixels)
     # Newton's method has converged to rounding: 1e-8 px is far below any corner's noise.
@@ -27,7 +28,7 @@ def test_projecting_and_looking_back_undo_each_other(camera):
 
 
 @given(lenses())
-def test_newtons_method_in_the_plane_serves_every_lens(lens):
+def test_newtons_method_in_the_plane_serves_every_lens(lens: Radial) -> None:
     ideal = np.random.default_rng(0).uniform(-0.4, 0.4, (40, 2))
     assert np.allclose(Lens.undistort(lens, lens.distort(ideal)), ideal, rtol=0.0, atol=1e-12)
 
@@ -92,7 +93,7 @@ def test_opencv_projects_alike(lens: Lens) -> None:
 
 
 @given(cameras)
-def test_jacobians_are_derivatives(camera):
+def test_jacobians_are_derivatives(camera: Camera) -> None:
     points = camera.rays(pixels_of(camera)) * 1200.0
     by_parameter, by_point = camera.jacobians(points)
     assert by_parameter.shape == (len(points), 2, len(camera.parameter_names))
@@ -109,7 +110,7 @@ def test_jacobians_are_derivatives(camera):
 
 
 @given(cameras)
-def test_a_step_of_a_difference_is_small_in_the_image(camera):
+def test_a_step_of_a_difference_is_small_in_the_image(camera: Camera) -> None:
     points = camera.rays(pixels_of(camera))
     for step in np.diag(camera.difference_steps):
         moved = np.abs(camera.moved(step).project(points) - camera.project(points)).max()
@@ -117,7 +118,7 @@ def test_a_step_of_a_difference_is_small_in_the_image(camera):
 
 
 @given(cameras)
-def test_parameters_are_read_and_moved_by_name(camera):
+def test_parameters_are_read_and_moved_by_name(camera: Camera) -> None:
     named = dict(zip(camera.parameter_names, camera.parameters, strict=True))
     assert named["alpha"] == camera.alpha
     step = np.zeros(len(named))
@@ -127,12 +128,12 @@ def test_parameters_are_read_and_moved_by_name(camera):
 
 
 @given(cameras)
-def test_a_camera_is_read_as_it_was_written(camera):
+def test_a_camera_is_read_as_it_was_written(camera: Camera) -> None:
     assert from_fields(to_fields(camera)) == camera
 
 
 @given(lenses())
-def test_a_lens_of_opencvs_is_read_as_it_was_written(lens):
+def test_a_lens_of_opencvs_is_read_as_it_was_written(lens: Radial) -> None:
     try:
         coefficients = lens.opencv()
     except BadInput:
@@ -155,12 +156,12 @@ def fields() -> dict:
         ({"alpha": "600"}, "alpha of a camera is '600', not a number"),
     ],
 )
-def test_fields_of_no_camera_are_refused(changed, message):
+def test_fields_of_no_camera_are_refused(changed: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         from_fields(fields() | changed)
 
 
-def test_a_coefficient_left_out_is_named():
+def test_a_coefficient_left_out_is_named() -> None:
     damaged = fields()
     del damaged["k2"]
     with pytest.raises(ValueError, match="lacks or does not have k2"):

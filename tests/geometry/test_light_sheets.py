@@ -1,11 +1,17 @@
 """Every model of the light against its own derivatives, and against the chapter's planes."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sheet_models import MATRIX, MIDDLE, PINHOLE, STRIPES, models, moved
 
+from bodyscan.arrays import Array
+from bodyscan.geometry.bowed_sheets import BowedSheets
+from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.ray_depths import intersect_rays
 from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
@@ -31,13 +37,15 @@ def sliced(model: SmoothSheets, rays: np.ndarray, depth: np.ndarray) -> np.ndarr
 
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10_000))
-def test_derivatives_are_those_of_the_offset(seed):
+def test_derivatives_are_those_of_the_offset(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points, s = some_points(rng)
     for model in models(seed):
         offset = model.offset(points, model.at(s), parameters=True)
 
-        def by(change, step, model=model):
+        def by(
+            change: Callable[..., Any], step: float, model: BowedSheets | LensSheets = model
+        ) -> Array:
             return (change(step) - change(-step)) / (2.0 * step)
 
         for k, axis in enumerate(np.eye(3)):
@@ -59,7 +67,7 @@ def test_derivatives_are_those_of_the_offset(seed):
 
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10_000))
-def test_depth_and_its_slope(seed):
+def test_depth_and_its_slope(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points, _ = some_points(rng)
     rays, depth = points / points[:, 2:], points[:, 2]
@@ -74,7 +82,7 @@ def test_depth_and_its_slope(seed):
 
 @settings(max_examples=2, deadline=None)
 @given(st.integers(0, 10_000))
-def test_variance_is_that_of_sheets_drawn_from_the_covariance(seed):
+def test_variance_is_that_of_sheets_drawn_from_the_covariance(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points, _ = some_points(rng, 8)
     rays, depth = points / points[:, 2:], points[:, 2]
@@ -91,7 +99,7 @@ def test_variance_is_that_of_sheets_drawn_from_the_covariance(seed):
         assert np.all(np.abs(ratio[inside] - 1.0) < 0.25)
 
 
-def test_smooth_planes_are_planes():
+def test_smooth_planes_are_planes() -> None:
     model = next(m for m in models(4) if m.kind == "smooth-planes")
     index = np.arange(STRIPES + 1)
     planes = model.tangent_planes(index)
@@ -106,7 +114,7 @@ def test_smooth_planes_are_planes():
     assert np.allclose(model.depth(rays, s)[near], chapter.depth(rays, s)[near], rtol=1e-9)
 
 
-def test_a_lens_without_distortion_is_the_two_by_four_matrix():
+def test_a_lens_without_distortion_is_the_two_by_four_matrix() -> None:
     points, _ = some_points(np.random.default_rng(2))
     homogeneous = np.column_stack([points, np.ones(len(points))])
     above, below = MATRIX @ homogeneous.T
@@ -114,7 +122,7 @@ def test_a_lens_without_distortion_is_the_two_by_four_matrix():
     assert abs(PINHOLE.projector_from_camera.apply(MIDDLE)[0]) < 1e-9
 
 
-def test_turning_a_projector_moves_its_axis_and_little_else():
+def test_turning_a_projector_moves_its_axis_and_little_else() -> None:
     turned = PINHOLE.turned(140.0)
     assert turned.parameters[1] == 140.0
     assert np.allclose(turned.projector_from_camera.inverse().translation,
@@ -124,7 +132,7 @@ def test_turning_a_projector_moves_its_axis_and_little_else():
     assert abs(PINHOLE.stripe(along) - 140.0) < 1e-6
 
 
-def test_no_depth_outside_the_stripes_or_behind():
+def test_no_depth_outside_the_stripes_or_behind() -> None:
     rays = np.tile([0.0, 0.0, 1.0], (3, 1))
     for model in models(3):
         assert np.isnan(model.depth(rays, np.array([-0.5, STRIPES + 0.5, np.nan]))).all()
@@ -133,7 +141,7 @@ def test_no_depth_outside_the_stripes_or_behind():
     assert np.isnan(PINHOLE.depth(steep, np.array([10.0]))).all()
 
 
-def test_arrays_hold_everything():
+def test_arrays_hold_everything() -> None:
     rng = np.random.default_rng(5)
     points, s = some_points(rng)
     rays = points / points[:, 2:]
@@ -148,7 +156,7 @@ def test_arrays_hold_everything():
         assert np.array_equal(again.depth(rays, s), sheets.depth(rays, s), equal_nan=True)
 
 
-def test_arrays_of_another_kind_are_refused():
+def test_arrays_of_another_kind_are_refused() -> None:
     bowed = models(0)[6]
     with pytest.raises(ValueError, match="smooth-planes"):
         from_arrays("smooth-planes", to_arrays(bowed), "horizontal")
@@ -156,7 +164,7 @@ def test_arrays_of_another_kind_are_refused():
         from_arrays("cones", to_arrays(bowed), "horizontal")
 
 
-def test_planes_have_slope_and_variance_between_two_and_at_the_last():
+def test_planes_have_slope_and_variance_between_two_and_at_the_last() -> None:
     planes = models(4)[4].tangent_planes(np.arange(STRIPES + 1))
     spread = np.zeros((STRIPES + 1, 4, 4))
     spread[:, 3, 3] = 0.01
@@ -176,7 +184,7 @@ def test_planes_have_slope_and_variance_between_two_and_at_the_last():
     assert np.isnan(chapter.variance_mm2(ray, np.array([149.5]))).all()
 
 
-def test_what_is_too_uncertain_is_not_measured():
+def test_what_is_too_uncertain_is_not_measured() -> None:
     model = models(2)[0]
     points, _ = some_points(np.random.default_rng(6))
     rays = points / points[:, 2:]
@@ -192,7 +200,7 @@ def test_what_is_too_uncertain_is_not_measured():
 
 
 @pytest.mark.parametrize("terms", [0, 1, 4, 5, 8])
-def test_a_lens_measures_rays_as_newtons_method_on_its_offset_does(terms):
+def test_a_lens_measures_rays_as_newtons_method_on_its_offset_does(terms: int) -> None:
     """Depth, its change and its variance in one go, against the ways all smooth sheets share."""
     model = moved(PINHOLE.with_lens(terms), np.random.default_rng(terms))
     rng = np.random.default_rng(13)

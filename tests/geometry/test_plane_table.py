@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from sheet_models import MIDDLE, STRIPES, models
 
+from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.plane_table import PlaneTable
@@ -13,7 +14,7 @@ from bodyscan.geometry.ray_depths import MOST_SIGMA, intersect_rays, triangulate
 
 
 @pytest.fixture(params=[3, 4, 5])
-def planes(request):
+def planes(request: pytest.FixtureRequest) -> BowedSheets:
     return next(model for model in models(request.param) if model.kind == "smooth-planes")
 
 
@@ -26,7 +27,7 @@ def some_rays(count: int) -> tuple[np.ndarray, np.ndarray]:
     return points / points[:, 2:], rng.uniform(0.0, STRIPES, count)
 
 
-def test_it_agrees_with_the_sheets(planes):
+def test_it_agrees_with_the_sheets(planes: BowedSheets) -> None:
     rays, s = some_rays(40_000)  # more than a chunk
     depth = planes.depth(rays, s)
     found, per_stripe, variance = PlaneTable.of(planes).measure(rays, s)
@@ -41,7 +42,7 @@ def test_it_agrees_with_the_sheets(planes):
     np.testing.assert_allclose(variance[near], planes.variance_mm2(rays, s, depth)[near], rtol=2e-3)
 
 
-def test_nothing_outside_the_stripes_or_behind(planes):
+def test_nothing_outside_the_stripes_or_behind(planes: BowedSheets) -> None:
     rays, _ = some_rays(300)
     table = PlaneTable.of(planes)
     for s in (-0.1, STRIPES + 0.1, np.nan):
@@ -53,7 +54,7 @@ def test_nothing_outside_the_stripes_or_behind(planes):
     )
 
 
-def test_measuring_takes_the_table(planes):
+def test_measuring_takes_the_table(planes: BowedSheets) -> None:
     rays, s = some_rays(500)
     found = intersect_rays(planes, rays.reshape(20, 25, 3), s.reshape(20, 25))
     assert found.depth.shape == (20, 25)
@@ -62,7 +63,7 @@ def test_measuring_takes_the_table(planes):
     np.testing.assert_array_equal(found.depth.ravel()[known], expected[known])
 
 
-def test_an_image_is_measured_as_its_rays_are(planes):
+def test_an_image_is_measured_as_its_rays_are(planes: BowedSheets) -> None:
     """The same points and sigmas as the sheets' own depth, slope and variance give, pixel by pixel."""
     rng = np.random.default_rng(4)
     shape = (CAMERA.height, CAMERA.width)

@@ -3,6 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform, adjoint, cross_matrix, rigid_fit
 
 vectors = arrays(float, 3, elements=st.floats(-3.0, 3.0))
@@ -11,31 +12,33 @@ transforms = st.builds(RigidTransform.from_rotation_vector, vectors, lengths)
 
 
 @given(transforms, arrays(float, (5, 3), elements=st.floats(-2000.0, 2000.0)))
-def test_inverse_undoes(a_from_b, points):
+def test_inverse_undoes(a_from_b: RigidTransform, points: Array) -> None:
     # 1e-9 mm: a thousand times the rounding of coordinates of a few metres.
     assert np.allclose(a_from_b.inverse().apply(a_from_b.apply(points)), points, atol=1e-9)
 
 
 @given(transforms, transforms, lengths)
-def test_composition_applies_right_to_left(a_from_b, b_from_c, point):
+def test_composition_applies_right_to_left(
+    a_from_b: RigidTransform, b_from_c: RigidTransform, point: Array
+) -> None:
     composed = (a_from_b @ b_from_c).apply(point)
     assert np.allclose(composed, a_from_b.apply(b_from_c.apply(point)), atol=1e-9)
 
 
 @given(transforms)
-def test_rotations_stay_rotations(a_from_b):
+def test_rotations_stay_rotations(a_from_b: RigidTransform) -> None:
     assert np.allclose(a_from_b.rotation @ a_from_b.rotation.T, np.eye(3), atol=1e-12)
     assert np.isclose(np.linalg.det(a_from_b.rotation), 1.0)
 
 
 @given(transforms)
-def test_matrix_round_trip(a_from_b):
+def test_matrix_round_trip(a_from_b: RigidTransform) -> None:
     again = RigidTransform.from_matrix(a_from_b.matrix)
     assert np.allclose(again.matrix, a_from_b.matrix, atol=1e-12)
 
 
 @given(transforms, vectors, vectors)
-def test_adjoint_carries_small_motions(a_from_b, turn, shift):
+def test_adjoint_carries_small_motions(a_from_b: RigidTransform, turn: Array, shift: Array) -> None:
     twist = 1e-6 * np.concatenate([turn, shift])
     in_b = a_from_b @ RigidTransform.identity().moved(twist)
     in_a = RigidTransform.identity().moved(adjoint(a_from_b) @ twist) @ a_from_b
@@ -44,12 +47,12 @@ def test_adjoint_carries_small_motions(a_from_b, turn, shift):
 
 
 @given(vectors, vectors)
-def test_skew_is_the_cross_product(a, b):
+def test_skew_is_the_cross_product(a: Array, b: Array) -> None:
     assert np.allclose(cross_matrix(a) @ b, np.cross(a, b))
 
 
 @given(transforms, st.integers(0, 2**32 - 1))
-def test_rigid_fit_recovers_the_transform(a_from_b, seed):
+def test_rigid_fit_recovers_the_transform(a_from_b: RigidTransform, seed: int) -> None:
     points = np.random.default_rng(seed).uniform(-500.0, 500.0, (12, 3))
     found = rigid_fit(points, a_from_b.apply(points))
     assert np.allclose(found.matrix, a_from_b.matrix, atol=1e-9)

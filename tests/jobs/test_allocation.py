@@ -22,11 +22,13 @@ NEEDS = Resources(threads=2, memory_mb=4000)
         (40, 1, 16, 100_000, (1, 2)),
     ],
 )
-def test_shares(jobs, workers, cores_, memory_mb, wanted):
+def test_shares(
+    jobs: int, workers: int | None, cores_: int, memory_mb: int, wanted: tuple[int, int]
+) -> None:
     shares = allocate(NEEDS, jobs, workers, cores_, memory_mb)
     assert (shares.workers, shares.threads) == wanted
 
 
-def test_this_machine_has_something():
+def test_this_machine_has_something() -> None:
     assert cores() >= 1
     assert 10 < free_memory_mb() < 1e8

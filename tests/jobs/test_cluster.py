@@ -6,6 +6,9 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cheap_job
 import pytest
@@ -16,7 +19,9 @@ from bodyscan.jobs.batch import run_batch
 from bodyscan.jobs.cluster import run_on_cluster
 
 
-def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(make_scans, tmp_path):
+def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(
+    make_scans: Callable[..., Any], tmp_path: Path
+) -> None:
     distributed = pytest.importorskip(
         "distributed", reason="dask.distributed is not installed (pip install '.[cluster]')"
     )
@@ -47,7 +52,9 @@ def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(make_scans, tmp_p
     assert begun == 6, "five jobs, one of them begun again on the other worker"
 
 
-def test_a_scheduler_that_is_not_there_is_named(make_scans, tmp_path, monkeypatch):
+def test_a_scheduler_that_is_not_there_is_named(
+    make_scans: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
     monkeypatch.setattr("bodyscan.jobs.cluster._TIMEOUT_S", 1)
     run = run_on_cluster("tcp://127.0.0.1:9", 1)
@@ -55,13 +62,13 @@ def test_a_scheduler_that_is_not_there_is_named(make_scans, tmp_path, monkeypatc
         run_batch(jobs_of(make_scans(a="nothing"), tmp_path / "out"), tmp_path / "out", run)
 
 
-def test_without_dask_the_extra_is_named(monkeypatch):
+def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(BodyscanError, match="bodyscan\\[cluster\\]"):
         run_on_cluster("tcp://127.0.0.1:9", 1)
 
 
-def _a_running_job(out) -> int:
+def _a_running_job(out: Path) -> int:
     """The process that holds the lock of a job in the middle of its work."""
     end = time.monotonic() + 30.0
     while time.monotonic() < end:

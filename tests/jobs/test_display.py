@@ -27,7 +27,7 @@ EVENTS = [
 ]  # fmt: skip
 
 
-def test_people_are_told_what_happened(capsys):
+def test_people_are_told_what_happened(capsys: pytest.CaptureFixture[str]) -> None:
     with screen() as listen:
         for event in EVENTS:
             listen(event)
@@ -39,7 +39,7 @@ def test_people_are_told_what_happened(capsys):
     assert "out/summary.csv" in said
 
 
-def test_programs_are_told_in_json(capsys):
+def test_programs_are_told_in_json(capsys: pytest.CaptureFixture[str]) -> None:
     with json_lines() as listen:
         for event in EVENTS:
             listen(event)
@@ -47,9 +47,9 @@ def test_programs_are_told_in_json(capsys):
     assert [{k: v for k, v in line.items() if k != "time"} for line in lines] == EVENTS
 
 
-def test_a_reader_that_goes_away_stops_nothing(monkeypatch):
+def test_a_reader_that_goes_away_stops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     class Gone:
-        def write(self, text):
+        def write(self, text: str) -> None:
             raise BrokenPipeError
 
     monkeypatch.setattr(sys, "stdout", Gone())
@@ -60,6 +60,6 @@ def test_a_reader_that_goes_away_stops_nothing(monkeypatch):
 @pytest.mark.parametrize(
     ("seconds", "said"), [(40.2, "40 s"), (600.0, "10 min"), (7200.0, "2.0 h")]
 )
-def test_times_are_said_in_words(seconds, said):
+def test_times_are_said_in_words(seconds: float, said: str) -> None:
     event = {"job": "a", "state": "done", "stages": ["scan"], "seconds": seconds}
     assert ending(event) == f"a: scan in {said}"

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 from cheap_batch import results, run_cheap
 
 
 @pytest.fixture
-def small_disk(tmp_path):
+def small_disk(tmp_path: Path) -> Iterator[None]:
     """A file system of 1 MB."""
     folder = tmp_path / "small"
     folder.mkdir()
@@ -24,7 +27,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def test_a_full_disk_is_said_and_survived(make_scans, small_disk, tmp_path):
+def test_a_full_disk_is_said_and_survived(make_scans: Any, small_disk: Any, tmp_path: Path) -> None:
     scans = make_scans(**{f"s{number}": "nothing" for number in range(3)})
     assert run_cheap(scans, tmp_path / "roomy").code == 0
     ballast = small_disk / "ballast"

@@ -5,7 +5,10 @@ from __future__ import annotations
 import csv
 import os
 import stat
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import cheap_job
 from cheap_batch import jobs_of, results, run_cheap
@@ -15,7 +18,9 @@ from bodyscan.jobs.supervision import JobProcess, supervise_job
 from bodyscan.settings import Resources
 
 
-def test_crashes_and_errors_take_nobody_with_them(make_scans, tmp_path):
+def test_crashes_and_errors_take_nobody_with_them(
+    make_scans: Callable[..., Any], tmp_path: Path
+) -> None:
     todo = {"crash": "crash", "exit": "exit", "raise": "raise", "once": "once", "good": "nothing"}
     scans = make_scans(**todo)
     done = run_cheap(scans, tmp_path / "out")
@@ -40,7 +45,7 @@ def test_crashes_and_errors_take_nobody_with_them(make_scans, tmp_path):
     assert rows["good"]["state"] == "done"
 
 
-def test_a_job_that_is_stuck_is_ended(make_scans, tmp_path):
+def test_a_job_that_is_stuck_is_ended(make_scans: Callable[..., Any], tmp_path: Path) -> None:
     (job,) = jobs_of(make_scans(a="sleep 60"), tmp_path)
     soon = job.pipeline.model_copy(update={"resources": Resources(limit_minutes=0.025)})
     write_job(job)
@@ -49,7 +54,9 @@ def test_a_job_that_is_stuck_is_ended(make_scans, tmp_path):
     assert "was stuck" in outcome.reason
 
 
-def test_a_scan_that_changes_while_it_is_read_is_not_believed(make_scans, tmp_path):
+def test_a_scan_that_changes_while_it_is_read_is_not_believed(
+    make_scans: Callable[..., Any], tmp_path: Path
+) -> None:
     scans = make_scans(moving="change", still="nothing")
     ends = run_cheap(scans, tmp_path / "out").endings()
     assert ends["moving"]["state"] == "set aside"
@@ -60,7 +67,9 @@ def test_a_scan_that_changes_while_it_is_read_is_not_believed(make_scans, tmp_pa
     assert run_cheap(scans, tmp_path / "out").code == 0
 
 
-def test_a_pipe_among_the_images_is_not_waited_for(make_scans, tmp_path):
+def test_a_pipe_among_the_images_is_not_waited_for(
+    make_scans: Callable[..., Any], tmp_path: Path
+) -> None:
     scans = make_scans(a="nothing", b="nothing")
     os.mkfifo(scans / "a" / "image2.txt")
     ends = run_cheap(scans, tmp_path / "out").endings()
@@ -68,7 +77,9 @@ def test_a_pipe_among_the_images_is_not_waited_for(make_scans, tmp_path):
     assert ends["b"]["state"] == "done"
 
 
-def test_odd_names_neither_hurt_nor_leak_out(make_scans, tmp_path):
+def test_odd_names_neither_hurt_nor_leak_out(
+    make_scans: Callable[..., Any], tmp_path: Path
+) -> None:
     names = ["a b", "it's \"quoted\"", "two\nlines", "Ωμέγα", "-rf", "..x", "$(touch x)", "[red]x",
              "summary.csv", "n" * 200]  # fmt: skip
     scans = make_scans(**dict.fromkeys(names, "nothing"))
@@ -82,7 +93,9 @@ def test_odd_names_neither_hurt_nor_leak_out(make_scans, tmp_path):
     assert all(name.isascii() and name.isprintable() and " " not in name for name in folders)
 
 
-def test_a_link_in_the_output_folder_is_not_followed(make_scans, tmp_path):
+def test_a_link_in_the_output_folder_is_not_followed(
+    make_scans: Callable[..., Any], tmp_path: Path
+) -> None:
     scans, elsewhere = make_scans(a="nothing", b="nothing"), tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "log.txt").write_text("theirs")
@@ -96,7 +109,9 @@ def test_a_link_in_the_output_folder_is_not_followed(make_scans, tmp_path):
     assert (elsewhere / "log.txt").read_text() == "theirs"
 
 
-def test_everything_is_readable_by_its_owner_alone(make_scans, tmp_path):
+def test_everything_is_readable_by_its_owner_alone(
+    make_scans: Callable[..., Any], tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     assert run_cheap(make_scans(a="nothing", b="raise"), out).code == 1
     assert len(results(out)) > 4

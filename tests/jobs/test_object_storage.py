@@ -12,6 +12,7 @@ from typing import Any
 import cheap_job
 import pytest
 from cheap_batch import results
+from fsspec.implementations.memory import MemoryFileSystem
 from typer.testing import CliRunner
 
 from bodyscan.cli.main import app
@@ -26,6 +27,7 @@ from bodyscan.jobs.object_storage import (
     work_on_stored,
 )
 from bodyscan.jobs.pipeline import load_pipeline
+from bodyscan.jobs.supervision import JobResult
 
 fsspec = pytest.importorskip("fsspec", reason="fsspec is not installed (pip install '.[cluster]')")
 
@@ -45,7 +47,7 @@ def memory(batched: Path) -> Iterator[Any]:
     system.store.clear()
 
 
-def batch(tmp_path, name):
+def batch(tmp_path: Path, name: str) -> dict[str, JobResult]:
     """What `bodyscan batch` does with URLs, with cheap stages."""
     work = tmp_path / name
     jobs = find_stored_jobs(STORE, load_pipeline(cheap_job.PIPELINE), "export", work)
@@ -59,7 +61,9 @@ def batch(tmp_path, name):
     return {outcome.job: outcome for outcome in outcomes}
 
 
-def test_the_same_bytes_as_in_folders_and_nothing_twice(memory, batched, tmp_path):
+def test_the_same_bytes_as_in_folders_and_nothing_twice(
+    memory: MemoryFileSystem, batched: Path, tmp_path: Path
+) -> None:
     first = batch(tmp_path, "first")
     assert {outcome.state for outcome in first.values()} == {"done"}, first
     memory.get("/day/out", str(tmp_path / "fetched"), recursive=True)
@@ -69,7 +73,9 @@ def test_the_same_bytes_as_in_folders_and_nothing_twice(memory, batched, tmp_pat
     assert all(outcome.stages == () for outcome in again.values())
 
 
-def test_an_upload_that_was_cut_short_is_made_again(memory, tmp_path):
+def test_an_upload_that_was_cut_short_is_made_again(
+    memory: MemoryFileSystem, tmp_path: Path
+) -> None:
     batch(tmp_path, "first")
     memory.rm("/day/out/anna/scan/stage.json")
     memory.pipe_file("/day/out/bert/export/body.bin", b"half")
@@ -79,7 +85,7 @@ def test_an_upload_that_was_cut_short_is_made_again(memory, tmp_path):
     assert len(memory.cat_file("/day/out/bert/export/body.bin")) > 4
 
 
-def test_names_that_climb_out_are_refused(memory, tmp_path):
+def test_names_that_climb_out_are_refused(memory: MemoryFileSystem, tmp_path: Path) -> None:
     memory.store["/day/scans/anna/../../../escaped"] = memory.store["/day/scans/anna/do.txt"]
     outcomes = batch(tmp_path, "first")
     assert outcomes["anna"].state == "set aside"
@@ -87,7 +93,7 @@ def test_names_that_climb_out_are_refused(memory, tmp_path):
     assert outcomes["bert"].state == "done"
 
 
-def test_the_command_takes_urls(memory):
+def test_the_command_takes_urls(memory: MemoryFileSystem) -> None:
     """All the way through the real command, whose real stage then refuses this calibration."""
     places = ("--scans", STORE.scans, "--out", STORE.out, "--calibration", str(STORE.calibration))
     result = CliRunner().invoke(app, ["batch", str(cheap_job.PIPELINE), *places, "--json"])
@@ -101,7 +107,7 @@ def test_the_command_takes_urls(memory):
     assert "either all lie in object storage or none" in str(half.exception)
 
 
-def test_an_unknown_store_is_bad_input(tmp_path):
+def test_an_unknown_store_is_bad_input(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="cannot be opened"):
         find_stored_jobs(
             replace(STORE, scans="nowhere://x"),

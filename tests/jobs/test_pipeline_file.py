@@ -20,7 +20,7 @@ FUSE = next(path for path in PIPELINES if path.stem == "fuse")
 
 
 @pytest.mark.parametrize("path", PIPELINES, ids=lambda path: path.stem)
-def test_every_file_names_every_parameter_with_a_comment(path):
+def test_every_file_names_every_parameter_with_a_comment(path: Path) -> None:
     pipeline = load_pipeline(path)
     assert pipeline.name == path.stem
     written = yaml.safe_load(path.read_text())
@@ -31,13 +31,13 @@ def test_every_file_names_every_parameter_with_a_comment(path):
             assert "#" in line, line
 
 
-def test_the_defaults_are_those_of_the_commands():
+def test_the_defaults_are_those_of_the_commands() -> None:
     """A batch fuses as `bodyscan scan` does, and fuse.yaml says the same as no word at all."""
     assert Pipeline(name="fuse", kind="fuse").scan == ScanSettings()
     assert load_pipeline(FUSE) == Pipeline(name="fuse", kind="fuse")
 
 
-def test_changes_are_applied():
+def test_changes_are_applied() -> None:
     changed = load_pipeline(
         FUSE, ["fusion.points=2000", "export.formats=glb", "export.deface=true"]
     )
@@ -62,13 +62,13 @@ def test_changes_are_applied():
         ("rig_export.formats=colmap", "is for another kind"),
     ],
 )
-def test_wrong_changes_are_named(change, said):
+def test_wrong_changes_are_named(change: str, said: str) -> None:
     with pytest.raises(PipelineError) as caught:
         load_pipeline(FUSE, [change])
     assert said in str(caught.value)
 
 
-def test_wrong_files_are_told_by_line(tmp_path):
+def test_wrong_files_are_told_by_line(tmp_path: Path) -> None:
     path = tmp_path / "p.yaml"
     path.write_text("name: x\nkind: fuse\nfusion:\n  points: -1\n  colour: red\n")
     with pytest.raises(PipelineError) as caught:
@@ -77,7 +77,7 @@ def test_wrong_files_are_told_by_line(tmp_path):
     assert f"{path}:5:3: fusion.colour: is not a key known here" in str(caught.value)
 
 
-def test_a_billion_laughs_end_early(tmp_path):
+def test_a_billion_laughs_end_early(tmp_path: Path) -> None:
     path = tmp_path / "p.yaml"
     lines = ["a: &a [ha, ha, ha, ha, ha, ha, ha, ha, ha]"]
     for one, next_ in zip("abcdefgh", "bcdefghi", strict=True):

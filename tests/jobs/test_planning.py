@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cheap_job
 import pytest
@@ -19,7 +21,7 @@ def day(batched: Path, tmp_path: Path) -> Path:
     return shutil.copytree(batched, tmp_path / "day")
 
 
-def steps(day, *changes, version=1):
+def steps(day: Path, *changes: Any, version: int = 1) -> list[str]:
     """Of Anna's job, why each stage would run now."""
     anna, bert = jobs_of(day / "scans", day / "out", *changes)
     stages = cheap_job.kinds(version)["fuse"]
@@ -28,7 +30,7 @@ def steps(day, *changes, version=1):
     return [step.why for step in plan(anna, stages)]
 
 
-def test_times_and_places_do_not_count(day):
+def test_times_and_places_do_not_count(day: Path) -> None:
     for path in (day / "scans" / "anna").iterdir():
         os.utime(path, (1, 1))
     assert steps(day) == ["", ""]
@@ -39,20 +41,20 @@ def test_times_and_places_do_not_count(day):
     assert steps(moved) == ["", ""]
 
 
-def test_another_content_counts(day):
+def test_another_content_counts(day: Path) -> None:
     (day / "scans" / "anna" / "image.txt").write_text("other")
     scan, export = steps(day)
     assert scan == "inputs changed: image.txt has other content"
     assert export == "scan runs before it"
 
 
-def test_files_that_come_and_go_count(day):
+def test_files_that_come_and_go_count(day: Path) -> None:
     folder = day / "scans" / "anna"
     (folder / "image.txt").rename(folder / "picture.txt")
     assert steps(day)[0] == "inputs changed: picture.txt is new, image.txt is gone"
 
 
-def test_settings_count_for_the_stages_that_obey_them(day):
+def test_settings_count_for_the_stages_that_obey_them(day: Path) -> None:
     assert steps(day, "fusion.points=2000") == [
         "settings changed: fusion.points 1000000 -> 2000",
         "scan runs before it",
@@ -64,11 +66,11 @@ def test_settings_count_for_the_stages_that_obey_them(day):
     assert steps(day, "resources.threads=1") == ["", ""]
 
 
-def test_the_version_of_a_stage_counts(day):
+def test_the_version_of_a_stage_counts(day: Path) -> None:
     assert steps(day, version=2)[0] == "version 2 of the stage, it was 1"
 
 
-def test_results_that_were_touched_are_made_again(day):
+def test_results_that_were_touched_are_made_again(day: Path) -> None:
     result = day / "out" / "anna" / "scan" / "1.bin"
     result.write_bytes(b"x" + result.read_bytes()[1:])
     assert steps(day)[0] == "its result was changed: 1.bin has other content"
@@ -76,7 +78,7 @@ def test_results_that_were_touched_are_made_again(day):
     assert steps(day) == ["", ""]
 
 
-def test_a_failure_is_told_the_next_time(make_scans, tmp_path):
+def test_a_failure_is_told_the_next_time(make_scans: Callable[..., Any], tmp_path: Path) -> None:
     scans = make_scans(a="raise")
     run_cheap(scans, tmp_path / "out")
     (job,) = jobs_of(scans, tmp_path / "out")
@@ -85,7 +87,7 @@ def test_a_failure_is_told_the_next_time(make_scans, tmp_path):
     )
 
 
-def test_models_beside_scans_are_no_jobs(make_scans, tmp_path):
+def test_models_beside_scans_are_no_jobs(make_scans: Callable[..., Any], tmp_path: Path) -> None:
     scans = make_scans(anna="nothing")
     (scans / "anna-model").mkdir()
     (scans / "anna-model" / "scan.json").write_text("{}")

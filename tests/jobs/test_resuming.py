@@ -6,7 +6,9 @@ import os
 import random
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from cheap_batch import batch_command, jobs_of, results, run_cheap
 
@@ -14,7 +16,9 @@ from bodyscan.errors import BadInput
 from bodyscan.files.locking import file_lock
 
 
-def test_ten_kills_leave_the_same_bytes_as_none(make_scans, tmp_path):
+def test_ten_kills_leave_the_same_bytes_as_none(
+    make_scans: Callable[..., Any], tmp_path: Path
+) -> None:
     scans = make_scans(**{f"s{number}": "sleep 0.05" for number in range(6)})
     assert run_cheap(scans, tmp_path / "undisturbed").code == 0
     moments = random.Random(1)
@@ -36,7 +40,9 @@ def test_ten_kills_leave_the_same_bytes_as_none(make_scans, tmp_path):
     assert all(ending["stages"] == [] for ending in again.endings().values())
 
 
-def test_the_processes_of_a_killed_batch_end_with_it(make_scans, tmp_path):
+def test_the_processes_of_a_killed_batch_end_with_it(
+    make_scans: Callable[..., Any], tmp_path: Path
+) -> None:
     scans = make_scans(a="sleep 60")
     process = subprocess.Popen(batch_command(scans, tmp_path / "out"), stdout=subprocess.DEVNULL)
     lock = tmp_path / "out" / "a" / "lock"
@@ -49,7 +55,9 @@ def test_the_processes_of_a_killed_batch_end_with_it(make_scans, tmp_path):
         pass
 
 
-def test_a_second_batch_on_the_same_folder_is_refused(make_scans, tmp_path):
+def test_a_second_batch_on_the_same_folder_is_refused(
+    make_scans: Callable[..., Any], tmp_path: Path
+) -> None:
     scans = make_scans(a="sleep 1.5")
     out = tmp_path / "out"
     first = subprocess.Popen(batch_command(scans, out), stdout=subprocess.DEVNULL)
@@ -61,7 +69,9 @@ def test_a_second_batch_on_the_same_folder_is_refused(make_scans, tmp_path):
     assert run_cheap(scans, out).endings()["a"]["stages"] == []
 
 
-def test_half_made_folders_are_taken_away_and_not_believed(make_scans, tmp_path):
+def test_half_made_folders_are_taken_away_and_not_believed(
+    make_scans: Callable[..., Any], tmp_path: Path
+) -> None:
     scans = make_scans(a="nothing")
     out = tmp_path / "out"
     half = out / "a" / ".making-scan-0123"
@@ -91,7 +101,7 @@ def _is_held(lock: Path) -> bool:
         return True
 
 
-def _wait_for(true, seconds=30.0):
+def _wait_for(true: Callable[..., Any], seconds: float = 30.0) -> None:
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "waited in vain"

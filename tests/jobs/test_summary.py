@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from cheap_batch import jobs_of
 
+from bodyscan.arrays import Array
 from bodyscan.jobs.batch import seconds_left
+from bodyscan.jobs.job import Job
 from bodyscan.jobs.summary import to_repeat, write_summary
 from bodyscan.jobs.supervision import JobResult
 from bodyscan.settings import BODY_CENTRE_MM
@@ -17,7 +22,7 @@ from bodyscan.settings import BODY_CENTRE_MM
 NAMES = [f"s{number}" for number in range(9)]
 
 
-def placed(shift_mm, turn_rad=0.0):
+def placed(shift_mm: Array, turn_rad: float = 0.0) -> list[list[float]]:
     """(4, 4): a camera 1.5 m in front of the body, turned about the body's centre and shifted."""
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -29,7 +34,7 @@ def placed(shift_mm, turn_rad=0.0):
 
 
 @pytest.fixture
-def day(make_scans, tmp_path):
+def day(make_scans: Callable[..., Any], tmp_path: Path) -> tuple[list[Job], Path]:
     """Nine scans: everybody sways by a millimetre; pair b moves away, 0.5 mm a scan."""
     scans = make_scans(**dict.fromkeys(NAMES, "nothing"))
     pairs = {pair: {"rig_from_camera": placed(np.zeros(3))} for pair in ("a", "b")}
@@ -57,13 +62,13 @@ def day(make_scans, tmp_path):
     return jobs, tmp_path / "out"
 
 
-def rows(jobs, out):
+def rows(jobs: list[Job], out: Path) -> list[dict[str, str]]:
     path = write_summary(jobs, [JobResult(job.name, "done", 1) for job in jobs], out)
     with path.open(newline="", encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
 
 
-def test_drift_is_what_neighbours_in_time_have_in_common(day):
+def test_drift_is_what_neighbours_in_time_have_in_common(day: tuple[list[Job], Path]) -> None:
     jobs, out = day
     table = rows(jobs, out)
     middle = table[2:-2]
@@ -79,12 +84,12 @@ def test_drift_is_what_neighbours_in_time_have_in_common(day):
     assert to_repeat(jobs) == ["s3"]
 
 
-def test_two_scans_tell_no_drift_from_sway(day):
+def test_two_scans_tell_no_drift_from_sway(day: tuple[list[Job], Path]) -> None:
     jobs, out = day
     assert [row["drift_mm"] for row in rows(jobs[:2], out)] == ["", ""]
 
 
-def test_the_time_left_counts_only_what_has_to_be_done():
+def test_the_time_left_counts_only_what_has_to_be_done() -> None:
     """Two jobs of 60 s ran side by side; one was up to date, one failed at once; four wait."""
     ended = [
         JobResult("a", "done", 1, ("scan",), 60.0),

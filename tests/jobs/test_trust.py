@@ -40,7 +40,7 @@ def day(made: Path, tmp_path: Path) -> Path:
     return shutil.copytree(made, tmp_path, dirs_exist_ok=True)
 
 
-def test_any_byte_that_changed_is_found(day):
+def test_any_byte_that_changed_is_found(day: Path) -> None:
     kinds = cheap_job.kinds()
     clean = verify(day / "out", kinds)
     assert clean.faults == ()
@@ -61,7 +61,7 @@ def test_any_byte_that_changed_is_found(day):
     assert verify(day / "out", kinds).faults == ()
 
 
-def test_what_came_and_went_is_found(day):
+def test_what_came_and_went_is_found(day: Path) -> None:
     kinds = cheap_job.kinds()
     (day / "out" / "m1" / "scan" / "0.bin").unlink()
     (day / "out" / "e1" / "export" / "more.bin").write_text("x")
@@ -76,7 +76,7 @@ def test_what_came_and_went_is_found(day):
         verify(day / "scans")
 
 
-def test_forget_removes_a_subject_and_nothing_else(day):
+def test_forget_removes_a_subject_and_nothing_else(day: Path) -> None:
     (day / "scans" / "m1" / "link").symlink_to(day / "elder.obj")
     before = set(files_below(day))
     others = {path: path.read_bytes() for path in before if "e1" in path.parts}
@@ -101,7 +101,7 @@ def test_forget_removes_a_subject_and_nothing_else(day):
         forget_subject("mallow", day)
 
 
-def test_a_forgetting_that_was_cut_short_can_be_taken_up(day):
+def test_a_forgetting_that_was_cut_short_can_be_taken_up(day: Path) -> None:
     files = find_subject("mallow", day).files
     for path in files[: len(files) // 2]:
         path.unlink()
@@ -110,7 +110,7 @@ def test_a_forgetting_that_was_cut_short_can_be_taken_up(day):
     assert not any("mallow" in path.read_text(errors="replace") for path in files_below(day))
 
 
-def test_a_batch_at_work_is_not_disturbed(day):
+def test_a_batch_at_work_is_not_disturbed(day: Path) -> None:
     with (
         file_lock(day / "out" / "batch.lock", wait=False),
         pytest.raises(BadInput, match="at work"),
@@ -119,6 +119,6 @@ def test_a_batch_at_work_is_not_disturbed(day):
     assert len(jobs_of(day / "scans", day / "out")) == 4
 
 
-def test_a_subject_is_never_told_from_a_name(day):
+def test_a_subject_is_never_told_from_a_name(day: Path) -> None:
     with pytest.raises(BadInput, match="holds nothing"):
         forget_subject("m1", day)

@@ -1,5 +1,7 @@
 """The chapter's experiments once, coarsely: images rendered, decoded, every approach calibrated."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,10 @@ from bodyscan.boards.detection import find_boards
 from bodyscan.evaluation.sphere_search import find_spheres
 from bodyscan.geometry.light_planes import baseline_angle_tilt
 from bodyscan.laboratory.chapter import apparatus
-from bodyscan.laboratory.chapter.calibrating import calibrate_all, sigma_trial
-from bodyscan.laboratory.chapter.captures import take_captures
+from bodyscan.laboratory.chapter.calibrating import Calibrations, calibrate_all, sigma_trial
+from bodyscan.laboratory.chapter.captures import ChapterCaptures, take_captures
 from bodyscan.laboratory.chapter.measuring import (
+    ApproachAccuracy,
     measure_artefacts,
     noise_bound,
     points_of,
@@ -23,18 +26,20 @@ from bodyscan.reconstruction.triangulation import grid_normals
 
 
 @pytest.fixture(scope="module")
-def captures():
+def captures() -> ChapterCaptures:
     # Two rays a pixel each way: boundaries are then some 0.02 px worse than in the real run.
     return take_captures(apparatus.chapter_setup(apparatus.ideal_settings(2)), stage_stops=3)
 
 
 @pytest.fixture(scope="module")
-def calibrated(captures):
+def calibrated(captures: ChapterCaptures) -> Calibrations:
     return calibrate_all(captures)
 
 
 @pytest.fixture(scope="module")
-def measured(captures, calibrated):
+def measured(
+    captures: ChapterCaptures, calibrated: Calibrations
+) -> dict[bool, dict[str, ApproachAccuracy]]:
     approaches = [*calibrated.approaches, true_approach(captures.setup)]
     return {
         whole: {
@@ -44,7 +49,7 @@ def measured(captures, calibrated):
     }
 
 
-def test_baselines_reduce_angles_grow_tilts_stay():
+def test_baselines_reduce_angles_grow_tilts_stay() -> None:
     # Fig. 6, in words.
     baseline, angle, tilt = baseline_angle_tilt(
         apparatus.true_planes(apparatus.chapter_setup(apparatus.ideal_settings(1))), "vertical"
@@ -54,14 +59,14 @@ def test_baselines_reduce_angles_grow_tilts_stay():
     assert np.degrees(np.ptp(tilt)) < 0.5 < np.degrees(np.ptp(angle))
 
 
-def test_boards_and_stage_are_wholly_in_the_picture(captures):
+def test_boards_and_stage_are_wholly_in_the_picture(captures: ChapterCaptures) -> None:
     assert len(captures.boards) == 3
     assert len(captures.stage) == 3
     for shot in (*captures.boards, *captures.stage):
         assert len(shot.view.corner_ids) == 48
 
 
-def test_corners_are_the_simulated_boards(captures):
+def test_corners_are_the_simulated_boards(captures: ChapterCaptures) -> None:
     camera = captures.setup.view.camera
     places = [*apparatus.board_poses(), *apparatus.stage_poses(apparatus.stage_readings(3), 0)]
     for shot, place in zip((*captures.boards, *captures.stage), places, strict=True):
@@ -70,7 +75,7 @@ def test_corners_are_the_simulated_boards(captures):
         assert np.sqrt(np.mean((shot.view.pixels - true) ** 2)) < 0.04
 
 
-def test_true_stripes_and_true_calibration_leave_nothing(captures):
+def test_true_stripes_and_true_calibration_leave_nothing(captures: ChapterCaptures) -> None:
     truth = true_approach(captures.setup)
     for number, centre in enumerate(apparatus.CENTRES):
         own = captures.owner == number
@@ -80,7 +85,9 @@ def test_true_stripes_and_true_calibration_leave_nothing(captures):
     assert measure_artefacts(truth, captures).plate_systematic_mm < 1e-3
 
 
-def test_whole_stripes_hide_the_calibration(measured):
+def test_whole_stripes_hide_the_calibration(
+    measured: dict[bool, dict[str, ApproachAccuracy]],
+) -> None:
     third = measured[True]["(iii)"]
     for name, one in measured[True].items():
         # The issue's trial: 0.31 to 0.52 with whole stripes, chapter's Table 2: 0.13 to 0.41.
@@ -89,7 +96,7 @@ def test_whole_stripes_hide_the_calibration(measured):
         assert one.mean_e == pytest.approx(third.mean_e, rel=0.1), name
 
 
-def test_sub_pixel_boundaries_do_not(measured):
+def test_sub_pixel_boundaries_do_not(measured: dict[bool, dict[str, ApproachAccuracy]]) -> None:
     fine = measured[False]
     assert fine["(iii)"].mean_e < 0.02 * measured[True]["(iii)"].mean_e
     assert fine["(i)"].mean_e > 1.3 * fine["(iii)"].mean_e
@@ -102,7 +109,9 @@ def test_sub_pixel_boundaries_do_not(measured):
         assert min(one.covered) > 0.9
 
 
-def test_the_plate_and_the_centres_tell_calibrations_apart(measured):
+def test_the_plate_and_the_centres_tell_calibrations_apart(
+    measured: dict[bool, dict[str, ApproachAccuracy]],
+) -> None:
     fine = measured[False]
     # Corners found to 0.03 px in rendering this coarse: a few um, and 0.2 um for all in one solve.
     assert fine["(iii)"].plate_systematic_mm < 0.02
@@ -117,14 +126,14 @@ def test_the_plate_and_the_centres_tell_calibrations_apart(measured):
             assert np.linalg.norm(sphere.given.centre - true) < 0.8
 
 
-def test_table_1_is_recovered(calibrated):
+def test_table_1_is_recovered(calibrated: Calibrations) -> None:
     found, sigmas = calibrated.reference.camera, np.sqrt(np.diag(calibrated.reference.covariance))
     errors = found.parameters - [getattr(apparatus.CAMERA, name) for name in found.parameter_names]
     # Three sigmas is the issue's bound; a fixed seed makes it no matter of chance.
     assert np.all(np.abs(errors) < 3.0 * sigmas), np.array(errors) / sigmas
 
 
-def test_sigmas_are_honest_over_many_seeds():
+def test_sigmas_are_honest_over_many_seeds() -> None:
     trial = sigma_trial(50)
     # RMS of 50 normal draws is 1 +- 0.1.
     assert np.all(np.abs(trial.spread - 1.0) < 0.3), trial.spread
@@ -132,7 +141,9 @@ def test_sigmas_are_honest_over_many_seeds():
     assert trial.beyond_three < 5
 
 
-def test_the_spheres_are_found_without_knowing_where_they_are(captures, calibrated):
+def test_the_spheres_are_found_without_knowing_where_they_are(
+    captures: ChapterCaptures, calibrated: Calibrations
+) -> None:
     s = captures.spheres.stripes.s
     points = points_of(calibrated.ours, s).reshape(*s.shape, 3).astype(np.float32)
     found = find_spheres(points.astype(float), grid_normals(points).astype(float), 25.0, 5)
@@ -140,7 +151,9 @@ def test_the_spheres_are_found_without_knowing_where_they_are(captures, calibrat
     assert np.allclose(places, apparatus.CENTRES, atol=0.8)
 
 
-def test_noise_is_less_than_everything(captures, measured):
+def test_noise_is_less_than_everything(
+    captures: ChapterCaptures, measured: dict[bool, dict[str, ApproachAccuracy]]
+) -> None:
     noise = noise_bound(captures)
     assert max(noise.best_share) < 0.001
     for alone, sphere in zip(
@@ -149,7 +162,9 @@ def test_noise_is_less_than_everything(captures, measured):
         assert 0 < alone < sphere.e_given
 
 
-def test_points_are_as_far_off_as_they_say(captures, calibrated):
+def test_points_are_as_far_off_as_they_say(
+    captures: ChapterCaptures, calibrated: Calibrations
+) -> None:
     found = point_sigma(calibrated.ours, captures)
     # 0.9 to 1.0 in docs/reproduction.md; so coarsely rendered, boards seem worse placed than they are.
     assert 0.25 < found.spheres < 1.7
@@ -157,12 +172,17 @@ def test_points_are_as_far_off_as_they_say(captures, calibrated):
     assert found.beyond_three < 0.02
 
 
-def test_whole_stripes_are_middles():
+def test_whole_stripes_are_middles() -> None:
     assert whole_stripes(np.array([0.0, 3.2, 3.99])) == pytest.approx([0.5, 3.5, 3.5])
     assert np.isnan(whole_stripes(np.array([np.nan]))[0])
 
 
-def test_the_report_says_all_of_it(tmp_path, captures, calibrated, measured):
+def test_the_report_says_all_of_it(
+    tmp_path: Path,
+    captures: ChapterCaptures,
+    calibrated: Calibrations,
+    measured: dict[bool, dict[str, ApproachAccuracy]],
+) -> None:
     fine, whole = tuple(measured[False].values()), tuple(measured[True].values())
     found = Reproduction(
         seed=0,
@@ -190,5 +210,5 @@ def test_the_report_says_all_of_it(tmp_path, captures, calibrated, measured):
     assert not list(tmp_path.glob("*.tmp*"))
 
 
-def test_no_board_is_seen_among_the_spheres(captures):
+def test_no_board_is_seen_among_the_spheres(captures: ChapterCaptures) -> None:
     assert find_boards(captures.spheres.lit, [apparatus.BOARD], pair="p", shot="s") == []

@@ -1,9 +1,13 @@
 """The rival projectors: exact where light is as they take it to be, and how far off for a mirror."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from mirror_points import MIRROR, STRIPES, TRUE_PLANES, mirror_points, systematic_mm
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
 from bodyscan.laboratory.rivals.approaches import PROJECTORS
 from bodyscan.laboratory.rivals.baseline_models import (
@@ -16,7 +20,7 @@ ANGLES = np.radians(np.linspace(2.0, 38.0, STRIPES + 1))
 BASELINES = np.linspace(165.0, 150.0, STRIPES + 1)
 
 
-def baseline_planes(baseline, tilt_deg: float = 0.0) -> LightPlanes:
+def baseline_planes(baseline: Array | float, tilt_deg: float = 0.0) -> LightPlanes:
     """Eq. 7-9 backwards, written out."""
     tilt = np.tan(np.radians(tilt_deg))
     planes = np.column_stack(
@@ -26,7 +30,7 @@ def baseline_planes(baseline, tilt_deg: float = 0.0) -> LightPlanes:
     return LightPlanes(planes, np.zeros((len(planes), 4, 4)), "vertical")
 
 
-def stripe_of(planes: LightPlanes):
+def stripe_of(planes: LightPlanes) -> Callable[..., Any]:
     """s of points: the linear interpolation of where each plane lies along x."""
 
     def stripe(points: np.ndarray) -> np.ndarray:
@@ -49,7 +53,7 @@ def worst_offset(found: LightPlanes, true: LightPlanes) -> float:
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 1.5])
-def test_an_invariable_baseline_is_found(tilt_deg):
+def test_an_invariable_baseline_is_found(tilt_deg: float) -> None:
     true = baseline_planes(160.0, tilt_deg)
     points = mirror_points(stripe=stripe_of(true), every_px=16)
     found = fit_invariable_baseline(points, STRIPES, "vertical")
@@ -60,7 +64,7 @@ def test_an_invariable_baseline_is_found(tilt_deg):
     assert np.degrees(np.nanmedian(tilt)) == pytest.approx(tilt_deg, abs=1e-4)
 
 
-def test_a_variable_baseline_is_found_and_an_invariable_one_misses_it():
+def test_a_variable_baseline_is_found_and_an_invariable_one_misses_it() -> None:
     true = baseline_planes(BASELINES, 1.5)
     points = mirror_points(stripe=stripe_of(true), every_px=16)
     assert worst_offset(fit_variable_baseline(points, STRIPES, "vertical"), true) < 1e-4
@@ -69,7 +73,7 @@ def test_a_variable_baseline_is_found_and_an_invariable_one_misses_it():
     assert worst_offset(fit_invariable_baseline(points, STRIPES, "vertical"), true) > 0.05
 
 
-def test_tilted_light_needs_a_tilted_model():
+def test_tilted_light_needs_a_tilted_model() -> None:
     true = baseline_planes(160.0, 1.5)
     points = mirror_points(stripe=stripe_of(true), every_px=16)
     straight = fit_invariable_baseline(points, STRIPES, "vertical", fit_tilt=False)
@@ -77,7 +81,7 @@ def test_tilted_light_needs_a_tilted_model():
     assert worst_offset(straight, true) > 0.5
 
 
-def test_outliers_lose_their_weight():
+def test_outliers_lose_their_weight() -> None:
     true = baseline_planes(160.0)
     points = mirror_points(stripe=stripe_of(true), every_px=8, noise_px=0.02)
     points.points[::50] += [3.0, 0.0, 0.0]
@@ -86,7 +90,7 @@ def test_outliers_lose_their_weight():
     assert worst_offset(found, true) < 0.05
 
 
-def test_horizontal_stripes_are_the_same_turned():
+def test_horizontal_stripes_are_the_same_turned() -> None:
     points = mirror_points(every_px=16)
     turned = type(points)(
         points.index,
@@ -103,7 +107,7 @@ def test_horizontal_stripes_are_the_same_turned():
     )
 
 
-def test_equal_angles_through_one_line_need_a_new_index():
+def test_equal_angles_through_one_line_need_a_new_index() -> None:
     # Stripes at equal angles from one centre: no slide has them evenly, a re-mapped one does.
     true = baseline_planes(160.0)
     points = mirror_points(stripe=stripe_of(true), every_px=16)
@@ -115,7 +119,7 @@ def test_equal_angles_through_one_line_need_a_new_index():
     assert worst_offset(matrix, true) > 0.2
 
 
-def test_a_rotating_mirror_fits_planes_best():
+def test_a_rotating_mirror_fits_planes_best() -> None:
     points = mirror_points(every_px=16)
     error = {
         name: systematic_mm(model(points, STRIPES, "vertical"))
@@ -130,7 +134,7 @@ def test_a_rotating_mirror_fits_planes_best():
     assert error["variable baseline, tilted"] < 0.5 * error["variable baseline"]
 
 
-def test_true_planes_hold_the_light():
+def test_true_planes_hold_the_light() -> None:
     points = mirror_points(every_px=16)
     planes = TRUE_PLANES[points.index]
     off = np.sum(points.points * planes[:, :3], axis=1) + planes[:, 3]

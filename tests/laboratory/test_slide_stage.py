@@ -30,7 +30,9 @@ PLACE = RigidTransform.from_rotation_vector([0.12, -0.16, 0.02], [-98.0, -87.0, 
     skew=st.floats(-5.0, 5.0),
     turn=st.tuples(*[st.floats(-0.4, 0.4)] * 3),
 )
-def test_a_camera_without_lens_is_its_matrix(focal, aspect, skew, turn):
+def test_a_camera_without_lens_is_its_matrix(
+    focal: float, aspect: float, skew: float, turn: tuple[float, float, float]
+) -> None:
     true = Camera(focal * aspect, focal, skew, 350.0, 230.0, Radial(), 640, 480)
     place = RigidTransform.from_rotation_vector(turn, [-90.0, -70.0, 450.0])
     pixels = true.project(place.apply(POINTS))
@@ -52,7 +54,7 @@ def tsai_pixels(focal: float, kappa: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kappa", [0.0, 0.15, -0.1])
-def test_tsai_finds_his_own_camera(kappa):
+def test_tsai_finds_his_own_camera(kappa: float) -> None:
     found = calibrate_tsai(POINTS, tsai_pixels(1064.0, kappa), MIDDLE)
     assert found.focal == pytest.approx(1064.0, rel=1e-6)
     assert found.aspect == pytest.approx(0.998, rel=1e-6)
@@ -65,7 +67,7 @@ def test_tsai_finds_his_own_camera(kappa):
     assert np.max(np.abs(error)) < 0.01
 
 
-def test_tsai_sees_the_chapters_lens_nearly():
+def test_tsai_sees_the_chapters_lens_nearly() -> None:
     pixels = TABLE_1.project(PLACE.apply(POINTS))
     found = calibrate_tsai(POINTS, pixels, MIDDLE)
     # One coefficient for two, and no skew (0.5 px over the whole image): a few hundredths of a px.
@@ -76,7 +78,7 @@ def test_tsai_sees_the_chapters_lens_nearly():
     assert camera.alpha == pytest.approx(TABLE_1.alpha, rel=1e-3)
 
 
-def test_a_matrix_does_not_see_the_lens():
+def test_a_matrix_does_not_see_the_lens() -> None:
     pixels = TABLE_1.project(PLACE.apply(POINTS))
     camera, place = split_projection_matrix(projection_matrix(POINTS, pixels), 640, 480)
     error = camera.project(place.apply(POINTS)) - pixels

@@ -12,25 +12,26 @@ from made_bodies import cylinder, ellipsoid, mesh_of, together
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.measurements import measure
+from bodyscan.mesh.body import BodyMesh
 from bodyscan.report.measurements import measurements_document, tables
 
 SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
 
 
 @pytest.fixture(scope="module")
-def subject():
+def subject() -> BodyMesh:
     """Facing x, mm, made smooth as the simulator does."""
     read = o3d.io.read_triangle_mesh(str(SUBJECT)).subdivide_loop(1)
     x, y, z = 1000.0 * np.asarray(read.vertices).T
     return mesh_of(np.stack([-y, x, z], axis=-1), np.asarray(read.triangles))
 
 
-def turned(body, degrees: float, shift):
+def turned(body: BodyMesh, degrees: float, shift: list[float]) -> BodyMesh:
     turn = RigidTransform.from_rotation_vector([0.0, 0.0, np.radians(degrees)], shift)
     return mesh_of(turn.apply(body.vertices), body.faces)
 
 
-def test_the_subject_measures_what_its_description_says(subject):
+def test_the_subject_measures_what_its_description_says(subject: BodyMesh) -> None:
     # data/subjects/README.md: 1.633 m, hip 1014 mm (at 800 mm), waist 727 mm (the narrowest).
     found = measure(subject, [800.0])
     assert found.stature_mm == pytest.approx(1633.0, abs=2.0)
@@ -40,7 +41,7 @@ def test_the_subject_measures_what_its_description_says(subject):
     assert found.measured == 1.0
 
 
-def test_parts_by_height(subject):
+def test_parts_by_height(subject: BodyMesh) -> None:
     shins, hips, breast = measure(subject, [350.0, 850.0, 1150.0]).slices
     assert {girth.part for girth in shins.girths} == {"left leg", "right leg"}
     every = {"left arm", "right arm", "trunk"}
@@ -53,7 +54,7 @@ def test_parts_by_height(subject):
 
 
 @pytest.mark.parametrize("degrees", [-60.0, 25.0, 80.0])
-def test_how_the_subject_stands_changes_nothing(subject, degrees: float):
+def test_how_the_subject_stands_changes_nothing(subject: BodyMesh, degrees: float) -> None:
     straight = measure(subject, [350.0, 900.0])
     askew = measure(turned(subject, degrees, [120.0, -80.0, 0.0]), [350.0, 900.0])
     assert askew.stature_mm == pytest.approx(straight.stature_mm, abs=1e-6)
@@ -67,7 +68,7 @@ def test_how_the_subject_stands_changes_nothing(subject, degrees: float):
     assert np.degrees(np.arctan2(turn[1, 0], turn[0, 0])) == pytest.approx(degrees, abs=0.01)
 
 
-def test_volume_area_and_crown_of_an_ellipsoid():
+def test_volume_area_and_crown_of_an_ellipsoid() -> None:
     vertices, faces = ellipsoid((100.0, 200.0, 800.0), (0.0, 0.0, 800.0))
     filled = vertices[faces].mean(axis=1)[:, 2] > 1500.0
     found = measure(mesh_of(vertices, faces, filled))
@@ -78,12 +79,12 @@ def test_volume_area_and_crown_of_an_ellipsoid():
     assert len(found.slices) == 15  # every 100 mm below 1600
 
 
-def test_a_cylinder_has_its_formulas_area():
+def test_a_cylinder_has_its_formulas_area() -> None:
     found = measure(mesh_of(*cylinder(100.0, 0.0, 1000.0)))
     assert found.area_m2 == pytest.approx(2 * np.pi * (0.1 * 1.0 + 0.01), rel=1e-4)
 
 
-def test_fingers_are_no_legs():
+def test_fingers_are_no_legs() -> None:
     """Two legs, and hands beside them that hang lower than the crotch."""
     limbs = together(
         cylinder(70.0, 0.0, 900.0, y=90.0),
@@ -96,12 +97,12 @@ def test_fingers_are_no_legs():
     assert level.of("left leg").tape_mm == pytest.approx(2 * np.pi * 70.0, rel=1e-3)
 
 
-def test_no_body_at_that_height(subject):
+def test_no_body_at_that_height(subject: BodyMesh) -> None:
     with pytest.raises(BadInput, match="no body at a height of 2500"):
         measure(subject, [2500.0])
 
 
-def test_table_and_document_say_the_same(subject):
+def test_table_and_document_say_the_same(subject: BodyMesh) -> None:
     found = measure(subject, [900.0])
     said = measurements_document(found, {"subject": "s1", "calibration_id": "c", "when": None})
     assert said["stature_mm"] == found.stature_mm
@@ -109,7 +110,7 @@ def test_table_and_document_say_the_same(subject):
     assert [table.row_count for table in tables(found)] == [4, 3]
 
 
-def test_of_a_body_seen_from_the_knees_up_the_slices_there_are_are_given(subject):
+def test_of_a_body_seen_from_the_knees_up_the_slices_there_are_are_given(subject: BodyMesh) -> None:
     upper = mesh_of(subject.vertices, subject.faces)
     low = upper.vertices[:, 2].copy()
     upper.vertices[:, 2] = np.maximum(low, 430.0)

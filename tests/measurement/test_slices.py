@@ -14,7 +14,7 @@ from bodyscan.measurement.slices import loops_at
 
 
 @pytest.mark.parametrize("height", [55.0, 100.0, 123.4])  # 100 lies on a ring of vertices
-def test_a_cylinder_is_cut_in_a_circle(height: float):
+def test_a_cylinder_is_cut_in_a_circle(height: float) -> None:
     (loop,) = loops_at(*cylinder(80.0, 0.0, 200.0), height)
     # 400 corners on a circle: shorter by pi^2 / (6 * 400^2), a hundred-thousandth.
     assert loop.girth_mm == pytest.approx(2 * np.pi * 80.0, rel=2e-5)
@@ -24,7 +24,7 @@ def test_a_cylinder_is_cut_in_a_circle(height: float):
 
 
 @given(share=st.floats(-0.9, 0.9))
-def test_an_ellipsoid_is_cut_in_an_ellipse(share: float):
+def test_an_ellipsoid_is_cut_in_an_ellipse(share: float) -> None:
     (loop,) = loops_at(*ELLIPSOID, 250.0 * share)
     long, short = np.array([150.0, 90.0]) * np.sqrt(1.0 - share**2)
     girth = 4.0 * long * ellipe(1.0 - (short / long) ** 2)
@@ -37,7 +37,7 @@ def test_an_ellipsoid_is_cut_in_an_ellipse(share: float):
 ELLIPSOID = ellipsoid((150.0, 90.0, 250.0))
 
 
-def test_a_hollow_is_followed_by_the_surface_and_spanned_by_the_tape():
+def test_a_hollow_is_followed_by_the_surface_and_spanned_by_the_tape() -> None:
     """A torus that stands upright, cut above its hole's bottom: two circles; the lying one: a ring."""
     vertices, faces = arrays(o3d.geometry.TriangleMesh.create_torus(100.0, 30.0, 200, 100))
     outer, inner = loops_at(vertices, faces, 0.0)
@@ -55,7 +55,7 @@ def test_a_hollow_is_followed_by_the_surface_and_spanned_by_the_tape():
     assert both.area_mm2 > 0
 
 
-def test_legs_are_loops_of_their_own():
+def test_legs_are_loops_of_their_own() -> None:
     legs = together(cylinder(70.0, 0.0, 700.0, y=90.0), cylinder(60.0, 0.0, 700.0, y=-90.0))
     left, right = loops_at(*legs, 333.0)
     assert left.girth_mm == pytest.approx(2 * np.pi * 70.0, rel=2e-5)
@@ -63,13 +63,13 @@ def test_legs_are_loops_of_their_own():
     assert left.centre[1] == pytest.approx(90.0)
 
 
-def test_what_is_made_up_is_told():
+def test_what_is_made_up_is_told() -> None:
     vertices, faces = ellipsoid((100.0, 100.0, 100.0))
     filled = vertices[faces].mean(axis=1)[:, 0] > 0
     (loop,) = loops_at(vertices, faces, 10.0, filled)
     assert loop.measured_share == pytest.approx(0.5, abs=0.01)
 
 
-def test_a_plane_beside_the_body_cuts_nothing():
+def test_a_plane_beside_the_body_cuts_nothing() -> None:
     assert loops_at(*ELLIPSOID, 251.0) == ()
     assert loops_at(*ELLIPSOID, -251.0) == ()

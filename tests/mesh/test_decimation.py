@@ -25,7 +25,7 @@ def farthest(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.nda
     return float(NearestSurface(*other).nearest(np.concatenate([vertices, inside]))[1].max())
 
 
-def test_a_coarse_ball_comes_within_the_limit():
+def test_a_coarse_ball_comes_within_the_limit() -> None:
     fine, coarse = ball(100), ball(10)
     assert farthest(coarse, fine) > 2.0
     found = refine_to_tolerance(*coarse, *fine, 0.5)
@@ -38,14 +38,14 @@ def test_a_coarse_ball_comes_within_the_limit():
     assert len(found[1]) < 4000
 
 
-def test_what_is_near_enough_stays():
+def test_what_is_near_enough_stays() -> None:
     fine, coarse = ball(60), ball(40)
     vertices, faces = refine_to_tolerance(*coarse, *fine, 1.0)
     np.testing.assert_array_equal(faces, coarse[1])
     np.testing.assert_array_equal(vertices, coarse[0])
 
 
-def test_one_bad_place_costs_a_few_faces_only():
+def test_one_bad_place_costs_a_few_faces_only() -> None:
     fine, coarse = ball(60), ball(60)
     dented = coarse[0].copy()
     dent = int(np.argmax(dented[:, 0]))
@@ -55,13 +55,13 @@ def test_one_bad_place_costs_a_few_faces_only():
     assert len(faces) <= len(coarse[1]) + 20
 
 
-def test_the_same_input_gives_the_same_bytes():
+def test_the_same_input_gives_the_same_bytes() -> None:
     one, other = (refine_to_tolerance(*ball(10), *ball(60), 0.5) for _ in range(2))
     assert one[0].tobytes() == other[0].tobytes()
     assert one[1].tobytes() == other[1].tobytes()
 
 
-def test_a_spike_that_was_lost_comes_back():
+def test_a_spike_that_was_lost_comes_back() -> None:
     fine, coarse = ball(60), ball(20)
     spiked = fine[0].copy()
     tip = int(np.argmax(spiked[:, 1]))

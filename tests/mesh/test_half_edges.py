@@ -20,7 +20,7 @@ def ends(faces: np.ndarray) -> np.ndarray:
 
 
 @given(seed=st.integers(0, 1000), missing=st.integers(0, 60))
-def test_twins_run_the_other_way(seed: int, missing: int):
+def test_twins_run_the_other_way(seed: int, missing: int) -> None:
     gone = np.random.default_rng(seed).choice(len(FACES), missing, replace=False)
     faces = np.delete(FACES, gone, axis=0)
     twin, edges = twins(faces, COUNT).ravel(), ends(faces)
@@ -29,7 +29,7 @@ def test_twins_run_the_other_way(seed: int, missing: int):
     np.testing.assert_array_equal(twin, expected)
 
 
-def test_edges_of_three_faces_are_unsound():
+def test_edges_of_three_faces_are_unsound() -> None:
     faces = np.concatenate([FACES, [[FACES[0, 0], FACES[0, 1], COUNT]]])
     twin = twins(faces, COUNT + 1)
     assert twin[0, 0] == UNSOUND
@@ -38,19 +38,19 @@ def test_edges_of_three_faces_are_unsound():
     assert np.count_nonzero(twin == UNSOUND) == 3
 
 
-def test_an_edge_without_length_is_unsound():
+def test_an_edge_without_length_is_unsound() -> None:
     twin = twins(np.array([[0, 0, 1]]), 2)
     assert twin[0, 0] == UNSOUND
 
 
-def test_every_vertex_of_a_closed_surface_has_one_fan():
+def test_every_vertex_of_a_closed_surface_has_one_fan() -> None:
     labels, count = corner_fans(twins(FACES, COUNT))
     assert count == COUNT
     pairs = np.unique(np.stack([labels.ravel(), FACES.ravel()], axis=-1), axis=0)
     assert len(pairs) == COUNT
 
 
-def test_a_vertex_with_two_rims_has_two_fans():
+def test_a_vertex_with_two_rims_has_two_fans() -> None:
     """Four of the six faces about a vertex, in two pairs that only the vertex joins."""
     around = np.flatnonzero((FACES == 20).any(axis=1))
     assert len(around) == 6
@@ -69,7 +69,7 @@ def test_a_vertex_with_two_rims_has_two_fans():
     assert own[0] == own[1] != own[2] == own[3]
 
 
-def test_no_faces_have_no_fans():
+def test_no_faces_have_no_fans() -> None:
     labels, count = corner_fans(twins(np.empty((0, 3), np.int64), 0))
     assert labels.shape == (0, 3)
     assert count == 0

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -22,13 +24,13 @@ def assert_same(one: object, other: object) -> None:
         assert mine.tobytes() == theirs.tobytes(), field.name
 
 
-def test_a_cloud_is_read_back_to_the_last_bit(tmp_path: Path):
+def test_a_cloud_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
     cloud = points()
     write_ply(tmp_path / "cloud.ply", cloud)
     assert_same(read_ply_cloud(tmp_path / "cloud.ply"), cloud)
 
 
-def test_a_mesh_is_read_back_to_the_last_bit(tmp_path: Path):
+def test_a_mesh_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
     mesh = ball()
     assert mesh.filled.any()
     assert not mesh.filled.all()
@@ -36,13 +38,13 @@ def test_a_mesh_is_read_back_to_the_last_bit(tmp_path: Path):
     assert_same(read_ply_mesh(tmp_path / "mesh.ply"), mesh)
 
 
-def test_an_empty_cloud_can_be_stored(tmp_path: Path):
+def test_an_empty_cloud_can_be_stored(tmp_path: Path) -> None:
     cloud = BodyCloud(*(getattr(points(), field.name)[:0] for field in fields(BodyCloud)))
     write_ply(tmp_path / "empty.ply", cloud)
     assert len(read_ply_cloud(tmp_path / "empty.ply").points) == 0
 
 
-def test_others_can_read_it(tmp_path: Path):
+def test_others_can_read_it(tmp_path: Path) -> None:
     mesh, cloud = ball(), points()
     write_ply(tmp_path / "mesh.ply", mesh)
     write_ply(tmp_path / "cloud.ply", cloud)
@@ -57,7 +59,7 @@ def test_others_can_read_it(tmp_path: Path):
     np.testing.assert_array_equal(dots.point.pairs_seen.numpy()[:, 0], cloud.pairs_seen)
 
 
-def test_other_comments_do_not_matter(tmp_path: Path):
+def test_other_comments_do_not_matter(tmp_path: Path) -> None:
     path, cloud = tmp_path / "cloud.ply", points()
     write_ply(path, cloud)
     head, comment, rest = path.read_bytes().partition(b"comment bodyscan")
@@ -92,7 +94,7 @@ def _header_only(data: bytes) -> bytes:
 @pytest.mark.parametrize(
     "damage", [_cut, _lengthened, _other_property, _other_count, _no_ply, _header_only]
 )
-def test_a_damaged_file_is_refused(tmp_path: Path, damage):
+def test_a_damaged_file_is_refused(tmp_path: Path, damage: Callable[..., Any]) -> None:
     path = tmp_path / "cloud.ply"
     write_ply(path, points())
     path.write_bytes(damage(path.read_bytes()))
@@ -100,7 +102,7 @@ def test_a_damaged_file_is_refused(tmp_path: Path, damage):
         read_ply_cloud(path)
 
 
-def test_a_mesh_is_no_cloud_and_nothing_is_neither(tmp_path: Path):
+def test_a_mesh_is_no_cloud_and_nothing_is_neither(tmp_path: Path) -> None:
     write_ply(tmp_path / "mesh.ply", ball())
     with pytest.raises(ResultError, match="not a cloud"):
         read_ply_cloud(tmp_path / "mesh.ply")
@@ -111,7 +113,7 @@ def test_a_mesh_is_no_cloud_and_nothing_is_neither(tmp_path: Path):
         read_ply_mesh(tmp_path / "nowhere.ply")
 
 
-def test_a_face_without_its_vertex_is_refused(tmp_path: Path):
+def test_a_face_without_its_vertex_is_refused(tmp_path: Path) -> None:
     mesh = ball()
     mesh.faces[7, 1] = len(mesh.vertices)
     write_ply(tmp_path / "mesh.ply", mesh)

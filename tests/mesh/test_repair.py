@@ -17,7 +17,7 @@ FACES = np.asarray(SPHERE.triangles).astype(np.int64)
 VOLUME = topology(VERTICES, FACES).volume_mm3
 
 
-def test_a_sound_surface_stays_as_it_is():
+def test_a_sound_surface_stays_as_it_is() -> None:
     vertices, faces = close_mesh(VERTICES, FACES)
     assert len(vertices) == len(VERTICES)
     assert len(faces) == len(FACES)
@@ -26,7 +26,7 @@ def test_a_sound_surface_stays_as_it_is():
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000), share=st.floats(0.0, 0.4))
-def test_holes_are_closed(seed: int, share: float):
+def test_holes_are_closed(seed: int, share: float) -> None:
     kept = np.random.default_rng(seed).random(len(FACES)) >= share
     vertices, faces = close_mesh(VERTICES, FACES[kept])
     found = topology(vertices, faces)
@@ -34,14 +34,14 @@ def test_holes_are_closed(seed: int, share: float):
     assert found.volume_mm3 > 0
 
 
-def test_a_hole_of_one_face_costs_next_to_no_volume():
+def test_a_hole_of_one_face_costs_next_to_no_volume() -> None:
     found = topology(*close_mesh(VERTICES, FACES[1:]))
     assert found.euler == 2
     assert found.components == 1
     assert found.volume_mm3 == pytest.approx(VOLUME, rel=1e-6)
 
 
-def test_a_fin_on_an_edge_goes():
+def test_a_fin_on_an_edge_goes() -> None:
     vertices = np.concatenate([VERTICES, [[0.0, 0.0, 200.0]]])
     fin = [FACES[50, 0], FACES[50, 1], len(VERTICES)]
     assert not topology(vertices, np.concatenate([FACES, [fin]])).closed
@@ -53,14 +53,14 @@ def test_a_fin_on_an_edge_goes():
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_a_doubled_face_goes(turned: bool):
+def test_a_doubled_face_goes(turned: bool) -> None:
     again = FACES[30:31, ::-1] if turned else FACES[30:31]
     found = topology(*close_mesh(VERTICES, np.concatenate([FACES, again])))
     assert found.manifold
     assert found.volume_mm3 == pytest.approx(VOLUME, rel=0.01)
 
 
-def test_surfaces_that_touch_in_a_vertex_are_parted():
+def test_surfaces_that_touch_in_a_vertex_are_parted() -> None:
     other = np.where(FACES == 0, 0, FACES + len(VERTICES))
     top = VERTICES[0]
     vertices = np.concatenate([VERTICES, 2.0 * top - VERTICES])
@@ -73,6 +73,6 @@ def test_surfaces_that_touch_in_a_vertex_are_parted():
     assert (found.components, found.euler) == (2, 4)
 
 
-def test_a_face_with_a_repeated_corner_goes():
+def test_a_face_with_a_repeated_corner_goes() -> None:
     found = topology(*close_mesh(VERTICES, np.concatenate([FACES, [[5, 5, 6]]])))
     assert found.manifold

@@ -22,13 +22,13 @@ def together(*bodies: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.nda
     )
 
 
-def test_a_ball_and_two_apart_do_not():
+def test_a_ball_and_two_apart_do_not() -> None:
     assert len(self_intersections(*ball((900.0, 50.0, 1500.0), 40.0))) == 0
     apart = together(ball((900.0, 50.0, 1500.0), 40.0), ball((900.0, 131.0, 1500.0), 40.0))
     assert len(self_intersections(*apart)) == 0
 
 
-def test_two_balls_meet_along_a_circle():
+def test_two_balls_meet_along_a_circle() -> None:
     distance, radius = 50.0, 40.0
     vertices, faces = together(ball((0.0, 0.0, 0.0), radius), ball((0.0, distance, 1.0), radius))
     found = self_intersections(vertices, faces)
@@ -39,7 +39,7 @@ def test_two_balls_meet_along_a_circle():
     assert np.linalg.norm(middles[:, [0, 2]], axis=1).mean() == pytest.approx(31.0, abs=4.0)
 
 
-def test_a_vertex_pulled_through_the_other_side():
+def test_a_vertex_pulled_through_the_other_side() -> None:
     vertices, faces = ball((0.0, 0.0, 0.0), 40.0)
     pulled = int(np.argmax(vertices[:, 0]))
     vertices = vertices.copy()

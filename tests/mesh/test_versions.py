@@ -19,7 +19,7 @@ def filled_share(mesh: BodyMesh) -> float:
     return float(areas[mesh.filled].sum() / areas.sum())
 
 
-def test_the_light_version_is_close_and_closed(body: BodyMesh):
+def test_the_light_version_is_close_and_closed(body: BodyMesh) -> None:
     lean = decimate(body, faces=20_000, within_mm=0.5)
     # What the spare faces were not needed for, or more than them.
     assert abs(len(lean.faces) - 20_000) <= 600
@@ -45,11 +45,11 @@ def test_the_light_version_is_close_and_closed(body: BodyMesh):
     np.testing.assert_array_equal(lean.filled, np.isnan(lean.sigma_mm)[lean.faces].any(axis=1))
 
 
-def test_a_small_mesh_stays_as_it_is(body: BodyMesh):
+def test_a_small_mesh_stays_as_it_is(body: BodyMesh) -> None:
     assert decimate(body, faces=len(body.faces)) is body
 
 
-def test_the_open_version_is_what_was_measured(body: BodyMesh):
+def test_the_open_version_is_what_was_measured(body: BodyMesh) -> None:
     measured = body.measured_part()
     assert len(measured.faces) == np.count_nonzero(~body.filled)
     assert not measured.filled.any()
@@ -63,7 +63,7 @@ def test_the_open_version_is_what_was_measured(body: BodyMesh):
     )
 
 
-def test_a_reduction_that_folds_is_mended():
+def test_a_reduction_that_folds_is_mended() -> None:
     # A thin wavy sheet: its two sides collapse onto each other, and Open3D leaves an open fold.
     sphere = o3d.geometry.TriangleMesh.create_sphere(1.0, resolution=60)
     vertices = np.asarray(sphere.vertices) * [100.0, 60.0, 0.05]

@@ -11,6 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from small_pair import CAMERA, STRIPES, pair, planes, stripe_map
 
+from bodyscan.calibration.pair import PairCalibration
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.ray_depths import triangulate_image
@@ -38,7 +39,7 @@ def looking_at_the_middle(distance_mm: float, turn: float, tilt: float) -> Rigid
     )
 
 
-def calibrated(rising: bool):
+def calibrated(rising: bool) -> PairCalibration:
     """The pair of the other tests; with its stripes numbered from the other end, s grows with
     depth."""
     sheets = planes()
@@ -65,7 +66,9 @@ def some_s(seed: int, rising: bool) -> np.ndarray:
 )
 @example(788.0, 0.0, -0.125, True, 0)  # a camera at the height of the volume's bottom
 @example(789.3, -2.444, -0.1453, True, 12)  # and one a little below it
-def test_all_that_lies_in_the_volume_is_wanted(distance_mm, turn, tilt, rising, seed):
+def test_all_that_lies_in_the_volume_is_wanted(
+    distance_mm: float, turn: float, tilt: float, rising: bool, seed: int
+) -> None:
     one, at = calibrated(rising), looking_at_the_middle(distance_mm, turn, tilt)
     wanted = stripes_in_volume(one, at, VOLUME)
     s = some_s(seed, rising)
@@ -86,7 +89,7 @@ def test_all_that_lies_in_the_volume_is_wanted(distance_mm, turn, tilt, rising, 
     assert not beyond[points[..., 2] < distance_mm - half].any()
 
 
-def test_integers_are_stripes_and_columns_may_be_lines():
+def test_integers_are_stripes_and_columns_may_be_lines() -> None:
     one, at = calibrated(True), looking_at_the_middle(500.0, 0.3, 0.1)
     wanted = stripes_in_volume(one, at, VOLUME)
     stripe = np.floor(some_s(1, True)).astype(np.int32)
@@ -99,7 +102,7 @@ def test_integers_are_stripes_and_columns_may_be_lines():
     np.testing.assert_array_equal(turned[0].T, wanted.split(stripe, usable)[0])
 
 
-def test_a_volume_out_of_sight_is_seen_nowhere():
+def test_a_volume_out_of_sight_is_seen_nowhere() -> None:
     away = looking_at_the_middle(500.0, 0.0, 0.0)
     behind = RigidTransform(away.rotation, -away.translation)
     wanted = stripes_in_volume(calibrated(True), behind, VOLUME)
@@ -108,7 +111,7 @@ def test_a_volume_out_of_sight_is_seen_nowhere():
     assert not beyond.any()
 
 
-def test_without_a_projector_or_an_order_in_depth_all_stripes_count():
+def test_without_a_projector_or_an_order_in_depth_all_stripes_count() -> None:
     at = looking_at_the_middle(500.0, 0.0, 0.0)
     assert stripes_in_volume(replace(pair(), sheets=None), at, VOLUME) is None
     # Sheets that fan out from a line in the middle of the picture: nearer above, farther below.
@@ -119,7 +122,7 @@ def test_without_a_projector_or_an_order_in_depth_all_stripes_count():
 
 
 @pytest.mark.parametrize("rising", [True, False])
-def test_most_of_the_room_is_not_wanted(rising):
+def test_most_of_the_room_is_not_wanted(rising: bool) -> None:
     at = looking_at_the_middle(700.0, 0.0, 0.0)
     larger = Camera(1600.0, 1608.0, -2.0, 320.0, 240.0, Radial(-0.1, 0.02), 640, 480)
     one = replace(calibrated(rising), camera=larger)
@@ -133,7 +136,9 @@ def test_most_of_the_room_is_not_wanted(rising):
 
 
 @given(st.floats(100.0, 1500.0), st.floats(-3.0, 3.0), st.floats(-1.3, 1.3), st.integers(0, 99))
-def test_a_ray_is_in_the_volume_between_where_it_enters_and_leaves(distance_mm, turn, tilt, seed):
+def test_a_ray_is_in_the_volume_between_where_it_enters_and_leaves(
+    distance_mm: float, turn: float, tilt: float, seed: int
+) -> None:
     at = looking_at_the_middle(distance_mm, turn, tilt)
     rng = np.random.default_rng(seed)
     rays = np.concatenate([rng.uniform(-0.6, 0.6, (200, 2)), np.ones((200, 1))], axis=1)
@@ -145,7 +150,7 @@ def test_a_ray_is_in_the_volume_between_where_it_enters_and_leaves(distance_mm, 
     np.testing.assert_array_equal((depth > enter) & (depth < leave), within)
 
 
-def test_what_lies_flat_is_wanted_where_nothing_stands():
+def test_what_lies_flat_is_wanted_where_nothing_stands() -> None:
     """A plate on the floor; and the floor beside somebody's feet, but not the rest of it."""
     at = looking_at_the_middle(900.0, 0.0, 0.6)
     one = calibrated(True)

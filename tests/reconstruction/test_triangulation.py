@@ -9,7 +9,7 @@ from bodyscan.reconstruction.triangulation import grid_normals, reconstruct_rang
 from bodyscan.stripes.stripe_map import StripeMap
 
 
-def test_a_slanted_plane_is_measured_where_it_is():
+def test_a_slanted_plane_is_measured_where_it_is() -> None:
     normal = np.array([0.2, 0.1, -1.0]) / np.linalg.norm([0.2, 0.1, -1.0])
     rays = CAMERA.pixel_rays()
     depth = -500.0 / (rays @ normal)
@@ -23,7 +23,7 @@ def test_a_slanted_plane_is_measured_where_it_is():
     assert np.allclose(inner, normal, atol=1e-3)
 
 
-def test_sigma_follows_from_the_decoding():
+def test_sigma_follows_from_the_decoding() -> None:
     rays = CAMERA.pixel_rays()
     depth = np.full(rays.shape[:2], 480.0)
     stripes = stripe_map(depth)
@@ -38,7 +38,7 @@ def test_sigma_follows_from_the_decoding():
     assert np.allclose(moved, image.sigma_mm[known], rtol=0.1)
 
 
-def test_normals_of_a_sphere_point_to_the_camera():
+def test_normals_of_a_sphere_point_to_the_camera() -> None:
     rays = CAMERA.pixel_rays()
     centre, radius = np.array([0.0, 0.0, 600.0]), 80.0
     along = rays @ centre / np.sum(rays**2, axis=-1)
@@ -54,7 +54,7 @@ def test_normals_of_a_sphere_point_to_the_camera():
     assert np.min(np.sum(normals[middle] * true[middle], axis=1)) > 0.999
 
 
-def test_a_normal_needs_its_whole_window():
+def test_a_normal_needs_its_whole_window() -> None:
     rays = CAMERA.pixel_rays()
     points = (rays * 500.0).astype(np.float32)
     points[40, 70] = np.nan
@@ -65,7 +65,7 @@ def test_a_normal_needs_its_whole_window():
     np.testing.assert_array_equal(unknown, expected)
 
 
-def test_normals_are_those_of_planes_fitted_to_the_windows():
+def test_normals_are_those_of_planes_fitted_to_the_windows() -> None:
     """Against a least-squares fit of 1/z by column and row, window by window, on a rough surface."""
     rng = np.random.default_rng(6)
     camera = Camera(400.0, 400.0, 0.0, 15.0, 10.0, Radial(), 30, 20)
@@ -83,7 +83,7 @@ def test_normals_are_those_of_planes_fitted_to_the_windows():
         assert np.allclose(normals[v, u], normal / np.linalg.norm(normal), atol=1e-4)
 
 
-def test_another_image_size_is_refused():
+def test_another_image_size_is_refused() -> None:
     stripes = stripe_map(np.full((CAMERA.height, CAMERA.width), 480.0))
     small = StripeMap(**{**vars(stripes), "s": stripes.s[:100]})
     with pytest.raises(BadInput, match="160 x 100"):

@@ -1,12 +1,17 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
 from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.calibration.board_views import LocatedView
+from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.pose_covariance import position_sigma
 from bodyscan.geometry.scaled_systems import invert_scaled
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.advice import advise, crucial_shots
+from bodyscan.registration.more_shots import BoardPlace
 from bodyscan.registration.normal_equations import normal_equations
 from bodyscan.registration.rig_solve import solve_rig
 
@@ -14,14 +19,20 @@ NOISE_PX = 0.03
 
 
 @pytest.fixture(scope="module")
-def ring():
+def ring() -> Any:
     placings, cameras = ring_of_cameras()
     views, truth = ring_views(placings, cameras, noise_px=NOISE_PX)
     rig = ring_rig(placings)
     return rig, placings, cameras, views, truth, solve_rig(rig, views, cameras).value
 
 
-def captured(place, count, placings, cameras, rng):
+def captured(
+    place: BoardPlace,
+    count: int,
+    placings: dict[str, RigidTransform],
+    cameras: dict[str, Camera],
+    rng: np.random.Generator,
+) -> list[LocatedView]:
     """`count` shots of the board as advised, imaged by the true cameras at their true places."""
     corners, per_face = corner_points(CHARUCO), corners_per_face(CHARUCO)
     views = []
@@ -38,7 +49,7 @@ def captured(place, count, placings, cameras, rng):
     return views
 
 
-def test_shots_as_advised_do_halve_the_sigma(ring):
+def test_shots_as_advised_do_halve_the_sigma(ring: Any) -> None:
     rig, placings, cameras, views, _, placed = ring
     more = advise(rig, placed).more
     assert more.halves
@@ -51,7 +62,7 @@ def test_shots_as_advised_do_halve_the_sigma(ring):
     assert sigma == pytest.approx(more.after_mm, rel=0.1)
 
 
-def test_the_worst_pair_is_that_of_the_covariance(ring):
+def test_the_worst_pair_is_that_of_the_covariance(ring: Any) -> None:
     rig, _, _, _, _, placed = ring
     advice = advise(rig, placed)
     sigmas = {
@@ -67,7 +78,7 @@ def test_the_worst_pair_is_that_of_the_covariance(ring):
     assert f"seen by both {' and '.join(advice.more.between)}" in advice.lines[-1]
 
 
-def test_links_that_nothing_doubles_are_named():
+def test_links_that_nothing_doubles_are_named() -> None:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     views, _ = ring_views(placings, cameras, shots=30)
     # The third pole sees the board together with the others in one shot only.
@@ -100,7 +111,7 @@ def test_links_that_nothing_doubles_are_named():
 
 
 @pytest.mark.parametrize("by_board", [False, True])
-def test_eliminating_boards_keeps_the_covariance(ring, by_board):
+def test_eliminating_boards_keeps_the_covariance(ring: Any, by_board: bool) -> None:
     placed = ring[-1]
     equations = normal_equations(
         placed.views,

@@ -28,24 +28,24 @@ RIG = Rig(
 )
 
 
-def view(count):
+def view(count: int) -> BoardView:
     return BoardView("a", "s1", "seen", np.arange(count), np.zeros((count, 2)))
 
 
-def test_a_board_never_found_is_named_with_what_the_rig_file_says():
+def test_a_board_never_found_is_named_with_what_the_rig_file_says() -> None:
     (note,) = boards_not_found(RIG, [view(48)], 30)
     assert "board unseen" in note
     assert "10 columns x 7 rows" in note
     assert "none of 30 images" in note
 
 
-def test_a_board_of_which_little_is_found_is_doubted():
+def test_a_board_of_which_little_is_found_is_doubted() -> None:
     assert "may not be those" in describe_findings(RIG, [view(10)], 30)
     assert "may not be those" not in describe_findings(RIG, [view(45)], 30)
 
 
-def test_squares_of_another_size_show_in_the_size_of_the_rig():
-    def placed(factor):
+def test_squares_of_another_size_show_in_the_size_of_the_rig() -> None:
+    def placed(factor: float) -> dict[str, RigidTransform]:
         return {n: RigidTransform(np.eye(3), factor * np.array(p)) for n, p in PLACES.items()}
 
     (note,) = check_board_size(RIG, placed(1.25))

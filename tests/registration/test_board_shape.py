@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from bodyscan.registration.rig_solve import solve_rig
 PLACINGS, CAMERAS = ring_of_cameras(heights=(700, 1200))
 
 
-def really(points):
+def really(points: Any) -> Any:
     """Where the corners of a bent board lie whose print is 1 per mille too wide."""
     x, y, z = points.T
     middle = 315.0
@@ -23,7 +24,7 @@ def really(points):
     return np.column_stack([middle + 1.001 * (x - middle), y, z + bow])
 
 
-def bent_views(shots=30):
+def bent_views(shots: int = 30) -> Any:
     """`ring_views` of that board, and of the flat one."""
     rng = np.random.default_rng(3)
     flat, truth = ring_views(PLACINGS, CAMERAS, shots=shots)
@@ -39,13 +40,13 @@ def bent_views(shots=30):
 
 
 @pytest.fixture(scope="module")
-def placed():
+def placed() -> Any:
     bent, flat = bent_views()
     rig = ring_rig(PLACINGS)
     return solve_rig(rig, bent, CAMERAS), solve_rig(rig, flat, CAMERAS)
 
 
-def rms(placed):
+def rms(placed: Any) -> Any:
     errors = [
         placed.value.rig_from_camera[name].translation - true.translation
         for name, true in PLACINGS.items()
@@ -53,7 +54,7 @@ def rms(placed):
     return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
 
 
-def test_the_bend_and_the_stretch_are_measured(placed):
+def test_the_bend_and_the_stretch_are_measured(placed: Any) -> None:
     bent, _ = placed
     shape = bent.value.board_shapes[CHARUCO.name]
     found = shape.points + shape.offsets
@@ -69,14 +70,14 @@ def test_the_bend_and_the_stretch_are_measured(placed):
     assert any("used, boards held out" in note and "mm out of plane" in note for note in bent.notes)
 
 
-def test_the_rig_is_as_good_as_with_a_flat_board(placed):
+def test_the_rig_is_as_good_as_with_a_flat_board(placed: Any) -> None:
     bent, flat = placed
     # The size of the board is 0.3 per mille off on average, so are the distances of the cameras.
     assert rms(bent) < 2.0 * rms(flat) + 1e-3 * 1300.0
     assert max(bent.value.rms_px.values()) < 1.1 * max(flat.value.rms_px.values())
 
 
-def test_a_flat_board_is_left_alone(placed):
+def test_a_flat_board_is_left_alone(placed: Any) -> None:
     _, flat = placed
     assert not flat.value.board_shapes
     assert not flat.notes

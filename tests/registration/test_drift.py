@@ -1,12 +1,15 @@
 """A pair or a pole that moved since the calibration is named, and by how much it moved."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from ring import ring_of_cameras, ring_rig, ring_views
 
+from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.drift import find_drift, seen_pose
-from bodyscan.registration.rig_solve import solve_rig
+from bodyscan.registration.drift import Drift, find_drift, seen_pose
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
 
 NOISE_PX = 0.03
 PLACINGS, CAMERAS = ring_of_cameras()
@@ -14,12 +17,14 @@ POLES = {name: name[:2] for name in PLACINGS}
 
 
 @pytest.fixture(scope="module")
-def calibrated():
+def calibrated() -> RigSolution:
     views, _ = ring_views(PLACINGS, CAMERAS, shots=40, noise_px=NOISE_PX, seed=5)
     return solve_rig(ring_rig(PLACINGS), views, CAMERAS).value
 
 
-def drift_after(calibrated, moved: dict[str, RigidTransform], shots=3, seed=11):
+def drift_after(
+    calibrated: RigSolution, moved: dict[str, RigidTransform], shots: int = 3, seed: int = 11
+) -> Drift:
     """Some boards later, seen by a rig of which `moved` pairs stand elsewhere."""
     now = {name: moved.get(name, RigidTransform.identity()) @ at for name, at in PLACINGS.items()}
     views, _ = ring_views(now, CAMERAS, shots=shots, noise_px=NOISE_PX, seed=seed)
@@ -27,7 +32,7 @@ def drift_after(calibrated, moved: dict[str, RigidTransform], shots=3, seed=11):
     return find_drift(poses, calibrated.rig_from_camera, calibrated.covariance, POLES)
 
 
-def about(place, turn_deg, shift_mm) -> RigidTransform:
+def about(place: Array | list[float], turn_deg: list[Any], shift_mm: list[Any]) -> RigidTransform:
     """A motion in the rig frame that turns about `place`."""
     turn = RigidTransform.from_rotation_vector(np.radians(turn_deg), np.zeros(3))
     here = RigidTransform(np.eye(3), np.asarray(place, float))
@@ -36,7 +41,7 @@ def about(place, turn_deg, shift_mm) -> RigidTransform:
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13, 14])
-def test_a_rig_that_stood_still_is_not_suspected(calibrated, seed):
+def test_a_rig_that_stood_still_is_not_suspected(calibrated: RigSolution, seed: int) -> None:
     drift = drift_after(calibrated, {}, seed=seed)
     assert drift.moves == ()
     # Corners here are independent, and CORRELATED takes three of them for one.
@@ -48,8 +53,11 @@ def test_a_rig_that_stood_still_is_not_suspected(calibrated, seed):
     ("turn_deg", "shift_mm"), [([0, 0, 0], [0.3, -0.4, 0]), ([0.012, 0, 0.016], [0, 0, 0])]
 )
 def test_half_a_millimetre_or_a_fiftieth_of_a_degree_is_noticed(
-    calibrated, pair, turn_deg, shift_mm
-):
+    calibrated: RigSolution,
+    pair: str,
+    turn_deg: list[float | int] | list[int],
+    shift_mm: list[float | int] | list[int],
+) -> None:
     motion = about(PLACINGS[pair].translation, turn_deg, shift_mm)
     (move,) = drift_after(calibrated, {pair: motion}, shots=6).moves
     assert move.pairs == (pair,)
@@ -58,7 +66,7 @@ def test_half_a_millimetre_or_a_fiftieth_of_a_degree_is_noticed(
     assert move.sigma_mm < 0.3
 
 
-def test_a_pole_that_was_bumped_is_one_move(calibrated):
+def test_a_pole_that_was_bumped_is_one_move(calibrated: RigSolution) -> None:
     motion = about([-1300.0, 0.0, 0.0], [0.1, 0.05, 0.0], [0.0, 0.0, 0.0])
     pairs = {name: motion for name in PLACINGS if name.startswith("p2")}
     (move,) = drift_after(calibrated, pairs, shots=6).moves
@@ -67,7 +75,7 @@ def test_a_pole_that_was_bumped_is_one_move(calibrated):
     assert move.turn_deg == pytest.approx(np.degrees(motion.angle), abs=0.01)
 
 
-def test_a_pair_far_off_is_found_as_well_as_a_pole(calibrated):
+def test_a_pair_far_off_is_found_as_well_as_a_pole(calibrated: RigSolution) -> None:
     pole = about([-1300.0, 0.0, 0.0], [0.0, 0.0, 0.05], [0.0, 0.0, 0.0])
     far = about(PLACINGS["p3-2"].translation, [2.0, 0.0, 1.0], [30.0, 10.0, -20.0])
     moved = {name: pole for name in PLACINGS if name.startswith("p2")} | {"p3-2": far}
@@ -78,7 +86,7 @@ def test_a_pair_far_off_is_found_as_well_as_a_pole(calibrated):
     assert drift.misfit < 0.1 * drift.misfit_before
 
 
-def test_a_board_that_one_pair_alone_sees_says_nothing(calibrated):
+def test_a_board_that_one_pair_alone_sees_says_nothing(calibrated: RigSolution) -> None:
     views, _ = ring_views(PLACINGS, CAMERAS, shots=3, noise_px=NOISE_PX, seed=1)
     poses = [seen_pose(v, CAMERAS[v.pair], NOISE_PX) for v in views if v.pair == "p1-1"]
     drift = find_drift(poses, calibrated.rig_from_camera, calibrated.covariance, POLES)

@@ -8,20 +8,21 @@ import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
-from bodyscan.calibration.board_views import PlanarView
+from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import locate_board
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.outcome import Outcome
 from bodyscan.registration.rig_solve import solve_rig
 
 PLACINGS, CAMERAS = ring_of_cameras()
 
 
-def place(views):
+def place(views: list[LocatedView]) -> Outcome:
     return solve_rig(ring_rig(PLACINGS), views, CAMERAS)
 
 
-def rms(placed):
+def rms(placed: Outcome) -> float:
     errors = [
         placed.value.rig_from_camera[name].translation - PLACINGS[name].translation
         for name in placed.value.rig_from_camera
@@ -30,12 +31,14 @@ def rms(placed):
 
 
 @pytest.fixture(scope="module")
-def seen():
+def seen() -> tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float]:
     views, truth = ring_views(PLACINGS, CAMERAS)
     return views, truth, rms(place(views))
 
 
-def seen_anew(view, rig_from_board, rng, size=1.0):
+def seen_anew(
+    view: LocatedView, rig_from_board: RigidTransform, rng: np.random.Generator, size: float = 1.0
+) -> LocatedView:
     """The view as it would have been with the board there, its squares so many times as large."""
     camera = CAMERAS[view.pair]
     camera_from_board = PLACINGS[view.pair].inverse() @ rig_from_board
@@ -45,14 +48,16 @@ def seen_anew(view, rig_from_board, rng, size=1.0):
     return replace(view, pixels=pixels, camera_from_board=pose)
 
 
-def busiest(views):
+def busiest(views: list[LocatedView]) -> tuple[str, list[str]]:
     """The shot with most views, and the pairs that see it."""
     shots = [view.shot for view in views]
     shot = max(sorted(set(shots)), key=shots.count)
     return shot, sorted(view.pair for view in views if view.shot == shot)
 
 
-def test_a_camera_with_half_its_shots_missing(seen):
+def test_a_camera_with_half_its_shots_missing(
+    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float],
+) -> None:
     views, _, clean = seen
     own = [view for view in views if view.pair == "p2-3"]
     missing = {view.shot for view in own[::2]}
@@ -66,7 +71,9 @@ def test_a_camera_with_half_its_shots_missing(seen):
     assert np.sqrt(np.mean(np.square(others))) < 1.2 * clean
 
 
-def test_a_pair_entirely_absent(seen):
+def test_a_pair_entirely_absent(
+    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float],
+) -> None:
     views, _, clean = seen
     cameras = {name: camera for name, camera in CAMERAS.items() if name != "p3-2"}
     rig = ring_rig(PLACINGS)
@@ -75,7 +82,9 @@ def test_a_pair_entirely_absent(seen):
     assert rms(placed) < 1.2 * clean
 
 
-def test_shuffled_corners(seen):
+def test_shuffled_corners(
+    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float],
+) -> None:
     views, _, clean = seen
     number = next(k for k, v in enumerate(views) if v.pair == "p2-2" and len(v.pixels) > 30)
     order = np.random.default_rng(1).permutation(len(views[number].pixels))
@@ -91,7 +100,9 @@ def test_shuffled_corners(seen):
 
 
 @pytest.mark.parametrize("slip_mm", [1.5, 60.0])
-def test_a_board_that_slipped_between_exposures(seen, slip_mm):
+def test_a_board_that_slipped_between_exposures(
+    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float], slip_mm: float
+) -> None:
     views, truth, clean = seen
     shot, pairs = busiest(views)
     late = pairs[-2:]
@@ -108,7 +119,9 @@ def test_a_board_that_slipped_between_exposures(seen, slip_mm):
 
 
 @pytest.mark.parametrize("size", [0.8, 1.02])
-def test_a_different_board_in_one_shot(seen, size):
+def test_a_different_board_in_one_shot(
+    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float], size: float
+) -> None:
     views, truth, clean = seen
     shot, pairs = busiest(views)
     rng = np.random.default_rng(3)
@@ -124,7 +137,9 @@ def test_a_different_board_in_one_shot(seen, size):
 
 
 @pytest.mark.parametrize("step_mm", [10.0, 400.0])
-def test_a_camera_that_took_its_pictures_at_other_times(seen, step_mm):
+def test_a_camera_that_took_its_pictures_at_other_times(
+    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float], step_mm: float
+) -> None:
     views, truth, clean = seen
     rng = np.random.default_rng(4)
     changed = [
@@ -139,7 +154,9 @@ def test_a_camera_that_took_its_pictures_at_other_times(seen, step_mm):
 
 
 @pytest.mark.parametrize("step_mm", [10.0, 400.0])
-def test_pictures_none_of_which_were_taken_together_are_refused(seen, step_mm):
+def test_pictures_none_of_which_were_taken_together_are_refused(
+    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float], step_mm: float
+) -> None:
     views, truth, _ = seen
     rng = np.random.default_rng(5)
     changed = [seen_anew(v, drifted(truth[v.target], step_mm, rng), rng) for v in views]
@@ -149,7 +166,9 @@ def test_pictures_none_of_which_were_taken_together_are_refused(seen, step_mm):
     assert "synchronise" in str(caught.value)
 
 
-def drifted(rig_from_board, step_mm, rng):
+def drifted(
+    rig_from_board: RigidTransform, step_mm: float, rng: np.random.Generator
+) -> RigidTransform:
     """The board as it stood at some other moment."""
     turn = RigidTransform.from_rotation_vector(
         rng.normal(0.0, step_mm / 2000.0, 3), rng.normal(0.0, step_mm / 2.0, 3)
@@ -159,7 +178,9 @@ def drifted(rig_from_board, step_mm, rng):
     return to_middle @ turn @ to_middle.inverse() @ rig_from_board
 
 
-def test_one_of_two_boards_with_other_squares_than_the_rig_file_says(seen):
+def test_one_of_two_boards_with_other_squares_than_the_rig_file_says(
+    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float],
+) -> None:
     views, truth, clean = seen
     rng = np.random.default_rng(6)
     second = {f"s{number:02d}" for number in range(0, 40, 4)}

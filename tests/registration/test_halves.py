@@ -1,20 +1,26 @@
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from ring import ring_of_cameras, ring_rig, ring_views
 from seen_boards import seen_boards
 
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.halves import compare_halves, split_shots
-from bodyscan.registration.rig_solve import solve_rig
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
+from bodyscan.rig.rig import Rig
 from bodyscan.workflows.find_boards import calibrate_cameras, locate_views
 
 
 @cache
-def placed_ring(seed=0, shots=40, spoil=None):
+def placed_ring(
+    seed: int = 0, shots: int = 40, spoil: Callable[..., Any] | None = None
+) -> tuple[Rig, RigSolution]:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     views, _ = ring_views(placings, cameras, shots=shots, seed=seed)
     views = [spoil(view) for view in views] if spoil else views
@@ -22,7 +28,7 @@ def placed_ring(seed=0, shots=40, spoil=None):
     return rig, solve_rig(rig, views, cameras).value
 
 
-def test_honest_halves_differ_by_what_they_promise():
+def test_honest_halves_differ_by_what_they_promise() -> None:
     found = [compare_halves(*placed_ring(seed), seed=seed) for seed in range(5)]
     ratios = [comparison.over_expected for comparison in found]
     # 5 x 30 independent normalised differences: 1 +- 0.06, and covariances good to 15 % or so.
@@ -31,7 +37,7 @@ def test_honest_halves_differ_by_what_they_promise():
     assert 0.7 < np.sqrt(np.mean(shifts**2)) < 1.35  # components of one pair go together: wider
 
 
-def test_the_frame_itself_is_taken_out():
+def test_the_frame_itself_is_taken_out() -> None:
     """The same differences whichever pair holds the frame; the holder, too, may differ."""
     rig, placed = placed_ring()
     comparison = compare_halves(rig, placed, seed=1)
@@ -44,18 +50,18 @@ def test_the_frame_itself_is_taken_out():
     np.testing.assert_allclose(comparison.sigmas_mm, again.sigmas_mm, rtol=0.02)
 
 
-def test_errors_that_the_covariance_does_not_know_show():
+def test_errors_that_the_covariance_does_not_know_show() -> None:
     """All corners of a view 0.1 px aside, another way in each: 48 corners then tell no more than
     one, so that 0.03 px of noise promises far too much."""
     rng = np.random.default_rng(8)
 
-    def aside(view):
+    def aside(view: LocatedView) -> LocatedView:
         return replace(view, pixels=view.pixels + rng.normal(0.0, 0.1, 2))
 
     assert compare_halves(*placed_ring(spoil=aside)).over_expected > 1.5
 
 
-def test_halves_are_seeded_disjoint_and_whole():
+def test_halves_are_seeded_disjoint_and_whole() -> None:
     _, placed = placed_ring()
     names = sorted(placed.rig_from_camera)
     tied, first, second = split_shots(placed.views, names, seed=4)
@@ -67,7 +73,7 @@ def test_halves_are_seeded_disjoint_and_whole():
     assert abs(len(first) - len(second)) <= 1
 
 
-def test_a_pair_that_a_half_does_not_tell_of_is_left_out_and_named():
+def test_a_pair_that_a_half_does_not_tell_of_is_left_out_and_named() -> None:
     rig, placed = placed_ring()
     own = sorted({view.shot for view in placed.views if view.pair == "p3-1"})
     few = tuple(v for v in placed.views if v.pair != "p3-1" or v.shot in own[:5])
@@ -78,13 +84,13 @@ def test_a_pair_that_a_half_does_not_tell_of_is_left_out_and_named():
     assert "without p3-1, not known from a half" in found.summary
 
 
-def test_a_pair_that_does_not_fit_in_a_half_is_left_out_and_named():
+def test_a_pair_that_does_not_fit_in_a_half_is_left_out_and_named() -> None:
     """Moved in most of one half's shots: the half's solve drops it, where all shots may keep it."""
     rig, placed = placed_ring()
     _, first, _ = split_shots(placed.views, sorted(placed.rig_from_camera))
     rng = np.random.default_rng(3)
 
-    def moved(view):
+    def moved(view: Any) -> Any:
         shift = RigidTransform.from_rotation_vector(np.zeros(3), rng.normal(0.0, 20.0, 3))
         pixels = placed.cameras[view.pair].project(
             (shift @ view.camera_from_board).apply(view.points)
@@ -100,14 +106,14 @@ def test_a_pair_that_does_not_fit_in_a_half_is_left_out_and_named():
 
 
 @pytest.mark.parametrize("shots", [2, 3, 5])
-def test_so_few_shots_are_not_halved(shots: int):
+def test_so_few_shots_are_not_halved(shots: int) -> None:
     rig, placed = placed_ring()
     usual = sorted({view.shot for view in placed.views})[:shots]
     with pytest.raises(FailedWork, match=f"{shots} shots cannot be halved"):
         compare_halves(rig, replace(placed, views=[v for v in placed.views if v.shot in usual]))
 
 
-def test_halves_that_know_far_less_than_the_whole_say_nothing():
+def test_halves_that_know_far_less_than_the_whole_say_nothing() -> None:
     """All boards but one parallel to each other: the half without that one knows no focal length."""
     seen = seen_boards(3, shots=9, tilted=1)
     rig = seen.rig
@@ -118,7 +124,7 @@ def test_halves_that_know_far_less_than_the_whole_say_nothing():
         compare_halves(rig, placed)
 
 
-def test_no_two_pairs_that_both_halves_tie_together_are_refused():
+def test_no_two_pairs_that_both_halves_tie_together_are_refused() -> None:
     rig, placed = placed_ring()
     only = min(view.shot for view in placed.views if view.pair == "p3-1")
     views = [v for v in placed.views if v.pair in ("p3-1", "p1-1")]

@@ -4,26 +4,28 @@ import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
+from bodyscan.arrays import Array
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.pose_covariance import position_sigma
-from bodyscan.registration.rig_solve import solve_rig
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import NominalPose
 from bodyscan.rig.rig_frame import RigFrame
 
 
-def centre_errors(placed, placings):
+def centre_errors(placed: RigSolution, placings: dict[str, RigidTransform]) -> dict[str, Array]:
     return {
         name: placed.rig_from_camera[name].translation - placings[name].translation
         for name in placings
     }
 
 
-def rms(errors):
+def rms(errors: dict[str, Array]) -> float:
     return float(np.sqrt(np.mean([np.sum(e**2) for e in errors.values()])))
 
 
-def test_twelve_cameras_are_placed():
+def test_twelve_cameras_are_placed() -> None:
     placings, cameras = ring_of_cameras()
     views, _ = ring_views(placings, cameras)
     outcome = solve_rig(ring_rig(placings), views, cameras)
@@ -33,7 +35,7 @@ def test_twelve_cameras_are_placed():
     assert not outcome.notes
 
 
-def test_sigmas_of_positions_are_honest():
+def test_sigmas_of_positions_are_honest() -> None:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     normalized = []
     for seed in range(12):
@@ -47,7 +49,7 @@ def test_sigmas_of_positions_are_honest():
     assert 0.75 < np.sqrt(np.mean(np.square(normalized))) < 1.3
 
 
-def test_wrong_views_are_found_and_named():
+def test_wrong_views_are_found_and_named() -> None:
     placings, cameras = ring_of_cameras()
     views, _ = ring_views(placings, cameras)
     clean = rms(centre_errors(solve_rig(ring_rig(placings), views, cameras).value, placings))
@@ -68,7 +70,7 @@ def test_wrong_views_are_found_and_named():
     assert rms(centre_errors(outcome.value, placings)) < 1.2 * clean + 0.02
 
 
-def test_two_groups_without_a_shared_view_are_named():
+def test_two_groups_without_a_shared_view_are_named() -> None:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     views, _ = ring_views(placings, cameras, shots=20)
     apart = [v for v in views if (v.pair[:2] == "p3") == (int(v.shot[1:]) % 2 == 0)]
@@ -78,7 +80,7 @@ def test_two_groups_without_a_shared_view_are_named():
 
 
 @pytest.mark.parametrize(("columns", "faces"), [(9, 1), (9, 2), (10, 2)])
-def test_plain_boards_numbered_from_either_end_are_resolved(columns, faces):
+def test_plain_boards_numbered_from_either_end_are_resolved(columns: int, faces: int) -> None:
     board = Board(
         name="plain",
         columns=columns,
@@ -96,7 +98,7 @@ def test_plain_boards_numbered_from_either_end_are_resolved(columns, faces):
     assert rms(centre_errors(placed, placings)) < 0.5
 
 
-def test_an_ambiguous_board_seen_once_is_not_guessed():
+def test_an_ambiguous_board_seen_once_is_not_guessed() -> None:
     board = Board(name="plain", columns=9, rows=7, square_mm=70)
     placings, cameras = ring_of_cameras(poles=1, heights=(900, 1100))
     views, _ = ring_views(placings, cameras, shots=60, board=board)
@@ -109,7 +111,7 @@ def test_an_ambiguous_board_seen_once_is_not_guessed():
         solve_rig(rig, views, cameras)
 
 
-def test_the_board_can_fix_the_frame():
+def test_the_board_can_fix_the_frame() -> None:
     placings, cameras = ring_of_cameras()
     views, truth = ring_views(placings, cameras)
     fixed = truth["s00", "board"]
@@ -132,7 +134,7 @@ def test_the_board_can_fix_the_frame():
     assert rms(centre_errors(placed, placings)) < 0.5
 
 
-def test_a_corner_seen_only_once_does_no_harm():
+def test_a_corner_seen_only_once_does_no_harm() -> None:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     views, _ = ring_views(placings, cameras, shots=20)
     rare = views[0].points[0]
@@ -144,7 +146,7 @@ def test_a_corner_seen_only_once_does_no_harm():
     assert rms(centre_errors(placed, placings)) < 0.5
 
 
-def test_a_plain_board_fixes_the_frame_the_way_round_that_the_rig_is_meant():
+def test_a_plain_board_fixes_the_frame_the_way_round_that_the_rig_is_meant() -> None:
     board = Board(name="plain", columns=9, rows=7, square_mm=70, faces=2, thickness_mm=6)
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     views, truth = ring_views(placings, cameras, shots=30, board=board)
@@ -171,14 +173,14 @@ def test_a_plain_board_fixes_the_frame_the_way_round_that_the_rig_is_meant():
     assert (found.inverse() @ fixed).angle < 1e-6
 
 
-def near(placing):
+def near(placing: RigidTransform) -> NominalPose:
     position = placing.translation + [12.0, -9.0, 15.0]
     return NominalPose(
         position_mm=tuple(position), look_at_mm=tuple(position + 1000.0 * placing.rotation[:, 2])
     )
 
 
-def test_skew_and_aspect_that_were_not_known_neither_harm_nor_stay_unsaid():
+def test_skew_and_aspect_that_were_not_known_neither_harm_nor_stay_unsaid() -> None:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     rng = np.random.default_rng(11)
     given = {

@@ -5,12 +5,14 @@ from __future__ import annotations
 import base64
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from ring import ring_of_cameras, ring_rig
 
 from bodyscan.calibration.pair import PairCalibration, PairQuality
+from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
@@ -26,7 +28,7 @@ SIGMA_MM = np.array([0.01, 0.02, 0.05])
 SHOTS = {("b1", "board"): 0, ("b2", "board"): 1, ("b3", "board"): 2}
 
 
-def corners(camera, targets: list[int], share: float = 0.9) -> SeenCorners:
+def corners(camera: Camera, targets: list[int], share: float = 0.9) -> SeenCorners:
     """A grid over so much of the picture's width and height, in each of the shots."""
     x, y = np.meshgrid(np.linspace(0.5 - share / 2, 0.5 + share / 2, 9), np.linspace(0.1, 0.9, 7))
     pixels = np.stack([x.ravel() * camera.width, y.ravel() * camera.height], axis=1)
@@ -60,17 +62,19 @@ def calibration() -> RigCalibration:
     )
 
 
-def worse(calibration: RigCalibration, name: str, **changes) -> RigCalibration:
+def worse(calibration: RigCalibration, name: str, **changes: Any) -> RigCalibration:
     pair = calibration.pairs[name]
     quality = replace(pair.quality, **changes)
     return replace(calibration, pairs=calibration.pairs | {name: replace(pair, quality=quality)})
 
 
-def test_a_calibration_within_all_limits_is_good(calibration):
+def test_a_calibration_within_all_limits_is_good(calibration: RigCalibration) -> None:
     assert grade_calibration(calibration) == Verdict("good")
 
 
-def test_what_exceeds_a_limit_is_named_with_pair_value_and_limit(calibration):
+def test_what_exceeds_a_limit_is_named_with_pair_value_and_limit(
+    calibration: RigCalibration,
+) -> None:
     name = min(calibration.pairs)
     verdict = grade_calibration(worse(calibration, name, corners_rms_px=0.4))
     assert verdict.grade == "usable"
@@ -81,13 +85,13 @@ def test_what_exceeds_a_limit_is_named_with_pair_value_and_limit(calibration):
     assert "5 board poses (at least 6 is good)" in verdict.reasons[1]
 
 
-def test_a_failed_pair_asks_for_a_new_calibration(calibration):
+def test_a_failed_pair_asks_for_a_new_calibration(calibration: RigCalibration) -> None:
     verdict = grade_calibration(replace(calibration, failed={"c9": "saw nothing"}))
     assert verdict.grade == "recalibrate"
     assert verdict.reasons == ("recalibrate: pair c9 failed: saw nothing",)
 
 
-def test_a_picture_that_boards_hardly_cover_is_named(calibration):
+def test_a_picture_that_boards_hardly_cover_is_named(calibration: RigCalibration) -> None:
     name = min(calibration.pairs)
     narrow = corners(calibration.pairs[name].camera, [0, 1], share=0.3)
     verdict = grade_calibration(replace(calibration, seen=calibration.seen | {name: narrow}))
@@ -96,14 +100,14 @@ def test_a_picture_that_boards_hardly_cover_is_named(calibration):
     assert f"pair {name}: boards covered 2" in verdict.reasons[0]
 
 
-def test_boards_in_common_are_counted_shot_by_shot(calibration):
+def test_boards_in_common_are_counted_shot_by_shot(calibration: RigCalibration) -> None:
     together = shared_boards(calibration)
     assert together[0, 1] == together[1, 0] == 1
     assert together[1, 2] == 2
     assert np.all(np.diag(together) == 0)
 
 
-def test_ellipsoids_are_as_large_as_the_covariance_says(calibration):
+def test_ellipsoids_are_as_large_as_the_covariance_says(calibration: RigCalibration) -> None:
     model, times = rig_model(calibration)
     whole = np.frombuffer(base64.b64decode(model["positions"]), "<u2").reshape(-1, 3)
     vertices = np.array(model["low"]) + model["step"] * whole
@@ -115,7 +119,9 @@ def test_ellipsoids_are_as_large_as_the_covariance_says(calibration):
         assert middle == pytest.approx(placing.translation, abs=1.0)
 
 
-def test_everything_is_said_and_read_back_from_disk(calibration, tmp_path: Path):
+def test_everything_is_said_and_read_back_from_disk(
+    calibration: RigCalibration, tmp_path: Path
+) -> None:
     failed = replace(calibration, failed={"c9": "saw nothing"})
     save_calibration(failed, tmp_path)
     stored = load_calibration(tmp_path)
@@ -128,7 +134,9 @@ def test_everything_is_said_and_read_back_from_disk(calibration, tmp_path: Path)
         assert part in text
 
 
-def test_a_calibration_of_before_has_a_report_too(calibration, tmp_path: Path):
+def test_a_calibration_of_before_has_a_report_too(
+    calibration: RigCalibration, tmp_path: Path
+) -> None:
     save_calibration(replace(calibration, seen={}), tmp_path)
     text = render(calibration_page(tmp_path))
     assert "calibrate again to see where the boards lay" in text

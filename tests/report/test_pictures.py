@@ -62,7 +62,7 @@ def strongly(picture: np.ndarray, channel: int, over: int) -> np.ndarray:
     return picture[..., channel] > picture[..., over] + 40
 
 
-def test_a_ball_is_a_disc_with_its_made_up_half_orange():
+def test_a_ball_is_a_disc_with_its_made_up_half_orange() -> None:
     picture = read(draw_mesh(ball(), ["front"], height_px=300))
     area = np.count_nonzero(~background(picture)) * STEP**2
     assert area == pytest.approx(np.pi * RADIUS**2, rel=0.01)
@@ -76,7 +76,7 @@ def test_a_ball_is_a_disc_with_its_made_up_half_orange():
 
 
 @pytest.mark.parametrize(("view", "side"), [("back", "left"), ("side", "all")])
-def test_views_stand_where_they_say(view: str, side: str):
+def test_views_stand_where_they_say(view: str, side: str) -> None:
     picture = read(draw_mesh(ball(), [view], height_px=300))
     orange, shown = strongly(picture, 2, 0), ~background(picture)
     share = np.count_nonzero(orange) / np.count_nonzero(shown)
@@ -85,7 +85,7 @@ def test_views_stand_where_they_say(view: str, side: str):
         assert np.nonzero(orange)[1].mean() < picture.shape[1] / 2
 
 
-def test_faces_turned_inside_out_are_magenta():
+def test_faces_turned_inside_out_are_magenta() -> None:
     mesh = replace(ball(), filled=np.zeros_like(ball().filled))
     turned = replace(mesh, faces=mesh.faces[:, ::-1])
     right, wrong = (read(draw_mesh(one, ["front"], height_px=300)) for one in (mesh, turned))
@@ -94,12 +94,12 @@ def test_faces_turned_inside_out_are_magenta():
     assert np.mean(strongly(wrong, 2, 1)[shown]) > 0.9
 
 
-def test_several_views_stand_side_by_side():
+def test_several_views_stand_side_by_side() -> None:
     one, two = (read(draw_mesh(ball(), ["front"] * n, height_px=300)) for n in (1, 2))
     assert (two == np.concatenate([one, one], axis=1)).all()
 
 
-def test_the_side_facing_away_is_hidden():
+def test_the_side_facing_away_is_hidden() -> None:
     picture = read(draw_cloud(dots(), ["front", "back"], height_px=300))
     front, back = np.split(picture, 2, axis=1)
     # The front half is red, the back half blue; at the outline either may show.
@@ -108,14 +108,14 @@ def test_the_side_facing_away_is_hidden():
         assert np.mean(strongly(half, channel, 2 - channel)[shown]) > 0.98
 
 
-def test_a_ball_of_points_has_no_holes():
+def test_a_ball_of_points_has_no_holes() -> None:
     shown = ~background(read(draw_cloud(dots(), ["side"], height_px=300)))
     area = np.count_nonzero(shown) * STEP**2
     # Four of them fall on the 2 x 2 pixels that each paints: 2 % are left; a pixel of outline.
     assert area == pytest.approx(np.pi * RADIUS**2, rel=0.05)
 
 
-def test_sigma_and_pairs_have_their_colours_and_a_bar():
+def test_sigma_and_pairs_have_their_colours_and_a_bar() -> None:
     photo, sigma, pairs = (
         read(draw_cloud(dots(), ["front"], colour=colour, height_px=300))
         for colour in ("photo", "sigma", "pairs_seen")
@@ -128,7 +128,7 @@ def test_sigma_and_pairs_have_their_colours_and_a_bar():
     assert left[:, 2].mean() > right[:, 2].mean() + 40
 
 
-def test_deviations_are_red_outside_and_blue_inside():
+def test_deviations_are_red_outside_and_blue_inside() -> None:
     cloud = dots()
     signed = np.where(cloud.points[:, 2] > 900.0, 0.8, -0.8)
     picture = read(draw_deviation(cloud.points, cloud.normals, signed, ["front"], height_px=300))
@@ -138,7 +138,7 @@ def test_deviations_are_red_outside_and_blue_inside():
     assert strongly(picture[160:220, middle], 0, 2).mean() > 0.9
 
 
-def test_unknown_colours_are_refused():
+def test_unknown_colours_are_refused() -> None:
     with pytest.raises(ValueError, match="pink"):
         draw_cloud(dots(100), colour="pink")
 
@@ -152,6 +152,8 @@ def test_unknown_colours_are_refused():
         (1.0, 4.0, [1, 2, 3, 4]),
     ],
 )
-def test_colour_bars_have_round_numbers(low, high, ticks):
+def test_colour_bars_have_round_numbers(
+    low: float, high: float, ticks: list[float | int] | list[int]
+) -> None:
     assert round_ticks(low, high) == pytest.approx(ticks)
     assert "-0.0" not in map(str, round_ticks(low, high))

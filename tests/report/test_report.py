@@ -40,7 +40,7 @@ def html(scan: MadeScan) -> str:
     return (scan.folder / "report.html").read_text("utf-8")
 
 
-def test_the_verdict_comes_first_with_its_reason_as_text(html: str):
+def test_the_verdict_comes_first_with_its_reason_as_text(html: str) -> None:
     body = html[html.index("<body>") :]
     assert "Verdict: usable" in body
     assert "the person moved by 3.4 mm &lt;/script&gt;&lt;b&gt;" in body
@@ -48,7 +48,9 @@ def test_the_verdict_comes_first_with_its_reason_as_text(html: str):
     assert "no light" in body
 
 
-def test_a_report_elsewhere_is_found_when_its_subject_is_forgotten(scan: MadeScan, tmp_path: Path):
+def test_a_report_elsewhere_is_found_when_its_subject_is_forgotten(
+    scan: MadeScan, tmp_path: Path
+) -> None:
     path = tmp_path / "elsewhere" / "r.html"
     result = CliRunner().invoke(app, ["report", str(scan.folder), "--out", str(path)])
     assert result.exit_code == 0, result.output
@@ -56,7 +58,7 @@ def test_a_report_elsewhere_is_found_when_its_subject_is_forgotten(scan: MadeSca
     assert find_subject("s-18", tmp_path).files == ()
 
 
-def test_nothing_lies_outside_of_the_file(html: str):
+def test_nothing_lies_outside_of_the_file(html: str) -> None:
     assert len(html) < 8_000_000
     assert re.findall(r"""(?:src|href)=["'](?!data:|#)""", html) == []
     assert "default-src 'none'" in html
@@ -64,11 +66,11 @@ def test_nothing_lies_outside_of_the_file(html: str):
     assert "compliant" not in html.lower()
 
 
-def test_the_same_result_gives_the_same_bytes(scan: MadeScan, html: str):
+def test_the_same_result_gives_the_same_bytes(scan: MadeScan, html: str) -> None:
     assert render(build_page(scan.folder)) == html
 
 
-def test_simulated_is_said_and_only_where_it_is_known(tmp_path: Path, html: str):
+def test_simulated_is_said_and_only_where_it_is_known(tmp_path: Path, html: str) -> None:
     assert "synthetic" not in html[html.index("<body>") :]
     beside = make_scan(tmp_path / "w" / "scan")
     write_json(tmp_path / "w" / "truth" / "truth.json", {})
@@ -76,7 +78,7 @@ def test_simulated_is_said_and_only_where_it_is_known(tmp_path: Path, html: str)
     assert build_page(make_scan(tmp_path / "x" / "scan", subject="sim-woman").folder).synthetic
 
 
-def test_the_body_is_packed_to_a_fraction_of_a_millimetre(html: str, scan: MadeScan):
+def test_the_body_is_packed_to_a_fraction_of_a_millimetre(html: str, scan: MadeScan) -> None:
     model = json.loads(re.search(r'<script type="application/json">(.*?)</script>', html)[1])
     whole = np.frombuffer(base64.b64decode(model["positions"]), "<u2").reshape(-1, 3)
     vertices = np.array(model["low"]) + model["step"] * whole
@@ -91,13 +93,13 @@ def test_the_body_is_packed_to_a_fraction_of_a_millimetre(html: str, scan: MadeS
     assert np.array_equal(np.flatnonzero(orange[:, 0] == 255), made_up)
 
 
-def test_a_mesh_too_large_for_its_indices_is_refused():
+def test_a_mesh_too_large_for_its_indices_is_refused() -> None:
     many = np.zeros((65_537, 3))
     with pytest.raises(ValueError, match="65537"):
         pack(Shape(many, np.zeros((1, 3), np.int64), many), [Layer("", many.astype(np.uint8))])
 
 
-def test_holes_are_found_where_nothing_was_measured():
+def test_holes_are_found_where_nothing_was_measured() -> None:
     mesh = egg()
     height = mesh.vertices[mesh.faces][:, :, 2].mean(axis=1)
     (sole, crown) = height < 80.0, height > 1600.0
@@ -114,7 +116,7 @@ def test_holes_are_found_where_nothing_was_measured():
     assert holes(replace(mesh, filled=np.zeros_like(mesh.filled))) == []
 
 
-def test_a_larger_body_lies_outside_of_a_smaller_one(tmp_path: Path):
+def test_a_larger_body_lies_outside_of_a_smaller_one(tmp_path: Path) -> None:
     small, large = make_scan(tmp_path / "small"), make_scan(tmp_path / "large", grown_mm=0.5)
     standing, laid = compare_surfaces(large.mesh, small.folder)
     assert (standing.fitted, laid.fitted) == (False, True)
@@ -129,7 +131,7 @@ def test_a_larger_body_lies_outside_of_a_smaller_one(tmp_path: Path):
     assert "Compared with small" in page
 
 
-def test_a_scan_that_stood_elsewhere_is_laid_on_the_other(tmp_path: Path):
+def test_a_scan_that_stood_elsewhere_is_laid_on_the_other(tmp_path: Path) -> None:
     other = make_scan(tmp_path / "there")
     mesh = egg()
     away = replace(mesh, vertices=mesh.vertices + np.array([6.0, -4.0, 2.0]))
@@ -139,14 +141,14 @@ def test_a_scan_that_stood_elsewhere_is_laid_on_the_other(tmp_path: Path):
     assert laid.other_from_scan.translation == pytest.approx([-6.0, 4.0, -2.0], abs=0.3)
 
 
-def test_a_surface_in_metres_is_refused(tmp_path: Path):
+def test_a_surface_in_metres_is_refused(tmp_path: Path) -> None:
     ball = o3d.geometry.TriangleMesh.create_sphere(0.9)
     o3d.io.write_triangle_mesh(str(tmp_path / "metres.ply"), ball)
     with pytest.raises(BadInput, match="millimetres"):
         compare_surfaces(egg(20), tmp_path / "metres.ply")
 
 
-def test_a_scan_without_a_model_has_a_report_of_why(tmp_path: Path):
+def test_a_scan_without_a_model_has_a_report_of_why(tmp_path: Path) -> None:
     facts = {
         "schema": "bodyscan-scan",
         "software": "bodyscan 0.1.0",
@@ -162,7 +164,7 @@ def test_a_scan_without_a_model_has_a_report_of_why(tmp_path: Path):
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"schema": "bodyscan-scan"}'])
-def test_what_is_no_result_is_said(tmp_path: Path, content: str):
+def test_what_is_no_result_is_said(tmp_path: Path, content: str) -> None:
     with pytest.raises(BadInput, match="neither"):
         build_page(tmp_path)
     (tmp_path / "scan.json").write_text(content)
@@ -170,7 +172,7 @@ def test_what_is_no_result_is_said(tmp_path: Path, content: str):
         build_page(tmp_path)
 
 
-def test_a_slip_of_the_pen_is_not_taken_for_the_folder_above(scan: MadeScan):
+def test_a_slip_of_the_pen_is_not_taken_for_the_folder_above(scan: MadeScan) -> None:
     with pytest.raises(BadInput, match="no such file"):
         build_page(scan.folder / "scam.json")
     with pytest.raises(BadInput, match="neither"):
@@ -178,7 +180,7 @@ def test_a_slip_of_the_pen_is_not_taken_for_the_folder_above(scan: MadeScan):
     assert build_page(scan.folder / "scan.json").title == "Scan of s-17"
 
 
-def test_limits_are_kept_or_not():
+def test_limits_are_kept_or_not() -> None:
     assert Number("n", 0.4, "mm", "", 0.4).within_limit
     assert not Number("n", 0.41, "mm", "", 0.4).within_limit
     assert Number("n", 7, "", "", 6, at_least=True).within_limit
@@ -196,7 +198,7 @@ def executable() -> str:
 
 def test_a_browser_shows_the_body_and_turns_it(
     scan: MadeScan, html: str, executable: str, tmp_path: Path
-):
+) -> None:
     with browser_page(executable, tmp_path / "profile") as page:
         page.open(scan.folder / "report.html")
         page.evaluate("document.querySelector('.stage').scrollIntoView()")

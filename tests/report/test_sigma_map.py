@@ -6,6 +6,7 @@ from ring import ring_of_cameras
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.visibility import in_image
 from bodyscan.report.sigma_map import draw_sigma_map, sigma_at
 from bodyscan.rig.rig import Volume
@@ -13,20 +14,20 @@ from bodyscan.rig.rig import Volume
 MIDDLE = np.array([[0.0, 0.0, 1000.0]])
 
 
-def shifts(names, mm):
+def shifts(names: dict[str, RigidTransform], mm: float) -> PoseCovariance:
     """Every pair shifted by itself, `mm` along each axis, not turned."""
     own = np.diag([0.0, 0.0, 0.0, *[mm**2] * 3])
     return PoseCovariance(tuple(names), np.kron(np.eye(len(names)), own))
 
 
-def test_independent_shifts_average_out():
+def test_independent_shifts_average_out() -> None:
     placings, cameras = ring_of_cameras(heights=(1000,))
     sigma, seen = sigma_at(MIDDLE, placings, cameras, shifts(placings, 0.3))
     assert seen[0] == 3
     assert sigma[0] == pytest.approx(0.3 * np.sqrt(3) / np.sqrt(3))  # three axes, three pairs
 
 
-def test_shifts_in_common_do_not():
+def test_shifts_in_common_do_not() -> None:
     placings, cameras = ring_of_cameras(heights=(1000,))
     own = np.diag([0.0, 0.0, 0.0, *[0.3**2] * 3])
     together = PoseCovariance(tuple(placings), np.kron(np.ones((3, 3)), own))
@@ -34,7 +35,7 @@ def test_shifts_in_common_do_not():
     assert sigma[0] == pytest.approx(0.3 * np.sqrt(3))
 
 
-def test_sigma_is_that_of_drawn_placings():
+def test_sigma_is_that_of_drawn_placings() -> None:
     placings, cameras = ring_of_cameras(heights=(900, 1300))
     names = tuple(placings)
     rng = np.random.default_rng(1)
@@ -60,7 +61,7 @@ def test_sigma_is_that_of_drawn_placings():
     np.testing.assert_allclose(sigma, drawn, rtol=0.1)
 
 
-def test_what_no_pair_sees_has_no_sigma():
+def test_what_no_pair_sees_has_no_sigma() -> None:
     placings, cameras = ring_of_cameras(heights=(400,))
     sigma, seen = sigma_at(np.array([[0.0, 0.0, 2100.0]]), placings, cameras, shifts(placings, 0.3))
     assert seen[0] == 0
@@ -78,7 +79,7 @@ def test_what_no_pair_sees_has_no_sigma():
         assert np.ptp(picture[700, column].astype(int)) > 50
 
 
-def test_points_that_the_lens_folds_back_are_not_seen():
+def test_points_that_the_lens_folds_back_are_not_seen() -> None:
     """With Radial(-0.4, 0) a point at 70 degrees projects into the image, which ends at 23 degrees."""
     camera = Camera(1500.0, 1500.0, 0.0, 640.0, 512.0, Radial(-0.4, 0.0), 1280, 1024)
     angles = np.linspace(0.0, 1.4, 200)

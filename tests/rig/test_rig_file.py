@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -330,7 +331,9 @@ def test_frame_names() -> None:
         max_leaves=20,
     )
 )
-def test_written_yaml_reads_back_as_it_was(tmp_path_factory: pytest.TempPathFactory, data) -> None:
+def test_written_yaml_reads_back_as_it_was(
+    tmp_path_factory: pytest.TempPathFactory, data: Any
+) -> None:
     path = tmp_path_factory.getbasetemp() / "any.yaml"
     path.write_text(dump_yaml(data), encoding="utf-8", newline="")
     document = read_yaml(path)

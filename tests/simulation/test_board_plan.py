@@ -49,7 +49,9 @@ def seen(pair: TruePair, shot: BoardShot, rig: Rig) -> tuple[float, float, bool]
     return float(np.degrees(np.arccos(abs(cosine)))), float(np.mean(inside)), bool(cosine < 0)
 
 
-def test_who_takes_what_follows_the_rules(plan) -> None:
+def test_who_takes_what_follows_the_rules(
+    plan: tuple[Rig, dict[str, TruePair], list[BoardShot]],
+) -> None:
     rig, pairs, shots = plan
     for shot in [shot for shot in shots if shot.name != rig.rig_frame.shot][::4]:
         assert not set(shot.stripes) & set(shot.lit)
@@ -68,7 +70,9 @@ def test_who_takes_what_follows_the_rules(plan) -> None:
                 assert angle > 69 or inside < (1.0 if whole else 0.3) or not front
 
 
-def test_every_pair_gets_its_boards_near_and_far_and_tilted(plan) -> None:
+def test_every_pair_gets_its_boards_near_and_far_and_tilted(
+    plan: tuple[Rig, dict[str, TruePair], list[BoardShot]],
+) -> None:
     rig, pairs, shots = plan
     for name, pair in pairs.items():
         own = [shot for shot in shots if name in shot.stripes]
@@ -83,7 +87,9 @@ def test_every_pair_gets_its_boards_near_and_far_and_tilted(plan) -> None:
         assert spread[1] > 0.08  # about two axes, by 5 degrees and more (one sigma)
 
 
-def test_boards_are_above_the_floor_and_in_the_middle(plan) -> None:
+def test_boards_are_above_the_floor_and_in_the_middle(
+    plan: tuple[Rig, dict[str, TruePair], list[BoardShot]],
+) -> None:
     rig, _, shots = plan
     for shot in shots:
         board = rig.board(shot.board)
@@ -113,7 +119,9 @@ def test_stripes_are_seen_on_three_boards_where_the_subject_stands() -> None:
         assert np.mean(count >= 3) > 0.8, name
 
 
-def test_pairs_of_all_poles_are_tied_together(plan) -> None:
+def test_pairs_of_all_poles_are_tied_together(
+    plan: tuple[Rig, dict[str, TruePair], list[BoardShot]],
+) -> None:
     _, pairs, shots = plan
     groups = {name: {name} for name in pairs}
     for shot in shots:

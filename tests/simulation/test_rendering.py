@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,9 +12,11 @@ import open3d as o3d
 import pytest
 from small_view import CAMERA, CRISP, LAMPS, SHARP, STRIPES, projector, view, wall
 
+from bodyscan.arrays import Floats
 from bodyscan.simulation.gray import code_bits
 from bodyscan.simulation.layout import build_mirror, build_pinhole
 from bodyscan.simulation.lens import TrueCamera
+from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
 from bodyscan.simulation.render import View, pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.sensor import blur, expose
@@ -30,7 +34,15 @@ def ball(centre: list[float], radius: float, albedo: float = 0.8) -> Surface:
     )
 
 
-def render(surfaces, *, projection=CRISP, optics=SHARP, light=None, sequence=True, seed=0):
+def render(
+    surfaces: list[Surface],
+    *,
+    projection: Projection = CRISP,
+    optics: Optics = SHARP,
+    light: MirrorProjector | PinholeProjector | None = None,
+    sequence: bool = True,
+    seed: int = 0,
+) -> dict[str, Floats]:
     return render_pair(
         Scene(surfaces),
         view(optics),
@@ -52,7 +64,7 @@ def read(images: dict[str, np.ndarray]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("build", [build_mirror, build_pinhole])
-def test_frames_read_as_the_true_stripe(build) -> None:
+def test_frames_read_as_the_true_stripe(build: Callable[..., Any]) -> None:
     surfaces = [wall(1500.0, albedo=0.7), ball([40.0, -30.0, 1000.0], 200.0)]
     light = projector(build)
     images = render(surfaces, light=light)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,7 +94,7 @@ def test_tilt_angles_are_not_zero() -> None:
 
 @pytest.mark.parametrize("build", [build_mirror, build_pinhole])
 @pytest.mark.parametrize("horizontal", [True, False])
-def test_sweep_covers_what_the_camera_sees(build, horizontal: bool) -> None:
+def test_sweep_covers_what_the_camera_sees(build: Callable[..., Any], horizontal: bool) -> None:
     projector = build(ABOVE, 640, horizontal, SEEN, Projection(), np.random.default_rng(2))
     s = projector.stripe(SEEN)
     assert np.isfinite(s).all()

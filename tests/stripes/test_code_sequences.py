@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from stripe_rendering import code_light, render
 
+from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.codes import stripe_code
 from bodyscan.stripes.codes.phase_shift import PhaseShift
 from bodyscan.stripes.codes.stripe_index import StripeIndex
 from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.stripe_map import StripeMap
 
 STRIPES = 60
 
 
-def rendered(**code):
+def rendered(**code: Any) -> Callable[..., Any]:
     """A function that reads a good sequence after `change` has been at its images."""
     spec = stripe_code({**code, "stripes": STRIPES, "direction": "horizontal"})
     lights = code_light(stripes=STRIPES, **code)
@@ -26,7 +31,9 @@ def rendered(**code):
         shape=(130, 130),
     )
 
-    def read(change=lambda images: None, *, spec=spec, lit=lit):
+    def read(
+        change: Callable[..., Any] = lambda images: None, *, spec: Any = spec, lit: Bytes = lit
+    ) -> StripeMap:
         images = {"coded": coded.copy(), "dark": dark, "lit": lit}
         change(images)
         return decode_stripes(spec, images["lit"], images["dark"], images["coded"], where="pair a")
@@ -35,54 +42,56 @@ def rendered(**code):
     return read
 
 
-def exchanged(first, second):
-    def change(images):
+def exchanged(first: int, second: int) -> Callable[..., Any]:
+    def change(images: dict[str, Bytes]) -> None:
         images["coded"][[first, second]] = images["coded"][[second, first]]
 
     return change
 
 
-def replaced(place, by):
-    def change(images):
+def replaced(place: int, by: int | str) -> Callable[..., Any]:
+    def change(images: dict[str, Bytes]) -> None:
         images["coded"][place] = images[by] if isinstance(by, str) else images["coded"][by]
 
     return change
 
 
 @pytest.fixture(scope="module")
-def plain_gray():
+def plain_gray() -> Callable[..., Any]:
     return rendered(code="gray", inverses=False)
 
 
 @pytest.fixture(scope="module")
-def binary():
+def binary() -> Callable[..., Any]:
     return rendered(code="binary")
 
 
 @pytest.fixture(scope="module")
-def section():
+def section() -> Callable[..., Any]:
     return rendered(code="light-section")
 
 
 @pytest.fixture(scope="module")
-def phase():
+def phase() -> Callable[..., Any]:
     return rendered(code="phase-shift", steps=4, period=8)
 
 
-def test_exchanged_bits_without_inverses_are_named(plain_gray):
+def test_exchanged_bits_without_inverses_are_named(plain_gray: Callable[..., Any]) -> None:
     with pytest.raises(DecodingFailed, match="bits 1 and 3 were exchanged") as caught:
         plain_gray(exchanged(1, 3))
     assert caught.value.where == "pair a"
 
 
 @pytest.mark.parametrize("bit", range(6))
-def test_a_missing_pattern_without_inverse_is_noticed(plain_gray, bit):
+def test_a_missing_pattern_without_inverse_is_noticed(
+    plain_gray: Callable[..., Any], bit: int
+) -> None:
     with pytest.raises(DecodingFailed, match="do not make a stripe code"):
         plain_gray(replaced(bit, "dark"))
 
 
-def test_a_pattern_exposed_otherwise_is_named(plain_gray):
-    def brighter(images):
+def test_a_pattern_exposed_otherwise_is_named(plain_gray: Callable[..., Any]) -> None:
+    def brighter(images: dict[str, Bytes]) -> None:
         images["coded"][2] = np.minimum(images["coded"][2].astype(int) * 2, 255)
 
     with pytest.raises(DecodingFailed, match="the pattern of bit 2 is brighter than the lit frame"):
@@ -90,8 +99,10 @@ def test_a_pattern_exposed_otherwise_is_named(plain_gray):
 
 
 @pytest.mark.parametrize(("one", "other"), [(0, 1), (2, 5)])
-def test_exchanged_bits_of_the_plain_code_are_named(binary, one, other):
-    def change(images):
+def test_exchanged_bits_of_the_plain_code_are_named(
+    binary: Callable[..., Any], one: int, other: int
+) -> None:
+    def change(images: dict[str, Bytes]) -> None:
         exchanged(one, other)(images)
         exchanged(6 + one, 6 + other)(images)
 
@@ -100,31 +111,35 @@ def test_exchanged_bits_of_the_plain_code_are_named(binary, one, other):
 
 
 @pytest.mark.parametrize(("one", "other"), [(10, 30), (20, 21), (14, 16)])
-def test_exchanged_images_of_a_sweep_are_named(section, one, other):
+def test_exchanged_images_of_a_sweep_are_named(
+    section: Callable[..., Any], one: int, other: int
+) -> None:
     with pytest.raises(DecodingFailed, match=f"stripes {one} and {other} were exchanged"):
         section(exchanged(one, other))
 
 
-def test_images_of_a_sweep_that_are_missing_or_double_are_named(section):
+def test_images_of_a_sweep_that_are_missing_or_double_are_named(
+    section: Callable[..., Any],
+) -> None:
     with pytest.raises(DecodingFailed, match="stripe 25 shows no line of its own"):
         section(replaced(25, "dark"))
     with pytest.raises(DecodingFailed, match="stripe 26 shows no line of its own"):
         section(replaced(26, 25))
 
 
-def test_a_sweep_in_no_order_is_noticed(section):
-    def shuffled(images):
+def test_a_sweep_in_no_order_is_noticed(section: Callable[..., Any]) -> None:
+    def shuffled(images: dict[str, Bytes]) -> None:
         images["coded"] = np.random.default_rng(0).permutation(images["coded"])
 
     with pytest.raises(DecodingFailed, match="see whether the images are in their order"):
         section(shuffled)
 
 
-def test_a_sweep_that_is_dark_or_too_bright_is_refused(section):
-    def dark(images):
+def test_a_sweep_that_is_dark_or_too_bright_is_refused(section: Callable[..., Any]) -> None:
+    def dark(images: dict[str, Bytes]) -> None:
         images["coded"][:] = images["dark"]
 
-    def bright(images):
+    def bright(images: dict[str, Bytes]) -> None:
         images["coded"] = np.minimum(images["coded"].astype(int) * 3, 255).astype(np.uint8)
 
     with pytest.raises(DecodingFailed, match="lights only"):
@@ -145,35 +160,37 @@ def test_a_sweep_that_is_dark_or_too_bright_is_refused(section):
          "the phase images began with number 1"),
     ],
 )  # fmt: skip
-def test_phase_images_in_another_order_are_named(phase, change, cause):
+def test_phase_images_in_another_order_are_named(
+    phase: Callable[..., Any], change: Callable[..., Any], cause: str
+) -> None:
     with pytest.raises(DecodingFailed, match=cause):
         phase(change)
 
 
-def test_phase_images_that_are_missing_or_double_are_named(phase):
+def test_phase_images_that_are_missing_or_double_are_named(phase: Callable[..., Any]) -> None:
     with pytest.raises(DecodingFailed, match="phase images 1 and 2 look alike"):
         phase(replaced(-2, -3))
     with pytest.raises(DecodingFailed, match="phase image 3 is 0% as bright as lit"):
         phase(replaced(-1, "dark"))
 
 
-def test_a_wrong_period_is_noticed(phase):
+def test_a_wrong_period_is_noticed(phase: Callable[..., Any]) -> None:
     spec = PhaseShift(stripes=STRIPES, direction="horizontal", steps=4, period=6)
     with pytest.raises(DecodingFailed):
         phase(spec=spec)
 
 
-def index_image(s):
+def index_image(s: Array) -> Indices:
     return np.where((s >= 0) & (s < STRIPES), np.clip(s, 0, 254).astype(int) + 1, 0)
 
 
-def read_index(image, stripes=STRIPES, direction="horizontal"):
+def read_index(image: Indices, stripes: int = STRIPES, direction: str = "horizontal") -> StripeMap:
     spec = StripeIndex(stripes=stripes, direction=direction)
     lit = np.full(image.shape, 200, np.uint8)
     return decode_stripes(spec, lit, None, image.astype(np.uint8)[None])
 
 
-def test_a_stripe_index_image_is_read_or_refused():
+def test_a_stripe_index_image_is_read_or_refused() -> None:
     v, u = np.mgrid[:130, :130]
     image = index_image(1.2 + (v + 0.1 * u) / 2.3)
     image[:5], image[5:9] = 0, 255  # both are no stripe
@@ -191,8 +208,8 @@ def test_a_stripe_index_image_is_read_or_refused():
         read_index(np.where(image > 0, (image * 37) % 60 + 1, 0))
 
 
-def test_too_few_images_are_refused(section):
-    def fewer(images):
+def test_too_few_images_are_refused(section: Callable[..., Any]) -> None:
+    def fewer(images: dict[str, Bytes]) -> None:
         images["coded"] = images["coded"][1:]
 
     with pytest.raises(DecodingFailed, match="59 images of the code, but it has 60"):

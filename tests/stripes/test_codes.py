@@ -15,7 +15,7 @@ from bodyscan.stripes.patterns import pattern_frames
 
 
 @given(st.integers(2, 65535))
-def test_code_words_are_turned_back_into_stripes(stripes):
+def test_code_words_are_turned_back_into_stripes(stripes: int) -> None:
     stripe = np.unique(np.linspace(0, stripes - 1, 50).astype(np.int64))
     gray = gray_from_stripe(stripe)
     assert gray.max() < 2 ** bits_needed(stripes)
@@ -23,7 +23,7 @@ def test_code_words_are_turned_back_into_stripes(stripes):
 
 
 @given(st.integers(1, 65535))
-def test_exactly_one_known_bit_flips_at_a_boundary(boundary):
+def test_exactly_one_known_bit_flips_at_a_boundary(boundary: int) -> None:
     bits = 16
     before, behind = (int(gray_from_stripe(np.int64(boundary - k))) for k in (1, 0))
     flipped = f"{before ^ behind:016b}"
@@ -33,7 +33,9 @@ def test_exactly_one_known_bit_flips_at_a_boundary(boundary):
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @given(stripes=st.integers(2, 40))
-def test_patterns_are_stripes_that_differ_in_one_bit_from_their_neighbours(direction, stripes):
+def test_patterns_are_stripes_that_differ_in_one_bit_from_their_neighbours(
+    direction: str, stripes: int
+) -> None:
     spec = Gray(stripes=stripes, direction=direction)
     frames = pattern_frames(spec, width=41, height=40)
     frames, inverses = np.split(frames, 2)
@@ -52,14 +54,16 @@ def test_patterns_are_stripes_that_differ_in_one_bit_from_their_neighbours(direc
     assert not words[0].any(), "stripe 0 is written as 0"
 
 
-def test_stripes_narrower_than_a_projector_pixel_are_refused():
+def test_stripes_narrower_than_a_projector_pixel_are_refused() -> None:
     with pytest.raises(BadInput, match="do not fit"):
         pattern_frames(Gray(stripes=50, direction="vertical"), width=49, height=100)
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("with_dark", [True, False])
-def test_projected_frames_seen_as_they_are_give_their_stripes(direction, with_dark):
+def test_projected_frames_seen_as_they_are_give_their_stripes(
+    direction: str, with_dark: bool
+) -> None:
     spec = Gray(stripes=40, direction=direction)
     patterns, inverses = np.split(pattern_frames(spec, width=120, height=160) // 2 + 20, 2)
     lit = np.full((160, 120), 147, np.uint8)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from stripe_rendering import checkered, code_light, render, white
 
+from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.errors import BadInput, DecodingFailed
 from bodyscan.stripes.codes import stripe_code
 from bodyscan.stripes.decoding import decode_stripes
@@ -24,7 +28,7 @@ THREE_PHASES = {"code": "phase-shift", "steps": 3, "period": 16, "inverses": Fal
 ALL = [PLAIN_GRAY, BINARY, PLAIN_BINARY, SECTION, INDEX, PHASE, THREE_PHASES]
 
 
-def name(value):
+def name(value: Any) -> str | None:
     if not isinstance(value, dict):
         return None
     return "-".join(str(part) for part in value.values())
@@ -34,14 +38,16 @@ def spec_of(code: dict, stripes: int, direction: str = "horizontal") -> StripeCo
     return stripe_code({**code, "stripes": stripes, "direction": direction})
 
 
-def wavy(stripe_px):
-    def s_at(u, v):
+def wavy(stripe_px: float) -> Callable[..., Any]:
+    def s_at(u: Array | Indices, v: Array | Indices) -> Array:
         return 3.3 + (v + 0.1 * u + 2.5 * np.sin(u / 23) + 1.5 * np.sin(v / 31)) / stripe_px
 
     return s_at
 
 
-def captured(code: dict, s_at, stripes: int, **scene):
+def captured(
+    code: dict, s_at: Callable[..., Any], stripes: int, **scene: Any
+) -> tuple[Bytes, Bytes, Bytes, Array]:
     """Lit, dark, coded images and the true s at pixel centres."""
     scene = {"shape": (110, 140), **scene}
     if code["code"] != "stripe-index":
@@ -51,20 +57,20 @@ def captured(code: dict, s_at, stripes: int, **scene):
     return lit, dark, number.astype(np.uint8)[None], s
 
 
-def read(code: dict, images, stripes: int) -> StripeMap:
+def read(code: dict, images: tuple[Bytes, Bytes, Bytes, Array], stripes: int) -> StripeMap:
     lit, dark, coded, _ = images
     return decode_stripes(spec_of(code, stripes), lit, dark, coded)
 
 
-def rms(values):
+def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def robust(errors):
+def robust(errors: Array) -> float:
     return np.median(np.abs(errors)) / 0.6745
 
 
-def boundary_errors(seen, s_at):
+def boundary_errors(seen: StripeMap, s_at: Callable[..., Any]) -> Array:
     """How far boundaries lie from where they should be, across the stripes, px."""
     u, v = seen.boundary_pixels.T
     slope = s_at(u, v + 0.5) - s_at(u, v - 0.5)
@@ -88,7 +94,9 @@ def boundary_errors(seen, s_at):
     ],
     ids=name,
 )
-def test_s_and_boundaries_are_where_they_should_be(code, s_rms, boundary_px, share):
+def test_s_and_boundaries_are_where_they_should_be(
+    code: dict[str, Any], s_rms: float, boundary_px: float, share: float
+) -> None:
     s_at = wavy(2.2)
     images = captured(code, s_at, 60)
     seen = read(code, images, 60)
@@ -106,7 +114,9 @@ def test_s_and_boundaries_are_where_they_should_be(code, s_rms, boundary_px, sha
 @pytest.mark.parametrize(
     ("code", "s_rms"), [(SECTION, (0.024, 0.018)), (PHASE, (0.027, 0.016))], ids=name
 )
-def test_narrow_and_wide_stripes_are_read_too(code, s_rms, stripe_px):
+def test_narrow_and_wide_stripes_are_read_too(
+    code: dict[str, Any], s_rms: tuple[float, float], stripe_px: float
+) -> None:
     stripes = int(140 / stripe_px)
     images = captured(code, wavy(stripe_px), stripes)
     seen = read(code, images, stripes)
@@ -117,7 +127,7 @@ def test_narrow_and_wide_stripes_are_read_too(code, s_rms, stripe_px):
 
 
 @pytest.mark.parametrize("code", [PLAIN_GRAY, SECTION, PHASE, THREE_PHASES], ids=name)
-def test_sigmas_say_how_far_off_values_are_in_dim_light(code):
+def test_sigmas_say_how_far_off_values_are_in_dim_light(code: dict[str, Any]) -> None:
     s_at, light = wavy(3.0), 40.0
     images = captured(code, s_at, 50, light=light)
     seen = read(code, images, 50)
@@ -131,7 +141,9 @@ def test_sigmas_say_how_far_off_values_are_in_dim_light(code):
 @pytest.mark.parametrize(
     ("code", "untouched", "corrected"), [(SECTION, 0.16, 0.12), (PHASE, 0.13, 0.1)], ids=name
 )
-def test_black_and_white_pulls_pixels_less(code, untouched, corrected):
+def test_black_and_white_pulls_pixels_less(
+    code: dict[str, Any], untouched: float, corrected: float
+) -> None:
     images = captured(code, wavy(2.2), 60, albedo=checkered(24))
     seen = read(code, images, 60)
     error = (seen.s - images[3])[np.isfinite(images[3]) & np.isfinite(seen.s)]
@@ -140,7 +152,7 @@ def test_black_and_white_pulls_pixels_less(code, untouched, corrected):
 
 
 @pytest.mark.parametrize("code", ALL, ids=name)
-def test_vertical_stripes_are_horizontal_ones_transposed(code):
+def test_vertical_stripes_are_horizontal_ones_transposed(code: dict[str, Any]) -> None:
     images = captured(code, wavy(3.0), 64, shape=(120, 140))
     seen = read(code, images, 64)
     lit, dark, coded = images[0].T, images[1].T, images[2].transpose(0, 2, 1)
@@ -153,7 +165,7 @@ def test_vertical_stripes_are_horizontal_ones_transposed(code):
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("code", [each for each in ALL if each is not INDEX], ids=name)
-def test_what_is_projected_is_read_as_it_is(code, direction):
+def test_what_is_projected_is_read_as_it_is(code: dict[str, Any], direction: str) -> None:
     spec = spec_of(code, 40, direction)
     coded = pattern_frames(spec, 120, 160) // 2 + 20
     assert len(coded) == sum(spec.image_counts.values())
@@ -171,10 +183,10 @@ def test_what_is_projected_is_read_as_it_is(code, direction):
 
 
 @pytest.mark.parametrize("code", [SECTION, PHASE, INDEX], ids=name)
-def test_a_depth_jump_gives_no_values_in_between(code):
+def test_a_depth_jump_gives_no_values_in_between(code: dict[str, Any]) -> None:
     near, far = wavy(2.2), lambda u, v: wavy(2.2)(u, v) + 17.3
 
-    def s_at(u, v):
+    def s_at(u: Array | Indices, v: Array | Indices) -> Array:
         return np.where((u - 70) ** 2 + (v - 55) ** 2 < 35**2, near(u, v), far(u, v))
 
     seen = read(code, captured(code, s_at, 80), 80)
@@ -187,8 +199,8 @@ def test_a_depth_jump_gives_no_values_in_between(code):
     assert (nearest > 1.0).sum() == 0
 
 
-def test_too_bright_and_doubly_lit_pixels_have_no_value_in_a_light_section():
-    def bright_spot(u, v):
+def test_too_bright_and_doubly_lit_pixels_have_no_value_in_a_light_section() -> None:
+    def bright_spot(u: Array, v: Array) -> Array:
         return np.where((u - 60) ** 2 + (v - 60) ** 2 < 20**2, 1.5, 1.0)
 
     lit, dark, coded, s = captured(SECTION, wavy(3.0), 50, albedo=bright_spot)
@@ -205,19 +217,19 @@ def test_too_bright_and_doubly_lit_pixels_have_no_value_in_a_light_section():
 
 
 @pytest.mark.parametrize("code", [SECTION, PHASE], ids=name)
-def test_the_same_images_give_the_same_bytes(code):
+def test_the_same_images_give_the_same_bytes(code: dict[str, Any]) -> None:
     images = captured(code, wavy(3.0), 64, shape=(100, 120), albedo=white)
     one, other = read(code, images, 64), read(code, images, 64)
     assert one.s.tobytes() == other.s.tobytes()
     assert one.boundary_pixels.tobytes() == other.boundary_pixels.tobytes()
 
 
-def test_an_instrument_projects_stripes_of_its_own():
+def test_an_instrument_projects_stripes_of_its_own() -> None:
     with pytest.raises(BadInput, match="projects stripes of its own"):
         pattern_frames(spec_of(INDEX, 100), 640, 480)
 
 
-def test_black_must_be_known():
+def test_black_must_be_known() -> None:
     lit, _, coded, _ = captured(PLAIN_GRAY, wavy(3.0), 64, shape=(60, 80))
     with pytest.raises(DecodingFailed, match="show what black is"):
         decode_stripes(spec_of(PLAIN_GRAY, 64), lit, None, coded)
@@ -225,7 +237,7 @@ def test_black_must_be_known():
 
 @pytest.mark.parametrize("code", [{"code": "gray"}, *ALL], ids=name)
 @pytest.mark.parametrize("rising", [True, False])
-def test_wanted_stripes_are_decoded_as_if_all_were(code, rising):
+def test_wanted_stripes_are_decoded_as_if_all_were(code: dict[str, Any], rising: bool) -> None:
     stripes = 60
     images = captured(code, wavy(2.2), stripes)
     whole = read(code, images, stripes)

@@ -79,7 +79,9 @@ def test_a_shadow_that_other_surfaces_light_shows_no_stripes() -> None:
 
 
 @pytest.mark.parametrize("pixels", [1.3, 2.0, 6.0])
-def test_direct_light_is_never_taken_for_indirect(pixels: float, monkeypatch) -> None:
+def test_direct_light_is_never_taken_for_indirect(
+    pixels: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whatever the stripes' width: all pixels that were read without asking are read."""
     plain = render_sequence(
         lambda u, v: 0.5 + u / pixels, stripes=int(250 / pixels), light=60.0, noise=1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -30,14 +31,14 @@ NAMED = ITS_RIG + "frames: {digit: 'd{digit}'}\n"
 
 
 @pytest.fixture
-def registered():
+def registered() -> Iterator[None]:
     codes.register(ShiftedBinary)
     yield
     del codes._CODES["shifted-binary"]
 
 
 @pytest.mark.usefixtures("registered")
-def test_it_goes_all_the_way_from_the_rig_file_to_stripes(tmp_path: Path):
+def test_it_goes_all_the_way_from_the_rig_file_to_stripes(tmp_path: Path) -> None:
     rig = load_rig(write(tmp_path / "rig.yaml", NAMED))
     code = rig.pair("p1").projector
     assert code == ShiftedBinary(stripes=12, direction="horizontal", first=9)
@@ -81,14 +82,14 @@ def test_it_goes_all_the_way_from_the_rig_file_to_stripes(tmp_path: Path):
         ("frames: {", "frames: {dark: null, ", "frames.dark: is needed: pair p1"),
     ],
 )
-def test_its_keys_are_checked_as_all_are(tmp_path: Path, old: str, new: str, line: str):
+def test_its_keys_are_checked_as_all_are(tmp_path: Path, old: str, new: str, line: str) -> None:
     with pytest.raises(RigFileError) as caught:
         load_rig(write(tmp_path / "rig.yaml", NAMED.replace(old, new)))
     assert line in str(caught.value)
     assert len(str(caught.value).splitlines()) == 2
 
 
-def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path):
+def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path) -> None:
     rig = write(tmp_path / "rig.yaml", ITS_RIG)
     call = ("patterns", rig, "--out", "out", "--width", 40, "--height", 30)
     done = run_with_file(tmp_path, shifted_binary, "stripes/codes/shifted_binary.py", *call)
@@ -97,7 +98,7 @@ def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path):
 
 
 @pytest.mark.usefixtures("registered")
-def test_the_simulator_refuses_a_code_that_it_has_no_formulas_for(tmp_path: Path):
+def test_the_simulator_refuses_a_code_that_it_has_no_formulas_for(tmp_path: Path) -> None:
     rig = write(tmp_path / "rig.yaml", ITS_RIG)
     with pytest.raises(BadInput, match="shifted-binary is none that the simulator knows") as caught:
         simulate(rig, tmp_path / "made")
@@ -105,7 +106,7 @@ def test_the_simulator_refuses_a_code_that_it_has_no_formulas_for(tmp_path: Path
     assert not (tmp_path / "made").exists()
 
 
-def test_a_name_that_is_taken_is_refused():
+def test_a_name_that_is_taken_is_refused() -> None:
     class Another(ShiftedBinary):
         code: str = "gray"
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from stripe_rendering import Sequence, decode_gray, render_sequence
 
+from bodyscan.arrays import Bytes
 from bodyscan.errors import DecodingFailed
+from bodyscan.stripes.stripe_map import StripeMap
 
 STRIPES = 100
 BITS = 7
@@ -21,29 +23,29 @@ def good() -> Sequence:
     )
 
 
-def read(sequence, direction="horizontal"):
+def read(sequence: Sequence, direction: str = "horizontal") -> StripeMap:
     return decode_gray(
         sequence.lit, sequence.dark, sequence.patterns, sequence.inverses,
         stripes=STRIPES, direction=direction,
     )  # fmt: skip
 
 
-def reordered(sequence, order):
+def reordered(sequence: Sequence, order: list[int]) -> Sequence:
     return replace(sequence, patterns=sequence.patterns[order], inverses=sequence.inverses[order])
 
 
-def with_frame(sequence, name, bit, frame):
+def with_frame(sequence: Sequence, name: str, bit: int, frame: Bytes) -> Sequence:
     frames = getattr(sequence, name).copy()
     frames[bit] = frame
     return replace(sequence, **{name: frames})
 
 
-def test_a_good_sequence_is_read(good):
+def test_a_good_sequence_is_read(good: Sequence) -> None:
     assert np.isfinite(read(good).s).mean() > 0.9
 
 
 @pytest.mark.parametrize("bit", range(BITS))
-def test_an_exchanged_pattern_and_inverse_are_named(good, bit):
+def test_an_exchanged_pattern_and_inverse_are_named(good: Sequence, bit: int) -> None:
     bad = with_frame(good, "patterns", bit, good.inverses[bit])
     bad = with_frame(bad, "inverses", bit, good.patterns[bit])
     with pytest.raises(DecodingFailed, match=f"pattern and inverse of bit {bit} were exchanged"):
@@ -51,14 +53,14 @@ def test_an_exchanged_pattern_and_inverse_are_named(good, bit):
 
 
 @pytest.mark.parametrize(("one", "other"), [(0, 1), (2, 3), (5, 6), (1, 5)])
-def test_exchanged_bits_are_named(good, one, other):
+def test_exchanged_bits_are_named(good: Sequence, one: int, other: int) -> None:
     order = list(range(BITS))
     order[one], order[other] = other, one
     with pytest.raises(DecodingFailed, match=f"bits {one} and {other} were exchanged"):
         read(reordered(good, order))
 
 
-def test_reversed_bits_and_exchanged_lists_are_named(good):
+def test_reversed_bits_and_exchanged_lists_are_named(good: Sequence) -> None:
     with pytest.raises(DecodingFailed, match="reverse order"):
         read(reordered(good, list(range(BITS))[::-1]))
     with pytest.raises(DecodingFailed, match="all patterns and inverses were exchanged"):
@@ -66,7 +68,7 @@ def test_reversed_bits_and_exchanged_lists_are_named(good):
 
 
 @pytest.mark.parametrize("bit", [0, 3, 6])
-def test_a_frame_taken_twice_or_missing_is_named(good, bit):
+def test_a_frame_taken_twice_or_missing_is_named(good: Sequence, bit: int) -> None:
     with pytest.raises(DecodingFailed, match=f"bit {bit} look alike"):
         read(with_frame(good, "inverses", bit, good.patterns[bit]))
     with pytest.raises(DecodingFailed, match=f"bit {bit} do not add up"):
@@ -75,13 +77,13 @@ def test_a_frame_taken_twice_or_missing_is_named(good, bit):
         read(with_frame(good, "inverses", bit, good.patterns[(bit + 1) % BITS]))
 
 
-def test_a_bit_in_place_of_another_is_noticed(good):
+def test_a_bit_in_place_of_another_is_noticed(good: Sequence) -> None:
     order = [0, 1, 2, 4, 4, 5, 6]
     with pytest.raises(DecodingFailed, match="do not make a stripe code"):
         read(reordered(good, order))
 
 
-def test_a_sequence_of_the_wrong_length_or_size_is_refused(good):
+def test_a_sequence_of_the_wrong_length_or_size_is_refused(good: Sequence) -> None:
     with pytest.raises(DecodingFailed, match="13 images of the code, but it has 14"):
         read(replace(good, patterns=good.patterns[1:]))
     with pytest.raises(DecodingFailed, match="images of"):
@@ -90,8 +92,8 @@ def test_a_sequence_of_the_wrong_length_or_size_is_refused(good):
         read(replace(good, dark=good.dark[:-1]))
 
 
-def test_exposures_that_cannot_be_read_are_refused(good):
-    def brighter(factor):
+def test_exposures_that_cannot_be_read_are_refused(good: Sequence) -> None:
+    def brighter(factor: float) -> Sequence:
         return Sequence(
             *(
                 np.clip(frames.astype(float) * factor, 0, 255).astype(np.uint8)
@@ -108,6 +110,6 @@ def test_exposures_that_cannot_be_read_are_refused(good):
         read(replace(good, lit=good.dark, dark=good.lit))
 
 
-def test_stripes_that_run_the_other_way_are_noticed(good):
+def test_stripes_that_run_the_other_way_are_noticed(good: Sequence) -> None:
     with pytest.raises(DecodingFailed, match="direction: horizontal"):
         read(good, direction="vertical")

@@ -2,43 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
-from stripe_rendering import checkered, decode_gray, render_sequence, white
+from stripe_rendering import Sequence, checkered, decode_gray, render_sequence, white
 
+from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.boards.detection import find_boards
 from bodyscan.rig.board import Board
+from bodyscan.stripes.stripe_map import StripeMap
 
 
-def wavy(stripe_px, *, slant=0.1, first=3.3):
+def wavy(stripe_px: float, *, slant: float = 0.1, first: float = 3.3) -> Callable[..., Any]:
     """A smooth, uneven field of s with stripes about `stripe_px` wide."""
 
-    def s_at(u, v):
+    def s_at(u: Array | Indices, v: Array | Indices) -> Array:
         return first + (v + slant * u + 2.5 * np.sin(u / 23) + 1.5 * np.sin(v / 31)) / stripe_px
 
     return s_at
 
 
-def read(sequence, stripes, direction="horizontal"):
+def read(sequence: Sequence, stripes: int, direction: str = "horizontal") -> StripeMap:
     return decode_gray(
         sequence.lit, sequence.dark, sequence.patterns, sequence.inverses,
         stripes=stripes, direction=direction,
     )  # fmt: skip
 
 
-def contrast(sequence):
+def contrast(sequence: Sequence) -> Bytes:
     return cv2.subtract(sequence.lit, sequence.dark)
 
 
-def boundary_errors(seen, s_at):
+def boundary_errors(seen: StripeMap, s_at: Callable[..., Any]) -> Array:
     """How far boundaries lie from where they should be, across the stripes, px."""
     u, v = seen.boundary_pixels.T
     slope = s_at(u, v + 0.5) - s_at(u, v - 0.5)
     return (s_at(u, v) - seen.boundary_index) / slope
 
 
-def robust(errors):
+def robust(errors: Array) -> float:
     return np.median(np.abs(errors)) / 0.6745
 
 
@@ -47,7 +53,9 @@ def robust(errors):
     ("stripe_px", "stripes", "boundary_px", "s_rms"),
     [(1.5, 160, 0.012, 0.009), (2.2, 100, 0.013, 0.007), (10.0, 30, 0.033, 0.004)],
 )
-def test_boundaries_and_s_on_a_plain_surface(stripe_px, stripes, boundary_px, s_rms):
+def test_boundaries_and_s_on_a_plain_surface(
+    stripe_px: float, stripes: int, boundary_px: float, s_rms: float
+) -> None:
     s_at = wavy(stripe_px)
     sequence = render_sequence(s_at, stripes=stripes)
     seen = read(sequence, stripes)
@@ -60,7 +68,7 @@ def test_boundaries_and_s_on_a_plain_surface(stripe_px, stripes, boundary_px, s_
     np.testing.assert_array_equal(np.isnan(seen.s), np.isnan(seen.sigma))
 
 
-def test_black_and_white_does_not_move_boundaries():
+def test_black_and_white_does_not_move_boundaries() -> None:
     s_at = wavy(2.2)
     sequence = render_sequence(s_at, stripes=100, albedo=checkered(24))
     seen = read(sequence, 100)
@@ -74,7 +82,7 @@ def test_black_and_white_does_not_move_boundaries():
 
 @pytest.mark.parametrize("light", [12.0, 40.0])
 @pytest.mark.parametrize("stripe_px", [1.5, 4.0])
-def test_sigmas_say_how_far_off_values_are_in_dim_light(stripe_px, light):
+def test_sigmas_say_how_far_off_values_are_in_dim_light(stripe_px: float, light: float) -> None:
     s_at, stripes = wavy(stripe_px), int(240 / stripe_px)
     sequence = render_sequence(s_at, stripes=stripes, light=light)
     seen = read(sequence, stripes)
@@ -87,7 +95,7 @@ def test_sigmas_say_how_far_off_values_are_in_dim_light(stripe_px, light):
     assert 0.6 < ratio < 1.2
 
 
-def test_vertical_stripes_are_horizontal_ones_transposed():
+def test_vertical_stripes_are_horizontal_ones_transposed() -> None:
     s_at = wavy(3.0)
     sequence = render_sequence(s_at, stripes=80, shape=(120, 140))
     seen = read(sequence, 80)
@@ -104,7 +112,7 @@ def test_vertical_stripes_are_horizontal_ones_transposed():
     np.testing.assert_array_equal(turned.boundary_pixels[:, ::-1], seen.boundary_pixels)
 
 
-def test_stripes_may_count_upwards():
+def test_stripes_may_count_upwards() -> None:
     sequence = render_sequence(lambda u, v: 70 - wavy(3.0)(u, v), stripes=70, shape=(120, 140))
     seen = read(sequence, 70)
     lit = np.isfinite(sequence.s) & np.isfinite(seen.s)
@@ -112,10 +120,10 @@ def test_stripes_may_count_upwards():
     assert np.sqrt(np.mean((seen.s - sequence.s)[lit] ** 2)) < 0.008
 
 
-def test_a_depth_jump_gives_no_values_in_between():
+def test_a_depth_jump_gives_no_values_in_between() -> None:
     near, far = wavy(2.2), wavy(2.2, first=20.6)
 
-    def s_at(u, v):
+    def s_at(u: Array, v: Array) -> Array:
         disc = (u - 130) ** 2 + (v - 100) ** 2 < 55**2
         return np.where(disc, near(u, v), far(u, v))
 
@@ -129,8 +137,8 @@ def test_a_depth_jump_gives_no_values_in_between():
     assert rim.sum() < 0.2 * 2 * np.pi * 55
 
 
-def test_pixels_half_off_the_surface_have_no_value():
-    def s_at(u, v):
+def test_pixels_half_off_the_surface_have_no_value() -> None:
+    def s_at(u: Array, v: Array) -> Array:
         return np.where(np.abs(u - 130.3) < 60, 3 + (v + 0.7 * u) / 2.2, np.nan)
 
     sequence = render_sequence(s_at, stripes=200)
@@ -145,7 +153,7 @@ def test_pixels_half_off_the_surface_have_no_value():
     assert (error > 0.1).sum() < 10
 
 
-def test_black_and_white_edges_along_the_scan_lines_do_not_move_slanted_stripes():
+def test_black_and_white_edges_along_the_scan_lines_do_not_move_slanted_stripes() -> None:
     s_at = wavy(2.2, slant=0.6)
     sequence = render_sequence(s_at, stripes=170, albedo=checkered(24, turned_deg=8))
     seen = read(sequence, 170)
@@ -155,7 +163,7 @@ def test_black_and_white_edges_along_the_scan_lines_do_not_move_slanted_stripes(
     assert np.sqrt(np.mean((seen.s - sequence.s)[both] ** 2)) < 0.033
 
 
-def test_boundaries_near_by_on_the_line_steady_each_other():
+def test_boundaries_near_by_on_the_line_steady_each_other() -> None:
     sequence = render_sequence(wavy(1.5), stripes=160, light=20.0)
     seen = read(sequence, 160)
     both = np.isfinite(sequence.s) & np.isfinite(seen.s)
@@ -163,11 +171,11 @@ def test_boundaries_near_by_on_the_line_steady_each_other():
     assert np.sqrt(np.mean((seen.s - sequence.s)[both] ** 2)) < 0.032
 
 
-def test_saturated_and_unlit_pixels_have_no_value():
-    def bright_spot(u, v):
+def test_saturated_and_unlit_pixels_have_no_value() -> None:
+    def bright_spot(u: Array, v: Array) -> Array:
         return np.where((u - 60) ** 2 + (v - 60) ** 2 < 20**2, 1.5, 1.0)
 
-    def s_at(u, v):
+    def s_at(u: Array, v: Array) -> Array:
         return np.where(u > 200, np.nan, wavy(3.0)(u, v))
 
     seen = read(render_sequence(s_at, stripes=90, albedo=bright_spot), 90)
@@ -180,7 +188,7 @@ def test_saturated_and_unlit_pixels_have_no_value():
     assert not inside.any()
 
 
-def test_the_same_frames_give_the_same_bytes():
+def test_the_same_frames_give_the_same_bytes() -> None:
     sequence = render_sequence(wavy(3.0), stripes=80, shape=(100, 120), albedo=white)
     one, other = read(sequence, 80), read(sequence, 80)
     assert one.s.tobytes() == other.s.tobytes()
@@ -188,7 +196,7 @@ def test_the_same_frames_give_the_same_bytes():
 
 
 @pytest.mark.parametrize("pose", [0, 1, 2, 4])
-def test_real_stripes_on_a_real_board_are_smooth(captures, pose):
+def test_real_stripes_on_a_real_board_are_smooth(captures: Path, pose: int) -> None:
     folder = captures / "procam-board" / f"capture_{pose}"
     frame = {k: cv2.imread(str(folder / f"graycode_{k}.png"), 0) for k in range(20, 42)}
     seen = decode_gray(
@@ -217,10 +225,10 @@ def test_real_stripes_on_a_real_board_are_smooth(captures, pose):
     assert 0.7 < robust(stray_px / sigma) < 1.4
 
 
-def test_stripes_that_end_and_begin_again_are_not_joined():
+def test_stripes_that_end_and_begin_again_are_not_joined() -> None:
     """Behind a narrow dark gap another surface happens to show the very next stripe."""
 
-    def s_at(u, v):
+    def s_at(u: Array, v: Array) -> Array:
         behind = 17.4 + (v - 113) / 9.0
         return np.where(v < 108, 3 + v / 7.5, np.where(v < 113, np.nan, behind))
 
@@ -231,7 +239,7 @@ def test_stripes_that_end_and_begin_again_are_not_joined():
     assert np.abs(seen.s - sequence.s)[both].max() < 0.08
 
 
-def test_between_boundaries_s_bends_as_it_does_around_them():
+def test_between_boundaries_s_bends_as_it_does_around_them() -> None:
     sequence = render_sequence(lambda u, v: 3 + v / 9.0 + (v / 60.0) ** 2, stripes=60, noise=0.3)
     seen = read(sequence, 60)
     both = np.isfinite(seen.s) & np.isfinite(sequence.s)
@@ -241,8 +249,8 @@ def test_between_boundaries_s_bends_as_it_does_around_them():
     assert abs(error.mean()) < 0.0004
 
 
-def test_shading_that_fades_gently_does_not_move_stripes():
-    def mean_error(fade):
+def test_shading_that_fades_gently_does_not_move_stripes() -> None:
+    def mean_error(fade: float) -> float:
         scene = render_sequence(
             lambda u, v: 3 + v / 4.0,
             stripes=90,

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.rig.board import Board
 
 SUPERSAMPLING = 8
@@ -35,16 +37,16 @@ class View:
 
 def view_of(
     board: Board,
-    slant_deg,
-    azimuth_deg,
-    spin_deg,
+    slant_deg: int,
+    azimuth_deg: int,
+    spin_deg: int,
     *,
-    width=640,
-    height=512,
-    fill=0.8,
-    k1=-0.1,
-    back=False,
-    shift=(0.0, 0.0),
+    width: int = 640,
+    height: int = 512,
+    fill: float = 0.8,
+    k1: float = -0.1,
+    back: bool = False,
+    shift: tuple[float, float] | tuple[int, int] = (0.0, 0.0),
 ) -> View:
     """The board's middle in the picture's middle, tilted by `slant_deg`, filling it by `fill`."""
     spin, azimuth, slant = np.radians([spin_deg, azimuth_deg, slant_deg])
@@ -61,7 +63,7 @@ def view_of(
     return View(focal, width, height, k1, rotation, translation)
 
 
-def true_corners(board: Board, view: View, face=0) -> np.ndarray:
+def true_corners(board: Board, view: View, face: int = 0) -> np.ndarray:
     """Pixels of one face's inner corners, written out here once more on purpose."""
     points = []
     for row in range(1, board.rows):
@@ -74,15 +76,15 @@ def true_corners(board: Board, view: View, face=0) -> np.ndarray:
 
 
 def render(
-    boards_and_views,
+    boards_and_views: list[tuple[Board, View]],
     *,
-    blur_px=0.7,
-    noise=1.0,
-    seed=0,
-    white=200.0,
-    black=20.0,
-    background=70.0,
-    light_falloff=0.0,
+    blur_px: float = 0.7,
+    noise: float = 1.0,
+    seed: int = 0,
+    white: float = 200.0,
+    black: float = 20.0,
+    background: float = 70.0,
+    light_falloff: float = 0.0,
 ) -> np.ndarray:
     """Picture (H, W) uint8 of [(board, view), ...], antialiased, blurred, noisy."""
     view = boards_and_views[0][1]
@@ -99,7 +101,7 @@ def render(
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-def _paint(fine, board, view, white, black):
+def _paint(fine: Floats, board: Board, view: View, white: float, black: float) -> None:
     """Colours the fine picture's samples whose rays meet the board."""
     n = SUPERSAMPLING
     face = 0 if view.rotation[:, 2] @ view.translation > 0 else 1
@@ -148,7 +150,7 @@ def _paint(fine, board, view, white, black):
     part[inside] = values[inside]
 
 
-def _colours(board, face, x, y):
+def _colours(board: Board, face: int, x: Array, y: Array) -> NDArray[np.int32]:
     """0 black, 1 white at print coordinates in squares; outside the squares white."""
     column, row = np.floor(x).astype(np.int32), np.floor(y).astype(np.int32)
     on_print = (column >= 0) & (column < board.columns) & (row >= 0) & (row < board.rows)
@@ -160,7 +162,7 @@ def _colours(board, face, x, y):
     return np.where(on_print, texture[ty, tx] > 127, 1).astype(np.int32)
 
 
-def _charuco_texture(board, face):
+def _charuco_texture(board: Board, face: int) -> Bytes:
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     count = board.columns * board.rows // 2
     ids = np.arange(count) + board.first_marker + face * count

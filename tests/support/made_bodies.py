@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import vertex_normals
 
@@ -26,12 +27,18 @@ def arrays(made: o3d.geometry.TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(made.vertices), np.asarray(made.triangles).astype(np.int64)
 
 
-def ellipsoid(axes, centre=(0.0, 0.0, 0.0), resolution: int = 200) -> tuple[np.ndarray, np.ndarray]:
+def ellipsoid(
+    axes: tuple[float, float, float],
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    resolution: int = 200,
+) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = arrays(o3d.geometry.TriangleMesh.create_sphere(1.0, resolution=resolution))
     return vertices * np.asarray(axes) + np.asarray(centre), faces
 
 
-def cylinder(radius: float, low: float, high: float, x: float = 0.0, y: float = 0.0):
+def cylinder(
+    radius: float, low: float, high: float, x: float = 0.0, y: float = 0.0
+) -> tuple[Array, Indices]:
     made = o3d.geometry.TriangleMesh.create_cylinder(radius, high - low, resolution=400, split=50)
     vertices, faces = arrays(made)
     return vertices + [x, y, 0.5 * (low + high)], faces

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
 from bodyscan.geometry.camera_fields import from_fields
+from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.chapter import apparatus
 
@@ -18,7 +20,9 @@ TRUE_PLANES = apparatus.true_planes(apparatus.chapter_setup(apparatus.ideal_sett
 STRIPES = apparatus.PROJECTOR.stripes
 
 
-def seen_on(place: RigidTransform, stripe, *, every_px: int = 8) -> tuple[np.ndarray, np.ndarray]:
+def seen_on(
+    place: RigidTransform, stripe: Callable[..., Any], *, every_px: int = 8
+) -> tuple[np.ndarray, np.ndarray]:
     """Boundaries (N,) and the pixels (N, 2) at which image lines meet them on a board."""
     normal = place.rotation[:, 2]
 
@@ -49,7 +53,7 @@ def seen_on(place: RigidTransform, stripe, *, every_px: int = 8) -> tuple[np.nda
 def mirror_points(
     places: Sequence[RigidTransform] | None = None,
     *,
-    stripe=MIRROR.stripe,
+    stripe: Callable[..., Any] = MIRROR.stripe,
     noise_px: float = 0.0,
     every_px: int = 8,
 ) -> BoundaryPoints:
@@ -66,7 +70,7 @@ def mirror_points(
     return concatenate(parts)
 
 
-def systematic_mm(planes, *, spread_mm: float = 60.0) -> float:
+def systematic_mm(planes: LightPlanes, *, spread_mm: float = 60.0) -> float:
     """RMS depth error over a wall at 400 mm, every stripe coordinate known exactly."""
     x, y = np.meshgrid(np.linspace(-spread_mm, spread_mm, 40), np.linspace(-50.0, 40.0, 30))
     points = np.stack([x, y, np.full_like(x, 400.0)], axis=-1).reshape(-1, 3)

@@ -9,12 +9,14 @@ import cv2
 import numpy as np
 import open3d as o3d
 import yaml
+from open3d.pybind.t.geometry import RaycastingScene
 
+from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.rig.pair import NominalPose
+from bodyscan.rig.pair import NominalPose, Pair
 from bodyscan.rig.rig import Rig
 
 ROOT = Path(__file__).parents[2]
@@ -108,7 +110,15 @@ def cast_scan(
     return Scan(images, poses, truth)
 
 
-def _cast(scene, pair, camera, pose, noise_mm, flying, rng) -> RangeImage:
+def _cast(
+    scene: RaycastingScene,
+    pair: Pair,
+    camera: Camera,
+    pose: RigidTransform,
+    noise_mm: float,
+    flying: float,
+    rng: np.random.Generator,
+) -> RangeImage:
     rays = camera.pixel_rays()
     directions = pose.rotate(rays)
     origins = np.broadcast_to(pose.translation, directions.shape)
@@ -142,7 +152,7 @@ def _cast(scene, pair, camera, pose, noise_mm, flying, rng) -> RangeImage:
     )
 
 
-def _mix_silhouettes(depth, valid, flying, rng):
+def _mix_silhouettes(depth: Array, valid: Mask, flying: float, rng: np.random.Generator) -> Array:
     """Pixels next to a jump in depth land anywhere between the two sides."""
     near = np.where(valid, depth, 1e9).astype(np.float32)
     far = np.where(valid, depth, -1e9).astype(np.float32)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 
+from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import LocatedView, PlanarView, board_symmetries
 from bodyscan.calibration.camera import locate_board
@@ -19,7 +23,7 @@ CHARUCO = Board(
 )  # fmt: skip
 
 
-def looking_at(position, target) -> RigidTransform:
+def looking_at(position: Any, target: Array | list[float]) -> RigidTransform:
     forward = np.asarray(target, float) - position
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -29,7 +33,9 @@ def looking_at(position, target) -> RigidTransform:
     )
 
 
-def ring_of_cameras(poles=3, heights=(400, 850, 1300, 1750)):
+def ring_of_cameras(
+    poles: int = 3, heights: Any = (400, 850, 1300, 1750)
+) -> tuple[dict[str, RigidTransform], dict[str, Camera]]:
     """`rig_from_camera` and cameras by name, at 1.3 m around the centre."""
     placings, cameras = {}, {}
     rng = np.random.default_rng(7)
@@ -46,7 +52,7 @@ def ring_of_cameras(poles=3, heights=(400, 850, 1300, 1750)):
     return placings, cameras
 
 
-def ring_rig(placings, fixed="p1-1") -> Rig:
+def ring_rig(placings: dict[str, RigidTransform], fixed: str = "p1-1") -> Rig:
     position = placings[fixed].translation
     target = position + 1000.0 * placings[fixed].rotation[:, 2]
     pairs = [{"name": name, "camera": {"width": 1280, "height": 1024}} for name in sorted(placings)]
@@ -58,7 +64,7 @@ def ring_rig(placings, fixed="p1-1") -> Rig:
     return Rig(name="ring", boards=(CHARUCO,), pairs=tuple(pairs), rig_frame={"pair": fixed})
 
 
-def board_poses(count, rng):
+def board_poses(count: int, rng: np.random.Generator) -> Iterator[RigidTransform]:
     """`rig_from_board`: upright boards near the centre at all heights, turned and tilted."""
     upright = np.column_stack([[0, 1, 0], [0, 0, -1], [-1, 0, 0]]).astype(float)
     for _ in range(count):
@@ -70,8 +76,15 @@ def board_poses(count, rng):
 
 
 def ring_views(
-    placings, cameras, *, shots=40, noise_px=0.03, seed=0, board=CHARUCO, least_facing=0.4
-):
+    placings: dict[str, RigidTransform],
+    cameras: dict[str, Camera],
+    *,
+    shots: int = 40,
+    noise_px: float = 0.03,
+    seed: int = 0,
+    board: Board = CHARUCO,
+    least_facing: float = 0.4,
+) -> tuple[list[LocatedView], dict[tuple[str, str], RigidTransform]]:
     """What each camera sees of each shot, located with the true camera."""
     rng = np.random.default_rng(seed)
     points = corner_points(board)

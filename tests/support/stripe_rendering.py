@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -47,7 +48,7 @@ def checkered(size_px: float, black: float = 0.1, turned_deg: float = 20.0) -> F
     return albedo
 
 
-def render_sequence(s_at: Field, *, stripes: int, **scene) -> Sequence:
+def render_sequence(s_at: Field, *, stripes: int, **scene: Any) -> Sequence:
     """Gray code with inverses on the surface on which s is `s_at(u, v)`; see `render`."""
     bits = gray_bits(np.arange(stripes))
     lit, dark, coded, s = render(s_at, np.concatenate([bits, 1 - bits]), stripes=stripes, **scene)

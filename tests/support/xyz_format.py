@@ -1,13 +1,15 @@
 """A format that bodyscan does not have: points and normals as text."""
 
+from pathlib import Path
+
 import numpy as np
 
 from bodyscan.export.body_format import BodyFormat
 from bodyscan.files.atomic import write_text
-from bodyscan.mesh.body import BodyCloud
+from bodyscan.mesh.body import BodyCloud, BodyMesh
 
 
-def write_xyz(path, body):
+def write_xyz(path: Path, body: BodyCloud | BodyMesh) -> None:
     points = body.points if isinstance(body, BodyCloud) else body.vertices
     rows = np.column_stack([points, body.normals])
     write_text(path, "".join(f"{' '.join(f'{value:.3f}' for value in row)}\n" for row in rows))

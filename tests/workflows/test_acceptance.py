@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from bodyscan.arrays import Array
 from bodyscan.cli.main import app
 from bodyscan.errors import FailedWork
 from bodyscan.evaluation.acceptance_file import AcceptanceError, load_acceptance
@@ -35,7 +38,13 @@ CENTRES = np.array([[0.0, 0.0, 0.0], [400.0, 0.0, 0.0], [0.0, 250.0, 150.0]])
 AT = np.array([-120.0, 80.0, 1100.0])
 
 
-def ball(centre, radius: float, count: int = 20_000, wave_mm: float = 0.0, seed: int = 0):
+def ball(
+    centre: Array | list[float],
+    radius: float,
+    count: int = 20_000,
+    wave_mm: float = 0.0,
+    seed: int = 0,
+) -> tuple[Array, Array]:
     """Points all over a ball, waved by so much to either side, and outward normals."""
     normals = np.random.default_rng(seed).normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -43,7 +52,7 @@ def ball(centre, radius: float, count: int = 20_000, wave_mm: float = 0.0, seed:
     return np.asarray(centre) + (radius + wave)[:, None] * normals, normals
 
 
-def test_form_and_size_are_what_was_put_in():
+def test_form_and_size_are_what_was_put_in() -> None:
     points, normals = ball(AT, RADIUS + 0.2, wave_mm=0.1)
     read = read_sphere(points, normals, Sphere(AT + 0.5, RADIUS), RADIUS)
     assert read.size_mm == pytest.approx(0.4, abs=0.005)
@@ -54,7 +63,7 @@ def test_form_and_size_are_what_was_put_in():
     assert np.linalg.norm(read.fitted.centre - AT) < 0.01
 
 
-def test_three_in_a_thousand_may_be_left_out_but_no_more():
+def test_three_in_a_thousand_may_be_left_out_but_no_more() -> None:
     points, normals = ball(AT, RADIUS)
     few, many = points.copy(), points.copy()
     few[:50] += 3.0 * normals[:50]
@@ -64,7 +73,7 @@ def test_three_in_a_thousand_may_be_left_out_but_no_more():
     assert read_sphere(many, normals, near, RADIUS).form_mm == pytest.approx(3.0, abs=0.05)
 
 
-def test_a_stand_is_no_part_of_its_sphere():
+def test_a_stand_is_no_part_of_its_sphere() -> None:
     points, normals = ball(AT, RADIUS)
     angle = np.linspace(0.0, 2.0 * np.pi, 4000)
     down = np.linspace(RADIUS - 3.0, RADIUS + 40.0, 4000)
@@ -80,7 +89,7 @@ def test_a_stand_is_no_part_of_its_sphere():
     assert read.form_mm < 0.01
 
 
-def test_spheres_are_told_apart_whatever_their_order():
+def test_spheres_are_told_apart_whatever_their_order() -> None:
     turn = np.array([[0.0, -1, 0], [0.6, 0, -0.8], [0.8, 0, 0.6]])
     places = (1.001 * CENTRES) @ turn.T + AT
     parts = [ball(places[k], RADIUS, seed=k) for k in (2, 0, 1)]
@@ -96,13 +105,13 @@ def test_spheres_are_told_apart_whatever_their_order():
     assert errors == pytest.approx(expected, abs=0.02)
 
 
-def test_a_missing_sphere_is_said():
+def test_a_missing_sphere_is_said() -> None:
     points, normals = ball(AT, RADIUS)
     with pytest.raises(FailedWork, match="1 spheres of radius 60 mm found, 3 were expected"):
         locate_spheres(points, normals, RADIUS, CENTRES)
 
 
-def plate(wave_mm: float = 0.0):
+def plate(wave_mm: float = 0.0) -> tuple[Array, Array]:
     """400 x 300 mm, tilted, with a rim that curls up by 3 mm, and clutter beside it."""
     rng = np.random.default_rng(3)
     u, v = rng.uniform(-200.0, 200.0, 40_000), rng.uniform(-150.0, 150.0, 40_000)
@@ -118,21 +127,21 @@ def plate(wave_mm: float = 0.0):
     return np.concatenate([surface + AT, clutter]), np.concatenate([normals, outward])
 
 
-def test_flatness_is_what_was_put_in_and_the_rim_is_left_out():
+def test_flatness_is_what_was_put_in_and_the_rim_is_left_out() -> None:
     read = read_plate(*plate(wave_mm=0.15))
     assert read.flatness_mm == pytest.approx(0.3, abs=0.02)
     assert read.rms_mm == pytest.approx(0.15 / np.sqrt(2.0), abs=0.01)
     assert read.area_mm2 == pytest.approx(400.0 * 300.0, rel=0.02)
 
 
-def test_no_plate_is_said():
+def test_no_plate_is_said() -> None:
     with pytest.raises(FailedWork, match="too few"):
         read_plate(*(part[:100] for part in plate()))
     with pytest.raises(FailedWork, match="no plate"):
         read_plate(*ball(AT, 30.0, 200_000))
 
 
-def test_artefacts_stand_inside_the_volume_as_they_are_described():
+def test_artefacts_stand_inside_the_volume_as_they_are_described() -> None:
     volume = Volume()
     for _, at in spheres_at(volume, CENTRES[:2]):
         placed = at.apply(CENTRES[:2])
@@ -144,12 +153,12 @@ def test_artefacts_stand_inside_the_volume_as_they_are_described():
     assert faces[0] == pytest.approx([1.0, 0.0, 0.0])
 
 
-def sphere_row(**more) -> SphereRow:
+def sphere_row(**more: Any) -> SphereRow:
     row = SphereRow("a", "s01", ALL, 1, 5000, 0.3, 0.2, 0.1)
     return replace(row, **more)
 
 
-def test_the_worst_of_all_places_is_judged():
+def test_the_worst_of_all_places_is_judged() -> None:
     readings = Readings(
         (sphere_row(), sphere_row(place="b", size_mm=-0.4), sphere_row(view="p1", form_mm=2.0)),
         (
@@ -183,7 +192,7 @@ def test_the_worst_of_all_places_is_judged():
         ("spheres: {centres_mm: [[0, 0, 0], [50, 0, 0]]}", "lies inside sphere 1"),
     ],
 )
-def test_a_wrong_file_is_explained(tmp_path, text: str, said: str):
+def test_a_wrong_file_is_explained(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / "acceptance.yaml"
     path.write_text(text)
     with pytest.raises(AcceptanceError, match=said):
@@ -200,7 +209,9 @@ def test_a_wrong_file_is_explained(tmp_path, text: str, said: str):
         ["--spheres", "a", "--calibration", "c", "--limit", "flatness_mm=flat"],
     ],
 )
-def test_what_cannot_be_measured_is_bad_input(tmp_path, monkeypatch, arguments):
+def test_what_cannot_be_measured_is_bad_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(app, ["accept", *arguments])
     assert result.exception is not None

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from small_workspace import run
+from small_workspace import Workspace, run
 
 from bodyscan.captures.folder import open_captures
 from bodyscan.errors import ResultError
@@ -19,7 +20,7 @@ from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards
 
 
 @pytest.fixture
-def copy(workspace, tmp_path):
+def copy(workspace: Workspace, tmp_path: Path) -> Path:
     """A copy of the captures and the rig file, to be damaged."""
     folder = tmp_path / "copy"
     folder.mkdir()
@@ -28,11 +29,11 @@ def copy(workspace, tmp_path):
     return folder
 
 
-def image(folder, shot, pair, frame):
+def image(folder: Path, shot: str, pair: str, frame: str) -> Path:
     return folder / "captures" / "calibration" / shot / pair / f"{frame}.png"
 
 
-def test_bad_images_cost_only_themselves(copy):
+def test_bad_images_cost_only_themselves(copy: Path) -> None:
     shots = sorted(p.name for p in (copy / "captures" / "calibration").glob("b*"))
     with_pair = [s for s in shots if image(copy, s, "p1-2", "bit00").exists()]
     missing = image(copy, with_pair[0], "p1-2", "bit03")
@@ -54,7 +55,7 @@ def test_bad_images_cost_only_themselves(copy):
     assert sorted(load_calibration(copy / "calibration").pairs) == ["p1-2", "p1-3", "p2-2", "p2-3"]
 
 
-def test_a_pair_with_too_few_poses_is_named_and_left_out(workspace):
+def test_a_pair_with_too_few_poses_is_named_and_left_out(workspace: Workspace) -> None:
     rig = load_rig(workspace.folder / "rig.yaml")
     captures = open_captures(rig, workspace.folder / "rig.yaml")
     views = find_all_boards(rig, captures).value
@@ -64,7 +65,7 @@ def test_a_pair_with_too_few_poses_is_named_and_left_out(workspace):
     assert "at least 3" in cameras.failures["p2-3"]
 
 
-def test_an_image_without_a_board_is_named(copy):
+def test_an_image_without_a_board_is_named(copy: Path) -> None:
     shots = sorted(p.name for p in (copy / "captures" / "calibration").glob("b*"))
     path = next(
         image(copy, s, "p1-3", "lit") for s in shots if image(copy, s, "p1-3", "lit").exists()
@@ -82,7 +83,7 @@ def test_an_image_without_a_board_is_named(copy):
         ("name: small", "name: small\ncolour: red", "colour"),
     ],
 )
-def test_a_wrong_rig_file_is_bad_input(copy, old, new, said):
+def test_a_wrong_rig_file_is_bad_input(copy: Path, old: str, new: str, said: str) -> None:
     path = copy / "rig.yaml"
     text = path.read_text()
     changed = text.replace(old, new).replace(old.replace("70", "70.0"), new)
@@ -93,7 +94,7 @@ def test_a_wrong_rig_file_is_bad_input(copy, old, new, said):
     assert said in str(result.exception) + result.output
 
 
-def test_a_scan_of_another_image_size_is_refused(workspace, copy):
+def test_a_scan_of_another_image_size_is_refused(workspace: Workspace, copy: Path) -> None:
     for path in (copy / "captures" / "person").rglob("*.png"):
         path.write_bytes(path.read_bytes())
         small = cv2.resize(cv2.imread(str(path), 0), (320, 256))
@@ -105,7 +106,7 @@ def test_a_scan_of_another_image_size_is_refused(workspace, copy):
     assert "320 x 256" in str(result.exception)
 
 
-def test_a_scan_with_one_pair_missing_goes_on_and_says_so(workspace, copy):
+def test_a_scan_with_one_pair_missing_goes_on_and_says_so(workspace: Workspace, copy: Path) -> None:
     shutil.rmtree(copy / "captures" / "person" / "s01" / "p2-3")
     result = run(
         "scan",
@@ -124,7 +125,7 @@ def test_a_scan_with_one_pair_missing_goes_on_and_says_so(workspace, copy):
     assert any("p2-3" in reason for reason in verdict["reasons"])
 
 
-def test_a_scan_of_nobody_ends_in_a_verdict(workspace, copy):
+def test_a_scan_of_nobody_ends_in_a_verdict(workspace: Workspace, copy: Path) -> None:
     """All images black but for the lit ones' noise: no pair can be read, and the JSON says so."""
     for path in (copy / "captures" / "person").rglob("*.png"):
         cv2.imwrite(str(path), np.full_like(cv2.imread(str(path), 0), 12))
@@ -138,7 +139,7 @@ def test_a_scan_of_nobody_ends_in_a_verdict(workspace, copy):
         load_scan(copy / "scan")
 
 
-def test_a_scan_with_one_frame_missing_names_it(workspace, copy):
+def test_a_scan_with_one_frame_missing_names_it(workspace: Workspace, copy: Path) -> None:
     (copy / "captures" / "person" / "s01" / "p1-3" / "bit04-inverse.png").unlink()
     arguments = (copy / "captures" / "person", "--calibration", workspace.folder / "calibration")
     result = run("scan", *arguments, "--out", copy / "scan", "--points", 50_000)
@@ -149,7 +150,7 @@ def test_a_scan_with_one_frame_missing_names_it(workspace, copy):
     assert "bit04-inverse.png" in said
 
 
-def test_a_damaged_calibration_is_refused(workspace, tmp_path):
+def test_a_damaged_calibration_is_refused(workspace: Workspace, tmp_path: Path) -> None:
     shutil.copytree(workspace.folder / "calibration", tmp_path / "calibration")
     arrays = tmp_path / "calibration" / "calibration.npz"
     arrays.write_bytes(arrays.read_bytes()[:-100])

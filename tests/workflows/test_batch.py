@@ -10,7 +10,8 @@ import zlib
 from pathlib import Path
 
 import pytest
-from small_workspace import PROJECT, run
+from small_workspace import PROJECT, Workspace, run
+from typer.testing import Result
 
 from bodyscan.files.hashing import file_hash, files_below
 
@@ -18,7 +19,7 @@ SMALL = ("--set", "fusion.points=20000", "--set", "mesh.depth=6", "--set", "expo
 ODD = "б 'q\"\n"
 
 
-def batch(day: Path, *more: object, pipeline: str = "fuse", scans: str = "scans"):
+def batch(day: Path, *more: object, pipeline: str = "fuse", scans: str = "scans") -> Result:
     return run(
         "batch",
         PROJECT / "pipelines" / f"{pipeline}.yaml",
@@ -30,16 +31,16 @@ def batch(day: Path, *more: object, pipeline: str = "fuse", scans: str = "scans"
     )
 
 
-def events(result) -> list[dict]:
+def events(result: Result) -> list[dict]:
     return [json.loads(line) for line in result.stdout.splitlines()]
 
 
-def endings(result) -> dict[str, dict]:
+def endings(result: Result) -> dict[str, dict]:
     return {e["job"]: e for e in events(result) if e["event"] == "job" and "reason" in e}
 
 
 @pytest.fixture(scope="module")
-def day(workspace, tmp_path_factory) -> Path:
+def day(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A day's scans, some of which hold what a bad disk or a bad person may put there."""
     day = tmp_path_factory.mktemp("day")
     person = workspace.folder / "captures" / "person"
@@ -62,13 +63,15 @@ def day(workspace, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def night(day):
+def night(day: Path) -> tuple[Result, Result]:
     """The batch over that day, stopped after the first stage, then finished."""
     first = batch(day, *SMALL, "--json", "--until", "scan")
     return first, batch(day, *SMALL, "--json")
 
 
-def test_good_scans_are_fused_and_bad_ones_are_named(day, night):
+def test_good_scans_are_fused_and_bad_ones_are_named(
+    day: Path, night: tuple[Result, Result]
+) -> None:
     first, second = night
     assert first.exit_code == second.exit_code == 1, second.output
     odd = next(name for name in endings(first) if name.startswith("q-"))
@@ -94,7 +97,7 @@ def test_good_scans_are_fused_and_bad_ones_are_named(day, night):
     assert (day / "out" / "anna" / "report" / "report.html").exists()
 
 
-def test_the_table_has_a_row_for_every_scan(day, night):
+def test_the_table_has_a_row_for_every_scan(day: Path, night: tuple[Result, Result]) -> None:
     with (day / "out" / "summary.csv").open(newline="", encoding="utf-8") as stream:
         rows = {row["job"]: row for row in csv.DictReader(stream)}
     assert len(rows) == 7
@@ -110,7 +113,7 @@ def test_the_table_has_a_row_for_every_scan(day, night):
     assert "symbolic link" in rows["link"]["reason"]
 
 
-def test_the_same_images_give_the_same_bytes(day, night):
+def test_the_same_images_give_the_same_bytes(day: Path, night: tuple[Result, Result]) -> None:
     odd = next((day / "out").glob("q-*"))
     for stage in ("scan", "export", "report"):
         one, other = (
@@ -120,7 +123,9 @@ def test_the_same_images_give_the_same_bytes(day, night):
         assert one == other
 
 
-def test_what_is_done_stays_done_and_its_bytes_are_vouched_for(day, night):
+def test_what_is_done_stays_done_and_its_bytes_are_vouched_for(
+    day: Path, night: tuple[Result, Result]
+) -> None:
     said = batch(day, *SMALL, "--explain").output.splitlines()
     assert "anna: scan: up to date" in said
     assert "anna: export: up to date" in said
@@ -136,7 +141,7 @@ def test_what_is_done_stays_done_and_its_bytes_are_vouched_for(day, night):
     path.write_bytes(content)
 
 
-def test_a_subject_is_forgotten(day, night, tmp_path):
+def test_a_subject_is_forgotten(day: Path, night: tuple[Result, Result], tmp_path: Path) -> None:
     shutil.copytree(day, tmp_path / "day", symlinks=True)
     result = run("forget", "sim-woman-average", "--workspace", tmp_path / "day", "--yes")
     assert result.exit_code == 0
@@ -149,7 +154,7 @@ def test_a_subject_is_forgotten(day, night, tmp_path):
     assert Path("/etc/passwd").exists()  # a link to it lay there
 
 
-def test_rigs_are_calibrated_in_batches(workspace, tmp_path):
+def test_rigs_are_calibrated_in_batches(workspace: Workspace, tmp_path: Path) -> None:
     """The same bytes as the command's, and no more work the second time."""
     rig = tmp_path / "scans" / "small"
     rig.mkdir(parents=True)
@@ -166,7 +171,7 @@ def test_rigs_are_calibrated_in_batches(workspace, tmp_path):
     assert events(batch(tmp_path, "--json", pipeline="calibrate"))[-1]["ran"] == 0
 
 
-def test_no_calibration_is_bad_input(tmp_path):
+def test_no_calibration_is_bad_input(tmp_path: Path) -> None:
     (tmp_path / "scans" / "a").mkdir(parents=True)
     result = batch(tmp_path)
     assert result.exit_code != 0

@@ -3,10 +3,11 @@
 import shutil
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
-from small_workspace import run
+from small_workspace import Workspace, run
 
 from bodyscan.alignment.icp import Alignment, Overlap
 from bodyscan.geometry.transforms import RigidTransform
@@ -16,7 +17,7 @@ from bodyscan.workflows.check_scans import judge_scans
 
 
 @pytest.fixture
-def board_shots(workspace, tmp_path):
+def board_shots(workspace: Workspace, tmp_path: Path) -> Path:
     """Three shots of the board; without captures.yaml, as someone would copy them together."""
     shots = sorted((workspace.folder / "captures" / "calibration").glob("b*"))
     lit_by_all = [s for s in shots if len(list(s.glob("*/lit.png"))) >= 3][:3]
@@ -26,7 +27,7 @@ def board_shots(workspace, tmp_path):
 
 
 @pytest.fixture
-def touched(workspace, tmp_path):
+def touched(workspace: Workspace, tmp_path: Path) -> Path:
     """A calibration that is wrong by what a touched camera would make it wrong: 1 mm sideways."""
     calibration = load_calibration(workspace.folder / "calibration")
     sideways = RigidTransform(np.eye(3), np.array([0.6, 0.8, 0.0]))
@@ -36,14 +37,16 @@ def touched(workspace, tmp_path):
     return tmp_path / "touched"
 
 
-def test_a_rig_that_stood_still_is_valid(workspace, board_shots):
+def test_a_rig_that_stood_still_is_valid(workspace: Workspace, board_shots: Path) -> None:
     folder = workspace.folder / "calibration"
     result = run("check-calibration", board_shots, "--calibration", folder)
     assert result.exit_code == 0, result.output
     assert "valid: all that see the board agree" in result.output
 
 
-def test_a_touched_pair_is_named_and_put_right(workspace, board_shots, touched, tmp_path):
+def test_a_touched_pair_is_named_and_put_right(
+    workspace: Workspace, board_shots: Path, touched: Path, tmp_path: Path
+) -> None:
     mended = tmp_path / "mended"
     before = (touched / "calibration.json").read_bytes()
     result = run("check-calibration", board_shots, "--calibration", touched, "--repair", mended)
@@ -62,7 +65,7 @@ def test_a_touched_pair_is_named_and_put_right(workspace, board_shots, touched, 
     assert again.exit_code == 0, again.output
 
 
-def test_a_scan_of_a_person_is_checked_too(workspace):
+def test_a_scan_of_a_person_is_checked_too(workspace: Workspace) -> None:
     person = workspace.folder / "captures" / "person"
     result = run("check-calibration", person, "--calibration", workspace.folder / "calibration")
     assert "overlaps in 1 scan:" in result.output
@@ -73,7 +76,7 @@ def test_a_scan_of_a_person_is_checked_too(workspace):
     assert "p2-2, p2-3; p1-2, p1-3" in words
 
 
-def test_boards_and_people_are_not_mixed(workspace, board_shots):
+def test_boards_and_people_are_not_mixed(workspace: Workspace, board_shots: Path) -> None:
     person = workspace.folder / "captures" / "person"
     folder = workspace.folder / "calibration"
     result = run("check-calibration", person, board_shots, "--calibration", folder)
@@ -90,7 +93,7 @@ def aligned(motions: dict[str, np.ndarray], joined: bool = True) -> Alignment:
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.8])
-def test_a_move_is_told_from_sway_by_several_scans(shift):
+def test_a_move_is_told_from_sway_by_several_scans(shift: float) -> None:
     rng = np.random.default_rng(3)
     names = [f"p{pole}-{k}" for pole in (1, 2, 3) for k in (1, 2)]
     constant = {name: np.array([shift if name == "p2-1" else 0.0, 0.0, 0.0]) for name in names}
@@ -106,7 +109,7 @@ def test_a_move_is_told_from_sway_by_several_scans(shift):
     assert not judge_scans(scans[:2], start, {}).decided
 
 
-def test_pairs_that_share_nothing_with_the_others_are_not_confirmed():
+def test_pairs_that_share_nothing_with_the_others_are_not_confirmed() -> None:
     """A pole that moved so far that no surface is near enough to its neighbours' leaves overlaps
     that are as good as ever."""
     names = ["p1-1", "p1-2", "p2-1", "p3-1"]

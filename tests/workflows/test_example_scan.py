@@ -5,12 +5,15 @@ from __future__ import annotations
 import runpy
 from pathlib import Path
 
-from small_workspace import PROJECT
+import pytest
+from small_workspace import PROJECT, Workspace
 
 import bodyscan
 
 
-def test_calibrate_and_scan(workspace, tmp_path: Path, capsys):
+def test_calibrate_and_scan(
+    workspace: Workspace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     example = runpy.run_path(str(PROJECT / "examples" / "calibrate_and_scan.py"))
     example["main"](workspace.folder, tmp_path)
     said = capsys.readouterr().out

@@ -1,6 +1,7 @@
 """A pair by itself whose stripes changed its camera: boards are where that camera sees them."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from bodyscan.registration.rig_solve import solve_rig
 from bodyscan.workflows.calibrate_rig import update_poses
 
 
-def misfit_px(placed, views) -> float:
+def misfit_px(placed: Any, views: Any) -> float:
     off = []
     for view in views:
         camera_from_rig = placed.rig_from_camera[view.pair].inverse()
@@ -21,7 +22,7 @@ def misfit_px(placed, views) -> float:
 
 
 @pytest.mark.parametrize("change", [0.0, 20.0])
-def test_boards_follow_the_camera(change):
+def test_boards_follow_the_camera(change: Any) -> None:
     placings, cameras = ring_of_cameras(poles=1, heights=(850,))
     views, _ = ring_views(placings, cameras, shots=8)
     rig = ring_rig(placings, fixed="p1-1")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from small_workspace import run
+from small_workspace import Workspace, run
 
 from bodyscan.evaluation.acceptance_file import load_acceptance
 from bodyscan.geometry.transforms import RigidTransform
@@ -16,13 +17,13 @@ from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.simulation.artefact import capture_artefact, open_workspace, sphere_surfaces
 
 
-def report(workspace, *arguments: object) -> str:
+def report(workspace: Workspace, *arguments: object) -> str:
     result = run("report", *arguments)
     assert result.exit_code == 0, f"{result.output}\n{result.exception!r}"
     return Path(str(arguments[2])).read_text("utf-8")
 
 
-def test_corners_are_kept_with_their_residuals(workspace):
+def test_corners_are_kept_with_their_residuals(workspace: Workspace) -> None:
     calibration = load_calibration(workspace.folder / "calibration")
     assert set(calibration.seen) == set(calibration.pairs)
     for name, seen in calibration.seen.items():
@@ -36,7 +37,7 @@ def test_corners_are_kept_with_their_residuals(workspace):
         assert 0.4 < median / quality.corners_rms_px < 1.2
 
 
-def test_the_calibration_has_a_report(workspace, tmp_path: Path):
+def test_the_calibration_has_a_report(workspace: Workspace, tmp_path: Path) -> None:
     text = report(workspace, workspace.folder / "calibration", "--out", tmp_path / "c.html")
     assert len(text) < 8_000_000
     for part in ("synthetic", "Verdict:", "Coverage of each camera", "View graph", "Residuals",
@@ -47,7 +48,7 @@ def test_the_calibration_has_a_report(workspace, tmp_path: Path):
         assert f"<th>{name}</th>" in text
 
 
-def test_the_scan_has_a_report_held_against_the_truth(workspace, tmp_path: Path):
+def test_the_scan_has_a_report_held_against_the_truth(workspace: Workspace, tmp_path: Path) -> None:
     truth = workspace.folder / "truth" / "subject.ply"
     text = report(
         workspace, workspace.folder / "scan", "--out", tmp_path / "s.html", "--compare", truth
@@ -57,13 +58,13 @@ def test_the_scan_has_a_report_held_against_the_truth(workspace, tmp_path: Path)
         assert part in text
 
 
-def test_a_calibration_is_not_compared(workspace):
+def test_a_calibration_is_not_compared(workspace: Workspace) -> None:
     result = run("report", workspace.folder / "calibration", "--compare", workspace.folder / "scan")
     assert getattr(result.exception, "exit_code", None) == 2
 
 
 @pytest.fixture(scope="module")
-def spheres(workspace) -> Path:
+def spheres(workspace: Workspace) -> Path:
     """A scan of two spheres in the middle of the volume."""
     world, file = open_workspace(workspace.folder), load_acceptance(None)
     centres = np.array(file.spheres.centres_mm)
@@ -72,12 +73,14 @@ def spheres(workspace) -> Path:
     return capture_artefact(world, balls, place, workspace.folder / "captures" / "spheres")
 
 
-def accept(folder: Path, calibration: Path, out: Path, *more: object):
+def accept(folder: Path, calibration: Path, out: Path, *more: object) -> Any:
     result = run("accept", "--spheres", folder, "--calibration", calibration, "--out", out, *more)
     return result, json.loads((out / "acceptance.json").read_text("utf-8"))
 
 
-def test_spheres_are_accepted_from_captures(workspace, spheres: Path, tmp_path: Path):
+def test_spheres_are_accepted_from_captures(
+    workspace: Workspace, spheres: Path, tmp_path: Path
+) -> None:
     # Half the pixels, two of three poles and ten boards: cameras stand within 0.6 mm (see
     # test_whole_way), so 500 mm between centres are known to about that.
     limits = ("--limit", "sphere_spacing_mm=0.6", "--limit", "probing_size_mm=0.6")
@@ -91,7 +94,9 @@ def test_spheres_are_accepted_from_captures(workspace, spheres: Path, tmp_path: 
     assert "is no test by these standards" in text
 
 
-def test_a_calibration_of_the_wrong_size_is_not_accepted(workspace, spheres: Path, tmp_path: Path):
+def test_a_calibration_of_the_wrong_size_is_not_accepted(
+    workspace: Workspace, spheres: Path, tmp_path: Path
+) -> None:
     right = load_calibration(workspace.folder / "calibration")
     shifted = {
         name: RigidTransform(t.rotation, 1.003 * t.translation) if name.startswith("p2") else t
@@ -105,7 +110,7 @@ def test_a_calibration_of_the_wrong_size_is_not_accepted(workspace, spheres: Pat
     assert found["figures"]["probing_form_mm"]["exceeded"]
 
 
-def test_artefacts_are_simulated_measured_and_judged(workspace, tmp_path: Path):
+def test_artefacts_are_simulated_measured_and_judged(workspace: Workspace, tmp_path: Path) -> None:
     limit = ("--limit", "flatness_mm=0.001")
     result = run("accept", "--simulate", workspace.folder, "--places", 1, "--repeats", 2,
                  "--out", tmp_path, *limit)  # fmt: skip

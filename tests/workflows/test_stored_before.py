@@ -6,6 +6,7 @@ scan by it, cut down to 200 points and a tetrahedron by that commit's own writer
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +18,11 @@ STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0"
 
 
 @pytest.fixture(scope="module")
-def calibration():
+def calibration() -> Any:
     return load_calibration(STORED / "calibration")
 
 
-def test_a_calibration_gives_the_depths_that_it_was_fitted_for(calibration):
+def test_a_calibration_gives_the_depths_that_it_was_fitted_for(calibration: Any) -> None:
     assert sorted(calibration.pairs) == ["p1-2", "p1-3", "p2-2", "p2-3"]
     for name, pair in calibration.pairs.items():
         seen = calibration.seen[name]
@@ -35,7 +36,7 @@ def test_a_calibration_gives_the_depths_that_it_was_fitted_for(calibration):
         assert 900.0 < depth[0] < 1800.0
 
 
-def test_a_calibration_is_written_again_as_it_was(calibration, tmp_path):
+def test_a_calibration_is_written_again_as_it_was(calibration: Any, tmp_path: Path) -> None:
     save_calibration(calibration, tmp_path)
     before = json.loads((STORED / "calibration" / "calibration.json").read_text("utf-8"))
     after = json.loads((tmp_path / "calibration.json").read_text("utf-8"))
@@ -54,7 +55,7 @@ def test_a_calibration_is_written_again_as_it_was(calibration, tmp_path):
         assert all(np.array_equal(new[key], old[key], equal_nan=True) for key in old.files)
 
 
-def test_a_scan_is_read():
+def test_a_scan_is_read() -> None:
     stored = load_scan(STORED / "scan")
     assert len(stored.cloud.points) == 200
     assert stored.mesh.filled.tolist() == [False, True, True, True]

@@ -3,32 +3,35 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from small_workspace import Workspace
 
 from bodyscan.evaluation.surface import deviation, normalized_errors, signed_distances
 from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.sheet_arrays import to_arrays
 from bodyscan.mesh.ply import read_ply_mesh
 from bodyscan.mesh.topology import topology
+from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.workflows.evaluate import compare_rig, load_truth
 
 
 @pytest.fixture(scope="module")
-def calibration(workspace):
+def calibration(workspace: Workspace) -> RigCalibration:
     return load_calibration(workspace.folder / "calibration")
 
 
-def test_all_pairs_are_calibrated(workspace, calibration):
+def test_all_pairs_are_calibrated(workspace: Workspace, calibration: RigCalibration) -> None:
     assert sorted(calibration.pairs) == ["p1-2", "p1-3", "p2-2", "p2-3"]
     assert not calibration.failed
     for name in calibration.pairs:
         assert name in workspace.outputs["calibrate-rig"]
 
 
-def test_cameras_stand_where_they_stand(workspace, calibration):
+def test_cameras_stand_where_they_stand(workspace: Workspace, calibration: RigCalibration) -> None:
     rig = compare_rig(calibration, load_truth(workspace.folder / "truth"))
     # The bound for 12 pairs at full size; half the pixels and a quarter of the shots here.
     assert rig.centres_rms_mm < 0.6
@@ -39,7 +42,7 @@ def test_cameras_stand_where_they_stand(workspace, calibration):
     assert np.all(np.abs(rig.centres_mm[others]) < 4.0 * rig.sigmas_mm[others])
 
 
-def test_the_cloud_lies_on_the_body(workspace):
+def test_the_cloud_lies_on_the_body(workspace: Workspace) -> None:
     truth = load_truth(workspace.folder / "truth")
     stored = load_scan(workspace.folder / "scan")
     found = deviation(signed_distances(stored.cloud.points, truth.vertices, truth.faces))
@@ -49,7 +52,7 @@ def test_the_cloud_lies_on_the_body(workspace):
     assert len(stored.cloud.points) > 100_000
 
 
-def test_points_are_as_far_off_as_they_say(workspace):
+def test_points_are_as_far_off_as_they_say(workspace: Workspace) -> None:
     truth = load_truth(workspace.folder / "truth")
     cloud = load_scan(workspace.folder / "scan").cloud
     spread, beyond = normalized_errors(
@@ -61,7 +64,7 @@ def test_points_are_as_far_off_as_they_say(workspace):
     assert beyond < 0.05
 
 
-def test_the_mesh_is_closed_and_looks_outwards(workspace):
+def test_the_mesh_is_closed_and_looks_outwards(workspace: Workspace) -> None:
     stored = load_scan(workspace.folder / "scan")
     shape = topology(stored.mesh.vertices, stored.mesh.faces)
     assert shape.closed
@@ -69,7 +72,7 @@ def test_the_mesh_is_closed_and_looks_outwards(workspace):
     assert shape.volume_mm3 > 0
 
 
-def test_exports_are_there_and_say_what_they_are(workspace):
+def test_exports_are_there_and_say_what_they_are(workspace: Workspace) -> None:
     folder = workspace.folder / "export"
     stored = load_scan(workspace.folder / "scan")
     for suffix in ("ply", "obj", "stl", "glb"):
@@ -80,7 +83,9 @@ def test_exports_are_there_and_say_what_they_are(workspace):
     assert np.array_equal(exported.faces, stored.mesh.faces)
 
 
-def test_calibration_reads_back_to_the_last_bit(calibration, tmp_path):
+def test_calibration_reads_back_to_the_last_bit(
+    calibration: RigCalibration, tmp_path: Path
+) -> None:
     save_calibration(calibration, tmp_path)
     again = load_calibration(tmp_path)
     for name, pair in calibration.pairs.items():
@@ -96,7 +101,7 @@ def test_calibration_reads_back_to_the_last_bit(calibration, tmp_path):
     assert (tmp_path / "again" / "calibration.json").read_bytes() == first
 
 
-def test_every_command_says_where_its_results_are(workspace):
+def test_every_command_says_where_its_results_are(workspace: Workspace) -> None:
     assert "calibration.json" in workspace.outputs["calibrate-rig"]
     assert "scan.json" in workspace.outputs["scan"]
     assert "body.glb" in workspace.outputs["export"]
