@@ -48,8 +48,8 @@ def decode_phase(
 
     Raises DecodingFailed if the images do not add up.
     """
-    halves = GRAY.stripes(read_words(GRAY, images, half_periods))
     variance = noise_variance(images)
+    halves = GRAY.stripes(read_words(GRAY, images, half_periods, variance))
     fine_bit = GRAY.two_wide(len(images.patterns))
     usable = usable_pixels(images, halves, variance, half_periods, fine_bit)
     waves = transpose(waves) if images.turned else waves

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import combinations
+from itertools import combinations, islice
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Bytes, Indices, Mask
+from bodyscan.arrays import Bytes, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.errors import DecodingFailed
+from bodyscan.stripes.bit_clarity import FINE_BITS, LitPairs, check_pairs, check_seen
 from bodyscan.stripes.bit_words import WordCode
+from bodyscan.stripes.clear_changes import clear_changes
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.usable_pixels import SATURATED
 
@@ -27,29 +29,30 @@ SAMPLES = 50_000
 MIN_CONTRAST = 4
 MIN_SHARE_LIT = 1e-3
 MAX_SHARE_SATURATED = 0.5
-MIN_DIFFERENCE = 0.06
-MOST_ALIKE = 0.75
-"""Of the pixels: a dark frame in place of a pattern looks like the inverse in half of them."""
-
 NOISE_GREY = 4
 MAX_SUM_ERROR = 0.15
 MAX_SHARE_BEYOND = 0.05
 MIN_FLIPS = 50
 WRONG_WAY = 2.0
-MIN_SHARE_IN_STEP = 0.6
-MIN_SHARE_WITHOUT_INVERSES = 0.75
-MAX_SHARE_FOLDED = 0.3
+MIN_SHARE_CLEAR = 0.5
+"""Of changes of one bit that noise has no part in. Wrong frames leave hardly any in step; in a right
+sequence light that wandered between frames, and rims, put up to a third of a coarse bit's out of it."""
+TREND_PX, TREND = 16, 3
+"""Stripes gained over so many pixels without a leap: more than misread ones make."""
+MIN_SHARE_IN_STEP, MIN_SHARE_WITHOUT_INVERSES = 0.6, 0.75
+MAX_SHARE_FOLDED = 0.15
+MOST_CAUSES = 3
 CONVINCING = 0.8
 ENOUGH = 200_000
 """Of the pixels lines are taken until there are so many, to look at neighbours along them."""
 
 
 def check_exposure(images: ScanLines) -> None:
-    """Raises DecodingFailed for frames that are black, overexposed, or do not add up in light.
+    """Raises DecodingFailed for frames that are black or overexposed.
 
-    Each pattern and its inverse together are as bright as the lit and the dark frame together,
-    and most pixels are lit in only one of them. Without an inverse, a pattern is at least nowhere
-    brighter than lit or darker than dark.
+    How bright a pattern and its inverse are together is not asked: cameras and projectors bend grey
+    levels, so that blurred patterns look brighter than sharp ones. Without an inverse, a pattern is
+    nowhere brighter than lit or darker than dark, or its threshold would be wrong.
     """
     step = _step(images)
     lit, dark = (frame[::step, ::step].astype(np.int16) for frame in (images.lit, images.dark))
@@ -61,17 +64,15 @@ def check_exposure(images: ScanLines) -> None:
             remedy="see whether the names of the two are exchanged in the rig file",
         )
     check_illumination(seen, lit)
+    if images.inverses is not None:
+        return
     bright = seen & (lit < SATURATED)
     bright &= contrast >= np.median(contrast[bright])
     line, place = np.nonzero(bright)
     at = step * (line * images.lit.shape[1] + place)
     frames = (images.lit.ravel(), images.dark.ravel())
-    for bit in range(len(images.patterns)):
-        pattern = images.patterns[bit].ravel()
-        if images.inverses is None:
-            _check_range(bit, _out_of_range(*frames, pattern, at))
-        else:
-            _check_sum(bit, *_in_sum(*frames, pattern, images.inverses[bit].ravel(), at))
+    for bit, pattern in enumerate(images.patterns):
+        _check_range(bit, _out_of_range(*frames, pattern.ravel(), at))
 
 
 def _step(images: ScanLines) -> int:
@@ -96,22 +97,6 @@ def check_illumination(seen: Mask, lit: NDArray[Any]) -> None:
         )
 
 
-def _check_sum(bit: int, alike: float, error: float) -> None:
-    """alike, error: see `_in_sum`."""
-    if alike > MOST_ALIKE:
-        raise DecodingFailed(
-            f"pattern and inverse of bit {bit} look alike",
-            remedy="see whether one of the two frames is missing or was taken twice",
-        )
-    if error > MAX_SUM_ERROR:
-        raise DecodingFailed(
-            f"pattern and inverse of bit {bit} do not add up to the lit frame "
-            f"(off by {error:.0%} of its contrast)",
-            remedy="see whether one of the two frames is missing, belongs to another bit or "
-            "was exposed differently",
-        )
-
-
 def _check_range(bit: int, error: float) -> None:
     """error: see `_out_of_range`."""
     if error > MAX_SUM_ERROR:
@@ -120,23 +105,6 @@ def _check_range(bit: int, error: float) -> None:
             f"(by {error:.0%} of their contrast)",
             remedy="see whether it was exposed as they were",
         )
-
-
-@compiled
-def _in_sum(
-    lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, at: Indices
-) -> tuple[float, float]:
-    """At flat pixels (N,): the share at which pattern and inverse look alike, and by how much of its
-    contrast their sum differs from the lit frame's and the dark one's."""
-    alike, error = 0, 0.0
-    for pixel in at:
-        light, black = float(lit[pixel]), float(dark[pixel])
-        seen, other = float(pattern[pixel]), float(inverse[pixel])
-        contrast = light - black
-        alike += abs(seen - other) < MIN_DIFFERENCE * contrast
-        excess = max(abs(seen + other - light - black) - NOISE_GREY, 0.0)
-        error += min(excess / contrast, 1.0)
-    return alike / at.size, error / at.size
 
 
 @compiled
@@ -151,48 +119,78 @@ def _out_of_range(lit: Bytes, dark: Bytes, pattern: Bytes, at: Indices) -> float
     return error / at.size
 
 
-def check_codes(images: ScanLines, words: Codes, code: WordCode, stripes: int) -> None:
-    """Raises DecodingFailed if neighbouring pixels do not lie in neighbouring stripes.
+def check_codes(
+    images: ScanLines, words: Codes, code: WordCode, stripes: int, variance: Floats
+) -> None:
+    """Raises DecodingFailed if patterns and inverses are not of one bit, or neighbouring pixels do not
+    lie in neighbouring stripes.
 
     words: (L, P) code words as read. Where just one bit of a Gray code differs between two pixels,
-    their stripes must be neighbours, whichever bit it is. Without inverses a pattern may be missing
-    unnoticed; then stripes count up and down along a line, which they must not. An exchange of the
-    coarsest pattern and its inverse turns the whole order round; it shows only in codes beyond the
-    last stripe, and not at all if the stripes are a power of two.
+    their stripes must be neighbours, whichever bit it is; bits that noise may have turned are left
+    out of that. A missing pattern may go unnoticed; then stripes count up and down along a line,
+    which they must not. An exchange of the coarsest pattern and its inverse turns the whole order
+    round; it shows only in codes beyond the last stripe, and not at all if all codes are in use.
+    variance: (256,) of each grey level.
     """
     bits = len(images.patterns)
     contrast = cv2.subtract(images.lit, images.dark)
-    some = slice(None, None, _step(images))
+    step = _step(images)
+    some = slice(None, None, step)
     sampled = contrast[some, some]
     # Darker pixels are misread too often by themselves to tell anything.
     good = contrast >= np.median(sampled[sampled >= MIN_CONTRAST])
-    check_direction(words, good, images.turned)
-    lines = slice(None, None, max(1, words.size // ENOUGH))
-    one, other = _changes(words[lines], good[lines], code)
-    least = MIN_SHARE_IN_STEP
-    if images.inverses is None:
-        _check_folds(one, other, code)
-        least = MIN_SHARE_WITHOUT_INVERSES
-    seen = words[some, some][good[some, some]]
-    in_step, beyond = _in_step(one, other, code, bits), _beyond(seen, code, stripes)
+    seen, shown, pairs = words[some, some], good[some, some], None
+    if images.inverses is not None:
+        every = LitPairs.of(
+            images.patterns[:, some, some], images.inverses[:, some, some], variance
+        )
+        pairs = every.where(shown)
+        check_seen(pairs)
+        shown = shown & every.coarse_clear
+    # Noise turns the finest bits along lines and across them.
+    check_direction(words >> max(min(FINE_BITS, bits - FINE_BITS), 0), good, images.turned)
+    if images.inverses is None or not code.single:
+        lines = slice(None, None, max(1, words.size // ENOUGH))
+        one, other = _changes(words[lines], good[lines], code)
+        in_step = _in_step(one, other, code, bits)
+        least = MIN_SHARE_IN_STEP if images.inverses is not None else MIN_SHARE_WITHOUT_INVERSES
+    else:
+        one, other, doubt = clear_changes(images, words, good, variance)
+        kept = ~doubt
+        in_step, least = _in_step(one & kept, other & kept, code, bits), MIN_SHARE_CLEAR
+        one, other = one[doubt == 0], other[doubt == 0]
     failing = [bit for bit, share in in_step.items() if share < least]
-    if not failing and beyond <= MAX_SHARE_BEYOND:
+    beyond = _beyond(seen[shown], code, stripes)
+    wrong = bool(failing) or beyond > MAX_SHARE_BEYOND
+    tried = _causes(one, other, seen[shown], code, bits, stripes) if wrong else ()
+    causes = list(islice(tried, MOST_CAUSES))
+    if pairs is not None and not causes:
+        check_pairs(pairs)
+    if not wrong:
+        _check_folds(code.stripes(words[::step]), good[::step])
         return
     found = [f"{beyond:.0%} of the codes lie beyond the last stripe"] if beyond > 0.01 else []
     if failing:
         names = ", ".join(str(bit) for bit in failing)
         found.append(f"where bit {names} flips, stripes do not follow each other")
-    cause = next(_causes(one, other, seen, code, bits, stripes), None)
     raise DecodingFailed(
         "the patterns do not make a stripe code: " + "; ".join(found or ["no order in them"]),
-        remedy=f"it would fit if {cause}" if cause else "see whether frames are in their order",
+        remedy="it would fit if " + ", or if ".join(causes)
+        if causes
+        else "see whether frames are in their order",
     )
 
 
-def _check_folds(one: Codes, other: Codes, code: WordCode) -> None:
-    """Raises DecodingFailed if stripes count up and down: a pattern shows no stripes then."""
-    step = code.stripes(other) - code.stripes(one)
-    up, down = np.count_nonzero(step == 1), np.count_nonzero(step == -1)
+def _check_folds(stripes: NDArray[np.int32], good: Mask) -> None:
+    """Raises DecodingFailed if stripes (L, P) count up and down: a pattern shows no stripes then.
+
+    Along a line of any camera they count one way on all that both camera and projector see.
+    """
+    leaps = np.cumsum(np.abs(np.diff(stripes, axis=1)) > 1, axis=1)
+    step = stripes[:, TREND_PX + 1 :] - stripes[:, 1:-TREND_PX]
+    whole = leaps[:, TREND_PX:] == leaps[:, :-TREND_PX]
+    told = whole & (np.abs(step) >= TREND) & good[:, TREND_PX + 1 :] & good[:, 1:-TREND_PX]
+    up, down = np.count_nonzero(step[told] > 0), np.count_nonzero(step[told] < 0)
     if min(up, down) > max(MAX_SHARE_FOLDED * (up + down), MIN_FLIPS):
         raise DecodingFailed(
             "the patterns do not make a stripe code: stripes count up and down in turn",

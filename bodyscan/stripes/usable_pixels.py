@@ -26,11 +26,22 @@ def usable_pixels(
     stripes: int,
     fine_bit: int,
 ) -> Mask:
-    """(L, P): pixels whose stripes `codes` can be relied on.
+    """(L, P): pixels whose stripes `codes` can be relied on: those of `shown_pixels` but for pixels
+    beside a jump of the code by more than one (a mixed pixel at a depth jump is one)."""
+    return shown_pixels(images, codes, variance, stripes, fine_bit)[0]
+
+
+def shown_pixels(
+    images: ScanLines,
+    codes: NDArray[np.int32],
+    variance: Floats,
+    stripes: int,
+    fine_bit: int,
+) -> tuple[Mask, Mask]:
+    """(L, P) the usable pixels, and all that show a code, those beside its jumps among them.
 
     Not low contrast, saturation, codes that were not projected, pixels that the surface's rim
-    covers only in part, pixels beside a jump of the code by more than one (a mixed pixel at a
-    depth jump is one), and pixels that other surfaces light more than the projector does.
+    covers only in part, and pixels that other surfaces light more than the projector does.
     variance: (256,) of each grey level.  fine_bit: see `mostly_direct`.
     """
     contrast = cv2.subtract(images.lit, images.dark)
@@ -38,9 +49,10 @@ def usable_pixels(
     least = np.minimum(np.ceil(least), 255).astype(np.uint8)
     bright = contrast >= cv2.LUT(cv2.max(images.lit, images.dark), least)
     bright &= ~half_covered_pixels(contrast, bright)
-    usable = bright & (images.lit < SATURATED) & (codes >= 0) & (codes < stripes)
-    usable &= ~beside_jumps(codes, usable)
-    return usable & mostly_direct(images, usable, fine_bit, variance)
+    shown = bright & (images.lit < SATURATED) & (codes >= 0) & (codes < stripes)
+    usable = shown & ~beside_jumps(codes, shown)
+    direct = mostly_direct(images, usable, fine_bit, variance)
+    return usable & direct, shown & direct
 
 
 def half_covered_pixels(contrast: NDArray[Any], lit: Mask) -> Mask:

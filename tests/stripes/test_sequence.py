@@ -71,10 +71,12 @@ def test_reversed_bits_and_exchanged_lists_are_named(good: Sequence) -> None:
 def test_a_frame_taken_twice_or_missing_is_named(good: Sequence, bit: int) -> None:
     with pytest.raises(DecodingFailed, match=f"bit {bit} look alike"):
         read(with_frame(good, "inverses", bit, good.patterns[bit]))
-    with pytest.raises(DecodingFailed, match=f"bit {bit} do not add up"):
+    unlike = "pattern 6 is darker than its inverse" if bit == 6 else f"differ clearly: bit {bit} "
+    with pytest.raises(DecodingFailed, match=unlike):
         read(with_frame(good, "patterns", bit, good.dark))
-    with pytest.raises(DecodingFailed, match=f"bit {bit} (look alike|do not add up)"):
-        read(with_frame(good, "inverses", bit, good.patterns[(bit + 1) % BITS]))
+    if bit < BITS - 1:  # of the finest, no finer one tells; a stripe's half is at stake there
+        with pytest.raises(DecodingFailed):
+            read(with_frame(good, "inverses", bit, good.patterns[bit + 1]))
 
 
 def test_a_bit_in_place_of_another_is_noticed(good: Sequence) -> None:

@@ -1,0 +1,78 @@
+"""Where along a scan line a Gray code changes in one bit, and noise has no part in the others."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.arrays import Bytes, Floats, Indices, Mask
+from bodyscan.compiled import compiled
+from bodyscan.stripes.bit_clarity import CLEAR
+from bodyscan.stripes.scan_lines import ScanLines
+
+Words = NDArray[np.uint16]
+
+MOST_OF_A_BIT = 2000
+EVERY = 61
+"""Lines are taken so far apart, then those beside them, so that few tell of the whole picture."""
+
+
+def clear_changes(
+    images: ScanLines, words: Words, good: Mask, variance: Floats
+) -> tuple[Words, Words, Words]:
+    """Code words (N,) of good neighbours that differ in one bit, and which finer bits to leave out.
+
+    Noise may have turned those; every coarser one is clear in both pixels, and so is the next finer
+    than the one that flips. Of each bit no more than a sample is taken.
+    words, good: (L, P).  variance: (256,) of each grey level.
+    """
+    assert images.inverses is not None
+    bits = len(images.patterns)
+    found = np.empty((bits * MOST_OF_A_BIT, 3), np.uint16)
+    lines = np.concatenate([np.arange(first, len(words), EVERY) for first in range(EVERY)])
+    count = _collect(
+        words, good, lines, images.patterns, images.inverses, CLEAR**2 * variance, found
+    )
+    one, other, doubt = np.ascontiguousarray(found[:count].T)
+    return one, other, doubt
+
+
+@compiled
+def _collect(
+    words: Words,
+    good: Mask,
+    lines: Indices,
+    patterns: Bytes,
+    inverses: Bytes,
+    least2: Floats,
+    found: Words,
+) -> int:
+    bits, count = len(patterns), 0
+    taken = np.zeros(bits, np.int64)
+    for line in lines:
+        for place in range(words.shape[1] - 1):
+            flip = words[line, place] ^ words[line, place + 1]
+            if flip == 0 or flip & (flip - 1) or not (good[line, place] and good[line, place + 1]):
+                continue
+            at = 0  # of the bit that flips, from the finest
+            while flip >> (at + 1):
+                at += 1
+            if at == 0 or taken[at] == MOST_OF_A_BIT:
+                continue
+            end = 0  # bits below that one are left out
+            for bit in range(bits):
+                height = bits - 1 - bit
+                if height == at or height < end:
+                    continue
+                for beside in (place, place + 1):
+                    seen, other = patterns[bit, line, beside], inverses[bit, line, beside]
+                    step = np.float32(seen) - np.float32(other)
+                    if step * step < least2[seen] + least2[other]:
+                        end = max(end, height + 1)
+            if end >= at:
+                continue
+            taken[at] += 1
+            found[count, 0], found[count, 1] = words[line, place], words[line, place + 1]
+            found[count, 2] = (1 << end) - 1
+            count += 1
+    return count
