@@ -6,13 +6,17 @@ import ast
 import json
 import re
 import tomllib
+from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
 import pycolmap
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 from ring import ring_of_cameras
 
 from bodyscan.arrays import Array
@@ -419,3 +423,35 @@ def test_a_colmap_model_of_others(tmp_path: Path) -> None:
     strange.write(tmp_path / "fisheye")
     with pytest.raises(CalibrationFileError, match="OPENCV_FISHEYE, which there is not here"):
         RIG_FORMATS.find("colmap").read(tmp_path / "fisheye")
+
+
+JUNK = st.sampled_from(
+    ["", "[", "]", "{", "}", "nan", "1e999", "-1", '"', "x", "\n", "\t", ":", "null", "[[1, 2], 3]",
+     "\x00", "- ", 'b"x"', "</a>", "!!opencv-matrix", "9" * 30]
+)  # fmt: skip
+
+
+@given(
+    st.sampled_from(sorted(WRITTEN_BY_OTHERS)), st.integers(0), st.sampled_from([0, 1, 5, 40]), JUNK
+)
+def test_whatever_a_file_holds_is_read_or_refused(kind: str, at: int, cut: int, junk: str) -> None:
+    name, text, _ = WRITTEN_BY_OTHERS[kind]
+    at %= len(text)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        path.write_text(text[:at] + junk + text[at + cut :])
+        with suppress(CalibrationFileError):
+            RIG_FORMATS.find(kind).read(path)
+
+
+@given(
+    st.sampled_from(["yaml", "xml", "json"]), st.integers(0), st.sampled_from([0, 1, 5, 40]), JUNK
+)
+def test_whatever_nodes_hold_is_read_or_refused(kind: str, at: int, cut: int, junk: str) -> None:
+    text = storage(kind)
+    at %= len(text)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "any"
+        path.write_text(text[:at] + junk + text[at + cut :])
+        with suppress(CalibrationFileError):
+            read_nodes(path, NODES)

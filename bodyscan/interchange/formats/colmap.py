@@ -72,7 +72,7 @@ def read_colmap(folder: Path) -> dict[str, FoundCamera]:
     folder, model = Path(folder), pycolmap.Reconstruction()
     try:
         model.read(folder)
-    except (OSError, ValueError, RuntimeError, IndexError) as error:
+    except (OSError, ValueError, RuntimeError, IndexError, MemoryError) as error:
         said = str(error).strip().splitlines() or [type(error).__name__]
         raise CalibrationFileError(
             f"is not a COLMAP model ({said[-1]})",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +105,9 @@ def _read_model(path: Path) -> FoundCamera:
 
 def _literal(file: ForeignFile) -> dict[Any, Any]:
     try:
-        content = ast.literal_eval(file.text.strip())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SyntaxWarning)
+            content = ast.literal_eval(file.text.strip())
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         line = getattr(error, "lineno", None)
         raise CalibrationFileError(
