@@ -13,3 +13,6 @@ Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 """Grey levels and colours."""
+
+Greys = NDArray[np.uint8] | NDArray[np.float32]
+"""Grey levels, 0 to 255: float32 where a camera or several exposures tell parts of them."""

@@ -18,6 +18,7 @@ from bodyscan.stripes.codes.light_section import STRIPE, LightSection
 from bodyscan.stripes.codes.phase_shift import PHASE, PhaseShift
 from bodyscan.stripes.codes.stripe_index import StripeIndex
 from bodyscan.stripes.stripe_code import ImageKind, StripeCode
+from bodyscan.stripes.wave import Wave
 
 PARTS = 16
 """Values of light in a stripe, where it changes inside stripes."""
@@ -63,12 +64,13 @@ def projected_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]
         return _named(frames, STRIPE, np.eye(code.stripes))
     if isinstance(code, PhaseShift):
         place = (np.arange(code.stripes * PARTS) + 0.5) / PARTS
-        halves = np.floor(2.0 * place / code.period).astype(int)
+        waves = np.concatenate([_wave_images(wave, place) for wave in code.waves])
+        phases = _named(frames, PHASE, waves)
+        if not code.needs_gray:
+            return phases
+        halves = np.floor(2.0 * place / code.waves[0].period).astype(int)
         bits = code_bits(int(halves[-1]) + 1)[:, halves].astype(float)
-        waves = np.stack(
-            [np.cos(np.pi * (place / code.period - i / code.steps)) ** 2 for i in range(code.steps)]
-        )
-        return _bit_images(frames, bits, code.inverses) | _named(frames, PHASE, waves)
+        return _bit_images(frames, bits, code.inverses) | phases
     if isinstance(code, Binary):
         last = code.first_code + code.stripes
         shifts = np.arange(bit_count(last))[::-1]
@@ -76,6 +78,15 @@ def projected_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]
         return _bit_images(frames, bits, code.inverses)
     inverses, first = (code.inverses, code.first_code) if isinstance(code, Gray) else (True, 0)
     return _bit_images(frames, code_bits(code.stripes, first).astype(float), inverses)
+
+
+def _wave_images(wave: Wave, place: Array) -> Array:
+    """(steps, N): at each step the wave's crests lie a part of its period farther on, or back."""
+    step = wave.period / wave.steps * (1.0 if wave.shift == "forward" else -1.0)
+    crest = wave.origin - wave.start * wave.period / (2.0 * np.pi)
+    return np.stack(
+        [np.cos(np.pi * (place - crest - k * step) / wave.period) ** 2 for k in range(wave.steps)]
+    )
 
 
 def _bit_images(frames: FrameNames, bits: Array, inverses: bool) -> dict[str, Array]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from bodyscan.arrays import Bytes, Floats, Indices, Mask
+from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.scan_lines import ScanLines
 
@@ -14,6 +16,9 @@ LARGEST_DIFFERENCE = 24
 BRIGHTEST = 250
 LEAST_VARIANCE = 0.15
 """Rounding to whole grey levels (1/12), and a little."""
+
+LEAST_FINE_VARIANCE = LEAST_VARIANCE / 16.0**2
+"""The same of 12 bits: what has more is noise in any camera."""
 
 
 def noise_variance(images: ScanLines) -> Floats:
@@ -33,16 +38,23 @@ def noise_variance(images: ScanLines) -> Floats:
     variance = (square / np.maximum(count, 1) - mean**2) / 2.0
     known = count >= ENOUGH_PIXELS
     grey = LEVELS * (np.arange(LEVELS) + 0.5)
-    if not known.any():
+    return fitted_variance(grey[known], variance[known], count[known], images.lit.dtype)
+
+
+def fitted_variance(grey: Array, variance: Array, count: Array, of: np.dtype[Any]) -> Floats:
+    """(256,) from the variance (N,) seen in N bands about grey levels `grey`, of `count` pixels each:
+    a line that is nowhere falling, and nowhere below the rounding of images of type `of`."""
+    least = LEAST_VARIANCE if of == np.uint8 else LEAST_FINE_VARIANCE
+    if not len(grey):
         return np.ones(256, np.float32)
-    rise, base = 0.0, float(np.average(variance[known], weights=count[known]))
-    if known.sum() >= 3:
+    rise, base = 0.0, float(np.average(variance, weights=count))
+    if len(grey) >= 3:
         # Each band's variance is known to the same relative precision for the same count.
-        weight = np.sqrt(count[known]) / np.maximum(variance[known], LEAST_VARIANCE)
-        slope, start = np.polyfit(grey[known], variance[known], 1, w=weight)
+        weight = np.sqrt(count) / np.maximum(variance, least)
+        slope, start = np.polyfit(grey, variance, 1, w=weight)
         if slope > 0:
             rise, base = float(slope), float(start)
-    return np.maximum(base + rise * np.arange(256), LEAST_VARIANCE).astype(np.float32)
+    return np.maximum(base + rise * np.arange(256), least).astype(np.float32)
 
 
 @compiled

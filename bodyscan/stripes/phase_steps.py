@@ -1,34 +1,29 @@
-"""Waves of light, shifted by a part of their period from image to image: s from their phase.
+"""One wave of light, and a Gray code of its half periods: s from the phase.
 
-Image n of N shows 1/2 + 1/2 cos(phi - 2 pi n / N) with phi = 2 pi s / period, so that
-
-    phi = atan2(sum I_n sin(2 pi n / N), sum I_n cos(2 pi n / N)),
-
-whatever the surface's brightness. A Gray code of half periods says which period it is: its
-word is off by one near its own boundaries at most, so its middle is never as much as half a
-period from s, and the period whose phase is nearest to it is the right one.
+The Gray code's word is off by one near its own boundaries at most, so its middle is never as much
+as half a period from s, and the period whose phase is nearest to it is the right one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
-from bodyscan.arrays import Bytes, Floats, Mask
+from bodyscan.arrays import Floats, Greys, Mask
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.bit_patterns import read_words
 from bodyscan.stripes.bit_words import GRAY
 from bodyscan.stripes.grey_noise import noise_variance
 from bodyscan.stripes.pixel_stripes import pixel_stripe_map
+from bodyscan.stripes.projector_response import error_of_repeated, share_of_error, without_error
 from bodyscan.stripes.scan_lines import ScanLines, transpose
 from bodyscan.stripes.stripe_map import StripeMap
-from bodyscan.stripes.usable_pixels import MIN_CONTRAST_TO_NOISE, usable_pixels
-
-MIN_AMPLITUDE = 2.0
-LEAST_SIGMA = 5e-4
-"""Of a period: what light that is not quite a wave, and rounding, leave."""
+from bodyscan.stripes.usable_pixels import MIN_CONTRAST_TO_NOISE, least_contrast, usable_pixels
+from bodyscan.stripes.wave import Wave
+from bodyscan.stripes.waves import see_wave
 
 ALIKE = 0.1
 MAX_MEAN_ERROR = 0.15
@@ -41,10 +36,10 @@ LEAP = 0.6
 
 
 def decode_phase(
-    images: ScanLines, lit: Bytes, waves: Bytes, half_periods: int, period: int, stripes: int
+    images: ScanLines, lit: Greys, phases: Greys, half_periods: int, wave: Wave, stripes: int
 ) -> StripeMap:
     """The stripe map.  images: scan lines of the Gray code of half periods.  lit: (H, W) as the
-    camera has it.  waves: (steps, H, W).  period: in stripes.
+    camera has it.  phases: (steps, H, W), the images of the wave.
 
     Raises DecodingFailed if the images do not add up.
     """
@@ -52,32 +47,26 @@ def decode_phase(
     halves = GRAY.stripes(read_words(GRAY, images, half_periods, variance))
     fine_bit = GRAY.two_wide(len(images.patterns))
     usable = usable_pixels(images, halves, variance, half_periods, fine_bit)
-    waves = transpose(waves) if images.turned else waves
-    _check_waves(images, waves, usable)
-    turn, amplitude, middle = _wave(waves)
-    noise = np.sqrt(variance[np.clip(middle, 0, 255).astype(np.uint8)])
-    usable &= amplitude >= np.maximum(MIN_AMPLITUDE, MIN_CONTRAST_TO_NOISE * noise)
+    phases = transpose(phases) if images.turned else phases
+    _check_waves(images, phases, usable)
+    seen = see_wave(phases, wave)
+    noise = np.sqrt(variance[np.clip(seen.mean, 0, 255).astype(np.uint8)])
+    least = least_contrast(phases.dtype) / 2.0
+    usable &= seen.amplitude >= np.maximum(least, MIN_CONTRAST_TO_NOISE * noise)
     coarse = (halves.astype(np.float32) + 0.5) / 2.0
-    _check_phase(waves, coarse, usable)
-    s = (turn + np.rint(coarse - turn)) * np.float32(period)
-    sigma = np.hypot(noise / amplitude / np.sqrt(2.0 * len(waves)) / np.pi, LEAST_SIGMA)
+    _check_phase(phases, coarse, usable, wave)
+    error = error_of_repeated(seen, usable, stripes)
+    turn = without_error(seen, error).turn
+    period = np.float32(wave.period)
+    s = (turn + np.rint(coarse - turn)) * period
+    sigma = seen.sigma(noise)
     s[~usable] = np.nan
-    sigma = np.where(usable, sigma * period, np.nan).astype(np.float32)
-    return pixel_stripe_map(images, lit, s, sigma, variance, stripes)
+    sigma = np.where(usable, sigma * period, np.float32(np.nan))
+    found = pixel_stripe_map(images, lit, s, sigma, variance, stripes)
+    return replace(found, response=share_of_error(error, seen, found.sigma))
 
 
-def _wave(waves: Bytes) -> tuple[Floats, Floats, Floats]:
-    """Phase in turns (0 to 1), amplitude and mean (grey levels) of waves (N, L, P)."""
-    angle = 2.0 * np.pi * np.arange(len(waves)) / len(waves)
-    sine, cosine, middle = (
-        np.einsum("nlp,n->lp", waves, weight.astype(np.float32))
-        for weight in (np.sin(angle), np.cos(angle), np.full(len(waves), 1.0 / len(waves)))
-    )
-    amplitude = np.maximum(np.hypot(sine, cosine) * np.float32(2.0 / len(waves)), 1e-3)
-    return np.arctan2(sine, cosine) / np.float32(2.0 * np.pi) % np.float32(1.0), amplitude, middle
-
-
-def _check_waves(images: ScanLines, waves: Bytes, usable: Mask) -> None:
+def _check_waves(images: ScanLines, waves: Greys, usable: Mask) -> None:
     """Raises DecodingFailed if an image is missing, taken twice or exposed otherwise.
 
     Each is, over the picture, half as bright as lit, and so are all together at each pixel.
@@ -109,7 +98,7 @@ def _check_waves(images: ScanLines, waves: Bytes, usable: Mask) -> None:
         )
 
 
-def _check_phase(waves: Bytes, coarse: Floats, usable: Mask) -> None:
+def _check_phase(waves: Greys, coarse: Floats, usable: Mask, wave: Wave) -> None:
     """Raises DecodingFailed if phases do not lie in their half periods, or leap between them."""
     across = (np.abs(np.diff(coarse, axis=1)) == 0.5) & usable[:, 1:] & usable[:, :-1]
     line, place = np.nonzero(across)
@@ -120,9 +109,9 @@ def _check_phase(waves: Bytes, coarse: Floats, usable: Mask) -> None:
     anywhere, anywhere_coarse = waves[:, None, usable], coarse[None, usable]
 
     def amiss(order: list[int]) -> float:
-        off = _wave(anywhere[order])[0] - anywhere_coarse
+        off = see_wave(anywhere[order], wave).turn - anywhere_coarse
         afar = float(np.mean(np.abs(off - np.rint(off)) > AFAR))
-        turn = _wave(leaping[order])[0]
+        turn = see_wave(leaping[order], wave).turn
         before, behind = turn + np.rint(leaping_coarse - turn)
         return max(afar, float(np.mean(np.abs(behind - before) > LEAP)))
 
@@ -135,7 +124,8 @@ def _check_phase(waves: Bytes, coarse: Floats, usable: Mask) -> None:
         f"the phase does not go with the Gray code at {found:.0%} of the pixels",
         remedy=f"it would fit if {cause}"
         if cause
-        else "see whether the images are in their order, and `steps` and `period` right",
+        else "see whether the images are in their order, and `steps`, `period`, `start_deg` and "
+        "`shift` right",
     )
 
 

@@ -12,6 +12,23 @@ from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.scan_lines import ScanLines
 
 
+@dataclass(frozen=True)
+class ResponseShare:
+    """What the projector's response did to s before it was taken out, and what noise does still.
+
+    response_rms, noise_rms: stripes, over the pixels that have s.
+    """
+
+    response_rms: float
+    noise_rms: float
+
+    def __str__(self) -> str:
+        return (
+            f"the projector's response moved s by {self.response_rms:.2g} stripes RMS and was taken"
+            f" out; noise moves it by {self.noise_rms:.2g}"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class StripeMap:
     """The stripe coordinate of every lit pixel, and the stripe boundaries between them.
@@ -26,6 +43,7 @@ class StripeMap:
     beyond: (height, width) bool, lit by a stripe that lies deeper than wanted; None where all stripes
     were wanted. s is NaN there (see `StripeLimits`).
     crossing: the map of the stripes that run the other way, where such were projected.
+    response: what the projector's response did, of codes that tell it; None where noise explains all.
     """
 
     s: Floats
@@ -37,6 +55,7 @@ class StripeMap:
     stripes: int
     beyond: Mask | None = None
     crossing: StripeMap | None = None
+    response: ResponseShare | None = None
 
 
 def stripe_map(

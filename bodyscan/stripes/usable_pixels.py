@@ -19,6 +19,12 @@ MIN_CONTRAST_TO_NOISE = 5.0
 WHOLLY_COVERED = 0.7
 
 
+def least_contrast(of: np.dtype[Any]) -> float:
+    """Grey levels of images of type `of`: below it whole grey levels are too few to tell anything;
+    of finer ones, noise alone says what is too little."""
+    return MIN_CONTRAST if of == np.uint8 else 0.0
+
+
 def usable_pixels(
     images: ScanLines,
     codes: NDArray[np.int32],

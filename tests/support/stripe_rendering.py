@@ -77,20 +77,35 @@ def gray_bits(words: np.ndarray) -> np.ndarray:
 
 
 def code_light(
-    code: str, stripes: int, *, inverses: bool = True, steps: int = 4, period: int = 8
+    code: str,
+    stripes: int,
+    *,
+    inverses: bool = True,
+    steps: int | tuple[int, ...] = 4,
+    period: float | tuple[float, ...] = 8,
+    backward: bool = False,
+    start_deg: float = 0.0,
+    origin: float = 0.0,
 ) -> np.ndarray:
     """(images, 16 stripes): light of each image of a code, sixteen values a stripe."""
     s = (np.arange(16 * stripes) + 0.5) / 16
     if code == "light-section":
         return (np.floor(s) == np.arange(stripes)[:, None]).astype(float)
+    parts = []
+    periods = period if isinstance(period, tuple) else (period,)
     if code == "binary":
         bits = np.floor(s).astype(int) >> np.arange((stripes - 1).bit_length())[::-1, None] & 1
-    else:
-        bits = gray_bits(np.floor(s if code == "gray" else 2 * s / period).astype(int))
-    parts = [bits, 1 - bits] if inverses else [bits]
+        parts = [bits, 1 - bits]
+    elif code == "gray" or len(periods) == 1:
+        bits = gray_bits(np.floor(s if code == "gray" else 2 * s / periods[0]).astype(int))
+        parts = [bits, 1 - bits]
+    parts = parts if inverses else parts[:1]
     if code == "phase-shift":
-        turns = s / period - np.arange(steps)[:, None] / steps
-        parts.append(0.5 + 0.5 * np.cos(2 * np.pi * turns))
+        counts = steps if isinstance(steps, tuple) else (steps,) * len(periods)
+        for length, count in zip(periods, counts, strict=True):
+            shift = np.arange(count)[:, None] / count * (-1 if backward else 1)
+            turns = (s - origin) / length - shift + start_deg / 360
+            parts.append(0.5 + 0.5 * np.cos(2 * np.pi * turns))
     return np.concatenate(parts).astype(float)
 
 

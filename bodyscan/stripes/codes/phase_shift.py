@@ -1,10 +1,12 @@
-"""Phase shift: waves of light, shifted from image to image, and a Gray code of half periods.
+"""Phase shift: waves of light, shifted from image to image.
 
-The phase tells s to a period; which period it is, the Gray code tells.
+A wave's phase tells s to a period. Which period it is, other waves tell, or a Gray code of half
+periods where there is one wave alone.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -13,72 +15,150 @@ from pydantic import Field
 from bodyscan.files.model import Problem
 from bodyscan.stripes.codes.gray import INVERSE, PATTERN, bits_needed
 from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
+from bodyscan.stripes.wave import Shift, Wave, alike_again
 
 if TYPE_CHECKING:
-    from bodyscan.arrays import Array
+    from bodyscan.arrays import Array, Greys
     from bodyscan.stripes.stripe_limits import StripeLimits
     from bodyscan.stripes.stripe_map import StripeMap
 
-PHASE = ImageKind("phase", "phase{step:02d}", "step", most=64)
+PHASE = ImageKind("phase", "phase{step:02d}", "step", most=256)
+USUAL_PERIOD = 8.0
+
+LEAST_CHANGE = 0.004
+"""Of a period: waves that change less are alike to any camera (8 times the least sigma of a phase,
+so that an order can be told at all)."""
+
+Steps = Annotated[int, Field(ge=3, le=64)]
+Period = Annotated[float, Field(ge=2, le=1e6)]
+Count = Annotated[float, Field(gt=0, le=65535)]
 
 
 class PhaseShift(StripeCode):
-    """inverses: of the Gray code.  steps: images in one period.  period: stripes in it."""
+    """period: stripes in a period of the wave, or of each wave; or else periods: how many of them the
+    stripes make.  steps: images of each wave.  shift: which way the waves move from image to image.
+    start_deg: the phase, in degrees, at `origin` in image 0.  origin: s where the waves begin.
+    inverses: of the Gray code, which there is for one wave alone that repeats.
+    """
 
     kinds: ClassVar = (PATTERN, INVERSE, PHASE)
     has_edges: ClassVar = False
 
     code: Literal["phase-shift"] = "phase-shift"
     inverses: bool = True
-    steps: Annotated[int, Field(ge=3, le=64)] = 4
-    period: Annotated[int, Field(ge=2, le=65535)] = 8
+    steps: Steps | Annotated[tuple[Steps, ...], Field(min_length=1, max_length=8)] = 4
+    period: Period | Annotated[tuple[Period, ...], Field(min_length=1, max_length=8)] | None = None
+    periods: Count | Annotated[tuple[Count, ...], Field(min_length=1, max_length=8)] | None = None
+    shift: Shift = "forward"
+    start_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    origin: Annotated[float, Field(ge=-65535, le=65535)] = 0.0
 
     def problems(self) -> Iterator[Problem]:
         yield from super().problems()
-        if self.period > self.stripes:
-            wrong = f"must be {self.stripes} (stripes) or less (got {self.period})"
-            yield ("period",), wrong
+        if self.period is not None and self.periods is not None:
+            yield ("periods",), "says again what period says: give one of the two"
+            return
+        lengths = self._lengths
+        if isinstance(self.steps, tuple) and len(self.steps) != len(lengths):
+            wrong = f"has {len(self.steps)} numbers, but there are {len(lengths)} waves"
+            yield ("steps",), wrong
+            return
+        key = "period" if self.periods is None else "periods"
+        if self.needs_gray:
+            if lengths[0] < 2.0:
+                yield (key,), f"gives waves of {lengths[0]:g} stripes: a period has 2 or more"
+            return
+        if len(lengths) == 1 and lengths[0] > self.stripes and key == "period":
+            wrong = f"must be {self.stripes} (stripes) or less (got {lengths[0]:g})"
+            yield (key,), wrong
+            return
+        again = alike_again(lengths, self.stripes, LEAST_CHANGE)
+        if again is not None:
+            all_periods = ", ".join(f"{length:g}" for length in lengths)
+            yield (
+                (key,),
+                f"does not tell all stripes apart: waves of {all_periods} stripes are alike again"
+                f" after {again:g} of {self.stripes}; one must cover all of them, or their beat",
+            )
+
+    @property
+    def _lengths(self) -> tuple[float, ...]:
+        """Stripes in a period of each wave."""
+        if self.periods is not None:
+            counts = self.periods if isinstance(self.periods, tuple) else (self.periods,)
+            return tuple(self.stripes / count for count in counts)
+        if self.period is None:
+            return (min(USUAL_PERIOD, float(self.stripes)),)
+        return self.period if isinstance(self.period, tuple) else (self.period,)
+
+    @property
+    def waves(self) -> tuple[Wave, ...]:
+        """In the order of their images."""
+        lengths = self._lengths
+        steps = self.steps if isinstance(self.steps, tuple) else (self.steps,) * len(lengths)
+        start = math.radians(self.start_deg)
+        return tuple(
+            Wave(length, count, self.shift, start, self.origin)
+            for length, count in zip(lengths, steps, strict=True)
+        )
+
+    @property
+    def needs_gray(self) -> bool:
+        """Whether a Gray code says which period it is."""
+        lengths = self._lengths
+        return len(lengths) == 1 and lengths[0] < self.stripes
 
     @property
     def half_periods(self) -> int:
-        """How many the stripes make, the last one perhaps in part."""
-        return -(-2 * self.stripes // self.period)
+        """How many the stripes make, the last one perhaps in part; of the one wave."""
+        return math.ceil(2.0 * self.stripes / self._lengths[0] - 1e-9)
 
     @property
     def needs_lit(self) -> bool:
-        return not self.inverses
+        return self.needs_gray and not self.inverses
 
     @property
     def needs_dark(self) -> bool:
-        return not self.inverses
+        return self.needs_gray and not self.inverses
 
     @property
     def image_counts(self) -> Mapping[ImageKind, int]:
+        phases = {PHASE: sum(wave.steps for wave in self.waves)}
+        if not self.needs_gray:
+            return phases
         bits = bits_needed(self.half_periods)
         inverse = {INVERSE: bits} if self.inverses else {}
-        return {PATTERN: bits} | inverse | {PHASE: self.steps}
+        return {PATTERN: bits} | inverse | phases
 
     def intensity(self, kind: ImageKind, s: Array) -> Array:
         import numpy as np
 
         from bodyscan.stripes.bit_words import GRAY
 
-        turns = s / self.period
         if kind == PHASE:
-            shift = np.arange(self.steps)[:, None] / self.steps
-            return 0.5 + 0.5 * np.cos(2.0 * np.pi * (turns - shift))
-        halves = np.floor(s * (2.0 / self.period)).astype(np.int64)
+            return np.concatenate([
+                0.5 + 0.5 * np.cos(2.0 * np.pi * (
+                    (s - wave.origin) / wave.period
+                    - wave.sign * np.arange(wave.steps)[:, None] / wave.steps
+                ) + wave.start)
+                for wave in self.waves
+            ])  # fmt: skip
+        halves = np.floor(s * (2.0 / self._lengths[0])).astype(np.int64)
         bright = GRAY.bits(halves, bits_needed(self.half_periods))
         return bright if kind == PATTERN else 1.0 - bright
 
     def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:
         from bodyscan.stripes.bit_patterns import bit_lines
         from bodyscan.stripes.phase_steps import decode_phase
+        from bodyscan.stripes.phase_waves import decode_waves
 
+        phases = images.coded[PHASE]
+        if not self.needs_gray:
+            return decode_waves(phases, self.waves, images.lit, self.direction, self.stripes)
         patterns, inverses = images.coded[PATTERN], images.coded.get(INVERSE)
         lines = bit_lines(images.lit, images.dark, patterns, inverses, self.direction)
-        waves = images.coded[PHASE]
-        return decode_phase(lines, images.lit, waves, self.half_periods, self.period, self.stripes)
+        (wave,) = self.waves
+        return decode_phase(lines, images.lit, phases, self.half_periods, wave, self.stripes)
 
 
 CODES = (PhaseShift,)

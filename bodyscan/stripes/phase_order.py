@@ -1,0 +1,140 @@
+"""Which period of the finest wave a pixel shows: the one with which all other waves agree best.
+
+A fine wave tells s exactly, but for whole periods. Of all s that it leaves open, each puts the
+other waves at some phase; how far they are from there, in sigmas, is the likelihood of that s. One
+rule, whether a single period covers all stripes (hierarchical unwrapping) or the waves only beat
+(heterodyne). A pixel whose next best s is nearly as likely has no order: it is not guessed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.arrays import Array, Floats, Indices, Mask
+from bodyscan.compiled import compiled
+from bodyscan.stripes.waves import WaveSeen
+
+CHANCE = 1e-4
+"""Of a wrong order, at most: one flying pixel in ten thousand, which cleaning finds."""
+
+MOST_SIGMAS = 4.5
+"""Between two waves of one pixel: once in 150,000 by noise, else the pixel sees two surfaces."""
+
+ENOUGH = 100
+COMBINED = 2.0
+"""Waves up to so many times as long as the finest help it to tell s; longer ones would bring in
+more of what is wrong with them than they take of its noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseOrder:
+    """s and its standard deviation (L, P), stripes; `certain` where its order is.
+
+    agreed: the share of the pixels asked for whose waves agree.  apart: by how many turns of the
+    finest wave each other one is off on the whole.  misfit: how many sigmas they are off, 1 if
+    noise explains it.
+    """
+
+    s: Floats
+    sigma: Floats
+    certain: Mask
+    agreed: float
+    apart: tuple[float, ...]
+    misfit: float
+
+
+def phase_order(
+    waves: Sequence[WaveSeen], sigmas: Sequence[Floats], usable: Mask, stripes: int
+) -> PhaseOrder:
+    """waves: the finest first.  sigmas: (L, P) of their turns.  usable: pixels asked for."""
+    periods = np.array([wave.wave.period for wave in waves])
+    turns = np.stack([wave.turn[usable] for wave in waves])
+    doubts = np.stack([sigma[usable] for sigma in sigmas])
+    orders, _, _ = _best_orders(turns, doubts, periods, float(stripes))
+    growth = _beyond_noise(turns, doubts, periods, orders)
+    doubts *= growth[:, None]
+    orders, best, second = _best_orders(turns, doubts, periods, float(stripes))
+    off, off_sigma = _apart(turns, doubts, periods, orders)
+    agree = np.all(np.abs(off) <= MOST_SIGMAS * off_sigma, axis=0)
+    told = second - best >= -2.0 * math.log(CHANCE)
+    s, sigma = _combined(turns, doubts, periods, orders, off)
+    inside = (s > MOST_SIGMAS * sigma) & (s < stripes - MOST_SIGMAS * sigma)
+    certain = agree & told & inside
+    whole_s, whole_sigma = (np.full(usable.shape, np.nan, np.float32) for _ in range(2))
+    whole_s[usable], whole_sigma[usable] = s, sigma
+    whole_certain = np.zeros(usable.shape, bool)
+    whole_certain[usable] = certain
+    apart = tuple(_middle(off * (periods[1:, None] / periods[0])))
+    agreed, misfit = _share(agree & told), float(growth.max())
+    return PhaseOrder(whole_s, whole_sigma, whole_certain, agreed, apart, misfit)
+
+
+def _share(agree: Mask) -> float:
+    return float(np.mean(agree)) if agree.size else 0.0
+
+
+def _middle(values: Floats) -> list[float]:
+    """Medians of the rows (W, M)."""
+    return np.median(values, axis=1).tolist() if values.size else [0.0] * len(values)
+
+
+def _apart(turns: Floats, sigmas: Floats, periods: Array, orders: Indices) -> tuple[Floats, Floats]:
+    """(W - 1, M) turns that the other waves are off from where the finest puts them, and the
+    standard deviation of that."""
+    ratio = (periods[0] / periods[1:, None]).astype(np.float32)
+    off = turns[1:] - (turns[0] + orders.astype(np.float32)) * ratio
+    return off - np.rint(off), np.hypot(sigmas[1:], sigmas[0] * ratio)
+
+
+def _beyond_noise(turns: Floats, sigmas: Floats, periods: Array, orders: Indices) -> Floats:
+    """(W,) by how much each wave's sigma is to grow so that it explains what is seen: what is left
+    of the projector's response, and light by way of other surfaces, are no noise."""
+    growth = np.ones(len(periods), np.float32)
+    if turns.shape[1] >= ENOUGH:
+        off, off_sigma = _apart(turns, sigmas, periods, orders)
+        seen = np.median(np.abs(off) / off_sigma, axis=1) / 0.6745
+        growth[1:] = np.maximum(seen, 1.0)
+    return growth
+
+
+def _combined(
+    turns: Floats, sigmas: Floats, periods: Array, orders: Indices, off: Floats
+) -> tuple[Floats, Floats]:
+    """s and its standard deviation (M,): the mean of the waves of about the finest's period."""
+    weights = 1.0 / np.square(sigmas * periods[:, None].astype(np.float32))
+    weights[periods > COMBINED * periods[0]] = 0.0
+    moved = np.sum(weights[1:] * off * periods[1:, None].astype(np.float32), axis=0)
+    total = np.sum(weights, axis=0)
+    s = (turns[0] + orders) * periods[0] + moved / total
+    return s.astype(np.float32), (1.0 / np.sqrt(total)).astype(np.float32)
+
+
+@compiled
+def _best_orders(
+    turns: Floats, sigmas: Floats, periods: Array, stripes: float
+) -> tuple[Indices, Array, Array]:
+    """The likeliest whole periods of the finest wave at M pixels, and chi squared of these and of
+    the next best (M,).  turns, sigmas: (W, M)."""
+    count = turns.shape[1]
+    orders = np.zeros(count, np.int64)
+    best, second = np.full(count, np.inf), np.full(count, np.inf)
+    ratios = periods[0] / periods
+    for pixel in range(count):
+        order, turn = 0, np.float64(turns[0, pixel])
+        while (turn + order) * periods[0] < stripes:
+            cost = 0.0
+            for wave in range(1, periods.size):
+                off = turns[wave, pixel] - (turn + order) * ratios[wave]
+                off -= math.floor(off + 0.5)
+                doubt2 = sigmas[wave, pixel] ** 2 + (sigmas[0, pixel] * ratios[wave]) ** 2
+                cost += off * off / doubt2
+            if cost < best[pixel]:
+                second[pixel], best[pixel], orders[pixel] = best[pixel], cost, order
+            elif cost < second[pixel]:
+                second[pixel] = cost
+            order += 1
+    return orders, best, second

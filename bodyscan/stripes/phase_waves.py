@@ -1,0 +1,233 @@
+"""Waves of several periods and nothing else: s from their phases, black and white from their means
+and amplitudes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+from bodyscan.arrays import Bytes, Floats, Greys, Mask
+from bodyscan.errors import DecodingFailed
+from bodyscan.stripes.phase_order import PhaseOrder, phase_order
+from bodyscan.stripes.pixel_stripes import pixel_stripe_map
+from bodyscan.stripes.projector_response import (
+    PhaseError,
+    error_against,
+    error_of_repeated,
+    share_of_error,
+    without_error,
+)
+from bodyscan.stripes.scan_lines import ScanLines, transpose
+from bodyscan.stripes.sequence_checks import check_direction, check_illumination
+from bodyscan.stripes.stripe_map import StripeMap
+from bodyscan.stripes.usable_pixels import (
+    MIN_CONTRAST_TO_NOISE,
+    SATURATED,
+    beside_jumps,
+    half_covered_pixels,
+    least_contrast,
+)
+from bodyscan.stripes.wave import Wave
+from bodyscan.stripes.wave_noise import wave_variance
+from bodyscan.stripes.waves import WaveSeen, see_wave, split_waves
+
+MOST_DIFFERENT = 0.15
+"""Of the mean brightness, between two waves: lamps and sensors drift by less."""
+
+ALIKE = 0.1
+MIN_SHARE_AGREED = 0.6
+MOST_APART = 0.06
+"""Of the finest period, between waves on the whole; the least wrong start, of 30 degrees, makes
+0.083 of it for any whole ratio of their periods but one of 12 k + 1."""
+
+LINES_TRIED = 40
+AS_GOOD = 1.3
+MOST_CAUSES = 2
+STARTS = range(30, 360, 30)
+"""Degrees, of waves that are written as sines, or begin at a step's middle."""
+
+
+def decode_waves(
+    images: Greys, waves: tuple[Wave, ...], lit: Greys, direction: str, stripes: int
+) -> StripeMap:
+    """The stripe map.  images: (F, H, W), those of each wave in the order of `waves`.  lit: (H, W).
+
+    Raises DecodingFailed if the images do not add up.
+    """
+    turned = direction == "horizontal"
+    lines = transpose(images) if turned else images
+    read = _Reading.of(lines, waves, stripes)
+    check_illumination(read.shown, read.brightest)
+    _check_images(read)
+    if not _in_order(read.order):
+        raise _disorder(lines, waves, stripes, read)
+    halves = np.floor(2.0 * np.nan_to_num(read.order.s) / read.finest.wave.period).astype(np.int32)
+    check_direction(halves, read.order.certain, turned)
+    usable = read.order.certain & ~beside_jumps(halves, read.order.certain)
+    s = np.where(usable, read.order.s, np.float32(np.nan))
+    sigma = np.where(usable, read.order.sigma, np.float32(np.nan))
+    light = ScanLines(read.white, read.black, lines[:0], None, turned)
+    found = pixel_stripe_map(light, lit, s, sigma, read.variance, stripes)
+    return replace(found, response=share_of_error(read.errors[0], read.finest, found.sigma))
+
+
+def white_and_black(waves: Sequence[WaveSeen]) -> tuple[Floats, Floats]:
+    """What the pixels would show under all of the projector's light, and under none of it."""
+    white = np.mean([wave.mean + wave.amplitude for wave in waves], axis=0)
+    black = np.mean([wave.mean - wave.amplitude for wave in waves], axis=0)
+    return np.clip(white, 0.0, 255.0), np.clip(black, 0.0, 255.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """What waves tell along scan lines (L, P).
+
+    waves: the finest first, their errors taken out.  images: of each.  errors: of each.  shown: lit
+    clearly.  brightest: of all images.  variance: (256,) of each grey level.
+    """
+
+    waves: list[WaveSeen]
+    images: list[Greys]
+    errors: list[PhaseError | None]
+    shown: Mask
+    brightest: Greys
+    white: Greys
+    black: Greys
+    variance: Floats
+    order: PhaseOrder
+
+    @property
+    def finest(self) -> WaveSeen:
+        return self.waves[0]
+
+    @staticmethod
+    def of(lines: Greys, waves: tuple[Wave, ...], stripes: int) -> _Reading:
+        stacks = split_waves(lines, waves)
+        both = sorted(zip(waves, stacks, strict=True), key=lambda each: each[0].period)
+        seen, images = [see_wave(stack, wave) for wave, stack in both], [one for _, one in both]
+        brightest = lines.max(axis=0)
+        white, black = white_and_black(seen)
+        contrast = np.min([2.0 * wave.amplitude for wave in seen], axis=0)
+        bright = contrast >= least_contrast(lines.dtype)
+        variance = wave_variance(seen, images, bright & (brightest < SATURATED))
+        noise = np.sqrt(variance[np.clip(np.rint(seen[0].mean), 0, 255).astype(np.uint8)])
+        shown = bright & (contrast >= np.float32(2.0 * MIN_CONTRAST_TO_NOISE) * noise)
+        usable = shown & (brightest < SATURATED)
+        usable &= ~half_covered_pixels(contrast, shown)
+        errors = [error_of_repeated(wave, usable, stripes) for wave in seen]
+        right = [without_error(wave, error) for wave, error in zip(seen, errors, strict=True)]
+        for place in range(1, len(right)):
+            if errors[place] is None:
+                errors[place] = error_against(right[place], right[0], usable, stripes)
+                right[place] = without_error(right[place], errors[place])
+        order = phase_order(right, [wave.sigma(noise) for wave in right], usable, stripes)
+        if lines.dtype == np.uint8:
+            white, black = (np.rint(image).astype(np.uint8) for image in (white, black))
+        return _Reading(right, images, errors, shown, brightest, white, black, variance, order)
+
+
+def _check_images(read: _Reading) -> None:
+    """Raises DecodingFailed if an image is missing, taken twice or exposed otherwise.
+
+    All waves have the same mean at each pixel, and no two images of one are the same.
+    """
+    shown = read.shown & (read.brightest < SATURATED)
+    if not shown.any():
+        return
+    for one, images in zip(read.waves, read.images, strict=True):
+        ratio = float(np.median(one.mean[shown] / read.finest.mean[shown]))
+        if abs(ratio - 1.0) > MOST_DIFFERENT:
+            raise DecodingFailed(
+                f"the images of the wave of {one.wave.period:g} stripes are on the mean {ratio:.2f} "
+                f"times as bright as those of the wave of {read.finest.wave.period:g}",
+                remedy="see whether one of them is missing, or was exposed differently",
+            )
+        strength = float(np.median(one.amplitude[shown]))
+        for first, second in combinations(range(len(images)), 2):
+            apart = images[first][shown].astype(np.float32) - images[second][shown]
+            if np.mean(np.abs(apart)) < ALIKE * strength * np.sin(np.pi / len(images)):
+                raise DecodingFailed(
+                    f"images {first} and {second} of the wave of {one.wave.period:g} stripes look "
+                    "alike",
+                    remedy="see whether one of the two is missing or was taken twice",
+                )
+
+
+def _in_order(order: PhaseOrder) -> bool:
+    """Whether the waves of most pixels agree, and not by being off alike."""
+    return order.agreed >= MIN_SHARE_AGREED and max(map(abs, order.apart), default=0.0) < MOST_APART
+
+
+def _disorder(
+    lines: Greys, waves: tuple[Wave, ...], stripes: int, read: _Reading
+) -> DecodingFailed:
+    """What is wrong where the waves of most pixels do not agree."""
+    rows = np.flatnonzero(read.shown.sum(axis=1) > 0)
+    some = lines[:, rows[:: max(1, len(rows) // LINES_TRIED)]]
+    tried = (
+        (cause, _Reading.of(some[order], changed, stripes).order)
+        for cause, order, changed in _mistakes(waves)
+    )
+    fitting = [(order.misfit, cause) for cause, order in tried if _in_order(order)]
+    best = min((misfit for misfit, _ in fitting), default=0.0)
+    # What mirrors all stripes fits as well as what does not: both are told.
+    causes = [cause for misfit, cause in fitting if misfit <= AS_GOOD * best][:MOST_CAUSES]
+    found = f"the phases of the waves go together at {read.order.agreed:.0%} of the pixels only"
+    if read.order.agreed >= MIN_SHARE_AGREED:
+        found = f"the waves begin {max(read.order.apart, key=abs):.2f} of a period apart"
+    return DecodingFailed(
+        found,
+        remedy="it would fit if " + ", or if ".join(causes)
+        if causes
+        else "see whether the images are in their order, and `steps`, `period` or `periods`, "
+        "`start_deg` and `shift` right",
+    )
+
+
+def _mistakes(waves: tuple[Wave, ...]) -> Iterator[tuple[str, list[int], tuple[Wave, ...]]]:
+    """Common mistakes with the order of the images and with the keys; order and waves that undo them."""
+    ends = np.cumsum([0, *(wave.steps for wave in waves)])
+    everything = list(range(int(ends[-1])))
+    for place, wave in enumerate(waves):
+        own = everything[ends[place] : ends[place + 1]]
+        for what, order in _orders(wave.steps):
+            changed = everything.copy()
+            changed[ends[place] : ends[place + 1]] = [own[k] for k in order]
+            yield f"of the wave of {wave.period:g} stripes {what}", changed, waves
+    for start in STARTS:
+        moved = tuple(
+            Wave(w.period, w.steps, w.shift, w.start + np.radians(start), w.origin) for w in waves
+        )
+        degrees = (np.degrees(moved[0].start) + 180.0) % 360.0 - 180.0
+        yield f"`start_deg` were {degrees:g}", everything, moved
+        other = "backward" if waves[0].shift == "forward" else "forward"
+        yield (
+            f"`shift` were {other} and `start_deg` {degrees:g}",
+            everything,
+            tuple(Wave(w.period, w.steps, other, w.start, w.origin) for w in moved),
+        )
+    for one, other in combinations(range(len(waves)), 2):
+        if waves[one].steps == waves[other].steps:
+            order = everything.copy()
+            here, there = (slice(ends[k], ends[k + 1]) for k in (one, other))
+            order[here], order[there] = everything[there], everything[here]
+            names = f"{waves[one].period:g} and {waves[other].period:g} stripes"
+            yield f"the images of the waves of {names} were exchanged", order, waves
+
+
+def _orders(steps: int) -> Iterator[tuple[str, list[int]]]:
+    """Common mistakes with the order of one wave's images, and the order that undoes them."""
+    order = list(range(steps))
+    reverse = [0, *order[:0:-1]]
+    yield "the images came in reverse order", reverse
+    for first in order[1:]:
+        yield f"the images began with number {first}", order[-first:] + order[:-first]
+    for first, second in combinations(order, 2):
+        swapped = order.copy()
+        swapped[first], swapped[second] = second, first
+        if swapped != reverse:
+            yield f"images {first} and {second} were exchanged", swapped

@@ -1,0 +1,185 @@
+"""What the projector's response (gamma, and what else bends a wave) does to phases, taken out.
+
+Of a wave that is no pure cosine, N steps read the harmonics jN +- 1 as an error of the phase that
+is a wave itself, of jN times the frequency (Guo, He, Chen 2004 for gamma). It is found from the
+images alone. A surface is smooth where it is not broken, whatever the phase there; so second
+differences of the phase along a line are, but for noise, those of the error: a linear fit. How
+often each phase is seen does not matter, as it does where histograms are made even. A wave too long
+to repeat in the picture is compared with a finer one instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bodyscan.arrays import Array, Floats, Mask
+from bodyscan.stripes.stripe_map import ResponseShare
+from bodyscan.stripes.waves import WaveSeen
+
+MULTIPLES = (1, 2, 3, 4)
+"""j above: more are far below the noise; with three steps and a gamma of 2.2, two are not enough."""
+
+FEWEST_PERIODS = 4
+"""Of a wave within the stripes; with fewer, the shape of the surface could look like its error."""
+
+LAG = 0.375
+"""Turns of the error's lowest wave between the places of a second difference: both waves show."""
+
+SHORTEST_PX = 1.5
+LEAST_SHOWN = 0.05
+"""Of what the best determined wave of the error shows in second differences."""
+
+MOST_PLACES = 300_000
+FEWEST_PLACES = 3_000
+STEEP_PX = 4
+OUTLYING = 5.0
+ROUNDS = 4
+SIGNIFICANT = 5.0
+"""Sigmas; neighbouring places share their pixels, so that sigmas are too small by about half."""
+
+BINS = 256
+ENOUGH_IN_BIN = 50
+SHARP = 0.3
+"""Length of the mean of a bin's phases as arrows: below it they point anywhere."""
+
+MOST_WHOLE_TURNS = 2
+MOST_LEFT = 0.1
+"""Turns of the finer wave RMS: an error that leaves more is none, but images in another order."""
+
+MOST_ERROR = 0.1
+"""Turns: three steps and a gamma of 5 make less."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseError:
+    """The error of a wave's turn as a wave of the turn as it was read.
+
+    cosines, sines: of 1, 2, ... times `steps` times its frequency, turns.
+    """
+
+    steps: int
+    cosines: Array
+    sines: Array
+
+    def at(self, turn: Floats) -> Floats:
+        """Turns that are too much at turns of any shape."""
+        total = np.zeros_like(turn)
+        for multiple, cosine, sine in zip(MULTIPLES, self.cosines, self.sines, strict=False):
+            angle = np.float32(2.0 * np.pi * multiple * self.steps) * turn
+            total += np.float32(cosine) * np.cos(angle) + np.float32(sine) * np.sin(angle)
+        return total
+
+
+def without_error(wave: WaveSeen, error: PhaseError | None) -> WaveSeen:
+    """The wave with its turns put right."""
+    if error is None:
+        return wave
+    return replace(wave, turn=(wave.turn - error.at(wave.turn)) % np.float32(1.0))
+
+
+def share_of_error(error: PhaseError | None, wave: WaveSeen, sigma: Floats) -> ResponseShare | None:
+    """What the error did to s where there is a sigma of it (stripes), in any layout of the pixels."""
+    known = np.isfinite(sigma)
+    if error is None or not known.any():
+        return None
+    turns = np.sqrt(np.sum(np.square([error.cosines, error.sines])) / 2.0)
+    noise = float(np.sqrt(np.mean(np.square(sigma[known]))))
+    return ResponseShare(float(turns * wave.wave.period), noise)
+
+
+def error_of_repeated(wave: WaveSeen, usable: Mask, stripes: int) -> PhaseError | None:
+    """Of a wave that repeats in the picture; None where noise explains all, or it does not repeat.
+
+    usable: (L, P); lines cross the wave.
+    """
+    if wave.wave.period * FEWEST_PERIODS > stripes:
+        return None
+    lag = _lag(wave, usable)
+    turns = _triples(wave.turn, usable, lag)
+    if turns.shape[1] < FEWEST_PLACES:
+        return None
+    before, behind = (_wrapped(turns[k + 1] - turns[k]) for k in (0, 1))
+    steps = wave.wave.steps
+    # Pixels do not tell error waves apart that are shorter.
+    most = max(1, round(lag / LAG / SHORTEST_PX))
+    first, middle, last = (_shapes(turn, steps, most) for turn in turns)
+    return _fitted(first - 2.0 * middle + last, (behind - before).astype(float), steps)
+
+
+def error_against(wave: WaveSeen, finer: WaveSeen, usable: Mask, stripes: int) -> PhaseError | None:
+    """Of a wave whose one period covers all stripes, from what a finer one says that is right."""
+    if wave.wave.period < stripes:
+        return None
+    ratio = np.float32(wave.wave.period / finer.wave.period)
+    turn = wave.turn[usable]
+    apart = 2.0j * np.pi * (ratio * turn - finer.turn[usable])
+    place = np.minimum((turn * BINS).astype(np.int64), BINS - 1)
+    count = np.bincount(place, minlength=BINS)
+    arrows = np.exp(apart)
+    sums = np.bincount(place, arrows.real, BINS) + 1.0j * np.bincount(place, arrows.imag, BINS)
+    clear = (count >= ENOUGH_IN_BIN) & (np.abs(sums) >= SHARP * count)
+    if np.count_nonzero(clear) <= 4 * len(MULTIPLES):
+        return None
+    curve = np.unwrap(np.angle(sums[clear])) / (2.0 * np.pi)
+    middle = ((np.arange(BINS) + 0.5) / BINS)[clear]
+    shapes = ratio * _shapes(middle, wave.wave.steps)
+    weight = np.sqrt(count[clear])[:, None]
+    # The curve is known but for whole turns; the error has none on the mean.
+    whole = np.arange(-MOST_WHOLE_TURNS, MOST_WHOLE_TURNS + 1)
+    wanted = curve[:, None] - np.rint(np.mean(curve)) - whole
+    found = np.linalg.lstsq(weight * shapes, weight * wanted, rcond=None)[0]
+    misfit = np.sum(np.square(weight * (wanted - shapes @ found)), axis=0)
+    best, left = found[:, np.argmin(misfit)], float(np.sqrt(misfit.min() / np.sum(weight**2)))
+    if left > MOST_LEFT or np.abs(shapes @ best).max() > MOST_ERROR * ratio:
+        return None
+    return _phase_error(best, wave.wave.steps)
+
+
+def _lag(wave: WaveSeen, usable: Mask) -> int:
+    """Pixels between the places of a second difference."""
+    both = usable[:, STEEP_PX:] & usable[:, :-STEEP_PX]
+    step = _wrapped(wave.turn[:, STEEP_PX:] - wave.turn[:, :-STEEP_PX])[both]
+    slope = float(np.median(np.abs(step))) / STEEP_PX if step.size else 1.0
+    return max(1, round(LAG / wave.wave.steps / max(slope, 1e-6)))
+
+
+def _triples(turn: Floats, usable: Mask, lag: int) -> Floats:
+    """(3, M) turns at three places of a line that are usable, as is all between them."""
+    if turn.shape[1] <= 2 * lag:
+        return np.empty((3, 0), np.float32)
+    total = np.pad(np.cumsum(usable, axis=1, dtype=np.int32), ((0, 0), (1, 0)))
+    whole = total[:, 2 * lag + 1 :] - total[:, : -2 * lag - 1] == 2 * lag + 1
+    line, first = np.nonzero(whole)
+    every = max(1, len(line) // MOST_PLACES)
+    line, first = line[::every], first[::every]
+    return np.stack([turn[line, first + k * lag] for k in range(3)])
+
+
+def _shapes(turn: Floats | Array, steps: int, most: int = len(MULTIPLES)) -> Array:
+    """(M, 2 K): cosines, then sines, of the first K multiples, `most` at most."""
+    angle = 2.0 * np.pi * steps * np.multiply.outer(turn, MULTIPLES[:most])
+    return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _fitted(shapes: Array, seen: Array, steps: int) -> PhaseError | None:
+    """Least squares without what lies far off: edges of surfaces, and their bends."""
+    near = np.ones(len(seen), bool)
+    for _ in range(ROUNDS):
+        found = np.linalg.lstsq(shapes[near], seen[near], rcond=LEAST_SHOWN)[0]
+        off = np.abs(seen - shapes @ found)
+        near = off <= OUTLYING * 1.4826 * np.median(off)
+    variance = np.var(seen[near] - shapes[near] @ found)
+    chi2 = np.sum(np.square(shapes[near] @ found)) / variance / len(found)
+    # Where too few different phases are seen to tell a wave of the error, it could be anything.
+    credible = np.abs(found).max() < MOST_ERROR
+    return _phase_error(found, steps) if credible and chi2 > SIGNIFICANT**2 else None
+
+
+def _phase_error(found: Array, steps: int) -> PhaseError:
+    return PhaseError(steps, *np.split(found, 2))
+
+
+def _wrapped(turn: Floats) -> Floats:
+    return turn - np.rint(turn)

@@ -1,0 +1,266 @@
+"""Waves of several periods without any Gray code: which s, how sure, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from stripe_rendering import checkered, code_light, render
+
+from bodyscan.errors import DecodingFailed
+from bodyscan.stripes.codes import stripe_code
+from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.patterns import pattern_frames
+from bodyscan.stripes.stripe_code import StripeCode
+from bodyscan.stripes.stripe_map import StripeMap
+
+STRIPES = 240
+HIERARCHICAL = {"period": (20, 240), "steps": 3}
+THREE_LEVELS = {"period": (240, 60, 12), "steps": (4, 3, 8)}
+HETERODYNE = {"period": (18, 20, 23), "steps": 4}
+TWO_BEAT = {"period": (17, 18.3), "steps": 4}
+ALL = [HIERARCHICAL, THREE_LEVELS, HETERODYNE, TWO_BEAT]
+
+
+def s_at(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Across a picture of 200 x 160 px, one stripe a pixel and bent."""
+    return 12 + 1.15 * (u + 0.08 * v + 3.0 * np.sin(v / 23) + 2.5 * np.sin(u / 31))
+
+
+def captured(
+    keys: dict[str, Any], *, gamma: float = 1.0, **scene: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lit and coded images, and the true s."""
+    lights = code_light("phase-shift", STRIPES, **keys) ** gamma
+    scene = {"shape": (160, 200), "ambient": 10.0, **scene}
+    lit, _, coded, s = render(s_at, lights, stripes=STRIPES, **scene)
+    return lit, coded, s
+
+
+def described(keys: dict[str, Any]) -> StripeCode:
+    """As a rig file has it."""
+    named = {key: list(value) if isinstance(value, tuple) else value for key, value in keys.items()}
+    if named.pop("backward", False):
+        named["shift"] = "backward"
+    common = {"code": "phase-shift", "stripes": STRIPES, "direction": "vertical"}
+    code: StripeCode = stripe_code({**common, **named})
+    return code
+
+
+def read(keys: dict[str, Any], lit: np.ndarray, coded: np.ndarray) -> StripeMap:
+    return decode_stripes(described(keys), lit, None, np.ascontiguousarray(coded))
+
+
+def inner(s: np.ndarray) -> np.ndarray:
+    """Without the picture's border, beyond which the rendering's lens has nothing to blur with."""
+    return s[3:-3, 3:-3]
+
+
+def errors(seen: StripeMap, s: np.ndarray) -> np.ndarray:
+    found: np.ndarray = inner(seen.s - s)
+    return found[np.isfinite(found)]
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize("keys", ALL, ids=str)
+def test_s_is_right_and_its_sigma_too(keys: dict[str, Any]) -> None:
+    lit, coded, s = captured(keys)
+    seen = read(keys, lit, coded)
+    off = errors(seen, s)
+    assert len(off) > 0.98 * np.isfinite(inner(s)).sum()
+    assert np.abs(off).max() < 2.0  # no wrong order: that would be 12 stripes or more
+    # Noise of 1 of an amplitude of 90: sqrt(2 / N) / 90 of a radian, times the period / 2 pi.
+    waves = sorted(described(keys).waves, key=lambda wave: wave.period)
+    fine = [wave for wave in waves if wave.period < 2 * waves[0].period]
+    weight = sum((90 * 2 * np.pi / wave.period) ** 2 * wave.steps / 2 for wave in fine)
+    assert rms(off) < 1.25 * weight**-0.5 + 0.005
+    known = np.isfinite(inner(seen.s - s))
+    assert 0.8 < rms(off / inner(seen.sigma)[known]) < 1.2
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"backward": True},
+        {"start_deg": -90.0},
+        {"origin": 0.5},
+        {"backward": True, "start_deg": 120.0, "origin": -7.0},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("keys", [HIERARCHICAL, HETERODYNE], ids=str)
+def test_waves_that_move_and_begin_otherwise(keys: dict[str, Any], more: dict[str, Any]) -> None:
+    lit, coded, s = captured(keys | more)
+    off = errors(read(keys | more, lit, coded), s)
+    assert len(off) > 0.98 * np.isfinite(inner(s)).sum()
+    assert abs(off.mean()) < 0.02  # half a stripe of `origin` would show
+
+
+def test_what_is_projected_is_what_the_keys_say() -> None:
+    keys = {"period": (20, 240), "steps": (3, 5), "backward": True, "start_deg": 30, "origin": 4}
+    shown = pattern_frames(described(keys), STRIPES, 4)[:, 0]
+    light = code_light("phase-shift", STRIPES, **keys).reshape(8, STRIPES, 16)
+    np.testing.assert_allclose(shown / 255.0, light.mean(axis=2), atol=0.004)
+
+
+@pytest.mark.parametrize(("keys", "light"), [(HIERARCHICAL, 45.0), (HETERODYNE, 30.0)], ids=str)
+def test_an_order_that_noise_leaves_open_is_not_guessed(keys: dict[str, Any], light: float) -> None:
+    lit, coded, s = captured(keys, light=light, noise=2.0)
+    seen = read(keys, lit, coded)
+    off = np.abs(errors(seen, s))
+    lost = 1.0 - len(off) / np.isfinite(inner(s)).sum()
+    assert lost < 0.9
+    assert np.mean(off > 8.0) < 5e-4  # 1e-4 is meant, of 30,000 pixels
+    # Guessing would have been wrong more often than that, or nothing would have been left out.
+    assert lost > 0.02
+
+
+@pytest.mark.parametrize("gamma", [1.4, 2.2])
+@pytest.mark.parametrize("keys", [HIERARCHICAL, HETERODYNE], ids=str)
+def test_the_projectors_response_is_taken_out_and_told(keys: dict[str, Any], gamma: float) -> None:
+    lit, coded, s = captured(keys, gamma=gamma)
+    straight = errors(read(keys, *captured(keys)[:2]), s)
+    seen = read(keys, lit, coded)
+    off = errors(seen, s)
+    assert len(off) > 0.97 * np.isfinite(inner(s)).sum()
+    # A quarter more than the noise of a straight projector: amplitudes are less at a gamma as well.
+    assert rms(off) < 1.35 * rms(straight) + 0.01
+    if keys is HIERARCHICAL:
+        assert seen.response is not None
+        # The second harmonic of cos^2's power, over the first, in turns of 20 stripes.
+        place = np.arange(3600) / 3600 * 2 * np.pi
+        wave = (0.5 + 0.5 * np.cos(place)) ** gamma
+        share = np.mean(wave * np.cos(2 * place)) / np.mean(wave * np.cos(place))
+        predicted = share / (2 * np.pi) * 20 / 2**0.5
+        assert seen.response.response_rms == pytest.approx(predicted, rel=0.2)
+        assert "was taken out" in str(seen.response)
+
+
+def test_a_straight_projector_has_no_response_to_take_out() -> None:
+    lit, coded, s = captured(HIERARCHICAL)
+    seen = read(HIERARCHICAL, lit, coded)
+    assert seen.response is None or seen.response.response_rms < 0.1 * rms(errors(seen, s))
+
+
+def test_uneven_phases_are_no_response() -> None:
+    """Of a surface that shows some phases five times as often as others; histograms would be fooled."""
+
+    def stepped(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        slow = np.sin(2 * np.pi * u / 25.0)
+        return np.asarray(20 + 0.8 * (u - 25.0 / (2 * np.pi) * 0.75 * slow) + 0.02 * v)
+
+    lights = code_light("phase-shift", STRIPES, **HIERARCHICAL)
+    lit, _, coded, s = render(stepped, lights, stripes=STRIPES, shape=(160, 200), ambient=10.0)
+    off = errors(read(HIERARCHICAL, lit, coded), s)
+    assert rms(off) < 0.06  # 0.043 is noise
+
+
+def test_black_and_white_squares_are_crossed() -> None:
+    lit, coded, s = captured(HIERARCHICAL, albedo=checkered(24, 0.2))
+    off = errors(read(HIERARCHICAL, lit, coded), s)
+    assert len(off) > 0.9 * np.isfinite(inner(s)).sum()
+    assert np.abs(off).max() < 3.0
+
+
+def test_a_depth_jump_gives_no_values_in_between() -> None:
+    def jump(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.where((u - 100) ** 2 + (v - 80) ** 2 < 50**2, s_at(u, v), s_at(u, v) + 17.3)
+
+    lights = code_light("phase-shift", 280, period=(20, 280), steps=3)
+    lit, _, coded, _ = render(jump, lights, stripes=280, shape=(160, 200))
+    code = stripe_code({"code": "phase-shift", "stripes": 280, "direction": "vertical",
+                        "period": [20, 280], "steps": 3})  # fmt: skip
+    seen = decode_stripes(code, lit, None, coded)
+    v, u = np.nonzero(np.isfinite(seen.s))
+    nearest = np.minimum(
+        np.abs(seen.s[v, u] - s_at(u, v)), np.abs(seen.s[v, u] - s_at(u, v) - 17.3)
+    )
+    assert len(nearest) > 0.9 * seen.s.size
+    assert np.mean(nearest > 1.0) < 1e-3
+
+
+def changed(change: str, coded: np.ndarray) -> np.ndarray:
+    order = list(range(len(coded)))
+    if change == "exchanged":
+        order[0], order[2] = 2, 0
+    elif change == "reversed":
+        order[3:6] = [3, 5, 4]
+    elif change == "later":
+        order[:3] = [1, 2, 0]
+    elif change == "waves":
+        order = [3, 4, 5, 0, 1, 2]
+    elif change == "twice":
+        order[1] = 0
+    result: np.ndarray = coded[order].copy()
+    if change == "black":
+        result[1] = 0
+    return result
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("exchanged", "of the wave of 20 stripes images 0 and 2 were exchanged"),
+        ("reversed", "of the wave of 240 stripes the images came in reverse order"),
+        ("later", "of the wave of 20 stripes the images began with number 1"),
+        ("waves", "the images of the waves of 20 and 240 stripes were exchanged"),
+        ("twice", "images 0 and 1 of the wave of 20 stripes look alike"),
+        ("black", "see whether one of them is missing, or was exposed differently"),
+    ],
+)
+def test_images_in_another_order_are_named(change: str, said: str) -> None:
+    lit, coded, _ = captured(HIERARCHICAL)
+    with pytest.raises(DecodingFailed) as refused:
+        read(HIERARCHICAL, lit, changed(change, coded))
+    assert said in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("projected", "said"),
+    [
+        ({"start_deg": -90.0}, "if `start_deg` were -90"),
+        ({"backward": True, "start_deg": -90.0}, "`shift` were backward and `start_deg` -90"),
+    ],
+)
+def test_waves_that_begin_otherwise_than_said_are_named(
+    projected: dict[str, Any], said: str
+) -> None:
+    lit, coded, _ = captured(HIERARCHICAL | projected)
+    with pytest.raises(DecodingFailed) as refused:
+        read(HIERARCHICAL, lit, coded)
+    assert said in str(refused.value)
+
+
+def test_other_periods_than_said_are_noticed() -> None:
+    lit, coded, _ = captured(HIERARCHICAL)
+    with pytest.raises(DecodingFailed, match="go together at"):
+        read({"period": (21.5, 240), "steps": 3}, lit, coded)
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"period": [20, 60]}, "alike again after 60 of 240; one must cover all of them"),
+        ({"periods": [12, 4]}, "waves of 20, 60 stripes are alike again after 60 of 240"),
+        ({"period": [16, 18]}, "alike again after 144 of 240"),
+        ({"period": [20, 240], "periods": [12, 1]}, "says again what period says"),
+        ({"period": [20, 240], "steps": [3, 3, 3]}, "has 3 numbers, but there are 2 waves"),
+        ({"period": 300}, "must be 240 (stripes) or less (got 300)"),
+    ],
+    ids=str,
+)
+def test_waves_that_do_not_tell_all_stripes_apart_are_refused(
+    keys: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ValidationError) as refused:
+        stripe_code({"code": "phase-shift", "stripes": 240, "direction": "vertical", **keys})
+    assert said in str(refused.value)
+
+
+def test_periods_may_be_counted() -> None:
+    assert described({"periods": (12, 1)}).waves == described({"period": (20, 240)}).waves
