@@ -1,5 +1,7 @@
 """The array types that signatures name; a docstring gives an array's shape, unit and frame."""
 
+from typing import cast
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,3 +18,8 @@ Bytes = NDArray[np.uint8]
 
 Greys = NDArray[np.uint8] | NDArray[np.float32]
 """Grey levels, 0 to 255: float32 where a camera or several exposures tell parts of them."""
+
+
+def whole_grey(image: Greys) -> Bytes:
+    """The image in whole grey levels."""
+    return cast(Bytes, image) if image.dtype == np.uint8 else np.rint(image).astype(np.uint8)

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Bytes
+from bodyscan.arrays import Bytes, whole_grey
 from bodyscan.captures.folder import ImageSequence
 from bodyscan.captures.grey_png import decode_grey_png
 from bodyscan.captures.image_faults import header_fault, image_error
@@ -78,7 +78,7 @@ def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
     if path is not None or pair.projector is None:
         return _read(sequence, sequence.seen_in, pair.camera, shows=True)
     code, images = pair.projector, read_sequence(sequence, pair.camera)
-    made = code.lit_from(images_by_kind(code, images.coded)[0])
+    made = whole_grey(code.lit_from(images_by_kind(code, images.coded)[0]))
     _refuse_black(made, sequence.seen_in, sequence.pair, sequence.shot)
     return made
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
+from bodyscan.arrays import Array, Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.geometry.crop import crop_of, ends_of
 from bodyscan.stripes.scan_lines import ScanLines
@@ -33,6 +33,8 @@ LEAST_PIXELS = np.float32(11.5)
 LEAST_SPREAD = np.float32(0.5)
 NOTHING, ONE, TWO, THREE, FOUR, NINE = (np.float32(number) for number in (0, 1, 2, 3, 4, 9))
 MAX_SHIFT_PX = 0.6
+LEAST_CONTRAST = 0.02
+"""Grey levels, of images that know parts of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,10 @@ class Brightness:
     def of(images: ScanLines, variance: Floats, usable: Mask) -> Brightness:
         """variance: (256,) of each grey level.  usable: (L, P) pixels on a lit surface."""
         logarithm, noise2 = np.empty((2, *images.lit.shape), np.float32)
-        _measure(images.lit, images.dark, variance, _LOGARITHMS, logarithm, noise2)
+        if images.lit.dtype == np.uint8:
+            _measure(images.lit, images.dark, variance, _LOGARITHMS, logarithm, noise2)
+        else:
+            logarithm, noise2 = _measured_finely(images.lit, images.dark, variance)
         along, across = gentle_gradient(logarithm, usable)
         _sharpen(logarithm, noise2, across)
         return Brightness(logarithm, noise2, across, along)
@@ -246,10 +251,17 @@ def _significant(gradient: float, variance: float) -> float:
     return gradient * square / (square + SIGNIFICANCE**2 * variance + 1e-12)
 
 
+def _measured_finely(lit: Greys, dark: Greys, variance: Floats) -> tuple[Floats, Floats]:
+    """As `_measure`, of images that know parts of grey levels."""
+    contrast = np.maximum(lit - dark, LEAST_CONTRAST).astype(np.float32)
+    at_lit, at_dark = (variance[grey.astype(np.uint8)] for grey in (lit, dark))
+    return np.log(contrast), (at_lit + at_dark) / np.square(contrast)
+
+
 @compiled
 def _measure(
-    lit: Bytes,
-    dark: Bytes,
+    lit: Greys,
+    dark: Greys,
     variance: Floats,
     logarithms: Floats,
     logarithm: Floats,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Bytes, Floats
+from bodyscan.arrays import Floats, Greys
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.albedo_edges import Brightness, without_edges_across
 from bodyscan.stripes.bit_words import WordCode
@@ -23,7 +23,7 @@ from bodyscan.stripes.usable_pixels import shown_pixels
 
 
 def decode_bits(
-    code: WordCode, images: ScanLines, lit: Bytes, stripes: int, limits: StripeLimits | None
+    code: WordCode, images: ScanLines, lit: Greys, stripes: int, limits: StripeLimits | None
 ) -> StripeMap:
     """The stripe map of `bit_lines`.  lit: (H, W) as the camera has it.
 
@@ -51,7 +51,7 @@ def decode_bits(
 
 
 def bit_lines(
-    lit: Bytes, dark: Bytes | None, patterns: Bytes, inverses: Bytes | None, direction: str
+    lit: Greys, dark: Greys | None, patterns: Greys, inverses: Greys | None, direction: str
 ) -> ScanLines:
     """The patterns (bits, H, W), and their inverses if there are any, as scan lines.
 

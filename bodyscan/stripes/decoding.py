@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodyscan.arrays import Bytes
+from bodyscan.arrays import Greys
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
@@ -16,9 +16,9 @@ from bodyscan.stripes.stripe_map import StripeMap
 
 def decode_stripes(
     code: StripeCode,
-    lit: Bytes | None,
-    dark: Bytes | None,
-    coded: Bytes,
+    lit: Greys | None,
+    dark: Greys | None,
+    coded: Greys,
     *,
     limits: StripeLimits | None = None,
     where: str = "",
@@ -44,9 +44,9 @@ def decode_stripes(
 
 def _decode(
     way: StripeCode,
-    lit: Bytes | None,
-    dark: Bytes | None,
-    coded: Mapping[ImageKind, Bytes],
+    lit: Greys | None,
+    dark: Greys | None,
+    coded: Mapping[ImageKind, Greys],
     limits: StripeLimits | None,
 ) -> StripeMap:
     """The map of stripes that run one way."""
@@ -71,7 +71,7 @@ def restrict(found: StripeMap, limits: StripeLimits) -> StripeMap:
     return replace(found, s=s, sigma=sigma, beyond=beyond)
 
 
-def images_by_kind(code: StripeCode, coded: Bytes) -> list[dict[ImageKind, Bytes]]:
+def images_by_kind(code: StripeCode, coded: Greys) -> list[dict[ImageKind, Greys]]:
     """The images (F, H, W) of a code, and of the stripes that cross, by their kinds.
 
     Raises DecodingFailed if there are too few or too many.
@@ -83,5 +83,6 @@ def images_by_kind(code: StripeCode, coded: Bytes) -> list[dict[ImageKind, Bytes
             f"{len(coded)} images of the code, but it has {ends[-1]}",
             remedy="give every image of the code, or correct `code` and `stripes`",
         )
-    parts = iter(np.split(coded, ends[:-1]))
+    starts = [0, *ends[:-1]]
+    parts = iter([coded[first:end] for first, end in zip(starts, ends, strict=True)])
     return [{kind: next(parts) for kind in each} for each in counts]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
+from bodyscan.arrays import Array, Floats, Greys, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.scan_lines import ScanLines
 
@@ -30,7 +30,7 @@ def noise_variance(images: ScanLines) -> Floats:
     measured for each band of grey levels, because light itself is noisy (and a laser's speckle
     more so), and smoothed by a line a + b grey that is nowhere falling.
     """
-    nothing = np.empty((0, 0), np.uint8)
+    nothing = np.empty((0, 0), images.lit.dtype)
     inverse = nothing if images.inverses is None else images.inverses[0]
     bright = images.bright(0) if images.inverses is None else nothing.astype(bool)
     count, total, square = _sums(images.lit, images.dark, images.patterns[0], inverse, bright)
@@ -58,13 +58,13 @@ def fitted_variance(grey: Array, variance: Array, count: Array, of: np.dtype[Any
 
 
 @compiled
-def _sums(lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, bright: Mask) -> Indices:
+def _sums(lit: Greys, dark: Greys, pattern: Greys, inverse: Greys, bright: Mask) -> Array:
     """How many, sum and sum of squares (LEVELS,) of what differs between two frames that show the
     same, by bands of grey levels; of every other pixel of every other line.
 
     Without an inverse (0, 0), `bright` (L, P) says where the pattern shows what the lit frame does.
     """
-    sums = np.zeros((3, LEVELS), np.int64)
+    sums = np.zeros((3, LEVELS))
     for line in range(0, lit.shape[0], 2):
         for place in range(0, lit.shape[1], 2):
             seen, light, black = pattern[line, place], lit[line, place], dark[line, place]
@@ -78,10 +78,10 @@ def _sums(lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, bright: Mask)
 
 
 @compiled
-def _add(sums: Indices, once: int, again: int) -> None:
-    difference = np.int64(again) - np.int64(once)
+def _add(sums: Array, once: float, again: float) -> None:
+    difference = np.float64(again) - np.float64(once)
     if abs(difference) <= LARGEST_DIFFERENCE and once < BRIGHTEST:
-        band = once // LEVELS
+        band = np.int64(once) // LEVELS
         sums[0, band] += 1
         sums[1, band] += difference
         sums[2, band] += difference * difference

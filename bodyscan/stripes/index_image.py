@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Bytes, Mask
+from bodyscan.arrays import Greys, Mask
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.boundaries import Boundaries, continues_to_next
 from bodyscan.stripes.scan_lines import ScanLines
@@ -25,7 +25,7 @@ MAX_SHARE_BEYOND = 0.01
 NONE = (0, 255)
 
 
-def decode_index(lit: Bytes, numbers: Bytes, direction: str, stripes: int) -> StripeMap:
+def decode_index(lit: Greys, numbers: Greys, direction: str, stripes: int) -> StripeMap:
     """The stripe map.  lit: (H, W).  numbers: (1, H, W).
 
     A boundary is known to lie between two pixels, no better. Along a line of boundaries s is

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
+from bodyscan.arrays import Array, Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.scan_lines import WHOLE_SHARE, ScanLines
 
@@ -30,6 +30,9 @@ BESIDE_PX = (3, 4, 5, 6)
 FEWEST_STRIPES = 2
 """Reach at least that is of use."""
 AT_A_TIME = 1 << 14  # boundaries: their pixels' values fit into a processor's cache
+LEAST_CONTRAST = 0.02
+"""Grey levels: below any that a usable pixel has."""
+
 SIGNIFICANCE = 4.0
 UNEXPLAINED = 0.3
 
@@ -101,7 +104,7 @@ def _beside(
 
 @compiled
 def _mean_imbalance(
-    lit: Bytes, dark: Bytes, pixels: Indices, difference: Floats, noise: Floats
+    lit: Greys, dark: Greys, pixels: Indices, difference: Floats, noise: Floats
 ) -> tuple[Array, Array]:
     """See `imbalance`: (N,) from the differences (N, K) at pixels beside each boundary."""
     result, doubt = np.zeros(len(pixels)), np.zeros(len(pixels))
@@ -111,7 +114,7 @@ def _mean_imbalance(
             pixel = pixels[k, n]
             if pixel < 0:
                 continue
-            bright = max(np.float64(lit[pixel]) - np.float64(dark[pixel]), 1.0)
+            bright = max(np.float64(lit[pixel]) - np.float64(dark[pixel]), LEAST_CONTRAST)
             total += difference[k, n] / bright
             size += abs(difference[k, n]) / bright
             noise2 += (noise[k, n] / bright) ** 2

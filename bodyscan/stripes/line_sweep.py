@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from bodyscan.arrays import Bytes, Floats
+from bodyscan.arrays import Floats, Greys
 from bodyscan.stripes.pixel_stripes import pixel_stripe_map
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.sequence_checks import check_illumination
@@ -48,7 +48,7 @@ BANDS = 8
 ENOUGH_PIXELS = 200
 
 
-def decode_sweep(lit: Bytes, frames: Bytes, direction: str) -> StripeMap:
+def decode_sweep(lit: Greys, frames: Greys, direction: str) -> StripeMap:
     """The stripe map.  lit: (H, W).  frames: (stripes, H, W), most of them dark at any one pixel.
 
     Raises DecodingFailed if the images do not add up.
@@ -89,14 +89,14 @@ class _Sweep:
         self.height, self.total = window[REACH], window.sum(axis=0)
 
     @staticmethod
-    def of(frames: Bytes) -> _Sweep:
+    def of(frames: Greys) -> _Sweep:
         """frames: (F, L, P)."""
         base = np.median(frames[:: max(1, len(frames) // SAMPLES)], axis=0).astype(np.float32)
         peak = frames.argmax(axis=0).astype(np.int32)
         image = peak + np.arange(-REACH, REACH + 1)[:, None, None]
         inside = (image >= 0) & (image < len(frames))
-        window = np.take_along_axis(frames, np.where(inside, image, 0), axis=0)
-        second = np.zeros(base.shape, np.uint8)
+        window = np.take_along_axis(frames, np.where(inside, image, 0), axis=0).astype(np.float32)
+        second = np.zeros(base.shape, frames.dtype)
         for number, frame in enumerate(frames):
             np.maximum(second, np.where(np.abs(peak - number) > REACH, frame, 0), out=second)
         return _Sweep(base, peak, np.where(inside, window - base, np.float32(0.0)), second - base)
@@ -121,7 +121,7 @@ class _Sweep:
         s = (self.peak + share).astype(np.float32)
         return s, sigma
 
-    def base_noise2(self, frames: Bytes) -> float:
+    def base_noise2(self, frames: Greys) -> float:
         """Variance of an image where the line is not."""
         every = max(1, len(frames) // SAMPLES)
         apart = [
@@ -132,7 +132,7 @@ class _Sweep:
         # Grey levels are whole numbers, so their median would be one too; the mean is not.
         return float(max(np.mean(np.minimum(stray, 8.0)) ** 2 * np.pi / 2.0, 0.15))
 
-    def noise_rise(self, lit: Bytes, base_noise2: float) -> float:
+    def noise_rise(self, lit: Greys, base_noise2: float) -> float:
         """By how much the variance grows with each grey level of light.
 
         The window adds up to what the lit image shows, but for the noise of both.

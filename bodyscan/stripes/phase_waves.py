@@ -3,14 +3,14 @@ and amplitudes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 
-import cv2
 import numpy as np
 
-from bodyscan.arrays import Bytes, Floats, Greys, Mask
+from bodyscan.arrays import Floats, Greys, Mask
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.phase_order import PhaseOrder, phase_order
 from bodyscan.stripes.pixel_stripes import pixel_stripe_map
@@ -31,9 +31,9 @@ from bodyscan.stripes.usable_pixels import (
     half_covered_pixels,
     least_contrast,
 )
-from bodyscan.stripes.wave import Wave
+from bodyscan.stripes.wave import Shift, Wave
 from bodyscan.stripes.wave_noise import wave_variance
-from bodyscan.stripes.waves import WaveSeen, see_wave, split_waves
+from bodyscan.stripes.waves import WaveSeen, in_type, see_wave, split_waves, white_and_black
 
 MOST_DIFFERENT = 0.15
 """Of the mean brightness, between two waves: lamps and sensors drift by less."""
@@ -73,13 +73,6 @@ def decode_waves(
     light = ScanLines(read.white, read.black, lines[:0], None, turned)
     found = pixel_stripe_map(light, lit, s, sigma, read.variance, stripes)
     return replace(found, response=share_of_error(read.errors[0], read.finest, found.sigma))
-
-
-def white_and_black(waves: Sequence[WaveSeen]) -> tuple[Floats, Floats]:
-    """What the pixels would show under all of the projector's light, and under none of it."""
-    white = np.mean([wave.mean + wave.amplitude for wave in waves], axis=0)
-    black = np.mean([wave.mean - wave.amplitude for wave in waves], axis=0)
-    return np.clip(white, 0.0, 255.0), np.clip(black, 0.0, 255.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +118,8 @@ class _Reading:
                 errors[place] = error_against(right[place], right[0], usable, stripes)
                 right[place] = without_error(right[place], errors[place])
         order = phase_order(right, [wave.sigma(noise) for wave in right], usable, stripes)
-        if lines.dtype == np.uint8:
-            white, black = (np.rint(image).astype(np.uint8) for image in (white, black))
-        return _Reading(right, images, errors, shown, brightest, white, black, variance, order)
+        light = in_type(white, lines), in_type(black, lines)
+        return _Reading(right, images, errors, shown, brightest, *light, variance, order)
 
 
 def _check_images(read: _Reading) -> None:
@@ -189,7 +181,7 @@ def _disorder(
 
 
 def _mistakes(waves: tuple[Wave, ...]) -> Iterator[tuple[str, list[int], tuple[Wave, ...]]]:
-    """Common mistakes with the order of the images and with the keys; order and waves that undo them."""
+    """Common mistakes with images and keys: what, and the order and the waves that undo it."""
     ends = np.cumsum([0, *(wave.steps for wave in waves)])
     everything = list(range(int(ends[-1])))
     for place, wave in enumerate(waves):
@@ -198,24 +190,19 @@ def _mistakes(waves: tuple[Wave, ...]) -> Iterator[tuple[str, list[int], tuple[W
             changed = everything.copy()
             changed[ends[place] : ends[place + 1]] = [own[k] for k in order]
             yield f"of the wave of {wave.period:g} stripes {what}", changed, waves
+    other: Shift = "backward" if waves[0].shift == "forward" else "forward"
     for start in STARTS:
-        moved = tuple(
-            Wave(w.period, w.steps, w.shift, w.start + np.radians(start), w.origin) for w in waves
-        )
-        degrees = (np.degrees(moved[0].start) + 180.0) % 360.0 - 180.0
+        moved = tuple(replace(wave, start=wave.start + math.radians(start)) for wave in waves)
+        degrees = (math.degrees(moved[0].start) + 180.0) % 360.0 - 180.0
         yield f"`start_deg` were {degrees:g}", everything, moved
-        other = "backward" if waves[0].shift == "forward" else "forward"
-        yield (
-            f"`shift` were {other} and `start_deg` {degrees:g}",
-            everything,
-            tuple(Wave(w.period, w.steps, other, w.start, w.origin) for w in moved),
-        )
-    for one, other in combinations(range(len(waves)), 2):
-        if waves[one].steps == waves[other].steps:
+        back = tuple(replace(wave, shift=other) for wave in moved)
+        yield f"`shift` were {other} and `start_deg` {degrees:g}", everything, back
+    for one, two in combinations(range(len(waves)), 2):
+        if waves[one].steps == waves[two].steps:
             order = everything.copy()
-            here, there = (slice(ends[k], ends[k + 1]) for k in (one, other))
+            here, there = (slice(ends[k], ends[k + 1]) for k in (one, two))
             order[here], order[there] = everything[there], everything[here]
-            names = f"{waves[one].period:g} and {waves[other].period:g} stripes"
+            names = f"{waves[one].period:g} and {waves[two].period:g} stripes"
             yield f"the images of the waves of {names} were exchanged", order, waves
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Bytes, Floats
+from bodyscan.arrays import Floats, Greys
 from bodyscan.stripes.albedo_edges import Brightness, without_edges_across
 from bodyscan.stripes.boundaries import LEAST_SIGMA_PX, Boundaries, continues_to_next
 from bodyscan.stripes.scan_lines import ScanLines
@@ -18,7 +18,7 @@ LARGEST_STEP = 1.5
 
 def pixel_stripe_map(
     images: ScanLines,
-    lit: Bytes,
+    lit: Greys,
     s: Floats,
     sigma: Floats,
     variance: Floats,

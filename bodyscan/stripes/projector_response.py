@@ -174,7 +174,11 @@ def _fitted(shapes: Array, seen: Array, steps: int) -> PhaseError | None:
     chi2 = np.sum(np.square(shapes[near] @ found)) / variance / len(found)
     # Where too few different phases are seen to tell a wave of the error, it could be anything.
     credible = np.abs(found).max() < MOST_ERROR
-    return _phase_error(found, steps) if credible and chi2 > SIGNIFICANT**2 else None
+    return (
+        _phase_error(np.asarray(found, float), steps)
+        if credible and chi2 > SIGNIFICANT**2
+        else None
+    )
 
 
 def _phase_error(found: Array, steps: int) -> PhaseError:

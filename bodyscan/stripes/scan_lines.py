@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Bytes, Floats, Indices, Mask
+from bodyscan.arrays import Bytes, Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
 
 Words = NDArray[np.uint16]
@@ -26,15 +26,15 @@ class ScanLines:
     turned: the lines are the camera image's columns (its stripes are horizontal).
     """
 
-    lit: Bytes
-    dark: Bytes
-    patterns: Bytes
-    inverses: Bytes | None
+    lit: Greys
+    dark: Greys
+    patterns: Greys
+    inverses: Greys | None
     turned: bool
 
     @staticmethod
     def along_lines(
-        lit: Bytes, dark: Bytes, patterns: Bytes, inverses: Bytes | None, direction: str
+        lit: Greys, dark: Greys, patterns: Greys, inverses: Greys | None, direction: str
     ) -> ScanLines:
         """From images (H, W) and stacks (F, H, W)."""
         if direction != "horizontal":
@@ -64,6 +64,8 @@ class ScanLines:
         dark if there is no inverse."""
         if self.inverses is not None:
             return np.asarray(self.patterns[bit] > self.inverses[bit])
+        if self.lit.dtype != np.uint8:
+            return np.asarray(2.0 * self.patterns[bit] > self.lit + self.dark)
         middle = cv2.add(self.lit, self.dark, dtype=cv2.CV_16S)
         return np.asarray(2 * self.patterns[bit].astype(np.int16) > middle)
 
@@ -84,25 +86,27 @@ class ScanLines:
         share = np.empty(self.lit.size, np.uint8)
         inverse = self._inverses[bit : bit + 1].reshape(-1)
         frames = (self.lit.ravel(), self.dark.ravel(), self.patterns[bit].ravel(), inverse)
-        _share(*frames, variance, share)
+        # Of whole grey levels there is one at least, where there is any light.
+        least = np.float32(1.0 if self.lit.dtype == np.uint8 else 0.02)
+        _share(*frames, variance, least, share)
         return share.reshape(self.lit.shape)
 
     @property
-    def _inverses(self) -> Bytes:
+    def _inverses(self) -> Greys:
         """(F, L, P), or (0, L, P) where none are projected."""
         return self.patterns[:0] if self.inverses is None else self.inverses
 
 
-def transpose(images: Bytes) -> Bytes:
+def transpose(images: Greys) -> Greys:
     """Each image of a stack (F, H, W) transpose."""
-    turned = np.empty((len(images), *images.shape[:0:-1]), np.uint8)
+    turned = np.empty((len(images), *images.shape[:0:-1]), images.dtype)
     for image, target in zip(images, turned, strict=True):
         cv2.transpose(image, dst=target)
     return turned
 
 
 @compiled
-def _append_bit(words: Words, pattern: Bytes, inverse: Bytes) -> None:
+def _append_bit(words: Words, pattern: Greys, inverse: Greys) -> None:
     """Makes room for one bit in code words (N,) and sets it where the pattern is brighter."""
     for at in range(words.size):
         words[at] = (words[at] << 1) | (pattern[at] > inverse[at])
@@ -110,23 +114,25 @@ def _append_bit(words: Words, pattern: Bytes, inverse: Bytes) -> None:
 
 @compiled
 def _difference(
-    pattern: int, inverse: int, lit: int, dark: int, inverted: bool, variance: Floats
+    pattern: float, inverse: float, lit: float, dark: float, inverted: bool, variance: Floats
 ) -> tuple[np.float32, np.float32]:
     """See `ScanLines.difference`; of one pixel."""
     seen = np.float32(pattern)
     if inverted:
-        return seen - np.float32(inverse), np.sqrt(variance[pattern] + variance[inverse])
+        return seen - np.float32(inverse), np.sqrt(
+            variance[np.int64(pattern)] + variance[np.int64(inverse)]
+        )
     above = (seen - np.float32(lit)) + (seen - np.float32(dark))
-    twice = variance[pattern] + variance[pattern]
-    return above, np.sqrt(twice + twice + variance[lit] + variance[dark])
+    twice = np.float32(2.0) * variance[np.int64(pattern)]
+    return above, np.sqrt(twice + twice + variance[np.int64(lit)] + variance[np.int64(dark)])
 
 
 @compiled
 def _differences(
-    lit: Bytes,
-    dark: Bytes,
-    patterns: Bytes,
-    inverses: Bytes,
+    lit: Greys,
+    dark: Greys,
+    patterns: Greys,
+    inverses: Greys,
     bit: Indices,
     at: Indices,
     variance: Floats,
@@ -148,7 +154,13 @@ def _differences(
 
 @compiled
 def _share(
-    lit: Bytes, dark: Bytes, pattern: Bytes, inverse: Bytes, variance: Floats, share: Bytes
+    lit: Greys,
+    dark: Greys,
+    pattern: Greys,
+    inverse: Greys,
+    variance: Floats,
+    least: np.float32,
+    share: Bytes,
 ) -> None:
     inverted = inverse.size > 0
     other = inverse if inverted else pattern
@@ -156,5 +168,5 @@ def _share(
     for at in range(lit.size):
         light, black = lit[at], dark[at]
         difference, noise = _difference(pattern[at], other[at], light, black, inverted, variance)
-        contrast = max(np.float32(light) - np.float32(black), np.float32(1.0))
+        contrast = max(np.float32(light) - np.float32(black), least)
         share[at] = min(np.float32(WHOLE_SHARE) * (abs(difference) + noise) / contrast, most)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Bytes, Floats, Indices, Mask
+from bodyscan.arrays import Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.bit_clarity import FINE_BITS, LitPairs, check_pairs, check_seen
@@ -108,7 +108,7 @@ def _check_range(bit: int, error: float) -> None:
 
 
 @compiled
-def _out_of_range(lit: Bytes, dark: Bytes, pattern: Bytes, at: Indices) -> float:
+def _out_of_range(lit: Greys, dark: Greys, pattern: Greys, at: Indices) -> float:
     """At flat pixels (N,): by how much of its contrast a pattern is brighter than the lit frame or
     darker than the dark one."""
     error = 0.0

@@ -22,7 +22,7 @@ from pydantic import (
 from bodyscan.files.model import Model, Problem
 
 if TYPE_CHECKING:
-    from bodyscan.arrays import Array, Bytes
+    from bodyscan.arrays import Array, Greys
     from bodyscan.stripes.stripe_limits import StripeLimits
     from bodyscan.stripes.stripe_map import StripeMap
 
@@ -48,12 +48,13 @@ class ImageKind:
 class SequenceImages:
     """What a camera saw of a sequence, grey levels.
 
-    lit, dark: (H, W) uint8; no dark where none was taken.  coded: (n, H, W) uint8 of each kind.
+    lit, dark: (H, W); no dark where none was taken.  coded: (n, H, W) of each kind.  All of one type:
+    uint8, or float32 where parts of grey levels are known.
     """
 
-    lit: Bytes
-    dark: Bytes | None
-    coded: Mapping[ImageKind, Bytes]
+    lit: Greys
+    dark: Greys | None
+    coded: Mapping[ImageKind, Greys]
 
 
 class StripeCode(Model):
@@ -113,13 +114,14 @@ class StripeCode(Model):
     def intensity(self, kind: ImageKind, s: Array) -> Array:
         """Of the images of one kind at stripe coordinates s (N,): (images, N), 0 to 1."""
 
-    def lit_from(self, coded: Mapping[ImageKind, Bytes]) -> Bytes:
-        """(H, W) uint8: the scene under all of the projector's light, from images (n, H, W) that each
+    def lit_from(self, coded: Mapping[ImageKind, Greys]) -> Greys:
+        """(H, W): the scene under all of the projector's light, from images (n, H, W) that each
         show a part of it; for a code that does not need a lit image."""
         import numpy as np
 
-        brightest = [images.max(axis=0) for images in coded.values()]
-        return np.asarray(np.max(brightest, axis=0), np.uint8)
+        brightest: list[Greys] = [images.max(axis=0) for images in coded.values()]
+        whole: Greys = np.max(brightest, axis=0)
+        return whole
 
     @abstractmethod
     def decode(self, images: SequenceImages, limits: StripeLimits | None) -> StripeMap:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
+from bodyscan.arrays import Array, Bytes, Floats, Greys, Indices, Mask, whole_grey
 from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.scan_lines import ScanLines
 
@@ -60,7 +60,7 @@ class StripeMap:
 
 def stripe_map(
     images: ScanLines,
-    lit: Bytes,
+    lit: Greys,
     s: Floats,
     sigma: Floats,
     boundaries: Boundaries,
@@ -76,7 +76,7 @@ def stripe_map(
     return StripeMap(
         s=s,
         sigma=sigma,
-        lit=lit,
+        lit=whole_grey(lit),
         boundary_index=boundaries.index,
         boundary_pixels=np.ascontiguousarray(pixels, float),
         boundary_sigma_px=boundaries.sigma_px.astype(np.float32),

@@ -51,9 +51,12 @@ def shown_pixels(
     variance: (256,) of each grey level.  fine_bit: see `mostly_direct`.
     """
     contrast = cv2.subtract(images.lit, images.dark)
-    least = np.maximum(MIN_CONTRAST, MIN_CONTRAST_TO_NOISE * np.sqrt(variance))
-    least = np.minimum(np.ceil(least), 255).astype(np.uint8)
-    bright = contrast >= cv2.LUT(cv2.max(images.lit, images.dark), least)
+    least = np.maximum(least_contrast(contrast.dtype), MIN_CONTRAST_TO_NOISE * np.sqrt(variance))
+    if contrast.dtype == np.uint8:
+        least = np.minimum(np.ceil(least), 255).astype(np.uint8)
+        bright = contrast >= cv2.LUT(cv2.max(images.lit, images.dark), least)
+    else:
+        bright = contrast >= least[np.maximum(images.lit, images.dark).astype(np.uint8)]
     bright &= ~half_covered_pixels(contrast, bright)
     shown = bright & (images.lit < SATURATED) & (codes >= 0) & (codes < stripes)
     usable = shown & ~beside_jumps(codes, shown)

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bodyscan.arrays import Array, Floats, Greys, Mask
+from bodyscan.arrays import Array, Floats, Greys, Indices, Mask
 from bodyscan.stripes.grey_noise import fitted_variance
 from bodyscan.stripes.waves import WaveSeen
 
@@ -40,7 +40,7 @@ def wave_variance(waves: Sequence[WaveSeen], images: Sequence[Greys], usable: Ma
     return fitted_variance(grey, spread2, np.ones(len(bands)), images[0].dtype)
 
 
-def _misfits(waves: Sequence[WaveSeen], images: Sequence[Greys], some: Array) -> Iterator[Array]:
+def _misfits(waves: Sequence[WaveSeen], images: Sequence[Greys], some: Indices) -> Iterator[Array]:
     """What would be zero without noise, at some pixels, each with the variance of one image."""
     for one, other in pairwise(waves):
         apart = one.mean.ravel()[some] - other.mean.ravel()[some]
@@ -50,7 +50,7 @@ def _misfits(waves: Sequence[WaveSeen], images: Sequence[Greys], some: Array) ->
             yield _beside_the_wave(wave, stack, some)
 
 
-def _beside_the_wave(wave: WaveSeen, images: Greys, some: Array) -> Array:
+def _beside_the_wave(wave: WaveSeen, images: Greys, some: Indices) -> Array:
     """What images show beside mean and wave, less the harmonics of the projector's response."""
     step = np.arange(wave.wave.steps)
     turn = 2.0 * np.pi * step / wave.wave.steps

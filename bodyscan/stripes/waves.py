@@ -9,7 +9,9 @@ Source: Creath, Phase-measurement interferometry techniques, Progress in Optics 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -53,6 +55,25 @@ def see_wave(images: Greys, wave: Wave) -> WaveSeen:
     return WaveSeen(wave, turn % np.float32(1.0), np.maximum(amplitude, floor), mean)
 
 
+def white_and_black(waves: Sequence[WaveSeen]) -> tuple[Floats, Floats]:
+    """What the pixels would show under all of the projector's light, and under none of it."""
+    white = np.mean([wave.mean + wave.amplitude for wave in waves], axis=0)
+    black = np.mean([wave.mean - wave.amplitude for wave in waves], axis=0)
+    return np.clip(white, 0.0, 255.0), np.clip(black, 0.0, 255.0)
+
+
+def white_image(images: Greys, waves: tuple[Wave, ...]) -> Greys:
+    """(H, W): the scene under all of the projector's light, from the images (F, H, W) of waves."""
+    parts = zip(split_waves(images, waves), waves, strict=True)
+    return in_type(white_and_black([see_wave(part, wave) for part, wave in parts])[0], images)
+
+
+def in_type(grey: Floats, images: Greys) -> Greys:
+    """Grey levels in the type that images have."""
+    return np.rint(grey).astype(np.uint8) if images.dtype == np.uint8 else grey
+
+
 def split_waves(images: Greys, waves: tuple[Wave, ...]) -> list[Greys]:
     """The images (F, L, P) of each wave, which follow each other."""
-    return np.split(images, np.cumsum([wave.steps for wave in waves])[:-1])
+    ends = np.cumsum([0, *(wave.steps for wave in waves)])
+    return [images[first:end] for first, end in pairwise(ends)]

@@ -110,7 +110,7 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
         ("{code: gray, stripes: 12, direction: horizontal}", "gray", "projector: must be a mapping"),
         ("code: gray", "code: light-section, inverses: true", "inverses: is for code: gray"),
         ("code: gray", "code: gray, steps: 4", "projector.steps: is for code: phase-shift"),
-        ("code: gray", "code: phase-shift, steps: 2", "projector.steps: must be 3 or more (got 2)"),
+        ("code: gray", "code: phase-shift, steps: 2", "steps: must be 3 or more or a list (got 2)"),
         ("code: gray", "code: phase-shift, period: 20", "period: must be 12 (stripes) or less (got"),
         ("code: gray, stripes: 12", "code: stripe-index, stripes: 255", "must be 254 or less for s"),
         ("version: 1", "version: 1\nframes: {stripe: line}", "frames.stripe: needs {stripe}, or"),

@@ -130,6 +130,13 @@ class PhaseShift(StripeCode):
         inverse = {INVERSE: bits} if self.inverses else {}
         return {PATTERN: bits} | inverse | phases
 
+    def lit_from(self, coded: Mapping[ImageKind, Greys]) -> Greys:
+        if self.needs_gray:
+            return super().lit_from(coded)
+        from bodyscan.stripes.waves import white_image
+
+        return white_image(coded[PHASE], self.waves)
+
     def intensity(self, kind: ImageKind, s: Array) -> Array:
         import numpy as np
 
