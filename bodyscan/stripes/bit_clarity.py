@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.arrays import Bytes, Floats, Mask
+from bodyscan.arrays import Floats, Greys, Mask
 from bodyscan.errors import DecodingFailed
 
 CLEAR = 4.0
@@ -42,16 +42,17 @@ class LitPairs:
     value: pattern minus inverse, grey levels.  sigma: its standard deviation.
     """
 
-    patterns: Bytes
-    inverses: Bytes
+    patterns: Greys
+    inverses: Greys
     value: Floats
     sigma: Floats
 
     @staticmethod
-    def of(patterns: Bytes, inverses: Bytes, variance: Floats) -> LitPairs:
+    def of(patterns: Greys, inverses: Greys, variance: Floats) -> LitPairs:
         """Of images (bits, ...).  variance: (256,) of each grey level."""
         value = patterns.astype(np.float32) - inverses
-        sigma = np.sqrt(variance[patterns] + variance[inverses])
+        levels = (images.astype(np.uint8, copy=False) for images in (patterns, inverses))
+        sigma = np.sqrt(sum(variance[level] for level in levels))
         return LitPairs(patterns, inverses, value, sigma)
 
     def where(self, kept: Mask) -> LitPairs:
@@ -134,7 +135,7 @@ def check_pairs(pairs: LitPairs) -> None:
         )
 
 
-def _partner(pattern: Bytes, inverses: Bytes, bit: int) -> str:
+def _partner(pattern: Greys, inverses: Greys, bit: int) -> str:
     """Which inverse a pattern (N,) differs from most, if that is another bit's."""
     apart = np.abs(inverses.astype(np.float32) - pattern).mean(axis=1)
     other = int(apart.argmax())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Bytes, Floats, Indices, Mask
+from bodyscan.arrays import Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.bit_clarity import CLEAR
 from bodyscan.stripes.scan_lines import ScanLines
@@ -42,8 +42,8 @@ def _collect(
     words: Words,
     good: Mask,
     lines: Indices,
-    patterns: Bytes,
-    inverses: Bytes,
+    patterns: Greys,
+    inverses: Greys,
     least2: Floats,
     found: Words,
 ) -> int:
@@ -67,7 +67,7 @@ def _collect(
                 for beside in (place, place + 1):
                     seen, other = patterns[bit, line, beside], inverses[bit, line, beside]
                     step = np.float32(seen) - np.float32(other)
-                    if step * step < least2[seen] + least2[other]:
+                    if step * step < least2[np.int64(seen)] + least2[np.int64(other)]:
                         end = max(end, height + 1)
             if end >= at:
                 continue

@@ -21,8 +21,8 @@ WHOLE_SHARE = 128
 class ScanLines:
     """Frames as scan lines: L lines, each of P positions across the stripes.
 
-    lit, dark: (L, P) uint8.  patterns: (F, L, P) uint8, the images of the code.
-    inverses: (F, L, P) uint8, None where none are projected.
+    lit, dark: (L, P).  patterns: (F, L, P), the images of the code.
+    inverses: (F, L, P), None where none are projected.  All of one type, see `Greys`.
     turned: the lines are the camera image's columns (its stripes are horizontal).
     """
 
