@@ -28,6 +28,7 @@ def register(app: typer.Typer) -> None:
         calibrate_rig,
         import_,
         check_calibration,
+        accept_changed,
         refine_rig,
         sigma_map,
         export_rig,
@@ -142,6 +143,13 @@ def check_calibration(
     if repair is not None:
         output.made("repaired", save_calibration(found.repaired(rig), repair))
     output.exit_code = 0 if found.valid else 1
+
+
+def accept_changed(output: Output, calibration: CalibrationArgument) -> None:
+    """Store a calibration that was edited by hand as one that holds, with a note that says so."""
+    from bodyscan.registration.storage import accept_calibration
+
+    output.made("calibration", accept_calibration(calibration))
 
 
 def refine_rig(

@@ -5,12 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from bodyscan.errors import BadInput
+from bodyscan.files.regular import open_regular
 
 _BLOCK = 1 << 20
 
@@ -21,10 +20,7 @@ def file_hash(path: Path) -> str:
     Raises BadInput for what is not a regular file (a pipe would be waited on for ever), OSError when it
     cannot be read.
     """
-    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-    with open(handle, "rb", buffering=0) as stream:
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise BadInput("is not a regular file", where=str(path), remedy="take it away")
+    with open_regular(path) as stream:
         digest = hashlib.sha256()
         while block := stream.read(_BLOCK):
             digest.update(block)

@@ -1,34 +1,47 @@
-"""Calibrations on disk: `calibration.json`, diffable and exact, dense arrays beside it as .npz."""
+"""Calibrations on disk: `calibration.json`, diffable and exact, dense arrays beside it as .npz.
+
+The JSON holds the hash of the arrays and one of all that it says itself, so that neither is changed
+by hand, by a disk or by a copy that broke off without anyone's knowing.
+"""
 
 from __future__ import annotations
 
 import json
-import zipfile
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
-from bodyscan.calibration.model_selection import HeldOutModel
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import CalibrationFileError
-from bodyscan.files.atomic import write_json, write_npz
-from bodyscan.files.hashing import file_hash
+from bodyscan.files.atomic import json_text, write_json, write_npz
+from bodyscan.files.hashing import content_hash, file_hash
+from bodyscan.files.json_file import read_json_object
+from bodyscan.files.npz_file import read_npz
 from bodyscan.geometry.camera_fields import from_fields, to_fields
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
+from bodyscan.registration.soundness import find_faults
 from bodyscan.rig.rig import Rig
 from bodyscan.version import __version__
 
 SCHEMA = "bodyscan-calibration"
-VERSION = 1
+VERSION = 2
+WITHOUT_HASH = 1
+"""The version before, which is read as well: it had no hash of the JSON itself."""
+HASH = "sha256"
+EDITED = "the calibration was edited by hand, and the change accepted"
+MOST_FAULTS = 5  # are named
 FILE_NAME = "calibration.json"
 ARRAYS_NAME = "calibration.npz"
+ACCEPT = "if the change is meant, say `bodyscan accept-changed` of its folder"
+CHANGED = f"restore the file from a copy, or calibrate again; {ACCEPT}"
 
 
 def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
@@ -62,14 +75,16 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
         "notes": calibration.notes,
         "advice": calibration.advice,
     }
-    write_json(folder / FILE_NAME, content)
+    plain = json.loads(json_text(content))
+    write_json(folder / FILE_NAME, plain | {HASH: content_hash(plain)})
     return folder / FILE_NAME
 
 
-def load_calibration(path: Path) -> RigCalibration:
+def load_calibration(path: Path, *, accept_changed: bool = False) -> RigCalibration:
     """Read a calibration from its folder or its JSON file.
 
-    Raises CalibrationFileError if files are missing, damaged, or of another schema version.
+    accept_changed: although it is not as it was stored. Raises CalibrationFileError if files are
+    missing, changed, of another schema version, or hold what no calibration can be like.
     """
     file = path / FILE_NAME if path.is_dir() else path
     if file.suffix in (".yaml", ".yml"):
@@ -80,8 +95,8 @@ def load_calibration(path: Path) -> RigCalibration:
             "beside the rig file",
         )
     try:
-        content = json.loads(file.read_text("utf-8"))
-        if content.get("schema") != SCHEMA or content.get("version") != VERSION:
+        content = read_json_object(file)
+        if content.get("schema") != SCHEMA or content.get("version") not in (VERSION, WITHOUT_HASH):
             raise CalibrationFileError(
                 f"schema {content.get('schema')} version {content.get('version')}, "
                 f"expected {SCHEMA} version {VERSION}",
@@ -89,34 +104,62 @@ def load_calibration(path: Path) -> RigCalibration:
                 remedy="calibrate again with this version of bodyscan",
             )
         arrays_file = file.with_name(ARRAYS_NAME)
-        if file_hash(arrays_file) != content["arrays_sha256"]:
-            raise CalibrationFileError(
-                f"does not belong to {file.name}",
-                where=str(arrays_file),
-                remedy="restore both files from one calibration, or calibrate again",
-            )
-        with np.load(arrays_file, allow_pickle=False) as arrays:
-            return _calibration(content, arrays)
+        if not accept_changed:
+            _refuse_changed(content, file, arrays_file)
+        calibration = _calibration(content, read_npz(arrays_file))
     except FileNotFoundError as error:
         raise CalibrationFileError(
             "there is no such file",
             where=str(error.filename or file),
             remedy="give the folder that `bodyscan calibrate-rig` wrote",
         ) from error
-    except (
-        OSError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        ValueError,
-        zipfile.BadZipFile,
-        ValidationError,
-    ) as error:
+    except (OSError, LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise CalibrationFileError(
-            f"is not a readable calibration ({type(error).__name__}: {error})",
+            f"is not a readable calibration ({_reason(error)})",
             where=str(file),
             remedy="restore the file from a copy, or calibrate again",
         ) from error
+    faults = list(islice(find_faults(calibration), MOST_FAULTS))
+    if faults:
+        raise CalibrationFileError(
+            "holds what no calibration can be like:"
+            + "".join(f"\n  {place} {what}" for place, what in faults),
+            where=str(file),
+            remedy="restore the file from a copy, or calibrate again",
+        )
+    return calibration
+
+
+def accept_calibration(path: Path) -> Path:
+    """Store a calibration that was edited as one that holds, with a note that says so; the path of
+    its JSON. Raises as `load_calibration` for all but the change."""
+    folder = path if path.is_dir() else path.parent
+    found = load_calibration(folder, accept_changed=True)
+    return save_calibration(replace(found, notes=(*found.notes, EDITED)), folder)
+
+
+def _refuse_changed(content: dict[str, Any], file: Path, arrays_file: Path) -> None:
+    if content["version"] == VERSION:
+        own = {key: value for key, value in content.items() if key != HASH}
+        if content_hash(own) != content[HASH]:
+            raise CalibrationFileError(
+                "was changed after it was stored", where=str(file), remedy=CHANGED
+            )
+    if file_hash(arrays_file) != content["arrays_sha256"]:
+        raise CalibrationFileError(
+            f"does not belong to {file.name}",
+            where=str(arrays_file),
+            remedy=f"restore both files from one calibration, or calibrate again; {ACCEPT}",
+        )
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, ValidationError):
+        first = error.errors(include_url=False)[0]
+        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    if isinstance(error, KeyError):
+        return f"{error.args[0]} is missing"
+    return str(error)
 
 
 def calibration_id(path: Path) -> str:
@@ -139,7 +182,8 @@ def _light_content(sheets: LightSheets) -> dict[str, Any]:
     return {"kind": sheets.kind, "direction": sheets.direction}
 
 
-def _calibration(content: dict[str, Any], arrays: Any) -> RigCalibration:
+def _calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCalibration:
+    parts = content["pairs"]
     pairs = {
         name: PairCalibration(
             name,
@@ -149,43 +193,63 @@ def _calibration(content: dict[str, Any], arrays: Any) -> RigCalibration:
             _quality(part["quality"]),
             _light(part["crossing"], f"{name}/crossing/", arrays) if "crossing" in part else None,
         )
-        for name, part in content["pairs"].items()
+        for name, part in parts.items()
     }
+    boards = {
+        (_text(part["shot"]), _text(part["board"])): _transform(part["rig_from_board"])
+        for part in content["boards"]
+    }
+    if len(boards) < len(content["boards"]):
+        raise ValueError("a board of a shot is listed twice")
     return RigCalibration(
         Rig.model_validate(content["rig"]),
         pairs,
-        {name: _transform(part["rig_from_camera"]) for name, part in content["pairs"].items()},
-        PoseCovariance(tuple(content["placing_covariance_order"]), arrays["placing_covariance"]),
-        {
-            (part["shot"], part["board"]): _transform(part["rig_from_board"])
-            for part in content["boards"]
-        },
-        content["failed"],
-        tuple(content["notes"]),
-        tuple(content.get("advice", ())),
+        {name: _transform(part["rig_from_camera"]) for name, part in parts.items()},
+        PoseCovariance(_texts(content["placing_covariance_order"]), arrays["placing_covariance"]),
+        boards,
+        {name: _text(reason) for name, reason in content["failed"].items()},
+        _texts(content["notes"]),
+        _texts(content.get("advice", [])),
         {
             name: SeenCorners(**_under(f"{name}/seen/", arrays))
-            for name in content["pairs"]
-            if f"{name}/seen/pixels" in arrays.files
+            for name in parts
+            if f"{name}/seen/pixels" in arrays
         },
     )
 
 
-def _light(content: dict[str, Any], prefix: str, arrays: Any) -> LightSheets:
+def _light(content: dict[str, Any], prefix: str, arrays: dict[str, Any]) -> LightSheets:
     return from_arrays(content["kind"], _under(prefix, arrays), content["direction"])
 
 
-def _under(prefix: str, arrays: Any) -> dict[str, Any]:
-    return {key.removeprefix(prefix): arrays[key] for key in arrays.files if key.startswith(prefix)}
+def _under(prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:
+    return {k.removeprefix(prefix): array for k, array in arrays.items() if k.startswith(prefix)}
 
 
 def _quality(content: dict[str, Any]) -> PairQuality:
-    tried = tuple(HeldOutModel(**figures) for figures in content["held_out"])
-    two = {name: tuple(content[name]) for name in ("flatness_mm", "boards_mm") if content.get(name)}
-    return PairQuality(**content | {"held_out": tried} | two)
+    """Strictly of the types that its fields have."""
+    odd = content.keys() - {part.name for part in fields(PairQuality)}
+    if odd:
+        raise ValueError(f"quality has no {', '.join(sorted(odd))}")
+    return TypeAdapter(PairQuality).validate_json(json.dumps(content), strict=True)
 
 
 def _transform(matrix: Any) -> RigidTransform:
     """As written, to the last bit: no orthonormalisation on reading."""
-    array = np.array(matrix, float)
+    array = np.array(matrix)
+    if array.shape != (4, 4) or array.dtype.kind not in "fiu" or any(array[3] != (0, 0, 0, 1)):
+        raise ValueError(f"{matrix} is not a 4 x 4 matrix of a rigid motion")
+    array = array.astype(np.float64)
     return RigidTransform(array[:3, :3].copy(), array[:3, 3].copy())
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is not text")
+    return value
+
+
+def _texts(values: Any) -> tuple[str, ...]:
+    if not isinstance(values, list):
+        raise TypeError(f"{values!r} is not a list of texts")
+    return tuple(map(_text, values))
