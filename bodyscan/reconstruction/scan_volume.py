@@ -58,10 +58,11 @@ def stripes_in_volume(
     limits += np.array([-MARGIN_STRIPES, MARGIN_STRIPES, 0.0])[:, None, None]
     unknown = np.array([-ANYTHING, ANYTHING, ANYTHING])[:, None, None]
     limits = np.where(np.isnan(limits), unknown, limits).astype(np.float32)
-    pixel_mm = float(np.linalg.norm(rig_from_camera.translation)) / pair.camera.alpha
-    return StripeLimits(
-        limits[0], limits[1], limits[2], rising, block_px, around_px=AROUND_MM / pixel_mm
-    )
+    # In the volume's middle, as the camera sees it; it may stand at the rig's origin itself.
+    seen = near < far
+    middle_mm = 0.5 * float(np.median((near + far)[seen])) if seen.any() else FARTHEST_MM
+    around_px = AROUND_MM * pair.camera.alpha / middle_mm
+    return StripeLimits(limits[0], limits[1], limits[2], rising, block_px, around_px=around_px)
 
 
 def volume_interval(

@@ -102,6 +102,14 @@ def test_integers_are_stripes_and_columns_may_be_lines() -> None:
     np.testing.assert_array_equal(turned[0].T, wanted.split(stripe, usable)[0])
 
 
+def test_a_camera_may_stand_at_the_rigs_origin() -> None:
+    """As it does where one pair fixes the rig frame, and stands inside of the volume then."""
+    limits = stripes_in_volume(pair(), RigidTransform.identity(), Volume())
+    assert limits is not None
+    assert np.isfinite(limits.around_px)
+    assert limits.around_px > 1.0
+
+
 def test_a_volume_out_of_sight_is_seen_nowhere() -> None:
     away = looking_at_the_middle(500.0, 0.0, 0.0)
     behind = RigidTransform(away.rotation, -away.translation)
