@@ -60,7 +60,7 @@ def sees_through(
     # The nearest depth around, 0 if anything is missing: rims and flying pixels prove nothing.
     nearest = cv2.erode(image.open_depth, np.ones((5, 5), np.uint8))
     through[index] = in_camera[index, 2] < nearest[rows, columns] - margin_mm
-    stride = _stride(image.camera, rig_from_camera)
+    stride = _stride(image.camera, float(np.median(in_camera[index, 2])))
     block_rows, block_columns = rows // stride, columns // stride
     top, left = block_rows.min(), block_columns.min()
     blocks = slice(top, block_rows.max() + 1), slice(left, block_columns.max() + 1)
@@ -101,10 +101,9 @@ def gaps(
     return open_
 
 
-def _stride(camera: Camera, rig_from_camera: RigidTransform) -> int:
-    """Pixels between rays."""
-    pixel_mm = float(np.linalg.norm(rig_from_camera.translation)) / camera.alpha
-    return max(1, round(RAY_SPACING_MM / pixel_mm))
+def _stride(camera: Camera, depth_mm: float) -> int:
+    """Pixels between rays, where things are that far away."""
+    return max(1, round(RAY_SPACING_MM * camera.alpha / depth_mm))
 
 
 def _rays(
