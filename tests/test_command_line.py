@@ -47,6 +47,12 @@ def test_a_missing_calibration_is_bad_input(tmp_path: Path) -> None:
     assert "calibrate-rig" in done.stderr
 
 
+def test_a_wrong_setting_is_named_before_the_work(tmp_path: Path) -> None:
+    done = bodyscan("scan", tmp_path, "--calibration", tmp_path, "--set", "mesh.deth=8")
+    assert done.returncode == 2
+    assert "--set mesh.deth: is not a key known here (did you mean 'depth'?)" in done.stderr
+
+
 def test_check_and_help_import_nothing_heavy() -> None:
     for arguments in (["--help"], ["check", str(RIGS / "three-pole-12.yaml")]):
         program = (

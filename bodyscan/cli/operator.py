@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from bodyscan.cli.console import Output, add_command
-from bodyscan.cli.options import Calibration, Overwrite, Result, ScanFolder, refuse_file
+from bodyscan.cli.options import Calibration, Changes, Overwrite, Result, ScanFolder, refuse_file
 from bodyscan.errors import BadInput, FailedWork
 from bodyscan.progress import step
 from bodyscan.settings import AlignmentSettings, ExportSettings, FusionSettings, ScanSettings
@@ -51,6 +51,7 @@ def scan(
         Path | None,
         typer.Option(help="Captures of the empty rig: what they show is cut away."),
     ] = None,
+    changes: Changes = None,
     overwrite: Overwrite = False,
     e57: Annotated[
         bool, typer.Option("--e57", help="Write each pair's raw cloud too: `raw.e57` (pye57).")
@@ -58,14 +59,19 @@ def scan(
 ) -> None:
     """Fuse one person's captures into a body cloud and a closed mesh."""
     from bodyscan.cli import tables
+    from bodyscan.files.model_file import apply_settings
     from bodyscan.fusion.storage import make_room
     from bodyscan.workflows.scan_folder import scan_folder
 
     refuse_file(out)
     out = out or folder.with_name(f"{folder.name}-model")
     make_room(out, overwrite)
-    settings = ScanSettings(
-        fusion=FusionSettings(points=points), alignment=AlignmentSettings(matching=align)
+    settings = apply_settings(
+        ScanSettings(
+            fusion=FusionSettings(points=points), alignment=AlignmentSettings(matching=align)
+        ),
+        changes or (),
+        BadInput,
     )
     with output.stages() as progress:
         found, saved, pictures = scan_folder(
@@ -187,14 +193,7 @@ def batch(
         str | None,
         typer.Option(help="Default: `calibration` in the folder of scans, beside or above it."),
     ] = None,
-    changes: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Change a setting, such as fusion.points=2000000; repeatable.",
-        ),
-    ] = None,
+    changes: Changes = None,
     until: Annotated[
         str | None, typer.Option(metavar="STAGE", help="The last stage to run.")
     ] = None,

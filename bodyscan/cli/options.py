@@ -21,6 +21,14 @@ OutFolder = Annotated[Path, typer.Option("--out", help="Folder to write into.")]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace what lies there, with all that was made of it.")
 ]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Change a setting, such as mesh.depth=8; repeatable. docs/formats.md has them all.",
+    ),
+]
 
 Json = Annotated[
     bool, typer.Option("--json", help="Print one JSON document: what was made, notes, verdict.")

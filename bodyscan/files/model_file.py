@@ -89,6 +89,14 @@ def load_model(
     return loaded
 
 
+def apply_settings(model: M, changes: Iterable[str], error: type[BadInput]) -> M:
+    """`model` with `--set` changes such as `fusion.points=2000000`, checked anew; `a,b` is a list.
+
+    Raises `error` that names every change that is wrong by its path.
+    """
+    return apply_changes(model, dict(_change(text, error) for text in changes), error)
+
+
 def apply_changes(model: M, changes: Mapping[Where, Any], error: type[BadInput]) -> M:
     """`model` with the values at some paths replaced, checked anew.
 
@@ -109,6 +117,24 @@ def apply_changes(model: M, changes: Mapping[Where, Any], error: type[BadInput])
         problems = _translated(refused, Document(data), type(model))
         told = "\n".join(f"--set {problem.path}: {problem.text}" for problem in problems)
         raise error(told, remedy="docs/formats.md explains every key") from None
+
+
+def _change(text: str, error: type[BadInput]) -> tuple[tuple[str, ...], Any]:
+    """`fusion.points=2000000` as (("fusion", "points"), 2000000)."""
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise error(
+            f"--set {text} is not a change",
+            remedy="write --set KEY=VALUE, such as fusion.points=2000000",
+        )
+    where = tuple(key.strip().split("."))
+    try:
+        return where, json.loads(value)
+    except ValueError:
+        pass
+    if where[-1] in ("formats", "versions"):
+        return where, [part.strip() for part in value.split(",")]
+    return where, value.strip()
 
 
 def report(

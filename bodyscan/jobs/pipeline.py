@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +9,7 @@ from typing import Any, Literal
 from bodyscan.errors import BadInput
 from bodyscan.export.body_format import BODY_FORMATS
 from bodyscan.files.model import Model, Name, Problem, alternatives, did_you_mean
-from bodyscan.files.model_file import apply_changes, load_model
+from bodyscan.files.model_file import apply_settings, load_model
 from bodyscan.interchange.rig_format import RIG_FORMATS
 from bodyscan.settings import (
     AlignmentSettings,
@@ -84,24 +83,4 @@ def load_pipeline(path: Path, changes: Sequence[str] = ()) -> Pipeline:
     Raises PipelineError that lists every problem: those of the file by line and column.
     """
     pipeline = load_model(Path(path), Pipeline, PipelineError, remedy=_REMEDY)
-    return (
-        apply_changes(pipeline, dict(map(_change, changes)), PipelineError) if changes else pipeline
-    )
-
-
-def _change(text: str) -> tuple[tuple[str, ...], Any]:
-    """`fusion.points=2000000` as (("fusion", "points"), 2000000); `a,b` is a list."""
-    key, equals, value = text.partition("=")
-    if not equals or not key.strip():
-        raise PipelineError(
-            f"--set {text} is not a change",
-            remedy="write --set KEY=VALUE, such as fusion.points=2000000",
-        )
-    where = tuple(key.strip().split("."))
-    try:
-        return where, json.loads(value)
-    except ValueError:
-        pass
-    if where[-1] in ("formats", "versions"):
-        return where, [part.strip() for part in value.split(",")]
-    return where, value.strip()
+    return apply_settings(pipeline, changes, PipelineError) if changes else pipeline
