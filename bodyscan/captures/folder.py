@@ -17,7 +17,7 @@ from bodyscan.errors import CaptureError
 from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
-from bodyscan.rig.templates import SHOT, fill, has_field, shot_pattern
+from bodyscan.rig.templates import SHOT, fill, has_field, shot_pattern, with_exposure
 
 Kind = Literal["calibration", "scan"]
 
@@ -28,7 +28,8 @@ class ImageSequence:
 
     coded: the images of the stripe code, in the order of `FrameNames.of_code`; () where only the
     lit image, or that of the board, was taken. lit, dark, board: None where there is no such image.
-    missing: those of the paths that are not there.
+    missing: those of the paths that are not there.  exposure: its name, where the rig file names
+    several; longer: the same images of the longer ones, in their order.
     """
 
     pair: str
@@ -38,6 +39,8 @@ class ImageSequence:
     coded: tuple[Path, ...]
     missing: tuple[Path, ...]
     board: Path | None = None
+    exposure: str = ""
+    longer: tuple[ImageSequence, ...] = ()
 
     @property
     def has_stripes(self) -> bool:
@@ -46,9 +49,11 @@ class ImageSequence:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Lit, dark and that of the board, if there are such, then those of the code."""
+        """Lit, dark and that of the board, if there are such, then those of the code; then those of
+        longer exposures."""
         single = (self.lit, self.dark, self.board)
-        return (*(path for path in single if path is not None), *self.coded)
+        own = (*(path for path in single if path is not None), *self.coded)
+        return own + tuple(path for longer in self.longer for path in longer.paths)
 
     @property
     def seen_in(self) -> Path:
@@ -190,8 +195,9 @@ def _open(
             where=str(folder / FILE_NAME),
             remedy="Name the right folder, or correct `kind` in its captures.yaml.",
         )
+    first = with_exposure(template, rig.exposures[0]) if rig.exposures else template
     entries = {shot.name: shot for shot in (file.shots if file else None) or ()}
-    names = wanted or tuple(entries) or _discover(rig, listing, template)
+    names = wanted or tuple(entries) or _discover(rig, listing, first)
     if not has_field(template, "shot") and len(names) > 1:
         raise CaptureError(
             f"holds one shot by the template {template}, but {len(names)} are listed",
@@ -203,7 +209,7 @@ def _open(
         sequence for shot in shots for sequence in _sequences(rig, listing, template, shot)
     )
     if not sequences:
-        example = fill(template, shot="SHOT", pair=rig.pairs[0].name, frame=_some_frame(rig))
+        example = fill(first, shot="SHOT", pair=rig.pairs[0].name, frame=_some_frame(rig))
         raise CaptureError(
             f"holds no image of rig {rig.name} by the template {template}",
             where=str(folder),
@@ -269,8 +275,12 @@ def _sequences(
     rig: Rig, listing: Listing, template: str, shot: ShotEntry
 ) -> Iterator[ImageSequence]:
     look = shot.stripes is None and shot.lit is None
+    templates = [with_exposure(template, name) for name in rig.exposures]
+    template = templates[0] if templates else template
     for pair in rig.pairs:
         whole = _sequence(rig, listing, template, shot.name, pair)
+        if whole.coded and templates:
+            whole = _exposed(whole, rig, listing, templates)
         alone = _view_alone(rig, listing, template, shot.name, pair)
         if look:
             if set(whole.coded) - set(whole.missing):
@@ -308,6 +318,19 @@ def _sequence(rig: Rig, listing: Listing, template: str, shot: str, pair: Pair) 
     lit, dark, board = map(files.path, (frames.lit, dark_name, frames.board))
     coded = tuple(filter(None, map(files.path, frames.of_code(code))))
     return ImageSequence(pair.name, shot, lit, dark, coded, tuple(files.missing), board)
+
+
+def _exposed(
+    whole: ImageSequence, rig: Rig, listing: Listing, templates: list[str]
+) -> ImageSequence:
+    """The sequence with those of its longer exposures."""
+    first, *others = zip(rig.exposures, templates, strict=True)
+    longer = tuple(
+        replace(_sequence(rig, listing, template, whole.shot, rig.pair(whole.pair)), exposure=name)
+        for name, template in others
+    )
+    missing = whole.missing + tuple(path for each in longer for path in each.missing)
+    return replace(whole, missing=missing, exposure=first[0], longer=longer)
 
 
 def _view_alone(

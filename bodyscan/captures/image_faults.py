@@ -10,7 +10,7 @@ from bodyscan.rig.templates import ANYTHING
 
 
 def header_fault(path: Path, width: int, height: int) -> str | None:
-    """Why the file cannot be an 8-bit image of that size, or None."""
+    """Why the file cannot be an image of that size, of 16 bits a sample or fewer, or None."""
     try:
         header = read_header(path)
     except FileNotFoundError:
@@ -22,8 +22,8 @@ def header_fault(path: Path, width: int, height: int) -> str | None:
     if (header.width, header.height) != (width, height):
         size = f"{header.width} x {header.height}"
         return f"is {size} pixels, but the rig file says {width} x {height}"
-    if header.bits > 8:
-        return f"has {header.bits} bits a sample; only 8-bit images are read"
+    if header.bits > 16:
+        return f"has {header.bits} bits a sample; 8 to 16 are read"
     return None if header.complete else "is cut short"
 
 
@@ -55,5 +55,5 @@ def _remedy(what: str) -> str:
     if "the rig file says" in what:
         return "Check the camera's width and height in the rig file, and which camera took this."
     if "bits a sample" in what:
-        return "Save 8 bits a pixel; the camera's software can choose them."
+        return "Save whole numbers of 8 or 16 bits; the camera's software can choose them."
     return "Copy it again from where it was taken, or take the shot again."

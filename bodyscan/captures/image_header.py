@@ -1,4 +1,4 @@
-"""What a PNG or JPEG file says of itself in its first bytes, and whether it is all there.
+"""What an image file says of itself in its first bytes, and whether it is all there.
 
 So that a wrong image is refused before it is decoded: an image of 60000 x 60000 pixels fits into a
 few kilobytes of file and fills the memory.
@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from isal import isal_zlib
 
@@ -19,6 +19,9 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 _JPEG = b"\xff\xd8\xff"
 _JPEG_END = b"\xff\xd9"
+_BMP = b"BM"
+_TIFF = (b"II*\0", b"MM\0*")
+_MOST_TAGS, _MOST_STRIPS = 1000, 1 << 20
 _TAIL = 65536  # some writers add a few bytes behind the end
 
 
@@ -33,11 +36,11 @@ class ImageHeader:
 
 
 class NoImage(Exception):
-    """Not the start of a PNG or JPEG file; says why."""
+    """Not the start of a PNG, JPEG, BMP or TIFF file; says why."""
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Raises NoImage when `path` is no PNG or JPEG file, OSError when it cannot be read."""
+    """Raises NoImage when `path` is no file of these kinds, OSError when it cannot be read."""
     with path.open("rb") as stream:
         start = stream.read(33)
         if not start:
@@ -48,7 +51,11 @@ def read_header(path: Path) -> ImageHeader:
         if start.startswith(_JPEG):
             width, height, bits, end = _jpeg_header(stream)
             return ImageHeader(width, height, bits, _ends_with(stream, end, _JPEG_END))
-    raise NoImage("is neither a PNG nor a JPEG image")
+        if start.startswith(_BMP):
+            return _bmp_header(start, stream.seek(0, 2))
+        if start.startswith(_TIFF):
+            return _tiff_header(stream)
+    raise NoImage("is no PNG, JPEG, BMP or TIFF image")
 
 
 def png_damage(data: bytes) -> str | None:
@@ -118,6 +125,81 @@ def _jpeg_header(stream: BinaryIO) -> tuple[int, int, int, int]:
             bits, height, width = struct.unpack(">BHH", frame)
             return width, height, bits, stream.tell()
         stream.seek(length - 2, 1)
+
+
+def _bmp_header(start: bytes, size: int) -> ImageHeader:
+    """Source: BITMAPINFOHEADER, Windows GDI. Rows are padded to four bytes; a negative height means
+    that the first row is on top."""
+    if len(start) < 30:
+        raise NoImage("is cut short")
+    offset, kind, width, height, _, bits = struct.unpack_from("<IIiiHH", start, 10)
+    if kind < 40 or width <= 0 or height == 0 or bits not in (1, 4, 8, 16, 24, 32):
+        raise NoImage("is damaged (its BMP header is wrong)")
+    row = (width * bits + 31) // 32 * 4
+    packed = start[30:31] not in (b"\0", b"\3")
+    whole = packed or size >= offset + row * abs(height)
+    return ImageHeader(width, abs(height), min(bits, 8), whole)
+
+
+def _tiff_header(stream: BinaryIO) -> ImageHeader:
+    """Of the first image of the file. Source: TIFF 6.0, sections 2 and 8."""
+    size = stream.seek(0, 2)
+    stream.seek(0)
+    order = "<" if stream.read(4)[:1] == b"I" else ">"
+    (place,) = _read(stream, order + "I")
+    stream.seek(place)
+    (count,) = _read(stream, order + "H")
+    if count > _MOST_TAGS:
+        raise NoImage("is damaged (its TIFF header is wrong)")
+    entries = [_read(stream, order + "HHI4s") for _ in range(count)]
+    tags = {tag: _tiff_values(stream, order, *entry) for tag, *entry in entries if tag in _TAGS}
+    width, height, bits = (tags.get(tag, (0,))[0] for tag in (_WIDTH, _HEIGHT, _BITS))
+    if not width or not height:
+        raise NoImage("is damaged (its TIFF header is wrong)")
+    ends = zip(tags.get(_STRIPS, tags.get(_TILES, ())), _lengths(tags), strict=False)
+    return ImageHeader(
+        width, height, bits or 1, all(first + length <= size for first, length in ends)
+    )
+
+
+_WIDTH, _HEIGHT, _BITS, _STRIPS, _STRIP_BYTES, _TILES, _TILE_BYTES = (
+    256,
+    257,
+    258,
+    273,
+    279,
+    324,
+    325,
+)
+_TAGS = (_WIDTH, _HEIGHT, _BITS, _STRIPS, _STRIP_BYTES, _TILES, _TILE_BYTES)
+
+
+def _lengths(tags: dict[int, tuple[int, ...]]) -> tuple[int, ...]:
+    """Bytes of each strip or tile."""
+    return tags.get(_STRIP_BYTES, tags.get(_TILE_BYTES, ()))
+
+
+def _tiff_values(
+    stream: BinaryIO, order: str, kind: int, count: int, content: bytes
+) -> tuple[int, ...]:
+    """Of one entry: short or long whole numbers, in the entry itself if they fit."""
+    form = {3: "H", 4: "I"}.get(kind)
+    if form is None or not 0 < count <= _MOST_STRIPS:
+        raise NoImage("is damaged (its TIFF header is wrong)")
+    wanted = f"{order}{count}{form}"
+    if struct.calcsize(wanted) <= len(content):
+        return struct.unpack_from(wanted, content)
+    (place,) = struct.unpack(order + "I", content)
+    stream.seek(place)
+    return _read(stream, wanted)
+
+
+def _read(stream: BinaryIO, form: str) -> tuple[Any, ...]:
+    """What comes next in the file. Raises NoImage where it ends."""
+    content = stream.read(struct.calcsize(form))
+    if len(content) < struct.calcsize(form):
+        raise NoImage("is cut short")
+    return struct.unpack(form, content)
 
 
 def _ends_with(stream: BinaryIO, start: int, mark: bytes) -> bool:

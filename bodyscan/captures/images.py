@@ -5,12 +5,15 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Bytes, whole_grey
+from bodyscan.arrays import Bytes, Greys, whole_grey
+from bodyscan.captures.exposures import merge_exposures
 from bodyscan.captures.folder import ImageSequence
+from bodyscan.captures.grey_levels import Raw, as_greys, full_scale
 from bodyscan.captures.grey_png import decode_grey_png
 from bodyscan.captures.image_faults import header_fault, image_error
 from bodyscan.captures.image_header import png_damage
@@ -22,47 +25,31 @@ from bodyscan.stripes.decoding import images_by_kind
 SHOWS_NOTHING_BELOW = 8
 """Grey levels (sensor offset and noise): a lit image without a brighter pixel is black."""
 
+BLUE_GREEN_RED = ("blue", "green", "red")
+
 
 @dataclass(frozen=True, eq=False)
 class StripeImages:
     """The images of one stripe sequence, grey levels 0 to 255.
 
-    lit, dark: (H, W) uint8, None where none was taken. coded: (F, H, W) uint8, the images
-    of the code in the order of `FrameNames.of_code`.
+    lit, dark: (H, W), None where none was taken. coded: (F, H, W), the images of the code in the
+    order of `FrameNames.of_code`. All uint8, or float32 where files or exposures tell more.
     """
 
     pair: str
     shot: str
-    lit: Bytes | None
-    dark: Bytes | None
-    coded: Bytes
+    lit: Greys | None
+    dark: Greys | None
+    coded: Greys
 
 
 def read_image(
-    path: Path, width: int, height: int, *, pair: str = "", shot: str = "", lit: bool = False
+    path: Path, camera: CameraSpec, *, pair: str = "", shot: str = "", lit: bool = False
 ) -> Bytes:
-    """One image as grey levels, (height, width) uint8; colour is turned to grey (luma).
-
-    The size is compared with the header before anything is decoded. 16-bit images are refused: how
-    many of their bits a camera fills is not written in them, and a wrong guess gives black images.
-    A turn noted in EXIF is not applied, since it would swap the camera's axes. `lit`: the image
-    should show something. Raises ImageError: missing, no image, of the wrong size or depth, cut
-    short, damaged, or (lit) black.
-    """
-    fault = header_fault(path, width, height)
-    if fault:
-        raise image_error(fault, path, pair, shot)
-    data = path.read_bytes()
-    is_png = data.startswith(b"\x89PNG")
-    damage = png_damage(data) if is_png else None
-    if damage:
-        raise image_error(damage, path, pair, shot)
-    image = decode_grey_png(data, width, height) if is_png else None
-    if image is None:
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    if image is None or image.shape != (height, width) or image.dtype != np.uint8:
-        raise image_error("cannot be decoded", path, pair, shot)
+    """One image as whole grey levels, (height, width) uint8. Raises ImageError as `_read_raw`, and
+    as `full_scale`; `lit`: the image should show something, and is refused if it is black."""
+    raw = _read_raw(path, camera, pair, shot)
+    image = whole_grey(as_greys(raw, _scale([raw], camera, path, pair, shot)))
     if lit:
         _refuse_black(image, path, pair, shot)
     return image
@@ -70,13 +57,15 @@ def read_image(
 
 def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
     """The image of a sequence in which boards are looked for, (H, W) uint8: that of the board, the
-    lit one, or where neither was taken, one made from the images of the code.
+    lit one, or where neither was taken, one made from the images of the code. Of several exposures it
+    is the shortest.
 
     Raises ImageError as `read_image`.
     """
     path = sequence.board or sequence.lit
     if path is not None or pair.projector is None:
-        return _read(sequence, sequence.seen_in, pair.camera, shows=True)
+        names = {"pair": sequence.pair, "shot": sequence.shot}
+        return read_image(sequence.seen_in, pair.camera, lit=True, **names)
     code, images = pair.projector, read_sequence(sequence, pair.camera)
     made = whole_grey(code.lit_from(images_by_kind(code, images.coded)[0]))
     _refuse_black(made, sequence.seen_in, sequence.pair, sequence.shot)
@@ -86,9 +75,10 @@ def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
 def read_sequence(
     sequence: ImageSequence, camera: CameraSpec, *, workers: int = THREADS
 ) -> StripeImages:
-    """All images of a stripe sequence.
+    """All images of a stripe sequence; of several exposures, the best of each pixel.
 
-    Raises ImageError as `read_image`, and where the sequence is an image of the board alone.
+    Raises ImageError as `read_image`, where exposures are not in their order, and where the sequence
+    is an image of the board alone.
     """
     if not sequence.has_stripes:
         raise ImageError(
@@ -96,24 +86,93 @@ def read_sequence(
             where=f"{sequence.lit} (pair {sequence.pair}, shot {sequence.shot})",
             remedy="Take the stripes as well, or leave this pair out of this shot.",
         )
-    coded = np.empty((len(sequence.coded), camera.height, camera.width), np.uint8)
+    stacks = [_read_stack(exposure, camera, workers) for exposure in (sequence, *sequence.longer)]
+    names = [exposure.exposure for exposure in (sequence, *sequence.longer)]
+    where = f"pair {sequence.pair}, shot {sequence.shot}"
+    whole = stacks[0] if len(stacks) == 1 else merge_exposures(stacks, names, where)
+    singles = iter(whole)
+    lit, dark = (next(singles) if path else None for path in (sequence.lit, sequence.dark))
+    if lit is not None and sequence.lit is not None:
+        _refuse_black(whole_grey(lit), sequence.lit, sequence.pair, sequence.shot)
+    coded = whole[len(whole) - len(sequence.coded) :]
+    return StripeImages(sequence.pair, sequence.shot, lit, dark, coded)
+
+
+def _read_stack(sequence: ImageSequence, camera: CameraSpec, workers: int) -> Greys:
+    """(F, H, W) grey levels of one exposure: lit and dark, if there are such, and those of the code."""
+    taken = [path for path in (sequence.lit, sequence.dark) if path is not None]
+    paths = (*taken, *sequence.coded)
+    first = _read_raw(paths[0], camera, sequence.pair, sequence.shot)
+    stack = np.empty((len(paths), *first.shape), first.dtype)
+    stack[0] = first
 
     def read_into(place: int) -> None:
-        coded[place] = _read(sequence, sequence.coded[place], camera)
+        image = _read_raw(paths[place], camera, sequence.pair, sequence.shot)
+        if image.dtype != first.dtype:
+            bits = (
+                f"{8 * image.itemsize} bits a sample, but {paths[0].name} has {8 * first.itemsize}"
+            )
+            raise image_error(f"has {bits}", paths[place], sequence.pair, sequence.shot)
+        stack[place] = image
 
     with ThreadPoolExecutor(workers) as pool:
-        lit, dark = (
-            pool.submit(_read, sequence, path, camera, shows=path == sequence.lit) if path else None
-            for path in (sequence.lit, sequence.dark)
+        list(pool.map(read_into, range(1, len(paths))))
+    scale = _scale(list(stack), camera, paths[0], sequence.pair, sequence.shot)
+    return as_greys(stack, scale)
+
+
+def _scale(images: list[Raw], camera: CameraSpec, path: Path, pair: str, shot: str) -> float:
+    """See `full_scale`."""
+    try:
+        return full_scale(images, camera.bits)
+    except ImageError as error:
+        raise image_error(error.what, path, pair, shot, remedy=error.remedy or "") from None
+
+
+def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str) -> Raw:
+    """The numbers of an image file, (height, width) uint8 or uint16; of a colour image those of the
+    camera's channel, grey being luma.
+
+    The size is compared with the header before anything is decoded. A turn noted in EXIF is not
+    applied, since it would swap the camera's axes. Raises ImageError: missing, no image, of the wrong
+    size or depth, cut short, damaged, without the channel.
+    """
+    width, height = camera.width, camera.height
+    fault = header_fault(path, width, height)
+    if fault:
+        raise image_error(fault, path, pair, shot)
+    data = path.read_bytes()
+    is_png = data.startswith(b"\x89PNG")
+    damage = png_damage(data) if is_png else None
+    if damage:
+        raise image_error(damage, path, pair, shot)
+    image = decode_grey_png(data, width, height) if is_png else None
+    if image is not None and camera.channel == "grey":
+        return image
+    found = _decoded(data, camera.channel)
+    if found is None or found.shape[:2] != (height, width):
+        raise image_error("cannot be decoded", path, pair, shot)
+    if found.ndim == 3:
+        found = found[:, :, BLUE_GREEN_RED.index(camera.channel)]
+    elif camera.channel != "grey":
+        raise image_error(
+            f"is grey, but the rig file says `channel: {camera.channel}`",
+            path,
+            pair,
+            shot,
+            remedy="Leave `channel` out for this camera.",
         )
-        list(pool.map(read_into, range(len(coded))))
-    lit_image, dark_image = (image.result() if image else None for image in (lit, dark))
-    return StripeImages(sequence.pair, sequence.shot, lit_image, dark_image, coded)
+    return cast(Raw, np.ascontiguousarray(found))
 
 
-def _read(sequence: ImageSequence, path: Path, camera: CameraSpec, *, shows: bool = False) -> Bytes:
-    names = {"pair": sequence.pair, "shot": sequence.shot}
-    return read_image(path, camera.width, camera.height, lit=shows, **names)
+def _decoded(data: bytes, channel: str) -> Raw | None:
+    """(H, W) of a grey image and of channel grey, else (H, W, 3); None if it cannot be decoded."""
+    colour = cv2.IMREAD_GRAYSCALE if channel == "grey" else cv2.IMREAD_ANYCOLOR
+    flags = colour | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        return None
+    return cast(Raw, image)
 
 
 def _refuse_black(image: Bytes, path: Path, pair: str, shot: str) -> None:

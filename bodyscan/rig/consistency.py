@@ -26,6 +26,7 @@ class RigParts:
     pairs: tuple[Pair | None, ...]
     folders: tuple[CaptureFolder | None, ...]
     files: str | None
+    exposures: tuple[str, ...]
     frames: FrameNames | None
     rig_frame: RigFrame | None
 
@@ -115,12 +116,21 @@ def _wrong_counts(
 def _template_problems(parts: RigParts) -> Iterator[Problem]:
     many = len(parts.pairs) > 1
     stripes = any(pair and pair.projector for pair in parts.pairs)
+    if len(parts.exposures) == 1:
+        yield ("exposures",), "names one exposure: name two or more, the shortest first, or none"
+    for index, name in duplicates(parts.exposures):
+        yield ("exposures", index), f"is named twice (got {name!r})"
     if parts.files is not None:
-        for fault in template_faults(parts.files, many_pairs=many, needs_frame=stripes):
+        several = bool(parts.exposures)
+        for fault in template_faults(
+            parts.files, many_pairs=many, needs_frame=stripes, exposures=several
+        ):
             yield ("files",), fault
     for index, folder in enumerate(parts.folders):
         if folder and folder.files is not None:
-            for fault in template_faults(folder.files, many_pairs=many, needs_frame=False):
+            for fault in template_faults(
+                folder.files, many_pairs=many, needs_frame=False, exposures=bool(parts.exposures)
+            ):
                 yield ("calibration", index, "files"), fault
     places = tuple(folder.folder.rstrip("/") if folder else None for folder in parts.folders)
     for index, place in duplicates(places):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -16,10 +16,16 @@ Pixels = Annotated[int, Field(gt=0, le=32767)]
 
 
 class CameraSpec(Model):
-    """Image size in pixels."""
+    """Image size in pixels, and what its files hold.
+
+    bits: of a grey level, where files of 16 bits a sample hold fewer and their numbers do not show it.
+    channel: which colour of a colour image counts; grey: all of them, as bright as they look.
+    """
 
     width: Pixels
     height: Pixels
+    bits: Annotated[int, Field(ge=8, le=16)] | None = None
+    channel: Literal["grey", "red", "green", "blue"] = "grey"
 
 
 class NominalPose(Model):

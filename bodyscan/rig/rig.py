@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat
 
@@ -31,8 +31,15 @@ class Volume(Model):
             )
 
 
+ExposureName = Annotated[str, Field(pattern=r"^[\w.+-]+$", max_length=64)]
+
+
 class Rig(Model):
-    """The whole rig file."""
+    """The whole rig file.
+
+    exposures: what `{exposure}` becomes in file names, the shortest first; () where every image is
+    taken once.
+    """
 
     version: Literal[1] = 1
     name: Name
@@ -40,6 +47,7 @@ class Rig(Model):
     pairs: tuple[Pair, ...] = Field(min_length=1)
     calibration: tuple[CaptureFolder, ...] = ()
     files: str = "{shot}/{pair}/{frame}.png"
+    exposures: tuple[ExposureName, ...] = ()
     frames: FrameNames = FrameNames()
     rig_frame: RigFrame = RigFrame()
     volume: Volume = Volume()
@@ -80,6 +88,7 @@ class Rig(Model):
                 pairs=self.pairs,
                 folders=self.calibration,
                 files=self.files,
+                exposures=self.exposures,
                 frames=self.frames,
                 rig_frame=self.rig_frame,
             )

@@ -47,6 +47,7 @@ def _problems_of_parts(data: Any) -> Iterator[Problem]:
             pairs=tuple(validate(Pair, item) for item in pairs),
             folders=tuple(validate(CaptureFolder, item) for item in folders),
             files=files if isinstance(files, str) else None,
+            exposures=tuple(name for name in _items(data, "exposures") if isinstance(name, str)),
             frames=validate(FrameNames, data.get("frames", {})),
             rig_frame=validate(RigFrame, data.get("rig_frame", {})),
         )

@@ -11,13 +11,19 @@ from functools import lru_cache
 from string import Formatter
 
 SHOT = r"\w[\w.-]*"
-_FIELDS = ("shot", "pair", "frame")
-_SUFFIXES = (".png", ".jpg", ".jpeg")
+_FIELDS = ("shot", "pair", "frame", "exposure")
+_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
+_VIDEOS = (".mp4", ".m4v", ".avi", ".mov", ".mkv", ".webm", ".wmv", ".mpg", ".mpeg")
 
 
 def fill(template: str, *, shot: str, pair: str, frame: str) -> str:
     """The relative path that `template` gives; the template is one without `template_faults`."""
     return template.format(shot=shot, pair=pair, frame=frame)
+
+
+def with_exposure(template: str, exposure: str) -> str:
+    """The template of one exposure's images."""
+    return template.replace("{exposure}", exposure)
 
 
 def has_field(template: str, field: str) -> bool:
@@ -39,7 +45,9 @@ def shot_pattern(template: str, pair: str, frame: str) -> tuple[re.Pattern[str],
     return tuple(_shot_group(part) for part in marked)
 
 
-def template_faults(template: str, *, many_pairs: bool, needs_frame: bool) -> Iterator[str]:
+def template_faults(
+    template: str, *, many_pairs: bool, needs_frame: bool, exposures: bool = False
+) -> Iterator[str]:
     """What is wrong with a file-name template, in words that follow its key."""
     try:
         fields = _fields(template)
@@ -50,8 +58,19 @@ def template_faults(template: str, *, many_pairs: bool, needs_frame: bool) -> It
         yield "needs {pair}, since the rig has several pairs"
     if needs_frame and "frame" not in fields:
         yield "needs {frame}, since a stripe sequence has many images"
-    if not template.lower().endswith(_SUFFIXES):
-        yield f"must end in {', '.join(_SUFFIXES)}: only PNG and JPEG images are read"
+    if needs_frame and exposures and "exposure" not in fields:
+        yield "needs {exposure}, since every image is taken with several exposures"
+    if "exposure" in fields and not exposures:
+        yield "holds {exposure}, but the rig file names no `exposures`"
+    if template.lower().endswith(_VIDEOS):
+        images = f"{template.rpartition('.')[0]}/%04d.png"
+        yield (
+            "names a video: unpack each with `ffmpeg -i VIDEO -fps_mode passthrough -start_number 0"
+            f" FOLDER/%04d.png`, write {images.replace('%04d', '{frame}')!r} here, and under `frames`"
+            " the numbers of the images, such as '0000'"
+        )
+    elif not template.lower().endswith(_SUFFIXES):
+        yield f"must end in {', '.join(_SUFFIXES)}: only PNG, TIFF, BMP and JPEG images are read"
     fault = path_fault(template)
     if fault:
         yield fault

@@ -91,10 +91,10 @@ def test_the_images_that_a_code_takes_are_known(
     ("content", "what"),
     [
         (b"", "is an empty file"),
-        (b"text", "is neither a PNG nor a JPEG image"),
+        (b"text", "is no PNG, JPEG, BMP or TIFF image"),
         (encoded(picture("lit"))[:-12], "is cut short"),
         (encoded(picture("lit")[:-1]), "is 40 x 29 pixels, but the rig file says 40 x 30"),
-        (encoded(picture("lit").astype("uint16")), "has 16 bits a sample"),
+        (encoded(picture("lit").astype("float32"), ".tif"), "has 32 bits a sample"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

@@ -34,7 +34,7 @@ def first_sequence(folder: Path) -> ImageSequence:
 
 
 def read(path: Path, **options: bool) -> np.ndarray:
-    return read_image(path, WIDTH, HEIGHT, pair="p1", shot="b1", **options)
+    return read_image(path, CAMERA, pair="p1", shot="b1", **options)
 
 
 def png(width: int, height: int, bits: int = 8) -> bytes:
@@ -76,11 +76,16 @@ def test_colour_becomes_grey_and_exif_turns_are_not_applied(tmp_path: Path) -> N
     [
         (None, "is missing"),
         (b"", "is an empty file"),
-        (b"this is text", "is neither a PNG nor a JPEG image"),
-        (encoded(NOISE, ".bmp"), "is neither a PNG nor a JPEG image"),
+        (b"this is text", "is no PNG, JPEG, BMP or TIFF image"),
+        (encoded(NOISE, ".bmp")[:-20], "is cut short"),
+        (encoded(NOISE, ".bmp")[:20], "is cut short"),
+        (encoded(NOISE, ".tif")[:-20], "is cut short"),
+        (encoded(NOISE.astype(np.float32), ".tif"), "has 32 bits a sample; 8 to 16 are read"),
         (encoded(NOISE.T), "is 30 x 40 pixels, but the rig file says 40 x 30"),
         (encoded(NOISE.T.copy(), ".jpg"), "is 30 x 40 pixels, but the rig file says 40 x 30"),
-        (encoded(NOISE.astype(np.uint16) * 16), "has 16 bits a sample; only 8-bit images"),
+        (encoded(NOISE.astype(np.uint16)), "16 bits a sample, but 8 bits in them (none of"),
+        (encoded(NOISE.astype(np.uint16) * 256), "but 8 bits in them (all their numbers are mult"),
+        (encoded(NOISE.astype(np.uint16) * 257), "but 8 bits in them (all their numbers are mult"),
         (encoded(NOISE)[:-20], "is cut short"),
         (encoded(NOISE)[:600], "is cut short"),
         (encoded(NOISE)[:20], "is cut short"),
