@@ -68,13 +68,17 @@ class CheckReport:
         return not (self.bad_images or self.errors)
 
 
-def check(rig_path: Path, scans: Iterable[Path] = ()) -> CheckReport:
+def check(
+    rig_path: Path, scans: Iterable[Path] = (), known_errors: Iterable[str] = ()
+) -> CheckReport:
     """Check a rig file, the calibration captures it names, and scan folders if any are given.
+
+    known_errors: what is wrong with the files that it names as `known`.
 
     Raises RigFileError when the rig file is wrong: then nothing else can be looked at.
     """
     rig = load_rig(rig_path)
-    errors: list[str] = []
+    errors = list(known_errors)
     parts = [_attempt(errors, open_folder, rig, rig_path, entry) for entry in rig.calibration]
     opened = tuple(part for part in parts if part is not None)
     calibration = _attempt(errors, join_captures, opened) if opened else None

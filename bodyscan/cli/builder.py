@@ -40,8 +40,14 @@ def check(output: Output, rig_file: RigFile) -> None:
     """Validate a rig file and its capture folders, and list what is missing."""
     from bodyscan.captures.check import check as look_over
     from bodyscan.captures.check import report_lines
+    from bodyscan.rig.rig_file import load_rig
 
-    found = look_over(rig_file)
+    known_errors: list[str] = []
+    if any(pair.known for pair in load_rig(rig_file).pairs):
+        from bodyscan.workflows.import_rig import known_errors_of
+
+        known_errors = known_errors_of(rig_file)
+    found = look_over(rig_file, known_errors=known_errors)
     output.say(*report_lines(found), wrong=not found.ok)
     output.figures(images=found.images, shots=len(found.shots))
     output.exit_code = 0 if found.ok else 2

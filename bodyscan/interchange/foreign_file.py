@@ -12,6 +12,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.errors import CalibrationFileError
+from bodyscan.files.regular import read_regular
 from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.transforms import RigidTransform
@@ -33,12 +34,13 @@ class ForeignFile:
 
     @staticmethod
     def read(path: Path) -> ForeignFile:
-        """Raises CalibrationFileError for what is not a text file."""
+        """Raises CalibrationFileError for what is not a text file, BadInput for a folder or a pipe."""
         empty = ForeignFile(path)
         try:
-            if path.stat().st_size > MOST_BYTES:
+            data = read_regular(path, MOST_BYTES)
+            if len(data) > MOST_BYTES:
                 raise empty.error(f"is longer than {MOST_BYTES:,} bytes: this cannot be right")
-            return ForeignFile(path, path.read_text("utf-8-sig"))
+            return ForeignFile(path, data.decode("utf-8-sig"))
         except FileNotFoundError:
             raise empty.error("there is no such file") from None
         except UnicodeDecodeError:

@@ -73,6 +73,18 @@ def import_rig(rig: Rig, folder: Path, sigma_px: float | None = None) -> RigCali
     )
 
 
+def known_errors_of(rig_file: Path) -> list[str]:
+    """What is wrong with the files that a rig file names as `known`, a line or two each."""
+    errors = []
+    for pair in load_rig(rig_file).pairs:
+        try:
+            if pair.known is not None:
+                read_known_pair(pair, Path(rig_file).parent)
+        except BodyscanError as error:
+            errors.append(f"pair {pair.name}: {error}")
+    return errors
+
+
 def _read(pair: Pair, folder: Path, *, several: bool) -> KnownPair:
     if pair.known is None:
         raise CalibrationFileError(

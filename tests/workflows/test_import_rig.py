@@ -306,6 +306,16 @@ def test_the_command_makes_a_calibration_folder(folder: Path) -> None:
     assert CliRunner().invoke(app, export).exit_code == 0
 
 
+def test_the_check_of_a_rig_file_reads_what_is_known(folder: Path) -> None:
+    content = described("a")
+    checked = CliRunner().invoke(app, ["check", str(write_rig_file(folder, content))])
+    assert checked.exit_code == 0, checked.output
+    content["pairs"][0]["known"]["camera"]["matrix"] = "K"
+    checked = CliRunner().invoke(app, ["check", str(write_rig_file(folder, content))])
+    assert checked.exit_code == 2
+    assert "has no node 'K'" in checked.output
+
+
 def gray_code(folder: Path, axis: str, bits: int) -> tuple[Array, Mask]:
     """The plain decoding of `gray-jpeg`: signs of pattern less inverse; where every one of them is
     told by 5 grey levels or more."""
