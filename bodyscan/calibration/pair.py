@@ -135,8 +135,31 @@ def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
     if pair.alone:
         # In a rig of several pairs the boards are held by all cameras together, far better than
         # one pair's stripes could.
-        found = _refined(found, pair.own, shots, points)
-    return Outcome(found, notes)
+        found, shots = _refined(found, pair.own, shots, points)
+    crossed = _with_crossing(found, projector, shots)
+    return Outcome(crossed.value, (*notes, *crossed.notes))
+
+
+def _with_crossing(
+    pair: PairCalibration, projector: StripeCode, shots: Sequence[StripedView]
+) -> Outcome[PairCalibration]:
+    """With the sheets of the stripes that cross, if such were projected. The pair does without them
+    where they give none."""
+    across = projector.crossing
+    if across is None:
+        return Outcome(pair)
+    crossed = [
+        replace(shot, boundaries=shot.boundaries.crossing)
+        for shot in shots
+        if shot.boundaries.crossing is not None
+    ]
+    try:
+        points = boundaries_on_boards(pair.name, pair.camera, across, crossed)
+        fit = fit_light_sheets(points, across.stripes, across.direction, pair.camera)
+    except PairFailed as error:
+        return Outcome(pair, (f"{pair.name}: crossing stripes are not used: {error.what}",))
+    said = f"{pair.name}: crossing stripes: {fit.model}, {fit.rms_mm:.3f} mm from their sheets"
+    return Outcome(replace(pair, crossing=fit.sheets), (said,))
 
 
 def drop_disagreeing(
@@ -165,8 +188,9 @@ def _refined(
     own: CameraCalibration,
     shots: Sequence[StripedView],
     points: BoundaryPoints,
-) -> PairCalibration:
-    """Camera, boards and light of a pair by itself in one solve, where held-out boards gain."""
+) -> tuple[PairCalibration, tuple[StripedView, ...]]:
+    """Camera, boards and light of a pair by itself in one solve, where held-out boards gain; and its
+    shots with the boards where that puts them."""
     assert pair.sheets is not None
     data = bin_points(points, pair.camera, pair.sheets.direction)
     boards = [
@@ -177,15 +201,22 @@ def _refined(
     ]
     choice = refine_where_better(own, pair.sheets, boards, data)
     quality = replace(pair.quality, refinement=choice.reason, flatness_mm=choice.flatness_mm)
-    if choice.joint is None:
-        return replace(pair, quality=quality)
-    return replace(
+    joint = choice.joint
+    if joint is None:
+        return replace(pair, quality=quality), tuple(shots)
+    refined = replace(
         pair,
-        camera=choice.joint.camera,
-        camera_covariance=choice.joint.camera_covariance,
-        sheets=choice.joint.sheets,
-        quality=replace(quality, corners_rms_px=choice.joint.corners_rms_px),
+        camera=joint.camera,
+        camera_covariance=joint.camera_covariance,
+        sheets=joint.sheets,
+        quality=replace(quality, corners_rms_px=joint.corners_rms_px),
     )
+    poses = joint.camera_from_board
+    placed = (
+        replace(shot, view=replace(shot.view, camera_from_board=poses[shot.view.shot]))
+        for shot in shots
+    )
+    return refined, tuple(placed)
 
 
 def _mean_and_rms(values: Array) -> tuple[float, float] | None:

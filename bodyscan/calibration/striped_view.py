@@ -30,11 +30,13 @@ RIM_SQUARES = 0.1
 
 @dataclass(frozen=True, eq=False)
 class BoardBoundaries:
-    """Stripe boundaries of one shot that lie near a board: index (N,), pixels (N, 2), sigma (N,)."""
+    """Stripe boundaries of one shot that lie near a board: index (N,), pixels (N, 2), sigma (N,); and
+    those of the stripes that cross them, if there are such."""
 
     index: Indices
     pixels: Array
     sigma_px: Array
+    crossing: BoardBoundaries | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,7 @@ def boundaries_near(stripes: StripeMap, view: BoardView) -> BoardBoundaries:
         stripes.boundary_index[near],
         pixels[near],
         stripes.boundary_sigma_px[near].astype(np.float64),
+        boundaries_near(stripes.crossing, view) if stripes.crossing is not None else None,
     )
 
 

@@ -37,6 +37,12 @@ class Scan:
     range_images: tuple[RangeImage, ...]
     rig_from_camera: dict[str, RigidTransform]
 
+    @property
+    def agreements(self) -> tuple[str, ...]:
+        """Of pairs that project stripes of two directions, how well these agree."""
+        own = ((image.pair, image.agreement) for image in self.range_images)
+        return tuple(f"{pair}: {agreement}" for pair, agreement in own if agreement)
+
 
 def fuse(
     calibration: RigCalibration,

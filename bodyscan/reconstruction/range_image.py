@@ -8,6 +8,7 @@ import numpy as np
 
 from bodyscan.arrays import Bytes, Floats, Mask
 from bodyscan.geometry.camera import Camera
+from bodyscan.reconstruction.two_ways import Agreement
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +22,7 @@ class RangeImage:
     colours: (height, width) uint8, grey level of the lit image.
     beyond: (height, width) bool, where the camera saw something behind the scan volume; None if all
     that was seen has a point.
+    agreement: of stripes of two directions, if such were projected.
     """
 
     pair: str
@@ -30,6 +32,7 @@ class RangeImage:
     sigma_mm: Floats
     colours: Bytes
     beyond: Mask | None = None
+    agreement: Agreement | None = None
 
     @property
     def valid(self) -> Mask:

@@ -11,6 +11,7 @@ from bodyscan.errors import BadInput
 from bodyscan.geometry.crop import crop_of, ends_of
 from bodyscan.geometry.ray_depths import triangulate_image
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.reconstruction.two_ways import combine
 from bodyscan.stripes.stripe_map import StripeMap
 
 NORMAL_WINDOW_PX = 5
@@ -19,7 +20,8 @@ ZERO, ONE = np.float32(0.0), np.float32(1.0)  # a float64 among them would make 
 
 
 def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
-    """Points, normals and sigma on the camera's pixel grid, camera frame, mm.
+    """Points, normals and sigma on the camera's pixel grid, camera frame, mm; of stripes of both
+    directions where they were projected and calibrated.
 
     Raises BadInput if the pair has no projector or the image size is another.
     """
@@ -35,8 +37,16 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
             remedy="scan with the camera settings of the calibration, or calibrate again",
         )
     points, sigma_mm = triangulate_image(pair.sheets, camera, stripes.s, stripes.sigma)
+    agreement = None
+    if pair.crossing is not None and stripes.crossing is not None:
+        across = stripes.crossing
+        others = triangulate_image(pair.crossing, camera, across.s, across.sigma)
+        # Crossing stripes are decoded wherever they are, not in the scan volume alone.
+        alone = np.full(sigma_mm.shape, stripes.beyond is None)
+        points, sigma_mm, agreement = combine(points, sigma_mm, *others, alone=alone)
     normals = grid_normals(points, np.isfinite(sigma_mm))
-    return RangeImage(pair.name, camera, points, normals, sigma_mm, stripes.lit, stripes.beyond)
+    images = (stripes.lit, stripes.beyond)
+    return RangeImage(pair.name, camera, points, normals, sigma_mm, *images, agreement)
 
 
 def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:

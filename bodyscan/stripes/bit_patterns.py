@@ -12,6 +12,7 @@ from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.albedo_edges import Brightness, without_edges_across
 from bodyscan.stripes.bit_words import WordCode
 from bodyscan.stripes.boundaries import find_boundaries
+from bodyscan.stripes.boundary_scatter import scatter
 from bodyscan.stripes.code_lines import fill_from_codes
 from bodyscan.stripes.grey_noise import noise_variance
 from bodyscan.stripes.scan_lines import ScanLines
@@ -43,6 +44,7 @@ def decode_bits(
     )
     sigma_px = np.hypot(boundaries.sigma_px, code.doubt_px)
     boundaries = replace(boundaries, sigma_px=sigma_px)
+    boundaries = replace(boundaries, sigma_px=scatter(boundaries) * sigma_px)
     s, sigma = interpolate_stripes(boundaries, codes, usable)
     if code.single:  # of others, codes at boundaries are misread by any number
         fill_from_codes(s, sigma, codes, shown)

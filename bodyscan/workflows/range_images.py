@@ -47,4 +47,5 @@ def reconstruct_range_images(
     if not images:
         reasons = "\n".join(f"  {name}: {reason}" for name, reason in failed.items())
         raise ScanFailed(f"no pair gave a range image:\n{reasons}")
-    return Outcome(list(images.values()), failures=failed)
+    notes = tuple(f"{i.pair}: {i.agreement}" for i in images.values() if i.agreement is not None)
+    return Outcome(list(images.values()), notes, failed)

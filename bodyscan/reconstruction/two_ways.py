@@ -1,0 +1,67 @@
+"""Points that stripes of two directions measure: of both, as well as each is known, where they agree.
+
+A pixel's ray meets a sheet of each family. Both depths are of the same ray, so that they differ by
+what decoding and calibration are off, and by nothing else: a check that needs no board.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.arrays import Floats, Mask
+
+MOST_OFF = 5.0
+"""Sigmas: noise alone does not get there; a wrong code does, or a pixel that saw two surfaces."""
+FEWEST = 100
+ROBUST = 1.4826
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far the two ways were apart along the rays of `pixels` that have both: robust sigma, mm,
+    and the same in the sigmas that both depths claim.  dropped: pixels beyond MOST_OFF of those, or
+    of the claimed ones if these are larger, which have no point."""
+
+    pixels: int
+    apart_mm: float
+    apart_sigmas: float
+    dropped: int
+
+    def __str__(self) -> str:
+        return (
+            f"stripes of both directions agree to {self.apart_mm:.2f} mm ({self.apart_sigmas:.1f} of "
+            f"their sigmas) at {self.pixels} pixels; {self.dropped} that do not were left out"
+        )
+
+
+def combine(
+    points: Floats, sigma_mm: Floats, crossing: Floats, crossing_mm: Floats, *, alone: Mask
+) -> tuple[Floats, Floats, Agreement | None]:
+    """Points (H, W, 3) with sigma (H, W) along their rays from those of each way, NaN where none;
+    None where too few pixels have both.
+
+    alone: (H, W), where the crossing stripes may tell a point by themselves. Depths are weighted
+    by what their sigmas say. Sigmas that claim too little (calibrations of other programs have none)
+    make every pixel disagree alike: what is dropped is far beyond what most do.
+    """
+    points, sigma_mm = points.copy(), sigma_mm.copy()
+    both = np.isfinite(sigma_mm) & np.isfinite(crossing_mm)
+    alone = alone & ~np.isfinite(sigma_mm) & np.isfinite(crossing_mm)
+    points[alone], sigma_mm[alone] = crossing[alone], crossing_mm[alone]
+    pixels = int(np.count_nonzero(both))
+    if pixels < FEWEST:
+        return points, sigma_mm, None
+    one, other = points[both], crossing[both]
+    variance, variance_too = sigma_mm[both] ** 2, crossing_mm[both] ** 2
+    along = np.linalg.norm(one, axis=1) - np.linalg.norm(other, axis=1)
+    off = along / np.sqrt(variance + variance_too)
+    sigmas = ROBUST * float(np.median(np.abs(off)))
+    wrong = np.abs(off) > MOST_OFF * max(sigmas, 1.0)
+    share = variance / (variance + variance_too)  # of the other: weights are 1 / variance
+    points[both] = one + share[:, None] * (other - one)
+    merged = np.sqrt(share * variance_too)
+    sigma_mm[both] = np.where(wrong, np.float32(np.nan), merged)
+    apart = ROBUST * float(np.median(np.abs(along)))
+    return points, sigma_mm, Agreement(pixels, apart, sigmas, int(np.count_nonzero(wrong)))
