@@ -23,9 +23,11 @@ class ResponseShare:
     noise_rms: float
 
     def __str__(self) -> str:
+        total = self.response_rms**2 + self.noise_rms**2
         return (
             f"the projector's response moved s by {self.response_rms:.2g} stripes RMS and was taken"
-            f" out; noise moves it by {self.noise_rms:.2g}"
+            f" out ({self.response_rms**2 / total:.0%} of the variance, noise of"
+            f" {self.noise_rms:.2g} stripes being the rest)"
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_near
@@ -16,7 +16,7 @@ from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_limits import StripeLimits
-from bodyscan.stripes.stripe_map import StripeMap
+from bodyscan.stripes.stripe_map import ResponseShare, StripeMap
 
 FEW = 2
 """So many shots are told one by one, more with the same fault together."""
@@ -55,8 +55,11 @@ def decode_on_boards(
         wanted[view.pair, view.shot].append(view)
     sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
 
+    responses: dict[str, list[ResponseShare]] = defaultdict(list)
+
     def decode(sequence: ImageSequence) -> dict[ViewKey, BoardBoundaries]:
         stripes = decode_sequence(sequence, rig.pair(sequence.pair))
+        responses[sequence.pair] += responses_in(stripes)
         return {
             (view.pair, view.shot, view.board): boundaries_near(stripes, view)
             for view in wanted[sequence.pair, sequence.shot]
@@ -69,7 +72,20 @@ def decode_on_boards(
     failures = list(errors.items())
     failed = failed_pairs(failures, {pair for pair, _, _ in boundaries})
     kept = [failure for failure in failures if failure[0].pair not in failed]
-    return Outcome(boundaries, tuple(failure_notes(kept)), failed)
+    return Outcome(boundaries, (*failure_notes(kept), *response_notes(responses)), failed)
+
+
+def responses_in(stripes: StripeMap) -> list[ResponseShare]:
+    """Of a stripe map and the one that crosses it, those that the projector's response moved."""
+    maps = (stripes, stripes.crossing)
+    return [one.response for one in maps if one is not None and one.response is not None]
+
+
+def response_notes(responses: Mapping[str, Sequence[ResponseShare]]) -> Iterator[str]:
+    """A line a pair whose projector's response was taken out: that of the shot where it was most."""
+    for pair, shares in sorted(responses.items()):
+        if shares:
+            yield f"{pair}: {max(shares, key=lambda share: share.response_rms)}"
 
 
 def failed_pairs(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:

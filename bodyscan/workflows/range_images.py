@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.errors import BodyscanError, ScanFailed
 from bodyscan.outcome import Outcome
@@ -10,7 +12,8 @@ from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.scan_volume import stripes_in_volume
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.workflows.decode import decode_sequence
+from bodyscan.stripes.stripe_map import ResponseShare
+from bodyscan.workflows.decode import decode_sequence, response_notes, responses_in
 
 
 def reconstruct_range_images(
@@ -34,11 +37,15 @@ def reconstruct_range_images(
     }
     sequences = [s for s in captures.sequences if s.has_stripes and s.pair not in failed]
 
+    responses: dict[str, list[ResponseShare]] = defaultdict(list)
+
     def reconstruct(sequence: ImageSequence) -> RangeImage:
         pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
         limits = stripes_in_volume(pair, at, calibration.rig.volume)
         spec = calibration.rig.pair(sequence.pair)
-        return reconstruct_range_image(pair, decode_sequence(sequence, spec, limits=limits))
+        stripes = decode_sequence(sequence, spec, limits=limits)
+        responses[sequence.pair] += responses_in(stripes)
+        return reconstruct_range_image(pair, stripes)
 
     images, errors = attempt_each(
         reconstruct, sequences, BodyscanError, stage="range images", progress=progress
@@ -47,5 +54,5 @@ def reconstruct_range_images(
     if not images:
         reasons = "\n".join(f"  {name}: {reason}" for name, reason in failed.items())
         raise ScanFailed(f"no pair gave a range image:\n{reasons}")
-    notes = tuple(f"{i.pair}: {i.agreement}" for i in images.values() if i.agreement is not None)
-    return Outcome(list(images.values()), notes, failed)
+    notes = [f"{i.pair}: {i.agreement}" for i in images.values() if i.agreement is not None]
+    return Outcome(list(images.values()), (*notes, *response_notes(responses)), failed)
