@@ -57,8 +57,8 @@ def test_check_and_help_import_nothing_heavy() -> None:
     for arguments in (["--help"], ["check", str(RIGS / "three-pole-12.yaml")]):
         program = (
             f"import sys; sys.argv = ['bodyscan', *{arguments!r}]\n"
-            "from bodyscan.cli.main import main\n"
-            "try:\n    main()\nexcept SystemExit:\n    pass\n"
+            "from bodyscan.cli.main import app\n"
+            "try:\n    app()\nexcept SystemExit:\n    pass\n"
             f"print('heavy:', [m for m in {HEAVY!r} if m in sys.modules])"
         )
         done = subprocess.run(

@@ -13,8 +13,8 @@ from bodyscan.cli.options import (
     CalibrationArgument,
     OutFolder,
     RigFile,
-    refuse_file,
 )
+from bodyscan.files.os_errors import require_writable
 from bodyscan.settings import RigExportSettings
 
 PANEL = "Builder: calibrate a rig"
@@ -68,7 +68,7 @@ def patterns(
     from bodyscan.captures.pattern_files import uneven_stripes, write_patterns
     from bodyscan.rig.rig_file import load_rig
 
-    refuse_file(out)
+    require_writable(out)
     rig = load_rig(rig_file)
     orders = write_patterns(rig, out, width, height)
     output.notes(uneven_stripes(rig, width, height))
@@ -87,9 +87,10 @@ def calibrate_rig(
     from bodyscan.cli import tables
     from bodyscan.workflows.calibrate_rig import calibrate_folder
 
-    refuse_file(out)
+    out = out or rig_file.parent / "calibration"
+    require_writable(out)
     with output.stages() as progress:
-        found, saved = calibrate_folder(rig_file, out or rig_file.parent / "calibration", progress)
+        found, saved = calibrate_folder(rig_file, out, progress)
     output.notes(found.notes)
     output.failures(found.failed)
     with output.optional("table"):
@@ -117,8 +118,9 @@ def import_(
     from bodyscan.cli import tables
     from bodyscan.workflows.import_rig import import_folder
 
-    refuse_file(out)
-    found, saved = import_folder(rig_file, out or rig_file.parent / "calibration", sigma_px)
+    out = out or rig_file.parent / "calibration"
+    require_writable(out)
+    found, saved = import_folder(rig_file, out, sigma_px)
     output.notes(found.notes)
     output.failures(found.failed)
     output.show(tables.calibration_table(found))
@@ -171,7 +173,7 @@ def refine_rig(
     from bodyscan.registration.storage import load_calibration, save_calibration
     from bodyscan.workflows.refine_rig import refine_rig as refine
 
-    refuse_file(out)
+    require_writable(out)
     rig = load_calibration(calibration)
     with output.stages() as progress:
         found = refine(rig, open_scan(rig.rig, folder), folder.name, progress)
@@ -206,6 +208,6 @@ def export_rig(
     from bodyscan.export.rig import export_rig as write
     from bodyscan.registration.storage import load_calibration
 
-    refuse_file(out)
+    require_writable(out)
     for path in write(load_calibration(calibration), out, formats.split(",")):
         output.made("rig", path)

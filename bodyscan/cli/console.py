@@ -23,7 +23,8 @@ import typer
 from rich.console import Console, RenderableType
 
 from bodyscan.cli.options import SHARED
-from bodyscan.errors import BodyscanError
+from bodyscan.errors import BodyscanError, FailedWork
+from bodyscan.files.os_errors import in_words
 from bodyscan.optional import optional
 
 if TYPE_CHECKING:
@@ -238,7 +239,14 @@ def add_command(app: typer.Typer, panel: str, function: Callable[..., None]) -> 
     @wraps(function)
     def run(*, json: bool, quiet: bool, verbose: bool, **given: Any) -> None:
         with Output(name, json, quiet, verbose) as output:
-            function(output, **given)
+            try:
+                function(output, **given)
+            except OSError as error:
+                raise in_words(error) from error
+            except MemoryError as error:
+                raise FailedWork(
+                    "there is not enough memory", remedy="close other programs, or ask for less"
+                ) from error
         raise typer.Exit(output.exit_code)
 
     # What typer reads is the wrapped function's parameters, without the Output, and the shared.

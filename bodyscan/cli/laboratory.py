@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 import typer
 
 from bodyscan.cli.console import Output, add_command
-from bodyscan.cli.options import OutFolder, Overwrite, RigFile, refuse_file
+from bodyscan.cli.options import OutFolder, Overwrite, RigFile
 from bodyscan.errors import BadInput
+from bodyscan.files.os_errors import require_writable
 from bodyscan.progress import step
 
 PANEL = "Laboratory: simulate, measure against truth, accept"
@@ -45,7 +46,7 @@ def simulate(
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate captures of a rig, a board and (with --subject) a person, with known truth."""
-    refuse_file(out)
+    require_writable(out)
     if not overwrite and ((out / "captures").exists() or (out / "rig.yaml").exists()):
         raise BadInput(
             "this folder holds captures already, which would be written over",
@@ -176,7 +177,7 @@ def reproduce(
     from bodyscan.laboratory.reproduce import FIGURES, TEXT
     from bodyscan.laboratory.reproduce import reproduce as run
 
-    refuse_file(out)
+    require_writable(out)
     with output.stages() as progress:
         text = run(out, seed=seed, quick=quick, real_light=real_light, progress=progress)
     output.say(*text.splitlines())

@@ -14,7 +14,9 @@ from typing import Annotated
 import typer
 
 from bodyscan.cli import builder, laboratory, operator
+from bodyscan.cli.interruption import run_interruptibly
 from bodyscan.errors import BodyscanError
+from bodyscan.files.os_errors import in_words
 from bodyscan.memory import keep_freed_memory
 from bodyscan.version import __version__
 
@@ -42,13 +44,29 @@ def main() -> None:
     if debug:
         logging.basicConfig(format="%(message)s")
         logging.getLogger("bodyscan").setLevel(logging.DEBUG)
+        sys.exit(_run(arguments, debug=True))
+    sys.exit(run_interruptibly(lambda: _run(arguments, debug=False)))
+
+
+def _run(arguments: list[str], *, debug: bool) -> int:
+    """The exit code of a command, whose error is printed."""
     try:
         app(args=arguments)
+        code = 0
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
     except BodyscanError as error:
         if debug:
             raise
         typer.secho(f"error: {error}", err=True, fg="red")
-        sys.exit(error.exit_code)
+        code = error.exit_code
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what is flushed when Python ends
+        code = code or 1
+        typer.secho(f"error: {in_words(error)}", err=True, fg="red")
+    return code
 
 
 def _show_version(wanted: bool) -> None:

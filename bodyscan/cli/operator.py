@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from bodyscan.cli.console import Output, add_command
-from bodyscan.cli.options import Calibration, Changes, Overwrite, Result, ScanFolder, refuse_file
+from bodyscan.cli.options import Calibration, Changes, Overwrite, Result, ScanFolder
 from bodyscan.errors import BadInput, FailedWork
+from bodyscan.files.os_errors import require_writable
 from bodyscan.progress import step
 from bodyscan.settings import AlignmentSettings, ExportSettings, FusionSettings, ScanSettings
 
@@ -63,8 +64,8 @@ def scan(
     from bodyscan.fusion.storage import make_room
     from bodyscan.workflows.scan_folder import scan_folder
 
-    refuse_file(out)
     out = out or folder.with_name(f"{folder.name}-model")
+    require_writable(out)
     make_room(out, overwrite)
     settings = apply_settings(
         ScanSettings(
@@ -173,8 +174,8 @@ def export(
     from bodyscan.export.scan import export_scan
     from bodyscan.fusion.storage import load_scan
 
-    refuse_file(out)
     folder = out or result / ("shared" if deface else "export")
+    require_writable(folder)
     with output.stages() as progress, step(progress, "exporting"):
         written = export_scan(
             load_scan(result), folder, formats.split(","), deface=deface, frame=frame
@@ -228,7 +229,7 @@ def batch(
         if explain:
             _explain(output, jobs, stages)
             return
-        refuse_file(folder)
+        require_writable(folder)
         _run(output, jobs, folder, workers, cluster)
         return
     fuses = settings.kind == "fuse"

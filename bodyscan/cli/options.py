@@ -8,8 +8,6 @@ from typing import Annotated
 
 import typer
 
-from bodyscan.errors import BadInput
-
 RigFile = Annotated[Path, typer.Argument(metavar="RIG.YAML", help="The rig file.")]
 ScanFolder = Annotated[Path, typer.Argument(metavar="FOLDER", help="One scan's captures.")]
 Result = Annotated[Path, typer.Argument(metavar="RESULT", help="What `scan` wrote.")]
@@ -41,11 +39,3 @@ SHARED = [
     for name, option in {"json": Json, "quiet": Quiet, "verbose": Verbose}.items()
 ]
 """What every command takes."""
-
-
-def refuse_file(folder: Path | None) -> None:
-    """A folder to write into must not be a file: said before the work, not after it."""
-    if folder is not None and folder.exists() and not folder.is_dir():
-        raise BadInput(
-            "is a file; results go into a folder", where=str(folder), remedy="give another --out"
-        )

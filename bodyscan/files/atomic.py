@@ -29,9 +29,11 @@ def atomic_replacement(path: Path) -> Iterator[Path]:
         yield temporary
         flush(temporary, os.O_RDWR)
         os.replace(temporary, path)
-    except BaseException:
-        with suppress(FileNotFoundError):
+    except BaseException as error:
+        with suppress(OSError):
             temporary.unlink()
+        if isinstance(error, OSError) and error.filename in (None, str(temporary)) and error.errno:
+            raise OSError(error.errno, error.strerror, str(path)) from error  # the name people know
         raise
     if os.name == "posix":  # the rename itself must survive a power cut too
         flush(path.parent)

@@ -1,0 +1,90 @@
+"""Ctrl-C ends a command soon and in one line, whatever it is busy with."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+SOON_S = 2.0
+BUSY = {
+    "waiting": "import time; time.sleep(30)",
+    # As a library does that meshes for half a minute: no Python runs meanwhile, in no thread.
+    "in a library": "import ctypes; ctypes.PyDLL(None).sleep(30)",
+    "in threads": (
+        "import ctypes; from concurrent.futures import ThreadPoolExecutor\n"
+        "    with ThreadPoolExecutor(2) as pool: list(pool.map(ctypes.CDLL(None).sleep, [30, 30]))"
+    ),
+}
+
+
+def start(work: str) -> subprocess.Popen[str]:
+    """A process that has told its child's number and is at work."""
+    program = (
+        "import os, sys\n"
+        "from bodyscan.cli.interruption import run_interruptibly\n"
+        "def work():\n"
+        "    print(os.getpid(), flush=True)\n"
+        f"    {work}\n"
+        "    return 7\n"
+        "sys.exit(run_interruptibly(work))\n"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def child_of(process: subprocess.Popen[str]) -> int:
+    assert process.stdout is not None
+    return int(process.stdout.readline())
+
+
+@pytest.mark.parametrize("busy", BUSY)
+@pytest.mark.parametrize("whole_group", [True, False])  # as a terminal does, and as `kill` does
+def test_ctrl_c_ends_the_work(busy: str, whole_group: bool) -> None:
+    process = start(BUSY[busy])
+    child_of(process)
+    time.sleep(0.1)
+    since = time.monotonic()
+    (os.killpg if whole_group else os.kill)(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert time.monotonic() - since < SOON_S
+    assert process.returncode == 130
+    assert errors == "stopped\n"
+
+
+def test_the_work_ends_with_who_waits_for_it() -> None:
+    if not Path("/proc").exists():
+        pytest.skip("Linux alone ends a process with its parent")
+    process = start(BUSY["in a library"])
+    child = child_of(process)
+    process.kill()
+    process.wait()
+    until = time.monotonic() + 10.0
+    while Path(f"/proc/{child}").exists() and time.monotonic() < until:
+        if Path(f"/proc/{child}/stat").read_text().split()[2] == "Z":
+            return  # ended, though nobody has looked yet
+        time.sleep(0.02)
+    assert not Path(f"/proc/{child}").exists()
+
+
+def test_the_exit_code_is_that_of_the_work() -> None:
+    process = start("pass")
+    process.communicate(timeout=30)
+    assert process.returncode == 7
+
+
+def test_work_that_the_system_kills_is_told() -> None:
+    process = start("os.kill(os.getpid(), 9)")
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 137
+    assert errors == "error: the work was ended by SIGKILL (out of memory?)\n"
