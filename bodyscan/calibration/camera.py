@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.zhang import (
     camera_from_plane,
@@ -15,15 +16,30 @@ from bodyscan.calibration.zhang import (
     matrix_from_homographies,
 )
 from bodyscan.errors import DegeneratePoses
-from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.least_squares import Block, Noise, minimize
+from bodyscan.geometry.camera import MATRIX, Camera
+from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 FEWEST_POSES = 3
+SETTLED = 1e-6
 CHAPTERS_LENS = Radial()
 CORNERS = Noise("corners", group=2, cauchy=4.0)
+
+
+@dataclass(frozen=True)
+class LensTrial:
+    """How one kind of lens did on boards that it was not fitted to.
+
+    rms_px: of their corners, robustly weighted.  gain: by how many of its own standard errors it did
+    better than the lens it was tried against (the one chosen so far); None for the first.
+    """
+
+    kind: str
+    rms_px: float
+    gain: float | None = None
+    chosen: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +47,7 @@ class CameraCalibration:
     """camera with the covariance (P, P) of its parameters, and the board's pose in each shot.
 
     rms_px: root mean square distance of corners to their reprojection, robustly weighted.
+    lenses: those tried on held-out boards; empty where the lens was given.
     """
 
     camera: Camera
@@ -38,6 +55,40 @@ class CameraCalibration:
     camera_from_board: dict[str, RigidTransform]
     residuals_px: dict[str, Array]
     rms_px: float
+    lenses: tuple[LensTrial, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFit:
+    """A camera and `camera_from_board` of each of its views, with what that leaves over.
+
+    residuals: (N, 2) px of each view.  weights: (N,) of each, robust.  covariance: (P, P).
+    """
+
+    camera: Camera
+    poses: tuple[RigidTransform, ...]
+    residuals: tuple[Array, ...]
+    weights: tuple[Array, ...]
+    covariance: Array
+
+    @property
+    def rms_px(self) -> float:
+        """Robustly weighted."""
+        return weighted_rms(self.residuals, self.weights)
+
+    def calibration(
+        self, views: Sequence[PlanarView], lenses: tuple[LensTrial, ...] = ()
+    ) -> CameraCalibration:
+        """Of the views it was fitted to."""
+        shots = [view.shot for view in views]
+        return CameraCalibration(
+            self.camera,
+            self.covariance,
+            dict(zip(shots, self.poses, strict=True)),
+            dict(zip(shots, self.residuals, strict=True)),
+            self.rms_px,
+            lenses,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +110,13 @@ def calibrate_camera(
 
     Raises DegeneratePoses for fewer than three poses or poses that differ by a translation only.
     """
+    return fit_from_scratch(views, width, height, lens).calibration(views)
+
+
+def fit_from_scratch(
+    views: Sequence[PlanarView], width: int, height: int, lens: Lens = CHAPTERS_LENS
+) -> CameraFit:
+    """As `calibrate_camera`."""
     if len(views) < FEWEST_POSES:
         raise DegeneratePoses(
             f"{len(views)} usable board poses, at least {FEWEST_POSES} are needed",
@@ -72,37 +130,64 @@ def calibrate_camera(
         camera_from_plane(inverse @ h, float(view.points[0, 2]))
         for h, view in zip(homographies, views, strict=True)
     )
+    return fit_camera(camera, poses, views)
+
+
+def fit_camera(
+    camera: Camera,
+    poses: Sequence[RigidTransform],
+    views: Sequence[PlanarView],
+    *,
+    settled: float = SETTLED,
+) -> CameraFit:
+    """Least squares over camera and boards from where they are, `camera_from_board` of each view."""
     size = len(camera.parameters)
     solution = minimize(
-        _State(camera, poses),
+        _State(camera, tuple(poses)),
         lambda state: [
-            _corners(state.camera, pose, view, size + 6 * k)
-            for k, (pose, view) in enumerate(zip(state.poses, views, strict=True))
+            *_corners_of_all(state, views),
+            lens_prior(state.camera, np.arange(len(MATRIX), size)),
         ],
         _State.moved,
         unknowns=size + 6 * len(views),
+        settled=settled,
     )
-    residuals = [block.residuals.reshape(-1, 2) for block in solution.blocks]
-    weights = np.concatenate(solution.weights)[::2]
-    squared = np.sum(np.concatenate(residuals) ** 2, axis=1)
-    shots = [view.shot for view in views]
-    return CameraCalibration(
+    return CameraFit(
         solution.state.camera,
+        solution.state.poses,
+        tuple(block.residuals.reshape(-1, 2) for block in solution.blocks[:-1]),
+        tuple(weights[::2] for weights in solution.weights[:-1]),
         solution.variance * solution.covariance[:size, :size],
-        dict(zip(shots, solution.state.poses, strict=True)),
-        dict(zip(shots, residuals, strict=True)),
-        float(np.sqrt(np.sum(weights * squared) / np.sum(weights))),
     )
 
 
-def locate_board(camera: Camera, view: PlanarView) -> tuple[RigidTransform, Array]:
+def weighted_rms(residuals: Sequence[Array], weights: Sequence[Array]) -> float:
+    """Of distances (N, 2) px with weights (N,), view by view."""
+    weight = np.concatenate(weights)
+    squared = np.sum(np.concatenate(residuals) ** 2, axis=1)
+    return float(np.sqrt(np.sum(weight * squared) / np.sum(weight)))
+
+
+def lens_prior(camera: Camera, columns: Indices) -> Block:
+    """What is known of the lens beforehand: that it bends little. Keeps coefficients that the boards
+    leave open, or only the sum of, from running off; `columns` are theirs."""
+    known = 1.0 / camera.lens.prior_sigmas
+    return Block(known * camera.lens.coefficients, lambda: np.diag(known), columns, EXACT)
+
+
+def locate_board(
+    camera: Camera, view: PlanarView, start: RigidTransform | None = None
+) -> tuple[RigidTransform, Array]:
     """`camera_from_board` of one view for a known camera, and its residuals (N, 2) px."""
-    # A start only: where the lens folds, the pixel without its lens has to do.
-    seen = camera.rays(view.pixels)[:, :2]
-    normalized = np.where(np.isfinite(seen), seen, camera.normalized_from_pixels(view.pixels))
-    h = homography(view.points[:, :2], normalized)
+    if start is None:
+        # Where the lens folds, the pixel without its lens has to do for a start.
+        seen = camera.rays(view.pixels)[:, :2]
+        normalized = np.where(np.isfinite(seen), seen, camera.normalized_from_pixels(view.pixels))
+        start = camera_from_plane(
+            homography(view.points[:, :2], normalized), float(view.points[0, 2])
+        )
     solution = minimize(
-        camera_from_plane(h, float(view.points[0, 2])),
+        start,
         lambda pose: [_corners(camera, pose, view)],
         RigidTransform.moved,
         unknowns=6,
@@ -124,20 +209,43 @@ def _camera(matrix: Array, lens: Lens, width: int, height: int) -> Camera:
     )
 
 
-def _corners(
-    camera: Camera, pose: RigidTransform, view: PlanarView, column: int | None = None
-) -> Block:
-    """One view's reprojection errors, px; by the camera's parameters, which come first, and by its
-    board's pose from `column` on, or by the pose alone.
-    """
+def _corners_of_all(state: _State, views: Sequence[PlanarView]) -> list[Block]:
+    """Reprojection errors, px, of each view; by the camera's parameters, which come first, and by its
+    board's pose."""
+    placed = zip(state.poses, views, strict=True)
+    points = np.concatenate([pose.apply(view.points) for pose, view in placed])
+    cuts = np.cumsum([len(view.points) for view in views])[:-1]
+    seen = np.split(state.camera.project(points), cuts)
+
+    @cache
+    def linearize() -> list[Array]:
+        by_parameter, by_point = state.camera.jacobians(points)
+        jacobian = np.concatenate([by_parameter, by_point @ twist_jacobian(points)], axis=2)
+        return np.split(jacobian, cuts)
+
+    def of_view(k: int) -> Callable[[], Array]:
+        return lambda: linearize()[k].reshape(-1, size + 6)
+
+    size = len(state.camera.parameters)
+    own = np.arange(size)
+    return [
+        Block(
+            (seen[k] - view.pixels).ravel(),
+            of_view(k),
+            np.append(own, size + 6 * k + np.arange(6)),
+            CORNERS,
+        )
+        for k, view in enumerate(views)
+    ]
+
+
+def _corners(camera: Camera, pose: RigidTransform, view: PlanarView) -> Block:
+    """One view's reprojection errors, px, by its board's pose."""
     points = pose.apply(view.points)
 
     def linearize() -> Array:
-        by_parameter, by_point = camera.jacobians(points)
-        by_pose = by_point @ twist_jacobian(points)
-        every = by_pose if column is None else np.concatenate([by_parameter, by_pose], axis=2)
-        return every.reshape(-1, every.shape[2])
+        by_pose = camera.jacobians(points)[1] @ twist_jacobian(points)
+        return by_pose.reshape(-1, 6)
 
-    own = np.arange(6) + (column or 0)
-    columns = own if column is None else np.append(np.arange(len(camera.parameters)), own)
-    return Block((camera.project(points) - view.pixels).ravel(), linearize, columns, CORNERS)
+    residuals = (camera.project(points) - view.pixels).ravel()
+    return Block(residuals, linearize, slice(0, 6), CORNERS)

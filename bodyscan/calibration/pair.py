@@ -10,7 +10,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import BoundaryPoints, bin_points
-from bodyscan.calibration.camera import CameraCalibration
+from bodyscan.calibration.camera import CameraCalibration, LensTrial
 from bodyscan.calibration.joint_refinement import striped_board
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.model_selection import HeldOutModel
@@ -34,6 +34,8 @@ class PairQuality:
     distances of boundary points to their sheets, RMS (mm), over `stripe_shots` boards; boundaries
     with a sheet, of those thrown.
 
+    lenses: every kind of lens tried on held-out boards, simplest first; none where the lens was given,
+    or the boards stood in too few places.
     held_out: every model of the light tried on boards it was not fitted to, simplest first.
     refinement: of a pair by itself, whether camera, boards and light were refined together and why;
     flatness_mm: RMS of held-out boards about their own planes, before and after.
@@ -53,6 +55,7 @@ class PairQuality:
     refinement: str = ""
     flatness_mm: tuple[float, float] | None = None
     boards_mm: tuple[float, float] | None = None
+    lenses: tuple[LensTrial, ...] = ()
     imported: str = ""
     imported_sigma_px: float | None = None
 
@@ -90,14 +93,17 @@ class PairCalibration:
 class PlacedPair:
     """A pair whose camera and boards are known: what its light sheets are fitted from.
 
-    camera: as all corners of the rig have left it.  own: the camera as it was calibrated by itself.
+    camera: as all corners of the rig have left it, with the covariance of its parameters.  own: the
+    camera as it was calibrated by itself.  lenses: those that were tried.
     views: number of the board views it took part with.  shots: those on which stripes were decoded,
     with `camera_from_board` as the rig's solve has it.  alone: no other pair holds the boards.
     """
 
     name: str
     camera: Camera
+    camera_covariance: Array
     own: CameraCalibration
+    lenses: tuple[LensTrial, ...]
     projector: StripeCode | None
     rms_px: float
     views: int
@@ -107,11 +113,11 @@ class PlacedPair:
 
 def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
     """Light sheets of one pair. Raises PairFailed if its stripes cannot give any."""
-    quality = PairQuality(pair.rms_px, pair.views)
+    quality = PairQuality(pair.rms_px, pair.views, lenses=pair.lenses)
     camera, projector = pair.camera, pair.projector
     if projector is None:
         return Outcome(
-            PairCalibration(pair.name, camera, pair.own.covariance, None, quality),
+            PairCalibration(pair.name, camera, pair.camera_covariance, None, quality),
         )
     notes: tuple[str, ...] = ()
     shots = pair.shots
@@ -131,7 +137,7 @@ def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
         held_out=fit.held_out,
         boards_mm=_mean_and_rms(board_offsets(points, fit.sheets)),
     )
-    found = PairCalibration(pair.name, camera, pair.own.covariance, fit.sheets, quality)
+    found = PairCalibration(pair.name, camera, pair.camera_covariance, fit.sheets, quality)
     if pair.alone:
         # In a rig of several pairs the boards are held by all cameras together, far better than
         # one pair's stripes could.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ def calibration_table(calibration: RigCalibration) -> Table:
         "pair",
         "corners RMS px",
         "poses",
+        "lens",
         "light",
         "sheets RMS mm",
         "stripes",
@@ -44,6 +46,7 @@ def calibration_table(calibration: RigCalibration) -> Table:
             name,
             "-" if quality.corners_rms_px is None else f"{quality.corners_rms_px:.3f}",
             "-" if quality.imported else str(quality.poses),
+            pair.camera.lens.kind,
             quality.light_model or "-",
             "-" if quality.planes_rms_mm is None else f"{quality.planes_rms_mm:.3f}",
             f"{quality.stripes_calibrated} of {quality.stripes_projected}"
@@ -53,7 +56,7 @@ def calibration_table(calibration: RigCalibration) -> Table:
             "not known" if quality.unjudged else " ".join(f"{value:.3f}" for value in sigma),
         )
     for name in calibration.failed:
-        table.add_row(name, "failed", *["-"] * 6, style="red")
+        table.add_row(name, "failed", *["-"] * 7, style="red")
     return table
 
 
@@ -63,6 +66,8 @@ def calibration_figures(calibration: RigCalibration) -> dict[str, Any]:
         name: {
             "corners_rms_px": pair.quality.corners_rms_px,
             "poses": pair.quality.poses,
+            "lens": pair.camera.lens.kind,
+            "lenses_tried": [asdict(tried) for tried in pair.quality.lenses],
             "light_model": pair.quality.light_model,
             "sheets_rms_mm": pair.quality.planes_rms_mm,
             "stripes_calibrated": pair.quality.stripes_calibrated,

@@ -98,6 +98,22 @@ def with_board_shapes(
     return replace(shaped, notes=(f"{sizes}: used, {figures}",))
 
 
+def with_same_shapes(
+    views: Sequence[LocatedView], solution: JointSolution, found: ShapedSolution, *, root: str
+) -> ShapedSolution:
+    """Shapes estimated anew where `found` has some: with other lenses, or other views."""
+    if not found.shapes:
+        return replace(found, solution=solution, views=list(views))
+    return replace(_estimate(views, solution, root, True), notes=found.notes)
+
+
+def in_shape(view: LocatedView, shapes: Mapping[str, BoardShape]) -> LocatedView:
+    """The view with its corners where they lie on a board of that shape."""
+    if view.board not in shapes:
+        return view
+    return replace(view, points=shapes[view.board].applied(view.points))
+
+
 def _said(name: str, shape: BoardShape) -> str:
     across, down = shape.stretch
     return (
@@ -224,8 +240,7 @@ def _held_out(
         bent = _estimate(others, flat, root, refine_cameras)
         for target in held:
             own = [view for view in views if view.target == target]
-            true = [replace(v, points=bent.shapes[v.board].applied(v.points))
-                    if v.board in bent.shapes else v for v in own]  # fmt: skip
+            true = [in_shape(view, bent.shapes) for view in own]
             placing = solution.root_from_board[target]
             before = fit_board(own, flat, placing).rms_px
             after = fit_board(true, bent.solution, placing).rms_px

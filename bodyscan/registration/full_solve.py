@@ -15,6 +15,8 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.camera import lens_prior
+from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, minimize
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.normal_equations import CORNERS, corners_seen
@@ -89,15 +91,21 @@ def _blocks(
         yield Block(residuals, linearize, columns, CORNERS)
     if unknowns.refine_cameras:
         for name, own in unknowns.of_camera.items():
-            # About where it stands: it does not pull, but keeps what no view shows from running off.
-            known = np.diag(1.0 / solution.cameras[name].prior_sigmas)
-            yield Block(np.zeros(len(own)), _constant(known), own, EXACT)
+            yield from camera_priors(solution.cameras[name], own)
+
+
+def camera_priors(camera: Camera, own: Indices) -> Iterator[Block]:
+    """What is known of a camera, whose parameters' columns are `own`, beforehand.
+
+    Its matrix about where it stands: that does not pull, but keeps what no view shows from running
+    off. Its lens as `lens_prior` has it.
+    """
+    matrix, lens = own[: len(MATRIX)], own[len(MATRIX) :]
+    known = np.diag(1.0 / camera.prior_sigmas[: len(MATRIX)])
+    yield Block(np.zeros(len(MATRIX)), lambda: known, matrix, EXACT)
+    yield lens_prior(camera, lens)
 
 
 def _without_motion(linearize: Callable[[], Array]) -> Callable[[], Array]:
     """Of the root camera, which holds the frame."""
     return lambda: linearize()[:, 6:]
-
-
-def _constant(jacobian: Array) -> Callable[[], Array]:
-    return lambda: jacobian

@@ -158,8 +158,9 @@ def _placed_by(
     Raises FailedWork if the holder does."""
     held = rig.model_copy(update={"rig_frame": RigFrame(pair=holder)})
     views = [view for view in placed.views if view.shot in shots and view.pair in names]
+    cameras = {name: placed.cameras[name] for name in names}
     try:
-        half = solve_rig(held, views, {name: placed.cameras[name] for name in names}).value
+        half = solve_rig(held, views, cameras, choose=False).value
     except BadInput as error:
         raise FailedWork(f"{holder} does not fit the others in a half of the shots") from error
     to_rig = placed.rig_from_camera[holder] @ half.rig_from_camera[holder].inverse()

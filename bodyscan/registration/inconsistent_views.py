@@ -77,7 +77,7 @@ def find_inconsistent_views(
     found = [
         _examine_board(group, solution, limit_px)
         for _, group in sorted(groups.items())
-        if max(_error(view, solution) for view in group) > limit_px
+        if max(_error(view, solution, _placing(group, solution)) for view in group) > limit_px
     ]
     sizes = tuple(size for one in found for size in one.sizes)
     return InconsistentViews(
@@ -104,12 +104,12 @@ def _examine_board(
 ) -> InconsistentViews:
     """Which of one board's views at one moment are wrong, since not all of them can be true."""
     shot, board = group[0].target
-    start = solution.root_from_board[group[0].target]
+    start = _placing(group, solution)
     own = [fit_board([view], solution, start).rms_px[0] for view in group]
     bad = [view for view, error in zip(group, own, strict=True) if error > limit_px]
     notes = [
         f"{view.pair}: board {board} in shot {shot} fits no pose "
-        f"({error:.2f} px); corners may be mixed up; not used"
+        f"({error:.2f} px) with any lens that the other views allow; corners may be mixed up; not used"
         for view, error in zip(group, own, strict=True)
         if error > limit_px
     ]
@@ -128,8 +128,8 @@ def _examine_board(
     others = [view for view in kept if view not in agreeing]
     said = (
         f"shot {shot}: board {board} stood elsewhere when {_names(others)} saw it "
-        f"({together.rms_px.max():.2f} px off, usual is below {limit_px:.2f}): it moved, or the "
-        "pictures were not taken together; not used"
+        f"({together.rms_px.max():.2f} px off, usual is below {limit_px:.2f}, whatever the lens): it "
+        "moved, or the pictures were not taken together; not used"
     )
     return InconsistentViews((*bad, *others), (*notes, said))
 
@@ -208,11 +208,17 @@ def _corners(
     return Block(residuals, linearize, slice(0, unknowns), CORNERS)
 
 
-def _error(view: LocatedView, solution: JointSolution) -> float:
+def _error(view: LocatedView, solution: JointSolution, placing: RigidTransform) -> float:
     camera_from_root = solution.root_from_camera[view.pair].inverse()
-    camera_from_board = camera_from_root @ solution.root_from_board[view.target]
+    camera_from_board = camera_from_root @ placing
     seen = solution.cameras[view.pair].project(camera_from_board.apply(view.points))
     return _rms(seen - view.pixels)
+
+
+def _placing(group: Sequence[LocatedView], solution: JointSolution) -> RigidTransform:
+    """Of the views' board; where none of them took part in the solve, the first one's own."""
+    own = solution.root_from_camera[group[0].pair] @ group[0].camera_from_board
+    return solution.root_from_board.get(group[0].target, own)
 
 
 def _rms(residuals: Array) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -62,15 +63,28 @@ class NormalEquations:
     def free(self) -> Indices:
         return np.setdiff1d(np.arange(len(self.matrix)), self.held)
 
-    def covariance(self) -> PoseCovariance:
-        """Of the pairs' motions, the corners' variance taken from the residuals."""
+    @cached_property
+    def full_covariance(self) -> Array:
+        """Of all unknowns, the corners' variance taken from the residuals."""
         free = self.free
         full = np.zeros(self.matrix.shape)
         full[np.ix_(free, free)] = self.variance_px2 * invert_scaled(
             self.matrix[np.ix_(free, free)]
         )
+        return full
+
+    def covariance(self) -> PoseCovariance:
+        """Of the pairs' motions."""
         pairs = slice(0, self.first_board)
-        return PoseCovariance(self.names, full[pairs, pairs])
+        return PoseCovariance(self.names, self.full_covariance[pairs, pairs])
+
+    def camera_covariances(self) -> dict[str, Array]:
+        """(P, P) of each camera's parameters; none of cameras that were held."""
+        return {
+            name: self.full_covariance[np.ix_(own, own)]
+            for name, own in zip(self.names, self.camera_columns, strict=True)
+            if len(own)
+        }
 
     def without_boards(self) -> Array:
         """Information on pairs and cameras, the boards eliminated.

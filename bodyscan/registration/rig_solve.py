@@ -9,19 +9,31 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.camera import LensTrial
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
-from bodyscan.registration.board_shape import BoardShape, ShapedSolution, with_board_shapes
-from bodyscan.registration.full_solve import solve_fully
+from bodyscan.registration.board_shape import (
+    BoardShape,
+    ShapedSolution,
+    in_shape,
+    with_board_shapes,
+    with_same_shapes,
+)
+from bodyscan.registration.consistent_solve import (
+    ConsistentSolve,
+    solve_consistently,
+    view_key,
+)
 from bodyscan.registration.inconsistent_views import (
     error_limit,
     find_inconsistent_views,
@@ -30,6 +42,7 @@ from bodyscan.registration.inconsistent_views import (
 from bodyscan.registration.joint_solve import JointSolution, solve_jointly
 from bodyscan.registration.normal_equations import CORNERS, normal_equations
 from bodyscan.registration.rig_frame import frame_board_turn, frame_target, rig_from_root
+from bodyscan.registration.rig_lenses import choose_lenses, lens_notes
 from bodyscan.registration.view_graph import (
     Target,
     initial_poses,
@@ -39,10 +52,11 @@ from bodyscan.registration.view_graph import (
 )
 from bodyscan.rig.rig import Rig
 
-LOSS_PX = 0.3
+LOSSES_PX = (10.0, 0.3)
+"""First as wide as a start from one wrong view is off: with the second alone a pair stays with the
+few views that it was placed by, and all others seem wrong."""
 COARSE_PX = 30.0
 """What a view may be off where only the graph has placed the pairs."""
-ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +64,9 @@ class RigSolution:
     """Everything in the rig frame; cameras as the joint solve left them; rms_px of each pair.
 
     views: those used, their points where the boards' corners really lie.  board_shapes: of boards
-    that are not as described, where others' views confirm it.
+    that are not as described, where others' views confirm it.  lenses: those tried on held-out
+    boards, by camera; of cameras whose lens was open.  camera_covariances: (P, P) of each camera's
+    parameters, where the solve refined them.
     """
 
     rig_from_camera: dict[str, RigidTransform]
@@ -60,24 +76,33 @@ class RigSolution:
     rms_px: dict[str, float]
     views: tuple[LocatedView, ...]
     board_shapes: dict[str, BoardShape]
+    lenses: dict[str, tuple[LensTrial, ...]] = field(default_factory=dict)
+    camera_covariances: dict[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    solution: JointSolution
-    views: list[LocatedView]
+    """judged: the last solve of boards as they are; shaped: that solve with the shapes found for
+    them, and its views; dropped: views left out.  lenses: those tried, by camera."""
+
+    judged: ConsistentSolve
+    shaped: ShapedSolution
     dropped: list[LocatedView]
-    notes: list[str]
+    lenses: dict[str, tuple[LensTrial, ...]]
 
 
 def solve_rig(
     rig: Rig,
     views: Sequence[LocatedView],
     cameras: Mapping[str, Camera],
+    *,
+    choose: bool = True,
 ) -> Outcome[RigSolution]:
     """Join all pairs by their shared board views.
 
-    Pairs that agree with the others in too few shots to be placed are failures.
+    cameras: with the richest lens to be tried; of those whose lens the rig file leaves open, held-out
+    boards choose unless `choose` is False.  Pairs that agree with the others in too few shots to be
+    placed are failures.
 
     Raises RigDisconnected if groups of pairs share no view, only views whose board numbering leaves
     their poses open, or only views that contradict each other; BadInput if nothing fixes the rig
@@ -87,8 +112,8 @@ def solve_rig(
     while True:
         names = sorted(start)
         own = [view for view in views if view.pair in start]
-        solved = _solve(own, {n: cameras[n] for n in names}, start)
-        strangers = _strangers(solved)
+        solved = _solve(rig, own, {n: cameras[n] for n in names}, start, choose)
+        strangers = _strangers(solved.shaped.views, solved.dropped)
         if not strangers:
             break
         if 2 * len(strangers) >= len(names):
@@ -99,71 +124,78 @@ def solve_rig(
             )
         left_out |= {name: not_together([name]) for name in strangers}
         start = {name: placing for name, placing in start.items() if name not in strangers}
-    refine = len(start) > 1
-    shaped = ShapedSolution(solved.solution, solved.views, {}, ())
-    if refine:
-        root = min(start)
-        shaped = with_board_shapes(solved.views, solved.solution, root=root, refine_cameras=True)
-    placed = _placed(rig, shaped, refine)
-    return Outcome(placed, (*solved.notes, *shaped.notes), left_out)
+    placed = _placed(rig, solved, len(start) > 1)
+    notes = (*solved.judged.notes, *solved.shaped.notes, *lens_notes(solved.lenses))
+    return Outcome(placed, notes, left_out)
 
 
 def _solve(
+    rig: Rig,
     views: Sequence[LocatedView],
     cameras: dict[str, Camera],
     start: Mapping[str, RigidTransform],
+    choose: bool,
 ) -> _Solved:
-    """Solve, take out what cannot be true, solve again."""
+    """Solve with the richest lenses, take out what cannot be true, choose the lenses, solve again and
+    take back in what fits after all."""
     names = sorted(start)
     graph = view_graph(views, names)
     root = max(names, key=lambda name: (graph.degree(name), name))
     to_root = start[root].inverse()
     placed = {name: to_root @ placing for name, placing in start.items()}
-    kept, boards, doubtful = place_boards(views, placed)
+    resolved, boards, doubtful = place_boards(views, placed)
     solution = JointSolution(placed, boards, cameras)
     gross = find_inconsistent_views(
-        [view for view in kept if view.target in doubtful], solution, COARSE_PX
-    )
-    notes, dropped = list(gross.notes), list(gross.wrong)
-    kept = [view for view in kept if view not in gross.wrong]
-    limit = error_limit(single_view_errors(kept, cameras))
+        [view for view in resolved if view.target in doubtful], solution, COARSE_PX
+    ).wrong
+    kept = [view for view in resolved if view not in gross]
     # One camera alone was solved with its skew already; nothing is left to join.
-    refine = len(names) > 1
-    solution = solve_jointly(kept, solution, root=root, refine_cameras=refine, loss_px=LOSS_PX)
-    for _ in range(ROUNDS):
-        solution = solve_fully(kept, solution, root=root, refine_cameras=refine)
-        found = find_inconsistent_views(kept, solution, limit)
-        if not found.wrong:
-            break
-        notes += found.notes
-        dropped += found.wrong
-        kept = [view for view in kept if view not in found.wrong]
-        if 2 * len(found.wrong) > len(kept):
-            break  # whole cameras are wrong, see `_strangers`
-        seen = {view.target for view in kept}
-        solution = replace(
-            solution,
-            root_from_board={k: t for k, t in solution.root_from_board.items() if k in seen},
-        )
-    return _Solved(solution, kept, dropped, notes)
+    several = len(names) > 1
+    for loss_px in LOSSES_PX:
+        solution = solve_jointly(kept, solution, root=root, refine_cameras=several, loss_px=loss_px)
+    solve = partial(
+        solve_consistently,
+        root=root,
+        refine_cameras=several,
+        limit_px=error_limit(single_view_errors(kept, cameras)),
+    )
+    judged = solve(resolved, solution, wrong=[view_key(view) for view in gross])
+    shaped = ShapedSolution(judged.solution, judged.kept(resolved), {}, ())
+    trials: dict[str, tuple[LensTrial, ...]] = {}
+    # With strangers among them all are solved again.
+    if several and not _strangers(shaped.views, _dropped(resolved, judged)):
+        shaped = with_board_shapes(shaped.views, judged.solution, root=root, refine_cameras=True)
+        solution = shaped.solution
+        if choose:
+            solution, trials = choose_lenses(rig, shaped.views, solution)
+        if trials or shaped.shapes:
+            true = [in_shape(view, shaped.shapes) for view in resolved]
+            judged = solve(true, solution, wrong=judged.wrong)
+            shaped = with_same_shapes(judged.kept(resolved), judged.solution, shaped, root=root)
+    return _Solved(judged, shaped, _dropped(resolved, judged), trials)
 
 
-def _strangers(solved: _Solved) -> list[str]:
+def _dropped(views: Sequence[LocatedView], judged: ConsistentSolve) -> list[LocatedView]:
+    return [view for view in views if view_key(view) in judged.wrong]
+
+
+def _strangers(kept: Sequence[LocatedView], dropped: Sequence[LocatedView]) -> list[str]:
     """Pairs most of whose shared views had to be taken out."""
-    everything = [*solved.views, *solved.dropped]
+    everything = [*kept, *dropped]
     count = Counter(view.target for view in everything)
     shared = Counter(view.pair for view in everything if count[view.target] > 1)
-    out = Counter(view.pair for view in solved.dropped if count[view.target] > 1)
+    out = Counter(view.pair for view in dropped if count[view.target] > 1)
     return sorted(name for name, number in shared.items() if 2 * out[name] > number)
 
 
-def _placed(rig: Rig, solved: ShapedSolution, refine: bool) -> RigSolution:
+def _placed(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
     """The solution carried into the rig frame, with its covariance there."""
-    solution, kept = _frame_board_turned(rig, solved.solution, solved.views)
+    shaped = solved.shaped
+    solution, kept = _frame_board_turned(rig, shaped.solution, shaped.views)
     to_rig = rig_from_root(rig, solution.root_from_camera, solution.root_from_board)
     rig_from_camera = {name: to_rig @ t for name, t in solution.root_from_camera.items()}
     rig_from_board = {target: to_rig @ t for target, t in solution.root_from_board.items()}
-    covariance = normal_equations(
+    equations = normal_equations(
         kept,
         solution.cameras,
         rig_from_camera,
@@ -171,7 +203,7 @@ def _placed(rig: Rig, solved: ShapedSolution, refine: bool) -> RigSolution:
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
         fixed_target=frame_target(rig),
         cameras_free=refine,
-    ).covariance()
+    )
     rms = {
         name: _robust_rms(
             [
@@ -186,10 +218,12 @@ def _placed(rig: Rig, solved: ShapedSolution, refine: bool) -> RigSolution:
         rig_from_camera,
         rig_from_board,
         solution.cameras,
-        covariance,
+        equations.covariance(),
         rms,
         tuple(kept),
-        solved.shapes,
+        shaped.shapes,
+        solved.lenses,
+        equations.camera_covariances(),
     )
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
 
+from bodyscan.calibration.camera import LensTrial
+from bodyscan.calibration.lens_choice import FEWEST_PLACES
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import FILE_NAME, calibration_id, load_calibration
 from bodyscan.report import calibration_charts as draw
@@ -133,11 +136,36 @@ def _pairs(figures: list[PairFigures], calibration: RigCalibration) -> Section:
             limits.SIGMA_MM,
         ),
         Column("light", "", "model of the light sheets, chosen by held-out boards."),
+        Column("lens", "", "chosen by held-out boards, or named in the rig file; see below."),
     )
     rows = tuple(
-        (*astuple(one), calibration.pairs[one.name].quality.light_model) for one in figures
+        (
+            *astuple(one),
+            calibration.pairs[one.name].quality.light_model,
+            calibration.pairs[one.name].camera.lens.kind,
+        )
+        for one in figures
     )
-    return Section("Pairs", [Table(columns, rows)])
+    return Section("Pairs", [Table(columns, rows), Lines(tuple(_lens_lines(calibration)))])
+
+
+def _lens_lines(calibration: RigCalibration) -> Iterator[str]:
+    """How each lens that was tried did on boards it was not fitted to."""
+    for name, pair in calibration.pairs.items():
+        tried = pair.quality.lenses
+        if not tried:
+            yield (
+                f"{name}: lens {pair.camera.lens.kind}; none was tried on held-out boards (it was "
+                f"given, or boards stood in fewer than {FEWEST_PLACES} places of the picture)"
+            )
+            continue
+        figures = "; ".join(_lens_figure(one) for one in tried)
+        yield f"{name}: lens {pair.camera.lens.kind}; held-out corners, RMS: {figures}"
+
+
+def _lens_figure(tried: LensTrial) -> str:
+    gain = "" if tried.gain is None else f" ({tried.gain:+.1f} standard errors better)"
+    return f"{tried.kind} {tried.rms_px:.3f} px{gain}"
 
 
 def _advice(calibration: RigCalibration) -> Section:

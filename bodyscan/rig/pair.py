@@ -15,9 +15,14 @@ from bodyscan.stripes.codes import AnyStripeCode
 Pixels = Annotated[int, Field(gt=0, le=32767)]
 
 
-class CameraSpec(Model):
-    """Image size in pixels, and what its files hold.
+AUTO = "auto"
+"""Held-out boards choose."""
 
+
+class CameraSpec(Model):
+    """Image size in pixels, the kind of its lens, and what its files hold.
+
+    lens: a kind of lens; auto: held-out boards choose.
     bits: of a grey level, where files of 16 bits a sample hold fewer and their numbers do not show it.
     channel: which colour of a colour image counts; grey: all of them, as bright as they look.
     """
@@ -26,6 +31,15 @@ class CameraSpec(Model):
     height: Pixels
     bits: Annotated[int, Field(ge=8, le=16)] | None = None
     channel: Literal["grey", "red", "green", "blue"] = "grey"
+    lens: str = AUTO
+
+    def problems(self) -> Iterator[Problem]:
+        if self.lens == AUTO:
+            return
+        from bodyscan.geometry.lenses import LENSES  # which is heavier than a rig file
+
+        if self.lens not in LENSES:
+            yield ("lens",), f"must be one of {', '.join((AUTO, *LENSES))} (got {self.lens!r})"
 
 
 class NominalPose(Model):

@@ -154,7 +154,9 @@ def _placed_pair(
     return PlacedPair(
         name,
         placed.cameras[name],
+        placed.camera_covariances.get(name, own.covariance),
         own,
+        placed.lenses.get(name, own.lenses),
         rig.pair(name).projector,
         placed.rms_px[name],
         len(views),

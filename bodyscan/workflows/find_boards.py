@@ -14,11 +14,14 @@ from bodyscan.calibration.board_views import (
     planar_view,
 )
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
+from bodyscan.calibration.lens_choice import calibrate_with_best_lens
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_board_image
 from bodyscan.errors import BodyscanError
+from bodyscan.geometry.lenses import LENSES, RICHEST
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, threaded
+from bodyscan.rig.pair import AUTO
 from bodyscan.rig.rig import Rig
 
 NO_POSE_PX = 1.0
@@ -52,13 +55,21 @@ def find_all_boards(
 def calibrate_cameras(
     rig: Rig, views: Sequence[BoardView], progress: Progress = silent
 ) -> Outcome[dict[str, CameraCalibration]]:
-    """Every pair's camera by itself; those that cannot be calibrated are failures."""
+    """Every pair's camera by itself; those that cannot be calibrated are failures.
+
+    Lenses are those that the rig file names. Otherwise a pair alone gets the one that its held-out
+    boards choose; pairs of a rig get the richest, since the joint solve chooses.
+    """
 
     def calibrate(name: str) -> CameraCalibration:
         spec = rig.pair(name).camera
         own = [v for v in views if v.pair == name and has_enough_corners(v, rig.board(v.board))]
         planar = [planar_view(view, rig.board(view.board)) for view in own]
-        return calibrate_camera(planar, spec.width, spec.height)
+        if spec.lens != AUTO:
+            return calibrate_camera(planar, spec.width, spec.height, LENSES[spec.lens]())
+        if len(rig.pairs) == 1:
+            return calibrate_with_best_lens(planar, spec.width, spec.height)
+        return calibrate_camera(planar, spec.width, spec.height, RICHEST())
 
     names = [pair.name for pair in rig.pairs]
     cameras, errors = attempt_each(

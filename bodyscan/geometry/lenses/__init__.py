@@ -12,6 +12,15 @@ LENSES: dict[str, type[Lens]] = {lens.kind: lens for lens in (Radial, Brown, Rat
 """By their names in files, the simplest first; of those that have given coefficients of OpenCV's the
 first is taken."""
 
+FAMILY: tuple[type[Lens], ...] = (Radial, Brown, Rational)
+"""Those that a camera is tried with, each with all coefficients of the one before it and more."""
+RICHEST = FAMILY[-1]
+
+
+def family_up_to(kind: type[Lens]) -> tuple[type[Lens], ...]:
+    """Those of the family up to a kind; it alone if it is not of the family."""
+    return FAMILY[: FAMILY.index(kind) + 1] if kind in FAMILY else (kind,)
+
 
 def lens_from_opencv(coefficients: Array) -> Lens:
     """The lens with OpenCV's distortion coefficients k1, k2, p1, p2, k3, ... (5,) or more.

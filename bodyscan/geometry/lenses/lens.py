@@ -20,6 +20,9 @@ NEWTON_STEPS = 20
 """Five or six reach rounding; it takes more close to where a lens folds."""
 SETTLED, NOT_FOUND = 1e-14, 1e-9
 """A millionth of a pixel is 1e-9."""
+NEAREST_STEPS = 3
+NEAREST_HOLD = 1e-5
+"""What the points leave open of the nearest lens stays small: by a hundredth of a pixel a sigma."""
 FARTHEST, DIRECTIONS = 20.0, 16
 """A lens is looked at up to 87 degrees from its axis, all around it."""
 
@@ -70,6 +73,19 @@ class Lens(ABC):
     @abstractmethod
     def by_point(self, ideal: Array) -> Array:
         """Derivatives (..., 2, 2) of real points by the ideal ones (..., 2)."""
+
+    def nearest(self, other: Lens, ideal: Array) -> Self:
+        """The lens of this kind that bends the points (N, 2) most as `other` does, from this one on."""
+        lens, wanted = self, other.distort(ideal)
+        for _ in range(NEAREST_STEPS):
+            by_coefficient = lens.by_coefficients(ideal).reshape(-1, len(lens.names))
+            missing = (wanted - lens.distort(ideal)).ravel()
+            held = np.diag(NEAREST_HOLD / lens.prior_sigmas)
+            rows = np.concatenate([by_coefficient, held])
+            right = np.concatenate([missing, -held @ lens.coefficients])
+            step = np.linalg.lstsq(rows, right, rcond=None)[0]
+            lens = lens.with_coefficients(lens.coefficients + step)
+        return lens
 
     @property
     def reach(self) -> float:

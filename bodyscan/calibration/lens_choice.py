@@ -1,0 +1,179 @@
+"""Which lens a camera needs, found from boards that it was not fitted to.
+
+A richer lens is taken where it shows boards that took no part better than the simpler one does, by
+more than chance makes of it. Their poses are fitted to either lens, so that nothing but the lens
+differs; boards near one another are held out together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bodyscan.arrays import Array, Indices
+from bodyscan.calibration.board_views import PlanarView
+from bodyscan.calibration.camera import (
+    CORNERS,
+    CameraCalibration,
+    CameraFit,
+    LensTrial,
+    fit_camera,
+    fit_from_scratch,
+    locate_board,
+    weighted_rms,
+)
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import RICHEST, family_up_to
+from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.transforms import RigidTransform
+
+CLEARLY = 3.0
+"""Standard errors by which a richer lens has to do better: by chance once in 700 cameras."""
+FEWEST_PLACES = 4
+"""Without one of them a camera still has the three that it needs."""
+MOST_FOLDS = 6
+SETTLED = 1e-2
+"""Variances: a tenth of a standard deviation of the camera changes nothing of what is held out."""
+NEAR = 0.05
+"""Boards are at one place where corners moved by less than this share of the board's own size in the
+picture: they try the lens where it was tried before."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenLens:
+    """The camera fitted with the lens chosen, and how each lens did; no trials: too few places."""
+
+    fit: CameraFit
+    trials: tuple[LensTrial, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldOut:
+    """Residuals (N, 2) px of each view, from fits without it."""
+
+    residuals: tuple[Array, ...]
+
+    @property
+    def spread(self) -> float:
+        return CORNERS.spread_of(np.concatenate(self.residuals).ravel())
+
+
+def calibrate_with_best_lens(
+    views: Sequence[PlanarView], width: int, height: int
+) -> CameraCalibration:
+    """As `calibrate_camera`, with the lens of the family that held-out boards choose.
+
+    Raises DegeneratePoses as it does.
+    """
+    start = fit_from_scratch(views, width, height, RICHEST())
+    chosen = choose_lens(start.camera, start.poses, views)
+    return chosen.fit.calibration(views, chosen.trials)
+
+
+def choose_lens(
+    camera: Camera, poses: Sequence[RigidTransform], views: Sequence[PlanarView]
+) -> ChosenLens:
+    """The simplest lens of the family that no richer one clearly beats, up to the camera's own.
+
+    camera: with the richest lens to be tried; poses: `camera_from_board` of each view, about.
+    """
+    kinds = family_up_to(type(camera.lens))
+    place = places(views)
+    if len(set(place)) < FEWEST_PLACES:
+        return ChosenLens(_fit(kinds[0], camera, poses, views), ())
+    chosen = _fit(kinds[0], camera, poses, views)
+    held = _hold_out(chosen, views, place)
+    trials: list[tuple[CameraFit, _HeldOut, float | None]] = [(chosen, held, None)]
+    for kind in kinds[1:]:
+        tried = _fit(kind, camera, poses, views)
+        out = _hold_out(tried, views, place)
+        gain = _gain(held, out, place)
+        trials.append((tried, out, gain))
+        if gain < CLEARLY:
+            break  # the next has all coefficients of this one, and more
+        chosen, held = tried, out
+    weights = _weights([out for _, out, _ in trials])
+    told = tuple(
+        LensTrial(fit.camera.lens.kind, weighted_rms(out.residuals, weights), gain, fit is chosen)
+        for fit, out, gain in trials
+    )
+    return ChosenLens(chosen, told)
+
+
+def _fit(
+    kind: type[Lens], camera: Camera, poses: Sequence[RigidTransform], views: Sequence[PlanarView]
+) -> CameraFit:
+    ideal = np.concatenate(
+        [pose.apply(view.points) for pose, view in zip(poses, views, strict=True)]
+    )
+    lens = kind().nearest(camera.lens, ideal[:, :2] / ideal[:, 2:])
+    return fit_camera(replace(camera, lens=lens), poses, views)
+
+
+def places(views: Sequence[PlanarView]) -> Indices:
+    """(V,) number of the place in the picture at which each view shows its board; the views of one
+    shot share theirs."""
+    found: list[PlanarView] = []
+    number = np.zeros(len(views), np.int64)
+    of_shot: dict[str, int] = {}
+    for k, view in enumerate(views):
+        near = (n for n, first in enumerate(found) if _near(first, view))
+        number[k] = of_shot.get(view.shot, next(near, len(found)))
+        of_shot.setdefault(view.shot, int(number[k]))
+        found += [view] if number[k] == len(found) else []
+    return number
+
+
+def _near(first: PlanarView, second: PlanarView) -> bool:
+    """Whether most of the corners that both show hardly moved."""
+    number = {tuple(point): k for k, point in enumerate(np.round(first.points, 6).tolist())}
+    both = [(number.get(tuple(p)), k) for k, p in enumerate(np.round(second.points, 6).tolist())]
+    shared = np.array([pair for pair in both if pair[0] is not None])
+    if not len(shared):
+        return False
+    moved = np.linalg.norm(first.pixels[shared[:, 0]] - second.pixels[shared[:, 1]], axis=1)
+    return bool(np.median(moved) < NEAR * np.linalg.norm(np.ptp(first.pixels, axis=0)))
+
+
+def _hold_out(fit: CameraFit, views: Sequence[PlanarView], place: Indices) -> _HeldOut:
+    """Each place, or one of MOST_FOLDS groups of them, in turn left out of a fit from `fit` on."""
+    residuals: list[Array] = [np.empty(0)] * len(views)
+    fold = place % MOST_FOLDS
+    for number in np.unique(fold):
+        rest = np.flatnonzero(fold != number).tolist()
+        others = fit_camera(
+            fit.camera,
+            [fit.poses[k] for k in rest],
+            [views[k] for k in rest],
+            settled=SETTLED,
+        ).camera
+        for k in np.flatnonzero(fold == number).tolist():
+            residuals[k] = locate_board(others, views[k], fit.poses[k])[1]
+    return _HeldOut(tuple(residuals))
+
+
+def _weights(held: Sequence[_HeldOut]) -> list[Array]:
+    """(N,) of each view's corners: those that no lens explains count for less."""
+    spread = min(one.spread for one in held)
+    least = [
+        np.min([np.sum(one.residuals[k] ** 2, axis=1) for one in held], axis=0)
+        for k in range(len(held[0].residuals))
+    ]
+    return [CORNERS.weights(np.repeat(np.sqrt(own / 2.0), 2) / spread)[::2] for own in least]
+
+
+def _gain(simple: _HeldOut, rich: _HeldOut, place: Indices) -> float:
+    """By how many standard errors the richer lens lowers the squares of what is held out.
+
+    With residuals s = r + d the squares differ by d^2 + 2 r d: the first is what the lenses differ,
+    the second what the corners' noise adds, whose standard error is that of the places' sums: they
+    err independently, the corners of one board do not.
+    """
+    gained, noise = 0.0, np.zeros(place.max() + 1)
+    weights = _weights([simple, rich])
+    for s, r, weight, number in zip(simple.residuals, rich.residuals, weights, place, strict=True):
+        gained += float(np.sum(weight[:, None] * (s**2 - r**2)))
+        noise[number] += float(np.sum(weight[:, None] * 2.0 * r * (s - r)))
+    return gained / max(float(np.sqrt(np.sum(noise**2))), 1e-12)

@@ -1,0 +1,89 @@
+"""Held-out boards choose the lens: the simplest that shows them as well as any."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.calibration.board_views import PlanarView
+from bodyscan.calibration.lens_choice import calibrate_with_best_lens, places
+from bodyscan.errors import DegeneratePoses
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.brown import Brown
+from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.rational import Rational
+from bodyscan.geometry.transforms import RigidTransform
+
+WIDTH, HEIGHT, FOCAL = 1280, 1024, 800.0
+NOISE_PX = 0.05
+POINTS = np.array([[24.0 * x, 24.0 * y, 0.0] for y in range(10) for x in range(7)])
+MIDDLE = np.array([72.0, 108.0, 0.0])
+
+
+def seen(lens: Lens, *, shots: int = 12, seed: int = 0, again: int = 1) -> list[PlanarView]:
+    """Boards all over the picture, each `again` times in the same place."""
+    rng = np.random.default_rng(seed)
+    camera = Camera(FOCAL, FOCAL + 1.0, -0.5, 645.0, 508.0, lens, WIDTH, HEIGHT)
+    views: list[PlanarView] = []
+    while len(views) < shots * again:
+        tilt = RigidTransform.from_rotation_vector(rng.normal(0.0, 0.35, 3), np.zeros(3))
+        depth = rng.uniform(350.0, 600.0)
+        where = depth * np.array([*rng.uniform([-0.5, -0.35], [0.5, 0.35]), 1.0])
+        placed = RigidTransform(tilt.rotation, where - tilt.rotation @ MIDDLE).apply(POINTS)
+        pixels = camera.project(placed)
+        inside = np.all((pixels > 3.0) & (pixels < [WIDTH - 4.0, HEIGHT - 4.0]), axis=1)
+        inside &= np.linalg.norm(placed[:, :2] / placed[:, 2:], axis=1) < lens.reach
+        if inside.sum() < 30:
+            continue
+        for _ in range(again):
+            noisy = pixels[inside] + rng.normal(0.0, NOISE_PX, (inside.sum(), 2))
+            views.append(PlanarView(f"s{len(views)}", POINTS[inside], noisy))
+    return views
+
+
+CASES = [
+    (Radial(-0.3, 0.1), "radial"),
+    (Brown(-0.3, 0.1, 1.5e-3, -1e-3, 0.0), "brown"),
+    # Its radial factor levels out towards the corners, where no polynomial of three terms does.
+    (Rational(0.2, 0.05, 0.0, 0.0, 0.0, 1.1, 0.3, 0.0), "rational"),
+]
+
+
+@pytest.mark.parametrize(("lens", "kind"), CASES)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_lens_that_there_is_is_chosen(lens: Lens, kind: str, seed: int) -> None:
+    found = calibrate_with_best_lens(seen(lens, shots=16, seed=seed), WIDTH, HEIGHT)
+    assert found.camera.lens.kind == kind
+    (chosen,) = (tried for tried in found.lenses if tried.chosen)
+    assert chosen.kind == kind
+    # Corners err by NOISE_PX in u and v, boards held out hardly more: their poses are fitted to them.
+    assert chosen.rms_px == pytest.approx(np.sqrt(2.0) * NOISE_PX, rel=0.15)
+    simpler = found.lenses[: found.lenses.index(chosen)]
+    assert all(one.rms_px > chosen.rms_px for one in simpler)
+
+
+def test_a_board_whose_corners_are_mixed_up_does_not_choose() -> None:
+    views = seen(Radial(-0.3, 0.1), shots=14)
+    mixed = views[3].pixels[np.random.default_rng(0).permutation(len(views[3].pixels))]
+    views[3] = PlanarView(views[3].shot, views[3].points, mixed)
+    assert calibrate_with_best_lens(views, WIDTH, HEIGHT).camera.lens.kind == "radial"
+
+
+def test_boards_that_stood_still_are_one_place() -> None:
+    views = seen(Radial(-0.3, 0.1), shots=5, again=3)
+    assert len(set(places(views).tolist())) <= 5
+    assert all(len(set(places(views)[3 * k : 3 * k + 3].tolist())) == 1 for k in range(5))
+
+
+def test_in_too_few_places_the_simplest_lens_stays_untried() -> None:
+    # The same three poses ten times: 30 views, of which none says anything about another.
+    views = seen(Brown(-0.3, 0.1, 1.5e-3, -1e-3, 0.0), shots=3, again=10)
+    found = calibrate_with_best_lens(views, WIDTH, HEIGHT)
+    assert found.camera.lens.kind == "radial"
+    assert found.lenses == ()
+
+
+def test_two_poses_are_refused() -> None:
+    with pytest.raises(DegeneratePoses):
+        calibrate_with_best_lens(seen(Radial(), shots=2), WIDTH, HEIGHT)
