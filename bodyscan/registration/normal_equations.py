@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -16,12 +15,21 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import Noise
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.view_graph import Target
 
 CORNERS = Noise("corners", group=2, cauchy=4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class OfTarget:
+    """What the views of one board at one moment add: J^T W J (C, C) and J^T W r (C,) of the unknowns
+    `columns` (C,), of which its own motion is the last six."""
+
+    columns: Indices
+    matrix: Array
+    gradient: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +39,7 @@ class NormalEquations:
     Unknowns: motions of the pairs `names` (6 each), motions of the boards `targets` (6 each), then
     the parameters of each pair's camera, of which there are `parameters` (0 each if cameras are
     held).  held: unknowns that the rig frame's definition fixes.  variance_px2: of a corner's
-    coordinate.
+    coordinate.  parts: of each target, in their order; the prior is in none.
     """
 
     names: tuple[str, ...]
@@ -41,6 +49,7 @@ class NormalEquations:
     gradient: Array
     held: Indices
     variance_px2: float
+    parts: tuple[OfTarget, ...]
 
     @property
     def first_board(self) -> int:
@@ -62,29 +71,6 @@ class NormalEquations:
     @property
     def free(self) -> Indices:
         return np.setdiff1d(np.arange(len(self.matrix)), self.held)
-
-    @cached_property
-    def full_covariance(self) -> Array:
-        """Of all unknowns, the corners' variance taken from the residuals."""
-        free = self.free
-        full = np.zeros(self.matrix.shape)
-        full[np.ix_(free, free)] = self.variance_px2 * invert_scaled(
-            self.matrix[np.ix_(free, free)]
-        )
-        return full
-
-    def covariance(self) -> PoseCovariance:
-        """Of the pairs' motions."""
-        pairs = slice(0, self.first_board)
-        return PoseCovariance(self.names, self.full_covariance[pairs, pairs])
-
-    def camera_covariances(self) -> dict[str, Array]:
-        """(P, P) of each camera's parameters; none of cameras that were held."""
-        return {
-            name: self.full_covariance[np.ix_(own, own)]
-            for name, own in zip(self.names, self.camera_columns, strict=True)
-            if len(own)
-        }
 
     def without_boards(self) -> Array:
         """Information on pairs and cameras, the boards eliminated.
@@ -125,39 +111,66 @@ def normal_equations(
     parameters = tuple(len(cameras[n].parameters) if cameras_free else 0 for n in names)
     camera_columns = _runs(first_camera, parameters)
     size = first_camera + sum(parameters)
-    normal, gradient = np.zeros((size, size)), np.zeros(size)
-    parts = [
-        corners_seen(view, cameras, rig_from_camera, rig_from_board, cameras_free=cameras_free)
-        for view in views
-    ]
-    residuals = np.concatenate([residual for residual, _ in parts])
-    weights = CORNERS.weights(residuals / CORNERS.spread_of(residuals))
+    residuals, linearized = zip(
+        *(
+            corners_seen(view, cameras, rig_from_camera, rig_from_board, cameras_free=cameras_free)
+            for view in views
+        ),
+        strict=True,
+    )
+    spread = CORNERS.spread_of(np.concatenate(residuals))
     number_of = {name: number for number, name in enumerate(names)}
-    board_of = {target: number for number, target in enumerate(targets)}
-    cuts = np.cumsum([len(residual) for residual, _ in parts])[:-1]
-    for view, (residual, linearize), weight in zip(
-        views, parts, np.split(weights, cuts), strict=True
-    ):
-        number = number_of[view.pair]
-        columns = np.concatenate(
-            [
-                6 * number + np.arange(6),
-                first_board + 6 * board_of[view.target] + np.arange(6),
-                camera_columns[number],
-            ]
+    parts = []
+    for number, target in enumerate(targets):
+        own = [k for k, view in enumerate(views) if view.target == target]
+        board = first_board + 6 * number + np.arange(6)
+        pairs = [number_of[views[k].pair] for k in own]
+        columns = [np.append(6 * n + np.arange(6), camera_columns[n]) for n in pairs]
+        parts.append(
+            _of_target(
+                [residuals[k] for k in own],
+                [linearized[k]() for k in own],
+                [np.insert(mine, 6, board) for mine in columns],
+                board,
+                spread,
+            )
         )
-        jacobian = linearize()
-        weighted = jacobian * weight[:, None]
-        normal[np.ix_(columns, columns)] += jacobian.T @ weighted
-        gradient[columns] += weighted.T @ residual
+    normal, gradient = np.zeros((size, size)), np.zeros(size)
+    for part in parts:
+        normal[np.ix_(part.columns, part.columns)] += part.matrix
+        gradient[part.columns] += part.gradient
+    everything = np.concatenate(residuals)
+    weights = CORNERS.weights(everything / spread)
     held = _held(names, targets, first_board, fixed_pair, fixed_target)
     degrees = max(float(np.sum(weights)) - (size - len(held)), 1.0)
-    variance = float(np.sum(weights * residuals**2)) / degrees
+    variance = float(np.sum(weights * everything**2)) / degrees
     if cameras_free and camera_prior:
         own = np.concatenate(camera_columns)
         known = np.concatenate([cameras[name].prior_sigmas ** -2 for name in names])
         normal[own, own] += max(variance, 1e-12) * known
-    return NormalEquations(names, tuple(targets), parameters, normal, gradient, held, variance)
+    return NormalEquations(
+        names, tuple(targets), parameters, normal, gradient, held, variance, tuple(parts)
+    )
+
+
+def _of_target(
+    residuals: Sequence[Array],
+    jacobians: Sequence[Array],
+    columns: Sequence[Indices],
+    board: Indices,
+    spread: float,
+) -> OfTarget:
+    """Of views with residuals (2N,), jacobians (2N, C) by the unknowns `columns` (C,)."""
+    others = np.setdiff1d(np.unique(np.concatenate(columns)), board)
+    every = np.append(others, board)
+    place = {column: k for k, column in enumerate(every.tolist())}
+    matrix, gradient = np.zeros((len(every), len(every))), np.zeros(len(every))
+    for residual, jacobian, own in zip(residuals, jacobians, columns, strict=True):
+        rows = np.array([place[column] for column in own.tolist()])
+        weighted = jacobian * CORNERS.weights(residual / spread)[:, None]
+        matrix[np.ix_(rows, rows)] += jacobian.T @ weighted
+        gradient[rows] += weighted.T @ residual
+    return OfTarget(every, matrix, gradient)
 
 
 def _runs(first: int, sizes: Sequence[int]) -> list[Indices]:

@@ -34,6 +34,7 @@ from bodyscan.registration.consistent_solve import (
     solve_consistently,
     view_key,
 )
+from bodyscan.registration.honest_covariance import board_places, honest_covariance
 from bodyscan.registration.inconsistent_views import (
     error_limit,
     find_inconsistent_views,
@@ -66,7 +67,8 @@ class RigSolution:
     views: those used, their points where the boards' corners really lie.  board_shapes: of boards
     that are not as described, where others' views confirm it.  lenses: those tried on held-out
     boards, by camera; of cameras whose lens was open.  camera_covariances: (P, P) of each camera's
-    parameters, where the solve refined them.
+    parameters, where the solve refined them.  excess: by how many times variances are larger than
+    corners that err independently would make them, as the boards' places show.
     """
 
     rig_from_camera: dict[str, RigidTransform]
@@ -78,6 +80,7 @@ class RigSolution:
     board_shapes: dict[str, BoardShape]
     lenses: dict[str, tuple[LensTrial, ...]] = field(default_factory=dict)
     camera_covariances: dict[str, Array] = field(default_factory=dict)
+    excess: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +207,7 @@ def _placed(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
         fixed_target=frame_target(rig),
         cameras_free=refine,
     )
+    known = honest_covariance(equations, board_places(kept, rig_from_board))
     rms = {
         name: _robust_rms(
             [
@@ -218,12 +222,13 @@ def _placed(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
         rig_from_camera,
         rig_from_board,
         solution.cameras,
-        equations.covariance(),
+        known.poses,
         rms,
         tuple(kept),
         shaped.shapes,
         solved.lenses,
-        equations.camera_covariances(),
+        known.cameras,
+        known.excess,
     )
 
 
