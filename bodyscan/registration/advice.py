@@ -175,13 +175,17 @@ def more_shots(rig: Rig, placed: RigSolution, pair: str) -> MoreShots | None:
     if best.after_mm2[-1] > 0.98 * best.before_mm2:
         return None
     shots = best.shots_to_halve or MOST_SHOTS
+    # By what boards have shown of themselves; how much is gained, by corners that err independently.
+    here = placed.rig_from_camera[pair].translation
+    before = float(np.linalg.norm(position_sigma(placed.covariance, pair, here)))
+    gained = float(np.sqrt(best.after_mm2[shots - 1] / best.before_mm2))
     return MoreShots(
         pair,
         shots,
         _between(knowledge, place, pair, shots),
         place,
-        float(np.sqrt(best.before_mm2)),
-        float(np.sqrt(best.after_mm2[shots - 1])),
+        before,
+        gained * before,
         best.shots_to_halve is not None,
     )
 

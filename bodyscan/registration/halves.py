@@ -166,7 +166,9 @@ def _placed_by(
     to_rig = placed.rig_from_camera[holder] @ half.rig_from_camera[holder].inverse()
     carry = np.kron(np.eye(len(half.covariance.names)), adjoint(to_rig))
     placings = {name: to_rig @ t for name, t in half.rig_from_camera.items()}
-    matrix = carry @ half.covariance.matrix @ carry.T
+    # How much more than independent corners boards err is seen better on all of them.
+    unseen = max(placed.excess / half.excess, 1.0)
+    matrix = unseen * carry @ half.covariance.matrix @ carry.T
     return placings, PoseCovariance(half.covariance.names, matrix)
 
 

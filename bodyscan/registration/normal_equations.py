@@ -122,15 +122,15 @@ def normal_equations(
     number_of = {name: number for number, name in enumerate(names)}
     parts = []
     for number, target in enumerate(targets):
-        own = [k for k, view in enumerate(views) if view.target == target]
+        seen = [k for k, view in enumerate(views) if view.target == target]
         board = first_board + 6 * number + np.arange(6)
-        pairs = [number_of[views[k].pair] for k in own]
-        columns = [np.append(6 * n + np.arange(6), camera_columns[n]) for n in pairs]
+        pairs = [number_of[views[k].pair] for k in seen]
+        mine = [np.concatenate([6 * n + np.arange(6), board, camera_columns[n]]) for n in pairs]
         parts.append(
             _of_target(
-                [residuals[k] for k in own],
-                [linearized[k]() for k in own],
-                [np.insert(mine, 6, board) for mine in columns],
+                [residuals[k] for k in seen],
+                [linearized[k]() for k in seen],
+                mine,
                 board,
                 spread,
             )
@@ -161,7 +161,7 @@ def _of_target(
     spread: float,
 ) -> OfTarget:
     """Of views with residuals (2N,), jacobians (2N, C) by the unknowns `columns` (C,)."""
-    others = np.setdiff1d(np.unique(np.concatenate(columns)), board)
+    others = np.setdiff1d(np.concatenate([board, *columns]), board)
     every = np.append(others, board)
     place = {column: k for k, column in enumerate(every.tolist())}
     matrix, gradient = np.zeros((len(every), len(every))), np.zeros(len(every))
