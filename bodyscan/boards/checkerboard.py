@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import cv2
 import numpy as np
 
-from bodyscan.arrays import Array, Bytes, Floats
+from bodyscan.arrays import Array, Bytes, Floats, Indices
 from bodyscan.boards import board_layout
 from bodyscan.boards.board_map import BoardMap, fit_board_map
 from bodyscan.boards.corners import SightedCorners, refine_corners
@@ -24,7 +24,8 @@ SAME_CORNER_SQUARES = 0.15
 hundredths of a square, corners that are mixed up a whole one."""
 MIN_SHARE_OF_CORNERS = 0.8
 MIN_SHARE_TO_GO_ON = 0.4
-MOST_BEYOND = 0.5
+LEAST_BEYOND = 0.5
+"""Share of the corners, and of the contrast, that a board which goes on shows beyond its last ones."""
 ROUNDS = 3
 
 
@@ -79,21 +80,33 @@ def _refined(image: Bytes, board: Board, candidate: Array) -> SightedCorners | N
 
 
 def _goes_on(image: Bytes, board: Board, board_map: BoardMap, first_is_black: bool) -> bool:
-    """Whether corners follow beyond the last ones on some side: a part of a larger board."""
-    columns, rows = np.arange(1, board.columns), np.arange(1, board.rows)
-    for column, row in (
-        (columns, np.zeros_like(columns)),
-        (columns, np.full_like(columns, board.rows)),
-        (np.zeros_like(rows), rows),
-        (np.full_like(rows, board.columns), rows),
-    ):
-        printed = board.square_mm * np.stack([column, row], axis=-1).astype(float)
+    """Whether corners and squares go on beyond the last ones of a side: a part of a larger board."""
+    inside = _greys(image, board, board_map, _inner_squares(board))
+    contrast = abs(inside[0].mean() - inside[1].mean())
+    for lines, squares in _beyond(board):
+        even, odd = _greys(image, board, board_map, squares)
+        dark, light = (even, odd) if first_is_black else (odd, even)
+        if light.min() - dark.max() < LEAST_BEYOND * contrast:
+            continue
+        printed = board.square_mm * lines.astype(float)
         along = board.square_mm * board_map.jacobian(printed)
-        bright_diagonal = ((row + column) % 2 == 0) != first_is_black
+        bright_diagonal = (lines.sum(axis=1) % 2 == 0) != first_is_black
         _, found = refine_corners(image, board_map.apply(printed), along, bright_diagonal)
-        if found.mean() > MOST_BEYOND:
+        if found.mean() > LEAST_BEYOND:
             return True
     return False
+
+
+def _beyond(board: Board) -> Iterator[tuple[Indices, Indices]]:
+    """For each side, the corners (N, 2) and squares (M, 2) that a larger board would have there."""
+    size = np.array([board.columns, board.rows])
+    for along, across in ((0, 1), (1, 0)):
+        for line, square in ((0, -1), (size[across], size[across])):
+            corners = np.full((size[along] - 1, 2), line)
+            corners[:, along] = np.arange(1, size[along])
+            squares = np.full((size[along], 2), square)
+            squares[:, along] = np.arange(size[along])
+            yield corners, squares
 
 
 def _candidates(image: Bytes, board: Board) -> Iterator[Array]:
@@ -101,8 +114,8 @@ def _candidates(image: Bytes, board: Board) -> Iterator[Array]:
 
     The plain threshold of the whole picture finds most boards in hundredths of a second; adaptive
     thresholds those in uneven light or before a busy background; crops, enlarged, fine and slanted
-    boards; the sector-based detector, a second for a megapixel, blurred and noisy ones.  Its
-    CALIB_CB_NORMALIZE_IMAGE shifts corners by 0.25 px.
+    boards; the sector-based detector, a fifth of a second for a megapixel, blurred and noisy ones
+    (its CALIB_CB_NORMALIZE_IMAGE shifts corners by 0.25 px), and enlarged, in a second, fine ones.
     """
     size = (board.columns - 1, board.rows - 1)
     whole = Region(0, 0, image.shape[1], image.shape[0])
@@ -116,6 +129,8 @@ def _candidates(image: Bytes, board: Board) -> Iterator[Array]:
         yield from _found(_classic, image, size, region, scale)
     for region in (*regions, whole):
         yield from _found(_sector_based, image, size, region, 1.0)
+    for region in regions[:1]:
+        yield from _found(_sector_based_enlarged, image, size, region, 1.0)
 
 
 Detector = Callable[[Bytes, tuple[int, int]], tuple[bool, Floats | None]]
@@ -144,6 +159,10 @@ def _adaptive(image: Bytes, size: tuple[int, int]) -> tuple[bool, Floats | None]
 
 
 def _sector_based(image: Bytes, size: tuple[int, int]) -> tuple[bool, Floats | None]:
+    return cv2.findChessboardCornersSB(image, size)
+
+
+def _sector_based_enlarged(image: Bytes, size: tuple[int, int]) -> tuple[bool, Floats | None]:
     return cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
 
 
@@ -169,15 +188,24 @@ def _numbered_as_printed(
 def _first_is_black(image: Bytes, board: Board, pixels: Array, printed: Array) -> bool:
     """Whether the squares with an even sum of column and row are darker than the others.
 
-    Judged by the middles of all squares between inner corners, so that light across the board
-    does not matter.
+    Judged by all squares between inner corners, so that light across the board does not matter.
     """
-    board_map = fit_board_map(printed, pixels)
+    even, odd = _greys(image, board, fit_board_map(printed, pixels), _inner_squares(board))
+    return bool(even.mean() < odd.mean())
+
+
+def _inner_squares(board: Board) -> Indices:
+    """Column and row (N, 2) of the squares between inner corners."""
     column, row = np.meshgrid(np.arange(1, board.columns - 1), np.arange(1, board.rows - 1))
-    middle = board.square_mm * (np.stack([column.ravel(), row.ravel()], axis=-1) + 0.5).astype(
-        float
-    )
-    where = board_map.apply(middle).astype(np.float32)
+    return np.stack([column.ravel(), row.ravel()], axis=-1)
+
+
+def _greys(
+    image: Bytes, board: Board, board_map: BoardMap, squares: Indices
+) -> tuple[Array, Array]:
+    """Grey levels in the middles of squares, (N, 2) column and row: of those whose sum is even, and
+    of the others."""
+    where = board_map.apply(board.square_mm * (squares + 0.5)).astype(np.float32)
     grey = cv2.remap(image, where[:, None], None, cv2.INTER_LINEAR).ravel().astype(float)
-    even = (column.ravel() + row.ravel()) % 2 == 0
-    return bool(grey[even].mean() < grey[~even].mean())
+    even = squares.sum(axis=1) % 2 == 0
+    return grey[even], grey[~even]

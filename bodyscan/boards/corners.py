@@ -23,7 +23,9 @@ from bodyscan.geometry.least_squares import StackedEquations, minimize_each
 from bodyscan.geometry.scaled_systems import solve_scaled
 
 MAX_MOVE_PX = 1.5
-MAX_RADIUS_PX = 9.0
+RADIUS_PX = 9.0
+NOISY_PX, NOISY_RADIUS_PX = 0.04, 16.0
+"""Where corners of a picture are worse than that, wider windows are worth their time."""
 WINDOW_SQUARES = 0.42
 BLUR_PX = 0.9
 CLEAR_OF_MARKER_PX = 1.4
@@ -32,8 +34,12 @@ MIN_ARM_PX = 1.5
 BLUR_RANGE_PX = (0.3, 3.0)
 MIN_PIXELS = 16
 MIN_CONTRAST = 4.0
-MAX_RESIDUAL = 0.25
-MAX_SIGMA_PX = 0.06
+USUAL_RESIDUAL, MAX_RESIDUAL = 0.25, 0.7
+USUAL_SIGMA_PX, MAX_SIGMA_PX = 0.06, 0.35
+TIMES_MEDIAN = 2.0
+LEAST_OF_SEEN = 0.02
+"""Residuals (shares of the contrast) and sigmas of good corners of a clear picture, and of any: where
+all are worse, in noise or blur, a corner may be twice as bad as the usual one of its board."""
 STEPS = 12
 SETTLED = 1e-2  # a tenth of a corner's own sigma, before a last step that makes it far less
 
@@ -76,18 +82,33 @@ def refine_corners(
     """
     if not len(start):
         return start, np.zeros(0, bool)
-    patches = _patches(image, start, along, bright_diagonal, marker_gap)
-    fitted, residual, sigma = _fit(patches, start, along)
+
+    def patches(radius_px: float) -> _Patches:
+        return _patches(image, start, along, bright_diagonal, marker_gap, radius_px)
+
+    usual = patches(RADIUS_PX)
+    fit = _fit(usual, start, along)
+    if np.median(fit.sigma) > NOISY_PX:
+        fit = _fit(patches(NOISY_RADIUS_PX), start, along, _common_light(fit))
+    fitted, sigma = fit.state, fit.sigma
     # b is the brightness of the squares where one edge distance is negative: not the diagonal.
     pixels, contrast = fitted[:, :2], np.where(bright_diagonal, -fitted[:, 5], fitted[:, 5])
-    good = patches.weight.sum(axis=1) >= MIN_PIXELS
+    good = usual.weight.sum(axis=1) >= MIN_PIXELS
     good &= np.linalg.norm(pixels - start, axis=1) < MAX_MOVE_PX
-    good &= (contrast > MIN_CONTRAST) & (residual < MAX_RESIDUAL * contrast)
-    good &= sigma < MAX_SIGMA_PX
+    good &= contrast > MIN_CONTRAST
+    share = fit.residual / np.maximum(contrast, MIN_CONTRAST)
+    good &= share < _limit(share[good], USUAL_RESIDUAL, MAX_RESIDUAL)
+    good &= sigma < _limit(sigma[good], USUAL_SIGMA_PX, MAX_SIGMA_PX)
     # At the picture's rim a corner seen on one side only is fitted well, but in the wrong place.
     size = np.array(image.shape[::-1])
     good &= np.all((pixels >= MIN_BORDER_PX) & (pixels <= size - 1 - MIN_BORDER_PX), axis=1)
     return pixels, good
+
+
+def _limit(values: Array, usual: float, most: float) -> float:
+    """What a corner may have, by those that are good otherwise: (N,)."""
+    median = float(np.median(values)) if len(values) else 0.0
+    return float(np.clip(TIMES_MEDIAN * median, usual, most))
 
 
 def _patches(
@@ -96,9 +117,10 @@ def _patches(
     along: Array,
     bright_diagonal: Mask,
     marker_gap: float | None,
+    radius_px: float,
 ) -> _Patches:
     """The pixels of a square window that belong to the four squares around each corner."""
-    radius = int(np.ceil(MAX_RADIUS_PX))
+    radius = int(np.ceil(radius_px))
     across = np.arange(-radius, radius + 1)
     offset = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
     place = np.rint(start)[:, None] + offset.astype(np.float64)
@@ -108,7 +130,7 @@ def _patches(
     from_corner = place - start[:, None]
     squares = np.einsum("nij,npj->npi", np.linalg.pinv(along), from_corner)
     weight = inside & np.all(np.abs(squares) < WINDOW_SQUARES, axis=-1)
-    weight &= np.sum(from_corner**2, axis=-1) <= MAX_RADIUS_PX**2
+    weight &= np.sum(from_corner**2, axis=-1) <= radius_px**2
     if marker_gap is not None:
         # Distances in px from the two edges through the corner, and where markers begin.
         lengths = np.abs(np.linalg.det(along))[:, None] / np.linalg.norm(along, axis=1)[:, ::-1]
@@ -119,34 +141,78 @@ def _patches(
     return _Patches(place, image[row, column].astype(float), weight.astype(float))
 
 
-def _fit(patches: _Patches, start: Array, along: Array) -> tuple[Array, Array, Array]:
-    """Parameters (N, 9), RMS residuals (N,) in grey levels, and sigmas (N,) px of the corners' worse
-    coordinates, from what the fit leaves over.
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """state: (N, 9): corner (2), the angles of both edges' normals (2), blur, b, a, g (2).
 
-    Parameters: corner (2), the angles of both edges' normals (2), blur, b, a, g (2).
+    residual: (N,) RMS in grey levels.  variance: (N,) of a pixel.  covariance: (N, 9, 9).
     """
+
+    state: Array
+    residual: Array
+    variance: Array
+    covariance: Array
+
+    @property
+    def sigma(self) -> Array:
+        """(N,) px, of the corners' worse coordinates, from what the fit leaves over."""
+        corner = np.einsum("nii->ni", self.covariance)[:, :2]
+        return np.asarray(np.sqrt(np.maximum(corner.max(axis=1), 0.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Light:
+    """What is known of g beforehand: mean (2,), and information (N, 2) in squared grey levels."""
+
+    mean: Array
+    information: Array
+
+    def added(self, equations: StackedEquations, state: Array) -> StackedEquations:
+        off = state[:, 7:] - self.mean
+        normal, gradient = equations.normal.copy(), equations.gradient.copy()
+        normal[:, [7, 8], [7, 8]] += self.information
+        gradient[:, 7:] += self.information * off
+        cost = equations.cost + np.sum(self.information * off**2, axis=1)
+        return StackedEquations(normal, gradient, cost, equations.freedoms)
+
+
+def _common_light(fit: _Fit) -> _Light:
+    """Light changes over a board much alike at all corners; in noise each by itself says little of
+    it, and what it says wrongly moves the corner. How much it does differ the corners tell."""
+    slope = fit.state[:, 7:]
+    mean = np.median(slope, axis=0)
+    told = np.median(np.einsum("nii->ni", fit.covariance)[:, 7:], axis=0)
+    seen = (1.4826 * np.median(np.abs(slope - mean), axis=0)) ** 2
+    differs = np.maximum(seen - told, LEAST_OF_SEEN * seen + 1e-12)
+    return _Light(mean, fit.variance[:, None] / differs)
+
+
+def _fit(patches: _Patches, start: Array, along: Array, light: _Light | None = None) -> _Fit:
+    """Every corner's image fitted to its patch."""
     angles = np.arctan2(along[:, 1], along[:, 0]) + np.pi / 2.0
     state = np.column_stack(
         [start, angles, np.full(len(start), BLUR_PX), np.zeros((len(start), 4))]
     )
     state[:, 5:] = _linear(patches, state)
 
+    def equations(state: Array) -> StackedEquations:
+        own = StackedEquations.of(*_linearized(patches, state), patches.weight)
+        return light.added(own, state) if light else own
+
     def within(state: Array) -> Array:
         state[:, 4] = np.clip(state[:, 4], *BLUR_RANGE_PX)
         return state
 
     solution = minimize_each(
-        state,
-        lambda state: StackedEquations.of(*_linearized(patches, state), patches.weight),
-        within=within,
-        steps=STEPS,
-        settled=SETTLED,
-        damping=1e-3,
+        state, equations, within=within, steps=STEPS, settled=SETTLED, damping=1e-3
     )
     total = np.maximum(patches.weight.sum(axis=1), 1.0)
-    corner = np.einsum("nii->ni", solution.covariance())[:, :2]
-    sigma = np.sqrt(np.maximum(corner.max(axis=1), 0.0))
-    return solution.state, np.sqrt(solution.equations.cost / total), sigma
+    return _Fit(
+        solution.state,
+        np.sqrt(solution.equations.cost / total),
+        solution.equations.variance,
+        solution.covariance(),
+    )
 
 
 def _linear(patches: _Patches, state: Array) -> Array:

@@ -75,7 +75,7 @@ def test_corners_that_make_no_board_are_not_believed(monkeypatch: pytest.MonkeyP
     # Every one of them is a corner of the right colours, but two rows are exchanged.
     rows = true_corners(PLAIN, place).astype(np.float32).reshape(6, 9, 2)
     wrong = rows[[2, 1, 0, 3, 4, 5]].reshape(-1, 2)
-    for detector in ("_classic", "_adaptive", "_sector_based"):
+    for detector in ("_classic", "_adaptive", "_sector_based", "_sector_based_enlarged"):
         monkeypatch.setattr(checkerboard, detector, lambda image, size: (True, wrong))
     assert found(render([(PLAIN, place)]), PLAIN) == []
 
