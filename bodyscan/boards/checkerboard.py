@@ -205,7 +205,7 @@ def _greys(
 ) -> tuple[Array, Array]:
     """Grey levels in the middles of squares, (N, 2) column and row: of those whose sum is even, and
     of the others."""
-    where = board_map.apply(board.square_mm * (squares + 0.5)).astype(np.float32)
+    where = board_map.apply(board.square_mm * (squares.astype(float) + 0.5)).astype(np.float32)
     grey = cv2.remap(image, where[:, None], None, cv2.INTER_LINEAR).ravel().astype(float)
     even = squares.sum(axis=1) % 2 == 0
     return grey[even], grey[~even]

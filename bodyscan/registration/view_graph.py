@@ -16,8 +16,9 @@ from bodyscan.calibration.board_views import LocatedView, greatest_displacement
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
 
-AGREEMENT_MM = 40.0
-REACH_MM = 1000.0
+AGREEMENT = 0.04
+"""Poses that differ by this share of the boards' usual distance agree: graphs place pairs roughly."""
+BOARD_REACH = 0.3
 MOST_CANDIDATES = 12
 
 Target = tuple[str, str]
@@ -76,13 +77,13 @@ def initial_poses(
     numbering leaves a tie open, or the pairs of which no two agree.
     """
     _refuse_disconnected(view_graph(views, pairs))
-    targets = _by_target(views)
+    targets, reach = _by_target(views), _usual_distance(views)
     groups: list[Group] = [{name: RigidTransform.identity()} for name in pairs]
     ties: dict[tuple[int, int], RelativePose | None] = {}
     while len(groups) > 1:
         for i, j in combinations(range(len(groups)), 2):
             if (i, j) not in ties:
-                ties[i, j] = _tie(groups[i], groups[j], targets)
+                ties[i, j] = _tie(groups[i], groups[j], targets, reach)
         found = {key: tie for key, tie in ties.items() if tie is not None}
         (i, j), best = max(found.items(), key=lambda item: item[1].strength)
         if not best.decided:
@@ -125,7 +126,7 @@ def _most(groups: Sequence[Group], best: RelativePose) -> tuple[Group, dict[str,
 
 
 def place_boards(
-    views: Iterable[LocatedView], root_from_camera: Mapping[str, RigidTransform]
+    views: Sequence[LocatedView], root_from_camera: Mapping[str, RigidTransform]
 ) -> tuple[list[LocatedView], dict[Target, RigidTransform], set[Target]]:
     """Resolve every view's alternative and place every board.
 
@@ -134,31 +135,36 @@ def place_boards(
     kept: list[LocatedView] = []
     boards: dict[Target, RigidTransform] = {}
     doubtful: set[Target] = set()
+    reach = _usual_distance(views)
     for target, group in _by_target(views).items():
-        placing = _agreed_placing(group, root_from_camera)
+        placing = _agreed_placing(group, root_from_camera, reach)
         boards[target] = placing
         for view in group:
-            gap, resolved = min(_readings(view, root_from_camera, placing), key=itemgetter(0))
+            readings = _readings(view, root_from_camera, placing, reach)
+            gap, resolved = min(readings, key=itemgetter(0))
             kept.append(resolved)
-            if gap > 2.0 * AGREEMENT_MM:
+            if gap > 2.0 * AGREEMENT * reach:
                 doubtful.add(target)
     return kept, boards, doubtful
 
 
 def _readings(
-    view: LocatedView, root_from_camera: Mapping[str, RigidTransform], placing: RigidTransform
+    view: LocatedView,
+    root_from_camera: Mapping[str, RigidTransform],
+    placing: RigidTransform,
+    reach: float,
 ) -> list[tuple[float, LocatedView]]:
     """The ways to number a view's board, each with how far (mm) it puts it from a placing."""
     readings = [view.resolved(choice) for choice in view.alternatives]
     root = root_from_camera[view.pair]
     return [
-        (greatest_displacement(root @ one.camera_from_board, placing, 300.0), one)
+        (greatest_displacement(root @ one.camera_from_board, placing, BOARD_REACH * reach), one)
         for one in readings
     ]
 
 
 def _agreed_placing(
-    group: Sequence[LocatedView], root_from_camera: Mapping[str, RigidTransform]
+    group: Sequence[LocatedView], root_from_camera: Mapping[str, RigidTransform], reach: float
 ) -> RigidTransform:
     """The pose of a board that most corners of its views support."""
     candidates = [root_from_camera[view.pair] @ view.camera_from_board for view in group]
@@ -167,10 +173,18 @@ def _agreed_placing(
         return sum(
             len(view.pixels)
             for view in group
-            if min(gap for gap, _ in _readings(view, root_from_camera, placing)) < AGREEMENT_MM
+            if min(gap for gap, _ in _readings(view, root_from_camera, placing, reach))
+            < AGREEMENT * reach
         )
 
     return max(candidates, key=support)
+
+
+def _usual_distance(views: Sequence[LocatedView]) -> float:
+    """How far boards are from cameras, mm: the measure of all agreement, since a board's squares may
+    be given in any unit."""
+    distances = [float(np.linalg.norm(view.camera_from_board.translation)) for view in views]
+    return float(np.median(distances)) if distances else 1.0
 
 
 def _by_target(views: Iterable[LocatedView]) -> dict[Target, list[LocatedView]]:
@@ -181,7 +195,7 @@ def _by_target(views: Iterable[LocatedView]) -> dict[Target, list[LocatedView]]:
 
 
 def _tie(
-    first: Group, second: Group, targets: dict[Target, list[LocatedView]]
+    first: Group, second: Group, targets: dict[Target, list[LocatedView]], reach: float
 ) -> RelativePose | None:
     """Let every target that both groups saw propose `first_from_second`; take the most agreed."""
     proposals: dict[Target, list[RigidTransform]] = {}
@@ -204,13 +218,13 @@ def _tie(
     owner = np.repeat(np.arange(len(proposals)), [len(p) for p in proposals.values()])
     clearest = sorted(proposals, key=lambda target: -corners[target])[:MOST_CANDIDATES]
     candidates = [p for target in clearest for p in proposals[target]]
-    gaps = np.array([_gaps(candidate, everything) for candidate in candidates])
-    votes = [len(set(owner[gap < 2.0 * AGREEMENT_MM])) for gap in gaps]
+    gaps = np.array([_gaps(candidate, everything, reach) for candidate in candidates])
+    votes = [len(set(owner[gap < 2.0 * AGREEMENT * reach])) for gap in gaps]
     best = int(np.argmax(votes))
     rivals = [
         count
         for count, candidate in zip(votes, candidates, strict=True)
-        if greatest_displacement(candidate, candidates[best], REACH_MM) > 4.0 * AGREEMENT_MM
+        if greatest_displacement(candidate, candidates[best], reach) > 4.0 * AGREEMENT * reach
     ]
     return RelativePose(
         candidates[best],
@@ -226,13 +240,13 @@ def _size(view: LocatedView) -> int:
     return len(view.pixels)
 
 
-def _gaps(candidate: RigidTransform, others: Sequence[RigidTransform]) -> Array:
+def _gaps(candidate: RigidTransform, others: Sequence[RigidTransform], reach: float) -> Array:
     """`greatest_displacement` of one transform and many, (N,) mm."""
     rotations = np.array([other.rotation for other in others])
     shifts = np.array([other.translation for other in others]) - candidate.translation
     cosines = (np.einsum("ij,nij->n", candidate.rotation, rotations) - 1.0) / 2.0
     angles = np.arccos(np.clip(cosines, -1.0, 1.0))
-    return np.linalg.norm(shifts, axis=1) + angles * REACH_MM
+    return np.linalg.norm(shifts, axis=1) + angles * reach
 
 
 def _refuse_disconnected(graph: nx.Graph) -> None:
