@@ -83,7 +83,9 @@ COMMANDS = {command.name: command for command in app.registered_commands}
 
 
 def parameters(name: str) -> dict[str, inspect.Parameter]:
-    return dict(inspect.signature(COMMANDS[name].callback).parameters)
+    command = COMMANDS[name].callback
+    assert command is not None
+    return dict(inspect.signature(command).parameters)
 
 
 def test_commands_stand_in_three_groups() -> None:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ def share(values, whole):
 
 
 def test_a_function_whose_file_cannot_keep_it_is_compiled_all_the_same() -> None:
-    names: dict = {}
+    names: dict[str, Any] = {}
     exec(compile(SOURCE, "<nowhere>", "exec"), names)
     share = compiled(names["share"])
     assert share(np.array([1.0, 2.0, 3.0]), 4.0) == 1.5

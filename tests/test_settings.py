@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 
 from bodyscan import settings
+from bodyscan.files.model import Model
 from bodyscan.progress import THREADS
 
 PACKAGE = Path(settings.__file__).parent
 MODELS = {
     name: model
     for name, model in vars(settings).items()
-    if isinstance(model, type) and issubclass(model, settings.Model) and model is not settings.Model
+    if isinstance(model, type) and issubclass(model, Model) and model is not Model
 }
 NAMES = {field for model in MODELS.values() for field in model.model_fields}
 NEUTRAL = (0, None, False, ())
@@ -66,12 +67,16 @@ def defaults(tree: ast.AST) -> Iterator[tuple[int, str, object]]:
         if isinstance(node, ast.FunctionDef):
             arguments = node.args
             plain = reversed([*arguments.posonlyargs, *arguments.args])
-            given = [*zip(plain, reversed(arguments.defaults), strict=False)]
-            given += [*zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)]
+            given: list[tuple[ast.arg, ast.expr | None]] = [
+                *zip(plain, reversed(arguments.defaults), strict=False),
+                *zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True),
+            ]
             pairs = [(argument.arg, value) for argument, value in given if value]
         elif isinstance(node, ast.ClassDef):
-            fields = [n for n in node.body if isinstance(n, ast.AnnAssign) and n.value]
-            pairs = [(n.target.id, n.value) for n in fields if isinstance(n.target, ast.Name)]
+            fields = [n for n in node.body if isinstance(n, ast.AnnAssign)]
+            pairs = [
+                (n.target.id, n.value) for n in fields if n.value and isinstance(n.target, ast.Name)
+            ]
         else:
             continue
         for name, value in pairs:

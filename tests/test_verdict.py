@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bodyscan.verdict import Verdict
+from bodyscan.verdict import Grade, Mark, Verdict
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,7 @@ from bodyscan.verdict import Verdict
         ("not accepted", "bad"),
     ],
 )
-def test_every_grade_is_good_usable_or_bad(grade: str, mark: str) -> None:
+def test_every_grade_is_good_usable_or_bad(grade: Grade, mark: Mark) -> None:
     assert Verdict(grade).mark == mark
 
 

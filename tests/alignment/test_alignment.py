@@ -1,5 +1,7 @@
 """Range images of one body from several sides, pushed apart and brought together again."""
 
+from typing import Literal
+
 import numpy as np
 import open3d as o3d
 import pytest
@@ -55,9 +57,9 @@ def scanned() -> tuple[list[RangeImage], dict[str, RigidTransform]]:
 def known_to(names: dict[str, RigidTransform], mm: float, deg: float) -> PoseCovariance:
     """Independent errors of the pairs, about the body's middle."""
     carry = np.eye(6)
-    carry[3:, :3] = [[0, 900.0, 0], [-900.0, 0, 0], [0, 0, 0]]
+    carry[3:, :3] = [[0.0, 900.0, 0.0], [-900.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
     own = carry @ np.diag([np.radians(deg) ** 2] * 3 + [mm**2] * 3) @ carry.T
-    return PoseCovariance(tuple(names), np.kron(np.eye(len(names)), own))
+    return PoseCovariance(tuple(names), np.kron(np.eye(len(names)), own).astype(float))
 
 
 def pushed(
@@ -80,7 +82,8 @@ def disagreement_mm(placings: dict[str, RigidTransform], truth: dict[str, RigidT
 
 @pytest.mark.parametrize("matching", ["projected", "nearest"])
 def test_pairs_come_together(
-    scanned: tuple[list[RangeImage], dict[str, RigidTransform]], matching: str
+    scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
+    matching: Literal["projected", "nearest"],
 ) -> None:
     images, truth = scanned
     start = pushed(truth, 1.5)
@@ -164,7 +167,8 @@ def test_a_rig_is_refined_on_a_still_object(
 
 @pytest.mark.parametrize("matching", ["projected", "nearest"])
 def test_threads_change_nothing(
-    scanned: tuple[list[RangeImage], dict[str, RigidTransform]], matching: str
+    scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
+    matching: Literal["projected", "nearest"],
 ) -> None:
     images, truth = scanned
     start, prior = pushed(truth, 1.5), known_to(truth, 1.5, 0.02)

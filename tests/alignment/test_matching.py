@@ -1,7 +1,6 @@
 """Spots that two cameras see of one wavy surface, whose shape and place are known."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +8,7 @@ from ring import looking_at
 
 from bodyscan.alignment.matching import (
     AlignmentPoints,
+    Matches,
     alignment_points,
     match_nearest,
     match_projected,
@@ -66,7 +66,7 @@ def test_a_patch_is_about_evenly_spread(two: list[tuple[AlignmentPoints, RigidTr
 
 @pytest.mark.parametrize("match", [match_projected, match_nearest])
 def test_matches_lie_on_the_surface(
-    two: list[tuple[AlignmentPoints, RigidTransform]], match: Callable[..., Any]
+    two: list[tuple[AlignmentPoints, RigidTransform]], match: Callable[..., Matches]
 ) -> None:
     (a, rig_from_a), (b, rig_from_b) = two
     found = match(a, b, rig_from_a, rig_from_b, 6.0)

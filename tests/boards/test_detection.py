@@ -25,10 +25,10 @@ MARKED = Board(
     name="marked", kind="charuco", columns=9, rows=7, square_mm=70, marker_mm=52, margin_mm=10,
     faces=2, thickness_mm=6,
 )  # fmt: skip
-SMALL = {"width": 512, "height": 410}
+SMALL: dict[str, Any] = {"width": 512, "height": 410}
 
 
-def found(image: Bytes, *boards: Any) -> list[BoardView]:
+def found(image: Bytes, *boards: Board) -> list[BoardView]:
     return find_boards(image, boards, pair="p1-1", shot="b01")
 
 

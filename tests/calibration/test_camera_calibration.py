@@ -1,9 +1,10 @@
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pytest
 from table_one import CAMERA, POINTS, TURNS
 
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.camera import (
     calibrate_camera,
@@ -16,7 +17,9 @@ from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 
 
-def views(turns: Any, noise_px: float = 0.0, seed: int = 0) -> list[PlanarView]:
+def views(
+    turns: Iterable[Array | Sequence[float]], noise_px: float = 0.0, seed: int = 0
+) -> list[PlanarView]:
     rng = np.random.default_rng(seed)
     found = []
     for k, turn in enumerate(turns):

@@ -34,7 +34,7 @@ def test_views_in_the_same_place_cover_no_more() -> None:
 
 @pytest.mark.parametrize(("size", "named"), [(0.22, True), (0.6, False)])
 def test_only_a_small_board_is_noted(tmp_path: Path, size: float, named: bool) -> None:
-    rig = load_rig("rigs/one-pair.yaml")
+    rig = load_rig(Path("rigs/one-pair.yaml"))
     (pair,) = rig.pairs
     width, height = pair.camera.width, pair.camera.height
     views = [

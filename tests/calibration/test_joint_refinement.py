@@ -1,17 +1,17 @@
 """Corners and stripes in one solve: what it must better, on the chapter's own camera."""
 
-from typing import Any
-
 import numpy as np
 from lit_boards import Mirror, Scene
 
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import bin_points, boundary_points, concatenate
-from bodyscan.calibration.camera import calibrate_camera
-from bodyscan.calibration.joint_refinement import refine_jointly, striped_board
+from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
+from bodyscan.calibration.joint_refinement import StripedBoard, refine_jointly, striped_board
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 CAMERA = Camera(
     1061.71, 1064.09, -0.562002, 350.08, 286.547, Radial(-0.140279, -0.0916363), 640, 480
@@ -30,7 +30,7 @@ POSES = [
 ]
 
 
-def calibrated(seed: int) -> Any:
+def calibrated(seed: int) -> tuple[CameraCalibration, SmoothSheets, list[StripedBoard]]:
     """Camera, sheets and striped boards found one after the other, from noisy measurements."""
     rng = np.random.default_rng(seed)
     column, row = np.meshgrid(np.arange(1, 9), np.arange(1, 7))
@@ -55,10 +55,11 @@ def calibrated(seed: int) -> Any:
         )
     bins = bin_points(concatenate(parts), camera.camera, "vertical")
     sheets = fit_light_sheets(bins, 254, "vertical", camera.camera).sheets
+    assert isinstance(sheets, SmoothSheets)
     return camera, sheets, [striped_board(v, camera.camera, bins, k) for k, v in enumerate(views)]
 
 
-def flatness_rms_mm(camera: Any, sheets: Any) -> Any:
+def flatness_rms_mm(camera: Camera, sheets: LightSheets) -> float:
     """Of a flat plane 405 mm away, measured without noise: what is left is systematic."""
     u, v = np.meshgrid(np.arange(180.0, 520.0, 10.0), np.arange(150.0, 430.0, 10.0))
     pixels = np.column_stack([u.ravel(), v.ravel()])

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -10,7 +10,8 @@ from ring import ring_of_cameras, ring_rig, ring_views
 from table_one import POINTS, TURNS
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.camera import PlanarView, calibrate_camera
+from bodyscan.calibration.board_views import PlanarView
+from bodyscan.calibration.camera import calibrate_camera
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import BadInput
 from bodyscan.export.rig import export_rig
@@ -41,7 +42,7 @@ class Leaning(Lens):
         return np.array([0.05])
 
     @property
-    def difference_steps(self) -> Any:
+    def difference_steps(self) -> Array:
         return np.array([1e-5])
 
     def distort(self, ideal: Array) -> Array:
@@ -112,7 +113,9 @@ def test_its_pair_is_placed_among_others(
         assert np.linalg.norm(placed.rig_from_camera[name].translation - placing.translation) < 0.7
         assert placed.cameras[name].lens.kind == cameras[name].lens.kind
     first = next(iter(cameras))
-    assert placed.cameras[first].lens.t == pytest.approx(0.01, abs=2e-4)
+    lens = placed.cameras[first].lens
+    assert isinstance(lens, Leaning)
+    assert lens.t == pytest.approx(0.01, abs=2e-4)
 
 
 def test_its_calibration_is_read_as_it_was_written(

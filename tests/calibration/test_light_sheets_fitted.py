@@ -1,14 +1,16 @@
 """The right model of the light is found for projectors of known make, and measures as well."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
 from lit_boards import (
     BODY_POSES,
     CHAPTER_POSES,
+    Lens,
+    Pose,
     Scene,
     Uneven,
     body_scene,
@@ -19,11 +21,15 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate, select
 from bodyscan.calibration.light_sheets import SheetsFit, fit_light_sheets
 from bodyscan.errors import PairFailed
+from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.ray_depths import intersect_rays
+from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 
-def boards(scene: Scene, poses: Any, corner_px: float = 0.03, seed: int = 1) -> BoundaryPoints:
+def boards(
+    scene: Scene, poses: Sequence[Pose], corner_px: float = 0.03, seed: int = 1
+) -> BoundaryPoints:
     placed = [scene.looking_at(*pose) for pose in poses]
     return scene.boundaries(placed, corner_px=corner_px, seed=seed)
 
@@ -149,6 +155,8 @@ def test_a_lens_measures_as_well_as_perfect_sheets(k1: float, k2: float, axis: f
 def test_the_lens_axis_is_found_outside_the_image() -> None:
     scene, fit = lens(-0.12, 0.05, 800.0)
     # Planes alone hardly tell the axis; 4 boards and the bow do, to a hundredth of the image.
+    assert isinstance(fit.sheets, LensSheets)
+    assert isinstance(scene.projector, Lens)
     assert abs(fit.sheets.parameters[1] - scene.projector.centre) < 20.0
 
 
@@ -205,8 +213,11 @@ def test_the_order_of_points_does_not_matter_and_nothing_is_drawn() -> None:
     scene, fit = mirror()
     data = boards(scene, CHAPTER_POSES)
     again = fitted(scene, data)
+    assert isinstance(fit.sheets, SmoothSheets)
+    assert isinstance(again.sheets, SmoothSheets)
     assert np.array_equal(again.sheets.parameters, fit.sheets.parameters)
     late = concatenate([select(data, data.board == board) for board in (2, 0, 1)])
     shuffled = fitted(scene, late)
     assert shuffled.model == fit.model
+    assert isinstance(shuffled.sheets, SmoothSheets)
     assert np.allclose(shuffled.sheets.parameters, fit.sheets.parameters, rtol=1e-6, atol=1e-9)

@@ -1,13 +1,23 @@
 """A projector that moves between the shots of a calibration is noticed, and its shots named."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
-from lit_boards import BODY_POSES, CHAPTER_POSES, Scene, Uneven, body_scene, chapter_scene
+from lit_boards import (
+    BODY_POSES,
+    CHAPTER_POSES,
+    Lens,
+    Mirror,
+    Pose,
+    Scene,
+    Uneven,
+    body_scene,
+    chapter_scene,
+)
 
-from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
+from bodyscan.calibration.boundary_points import concatenate
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.stripe_agreement import (
     ProjectorMotion,
@@ -24,7 +34,7 @@ MORE_POSES = (
 
 
 def disagreement(
-    scene: Scene, poses: Any, moved: Scene | None = None, shots: Any = ()
+    scene: Scene, poses: Sequence[Pose], moved: Scene | None = None, shots: Sequence[int] = ()
 ) -> ProjectorMotion | None:
     """Boards of a scene; of the `shots`, as they are once its projector has moved."""
     parts = []
@@ -32,18 +42,21 @@ def disagreement(
         of = moved if moved is not None and number in shots else scene
         data = of.boundaries([of.looking_at(*pose)], seed=number)
         parts.append(replace(data, board=np.full_like(data.board, number)))
-    data: BoundaryPoints = concatenate(parts)
-    return find_projector_motion(data, scene.camera, scene.projector.stripes, scene.direction)
+    return find_projector_motion(
+        concatenate(parts), scene.camera, scene.projector.stripes, scene.direction
+    )
 
 
 def pushed(scene: Scene, push: tuple[float, float, float]) -> Scene:
     projector = scene.projector
+    assert isinstance(projector, Mirror)
     centre = projector.centre + np.array(push)
     return replace(scene, projector=replace(projector, centre=centre))
 
 
 def turned(scene: Scene, degrees: float) -> Scene:
     projector = scene.projector
+    assert isinstance(projector, Lens)
     moved = projector.projector_from_camera.moved(np.array([np.radians(degrees), 0, 0, 0, 0, 0]))
     return replace(scene, projector=replace(projector, projector_from_camera=moved))
 

@@ -211,7 +211,9 @@ def test_the_same_fault_in_many_shots_is_one_line(rig_path: Path) -> None:
     captures = rig_path.parent / "captures"
     for shot in ("b4", "b5"):
         shutil.copytree(captures / "b2", captures / shot)
-    shots = [path.unlink() for path in captures.glob("b*/p1/lit.png")]
+    shots = list(captures.glob("b*/p1/lit.png"))
+    for path in shots:
+        path.unlink()
     (line,) = lines_with(rig_path, "error: pair p1, ")
     assert f"{len(shots)} shots: " in line
     assert f"and {len(shots) - 1} more" in line

@@ -180,6 +180,8 @@ def test_a_sequence_comes_in_order(tmp_path: Path) -> None:
     assert (images.pair, images.shot) == ("p1", "b1")
     patterns, inverses = np.split(images.coded, 2)
     assert patterns.shape == inverses.shape == (BITS, HEIGHT, WIDTH)
+    assert images.lit is not None
+    assert images.dark is not None
     assert images.lit.min() == 200
     assert images.dark.max() == 5
     gray = sum(
@@ -201,6 +203,7 @@ def test_a_dark_image_need_not_be_taken(tmp_path: Path) -> None:
 @pytest.mark.parametrize("frame", ["lit", "dark", "bit02", "bit03-inverse"])
 def test_a_bad_image_of_a_sequence_is_named(tmp_path: Path, frame: str) -> None:
     sequence = first_sequence(tmp_path)
+    assert sequence.lit is not None
     path = sequence.lit.with_name(f"{frame}.png")
     path.unlink()
     with pytest.raises(ImageError, match="is missing") as caught:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import open3d as o3d
 import pytest
@@ -48,7 +50,7 @@ def test_what_was_filled_is_not_judged() -> None:
     assert girth_errors(body, vertices, faces).heights == 0
 
 
-def pairs(sways: list[RigidTransform]) -> dict[str, dict]:
+def pairs(sways: list[RigidTransform]) -> dict[str, dict[str, Any]]:
     """Cameras in front of the column, each with its projector 300 mm above it."""
     turn = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     camera = RigidTransform(turn, np.array([1500.0, 0.0, 850.0]))

@@ -36,7 +36,7 @@ def body() -> BodyMesh:
         vertex_normals(vertices, faces),
         rng.integers(0, 256, vertices.shape).astype(np.uint8),
         sigma_mm,
-        np.isnan(sigma_mm)[faces].any(axis=1),
+        np.any(np.isnan(sigma_mm)[faces], axis=1),
     )
 
 
@@ -149,7 +149,14 @@ def test_no_neck_no_export(body: BodyMesh) -> None:
 
 
 def test_exports_say_so(body: BodyMesh, tmp_path: Path) -> None:
-    empty = BodyCloud(*(np.zeros((0, 3)) for _ in range(2)), *(np.zeros(0) for _ in range(3)))
+    none = np.zeros((0, 3))
+    empty = BodyCloud(
+        none,
+        none.astype(np.float32),
+        np.zeros(0, np.float32),
+        np.zeros((0, 3), np.uint8),
+        np.zeros(0, np.uint8),
+    )
     scan = StoredScan(empty, body, {"subject": "s", "calibration_id": "c"})
     export_scan(scan, tmp_path, ["ply"], ["full", "light", "open"], deface=True)
     for name in ("body", "body-light", "body-open"):

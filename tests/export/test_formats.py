@@ -6,6 +6,7 @@ import json
 import struct
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -89,7 +90,7 @@ def test_stl(tmp_path: Path) -> None:
     assert (np.sum(np.asarray(seen.triangle_normals) * outward, axis=1) > 0).all()
 
 
-def glb_parts(path: Path) -> tuple[dict, bytes]:
+def glb_parts(path: Path) -> tuple[dict[str, Any], bytes]:
     """The JSON and the binary part, by the standard's own words (glTF 2.0, 4.4)."""
     data = path.read_bytes()
     magic, version, length = struct.unpack_from("<4sII", data)
@@ -106,7 +107,7 @@ def glb_parts(path: Path) -> tuple[dict, bytes]:
     return document, binary
 
 
-def accessor(document: dict, binary: bytes, number: int) -> np.ndarray:
+def accessor(document: dict[str, Any], binary: bytes, number: int) -> np.ndarray:
     told = document["accessors"][number]
     view = document["bufferViews"][told["bufferView"]]
     assert view["byteOffset"] % 4 == 0

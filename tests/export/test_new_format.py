@@ -45,8 +45,8 @@ def test_it_is_exported_as_all_are(tmp_path: Path) -> None:
     assert (told["kind"], told["units"], told["axes"]["z"]) == ("mesh", "mm", "up")
     write_body(tmp_path / "cloud.xyz", points(), Provenance(None, "3f2a"))
     assert len(np.loadtxt(tmp_path / "cloud.xyz")) == 500
-    export = {"formats": ["ply", "xyz"]}
-    assert Pipeline(name="p", kind="fuse", export=export).export.formats == ("ply", "xyz")
+    pipeline = {"name": "p", "kind": "fuse", "export": {"formats": ["ply", "xyz"]}}
+    assert Pipeline.model_validate(pipeline).export.formats == ("ply", "xyz")
 
 
 @pytest.mark.usefixtures("registered")

@@ -35,8 +35,8 @@ def test_a_wall_and_something_beyond_the_volume_are_seen_through_alike() -> None
     sheet = o3d.geometry.TriangleMesh.create_box(10.0, 900.0, 600.0).translate((0, -450, 600))
     vertices, faces = np.asarray(sheet.vertices), np.asarray(sheet.triangles).astype(np.int64)
     guess = Guess.of(vertices, faces, np.ones(len(faces), bool))
-    points = np.random.default_rng(0).uniform([-50, -400, 650], [50, 400, 1150], (5000, 3))
-    points = points.astype(np.float32)
+    places = np.random.default_rng(0).uniform([-50, -400, 650], [50, 400, 1150], (5000, 3))
+    points = places.astype(np.float32)
     through = sees_through(points, guess, wall, POSE, 10.0)
     assert 0.2 < through.mean() < 0.8
     np.testing.assert_array_equal(sees_through(points, guess, far, POSE, 10.0), through)

@@ -1,7 +1,5 @@
 """Error bars hold how well the pairs are placed."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from bodyscan.mesh.body import BodyCloud
 
 
 @pytest.fixture
-def cloud() -> Any:
+def cloud() -> BodyCloud:
     """Points of an upright cylinder, and one on top."""
     angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
     outward = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
@@ -28,13 +26,13 @@ def cloud() -> Any:
     )
 
 
-def placed(*places: Any) -> Any:
+def placed(*places: list[float]) -> dict[str, RigidTransform]:
     return {
         f"p{k}": RigidTransform(np.eye(3), np.array(place, float)) for k, place in enumerate(places)
     }
 
 
-def test_a_pair_that_is_shifted_along_x_errs_where_it_looks_along_x(cloud: Any) -> None:
+def test_a_pair_that_is_shifted_along_x_errs_where_it_looks_along_x(cloud: BodyCloud) -> None:
     covariance = np.diag([0.0, 0.0, 0.0, 0.04**2, 0.0, 0.0])
     prior = PoseCovariance(("p0",), covariance)
     found = add_pose_variance(cloud, placed([1300, 0, 900]), prior)
@@ -44,7 +42,7 @@ def test_a_pair_that_is_shifted_along_x_errs_where_it_looks_along_x(cloud: Any) 
     assert found.points is cloud.points
 
 
-def test_draws_of_the_placing_spread_by_the_error_bar(cloud: Any) -> None:
+def test_draws_of_the_placing_spread_by_the_error_bar(cloud: BodyCloud) -> None:
     rng = np.random.default_rng(4)
     root = rng.normal(size=(6, 6)) * np.array([1e-5] * 3 + [0.02] * 3)[:, None]
     prior = PoseCovariance(("p0",), root @ root.T)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import open3d as o3d
 import pytest
-from ray_cast_scan import Truth, cast_scan, load_body, load_rig, looking, without
+from ray_cast_scan import Truth, cast_scan, load_body, load_rig, nominal_placings, without
 
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.scan import Scan, fuse
@@ -41,11 +41,13 @@ def joined(*truths: Truth) -> Truth:
 def bar(start: list[float], end: list[float], radius: float) -> Truth:
     """A round bar between two places."""
     made = o3d.geometry.TriangleMesh.create_cylinder(radius, 1.0, resolution=40)
-    start, way = np.asarray(start, float), np.subtract(end, start)
+    way = np.subtract(end, start)
     vertices = np.asarray(made.vertices) * [1.0, 1.0, np.linalg.norm(way)]
     turn = o3d.geometry.get_rotation_matrix_from_axis_angle([-np.pi / 2, 0.0, 0.0])
     assert np.allclose(way / np.linalg.norm(way), turn @ [0.0, 0.0, 1.0])  # along y alone
-    return Truth(vertices @ turn.T + start + way / 2, np.asarray(made.triangles).astype(np.int64))
+    return Truth(
+        vertices @ turn.T + np.asarray(start) + way / 2, np.asarray(made.triangles).astype(np.int64)
+    )
 
 
 def ball(centre: list[float], radius: float) -> Truth:
@@ -68,7 +70,7 @@ def photographed(truth: Truth) -> list[RangeImage]:
 
 
 def placings() -> dict[str, RigidTransform]:
-    return {pair.name: looking(pair.nominal) for pair in RIG.pairs}
+    return nominal_placings(RIG)
 
 
 def fused(

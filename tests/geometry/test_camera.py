@@ -40,6 +40,7 @@ def test_distortion_is_that_of_equations_3_to_5(camera: Camera) -> None:
     u, v = (ideal[:, :2] / ideal[:, 2:]).T
     normalized = np.linalg.solve(camera.matrix, np.stack([u, v, np.ones_like(u)]))
     r2 = normalized[0] ** 2 + normalized[1] ** 2
+    assert isinstance(camera.lens, Radial)
     factor = camera.lens.k1 * r2 + camera.lens.k2 * r2**2
     # Eq. 3 scales u - u0, which holds x and, through the skew, y; so does ours.
     real = np.stack([u + (u - camera.u0) * factor, v + (v - camera.v0) * factor], axis=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,9 +48,9 @@ def fit(
     measured: Array,
     start: Array | list[float],
     noise: Noise = PLAIN,
-    jacobian: Callable[..., Any] = decay_jacobian,
+    jacobian: Callable[[Array], Array] = decay_jacobian,
     **options: Any,
-) -> Solution:
+) -> Solution[Array]:
     def blocks(state: Array) -> list[Block]:
         return [Block(decay(state) - measured, lambda: jacobian(state), slice(0, 3), noise)]
 
@@ -105,11 +106,11 @@ def test_states_without_finite_residuals_are_stepped_back_from() -> None:
 def test_the_covariance_is_what_many_repetitions_scatter_by() -> None:
     fits = [fit(noisy(seed), TRUE) for seed in range(400)]
     scatter = np.cov(np.stack([one.state for one in fits]).T)
-    said = np.mean([one.variance * one.covariance for one in fits], axis=0)
+    said = np.stack([one.variance * one.covariance for one in fits]).mean(axis=0)
     # 400 draws know a standard deviation to 3.5 %.
     assert np.allclose(np.sqrt(np.diag(said)), np.sqrt(np.diag(scatter)), rtol=0.12)
     assert said[0, 2] / np.sqrt(said[0, 0] * said[2, 2]) == pytest.approx(
-        np.corrcoef(np.stack([one.state for one in fits]).T)[0, 2], abs=0.1
+        np.asarray(np.corrcoef(np.stack([one.state for one in fits]).T))[0, 2], abs=0.1
     )
 
 
@@ -179,7 +180,7 @@ def test_blocks_that_touch_few_columns_give_what_one_dense_block_gives() -> None
     def sparse(state: Array) -> Iterator[Block]:
         for k, jacobian in enumerate(jacobians):
             residuals = jacobian @ state[columns[k]] - measured[k]
-            yield Block(residuals, lambda j=jacobian: j, columns[k], ROBUST)
+            yield Block(residuals, partial(np.asarray, jacobian), columns[k], ROBUST)
 
     def whole(state: Array) -> list[Block]:
         return [Block(dense @ state - measured.ravel(), lambda: dense, slice(0, 14), ROBUST)]

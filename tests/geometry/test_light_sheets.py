@@ -1,7 +1,6 @@
 """Every model of the light against its own derivatives, and against the chapter's planes."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +9,8 @@ from hypothesis import strategies as st
 from sheet_models import MATRIX, MIDDLE, PINHOLE, STRIPES, models, moved
 
 from bodyscan.arrays import Array
-from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.lens_sheets import LensSheets
-from bodyscan.geometry.light_planes import LightPlanes
+from bodyscan.geometry.light_planes import LightPlanes, LightSheets
 from bodyscan.geometry.ray_depths import intersect_rays
 from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
 from bodyscan.geometry.smooth_sheets import SmoothSheets
@@ -41,28 +39,35 @@ def test_derivatives_are_those_of_the_offset(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points, s = some_points(rng)
     for model in models(seed):
-        offset = model.offset(points, model.at(s), parameters=True)
+        assert_derivatives(model, points, s)
 
-        def by(
-            change: Callable[..., Any], step: float, model: BowedSheets | LensSheets = model
-        ) -> Array:
-            return (change(step) - change(-step)) / (2.0 * step)
 
-        for k, axis in enumerate(np.eye(3)):
-            slope = by(lambda h, a=axis, m=model: m.offset(points + h * a, m.at(s)).value, 0.01)
-            # Central differences over 0.01 mm in 1300: rounding and curvature below 1e-6.
-            assert np.allclose(offset.by_point[:, k], slope, rtol=1e-5, atol=1e-8)
-        slope = by(lambda h, m=model: m.offset(points, m.at(s + h)).value, 0.001)
-        assert np.allclose(offset.by_stripe, slope, rtol=1e-5, atol=1e-9)
-        for k, axis in enumerate(np.eye(len(model.covariance))):
-            size = np.abs(offset.by_parameter[:, k]).max() + 1e-12
-            slope = by(
-                lambda h, a=axis, m=model: (
-                    m.retract(h * a).offset(points, m.retract(h * a).at(s)).value
-                ),
-                1e-6 / size,
-            )
-            assert np.allclose(offset.by_parameter[:, k], slope, rtol=1e-4, atol=1e-4 * size)
+def assert_derivatives(model: SmoothSheets, points: Array, s: Array) -> None:
+    def moved_points(by: Array) -> Array:
+        return model.offset(points + by, model.at(s)).value
+
+    def moved_stripes(by: Array) -> Array:
+        return model.offset(points, model.at(s + by)).value
+
+    def moved_parameters(by: Array) -> Array:
+        other = model.retract(by)
+        return other.offset(points, other.at(s)).value
+
+    def slope(change: Callable[[Array], Array], axis: Array, step: float) -> Array:
+        return (change(step * axis) - change(-step * axis)) / (2.0 * step)
+
+    offset = model.offset(points, model.at(s), parameters=True)
+    for k, axis in enumerate(np.eye(3)):
+        # Central differences over 0.01 mm in 1300: rounding and curvature below 1e-6.
+        by_point = slope(moved_points, axis, 0.01)
+        assert np.allclose(offset.by_point[:, k], by_point, rtol=1e-5, atol=1e-8)
+    by_stripe = slope(moved_stripes, np.ones(1), 0.001)
+    assert np.allclose(offset.by_stripe, by_stripe, rtol=1e-5, atol=1e-9)
+    assert offset.by_parameter is not None
+    for k, axis in enumerate(np.eye(len(model.covariance))):
+        size = np.abs(offset.by_parameter[:, k]).max() + 1e-12
+        by_parameter = slope(moved_parameters, axis, 1e-6 / size)
+        assert np.allclose(offset.by_parameter[:, k], by_parameter, rtol=1e-4, atol=1e-4 * size)
 
 
 @settings(max_examples=10, deadline=None)
@@ -101,17 +106,17 @@ def test_variance_is_that_of_sheets_drawn_from_the_covariance(seed: int) -> None
 
 def test_smooth_planes_are_planes() -> None:
     model = next(m for m in models(4) if m.kind == "smooth-planes")
-    index = np.arange(STRIPES + 1)
+    index = np.arange(STRIPES + 1.0)
     planes = model.tangent_planes(index)
     chapter = LightPlanes(planes, np.zeros((STRIPES + 1, 4, 4)), "horizontal")
     rng = np.random.default_rng(1)
     rays = np.column_stack([rng.uniform(-0.3, 0.3, (300, 2)), np.ones(300)])
     s = rng.integers(1, STRIPES, 300).astype(float)
     # Far away rays and planes are nearly parallel: compare where a scanner measures.
-    near = chapter.depth(rays, s)
-    near = np.isfinite(near) & (near > 500.0) & (near < 3000.0)
+    depth = chapter.depth(rays, s)
+    near = np.isfinite(depth) & (depth > 500.0) & (depth < 3000.0)
     assert near.sum() > 50
-    assert np.allclose(model.depth(rays, s)[near], chapter.depth(rays, s)[near], rtol=1e-9)
+    assert np.allclose(model.depth(rays, s)[near], depth[near], rtol=1e-9)
 
 
 def test_a_lens_without_distortion_is_the_two_by_four_matrix() -> None:
@@ -146,7 +151,8 @@ def test_arrays_hold_everything() -> None:
     points, s = some_points(rng)
     rays = points / points[:, 2:]
     planes = LightPlanes(rng.normal(size=(5, 4)), rng.normal(size=(5, 4, 4)), "vertical")
-    for sheets in (*models(7), planes):
+    every: list[LightSheets] = [*models(7), planes]
+    for sheets in every:
         again = from_arrays(sheets.kind, to_arrays(sheets), sheets.direction)
         assert type(again) is type(sheets)
         assert (again.kind, again.direction) == (sheets.kind, sheets.direction)
@@ -165,16 +171,16 @@ def test_arrays_of_another_kind_are_refused() -> None:
 
 
 def test_planes_have_slope_and_variance_between_two_and_at_the_last() -> None:
-    planes = models(4)[4].tangent_planes(np.arange(STRIPES + 1))
+    planes = models(4)[4].tangent_planes(np.arange(STRIPES + 1.0))
     spread = np.zeros((STRIPES + 1, 4, 4))
     spread[:, 3, 3] = 0.01
     planes[150] = np.nan
     chapter = LightPlanes(planes, spread, "horizontal")
     ray = np.array([[0.02, 0.01, 1.0]])
-    for s in (100.5, 149.0, 151.0, 99.0):
-        s = np.array([s])
+    for place in (100.5, 149.0, 151.0, 99.0):
+        s = np.array([place])
         depth = chapter.depth(ray, s)
-        side = -1.0 if s[0] == 149.0 else 1.0
+        side = -1.0 if place == 149.0 else 1.0
         nearby = chapter.depth(ray, s + side * 1e-6)
         slope = (nearby - depth) / (side * 1e-6)
         assert np.allclose(chapter.depth_per_stripe(ray, s), slope, rtol=1e-4)
@@ -186,6 +192,7 @@ def test_planes_have_slope_and_variance_between_two_and_at_the_last() -> None:
 
 def test_what_is_too_uncertain_is_not_measured() -> None:
     model = models(2)[0]
+    assert isinstance(model, LensSheets)
     points, _ = some_points(np.random.default_rng(6))
     rays = points / points[:, 2:]
     s = model.stripe(points)

@@ -6,28 +6,29 @@ import numpy as np
 import pytest
 from sheet_models import MIDDLE, STRIPES, models
 
-from bodyscan.geometry.bowed_sheets import BowedSheets
+from bodyscan.arrays import Array
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.plane_table import PlaneTable
 from bodyscan.geometry.ray_depths import MOST_SIGMA, intersect_rays, triangulate_image
+from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 
 @pytest.fixture(params=[3, 4, 5])
-def planes(request: pytest.FixtureRequest) -> BowedSheets:
+def planes(request: pytest.FixtureRequest) -> SmoothSheets:
     return next(model for model in models(request.param) if model.kind == "smooth-planes")
 
 
 CAMERA = Camera(500.0, 502.0, -0.5, 100.0, 75.0, Radial(-0.15, 0.03), 200, 150)
 
 
-def some_rays(count: int) -> tuple[np.ndarray, np.ndarray]:
+def some_rays(count: int) -> tuple[Array, Array]:
     rng = np.random.default_rng(11)
     points = MIDDLE + rng.uniform(-300.0, 300.0, (count, 3))
     return points / points[:, 2:], rng.uniform(0.0, STRIPES, count)
 
 
-def test_it_agrees_with_the_sheets(planes: BowedSheets) -> None:
+def test_it_agrees_with_the_sheets(planes: SmoothSheets) -> None:
     rays, s = some_rays(40_000)  # more than a chunk
     depth = planes.depth(rays, s)
     found, per_stripe, variance = PlaneTable.of(planes).measure(rays, s)
@@ -42,11 +43,11 @@ def test_it_agrees_with_the_sheets(planes: BowedSheets) -> None:
     np.testing.assert_allclose(variance[near], planes.variance_mm2(rays, s, depth)[near], rtol=2e-3)
 
 
-def test_nothing_outside_the_stripes_or_behind(planes: BowedSheets) -> None:
+def test_nothing_outside_the_stripes_or_behind(planes: SmoothSheets) -> None:
     rays, _ = some_rays(300)
     table = PlaneTable.of(planes)
-    for s in (-0.1, STRIPES + 0.1, np.nan):
-        assert np.isnan(table.measure(rays, np.full(len(rays), s))).all()
+    for nowhere in (-0.1, STRIPES + 0.1, np.nan):
+        assert np.isnan(table.measure(rays, np.full(len(rays), nowhere))).all()
     s = np.linspace(0.0, STRIPES, 300)
     upward = np.tile([0.0, -2.0, 1.0], (300, 1))
     np.testing.assert_array_equal(
@@ -54,7 +55,7 @@ def test_nothing_outside_the_stripes_or_behind(planes: BowedSheets) -> None:
     )
 
 
-def test_measuring_takes_the_table(planes: BowedSheets) -> None:
+def test_measuring_takes_the_table(planes: SmoothSheets) -> None:
     rays, s = some_rays(500)
     found = intersect_rays(planes, rays.reshape(20, 25, 3), s.reshape(20, 25))
     assert found.depth.shape == (20, 25)
@@ -63,7 +64,7 @@ def test_measuring_takes_the_table(planes: BowedSheets) -> None:
     np.testing.assert_array_equal(found.depth.ravel()[known], expected[known])
 
 
-def test_an_image_is_measured_as_its_rays_are(planes: BowedSheets) -> None:
+def test_an_image_is_measured_as_its_rays_are(planes: SmoothSheets) -> None:
     """The same points and sigmas as the sheets' own depth, slope and variance give, pixel by pixel."""
     rng = np.random.default_rng(4)
     shape = (CAMERA.height, CAMERA.width)

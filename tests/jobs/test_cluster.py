@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cheap_job
 import pytest
@@ -20,7 +19,7 @@ from bodyscan.jobs.cluster import run_on_cluster
 
 
 def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(
-    make_scans: Callable[..., Any], tmp_path: Path
+    make_scans: Callable[..., Path], tmp_path: Path
 ) -> None:
     distributed = pytest.importorskip(
         "distributed", reason="dask.distributed is not installed (pip install '.[cluster]')"
@@ -36,8 +35,8 @@ def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(
             target=lambda: outcomes.extend(run_batch(jobs_of(scans, out), out, run))
         )
         batch.start()
-        job = _a_running_job(out)
-        os.kill(_parent(job), signal.SIGKILL)
+        running = _a_running_job(out)
+        os.kill(_parent(running), signal.SIGKILL)
         batch.join(timeout=60)
         assert not batch.is_alive()
     assert [outcome.state for outcome in outcomes] == ["done"] * 5, outcomes
@@ -53,7 +52,7 @@ def test_a_lost_worker_loses_nothing_and_nothing_is_done_twice(
 
 
 def test_a_scheduler_that_is_not_there_is_named(
-    make_scans: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_scans: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
     monkeypatch.setattr("bodyscan.jobs.cluster._TIMEOUT_S", 1)

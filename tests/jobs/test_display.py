@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
+from typing import Any
 
 import pytest
 
 from bodyscan.jobs.display import ending, json_lines, screen
 
-EVENTS = [
+EVENTS: list[dict[str, Any]] = [
     {"event": "shares", "workers": 2, "threads": 1, "why": "2 cores"},
     {"event": "batch", "jobs": ["[red]a", "b"]},
     {"event": "job", "job": "[red]a", "state": "running", "attempt": 1},

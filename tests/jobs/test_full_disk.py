@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import os
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from cheap_batch import results, run_cheap
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[None]:
+def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 1 MB."""
     folder = tmp_path / "small"
     folder.mkdir()
@@ -27,7 +26,9 @@ def small_disk(tmp_path: Path) -> Iterator[None]:
     subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def test_a_full_disk_is_said_and_survived(make_scans: Any, small_disk: Any, tmp_path: Path) -> None:
+def test_a_full_disk_is_said_and_survived(
+    make_scans: Callable[..., Path], small_disk: Path, tmp_path: Path
+) -> None:
     scans = make_scans(**{f"s{number}": "nothing" for number in range(3)})
     assert run_cheap(scans, tmp_path / "roomy").code == 0
     ballast = small_disk / "ballast"

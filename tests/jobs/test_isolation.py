@@ -8,7 +8,6 @@ import stat
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cheap_job
 from cheap_batch import jobs_of, results, run_cheap
@@ -19,7 +18,7 @@ from bodyscan.settings import Resources
 
 
 def test_crashes_and_errors_take_nobody_with_them(
-    make_scans: Callable[..., Any], tmp_path: Path
+    make_scans: Callable[..., Path], tmp_path: Path
 ) -> None:
     todo = {"crash": "crash", "exit": "exit", "raise": "raise", "once": "once", "good": "nothing"}
     scans = make_scans(**todo)
@@ -45,7 +44,7 @@ def test_crashes_and_errors_take_nobody_with_them(
     assert rows["good"]["state"] == "done"
 
 
-def test_a_job_that_is_stuck_is_ended(make_scans: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_job_that_is_stuck_is_ended(make_scans: Callable[..., Path], tmp_path: Path) -> None:
     (job,) = jobs_of(make_scans(a="sleep 60"), tmp_path)
     soon = job.pipeline.model_copy(update={"resources": Resources(limit_minutes=0.025)})
     write_job(job)
@@ -55,7 +54,7 @@ def test_a_job_that_is_stuck_is_ended(make_scans: Callable[..., Any], tmp_path: 
 
 
 def test_a_scan_that_changes_while_it_is_read_is_not_believed(
-    make_scans: Callable[..., Any], tmp_path: Path
+    make_scans: Callable[..., Path], tmp_path: Path
 ) -> None:
     scans = make_scans(moving="change", still="nothing")
     ends = run_cheap(scans, tmp_path / "out").endings()
@@ -68,7 +67,7 @@ def test_a_scan_that_changes_while_it_is_read_is_not_believed(
 
 
 def test_a_pipe_among_the_images_is_not_waited_for(
-    make_scans: Callable[..., Any], tmp_path: Path
+    make_scans: Callable[..., Path], tmp_path: Path
 ) -> None:
     scans = make_scans(a="nothing", b="nothing")
     os.mkfifo(scans / "a" / "image2.txt")
@@ -78,7 +77,7 @@ def test_a_pipe_among_the_images_is_not_waited_for(
 
 
 def test_odd_names_neither_hurt_nor_leak_out(
-    make_scans: Callable[..., Any], tmp_path: Path
+    make_scans: Callable[..., Path], tmp_path: Path
 ) -> None:
     names = ["a b", "it's \"quoted\"", "two\nlines", "Ωμέγα", "-rf", "..x", "$(touch x)", "[red]x",
              "summary.csv", "n" * 200]  # fmt: skip
@@ -94,7 +93,7 @@ def test_odd_names_neither_hurt_nor_leak_out(
 
 
 def test_a_link_in_the_output_folder_is_not_followed(
-    make_scans: Callable[..., Any], tmp_path: Path
+    make_scans: Callable[..., Path], tmp_path: Path
 ) -> None:
     scans, elsewhere = make_scans(a="nothing", b="nothing"), tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -110,7 +109,7 @@ def test_a_link_in_the_output_folder_is_not_followed(
 
 
 def test_everything_is_readable_by_its_owner_alone(
-    make_scans: Callable[..., Any], tmp_path: Path
+    make_scans: Callable[..., Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     assert run_cheap(make_scans(a="nothing", b="raise"), out).code == 1

@@ -6,7 +6,6 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cheap_job
 import pytest
@@ -21,7 +20,7 @@ def day(batched: Path, tmp_path: Path) -> Path:
     return shutil.copytree(batched, tmp_path / "day")
 
 
-def steps(day: Path, *changes: Any, version: int = 1) -> list[str]:
+def steps(day: Path, *changes: str, version: int = 1) -> list[str]:
     """Of Anna's job, why each stage would run now."""
     anna, bert = jobs_of(day / "scans", day / "out", *changes)
     stages = cheap_job.kinds(version)["fuse"]
@@ -78,7 +77,7 @@ def test_results_that_were_touched_are_made_again(day: Path) -> None:
     assert steps(day) == ["", ""]
 
 
-def test_a_failure_is_told_the_next_time(make_scans: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_failure_is_told_the_next_time(make_scans: Callable[..., Path], tmp_path: Path) -> None:
     scans = make_scans(a="raise")
     run_cheap(scans, tmp_path / "out")
     (job,) = jobs_of(scans, tmp_path / "out")
@@ -87,7 +86,7 @@ def test_a_failure_is_told_the_next_time(make_scans: Callable[..., Any], tmp_pat
     )
 
 
-def test_models_beside_scans_are_no_jobs(make_scans: Callable[..., Any], tmp_path: Path) -> None:
+def test_models_beside_scans_are_no_jobs(make_scans: Callable[..., Path], tmp_path: Path) -> None:
     scans = make_scans(anna="nothing")
     (scans / "anna-model").mkdir()
     (scans / "anna-model" / "scan.json").write_text("{}")

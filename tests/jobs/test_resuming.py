@@ -8,7 +8,6 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from cheap_batch import batch_command, jobs_of, results, run_cheap
 
@@ -17,7 +16,7 @@ from bodyscan.files.locking import file_lock
 
 
 def test_ten_kills_leave_the_same_bytes_as_none(
-    make_scans: Callable[..., Any], tmp_path: Path
+    make_scans: Callable[..., Path], tmp_path: Path
 ) -> None:
     scans = make_scans(**{f"s{number}": "sleep 0.05" for number in range(6)})
     assert run_cheap(scans, tmp_path / "undisturbed").code == 0
@@ -41,7 +40,7 @@ def test_ten_kills_leave_the_same_bytes_as_none(
 
 
 def test_the_processes_of_a_killed_batch_end_with_it(
-    make_scans: Callable[..., Any], tmp_path: Path
+    make_scans: Callable[..., Path], tmp_path: Path
 ) -> None:
     scans = make_scans(a="sleep 60")
     process = subprocess.Popen(batch_command(scans, tmp_path / "out"), stdout=subprocess.DEVNULL)
@@ -56,7 +55,7 @@ def test_the_processes_of_a_killed_batch_end_with_it(
 
 
 def test_a_second_batch_on_the_same_folder_is_refused(
-    make_scans: Callable[..., Any], tmp_path: Path
+    make_scans: Callable[..., Path], tmp_path: Path
 ) -> None:
     scans = make_scans(a="sleep 1.5")
     out = tmp_path / "out"
@@ -70,7 +69,7 @@ def test_a_second_batch_on_the_same_folder_is_refused(
 
 
 def test_half_made_folders_are_taken_away_and_not_believed(
-    make_scans: Callable[..., Any], tmp_path: Path
+    make_scans: Callable[..., Path], tmp_path: Path
 ) -> None:
     scans = make_scans(a="nothing")
     out = tmp_path / "out"
@@ -101,7 +100,7 @@ def _is_held(lock: Path) -> bool:
         return True
 
 
-def _wait_for(true: Callable[..., Any], seconds: float = 30.0) -> None:
+def _wait_for(true: Callable[[], bool], seconds: float = 30.0) -> None:
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "waited in vain"

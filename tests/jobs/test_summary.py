@@ -6,7 +6,6 @@ import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ def placed(shift_mm: Array, turn_rad: float = 0.0) -> list[list[float]]:
 
 
 @pytest.fixture
-def day(make_scans: Callable[..., Any], tmp_path: Path) -> tuple[list[Job], Path]:
+def day(make_scans: Callable[..., Path], tmp_path: Path) -> tuple[list[Job], Path]:
     """Nine scans: everybody sways by a millimetre; pair b moves away, 0.5 mm a scan."""
     scans = make_scans(**dict.fromkeys(NAMES, "nothing"))
     pairs = {pair: {"rig_from_camera": placed(np.zeros(3))} for pair in ("a", "b")}

@@ -1,7 +1,6 @@
 """The rival projectors: exact where light is as they take it to be, and how far off for a mirror."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,10 +29,10 @@ def baseline_planes(baseline: Array | float, tilt_deg: float = 0.0) -> LightPlan
     return LightPlanes(planes, np.zeros((len(planes), 4, 4)), "vertical")
 
 
-def stripe_of(planes: LightPlanes) -> Callable[..., Any]:
+def stripe_of(planes: LightPlanes) -> Callable[[Array], Array]:
     """s of points: the linear interpolation of where each plane lies along x."""
 
-    def stripe(points: np.ndarray) -> np.ndarray:
+    def stripe(points: Array) -> Array:
         a, b, c, d = planes.coefficients.T
         across = points @ np.stack([a, b, c]) + d
         below = np.argmax(across[:, :-1] * across[:, 1:] <= 0, axis=1)

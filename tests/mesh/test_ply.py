@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -13,11 +12,11 @@ import pytest
 from small_bodies import ball, points
 
 from bodyscan.errors import ResultError
-from bodyscan.mesh.body import BodyCloud
+from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
 
 
-def assert_same(one: object, other: object) -> None:
+def assert_same(one: BodyCloud | BodyMesh, other: BodyCloud | BodyMesh) -> None:
     for field in fields(one):
         mine, theirs = getattr(one, field.name), getattr(other, field.name)
         assert mine.dtype == theirs.dtype, field.name
@@ -94,7 +93,7 @@ def _header_only(data: bytes) -> bytes:
 @pytest.mark.parametrize(
     "damage", [_cut, _lengthened, _other_property, _other_count, _no_ply, _header_only]
 )
-def test_a_damaged_file_is_refused(tmp_path: Path, damage: Callable[..., Any]) -> None:
+def test_a_damaged_file_is_refused(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
     path = tmp_path / "cloud.ply"
     write_ply(path, points())
     path.write_bytes(damage(path.read_bytes()))

@@ -11,6 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from small_pair import CAMERA, STRIPES, pair, planes, stripe_map
 
+from bodyscan.arrays import Floats
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
@@ -23,6 +24,7 @@ from bodyscan.reconstruction.scan_volume import (
     volume_interval,
 )
 from bodyscan.rig.rig import Volume
+from bodyscan.stripes.stripe_limits import StripeLimits
 
 VOLUME = Volume(radius_mm=120.0, bottom_mm=-100.0, top_mm=150.0)
 
@@ -48,7 +50,13 @@ def calibrated(rising: bool) -> PairCalibration:
     return replace(pair(), sheets=replace(sheets, coefficients=sheets.coefficients[::-1].copy()))
 
 
-def some_s(seed: int, rising: bool) -> np.ndarray:
+def limits_of(one: PairCalibration, at: RigidTransform, volume: Volume = VOLUME) -> StripeLimits:
+    limits = stripes_in_volume(one, at, volume)
+    assert limits is not None
+    return limits
+
+
+def some_s(seed: int, rising: bool) -> Floats:
     """A bumpy room: stripe coordinates of all depths, next to each other."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     phase = np.random.default_rng(seed).uniform(0.0, 6.0, 4)
@@ -70,8 +78,9 @@ def test_all_that_lies_in_the_volume_is_wanted(
     distance_mm: float, turn: float, tilt: float, rising: bool, seed: int
 ) -> None:
     one, at = calibrated(rising), looking_at_the_middle(distance_mm, turn, tilt)
-    wanted = stripes_in_volume(one, at, VOLUME)
+    wanted = limits_of(one, at)
     s = some_s(seed, rising)
+    assert one.sheets is not None
     points, _ = triangulate_image(one.sheets, one.camera, s, np.full_like(s, 0.01))
     x, y, z = np.moveaxis(at.apply(points.astype(np.float64)), -1, 0)
     there = (np.hypot(x, y) < VOLUME.radius_mm) & (z > VOLUME.bottom_mm) & (z < VOLUME.top_mm)
@@ -91,7 +100,7 @@ def test_all_that_lies_in_the_volume_is_wanted(
 
 def test_integers_are_stripes_and_columns_may_be_lines() -> None:
     one, at = calibrated(True), looking_at_the_middle(500.0, 0.3, 0.1)
-    wanted = stripes_in_volume(one, at, VOLUME)
+    wanted = limits_of(one, at)
     stripe = np.floor(some_s(1, True)).astype(np.int32)
     middle = stripe.astype(np.float32) + np.float32(0.5)
     usable = np.random.default_rng(0).random(stripe.shape) < 0.9
@@ -113,7 +122,7 @@ def test_a_camera_may_stand_at_the_rigs_origin() -> None:
 def test_a_volume_out_of_sight_is_seen_nowhere() -> None:
     away = looking_at_the_middle(500.0, 0.0, 0.0)
     behind = RigidTransform(away.rotation, -away.translation)
-    wanted = stripes_in_volume(calibrated(True), behind, VOLUME)
+    wanted = limits_of(calibrated(True), behind)
     kept, beyond = wanted.split(some_s(0, True), np.ones((CAMERA.height, CAMERA.width), bool))
     assert not kept.any()
     assert not beyond.any()
@@ -136,7 +145,7 @@ def test_most_of_the_room_is_not_wanted(rising: bool) -> None:
     one = replace(calibrated(rising), camera=larger)
     small = Volume(radius_mm=40.0, bottom_mm=-30.0, top_mm=30.0)
     s = np.repeat(np.repeat(some_s(2, rising), 4, axis=0), 4, axis=1)
-    kept, beyond = stripes_in_volume(one, at, small).split(s, np.isfinite(s))
+    kept, beyond = limits_of(one, at, small).split(s, np.isfinite(s))
     # With 30 mm around it the volume is a sixth of the picture, and with one and a half stripes of
     # up to 50 mm at both ends a third of what there is in depth.
     assert 0.005 < kept.mean() < 0.1
@@ -162,7 +171,7 @@ def test_what_lies_flat_is_wanted_where_nothing_stands() -> None:
     """A plate on the floor; and the floor beside somebody's feet, but not the rest of it."""
     at = looking_at_the_middle(900.0, 0.0, 0.6)
     one = calibrated(True)
-    wanted = stripes_in_volume(one, at, Volume(radius_mm=300.0, bottom_mm=-5.0, top_mm=400.0))
+    wanted = limits_of(one, at, Volume(radius_mm=300.0, bottom_mm=-5.0, top_mm=400.0))
     rays = at.rotate(CAMERA.pixel_rays())
     floor = stripe_map((1.0 - at.translation[2]) / rays[..., 2]).s
     s = np.where(np.isfinite(floor), STRIPES - floor, np.nan).astype(np.float32)

@@ -1,5 +1,3 @@
-from typing import Any
-
 import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
@@ -13,13 +11,24 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.advice import advise, crucial_shots
 from bodyscan.registration.more_shots import BoardPlace
 from bodyscan.registration.normal_equations import normal_equations
-from bodyscan.registration.rig_solve import solve_rig
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
+from bodyscan.rig.rig import Rig
 
 NOISE_PX = 0.03
 
 
+Ring = tuple[
+    Rig,
+    dict[str, RigidTransform],
+    dict[str, Camera],
+    list[LocatedView],
+    dict[tuple[str, str], RigidTransform],
+    RigSolution,
+]
+
+
 @pytest.fixture(scope="module")
-def ring() -> Any:
+def ring() -> Ring:
     placings, cameras = ring_of_cameras()
     views, truth = ring_views(placings, cameras, noise_px=NOISE_PX)
     rig = ring_rig(placings)
@@ -49,9 +58,10 @@ def captured(
     return views
 
 
-def test_shots_as_advised_do_halve_the_sigma(ring: Any) -> None:
+def test_shots_as_advised_do_halve_the_sigma(ring: Ring) -> None:
     rig, placings, cameras, views, _, placed = ring
     more = advise(rig, placed).more
+    assert more is not None
     assert more.halves
     assert more.after_mm <= more.before_mm / 2
     extra = captured(more.place, more.shots, placings, cameras, np.random.default_rng(5))
@@ -62,14 +72,15 @@ def test_shots_as_advised_do_halve_the_sigma(ring: Any) -> None:
     assert sigma == pytest.approx(more.after_mm, rel=0.1)
 
 
-def test_the_worst_pair_is_that_of_the_covariance(ring: Any) -> None:
+def test_the_worst_pair_is_that_of_the_covariance(ring: Ring) -> None:
     rig, _, _, _, _, placed = ring
     advice = advise(rig, placed)
     sigmas = {
         name: np.linalg.norm(position_sigma(placed.covariance, name, t.translation))
         for name, t in placed.rig_from_camera.items()
     }
-    assert advice.worst == max(sigmas, key=sigmas.get)
+    assert advice.worst == max(sigmas, key=lambda name: sigmas[name])
+    assert advice.more is not None
     assert advice.more.before_mm == pytest.approx(sigmas[advice.worst], rel=1e-6)
     assert len(advice.chain) == len(sigmas) - 1
     assert not advice.bridges
@@ -104,6 +115,7 @@ def test_links_that_nothing_doubles_are_named() -> None:
     assert advice.weak[0].sigma_mm > 2 * np.median([link.sigma_mm for link in advice.chain])
     assert {advice.weak[0].first[:2], advice.weak[0].second[:2]} == {"p1", "p3"}
     assert advice.worst.startswith("p3")
+    assert advice.more is not None
     assert any(name.startswith("p3") for name in advice.more.between)
     assert not all(name.startswith("p3") for name in advice.more.between)
     assert advice.more.shots <= 3
@@ -111,7 +123,7 @@ def test_links_that_nothing_doubles_are_named() -> None:
 
 
 @pytest.mark.parametrize("by_board", [False, True])
-def test_eliminating_boards_keeps_the_covariance(ring: Any, by_board: bool) -> None:
+def test_eliminating_boards_keeps_the_covariance(ring: Ring, by_board: bool) -> None:
     placed = ring[-1]
     equations = normal_equations(
         placed.views,

@@ -11,20 +11,22 @@ from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
 PLACES = {"a": (1000.0, 0.0, 500.0), "b": (0.0, 1000.0, 500.0), "c": (-1000.0, 0.0, 900.0)}
-RIG = Rig(
-    name="three",
-    boards=(
-        Board(name="seen", columns=9, rows=7, square_mm=50),
-        Board(name="unseen", columns=10, rows=7, square_mm=20),
-    ),
-    pairs=tuple(
-        {
-            "name": name,
-            "camera": {"width": 640, "height": 480},
-            "nominal": {"position_mm": place, "look_at_mm": (0, 0, 500)},
-        }
-        for name, place in PLACES.items()
-    ),
+RIG = Rig.model_validate(
+    {
+        "name": "three",
+        "boards": (
+            Board(name="seen", columns=9, rows=7, square_mm=50),
+            Board(name="unseen", columns=10, rows=7, square_mm=20),
+        ),
+        "pairs": tuple(
+            {
+                "name": name,
+                "camera": {"width": 640, "height": 480},
+                "nominal": {"position_mm": place, "look_at_mm": (0, 0, 500)},
+            }
+            for name, place in PLACES.items()
+        ),
+    }
 )
 
 

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 
-from bodyscan.calibration.board_views import PlanarView
+from bodyscan.arrays import Array
+from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import locate_board
-from bodyscan.registration.rig_solve import solve_rig
+from bodyscan.outcome import Outcome
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
 
 PLACINGS, CAMERAS = ring_of_cameras(heights=(700, 1200))
 
 
-def really(points: Any) -> Any:
+def really(points: Array) -> Array:
     """Where the corners of a bent board lie whose print is 1 per mille too wide."""
     x, y, z = points.T
     middle = 315.0
@@ -24,7 +25,7 @@ def really(points: Any) -> Any:
     return np.column_stack([middle + 1.001 * (x - middle), y, z + bow])
 
 
-def bent_views(shots: int = 30) -> Any:
+def bent_views(shots: int = 30) -> tuple[list[LocatedView], list[LocatedView]]:
     """`ring_views` of that board, and of the flat one."""
     rng = np.random.default_rng(3)
     flat, truth = ring_views(PLACINGS, CAMERAS, shots=shots)
@@ -40,13 +41,13 @@ def bent_views(shots: int = 30) -> Any:
 
 
 @pytest.fixture(scope="module")
-def placed() -> Any:
+def placed() -> tuple[Outcome[RigSolution], Outcome[RigSolution]]:
     bent, flat = bent_views()
     rig = ring_rig(PLACINGS)
     return solve_rig(rig, bent, CAMERAS), solve_rig(rig, flat, CAMERAS)
 
 
-def rms(placed: Any) -> Any:
+def rms(placed: Outcome[RigSolution]) -> float:
     errors = [
         placed.value.rig_from_camera[name].translation - true.translation
         for name, true in PLACINGS.items()
@@ -54,7 +55,9 @@ def rms(placed: Any) -> Any:
     return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
 
 
-def test_the_bend_and_the_stretch_are_measured(placed: Any) -> None:
+def test_the_bend_and_the_stretch_are_measured(
+    placed: tuple[Outcome[RigSolution], Outcome[RigSolution]],
+) -> None:
     bent, _ = placed
     shape = bent.value.board_shapes[CHARUCO.name]
     found = shape.points + shape.offsets
@@ -70,14 +73,18 @@ def test_the_bend_and_the_stretch_are_measured(placed: Any) -> None:
     assert any("used, boards held out" in note and "mm out of plane" in note for note in bent.notes)
 
 
-def test_the_rig_is_as_good_as_with_a_flat_board(placed: Any) -> None:
+def test_the_rig_is_as_good_as_with_a_flat_board(
+    placed: tuple[Outcome[RigSolution], Outcome[RigSolution]],
+) -> None:
     bent, flat = placed
     # The size of the board is 0.3 per mille off on average, so are the distances of the cameras.
     assert rms(bent) < 2.0 * rms(flat) + 1e-3 * 1300.0
     assert max(bent.value.rms_px.values()) < 1.1 * max(flat.value.rms_px.values())
 
 
-def test_a_flat_board_is_left_alone(placed: Any) -> None:
+def test_a_flat_board_is_left_alone(
+    placed: tuple[Outcome[RigSolution], Outcome[RigSolution]],
+) -> None:
     _, flat = placed
     assert not flat.value.board_shapes
     assert not flat.notes

@@ -1,7 +1,5 @@
 """A pair or a pole that moved since the calibration is named, and by how much it moved."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from ring import ring_of_cameras, ring_rig, ring_views
@@ -32,7 +30,9 @@ def drift_after(
     return find_drift(poses, calibrated.rig_from_camera, calibrated.covariance, POLES)
 
 
-def about(place: Array | list[float], turn_deg: list[Any], shift_mm: list[Any]) -> RigidTransform:
+def about(
+    place: Array | list[float], turn_deg: list[float], shift_mm: list[float]
+) -> RigidTransform:
     """A motion in the rig frame that turns about `place`."""
     turn = RigidTransform.from_rotation_vector(np.radians(turn_deg), np.zeros(3))
     here = RigidTransform(np.eye(3), np.asarray(place, float))
@@ -55,8 +55,8 @@ def test_a_rig_that_stood_still_is_not_suspected(calibrated: RigSolution, seed: 
 def test_half_a_millimetre_or_a_fiftieth_of_a_degree_is_noticed(
     calibrated: RigSolution,
     pair: str,
-    turn_deg: list[float | int] | list[int],
-    shift_mm: list[float | int] | list[int],
+    turn_deg: list[float],
+    shift_mm: list[float],
 ) -> None:
     motion = about(PLACINGS[pair].translation, turn_deg, shift_mm)
     (move,) = drift_after(calibrated, {pair: motion}, shots=6).moves

@@ -13,16 +13,16 @@ from bodyscan.calibration.camera import locate_board
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
-from bodyscan.registration.rig_solve import solve_rig
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
 
 PLACINGS, CAMERAS = ring_of_cameras()
 
 
-def place(views: list[LocatedView]) -> Outcome:
+def place(views: list[LocatedView]) -> Outcome[RigSolution]:
     return solve_rig(ring_rig(PLACINGS), views, CAMERAS)
 
 
-def rms(placed: Outcome) -> float:
+def rms(placed: Outcome[RigSolution]) -> float:
     errors = [
         placed.value.rig_from_camera[name].translation - PLACINGS[name].translation
         for name in placed.value.rig_from_camera

@@ -1,7 +1,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from bodyscan.workflows.find_boards import calibrate_cameras, locate_views
 
 @cache
 def placed_ring(
-    seed: int = 0, shots: int = 40, spoil: Callable[..., Any] | None = None
+    seed: int = 0, shots: int = 40, spoil: Callable[[LocatedView], LocatedView] | None = None
 ) -> tuple[Rig, RigSolution]:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     views, _ = ring_views(placings, cameras, shots=shots, seed=seed)
@@ -97,7 +96,7 @@ def test_a_pair_that_does_not_fit_in_a_half_is_left_out_and_named() -> None:
     _, first, _ = split_shots(placed.views, sorted(placed.rig_from_camera))
     rng = np.random.default_rng(3)
 
-    def moved(view: Any) -> Any:
+    def moved(view: LocatedView) -> LocatedView:
         shift = RigidTransform.from_rotation_vector(np.zeros(3), rng.normal(0.0, 20.0, 3))
         pixels = placed.cameras[view.pair].project(
             (shift @ view.camera_from_board).apply(view.points)
@@ -116,8 +115,9 @@ def test_a_pair_that_does_not_fit_in_a_half_is_left_out_and_named() -> None:
 def test_so_few_shots_are_not_halved(shots: int) -> None:
     rig, placed = placed_ring()
     usual = sorted({view.shot for view in placed.views})[:shots]
+    views = tuple(view for view in placed.views if view.shot in usual)
     with pytest.raises(FailedWork, match=f"{shots} shots cannot be halved"):
-        compare_halves(rig, replace(placed, views=[v for v in placed.views if v.shot in usual]))
+        compare_halves(rig, replace(placed, views=views))
 
 
 def test_halves_that_know_far_less_than_the_whole_say_nothing() -> None:

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -80,7 +81,9 @@ def test_two_groups_without_a_shared_view_are_named() -> None:
 
 
 @pytest.mark.parametrize(("columns", "faces"), [(9, 1), (9, 2), (10, 2)])
-def test_plain_boards_numbered_from_either_end_are_resolved(columns: int, faces: int) -> None:
+def test_plain_boards_numbered_from_either_end_are_resolved(
+    columns: int, faces: Literal[1, 2]
+) -> None:
     board = Board(
         name="plain",
         columns=columns,

@@ -192,7 +192,7 @@ def test_no_value_is_changed_unseen(stored_now: Path, data: st.DataObject) -> No
     content = read(stored_now)
     where = data.draw(st.sampled_from(places(content)))
     values = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9)
-    value = data.draw(values | st.lists(values, max_size=4) | st.just({}))
+    value: object = data.draw(values | st.lists(values, max_size=4) | st.just({}))
     before = content
     for part in where:
         before = before[part]

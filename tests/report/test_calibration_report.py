@@ -51,7 +51,7 @@ def calibration() -> RigCalibration:
         for name, camera in cameras.items()
     }
     one = np.diag([0.0, 0.0, 0.0, *SIGMA_MM**2])
-    covariance = PoseCovariance(tuple(pairs), np.kron(np.eye(len(pairs)), one))
+    covariance = PoseCovariance(tuple(pairs), np.kron(np.eye(len(pairs)), one).astype(float))
     boards = {target: RigidTransform.identity() for target in SHOTS}
     seen = {
         name: corners(camera, [0, 1] if k else [1, 2])
@@ -109,7 +109,9 @@ def test_boards_in_common_are_counted_shot_by_shot(calibration: RigCalibration) 
 
 def test_ellipsoids_are_as_large_as_the_covariance_says(calibration: RigCalibration) -> None:
     model, times = rig_model(calibration)
-    whole = np.frombuffer(base64.b64decode(model["positions"]), "<u2").reshape(-1, 3)
+    positions = model["positions"]
+    assert isinstance(positions, str)
+    whole = np.frombuffer(base64.b64decode(positions), "<u2").reshape(-1, 3)
     vertices = np.array(model["low"]) + model["step"] * whole
     each = vertices.reshape(len(calibration.pairs), (RINGS + 1) * SECTORS, 3)
     for ellipsoid, placing in zip(each, calibration.rig_from_camera.values(), strict=True):

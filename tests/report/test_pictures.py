@@ -152,8 +152,6 @@ def test_unknown_colours_are_refused() -> None:
         (1.0, 4.0, [1, 2, 3, 4]),
     ],
 )
-def test_colour_bars_have_round_numbers(
-    low: float, high: float, ticks: list[float | int] | list[int]
-) -> None:
+def test_colour_bars_have_round_numbers(low: float, high: float, ticks: list[float]) -> None:
     assert round_ticks(low, high) == pytest.approx(ticks)
     assert "-0.0" not in map(str, round_ticks(low, high))

@@ -79,7 +79,9 @@ def test_simulated_is_said_and_only_where_it_is_known(tmp_path: Path, html: str)
 
 
 def test_the_body_is_packed_to_a_fraction_of_a_millimetre(html: str, scan: MadeScan) -> None:
-    model = json.loads(re.search(r'<script type="application/json">(.*?)</script>', html)[1])
+    script = re.search(r'<script type="application/json">(.*?)</script>', html)
+    assert script is not None
+    model = json.loads(script[1])
     whole = np.frombuffer(base64.b64decode(model["positions"]), "<u2").reshape(-1, 3)
     vertices = np.array(model["low"]) + model["step"] * whole
     faces = np.frombuffer(base64.b64decode(model["faces"]), "<u2").reshape(-1, 3)

@@ -17,7 +17,7 @@ MIDDLE = np.array([[0.0, 0.0, 1000.0]])
 def shifts(names: dict[str, RigidTransform], mm: float) -> PoseCovariance:
     """Every pair shifted by itself, `mm` along each axis, not turned."""
     own = np.diag([0.0, 0.0, 0.0, *[mm**2] * 3])
-    return PoseCovariance(tuple(names), np.kron(np.eye(len(names)), own))
+    return PoseCovariance(tuple(names), np.kron(np.eye(len(names)), own).astype(float))
 
 
 def test_independent_shifts_average_out() -> None:
@@ -30,7 +30,7 @@ def test_independent_shifts_average_out() -> None:
 def test_shifts_in_common_do_not() -> None:
     placings, cameras = ring_of_cameras(heights=(1000,))
     own = np.diag([0.0, 0.0, 0.0, *[0.3**2] * 3])
-    together = PoseCovariance(tuple(placings), np.kron(np.ones((3, 3)), own))
+    together = PoseCovariance(tuple(placings), np.kron(np.ones((3, 3)), own).astype(float))
     sigma, _ = sigma_at(MIDDLE, placings, cameras, together)
     assert sigma[0] == pytest.approx(0.3 * np.sqrt(3))
 

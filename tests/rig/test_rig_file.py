@@ -169,7 +169,7 @@ def test_what_is_wrong_with_codes_and_names_is_said_at_once(tmp_path: Path) -> N
 
 def test_keys_without_a_value_are_keys_not_given() -> None:
     """As calibrations have them that were written when every code had every key."""
-    keys = {"stripes": 12, "direction": "vertical"}
+    keys: dict[str, Any] = {"stripes": 12, "direction": "vertical"}
     nothing = {"inverses": None, "steps": None, "period": None}
     assert stripe_code({"code": "gray", **keys, **nothing}) == Gray(**keys)
     assert stripe_code({"code": "stripe-index", **keys, **nothing}).code == "stripe-index"
@@ -313,13 +313,13 @@ def test_a_code_without_inverses_needs_a_dark_image(tmp_path: Path) -> None:
          "bit00 bit01 bit02 phase00 phase01 phase02"),
     ],
 )  # fmt: skip
-def test_each_code_has_its_images(code: dict, names: str) -> None:
+def test_each_code_has_its_images(code: dict[str, Any], names: str) -> None:
     spec = stripe_code({**code, "stripes": 5, "direction": "vertical"})
     assert FrameNames().of_code(spec) == tuple(names.split())
 
 
 def test_frame_names() -> None:
-    names = FrameNames(inverse=("a", "b", "c"))
+    names = FrameNames.model_validate({"inverse": ("a", "b", "c")})
     assert names.of_kind(PATTERN, 3) == ("bit00", "bit01", "bit02")
     assert names.of_kind(INVERSE, 3) == ("a", "b", "c")
 
@@ -332,7 +332,7 @@ def test_frame_names() -> None:
     )
 )
 def test_written_yaml_reads_back_as_it_was(
-    tmp_path_factory: pytest.TempPathFactory, data: Any
+    tmp_path_factory: pytest.TempPathFactory, data: object
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "any.yaml"
     path.write_text(dump_yaml(data), encoding="utf-8", newline="")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -64,7 +63,7 @@ def read(images: dict[str, np.ndarray]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("build", [build_mirror, build_pinhole])
-def test_frames_read_as_the_true_stripe(build: Callable[..., Any]) -> None:
+def test_frames_read_as_the_true_stripe(build: Callable[..., MirrorProjector]) -> None:
     surfaces = [wall(1500.0, albedo=0.7), ball([40.0, -30.0, 1000.0], 200.0)]
     light = projector(build)
     images = render(surfaces, light=light)

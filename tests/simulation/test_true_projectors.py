@@ -26,8 +26,8 @@ SEEN = (
 SEEN = SEEN.reshape(-1, 3)
 
 
-def mirror(horizontal: bool = True, **change: object) -> MirrorProjector:
-    projection = replace(Projection(), **change)  # type: ignore[arg-type]
+def mirror(horizontal: bool = True, **change: Any) -> MirrorProjector:
+    projection = replace(Projection(), **change)
     rng = np.random.default_rng(5)
     return build_mirror(ABOVE, 640, horizontal, SEEN, projection, rng)
 
@@ -75,7 +75,7 @@ def metres(planes: np.ndarray) -> np.ndarray:
 def test_sheets_share_no_line() -> None:
     s = np.linspace(0, 640, 65)
     real = line_in_common(metres(mirror().plane(s)))
-    true = {"mirror_offset_mm": (0.0, 0.0), "sheet_tilt_deg": 0.0, "aim_mm": 0.0}
+    true: dict[str, Any] = {"mirror_offset_mm": (0.0, 0.0), "sheet_tilt_deg": 0.0, "aim_mm": 0.0}
     ideal = line_in_common(metres(mirror(**true).plane(s)))
     assert ideal < 1e-12  # a mirror and a sheet through the axis: all planes hold the axis
     assert real > 1e-3  # about a millimetre and more, at a metre
@@ -94,7 +94,9 @@ def test_tilt_angles_are_not_zero() -> None:
 
 @pytest.mark.parametrize("build", [build_mirror, build_pinhole])
 @pytest.mark.parametrize("horizontal", [True, False])
-def test_sweep_covers_what_the_camera_sees(build: Callable[..., Any], horizontal: bool) -> None:
+def test_sweep_covers_what_the_camera_sees(
+    build: Callable[..., MirrorProjector | PinholeProjector], horizontal: bool
+) -> None:
     projector = build(ABOVE, 640, horizontal, SEEN, Projection(), np.random.default_rng(2))
     s = projector.stripe(SEEN)
     assert np.isfinite(s).all()

@@ -11,16 +11,24 @@ from stripe_rendering import code_light, render
 
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.errors import DecodingFailed
+from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes import stripe_code
 from bodyscan.stripes.codes.phase_shift import PhaseShift
 from bodyscan.stripes.codes.stripe_index import StripeIndex
 from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
 
 STRIPES = 60
 
 
-def rendered(**code: Any) -> Callable[..., Any]:
+Images = dict[str, Bytes]
+Change = Callable[[Images], None]
+Read = Callable[..., StripeMap]
+"""Takes a Change of the images, and in place of its own another code (spec) or lit image (lit)."""
+
+
+def rendered(**code: Any) -> Read:
     """A function that reads a good sequence after `change` has been at its images."""
     spec = stripe_code({**code, "stripes": STRIPES, "direction": "horizontal"})
     lights = code_light(stripes=STRIPES, **code)
@@ -32,7 +40,7 @@ def rendered(**code: Any) -> Callable[..., Any]:
     )
 
     def read(
-        change: Callable[..., Any] = lambda images: None, *, spec: Any = spec, lit: Bytes = lit
+        change: Change = lambda images: None, *, spec: StripeCode = spec, lit: Bytes = lit
     ) -> StripeMap:
         images = {"coded": coded.copy(), "dark": dark, "lit": lit}
         change(images)
@@ -42,56 +50,54 @@ def rendered(**code: Any) -> Callable[..., Any]:
     return read
 
 
-def exchanged(first: int, second: int) -> Callable[..., Any]:
-    def change(images: dict[str, Bytes]) -> None:
+def exchanged(first: int, second: int) -> Change:
+    def change(images: Images) -> None:
         images["coded"][[first, second]] = images["coded"][[second, first]]
 
     return change
 
 
-def replaced(place: int, by: int | str) -> Callable[..., Any]:
-    def change(images: dict[str, Bytes]) -> None:
+def replaced(place: int, by: int | str) -> Change:
+    def change(images: Images) -> None:
         images["coded"][place] = images[by] if isinstance(by, str) else images["coded"][by]
 
     return change
 
 
 @pytest.fixture(scope="module")
-def plain_gray() -> Callable[..., Any]:
+def plain_gray() -> Read:
     return rendered(code="gray", inverses=False)
 
 
 @pytest.fixture(scope="module")
-def binary() -> Callable[..., Any]:
+def binary() -> Read:
     return rendered(code="binary")
 
 
 @pytest.fixture(scope="module")
-def section() -> Callable[..., Any]:
+def section() -> Read:
     return rendered(code="light-section")
 
 
 @pytest.fixture(scope="module")
-def phase() -> Callable[..., Any]:
+def phase() -> Read:
     return rendered(code="phase-shift", steps=4, period=8)
 
 
-def test_exchanged_bits_without_inverses_are_named(plain_gray: Callable[..., Any]) -> None:
+def test_exchanged_bits_without_inverses_are_named(plain_gray: Read) -> None:
     with pytest.raises(DecodingFailed, match="bits 1 and 3 were exchanged") as caught:
         plain_gray(exchanged(1, 3))
     assert caught.value.where == "pair a"
 
 
 @pytest.mark.parametrize("bit", range(6))
-def test_a_missing_pattern_without_inverse_is_noticed(
-    plain_gray: Callable[..., Any], bit: int
-) -> None:
+def test_a_missing_pattern_without_inverse_is_noticed(plain_gray: Read, bit: int) -> None:
     with pytest.raises(DecodingFailed, match="do not make a stripe code"):
         plain_gray(replaced(bit, "dark"))
 
 
-def test_a_pattern_exposed_otherwise_is_named(plain_gray: Callable[..., Any]) -> None:
-    def brighter(images: dict[str, Bytes]) -> None:
+def test_a_pattern_exposed_otherwise_is_named(plain_gray: Read) -> None:
+    def brighter(images: Images) -> None:
         images["coded"][2] = np.minimum(images["coded"][2].astype(int) * 2, 255)
 
     with pytest.raises(DecodingFailed, match="the pattern of bit 2 is brighter than the lit frame"):
@@ -99,10 +105,8 @@ def test_a_pattern_exposed_otherwise_is_named(plain_gray: Callable[..., Any]) ->
 
 
 @pytest.mark.parametrize(("one", "other"), [(0, 1), (2, 5)])
-def test_exchanged_bits_of_the_plain_code_are_named(
-    binary: Callable[..., Any], one: int, other: int
-) -> None:
-    def change(images: dict[str, Bytes]) -> None:
+def test_exchanged_bits_of_the_plain_code_are_named(binary: Read, one: int, other: int) -> None:
+    def change(images: Images) -> None:
         exchanged(one, other)(images)
         exchanged(6 + one, 6 + other)(images)
 
@@ -111,15 +115,13 @@ def test_exchanged_bits_of_the_plain_code_are_named(
 
 
 @pytest.mark.parametrize(("one", "other"), [(10, 30), (20, 21), (14, 16)])
-def test_exchanged_images_of_a_sweep_are_named(
-    section: Callable[..., Any], one: int, other: int
-) -> None:
+def test_exchanged_images_of_a_sweep_are_named(section: Read, one: int, other: int) -> None:
     with pytest.raises(DecodingFailed, match=f"stripes {one} and {other} were exchanged"):
         section(exchanged(one, other))
 
 
 def test_images_of_a_sweep_that_are_missing_or_double_are_named(
-    section: Callable[..., Any],
+    section: Read,
 ) -> None:
     with pytest.raises(DecodingFailed, match="stripe 25 shows no line of its own"):
         section(replaced(25, "dark"))
@@ -127,19 +129,19 @@ def test_images_of_a_sweep_that_are_missing_or_double_are_named(
         section(replaced(26, 25))
 
 
-def test_a_sweep_in_no_order_is_noticed(section: Callable[..., Any]) -> None:
-    def shuffled(images: dict[str, Bytes]) -> None:
+def test_a_sweep_in_no_order_is_noticed(section: Read) -> None:
+    def shuffled(images: Images) -> None:
         images["coded"] = np.random.default_rng(0).permutation(images["coded"])
 
     with pytest.raises(DecodingFailed, match="see whether the images are in their order"):
         section(shuffled)
 
 
-def test_a_sweep_that_is_dark_or_too_bright_is_refused(section: Callable[..., Any]) -> None:
-    def dark(images: dict[str, Bytes]) -> None:
+def test_a_sweep_that_is_dark_or_too_bright_is_refused(section: Read) -> None:
+    def dark(images: Images) -> None:
         images["coded"][:] = images["dark"]
 
-    def bright(images: dict[str, Bytes]) -> None:
+    def bright(images: Images) -> None:
         images["coded"] = np.minimum(images["coded"].astype(int) * 3, 255).astype(np.uint8)
 
     with pytest.raises(DecodingFailed, match="lights only"):
@@ -160,21 +162,19 @@ def test_a_sweep_that_is_dark_or_too_bright_is_refused(section: Callable[..., An
          "the phase images began with number 1"),
     ],
 )  # fmt: skip
-def test_phase_images_in_another_order_are_named(
-    phase: Callable[..., Any], change: Callable[..., Any], cause: str
-) -> None:
+def test_phase_images_in_another_order_are_named(phase: Read, change: Change, cause: str) -> None:
     with pytest.raises(DecodingFailed, match=cause):
         phase(change)
 
 
-def test_phase_images_that_are_missing_or_double_are_named(phase: Callable[..., Any]) -> None:
+def test_phase_images_that_are_missing_or_double_are_named(phase: Read) -> None:
     with pytest.raises(DecodingFailed, match="phase images 1 and 2 look alike"):
         phase(replaced(-2, -3))
     with pytest.raises(DecodingFailed, match="phase image 3 is 0% as bright as lit"):
         phase(replaced(-1, "dark"))
 
 
-def test_a_wrong_period_is_noticed(phase: Callable[..., Any]) -> None:
+def test_a_wrong_period_is_noticed(phase: Read) -> None:
     spec = PhaseShift(stripes=STRIPES, direction="horizontal", steps=4, period=6)
     with pytest.raises(DecodingFailed):
         phase(spec=spec)
@@ -184,7 +184,7 @@ def index_image(s: Array) -> Indices:
     return np.where((s >= 0) & (s < STRIPES), np.clip(s, 0, 254).astype(int) + 1, 0)
 
 
-def read_index(image: Indices, stripes: int = STRIPES, direction: str = "horizontal") -> StripeMap:
+def read_index(image: Indices, stripes: int = STRIPES, direction: Axis = "horizontal") -> StripeMap:
     spec = StripeIndex(stripes=stripes, direction=direction)
     lit = np.full(image.shape, 200, np.uint8)
     return decode_stripes(spec, lit, None, image.astype(np.uint8)[None])
@@ -208,8 +208,8 @@ def test_a_stripe_index_image_is_read_or_refused() -> None:
         read_index(np.where(image > 0, (image * 37) % 60 + 1, 0))
 
 
-def test_too_few_images_are_refused(section: Callable[..., Any]) -> None:
-    def fewer(images: dict[str, Bytes]) -> None:
+def test_too_few_images_are_refused(section: Read) -> None:
+    def fewer(images: Images) -> None:
         images["coded"] = images["coded"][1:]
 
     with pytest.raises(DecodingFailed, match="59 images of the code, but it has 60"):

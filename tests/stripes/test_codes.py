@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from stripe_rendering import decode_gray
 
 from bodyscan.errors import BadInput
+from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.bit_words import bit_that_flips, gray_from_stripe, stripe_from_gray
 from bodyscan.stripes.codes.gray import Gray, bits_needed
 from bodyscan.stripes.patterns import pattern_frames
@@ -25,7 +26,7 @@ def test_code_words_are_turned_back_into_stripes(stripes: int) -> None:
 @given(st.integers(1, 65535))
 def test_exactly_one_known_bit_flips_at_a_boundary(boundary: int) -> None:
     bits = 16
-    before, behind = (int(gray_from_stripe(np.int64(boundary - k))) for k in (1, 0))
+    before, behind = gray_from_stripe(np.array([boundary - 1, boundary])).tolist()
     flipped = f"{before ^ behind:016b}"
     assert flipped.count("1") == 1
     assert bit_that_flips(np.array([boundary]), bits)[0] == flipped.index("1")
@@ -34,7 +35,7 @@ def test_exactly_one_known_bit_flips_at_a_boundary(boundary: int) -> None:
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @given(stripes=st.integers(2, 40))
 def test_patterns_are_stripes_that_differ_in_one_bit_from_their_neighbours(
-    direction: str, stripes: int
+    direction: Axis, stripes: int
 ) -> None:
     spec = Gray(stripes=stripes, direction=direction)
     frames = pattern_frames(spec, width=41, height=40)
@@ -45,7 +46,7 @@ def test_patterns_are_stripes_that_differ_in_one_bit_from_their_neighbours(
     assert set(np.unique(frames)) <= {0, 255}
     along, across = (2, 1) if direction == "horizontal" else (1, 2)
     assert np.all(frames == frames.take([0], axis=along))
-    words = (frames.take(0, axis=along) > 0).T
+    words = np.take(frames, 0, axis=along).T > 0
     changes = np.abs(np.diff(words.astype(int), axis=0)).sum(axis=1)
     assert changes.max() <= 1
     assert changes.sum() == stripes - 1
@@ -62,7 +63,7 @@ def test_stripes_narrower_than_a_projector_pixel_are_refused() -> None:
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("with_dark", [True, False])
 def test_projected_frames_seen_as_they_are_give_their_stripes(
-    direction: str, with_dark: bool
+    direction: Axis, with_dark: bool
 ) -> None:
     spec = Gray(stripes=40, direction=direction)
     patterns, inverses = np.split(pattern_frames(spec, width=120, height=160) // 2 + 20, 2)
@@ -83,5 +84,6 @@ def test_projected_frames_seen_as_they_are_give_their_stripes(
     assert set(seen.boundary_index) == set(range(1, 40))
     assert seen.stripes == 40
     assert seen.lit is lit
-    assert (seen.s.dtype, seen.sigma.dtype) == (np.float32, np.float32)
-    assert (seen.boundary_index.dtype, seen.boundary_pixels.dtype) == (np.int64, np.float64)
+    assert seen.s.dtype == seen.sigma.dtype == np.float32
+    assert seen.boundary_index.dtype == np.int64
+    assert seen.boundary_pixels.dtype == np.float64

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from stripe_rendering import checkered, code_light, render, white
+from stripe_rendering import Field, checkered, code_light, render, white
 
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.errors import BadInput, DecodingFailed
+from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes import stripe_code
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.patterns import pattern_frames
@@ -28,17 +28,20 @@ THREE_PHASES = {"code": "phase-shift", "steps": 3, "period": 16, "inverses": Fal
 ALL = [PLAIN_GRAY, BINARY, PLAIN_BINARY, SECTION, INDEX, PHASE, THREE_PHASES]
 
 
-def name(value: Any) -> str | None:
+Code = dict[str, Any]  # as a rig file gives it
+
+
+def name(value: object) -> str | None:
     if not isinstance(value, dict):
         return None
     return "-".join(str(part) for part in value.values())
 
 
-def spec_of(code: dict, stripes: int, direction: str = "horizontal") -> StripeCode:
+def spec_of(code: Code, stripes: int, direction: Axis = "horizontal") -> StripeCode:
     return stripe_code({**code, "stripes": stripes, "direction": direction})
 
 
-def wavy(stripe_px: float) -> Callable[..., Any]:
+def wavy(stripe_px: float) -> Field:
     def s_at(u: Array | Indices, v: Array | Indices) -> Array:
         return 3.3 + (v + 0.1 * u + 2.5 * np.sin(u / 23) + 1.5 * np.sin(v / 31)) / stripe_px
 
@@ -46,7 +49,7 @@ def wavy(stripe_px: float) -> Callable[..., Any]:
 
 
 def captured(
-    code: dict, s_at: Callable[..., Any], stripes: int, **scene: Any
+    code: Code, s_at: Field, stripes: int, **scene: Any
 ) -> tuple[Bytes, Bytes, Bytes, Array]:
     """Lit, dark, coded images and the true s at pixel centres."""
     scene = {"shape": (110, 140), **scene}
@@ -57,7 +60,7 @@ def captured(
     return lit, dark, number.astype(np.uint8)[None], s
 
 
-def read(code: dict, images: tuple[Bytes, Bytes, Bytes, Array], stripes: int) -> StripeMap:
+def read(code: Code, images: tuple[Bytes, Bytes, Bytes, Array], stripes: int) -> StripeMap:
     lit, dark, coded, _ = images
     return decode_stripes(spec_of(code, stripes), lit, dark, coded)
 
@@ -70,7 +73,7 @@ def robust(errors: Array) -> float:
     return np.median(np.abs(errors)) / 0.6745
 
 
-def boundary_errors(seen: StripeMap, s_at: Callable[..., Any]) -> Array:
+def boundary_errors(seen: StripeMap, s_at: Field) -> Array:
     """How far boundaries lie from where they should be, across the stripes, px."""
     u, v = seen.boundary_pixels.T
     slope = s_at(u, v + 0.5) - s_at(u, v - 0.5)
@@ -95,7 +98,7 @@ def boundary_errors(seen: StripeMap, s_at: Callable[..., Any]) -> Array:
     ids=name,
 )
 def test_s_and_boundaries_are_where_they_should_be(
-    code: dict[str, Any], s_rms: float, boundary_px: float, share: float
+    code: Code, s_rms: float, boundary_px: float, share: float
 ) -> None:
     s_at = wavy(2.2)
     images = captured(code, s_at, 60)
@@ -115,7 +118,7 @@ def test_s_and_boundaries_are_where_they_should_be(
     ("code", "s_rms"), [(SECTION, (0.024, 0.018)), (PHASE, (0.027, 0.016))], ids=name
 )
 def test_narrow_and_wide_stripes_are_read_too(
-    code: dict[str, Any], s_rms: tuple[float, float], stripe_px: float
+    code: Code, s_rms: tuple[float, float], stripe_px: float
 ) -> None:
     stripes = int(140 / stripe_px)
     images = captured(code, wavy(stripe_px), stripes)
@@ -127,7 +130,7 @@ def test_narrow_and_wide_stripes_are_read_too(
 
 
 @pytest.mark.parametrize("code", [PLAIN_GRAY, SECTION, PHASE, THREE_PHASES], ids=name)
-def test_sigmas_say_how_far_off_values_are_in_dim_light(code: dict[str, Any]) -> None:
+def test_sigmas_say_how_far_off_values_are_in_dim_light(code: Code) -> None:
     s_at, light = wavy(3.0), 40.0
     images = captured(code, s_at, 50, light=light)
     seen = read(code, images, 50)
@@ -141,9 +144,7 @@ def test_sigmas_say_how_far_off_values_are_in_dim_light(code: dict[str, Any]) ->
 @pytest.mark.parametrize(
     ("code", "untouched", "corrected"), [(SECTION, 0.16, 0.12), (PHASE, 0.13, 0.1)], ids=name
 )
-def test_black_and_white_pulls_pixels_less(
-    code: dict[str, Any], untouched: float, corrected: float
-) -> None:
+def test_black_and_white_pulls_pixels_less(code: Code, untouched: float, corrected: float) -> None:
     images = captured(code, wavy(2.2), 60, albedo=checkered(24))
     seen = read(code, images, 60)
     error = (seen.s - images[3])[np.isfinite(images[3]) & np.isfinite(seen.s)]
@@ -152,7 +153,7 @@ def test_black_and_white_pulls_pixels_less(
 
 
 @pytest.mark.parametrize("code", ALL, ids=name)
-def test_vertical_stripes_are_horizontal_ones_transposed(code: dict[str, Any]) -> None:
+def test_vertical_stripes_are_horizontal_ones_transposed(code: Code) -> None:
     images = captured(code, wavy(3.0), 64, shape=(120, 140))
     seen = read(code, images, 64)
     lit, dark, coded = images[0].T, images[1].T, images[2].transpose(0, 2, 1)
@@ -165,7 +166,7 @@ def test_vertical_stripes_are_horizontal_ones_transposed(code: dict[str, Any]) -
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("code", [each for each in ALL if each is not INDEX], ids=name)
-def test_what_is_projected_is_read_as_it_is(code: dict[str, Any], direction: str) -> None:
+def test_what_is_projected_is_read_as_it_is(code: Code, direction: Axis) -> None:
     spec = spec_of(code, 40, direction)
     coded = pattern_frames(spec, 120, 160) // 2 + 20
     assert len(coded) == sum(spec.image_counts.values())
@@ -183,8 +184,11 @@ def test_what_is_projected_is_read_as_it_is(code: dict[str, Any], direction: str
 
 
 @pytest.mark.parametrize("code", [SECTION, PHASE, INDEX], ids=name)
-def test_a_depth_jump_gives_no_values_in_between(code: dict[str, Any]) -> None:
-    near, far = wavy(2.2), lambda u, v: wavy(2.2)(u, v) + 17.3
+def test_a_depth_jump_gives_no_values_in_between(code: Code) -> None:
+    near = wavy(2.2)
+
+    def far(u: Array | Indices, v: Array | Indices) -> Array:
+        return near(u, v) + 17.3
 
     def s_at(u: Array | Indices, v: Array | Indices) -> Array:
         return np.where((u - 70) ** 2 + (v - 55) ** 2 < 35**2, near(u, v), far(u, v))
@@ -192,9 +196,8 @@ def test_a_depth_jump_gives_no_values_in_between(code: dict[str, Any]) -> None:
     seen = read(code, captured(code, s_at, 80), 80)
     v, u = np.nonzero(np.isfinite(seen.s))
     nearest = np.minimum(np.abs(seen.s[v, u] - near(u, v)), np.abs(seen.s[v, u] - far(u, v)))
-    assert (
-        len(nearest) > 0.9 * np.isfinite(s_at(*np.meshgrid(np.arange(140), np.arange(110)))).sum()
-    )
+    everywhere = s_at(*np.meshgrid(np.arange(140), np.arange(110)))
+    assert len(nearest) > 0.9 * np.isfinite(everywhere).sum()
     # A mixed pixel would lie anywhere between surfaces 17.3 stripes apart.
     assert (nearest > 1.0).sum() == 0
 
@@ -217,7 +220,7 @@ def test_too_bright_and_doubly_lit_pixels_have_no_value_in_a_light_section() -> 
 
 
 @pytest.mark.parametrize("code", [SECTION, PHASE], ids=name)
-def test_the_same_images_give_the_same_bytes(code: dict[str, Any]) -> None:
+def test_the_same_images_give_the_same_bytes(code: Code) -> None:
     images = captured(code, wavy(3.0), 64, shape=(100, 120), albedo=white)
     one, other = read(code, images, 64), read(code, images, 64)
     assert one.s.tobytes() == other.s.tobytes()
@@ -237,7 +240,7 @@ def test_black_must_be_known() -> None:
 
 @pytest.mark.parametrize("code", [{"code": "gray"}, *ALL], ids=name)
 @pytest.mark.parametrize("rising", [True, False])
-def test_wanted_stripes_are_decoded_as_if_all_were(code: dict[str, Any], rising: bool) -> None:
+def test_wanted_stripes_are_decoded_as_if_all_were(code: Code, rising: bool) -> None:
     stripes = 60
     images = captured(code, wavy(2.2), stripes)
     whole = read(code, images, stripes)
@@ -254,6 +257,7 @@ def test_wanted_stripes_are_decoded_as_if_all_were(code: dict[str, Any], rising:
     assert shown.min() > 19.0
     assert shown.max() < 36.0
     deep = whole.s > 36.0 if rising else whole.s < 19.0
+    assert part.beyond is not None
     assert part.beyond[deep].mean() > 0.99
     assert not part.beyond[whole.s < 34.0 if rising else whole.s > 21.0].any()
     assert whole.beyond is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -56,6 +57,7 @@ def test_it_goes_all_the_way_from_the_rig_file_to_stripes(tmp_path: Path) -> Non
             write(tmp_path / "captures" / shot / "p1" / name, image)
     assert not [error for error in check(tmp_path / "rig.yaml").errors if "p1" in error]
     sequence = open_captures(rig, tmp_path / "rig.yaml").sequence("p1", "b2")
+    assert sequence is not None
     seen = decode_sequence(sequence, rig.pair("p1"))
     true = (np.arange(30) + 0.5)[:, None] * 12 / 30
     known = np.isfinite(seen.s)
@@ -108,7 +110,7 @@ def test_the_simulator_refuses_a_code_that_it_has_no_formulas_for(tmp_path: Path
 
 def test_a_name_that_is_taken_is_refused() -> None:
     class Another(ShiftedBinary):
-        code: str = "gray"
+        code: Literal["gray"] = "gray"  # type: ignore[assignment]  # the very thing refused
 
     class Clash(ShiftedBinary):
         kinds = (ImageKind(PATTERN.name, "other{bit}", "bit", 16),)

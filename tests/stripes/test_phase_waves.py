@@ -11,16 +11,17 @@ from stripe_rendering import checkered, code_light, render
 
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.codes import stripe_code
+from bodyscan.stripes.codes.phase_shift import PhaseShift
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.patterns import pattern_frames
-from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
 
 STRIPES = 240
-HIERARCHICAL = {"period": (20, 240), "steps": 3}
-THREE_LEVELS = {"period": (240, 60, 12), "steps": (4, 3, 8)}
-HETERODYNE = {"period": (18, 20, 23), "steps": 4}
-TWO_BEAT = {"period": (17, 18.3), "steps": 4}
+Keys = dict[str, Any]  # as a rig file gives them
+HIERARCHICAL: Keys = {"period": (20, 240), "steps": 3}
+THREE_LEVELS: Keys = {"period": (240, 60, 12), "steps": (4, 3, 8)}
+HETERODYNE: Keys = {"period": (18, 20, 23), "steps": 4}
+TWO_BEAT: Keys = {"period": (17, 18.3), "steps": 4}
 ALL = [HIERARCHICAL, THREE_LEVELS, HETERODYNE, TWO_BEAT]
 
 
@@ -30,7 +31,7 @@ def s_at(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def captured(
-    keys: dict[str, Any], *, gamma: float = 1.0, **scene: Any
+    keys: Keys, *, gamma: float = 1.0, **scene: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lit and coded images, and the true s."""
     lights = code_light("phase-shift", STRIPES, **keys) ** gamma
@@ -39,17 +40,18 @@ def captured(
     return lit, coded, s
 
 
-def described(keys: dict[str, Any]) -> StripeCode:
+def described(keys: Keys) -> PhaseShift:
     """As a rig file has it."""
     named = {key: list(value) if isinstance(value, tuple) else value for key, value in keys.items()}
     if named.pop("backward", False):
         named["shift"] = "backward"
     common = {"code": "phase-shift", "stripes": STRIPES, "direction": "vertical"}
-    code: StripeCode = stripe_code({**common, **named})
+    code = stripe_code({**common, **named})
+    assert isinstance(code, PhaseShift)
     return code
 
 
-def read(keys: dict[str, Any], lit: np.ndarray, coded: np.ndarray) -> StripeMap:
+def read(keys: Keys, lit: np.ndarray, coded: np.ndarray) -> StripeMap:
     return decode_stripes(described(keys), lit, None, np.ascontiguousarray(coded))
 
 
@@ -68,7 +70,7 @@ def rms(values: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("keys", ALL, ids=str)
-def test_s_is_right_and_its_sigma_too(keys: dict[str, Any]) -> None:
+def test_s_is_right_and_its_sigma_too(keys: Keys) -> None:
     lit, coded, s = captured(keys)
     seen = read(keys, lit, coded)
     off = errors(seen, s)
@@ -94,7 +96,7 @@ def test_s_is_right_and_its_sigma_too(keys: dict[str, Any]) -> None:
     ids=str,
 )
 @pytest.mark.parametrize("keys", [HIERARCHICAL, HETERODYNE], ids=str)
-def test_waves_that_move_and_begin_otherwise(keys: dict[str, Any], more: dict[str, Any]) -> None:
+def test_waves_that_move_and_begin_otherwise(keys: Keys, more: Keys) -> None:
     lit, coded, s = captured(keys | more)
     off = errors(read(keys | more, lit, coded), s)
     assert len(off) > 0.98 * np.isfinite(inner(s)).sum()
@@ -102,14 +104,20 @@ def test_waves_that_move_and_begin_otherwise(keys: dict[str, Any], more: dict[st
 
 
 def test_what_is_projected_is_what_the_keys_say() -> None:
-    keys = {"period": (20, 240), "steps": (3, 5), "backward": True, "start_deg": 30, "origin": 4}
+    keys: Keys = {
+        "period": (20, 240),
+        "steps": (3, 5),
+        "backward": True,
+        "start_deg": 30,
+        "origin": 4,
+    }
     shown = pattern_frames(described(keys), STRIPES, 4)[:, 0]
     light = code_light("phase-shift", STRIPES, **keys).reshape(8, STRIPES, 16)
     np.testing.assert_allclose(shown / 255.0, light.mean(axis=2), atol=0.004)
 
 
 @pytest.mark.parametrize(("keys", "light"), [(HIERARCHICAL, 45.0), (HETERODYNE, 30.0)], ids=str)
-def test_an_order_that_noise_leaves_open_is_not_guessed(keys: dict[str, Any], light: float) -> None:
+def test_an_order_that_noise_leaves_open_is_not_guessed(keys: Keys, light: float) -> None:
     lit, coded, s = captured(keys, light=light, noise=2.0)
     seen = read(keys, lit, coded)
     off = np.abs(errors(seen, s))
@@ -122,7 +130,7 @@ def test_an_order_that_noise_leaves_open_is_not_guessed(keys: dict[str, Any], li
 
 @pytest.mark.parametrize("gamma", [1.4, 2.2])
 @pytest.mark.parametrize("keys", [HIERARCHICAL, HETERODYNE], ids=str)
-def test_the_projectors_response_is_taken_out_and_told(keys: dict[str, Any], gamma: float) -> None:
+def test_the_projectors_response_is_taken_out_and_told(keys: Keys, gamma: float) -> None:
     lit, coded, s = captured(keys, gamma=gamma)
     straight = errors(read(keys, *captured(keys)[:2]), s)
     seen = read(keys, lit, coded)
@@ -227,9 +235,7 @@ def test_images_in_another_order_are_named(change: str, said: str) -> None:
         ({"backward": True, "start_deg": -90.0}, "`shift` were backward and `start_deg` -90"),
     ],
 )
-def test_waves_that_begin_otherwise_than_said_are_named(
-    projected: dict[str, Any], said: str
-) -> None:
+def test_waves_that_begin_otherwise_than_said_are_named(projected: Keys, said: str) -> None:
     lit, coded, _ = captured(HIERARCHICAL | projected)
     with pytest.raises(DecodingFailed) as refused:
         read(HIERARCHICAL, lit, coded)
@@ -254,9 +260,7 @@ def test_other_periods_than_said_are_noticed() -> None:
     ],
     ids=str,
 )
-def test_waves_that_do_not_tell_all_stripes_apart_are_refused(
-    keys: dict[str, Any], said: str
-) -> None:
+def test_waves_that_do_not_tell_all_stripes_apart_are_refused(keys: Keys, said: str) -> None:
     with pytest.raises(ValidationError) as refused:
         stripe_code({"code": "phase-shift", "stripes": 240, "direction": "vertical", **keys})
     assert said in str(refused.value)

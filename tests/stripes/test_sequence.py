@@ -10,6 +10,7 @@ from stripe_rendering import Sequence, decode_gray, render_sequence
 
 from bodyscan.arrays import Bytes
 from bodyscan.errors import DecodingFailed
+from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.stripe_map import StripeMap
 
 STRIPES = 100
@@ -23,7 +24,7 @@ def good() -> Sequence:
     )
 
 
-def read(sequence: Sequence, direction: str = "horizontal") -> StripeMap:
+def read(sequence: Sequence, direction: Axis = "horizontal") -> StripeMap:
     return decode_gray(
         sequence.lit, sequence.dark, sequence.patterns, sequence.inverses,
         stripes=STRIPES, direction=direction,
@@ -96,13 +97,11 @@ def test_a_sequence_of_the_wrong_length_or_size_is_refused(good: Sequence) -> No
 
 def test_exposures_that_cannot_be_read_are_refused(good: Sequence) -> None:
     def brighter(factor: float) -> Sequence:
-        return Sequence(
-            *(
-                np.clip(frames.astype(float) * factor, 0, 255).astype(np.uint8)
-                for frames in (good.lit, good.dark, good.patterns, good.inverses)
-            ),
-            s=good.s,
+        lit, dark, patterns, inverses = (
+            np.clip(frames.astype(float) * factor, 0, 255).astype(np.uint8)
+            for frames in (good.lit, good.dark, good.patterns, good.inverses)
         )
+        return Sequence(lit, dark, patterns, inverses, good.s)
 
     with pytest.raises(DecodingFailed, match="saturated"):
         read(brighter(3.0))

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from stripe_rendering import Sequence, checkered, decode_gray, render_sequence, white
+from stripe_rendering import Field, Sequence, checkered, decode_gray, render_sequence, white
 
 from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.boards.detection import find_boards
+from bodyscan.geometry.light_planes import Axis
 from bodyscan.rig.board import Board
 from bodyscan.stripes.stripe_map import StripeMap
 
 
-def wavy(stripe_px: float, *, slant: float = 0.1, first: float = 3.3) -> Callable[..., Any]:
+def wavy(stripe_px: float, *, slant: float = 0.1, first: float = 3.3) -> Field:
     """A smooth, uneven field of s with stripes about `stripe_px` wide."""
 
     def s_at(u: Array | Indices, v: Array | Indices) -> Array:
@@ -26,7 +25,7 @@ def wavy(stripe_px: float, *, slant: float = 0.1, first: float = 3.3) -> Callabl
     return s_at
 
 
-def read(sequence: Sequence, stripes: int, direction: str = "horizontal") -> StripeMap:
+def read(sequence: Sequence, stripes: int, direction: Axis = "horizontal") -> StripeMap:
     return decode_gray(
         sequence.lit, sequence.dark, sequence.patterns, sequence.inverses,
         stripes=stripes, direction=direction,
@@ -37,7 +36,7 @@ def contrast(sequence: Sequence) -> Bytes:
     return cv2.subtract(sequence.lit, sequence.dark)
 
 
-def boundary_errors(seen: StripeMap, s_at: Callable[..., Any]) -> Array:
+def boundary_errors(seen: StripeMap, s_at: Field) -> Array:
     """How far boundaries lie from where they should be, across the stripes, px."""
     u, v = seen.boundary_pixels.T
     slope = s_at(u, v + 0.5) - s_at(u, v - 0.5)

@@ -46,7 +46,7 @@ def view_of(
     fill: float = 0.8,
     k1: float = -0.1,
     back: bool = False,
-    shift: tuple[float, float] | tuple[int, int] = (0.0, 0.0),
+    shift: tuple[float, float] = (0.0, 0.0),
 ) -> View:
     """The board's middle in the picture's middle, tilted by `slant_deg`, filling it by `fill`."""
     spin, azimuth, slant = np.radians([spin_deg, azimuth_deg, slant_deg])

@@ -14,11 +14,13 @@ from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points
 from bodyscan.calibration.camera import locate_board
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 
 
 class Projector(Protocol):
-    stripes: int
+    @property
+    def stripes(self) -> int: ...
 
     def stripe(self, points: Array) -> Array: ...
 
@@ -87,7 +89,7 @@ class Uneven:
     """The same light with its boundaries out of place, each by its own share of a stripe, at most
     `size`."""
 
-    light: Mirror
+    light: Projector
     size: float
 
     @property
@@ -106,7 +108,7 @@ class Scene:
 
     camera: Camera
     projector: Projector
-    direction: str
+    direction: Axis
     square: float
     columns: int
     rows: int
@@ -217,7 +219,10 @@ def chapter_scene(**mirror: float) -> Scene:
     return Scene(camera, projector, "vertical", 20.0, 9, 7)
 
 
-CHAPTER_POSES = (
+Pose = tuple[Sequence[float], Sequence[float]]
+"""Of a board: its middle and its turn, see `Scene.looking_at`."""
+
+CHAPTER_POSES: tuple[Pose, ...] = (
     ([0.0, 0.0, 380.0], [0.35, 0.2, 0.1]),
     ([5.0, 5.0, 400.0], [-0.3, 0.25, 0.0]),
     ([-5.0, -5.0, 420.0], [0.05, -0.45, -0.1]),
@@ -239,7 +244,7 @@ def body_scene(k1: float, k2: float = 0.0, axis: float = 330.0) -> Scene:
     return Scene(camera, projector, "horizontal", 70.0, 9, 7)
 
 
-BODY_POSES = (
+BODY_POSES: tuple[Pose, ...] = (
     ([0.0, -140.0, 1150.0], [0.3, 0.2, 0.0]),
     ([20.0, 150.0, 1250.0], [-0.35, 0.3, 0.1]),
     ([-30.0, 0.0, 1400.0], [0.1, -0.4, 1.6]),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.light_planes import LightPlanes
@@ -21,12 +21,12 @@ STRIPES = apparatus.PROJECTOR.stripes
 
 
 def seen_on(
-    place: RigidTransform, stripe: Callable[..., Any], *, every_px: int = 8
-) -> tuple[np.ndarray, np.ndarray]:
+    place: RigidTransform, stripe: Callable[[Array], Array], *, every_px: int = 8
+) -> tuple[Indices, Array]:
     """Boundaries (N,) and the pixels (N, 2) at which image lines meet them on a board."""
     normal = place.rotation[:, 2]
 
-    def s_at(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def s_at(pixels: Array) -> tuple[Array, Array]:
         rays = apparatus.CAMERA.directions(pixels)
         points = rays * (normal @ place.translation / (rays @ normal))[:, None]
         return stripe(points), points
@@ -53,7 +53,7 @@ def seen_on(
 def mirror_points(
     places: Sequence[RigidTransform] | None = None,
     *,
-    stripe: Callable[..., Any] = MIRROR.stripe,
+    stripe: Callable[[Array], Array] = MIRROR.stripe,
     noise_px: float = 0.0,
     every_px: int = 8,
 ) -> BoundaryPoints:

@@ -67,6 +67,11 @@ def looking(placing: NominalPose) -> RigidTransform:
     return RigidTransform(np.stack([right, np.cross(forward, right), forward], axis=-1), position)
 
 
+def nominal_placings(rig: Rig) -> dict[str, RigidTransform]:
+    """rig_from_camera of every pair whose placing the rig file gives."""
+    return {pair.name: looking(pair.nominal) for pair in rig.pairs if pair.nominal}
+
+
 def nominal_camera(width: int, height: int) -> Camera:
     """Sees about 1 m x 0.8 m at 1.3 m, with a little barrel distortion."""
     focal = 1.33 * width
@@ -102,7 +107,7 @@ def cast_scan(
         square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32) * 2500
         scene.add_triangles(square, np.array([[0, 1, 2], [0, 2, 3]], np.uint32))
     rng = np.random.default_rng(seed)
-    poses = {pair.name: looking(pair.nominal) for pair in rig.pairs}
+    poses = nominal_placings(rig)
     images = []
     for pair in rig.pairs:
         camera = nominal_camera(round(scale * pair.camera.width), round(scale * pair.camera.height))
@@ -128,6 +133,7 @@ def _cast(
     seen = np.isfinite(depth)
     depth[~seen] = 0.0
     hit = pose.apply(rays * depth[..., None])
+    assert pair.projector_nominal is not None
     from_projector = hit - np.array(pair.projector_nominal.position_mm)
     lit = scene.cast_rays(
         np.concatenate(

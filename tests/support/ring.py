@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -23,7 +22,7 @@ CHARUCO = Board(
 )  # fmt: skip
 
 
-def looking_at(position: Any, target: Array | list[float]) -> RigidTransform:
+def looking_at(position: Array | list[float], target: Array | list[float]) -> RigidTransform:
     forward = np.asarray(target, float) - position
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -34,7 +33,7 @@ def looking_at(position: Any, target: Array | list[float]) -> RigidTransform:
 
 
 def ring_of_cameras(
-    poles: int = 3, heights: Any = (400, 850, 1300, 1750)
+    poles: int = 3, heights: Sequence[float] = (400, 850, 1300, 1750)
 ) -> tuple[dict[str, RigidTransform], dict[str, Camera]]:
     """`rig_from_camera` and cameras by name, at 1.3 m around the centre."""
     placings, cameras = {}, {}
@@ -55,13 +54,17 @@ def ring_of_cameras(
 def ring_rig(placings: dict[str, RigidTransform], fixed: str = "p1-1") -> Rig:
     position = placings[fixed].translation
     target = position + 1000.0 * placings[fixed].rotation[:, 2]
-    pairs = [{"name": name, "camera": {"width": 1280, "height": 1024}} for name in sorted(placings)]
+    pairs: list[dict[str, object]] = [
+        {"name": name, "camera": {"width": 1280, "height": 1024}} for name in sorted(placings)
+    ]
     for pair in pairs:
         if pair["name"] == fixed:
             pair["nominal"] = {
                 "position_mm": tuple(position), "look_at_mm": tuple(target)
             }  # fmt: skip
-    return Rig(name="ring", boards=(CHARUCO,), pairs=tuple(pairs), rig_frame={"pair": fixed})
+    return Rig.model_validate(
+        {"name": "ring", "boards": (CHARUCO,), "pairs": pairs, "rig_frame": {"pair": fixed}}
+    )
 
 
 def board_poses(count: int, rng: np.random.Generator) -> Iterator[RigidTransform]:
@@ -107,7 +110,7 @@ def ring_views(
             noisy = pixels[inside] + rng.normal(0.0, noise_px, (inside.sum(), 2))
             seen = face[inside]
             view = PlanarView(shot, seen, noisy)
-            symmetries = (RigidTransform.identity(),)
+            symmetries: tuple[RigidTransform, ...] = (RigidTransform.identity(),)
             if board.kind == "checkerboard":
                 # As a detector would: whichever end, and always as if it were the front.
                 symmetries = board_symmetries(board)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 
 from bodyscan.geometry.bowed_sheets import BowedSheets
@@ -27,7 +29,10 @@ def models(seed: int) -> list[SmoothSheets]:
     return [moved(model, rng) for model in made]
 
 
-def moved(model: SmoothSheets, rng: np.random.Generator) -> SmoothSheets:
+Sheets = TypeVar("Sheets", bound=SmoothSheets)
+
+
+def moved(model: Sheets, rng: np.random.Generator) -> Sheets:
     size = np.full(len(model.covariance), 0.01)
     if isinstance(model, BowedSheets):
         size[2:24] *= 0.1

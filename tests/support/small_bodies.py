@@ -23,7 +23,7 @@ def ball(resolution: int = 20, radius_mm: float = 120.0) -> BodyMesh:
         vertex_normals(vertices, faces),
         rng.integers(0, 256, vertices.shape).astype(np.uint8),
         sigma_mm,
-        np.isnan(sigma_mm)[faces].any(axis=1),
+        np.any(np.isnan(sigma_mm)[faces], axis=1),
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_map import StripeMap
@@ -63,7 +64,7 @@ def decode_gray(
     inverses: np.ndarray,
     *,
     stripes: int,
-    direction: str,
+    direction: Axis,
 ) -> StripeMap:
     """`decode_stripes` of a Gray code with inverses. patterns, inverses: (bits, H, W)."""
     code = Gray.model_validate({"stripes": stripes, "direction": direction})
@@ -91,7 +92,7 @@ def code_light(
     s = (np.arange(16 * stripes) + 0.5) / 16
     if code == "light-section":
         return (np.floor(s) == np.arange(stripes)[:, None]).astype(float)
-    parts = []
+    parts: list[np.ndarray] = []
     periods = period if isinstance(period, tuple) else (period,)
     if code == "binary":
         bits = np.floor(s).astype(int) >> np.arange((stripes - 1).bit_length())[::-1, None] & 1

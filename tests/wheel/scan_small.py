@@ -17,7 +17,7 @@ PAIRS = ("p1-2", "p1-3", "p2-2", "p2-3")
 def run(*arguments: object, or_code: int = 0) -> None:
     """The command as a user types it: the entry point that the wheel brings."""
     print("bodyscan", *arguments, flush=True)
-    command = [Path(sys.prefix) / "bin" / "bodyscan", *map(str, arguments)]
+    command = [str(Path(sys.prefix) / "bin" / "bodyscan"), *map(str, arguments)]
     if (code := subprocess.run(command, check=False).returncode) not in (0, or_code):
         sys.exit(f"bodyscan {arguments[0]} ended with {code}")
 

@@ -8,6 +8,7 @@ import shutil
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from small_workspace import PROJECT, Workspace, run
@@ -31,11 +32,11 @@ def batch(day: Path, *more: object, pipeline: str = "fuse", scans: str = "scans"
     )
 
 
-def events(result: Result) -> list[dict]:
+def events(result: Result) -> list[dict[str, Any]]:
     return [json.loads(line) for line in result.stdout.splitlines()]
 
 
-def endings(result: Result) -> dict[str, dict]:
+def endings(result: Result) -> dict[str, dict[str, Any]]:
     return {e["job"]: e for e in events(result) if e["event"] == "job" and "reason" in e}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,6 +37,7 @@ def board_errors(folder: Path, calibration: RigCalibration) -> np.ndarray:
     truth = json.loads((folder / "truth" / "truth.json").read_text("utf-8"))
     pair, found = truth["pairs"]["pair"], calibration.pairs["pair"]
     planes = np.array(pair["boundary_planes"])
+    assert found.sheets is not None
     camera_from_rig = np.linalg.inv(pair["rig_from_camera"])
     x, y = np.meshgrid(np.linspace(10, 170, 9), np.linspace(10, 130, 7))
     board = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=-1)
@@ -82,7 +84,9 @@ def misfit(points: np.ndarray, model: np.ndarray) -> np.ndarray:
     ],
     ids=lambda value: value.get("code", "gray") if isinstance(value, dict) else "",
 )
-def test_a_pair_is_calibrated_with_each_code(tmp_path: Path, code: dict, rms_mm: float) -> None:
+def test_a_pair_is_calibrated_with_each_code(
+    tmp_path: Path, code: dict[str, Any], rms_mm: float
+) -> None:
     folder = workspace(tmp_path, **code)
     calibration = load_calibration(folder / "calibration")
     errors = board_errors(folder, calibration)

@@ -1,14 +1,13 @@
 """Sequences that cannot be decoded: each cause said once, a pair of which all fail by its cause."""
 
 from pathlib import Path
-from typing import Any
 
 from bodyscan.captures.folder import ImageSequence
 from bodyscan.errors import DecodingFailed
 from bodyscan.workflows.decode import failed_pairs, failure_notes
 
 
-def failures(pair: str, what: str, *shots: str) -> Any:
+def failures(pair: str, what: str, *shots: str) -> list[tuple[ImageSequence, DecodingFailed]]:
     return [
         (
             ImageSequence(pair, shot, Path("lit.png"), None, (), ()),

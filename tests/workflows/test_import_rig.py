@@ -186,7 +186,7 @@ def test_a_pair_that_cannot_be_read_costs_that_pair(folder: Path) -> None:
     ],
 )
 def test_what_is_wrong_is_named(
-    folder: Path, where: tuple[str, ...], value: Any, said: str | None
+    folder: Path, where: tuple[str, ...], value: object, said: str | None
 ) -> None:
     content = json.loads(json.dumps(described("a")))
     inside = content["pairs"][0]

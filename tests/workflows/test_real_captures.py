@@ -20,7 +20,8 @@ from benchmarks.held_out_boards import hold_out_boards
 from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
-from bodyscan.workflows.calibrate_rig import calibrate_rig, find_all_boards
+from bodyscan.workflows.calibrate_rig import calibrate_rig
+from bodyscan.workflows.find_boards import find_all_boards
 
 
 def opened(path: Path) -> tuple[Rig, Captures]:
@@ -32,6 +33,7 @@ def test_a_real_pair_is_calibrated(captures: Path, tmp_path: Path) -> None:
     calibration = calibrate_rig(*opened(real_rig_file("procam-board", captures, tmp_path)))
     pair = calibration.pairs["procam"]
     assert pair.quality.poses == 4
+    assert pair.quality.corners_rms_px is not None
     # Sub-pixel corners of an 8-bit camera in focus; a wrong board order would be tens of px.
     assert pair.quality.corners_rms_px < 0.3
     # Horizontal stripes, which reach only part of the image: those that fall on boards.

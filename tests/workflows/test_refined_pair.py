@@ -1,18 +1,19 @@
 """A pair by itself whose stripes changed its camera: boards are where that camera sees them."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from ring import ring_of_cameras, ring_rig, ring_views
 
+from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.pair import PairCalibration, PairQuality
-from bodyscan.registration.rig_solve import solve_rig
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.workflows.calibrate_rig import update_poses
 
 
-def misfit_px(placed: Any, views: Any) -> float:
+def misfit_px(placed: RigSolution, views: Sequence[LocatedView]) -> float:
     off = []
     for view in views:
         camera_from_rig = placed.rig_from_camera[view.pair].inverse()
@@ -22,7 +23,7 @@ def misfit_px(placed: Any, views: Any) -> float:
 
 
 @pytest.mark.parametrize("change", [0.0, 20.0])
-def test_boards_follow_the_camera(change: Any) -> None:
+def test_boards_follow_the_camera(change: float) -> None:
     placings, cameras = ring_of_cameras(poles=1, heights=(850,))
     views, _ = ring_views(placings, cameras, shots=8)
     rig = ring_rig(placings, fixed="p1-1")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from small_workspace import Workspace, run
+from typer.testing import Result
 
 from bodyscan.evaluation.acceptance_file import load_acceptance
 from bodyscan.geometry.transforms import RigidTransform
@@ -34,6 +35,7 @@ def test_corners_are_kept_with_their_residuals(workspace: Workspace) -> None:
         # The robust RMS of the quality leaves outliers out; the median of a Rayleigh distribution
         # is 1.18 sigma, its RMS 1.41.
         median = float(np.median(np.linalg.norm(seen.residuals_px, axis=1)))
+        assert quality.corners_rms_px is not None
         assert 0.4 < median / quality.corners_rms_px < 1.2
 
 
@@ -73,7 +75,9 @@ def spheres(workspace: Workspace) -> Path:
     return capture_artefact(world, balls, place, workspace.folder / "captures" / "spheres")
 
 
-def accept(folder: Path, calibration: Path, out: Path, *more: object) -> Any:
+def accept(
+    folder: Path, calibration: Path, out: Path, *more: object
+) -> tuple[Result, dict[str, Any]]:
     result = run("accept", "--spheres", folder, "--calibration", calibration, "--out", out, *more)
     return result, json.loads((out / "acceptance.json").read_text("utf-8"))
 

@@ -6,23 +6,23 @@ scan by it, cut down to 200 points and a tetrahedron by that commit's own writer
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from bodyscan.fusion.storage import load_scan
+from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
 
 STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0"
 
 
 @pytest.fixture(scope="module")
-def calibration() -> Any:
+def calibration() -> RigCalibration:
     return load_calibration(STORED / "calibration")
 
 
-def test_a_calibration_gives_the_depths_that_it_was_fitted_for(calibration: Any) -> None:
+def test_a_calibration_gives_the_depths_that_it_was_fitted_for(calibration: RigCalibration) -> None:
     assert sorted(calibration.pairs) == ["p1-2", "p1-3", "p2-2", "p2-3"]
     for name, pair in calibration.pairs.items():
         seen = calibration.seen[name]
@@ -36,7 +36,9 @@ def test_a_calibration_gives_the_depths_that_it_was_fitted_for(calibration: Any)
         assert 900.0 < depth[0] < 1800.0
 
 
-def test_a_calibration_is_written_again_as_it_was(calibration: Any, tmp_path: Path) -> None:
+def test_a_calibration_is_written_again_as_it_was(
+    calibration: RigCalibration, tmp_path: Path
+) -> None:
     save_calibration(calibration, tmp_path)
     before = json.loads((STORED / "calibration" / "calibration.json").read_text("utf-8"))
     after = json.loads((tmp_path / "calibration.json").read_text("utf-8"))
@@ -58,7 +60,7 @@ def test_a_calibration_is_written_again_as_it_was(calibration: Any, tmp_path: Pa
         assert all(np.array_equal(new[key], old[key], equal_nan=True) for key in old.files)
 
 
-def of_keys_then(after: Any, before: Any) -> Any:
+def of_keys_then(after: object, before: object) -> object:
     """Without the keys that came since."""
     if isinstance(after, dict) and isinstance(before, dict):
         return {key: of_keys_then(after[key], before[key]) for key in after.keys() & before}
