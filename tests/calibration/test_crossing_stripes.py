@@ -78,7 +78,18 @@ def calibrated(*, alone: bool, crossed: int = len(POSES)) -> Outcome[PairCalibra
             for shot in shots
         ]
     return calibrate_pair(
-        PlacedPair("p", camera, own, COLUMNS, 0.05, len(shots), tuple(shots), alone)
+        PlacedPair(
+            "p",
+            camera,
+            own.covariance,
+            own,
+            own.lenses,
+            COLUMNS,
+            0.05,
+            len(shots),
+            tuple(shots),
+            alone,
+        )
     )
 
 

@@ -36,9 +36,17 @@ def hair_and_skin(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 def exposed(code: dict[str, Any], times: float) -> tuple[np.ndarray, np.ndarray]:
     """(F, H, W) images, lit and dark first, of light that a camera sees `times` as long; and s."""
     lights = code_light(stripes=STRIPES, **code)
-    noise = {"noise": 1.0, "seed": round(10 * times)}
-    scene = {"shape": SHAPE, "albedo": hair_and_skin, "light": 200 * times, "ambient": 8 * times}
-    lit, dark, coded, s = render(s_at, lights, stripes=STRIPES, **scene, **noise)
+    lit, dark, coded, s = render(
+        s_at,
+        lights,
+        stripes=STRIPES,
+        shape=SHAPE,
+        albedo=hair_and_skin,
+        light=200 * times,
+        ambient=8 * times,
+        noise=1.0,
+        seed=round(10 * times),
+    )
     return np.concatenate([[lit, dark], coded]), s
 
 
@@ -123,7 +131,9 @@ def rig_file(folder: Path, **changes: Any) -> Path:
 
 def test_a_rig_file_names_its_exposures(tmp_path: Path) -> None:
     rig = load_rig(rig_file(tmp_path))
-    frames = ("lit", "dark", *rig.frames.of_code(rig.pairs[0].projector))
+    projector = rig.pairs[0].projector
+    assert projector is not None
+    frames = ("lit", "dark", *rig.frames.of_code(projector))
     (tmp_path / "scan/a").mkdir(parents=True)
     for name, times in (("short", 1.0), ("long", 8.0)):
         images, _ = exposed(GRAY, times)

@@ -10,6 +10,7 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.projector_sheets import sheets_of_projector
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -20,6 +21,7 @@ WIDTH, HEIGHT = 160, 120
 CAMERA = Camera(400.0, 400.0, 0.0, 79.5, 59.5, Radial(0.0, 0.0), WIDTH, HEIGHT)
 FOCAL, CENTRE, SIZE = 420.0, (99.5, 79.5), (200, 160)
 PLACE = RigidTransform.from_rotation_vector([-0.15, 0.25, 0.02], [-180.0, -110.0, 10.0])
+WAYS: tuple[Axis, Axis] = ("vertical", "horizontal")
 SIGMA = 0.05
 FIELDS = (np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.float32))
 
@@ -28,7 +30,7 @@ def pair(*, crossing: bool = True) -> PairCalibration:
     light = Camera(FOCAL, FOCAL, 0.0, *CENTRE, Radial(0.0, 0.0), *SIZE)
     columns, rows = (
         sheets_of_projector(light, PLACE, np.array([0.0, 0.0, 700.0]), size, way)
-        for size, way in zip(SIZE, ("vertical", "horizontal"), strict=True)
+        for size, way in zip(SIZE, WAYS, strict=True)
     )
     known = PairQuality(0.1, 5)
     return PairCalibration(
@@ -51,8 +53,8 @@ def stripes(seed: int = 1) -> StripeMap:
     lit = np.full((HEIGHT, WIDTH), 200, np.uint8)
     maps = []
     for axis in (0, 1):
-        s = FOCAL * away[..., axis] / away[..., 2] + CENTRE[axis] + 0.5
-        s = (s + SIGMA * rng.standard_normal(s.shape)).astype(np.float32)
+        true = FOCAL * away[..., axis] / away[..., 2] + CENTRE[axis] + 0.5
+        s = (true + SIGMA * rng.standard_normal(true.shape)).astype(np.float32)
         sigma = np.full(s.shape, SIGMA, np.float32)
         maps.append(StripeMap(s, sigma, lit, *FIELDS, SIZE[axis]))
     return replace(maps[0], crossing=maps[1])

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Bytes
+from bodyscan.arrays import Bytes, Floats
 from bodyscan.captures.folder import open_scan
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import CaptureError, DecodingFailed
@@ -37,7 +37,7 @@ def code_of(rig: Rig) -> StripeCode:
     return pair.projector
 
 
-def images_in(folder: Path, rig: Rig) -> Bytes:
+def images_in(folder: Path, rig: Rig) -> Bytes | Floats:
     (sequence,) = open_scan(rig, folder).sequences
     assert sequence.lit is None
     assert sequence.dark is None
@@ -56,7 +56,7 @@ def plainly_decoded(coded: Bytes) -> tuple[NDArray[np.int32], NDArray[np.bool_]]
 
 
 @pytest.fixture(scope="module")
-def coded(captures: Path) -> Bytes:
+def coded(captures: Path) -> Bytes | Floats:
     return images_in(captures / "gray-jpeg", RIG)
 
 
