@@ -123,7 +123,8 @@ def calibrate_rig(rig_file: AnyPath, *, progress: Progress = silent) -> RigCalib
     from bodyscan.workflows.calibrate_rig import calibrate_rig as calibrate
 
     rig = load_rig(rig_file)
-    return calibrate(rig, open_captures(rig, Path(rig_file)), progress)
+    captures = open_captures(rig, Path(rig_file))
+    return calibrate(rig, captures, progress, folder=Path(rig_file).parent)
 
 
 def save_calibration(calibration: RigCalibration, folder: AnyPath) -> Path:

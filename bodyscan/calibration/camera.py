@@ -113,6 +113,20 @@ def calibrate_camera(
     return fit_from_scratch(views, width, height, lens).calibration(views)
 
 
+def calibrate_known_camera(views: Sequence[PlanarView], camera: Camera) -> CameraCalibration:
+    """A camera with a prior, which its views may move as far as that lets them; one will do.
+
+    Raises DegeneratePoses if there is none.
+    """
+    if not views:
+        raise DegeneratePoses(
+            "no board was seen well enough by a camera that is known",
+            remedy="show it the board in a shot that others see too",
+        )
+    poses = [locate_board(camera, view)[0] for view in views]
+    return fit_camera(camera, poses, views).calibration(views)
+
+
 def fit_from_scratch(
     views: Sequence[PlanarView], width: int, height: int, lens: Lens = CHAPTERS_LENS
 ) -> CameraFit:
@@ -146,7 +160,7 @@ def fit_camera(
         _State(camera, tuple(poses)),
         lambda state: [
             *_corners_of_all(state, views),
-            lens_prior(state.camera, np.arange(len(MATRIX), size)),
+            known_beforehand(state.camera, np.arange(size)),
         ],
         _State.moved,
         unknowns=size + 6 * len(views),
@@ -166,6 +180,16 @@ def weighted_rms(residuals: Sequence[Array], weights: Sequence[Array]) -> float:
     weight = np.concatenate(weights)
     squared = np.sum(np.concatenate(residuals) ** 2, axis=1)
     return float(np.sqrt(np.sum(weight * squared) / np.sum(weight)))
+
+
+def known_beforehand(camera: Camera, columns: Indices) -> Block:
+    """What is known of a camera by itself: its prior if it has one, else that its lens bends little;
+    `columns` are its parameters'."""
+    if camera.prior is None:
+        return lens_prior(camera, columns[len(MATRIX) :])
+    known = 1.0 / camera.prior.sigmas
+    away = known * (camera.parameters - camera.prior.parameters)
+    return Block(away, lambda: np.diag(known), columns, EXACT)
 
 
 def lens_prior(camera: Camera, columns: Indices) -> Block:

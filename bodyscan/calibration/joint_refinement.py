@@ -17,6 +17,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import BoundaryPoints, points_on_board
+from bodyscan.calibration.camera import known_beforehand
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.smooth_sheets import SmoothSheets
@@ -140,7 +141,8 @@ def refine_jointly(
 def _blocks(
     state: _State[Sheets], boards: Sequence[StripedBoard], unknowns: int
 ) -> Iterator[Block]:
-    """Of each board its corners and its stripes; last what is known of sheets beforehand."""
+    """Of each board its corners and its stripes; last what is known of camera and sheets
+    beforehand."""
     camera, sheets = np.arange(state.first_pose), np.arange(state.first_sheet, unknowns)
     with np.errstate(all="ignore"):
         for k, board in enumerate(boards):
@@ -150,6 +152,8 @@ def _blocks(
             of_stripes = partial(_stripe_jacobian, state, k, board)
             yield Block(corners, of_corners, np.concatenate([camera, pose]), CORNERS)
             yield Block(stripes, of_stripes, np.concatenate([camera, pose, sheets]), STRIPES)
+    if state.camera.prior is not None:
+        yield known_beforehand(state.camera, camera)
     known, jacobian = state.sheets.prior()
     yield Block(known, lambda: jacobian, sheets, EXACT)
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.errors import CalibrationFileError
-from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.camera import Camera, CameraPrior
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.projector_sheets import looked_at, sheets_of_projector
 from bodyscan.geometry.transforms import RigidTransform
@@ -19,6 +19,8 @@ from bodyscan.rig.known import Known, KnownCamera
 from bodyscan.rig.pair import Pair
 from bodyscan.stripes.stripe_code import StripeCode
 
+HELD_PX = 1e-6
+"""What a camera that is held may be moved by."""
 GRID = 9
 """Places of a picture, each way, at which a parameter's effect on its pixels is looked at."""
 
@@ -54,14 +56,16 @@ class KnownPair:
 
 
 def read_known_camera(pair: Pair, folder: Path) -> Camera:
-    """The camera of a pair with `known`, whose file lies relative to `folder`.
+    """The camera of a pair with `known`, whose file lies relative to `folder`; its prior lets boards
+    move it by `sigma_px`, or holds it where none is given.
 
     Raises CalibrationFileError for a file that is wrong or of another camera.
     """
     assert pair.known is not None
-    return _find(pair.known, pair.known.camera, pair.name, folder).camera(
-        pair.camera.width, pair.camera.height
-    )
+    found = _find(pair.known, pair.known.camera, pair.name, folder)
+    camera = found.camera(pair.camera.width, pair.camera.height)
+    sigmas = parameter_sigmas(camera, pair.known.sigma_px or HELD_PX)
+    return replace(camera, prior=CameraPrior(camera.parameters, sigmas))
 
 
 def read_known_pair(pair: Pair, folder: Path) -> KnownPair:

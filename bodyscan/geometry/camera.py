@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,11 +16,21 @@ leave open at worst."""
 MATRIX_STEP_PX = 1e-2
 
 
+@dataclass(frozen=True, eq=False)
+class CameraPrior:
+    """What was known of a camera before any board was seen: its parameters (P,), and their standard
+    deviations (P,)."""
+
+    parameters: Array
+    sigmas: Array
+
+
 @dataclass(frozen=True)
 class Camera:
     """Intrinsics in pixels, (u, v) = (column, row), whole numbers at pixel centres.
 
-    Camera frame: x right, y down, z forward, mm.
+    Camera frame: x right, y down, z forward, mm.  prior: of a camera that was calibrated elsewhere;
+    what it does to a point has nothing to do with it.
     """
 
     alpha: float
@@ -31,6 +41,7 @@ class Camera:
     lens: Lens
     width: int
     height: int
+    prior: CameraPrior | None = field(default=None, compare=False, repr=False)
 
     @property
     def matrix(self) -> Array:
@@ -52,6 +63,8 @@ class Camera:
     @property
     def prior_sigmas(self) -> Array:
         """(P,) standard deviations of the parameters before any shot of the rig was seen."""
+        if self.prior is not None:
+            return self.prior.sigmas
         return np.array([*MATRIX_PRIOR_PX, *self.lens.prior_sigmas])
 
     @property

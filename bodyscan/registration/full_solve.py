@@ -15,7 +15,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.calibration.camera import lens_prior
+from bodyscan.calibration.camera import known_beforehand
 from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, minimize
 from bodyscan.registration.joint_solve import JointSolution
@@ -97,13 +97,13 @@ def _blocks(
 def camera_priors(camera: Camera, own: Indices) -> Iterator[Block]:
     """What is known of a camera, whose parameters' columns are `own`, beforehand.
 
-    Its matrix about where it stands: that does not pull, but keeps what no view shows from running
-    off. Its lens as `lens_prior` has it.
+    Its prior, or its matrix about where it stands: that does not pull, but keeps what no view shows
+    from running off; and its lens as `lens_prior` has it.
     """
-    matrix, lens = own[: len(MATRIX)], own[len(MATRIX) :]
-    known = np.diag(1.0 / camera.prior_sigmas[: len(MATRIX)])
-    yield Block(np.zeros(len(MATRIX)), lambda: known, matrix, EXACT)
-    yield lens_prior(camera, lens)
+    if camera.prior is None:
+        known = np.diag(1.0 / camera.prior_sigmas[: len(MATRIX)])
+        yield Block(np.zeros(len(MATRIX)), lambda: known, own[: len(MATRIX)], EXACT)
+    yield known_beforehand(camera, own)
 
 
 def _without_motion(linearize: Callable[[], Array]) -> Callable[[], Array]:

@@ -58,7 +58,9 @@ def solve_jointly(
     for number, target in enumerate(targets, start=1):
         group = [view for view in views if view.target == target]
         _add_frame(model, number, group, ids, cameras, points, start.root_from_board[target])
-    _adjust(model, refine_cameras, loss_px)
+    # What others found of a camera, and how well, Ceres is not told: `full_solve` goes by it.
+    known = [ids[name] for name in names if cameras[name].prior is not None]
+    _adjust(model, refine_cameras, loss_px, known)
     rig = model.rig(1)
     placed = {root: RigidTransform.identity()}
     for name in names[1:]:
@@ -188,7 +190,9 @@ def _add_frame(
     model.register_frame(number)
 
 
-def _adjust(model: pycolmap.Reconstruction, refine_cameras: bool, loss_px: float) -> None:
+def _adjust(
+    model: pycolmap.Reconstruction, refine_cameras: bool, loss_px: float, known: Sequence[int]
+) -> None:
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_points3D = False
     options.refine_focal_length = refine_cameras
@@ -205,6 +209,8 @@ def _adjust(model: pycolmap.Reconstruction, refine_cameras: bool, loss_px: float
         config.add_image(image_id)
     for point_id in model.points3D:
         config.add_constant_point(point_id)
+    for camera_id in known:
+        config.set_constant_cam_intrinsics(camera_id)
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     summary = adjuster.solve()
     if not summary.is_solution_usable():

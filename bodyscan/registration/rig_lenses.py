@@ -54,10 +54,10 @@ def choose_lenses(
 
 
 def _undecided(rig: Rig, cameras: Mapping[str, Camera]) -> list[str]:
-    """Pairs whose lens the rig file leaves open, and for which there is a simpler one."""
+    """Pairs whose lens nobody has told, and for which there is a simpler one."""
     left_open = {pair.name for pair in rig.pairs if pair.camera.lens == AUTO}
     return sorted(
         name
         for name, camera in cameras.items()
-        if name in left_open and len(family_up_to(type(camera.lens))) > 1
+        if name in left_open and camera.prior is None and len(family_up_to(type(camera.lens))) > 1
     )

@@ -23,19 +23,23 @@ from bodyscan.registration.storage import save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.workflows.decode import ViewKey, decode_on_boards
-from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards, locate_views
+from bodyscan.workflows.find_boards import HERE, calibrate_cameras, find_all_boards, locate_views
 from bodyscan.workflows.rig_remarks import JoinedRig, remarked
 
 
-def calibrate_rig(rig: Rig, captures: Captures, progress: Progress = silent) -> RigCalibration:
+def calibrate_rig(
+    rig: Rig, captures: Captures, progress: Progress = silent, *, folder: Path = HERE
+) -> RigCalibration:
     """Board images in, calibrated rig out, with advice on it.
+
+    folder: what the files of cameras that are `known` are relative to.
 
     A bad image or pair costs that image or pair and is named in `failed` or `notes`.  Raises
     FailedWork if no pair is left, RigDisconnected if the pairs do not hang together, BadInput if
     nothing fixes the rig frame.
     """
     boards = find_all_boards(rig, captures, progress)
-    return remarked(join_rig(rig, captures, boards, progress), progress)
+    return remarked(join_rig(rig, captures, boards, progress, folder=folder), progress)
 
 
 def calibrate_folder(
@@ -45,17 +49,23 @@ def calibrate_folder(
     and the path of its JSON. Raises RigFileError and CaptureError besides."""
     rig = load_rig(rig_file)
     captures = open_captures(rig, rig_file)
-    found = join_rig(rig, captures, find_all_boards(rig, captures, progress), progress)
+    boards = find_all_boards(rig, captures, progress)
+    found = join_rig(rig, captures, boards, progress, folder=Path(rig_file).parent)
     save_calibration(found.calibration, folder)
     calibration = remarked(found, progress)
     return calibration, save_calibration(calibration, folder)
 
 
 def join_rig(
-    rig: Rig, captures: Captures, boards: Outcome[list[BoardView]], progress: Progress = silent
+    rig: Rig,
+    captures: Captures,
+    boards: Outcome[list[BoardView]],
+    progress: Progress = silent,
+    *,
+    folder: Path = HERE,
 ) -> JoinedRig:
     """From boards found in images to the calibration, with nothing in it that it stands without."""
-    cameras = calibrate_cameras(rig, boards.value, progress)
+    cameras = calibrate_cameras(rig, boards.value, progress, folder=folder)
     if not cameras.value:
         remedy = describe_findings(rig, boards.value, len(captures.sequences))
         raise _nothing_calibrated(rig, cameras.failures, remedy)
@@ -79,7 +89,14 @@ def join_rig(
         placed.covariance,
         placed.rig_from_board,
         failed,
-        (*boards.notes, *located.notes, *decoded.notes, *fitted.notes, *joined.notes),
+        (
+            *boards.notes,
+            *cameras.notes,
+            *located.notes,
+            *decoded.notes,
+            *fitted.notes,
+            *joined.notes,
+        ),
         seen=seen_corners(placed, pairs),
     )
     return JoinedRig(calibration, placed, boards.value, len(captures.sequences))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.detection import find_boards
@@ -13,7 +14,13 @@ from bodyscan.calibration.board_views import (
     has_enough_corners,
     planar_view,
 )
-from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
+from bodyscan.calibration.camera import (
+    CameraCalibration,
+    calibrate_camera,
+    calibrate_known_camera,
+    locate_board,
+)
+from bodyscan.calibration.known_pair import read_known_camera
 from bodyscan.calibration.lens_choice import calibrate_with_best_lens
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_board_image
@@ -21,9 +28,11 @@ from bodyscan.errors import BodyscanError
 from bodyscan.geometry.lenses import LENSES, RICHEST
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, threaded
+from bodyscan.rig.known import Known
 from bodyscan.rig.pair import AUTO
 from bodyscan.rig.rig import Rig
 
+HERE = Path()
 NO_POSE_PX = 1.0
 """A view that is farther off its best pose than this, and than NO_POSE_TIMES its camera's usual
 error, shows another board or mixed-up corners: real corners are good to a few tenths of a pixel."""
@@ -53,10 +62,15 @@ def find_all_boards(
 
 
 def calibrate_cameras(
-    rig: Rig, views: Sequence[BoardView], progress: Progress = silent
+    rig: Rig,
+    views: Sequence[BoardView],
+    progress: Progress = silent,
+    *,
+    folder: Path = HERE,
 ) -> Outcome[dict[str, CameraCalibration]]:
     """Every pair's camera by itself; those that cannot be calibrated are failures.
 
+    What is `known` of one is read from files relative to `folder`, and held or only begun with.
     Lenses are those that the rig file names. Otherwise a pair alone gets the one that its held-out
     boards choose; pairs of a rig get the richest, since the joint solve chooses.
     """
@@ -65,6 +79,8 @@ def calibrate_cameras(
         spec = rig.pair(name).camera
         own = [v for v in views if v.pair == name and has_enough_corners(v, rig.board(v.board))]
         planar = [planar_view(view, rig.board(view.board)) for view in own]
+        if rig.pair(name).known is not None:
+            return calibrate_known_camera(planar, read_known_camera(rig.pair(name), folder))
         if spec.lens != AUTO:
             return calibrate_camera(planar, spec.width, spec.height, LENSES[spec.lens]())
         if len(rig.pairs) == 1:
@@ -75,7 +91,25 @@ def calibrate_cameras(
     cameras, errors = attempt_each(
         calibrate, names, BodyscanError, stage="calibrating cameras", progress=progress
     )
-    return Outcome(cameras, failures={name: str(error) for name, error in errors.items()})
+    notes = [
+        line
+        for name, found in cameras.items()
+        for known in [rig.pair(name).known]
+        if known is not None
+        for line in _known_notes(name, known, found)
+    ]
+    failures = {name: str(error) for name, error in errors.items()}
+    return Outcome(cameras, tuple(notes), failures)
+
+
+def _known_notes(name: str, known: Known, found: CameraCalibration) -> Iterator[str]:
+    held = "held" if known.sigma_px is None else f"a start that is right to {known.sigma_px:g} px"
+    yield f"{name}: camera from {known.file} ({known.format}), {held}"
+    if found.rms_px > NO_POSE_PX:
+        yield (
+            f"{name}: boards fit the camera from {known.file} to {found.rms_px:.1f} px only: is it "
+            "this camera's, with the lens as it is set now?"
+        )
 
 
 def locate_views(
