@@ -72,8 +72,8 @@ def misfit(points: np.ndarray, model: np.ndarray) -> np.ndarray:
     return np.linalg.norm(a - b @ turn, axis=1)
 
 
-# About 1.6 times what was measured (0.018, 0.021, 0.103, 0.020, 0.013 mm) in images of 192 x 144 px, where
-# a pixel is 1.5 mm wide on the board, 300 to 400 mm away.
+# About 1.6 times what was measured (0.018, 0.021, 0.103, 0.020, 0.013 mm) in images of 192 x 144 px,
+# where a pixel is 1.5 mm wide on the board, 300 to 400 mm away.
 @pytest.mark.parametrize(
     ("code", "rms_mm"),
     [
