@@ -39,12 +39,16 @@ class ShotEntry(Model):
 
 
 class CapturesFile(Model):
-    """The whole captures.yaml."""
+    """The whole captures.yaml.
+
+    simulated: what the simulator says of its images, and reports then say too.
+    """
 
     version: Literal[1] = 1
     kind: Literal["calibration", "scan"]
     when: datetime | None = None
     subject: Name | None = None
+    simulated: bool | None = None
     shots: tuple[ShotEntry, ...] | None = None
 
     def problems(self) -> Iterator[Problem]:

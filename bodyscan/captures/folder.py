@@ -14,6 +14,7 @@ from typing import Literal
 from bodyscan.captures.captures_file import FILE_NAME, ShotEntry, load_captures_file
 from bodyscan.captures.listing import Listing
 from bodyscan.errors import CaptureError
+from bodyscan.files.relative_text import relative_text
 from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
@@ -77,7 +78,8 @@ class MissingImage:
 class Captures:
     """What one or more capture folders hold. `shots` in order; `sequences` by shot, then by pair.
 
-    when, subject: of a scan, as its captures.yaml says.
+    when, subject, simulated: of a scan, as its captures.yaml says.  base: the folder that kept messages
+    are relative to; that of the rig file, or of the scan.
     """
 
     rig: Rig
@@ -86,6 +88,8 @@ class Captures:
     sequences: tuple[ImageSequence, ...]
     when: datetime | None = None
     subject: str | None = None
+    simulated: bool = False
+    base: Path = Path()
 
     @cached_property
     def _by_pair_and_shot(self) -> dict[tuple[str, str], ImageSequence]:
@@ -102,6 +106,10 @@ class Captures:
     def of_shot(self, shot: str) -> tuple[ImageSequence, ...]:
         """What was taken in that shot, in the order of the rig's pairs."""
         return tuple(sequence for sequence in self.sequences if sequence.shot == shot)
+
+    def relative(self, text: str) -> str:
+        """A message with its paths relative to `base`, as it may be kept."""
+        return relative_text(text, self.base, self.folders)
 
     def missing(self) -> tuple[MissingImage, ...]:
         """Every image that should be there and is not."""
@@ -123,7 +131,8 @@ def open_captures(rig: Rig, rig_path: Path) -> Captures:
             where=str(rig_path),
             remedy="Add `calibration:` with a folder; docs/formats.md shows how.",
         )
-    return join_captures(tuple(open_folder(rig, rig_path, entry) for entry in rig.calibration))
+    parts = tuple(open_folder(rig, rig_path, entry) for entry in rig.calibration)
+    return replace(join_captures(parts), base=Path(rig_path).parent)
 
 
 def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
@@ -215,8 +224,10 @@ def _open(
             where=str(folder),
             remedy=f"An image should be named such as {example}; correct `files` in the rig file.",
         )
-    when, subject = (file.when, file.subject) if file else (None, None)
-    return Captures(rig, (folder,), names, sequences, when, subject)
+    captures = Captures(rig, (folder,), names, sequences, base=folder)
+    if file is None:
+        return captures
+    return replace(captures, when=file.when, subject=file.subject, simulated=bool(file.simulated))
 
 
 def _some_frame(rig: Rig) -> str:

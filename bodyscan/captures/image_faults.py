@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from bodyscan.captures.image_header import NoImage, read_header
-from bodyscan.errors import ImageError
+from bodyscan.errors import BadInput, ImageError
 from bodyscan.rig.templates import ANYTHING
 
 
@@ -17,6 +17,8 @@ def header_fault(path: Path, width: int, height: int) -> str | None:
         return absence(path)
     except NoImage as error:
         return str(error)
+    except BadInput as error:
+        return error.what
     except OSError as error:
         return f"cannot be read: {error.strerror or error}"
     if (header.width, header.height) != (width, height):

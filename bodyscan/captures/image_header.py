@@ -15,6 +15,8 @@ from typing import Any, BinaryIO
 
 from isal import isal_zlib
 
+from bodyscan.files.regular import open_regular
+
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 _JPEG = b"\xff\xd8\xff"
@@ -40,8 +42,9 @@ class NoImage(Exception):
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Raises NoImage when `path` is no file of these kinds, OSError when it cannot be read."""
-    with path.open("rb") as stream:
+    """Raises NoImage when `path` is no file of these kinds, BadInput when it is
+    not a regular file, OSError when it cannot be read."""
+    with open_regular(path) as stream:
         start = stream.read(33)
         if not start:
             raise NoImage("is an empty file")

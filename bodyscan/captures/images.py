@@ -18,6 +18,7 @@ from bodyscan.captures.grey_png import decode_grey_png
 from bodyscan.captures.image_faults import header_fault, image_error
 from bodyscan.captures.image_header import png_damage
 from bodyscan.errors import ImageError
+from bodyscan.files.regular import read_regular
 from bodyscan.progress import THREADS
 from bodyscan.rig.pair import CameraSpec, Pair
 from bodyscan.stripes.decoding import images_by_kind
@@ -141,7 +142,7 @@ def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str) -> Raw:
     fault = header_fault(path, width, height)
     if fault:
         raise image_error(fault, path, pair, shot)
-    data = path.read_bytes()
+    data = read_regular(path)
     is_png = data.startswith(b"\x89PNG")
     damage = png_damage(data) if is_png else None
     if damage:

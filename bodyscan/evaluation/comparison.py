@@ -12,7 +12,8 @@ import open3d as o3d
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
 from bodyscan.evaluation.surface import Deviation, deviation, signed_distances
-from bodyscan.fusion.storage import FILE_NAME, load_scan
+from bodyscan.fusion.scan_facts import FILE_NAME
+from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
 

@@ -14,6 +14,8 @@ from typing import Any, TypeAlias
 
 import yaml
 
+from bodyscan.files.regular import read_regular
+
 MOST_BYTES = 1_000_000
 MOST_NODES = 100_000  # counted after aliases are followed, so that alias bombs end here
 MOST_DEPTH = 40
@@ -96,9 +98,9 @@ class Document:
 
 
 def read_yaml(path: Path) -> Document:
-    """Read one YAML document. Raises YamlError when unreadable, OSError when not there."""
-    with path.open("rb") as stream:
-        content = stream.read(MOST_BYTES + 1)
+    """Read one YAML document. Raises YamlError when unreadable, BadInput when not a regular
+    file, OSError when not there."""
+    content = read_regular(path, MOST_BYTES)
     if len(content) > MOST_BYTES:
         raise _error(Place(1, 1), f"is longer than {MOST_BYTES:,} bytes: this cannot be right")
     try:

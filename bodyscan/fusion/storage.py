@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -15,15 +14,20 @@ from bodyscan.errors import ResultError, ScanFailed
 from bodyscan.files.atomic import write_json
 from bodyscan.files.hashing import file_hash
 from bodyscan.fusion.scan import Scan
+from bodyscan.fusion.scan_facts import (
+    CLOUD_NAME,
+    FILE_NAME,
+    MESH_NAME,
+    REMEDY,
+    SCHEMA,
+    VERSION,
+    read_facts,
+)
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
 from bodyscan.verdict import Verdict
 from bodyscan.version import __version__
 
-SCHEMA = "bodyscan-scan"
-VERSION = 1
-FILE_NAME = "scan.json"
-CLOUD_NAME, MESH_NAME = "cloud.ply", "mesh.ply"
 DERIVED = (
     *(CLOUD_NAME, MESH_NAME, "raw.e57", "report.html", "measurements.json", "export", "shared"),
     *("cloud.png", "sigma.png", "pairs.png", "mesh.png", "*-deviation.png"),
@@ -71,6 +75,7 @@ def save_scan(
     calibration_id: str,
     subject: str | None,
     when: datetime | None,
+    simulated: bool = False,
 ) -> Path:
     """Write the body model and what it is into `folder`; returns the path of scan.json."""
     (folder / FILE_NAME).unlink(missing_ok=True)
@@ -78,7 +83,7 @@ def save_scan(
     write_ply(folder / MESH_NAME, scan.mesh)
     write_json(
         folder / FILE_NAME,
-        _origin(calibration_id, subject, when)
+        _origin(calibration_id, subject, when, simulated)
         | {
             "sha256": {name: file_hash(folder / name) for name in (CLOUD_NAME, MESH_NAME)},
             "counts": {
@@ -105,6 +110,7 @@ def save_failure(
     calibration_id: str,
     subject: str | None,
     when: datetime | None,
+    simulated: bool = False,
 ) -> Path:
     """Write a scan.json that says why there is no model; one of an earlier try goes."""
     for name in (FILE_NAME, CLOUD_NAME, MESH_NAME):
@@ -112,12 +118,15 @@ def save_failure(
     reasons = tuple(line.strip() for line in str(error).splitlines())
     write_json(
         folder / FILE_NAME,
-        _origin(calibration_id, subject, when) | {"verdict": asdict(Verdict("repeat", reasons))},
+        _origin(calibration_id, subject, when, simulated)
+        | {"verdict": asdict(Verdict("repeat", reasons))},
     )
     return folder / FILE_NAME
 
 
-def _origin(calibration_id: str, subject: str | None, when: datetime | None) -> dict[str, Any]:
+def _origin(
+    calibration_id: str, subject: str | None, when: datetime | None, simulated: bool
+) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "version": VERSION,
@@ -127,36 +136,29 @@ def _origin(calibration_id: str, subject: str | None, when: datetime | None) -> 
         "subject": subject,
         "when": when.isoformat() if when else None,
         "calibration_id": calibration_id,
-    }
+    } | ({"simulated": True} if simulated else {})
 
 
 def load_scan(folder: Path) -> StoredScan:
     """Read what `save_scan` wrote. Raises ResultError if it is missing, incomplete or damaged, or
     if the scan gave no model.
     """
-    file = folder / FILE_NAME
-    remedy = "scan again, or give the folder that `bodyscan scan` wrote"
-    try:
-        facts = json.loads(file.read_text("utf-8"))
-        if "sha256" not in facts and "verdict" in facts:
-            reasons = "; ".join(facts["verdict"]["reasons"])
-            raise ResultError(f"this scan gave no model: {reasons}", where=str(file))
-        for name, digest in facts["sha256"].items():
-            if file_hash(folder / name) != digest:
-                raise ResultError(
-                    "was changed or cut short", where=str(folder / name), remedy=remedy
-                )
-        cloud, mesh = read_ply_cloud(folder / CLOUD_NAME), read_ply_mesh(folder / MESH_NAME)
-    except FileNotFoundError as error:
-        raise ResultError(
-            "there is no such file", where=str(error.filename or file), remedy=remedy
-        ) from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ResultError(
-            f"is not a readable scan result ({type(error).__name__}: {error})",
-            where=str(file),
-            remedy=remedy,
-        ) from error
+    facts = read_facts(folder)
+    if "sha256" not in facts:
+        reasons = (
+            "; ".join(facts["verdict"]["reasons"]) if facts.get("verdict") else "it was cut short"
+        )
+        raise ResultError(f"this scan gave no model: {reasons}", where=str(folder / FILE_NAME))
+    for name, digest in facts["sha256"].items():
+        file = folder / name
+        try:
+            same = file_hash(file) == digest
+        except OSError as error:
+            said = "there is no such file" if isinstance(error, FileNotFoundError) else str(error)
+            raise ResultError(said, where=str(file), remedy=REMEDY) from error
+        if not same:
+            raise ResultError("was changed or cut short", where=str(file), remedy=REMEDY)
+    cloud, mesh = read_ply_cloud(folder / CLOUD_NAME), read_ply_mesh(folder / MESH_NAME)
     return StoredScan(cloud, mesh, facts)
 
 

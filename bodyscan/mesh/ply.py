@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.errors import ResultError
 from bodyscan.files.atomic import atomic_replacement
+from bodyscan.files.regular import read_regular
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 
 Records = NDArray[np.void]
@@ -124,7 +125,7 @@ def _header(elements: Sequence[Element], counts: Sequence[int]) -> bytes:
 def _read(path: Path, elements: Sequence[Element], what: str) -> list[Records]:
     """The records of a file that `write_ply` wrote with these elements."""
     try:
-        data = path.read_bytes()
+        data = read_regular(path)
     except OSError as error:
         raise ResultError(f"cannot be read ({error.strerror})", where=str(path)) from error
     end = data[:HEADER_LIMIT].find(END) + len(END)

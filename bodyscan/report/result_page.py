@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from bodyscan.errors import BadInput
-from bodyscan.fusion import storage as scans
+from bodyscan.fusion import scan_facts as scans
 from bodyscan.registration import storage as calibrations
 from bodyscan.report.page import Page
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bodyscan.errors import ResultError
 from bodyscan.evaluation.comparison import Comparison, compare_surfaces
 from bodyscan.fusion import scan_verdict as limits
-from bodyscan.fusion.storage import FILE_NAME, SCHEMA, StoredScan, load_scan
+from bodyscan.fusion.scan_facts import read_facts, told_verdict
+from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.mesh.holes import holes
 from bodyscan.mesh.topology import topology
 from bodyscan.report import charts
@@ -48,9 +47,8 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
 
     A scan that gave no model has a report too: its reasons. Raises ResultError, BadInput.
     """
-    facts = _facts(folder)
+    facts = read_facts(folder)
     subject = facts.get("subject")
-    told = facts.get("verdict") or {"grade": "usable", "reasons": [NO_VERDICT]}
     sections: list[Section] = []
     if "sha256" in facts:
         scan = load_scan(folder)
@@ -58,8 +56,8 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
         sections = _sections(scan, found)
     return Page(
         f"Scan of {subject}" if subject else f"Scan {folder.resolve().name}",
-        Verdict(told["grade"], tuple(told["reasons"])),
-        is_synthetic(folder, subject),
+        told_verdict(facts) or Verdict("usable", (NO_VERDICT,)),
+        is_synthetic(folder) or facts.get("simulated", False),
         (
             ("taken", str(facts.get("when") or "not known")),
             ("calibration", str(facts["calibration_id"])[:12]),
@@ -69,23 +67,6 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
         sections,
         subject,
     )
-
-
-def _facts(folder: Path) -> dict[str, Any]:
-    """The content of scan.json, of a scan that gave a model or did not."""
-    file = folder / FILE_NAME
-    try:
-        facts = json.loads(file.read_text("utf-8"))
-        known = facts["schema"] == SCHEMA and bool(facts["calibration_id"])
-    except (OSError, ValueError, KeyError, TypeError):
-        known = False
-    if not known:
-        raise ResultError(
-            "is not a readable scan result",
-            where=str(file),
-            remedy="give the folder that `bodyscan scan` wrote",
-        )
-    return dict(facts)
 
 
 def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:

@@ -61,7 +61,8 @@ def write_captures(
         ShotEntry(name=name, stripes=tuple(stripes) or None, lit=tuple(lit) or None)
         for name, stripes, lit in shots
     )
-    write_captures_file(folder, CapturesFile(kind=kind, when=WHEN, subject=subject, shots=entries))
+    captures = CapturesFile(kind=kind, when=WHEN, subject=subject, simulated=True, shots=entries)
+    write_captures_file(folder, captures)
 
 
 def write_image(path: Path, image: Bytes) -> None:

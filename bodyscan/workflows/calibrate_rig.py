@@ -82,21 +82,16 @@ def join_rig(
         raise _nothing_calibrated(rig, failed)
     for pair in pairs.values():
         placed = update_poses(rig, placed, pair)
+    stages = (boards, cameras, located, decoded, fitted, joined)
+    notes = [note for stage in stages for note in stage.notes]
     calibration = RigCalibration(
         rig,
         pairs,
         {name: placed.rig_from_camera[name] for name in pairs},
         placed.covariance,
         placed.rig_from_board,
-        failed,
-        (
-            *boards.notes,
-            *cameras.notes,
-            *located.notes,
-            *decoded.notes,
-            *fitted.notes,
-            *joined.notes,
-        ),
+        {name: captures.relative(reason) for name, reason in failed.items()},
+        tuple(captures.relative(note) for note in notes),
         seen=seen_corners(placed, pairs),
     )
     return JoinedRig(calibration, placed, boards.value, len(captures.sequences))

@@ -50,7 +50,7 @@ def reconstruct_range_images(
     images, errors = attempt_each(
         reconstruct, sequences, BodyscanError, stage="range images", progress=progress
     )
-    failed |= {sequence.pair: str(error) for sequence, error in errors.items()}
+    failed |= {s.pair: captures.relative(str(error)) for s, error in errors.items()}
     if not images:
         reasons = "\n".join(f"  {name}: {reason}" for name, reason in failed.items())
         raise ScanFailed(f"no pair gave a range image:\n{reasons}")

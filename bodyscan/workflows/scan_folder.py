@@ -34,15 +34,19 @@ def scan_folder(
     captures = open_scan(rig.rig, folder)
     nobody = open_scan(rig.rig, empty) if empty else None
     origin = calibration_id(calibration)
-    subject, when = captures.subject, captures.when
+    subject, when, simulated = captures.subject, captures.when, captures.simulated
     try:
         scan = scan_person(rig, captures, settings, progress, empty=nobody)
     except ScanFailed as error:
         clear(out)
-        save_failure(error, out, calibration_id=origin, subject=subject, when=when)
+        save_failure(
+            error, out, calibration_id=origin, subject=subject, when=when, simulated=simulated
+        )
         raise
     clear(out)
-    saved = save_scan(scan, out, calibration_id=origin, subject=subject, when=when)
+    saved = save_scan(
+        scan, out, calibration_id=origin, subject=subject, when=when, simulated=simulated
+    )
     with step(progress, "drawing"):
         pictures = draw_scan(scan.cloud, scan.mesh, out)
     return scan, saved, pictures

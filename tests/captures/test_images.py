@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from contextlib import suppress
@@ -15,10 +16,11 @@ from hypothesis import strategies as st
 from small_captures import BITS, FRAMES, HEIGHT, STRIPES, WIDTH, encoded, picture, write
 from small_captures import write_small_captures as small
 
+from bodyscan.captures.check import check, report_lines
 from bodyscan.captures.folder import ImageSequence, open_captures
 from bodyscan.captures.image_header import NoImage, png_damage, read_header
 from bodyscan.captures.images import read_board_image, read_image, read_sequence
-from bodyscan.errors import ImageError
+from bodyscan.errors import BadInput, ImageError
 from bodyscan.rig.pair import CameraSpec
 from bodyscan.rig.rig_file import load_rig
 
@@ -293,3 +295,16 @@ def test_a_star_in_a_name_stands_for_what_differs(tmp_path: Path) -> None:
     assert gone is not None
     with pytest.raises(ImageError, match="is missing"):
         read_sequence(gone, CAMERA)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
+def test_a_named_pipe_among_the_images_is_not_waited_for(tmp_path: Path) -> None:
+    sequence = first_sequence(tmp_path)
+    sequence.coded[1].unlink()
+    os.mkfifo(sequence.coded[1])
+    with pytest.raises(ImageError, match="is not a regular file"):
+        read_sequence(sequence, CAMERA)
+    os.mkfifo(tmp_path / "pipe.yaml")
+    with pytest.raises(BadInput, match="is not a regular file"):
+        load_rig(tmp_path / "pipe.yaml")
+    assert "is not a regular file" in "".join(report_lines(check(tmp_path / "rig.yaml")))

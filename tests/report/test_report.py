@@ -75,7 +75,11 @@ def test_simulated_is_said_and_only_where_it_is_known(tmp_path: Path, html: str)
     beside = make_scan(tmp_path / "w" / "scan")
     write_json(tmp_path / "w" / "truth" / "truth.json", {})
     assert build_page(beside.folder).synthetic
-    assert build_page(make_scan(tmp_path / "x" / "scan", subject="sim-woman").folder).synthetic
+    elsewhere = make_scan(tmp_path / "x" / "scan", subject="sim-woman").folder
+    assert not build_page(elsewhere).synthetic  # a person's pseudonym may begin so
+    facts = json.loads((elsewhere / "scan.json").read_text("utf-8"))
+    write_json(elsewhere / "scan.json", facts | {"simulated": True})
+    assert build_page(elsewhere).synthetic
 
 
 def test_the_body_is_packed_to_a_fraction_of_a_millimetre(html: str, scan: MadeScan) -> None:
@@ -153,6 +157,7 @@ def test_a_surface_in_metres_is_refused(tmp_path: Path) -> None:
 def test_a_scan_without_a_model_has_a_report_of_why(tmp_path: Path) -> None:
     facts = {
         "schema": "bodyscan-scan",
+        "version": 1,
         "software": "bodyscan 0.1.0",
         "calibration_id": "01",
         "subject": None,

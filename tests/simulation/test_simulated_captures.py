@@ -56,6 +56,7 @@ def test_files_are_those_that_captures_yaml_lists(simulated: Path) -> None:
         assert set(hashes(folder)) == expected
     assert listed["kind"] == "scan"
     assert listed["subject"] == "sim-woman-average"
+    assert listed["simulated"] is True
 
 
 def test_the_rig_file_is_the_given_one_scaled(simulated: Path) -> None:

@@ -1,0 +1,68 @@
+"""A scan.json that is not one is refused before anything is read off it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bodyscan.errors import BodyscanError, ResultError
+from bodyscan.export.scan import export_scan
+from bodyscan.fusion.storage import load_scan
+
+STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0" / "scan"
+
+MISTAKES: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "of another schema": lambda f: f.update(schema="other"),
+    "of another version": lambda f: f.update(version=9),
+    "without calibration": lambda f: f.pop("calibration_id"),
+    "with a subject that is a number": lambda f: f.update(subject=7),
+    "with a verdict that is a text": lambda f: f.update(verdict="good"),
+    "with a grade unheard of": lambda f: f["verdict"].update(grade="splendid"),
+    "with reasons that are a text": lambda f: f["verdict"].update(reasons="none"),
+    "without the cloud's hash": lambda f: f["sha256"].pop("cloud.ply"),
+    "with a file elsewhere": lambda f: f["sha256"].update({"../../other": "0" * 64}),
+    "with a wrong hash": lambda f: f["sha256"].update({"mesh.ply": "0" * 64}),
+    "with sway that is a text": lambda f: f["alignment"]["motion_mm"].update({"p1-2": "far"}),
+    "with NaN": lambda f: f["alignment"]["motion_mm"].update({"p1-2": float("nan")}),
+    "with an alignment that is a list": lambda f: f.update(alignment=[]),
+    "with failures that are numbers": lambda f: f.update(failed={"p1-2": 3}),
+}
+
+
+def with_facts(folder: Path, text: str) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("cloud.ply", "mesh.ply"):
+        shutil.copy(STORED / name, folder)
+    (folder / "scan.json").write_text(text, "utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_what_is_not_the_result_of_a_scan_is_refused(mistake: str, tmp_path: Path) -> None:
+    facts = json.loads((STORED / "scan.json").read_text("utf-8"))
+    MISTAKES[mistake](facts)
+    with pytest.raises(ResultError) as refused:
+        load_scan(with_facts(tmp_path, json.dumps(facts)))
+    assert str(tmp_path) in refused.value.where
+
+
+@given(st.data())
+def test_a_damaged_one_raises_nothing_but_our_own_errors(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    damaged = bytearray((STORED / "scan.json").read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        start = data.draw(st.integers(0, len(damaged) - 1))
+        damaged[start : start + data.draw(st.integers(0, 30))] = data.draw(st.binary(max_size=30))
+    folder = with_facts(tmp_path_factory.getbasetemp() / "damaged", "")
+    (folder / "scan.json").write_bytes(damaged)
+    with suppress(BodyscanError):
+        export_scan(load_scan(folder), folder / "out", ["stl"], ["full"])

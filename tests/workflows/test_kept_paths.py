@@ -1,0 +1,31 @@
+"""No folder's name gets into what is kept: the same work elsewhere gives the same bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from small_workspace import run
+
+from bodyscan.errors import ScanFailed
+
+STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0" / "calibration"
+PAIRS = ("p1-2", "p1-3", "p2-2", "p2-3")
+
+
+def failed_scan(folder: Path) -> bytes:
+    """scan.json of captures whose images are all damaged or missing."""
+    for pair in PAIRS:
+        image = folder / "captures" / "person" / pair / "bit00.png"
+        image.parent.mkdir(parents=True)
+        image.write_bytes(b"no image")
+    result = run("scan", folder / "captures", "--calibration", STORED, "--out", folder / "made")
+    assert isinstance(result.exception, ScanFailed)
+    return (folder / "made" / "scan.json").read_bytes()
+
+
+def test_a_scan_of_damaged_images_is_told_by_their_names_alone(tmp_path: Path) -> None:
+    kept = failed_scan(tmp_path / "anna.miller")
+    assert b"person/p2-3/lit.png (pair p2-3" in kept
+    assert b"anna" not in kept
+    assert str(tmp_path).encode() not in kept
+    assert failed_scan(tmp_path / "b" / "elsewhere") == kept
