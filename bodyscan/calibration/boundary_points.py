@@ -33,9 +33,13 @@ class BoundaryPoints:
 
 def points_on_board(camera: Camera, camera_from_board: RigidTransform, pixels: Array) -> Array:
     """Eq. 18: pixels (N, 2) carried onto the board's plane z = 0, camera frame (N, 3) mm."""
+    return rays_on_board(camera.rays(pixels), camera_from_board)
+
+
+def rays_on_board(rays: Array, camera_from_board: RigidTransform) -> Array:
+    """Where rays (..., 3) of the camera frame meet the board's plane z = 0, (..., 3) mm."""
     normal = camera_from_board.rotation[:, 2]
-    rays = camera.rays(pixels)
-    return rays * (normal @ camera_from_board.translation / (rays @ normal))[:, None]
+    return rays * (normal @ camera_from_board.translation / (rays @ normal))[..., None]
 
 
 def boundary_points(

@@ -8,7 +8,7 @@ parameters are unknowns like any other.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Generic, TypeVar
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import BoundaryPoints, points_on_board
+from bodyscan.calibration.boundary_points import BoundaryPoints, rays_on_board
 from bodyscan.calibration.camera import known_beforehand
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
@@ -127,7 +127,10 @@ def refine_jointly(
     )
     state, covariance = solution.state, solution.covariance
     corners = np.concatenate([_corner_residuals(state, k, b) for k, b in enumerate(boards)])
-    offsets = [_offsets(state, k, b) * b.sigma_px for k, b in enumerate(boards)]
+    offsets = [
+        _offsets(state.sheets, pose, b, _rays(state.camera, b)) * b.sigma_px
+        for pose, b in zip(state.poses, boards, strict=True)
+    ]
     return JointFit(
         state.camera,
         {b.view.shot: pose for b, pose in zip(boards, state.poses, strict=True)},
@@ -147,9 +150,10 @@ def _blocks(
     with np.errstate(all="ignore"):
         for k, board in enumerate(boards):
             pose = state.first_pose + 6 * k + np.arange(6)
-            corners, stripes = _corner_residuals(state, k, board), _offsets(state, k, board)
+            corners, rays = _corner_residuals(state, k, board), _rays(state.camera, board)
+            stripes = _offsets(state.sheets, state.poses[k], board, rays)
             of_corners = partial(_corner_jacobian, state, k, board)
-            of_stripes = partial(_stripe_jacobian, state, k, board)
+            of_stripes = partial(_stripe_jacobian, state, k, board, rays)
             yield Block(corners, of_corners, np.concatenate([camera, pose]), CORNERS)
             yield Block(stripes, of_stripes, np.concatenate([camera, pose, sheets]), STRIPES)
     if state.camera.prior is not None:
@@ -163,21 +167,38 @@ def _corner_residuals(state: _State[Sheets], k: int, board: StripedBoard) -> Arr
     return (seen - board.view.pixels).ravel()
 
 
-def _points(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
-    return _on_board(state.camera, state.poses[k], board)
+def _rays(camera: Camera, board: StripedBoard) -> Array:
+    """(2, N, 3) with z = 1: through the boundaries' pixels, and half a pixel across from them."""
+    return camera.rays(np.stack([board.pixels, board.pixels + 0.5 * board.across]))
 
 
-def _on_board(camera: Camera, camera_from_board: RigidTransform, board: StripedBoard) -> Array:
-    height = RigidTransform(np.eye(3), np.array([0.0, 0.0, board.view.points[0, 2]]))
-    return points_on_board(camera, camera_from_board @ height, board.pixels)
+def _ray_slopes(camera: Camera, rays: Array) -> Array:
+    """(2, N, 2, P): how rays turn with the camera's parameters while their pixels stay, which undoes
+    what the parameters do to the pixels of rays that stay."""
+    by_parameter, by_point = camera.jacobians(rays.reshape(-1, 3))
+    (a, b), (c, d) = by_point[:, :, :2].transpose(1, 2, 0)
+    inverse = np.stack([d, -b, -c, a], axis=-1).reshape(-1, 2, 2) / (a * d - b * c)[:, None, None]
+    return -(inverse @ by_parameter).reshape(*rays.shape[:2], 2, -1)
 
 
-def _sigma(
-    state: _State[Sheets], k: int, board: StripedBoard, points: Array, by_point: Array
+def _offsets(
+    sheets: Sheets, camera_from_board: RigidTransform, board: StripedBoard, rays: Array
 ) -> Array:
+    """Offsets of one board's boundaries from their sheets, over their sigma, (N,); rays: `_rays`."""
+    points, across = _on_board(camera_from_board, board, rays)
+    offset = sheets.offset(points, sheets.at(board.index))
+    return np.asarray(offset.value / _sigma(board, points, across, offset.by_point), np.float64)
+
+
+def _on_board(camera_from_board: RigidTransform, board: StripedBoard, rays: Array) -> Array:
+    """(2, N, 3) mm: where rays meet the face on which the stripes were seen."""
+    height = RigidTransform(np.eye(3), np.array([0.0, 0.0, board.view.points[0, 2]]))
+    return rays_on_board(rays, camera_from_board @ height)
+
+
+def _sigma(board: StripedBoard, points: Array, across: Array, by_point: Array) -> Array:
     """What one sigma_px across the stripe is worth in the offset's unit, (N,)."""
-    shifted = _points(state, k, replace(board, pixels=board.pixels + 0.5 * board.across))
-    leverage = np.abs(np.sum(by_point * (shifted - points), axis=1)) / 0.5
+    leverage = np.abs(np.sum(by_point * (across - points), axis=1)) / 0.5
     return np.maximum(leverage, 1e-12) * board.sigma_px
 
 
@@ -188,39 +209,32 @@ def _corner_jacobian(state: _State[Sheets], k: int, board: StripedBoard) -> Arra
     return jacobian.reshape(-1, jacobian.shape[2])
 
 
-def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
-    """Of the offsets over their sigma (N, ...), by camera, this board's pose, and sheets."""
-    points = _points(state, k, board)
+def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
+    """Of the offsets over their sigma (N, ...), by camera, this board's pose, and sheets.
+
+    By differences for camera and pose, since the sigma changes too: left out of the derivative, noise
+    would pull the focal lengths up.
+    """
+    pose, slopes = state.poses[k], _ray_slopes(state.camera, rays)
+    points, across = _on_board(pose, board, rays)
     offset = state.sheets.offset(points, state.sheets.at(board.index), parameters=True)
     assert offset.by_parameter is not None
-    sigma = _sigma(state, k, board, points, offset.by_point)
-    steps = np.array([*state.camera.difference_steps, *TWIST_STEPS])
-    by_place = np.empty((len(points), len(steps)))
-    for column, size in enumerate(steps):
-        ahead, behind = (_nudged(state, k, board, column, step) for step in (size, -size))
-        by_place[:, column] = (ahead - behind) / (2.0 * size)
-    return np.concatenate([by_place, offset.by_parameter / sigma[:, None]], axis=1)
+    sigma = _sigma(board, points, across, offset.by_point)
 
+    def turned(column: int, step: float) -> Array:
+        turn = np.zeros_like(rays)
+        turn[..., :2] = step * slopes[..., column]
+        return _offsets(state.sheets, pose, board, rays + turn)
 
-def _nudged(state: _State[Sheets], k: int, board: StripedBoard, column: int, step: float) -> Array:
-    """Offsets over their sigma after a step of one of the camera's parameters, or of the board's
-    pose, whose columns follow.
+    def moved(column: int, step: float) -> Array:
+        return _offsets(state.sheets, pose.moved(step * np.eye(6)[column]), board, rays)
 
-    The sigma changes too: left out of the derivative, noise would pull the focal lengths up.
-    """
-    change = np.zeros(state.first_pose + 6)
-    change[column] = step
-    camera = state.camera.moved(change[: state.first_pose])
-    pose = state.poses[k].moved(change[state.first_pose :])
-    poses = (*state.poses[:k], pose, *state.poses[k + 1 :])
-    return _offsets(replace(state, camera=camera, poses=poses), k, board)
-
-
-def _offsets(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
-    """Offsets of one board's boundaries from their sheets, over their sigma, (N,)."""
-    points = _points(state, k, board)
-    offset = state.sheets.offset(points, state.sheets.at(board.index))
-    return np.asarray(offset.value / _sigma(state, k, board, points, offset.by_point), np.float64)
+    by_place = [
+        (change(column, size) - change(column, -size)) / (2.0 * size)
+        for change, sizes in ((turned, state.camera.difference_steps), (moved, TWIST_STEPS))
+        for column, size in enumerate(sizes)
+    ]
+    return np.column_stack([*by_place, offset.by_parameter / sigma[:, None]])
 
 
 def _weighted_rms(residuals: Array, noise: Noise) -> float:
