@@ -55,11 +55,6 @@ class LitPairs:
         sigma = np.sqrt(sum(variance[level] for level in levels))
         return LitPairs(patterns, inverses, value, sigma)
 
-    def where(self, kept: Mask) -> LitPairs:
-        """Of the pixels (...) that are kept: (bits, N)."""
-        images = self.patterns[:, kept], self.inverses[:, kept]
-        return LitPairs(*images, self.value[:, kept], self.sigma[:, kept])
-
     @property
     def clear(self) -> Mask:
         """(bits, ...): where noise did not decide."""

@@ -12,7 +12,7 @@ import numpy as np
 from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.stripe_coordinates import REACH_PX, SMOOTHERS
 
-FEWEST = 1000
+FEWEST, ENOUGH = 1000, 20_000
 CLEARLY = 1.2
 """Sigmas that claim so much too little are put right: less may be the surface."""
 ROBUST = 1.4826
@@ -25,9 +25,12 @@ def scatter(boundaries: Boundaries) -> float:
     middle, span = len(weights) // 2, len(weights) - 1
     if len(boundaries.joined) < span:
         return 1.0
-    run = np.lib.stride_tricks.sliding_window_view(boundaries.joined, span).all(axis=1)
-    run &= boundaries.position[span:] - boundaries.position[:-span] < 2.0 * REACH_PX
-    first = np.flatnonzero(run)
+    starts = len(boundaries.joined) - span + 1
+    first = np.arange(0, starts, max(1, starts // ENOUGH))
+    run = boundaries.position[first + span] - boundaries.position[first] < 2.0 * REACH_PX
+    for k in range(span):
+        run &= boundaries.joined[first + k]
+    first = first[run]
     if len(first) < FEWEST:
         return 1.0
     off, variance = np.zeros(len(first)), np.zeros(len(first))

@@ -13,6 +13,8 @@ from bodyscan.stripes.scan_lines import ScanLines
 Words = NDArray[np.uint16]
 
 MOST_OF_A_BIT = 2000
+ENOUGH = 600_000
+"""Of the pixels lines are taken until there are so many."""
 EVERY = 61
 """Lines are taken so far apart, then those beside them, so that few tell of the whole picture."""
 
@@ -30,6 +32,7 @@ def clear_changes(
     bits = len(images.patterns)
     found = np.empty((bits * MOST_OF_A_BIT, 3), np.uint16)
     lines = np.concatenate([np.arange(first, len(words), EVERY) for first in range(EVERY)])
+    lines = lines[: 1 + ENOUGH // words.shape[1]]
     count = _collect(
         words, good, lines, images.patterns, images.inverses, CLEAR**2 * variance, found
     )

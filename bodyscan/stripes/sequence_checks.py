@@ -139,14 +139,15 @@ def check_codes(
     sampled = contrast[some, some]
     # Darker pixels are misread too often by themselves to tell anything.
     good = contrast >= np.median(sampled[sampled >= MIN_CONTRAST])
-    seen, shown, pairs = words[some, some], good[some, some], None
+    shown, pairs = good[some, some], None
+    seen = words[some, some][shown]
     if images.inverses is not None:
-        every = LitPairs.of(
-            images.patterns[:, some, some], images.inverses[:, some, some], variance
+        sampled_pairs = (
+            each[:, some, some][:, shown] for each in (images.patterns, images.inverses)
         )
-        pairs = every.where(shown)
+        pairs = LitPairs.of(*sampled_pairs, variance)
         check_seen(pairs)
-        shown = shown & every.coarse_clear
+        seen = seen[pairs.coarse_clear]
     # Noise turns the finest bits along lines and across them.
     check_direction(words >> max(min(FINE_BITS, bits - FINE_BITS), 0), good, images.turned)
     if images.inverses is None or not code.single:
@@ -160,9 +161,9 @@ def check_codes(
         in_step, least = _in_step(one & kept, other & kept, code, bits), MIN_SHARE_CLEAR
         one, other = one[doubt == 0], other[doubt == 0]
     failing = [bit for bit, share in in_step.items() if share < least]
-    beyond = _beyond(seen[shown], code, stripes)
+    beyond = _beyond(seen, code, stripes)
     wrong = bool(failing) or beyond > MAX_SHARE_BEYOND
-    tried = _causes(one, other, seen[shown], code, bits, stripes) if wrong else ()
+    tried = _causes(one, other, seen, code, bits, stripes) if wrong else ()
     causes = list(islice(tried, MOST_CAUSES))
     if pairs is not None and not causes:
         check_pairs(pairs)
