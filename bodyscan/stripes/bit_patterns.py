@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,14 @@ from bodyscan.stripes.sequence_checks import check_codes, check_exposure
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap, stripe_map
-from bodyscan.stripes.usable_pixels import shown_pixels
+from bodyscan.stripes.usable_pixels import MIN_CONTRAST, shown_pixels
+
+SAMPLES = 20_000
+COARSE_BITS = 3
+"""Finer ones may be blurred, and bent grey levels then make both frames brighter."""
+NOISE_GREY, MAX_OFF = 8, 0.25
+"""Grey levels that noise may put two frames off, and share of the contrast beyond which they were
+not exposed alike: boundaries would move by as much of their blur, a tenth of a pixel."""
 
 
 def decode_bits(
@@ -58,7 +66,8 @@ def bit_lines(
     """The patterns (bits, H, W), and their inverses if there are any, as scan lines.
 
     Without a dark frame it is taken from the patterns and their inverses: every stripe is dark in
-    one of each two. Raises DecodingFailed if there are no inverses either.
+    one of each two; and both lit and dark, if they were exposed otherwise. Raises DecodingFailed if
+    there are no inverses either.
     """
     if dark is None:
         if inverses is None:
@@ -67,7 +76,30 @@ def bit_lines(
                 remedy="take a dark frame",
             )
         dark = np.minimum(patterns, inverses).min(axis=0)
+    if inverses is not None and not _exposed_alike(lit, dark, patterns, inverses):
+        lit = np.maximum(patterns, inverses).max(axis=0)
+        dark = np.minimum(patterns, inverses).min(axis=0)
     return ScanLines.along_lines(lit, dark, patterns, inverses, direction)
+
+
+def _exposed_alike(lit: Greys, dark: Greys, patterns: Greys, inverses: Greys) -> bool:
+    """Whether the brighter of a coarse pattern and its inverse is as bright as the lit frame, and the
+    darker one as dark as the dark one; cameras that expose by themselves make them others."""
+    step = max(1, math.isqrt(lit.size // SAMPLES))
+    some = (slice(None, None, step), slice(None, None, step))
+    light, black = lit[some].astype(np.float32), dark[some].astype(np.float32)
+    contrast = light - black
+    shown = contrast >= MIN_CONTRAST
+    if not shown.any():
+        return True
+    shown &= contrast >= np.median(contrast[shown])
+    errors = []
+    for bit in range(min(COARSE_BITS, len(patterns))):
+        one, other = patterns[bit][some][shown], inverses[bit][some][shown]
+        off = np.abs(np.maximum(one, other) - light[shown])
+        off += np.abs(np.minimum(one, other) - black[shown])
+        errors.append(float(np.mean(np.maximum(off - NOISE_GREY, 0.0) / contrast[shown])))
+    return min(errors) < MAX_OFF
 
 
 def read_words(

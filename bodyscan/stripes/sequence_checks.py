@@ -142,10 +142,8 @@ def check_codes(
     shown, pairs = good[some, some], None
     seen = words[some, some][shown]
     if images.inverses is not None:
-        sampled_pairs = (
-            each[:, some, some][:, shown] for each in (images.patterns, images.inverses)
-        )
-        pairs = LitPairs.of(*sampled_pairs, variance)
+        patterns, inverses = images.patterns[:, some, some], images.inverses[:, some, some]
+        pairs = LitPairs.of(patterns[:, shown], inverses[:, shown], variance)
         check_seen(pairs)
         seen = seen[pairs.coarse_clear]
     # Noise turns the finest bits along lines and across them.

@@ -11,6 +11,8 @@ from stripe_rendering import Sequence, decode_gray, render_sequence
 from bodyscan.arrays import Bytes
 from bodyscan.errors import DecodingFailed
 from bodyscan.geometry.light_planes import Axis
+from bodyscan.stripes.codes.gray import Gray
+from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_map import StripeMap
 
 STRIPES = 100
@@ -114,3 +116,71 @@ def test_exposures_that_cannot_be_read_are_refused(good: Sequence) -> None:
 def test_stripes_that_run_the_other_way_are_noticed(good: Sequence) -> None:
     with pytest.raises(DecodingFailed, match="direction: horizontal"):
         read(good, direction="vertical")
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.25])
+def test_lit_and_dark_exposed_otherwise_are_made_from_the_patterns(
+    good: Sequence, factor: float
+) -> None:
+    """Cameras that expose by themselves darken the lit image, which is twice as bright as a pattern."""
+
+    def exposed(frame: Bytes) -> Bytes:
+        return np.clip(frame * factor, 0, 255).astype(np.uint8)
+
+    right = read(good)
+    found = read(replace(good, lit=exposed(good.lit), dark=exposed(good.dark)))
+    both = np.isfinite(found.s) & np.isfinite(right.s)
+    assert both.sum() > 0.97 * np.isfinite(right.s).sum()
+    assert np.sqrt(np.mean((found.s - good.s)[both] ** 2)) < 1.1 * np.sqrt(
+        np.mean((right.s - good.s)[both] ** 2)
+    )
+
+
+def test_bent_grey_levels_are_read_as_straight_ones(good: Sequence) -> None:
+    """Gamma of 2.2: blurred patterns and their inverses together are far brighter than lit and dark."""
+
+    def bent(frames: Bytes) -> Bytes:
+        return np.rint(255.0 * (frames / 255.0) ** (1.0 / 2.2)).astype(np.uint8)
+
+    right = read(good)
+    found = read(
+        replace(
+            good, lit=bent(good.lit), dark=bent(good.dark),
+            patterns=bent(good.patterns), inverses=bent(good.inverses),
+        )
+    )  # fmt: skip
+    both = np.isfinite(found.s) & np.isfinite(right.s)
+    assert both.sum() > 0.95 * np.isfinite(right.s).sum()
+    error = (found.s - good.s)[both]
+    assert np.sqrt(np.mean(error**2)) < 2.0 * np.sqrt(np.mean((right.s - good.s)[both] ** 2))
+    assert 0.5 < np.sqrt(np.mean((error / found.sigma[both]) ** 2)) < 1.5
+
+
+@pytest.mark.parametrize("made", ["lit", "dark", "both"])
+def test_lit_and_dark_are_made_where_none_was_taken(good: Sequence, made: str) -> None:
+    lit = None if made in ("lit", "both") else good.lit
+    dark = None if made in ("dark", "both") else good.dark
+    coded = np.concatenate([good.patterns, good.inverses])
+    code = Gray(stripes=STRIPES, direction="horizontal")
+    right, found = read(good), decode_stripes(code, lit, dark, coded)
+    both = np.isfinite(found.s) & np.isfinite(right.s)
+    assert both.sum() > 0.97 * np.isfinite(right.s).sum()
+    assert np.sqrt(np.mean((found.s - right.s)[both] ** 2)) < 0.01
+
+
+@pytest.mark.parametrize("first", [28])
+def test_codes_may_count_from_another_number(first: int) -> None:
+    """100 stripes in the middle of 128 codes; the images are those of stripes 14 to 113 of 128."""
+    whole = render_sequence(
+        lambda u, v: first + 1.2 + (v + 0.1 * u + 2 * np.sin(u / 20)) / 2.3, stripes=128
+    )
+    spec = Gray(stripes=STRIPES, direction="horizontal", first_code=first)
+    coded = np.concatenate([whole.patterns, whole.inverses])
+    found = decode_stripes(spec, whole.lit, whole.dark, coded)
+    told = np.isfinite(found.s)
+    assert told.mean() > 0.9
+    assert np.sqrt(np.mean((found.s + first - whole.s)[told] ** 2)) < 0.02
+    assert found.boundary_index.min() >= 1
+    assert found.boundary_index.max() < STRIPES
+    with pytest.raises(DecodingFailed, match="of the codes lie beyond the last stripe"):
+        decode_stripes(spec.model_copy(update={"first_code": 0}), whole.lit, whole.dark, coded)
