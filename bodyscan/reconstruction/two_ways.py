@@ -14,6 +14,9 @@ from bodyscan.arrays import Floats, Mask
 
 MOST_OFF = 5.0
 """Sigmas: noise alone does not get there; a wrong code does, or a pixel that saw two surfaces."""
+BELIEVED = 2.0
+"""Sigmas that the ways may commonly be apart: beyond, sigmas lack most of what is wrong (those of a
+calibration made elsewhere lack all of its own error), and cannot say what each way is worth."""
 FEWEST = 100
 ROBUST = 1.4826
 
@@ -44,7 +47,8 @@ def combine(
 
     alone: (H, W), where the crossing stripes may tell a point by themselves. Depths are weighted
     by what their sigmas say. Sigmas that claim too little (calibrations of other programs have none)
-    make every pixel disagree alike: what is dropped is far beyond what most do.
+    make every pixel disagree alike: what is dropped is far beyond what most do, and the better way
+    alone tells the depth, the other being a check.
     """
     points, sigma_mm = points.copy(), sigma_mm.copy()
     both = np.isfinite(sigma_mm) & np.isfinite(crossing_mm)
@@ -60,8 +64,10 @@ def combine(
     sigmas = ROBUST * float(np.median(np.abs(off)))
     wrong = np.abs(off) > MOST_OFF * max(sigmas, 1.0)
     share = variance / (variance + variance_too)  # of the other: weights are 1 / variance
+    if sigmas > BELIEVED:
+        share = np.full_like(share, float(np.median(share) > 0.5))
     points[both] = one + share[:, None] * (other - one)
-    merged = np.sqrt(share * variance_too)
+    merged = np.sqrt((1.0 - share) ** 2 * variance + share**2 * variance_too)
     sigma_mm[both] = np.where(wrong, np.float32(np.nan), merged)
     apart = ROBUST * float(np.median(np.abs(along)))
     return points, sigma_mm, Agreement(pixels, apart, sigmas, int(np.count_nonzero(wrong)))

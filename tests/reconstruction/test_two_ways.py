@@ -15,6 +15,7 @@ from bodyscan.geometry.projector_sheets import sheets_of_projector
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
+from bodyscan.reconstruction.two_ways import combine
 from bodyscan.stripes.stripe_map import StripeMap
 
 WIDTH, HEIGHT = 160, 120
@@ -125,3 +126,21 @@ def test_one_way_tells_where_the_other_does_not() -> None:
     without = reconstruct_range_image(pair(crossing=False), replace(seen, s=s))
     assert without.agreement is None
     assert not without.valid[:, :40].any()
+
+
+def test_ways_that_differ_by_more_than_their_sigmas_are_not_averaged() -> None:
+    """Rows across a baseline of columns: 9 times the noise, and more of a calibration's error, which
+    no sigma knows of."""
+    shape = (HEIGHT, WIDTH)
+    points = surface().astype(np.float32)
+    wrong = points * np.float32(1.005)
+    fine, rough = np.full(shape, 0.1, np.float32), np.full(shape, 0.9, np.float32)
+    nowhere = np.zeros(shape, bool)
+    found, sigma_mm, agreement = combine(points, fine, wrong, rough, alone=nowhere)
+    np.testing.assert_array_equal(found, points)
+    np.testing.assert_array_equal(sigma_mm, fine)
+    assert agreement is not None
+    assert agreement.apart_mm > 1.0
+    swapped, sigma_mm, _ = combine(wrong, rough, points, fine, alone=nowhere)
+    np.testing.assert_allclose(swapped, points, rtol=1e-6)
+    np.testing.assert_allclose(sigma_mm, fine, rtol=1e-6)
