@@ -99,7 +99,7 @@ def _commands(rig: Path, workspace: Path, subject: Path) -> dict[str, list[objec
     person, calibration = workspace / "captures" / "person", workspace / "calibration"
     return {
         "simulate": [rig, "--out", workspace, "--subject", subject],
-        "calibrate-rig": [workspace / "rig.yaml"],
+        "calibrate-rig": [workspace / "rig.yaml", "--overwrite"],
         "scan": [person, "--calibration", calibration, "--out", result, "--overwrite"],
         "export": [result, "--out", workspace / "export"],
         "evaluate": [workspace],

@@ -12,6 +12,7 @@ from bodyscan.cli.options import (
     Calibration,
     CalibrationArgument,
     OutFolder,
+    OverwriteCalibration,
     RigFile,
 )
 from bodyscan.files.os_errors import require_writable
@@ -82,13 +83,16 @@ def calibrate_rig(
     out: Annotated[
         Path | None, typer.Option(help="Default: `calibration` beside the rig file.")
     ] = None,
+    overwrite: OverwriteCalibration = False,
 ) -> None:
     """Calibrate every pair of a rig and join them in one frame."""
     from bodyscan.cli import tables
+    from bodyscan.registration.storage import refuse_existing
     from bodyscan.workflows.calibrate_rig import calibrate_folder
 
     out = out or rig_file.parent / "calibration"
     require_writable(out)
+    refuse_existing(out, overwrite)
     with output.stages() as progress:
         found, saved = calibrate_folder(rig_file, out, progress)
     output.notes(found.notes)
@@ -113,13 +117,16 @@ def import_(
             help="By how many pixels it may be off, 1 sigma. Default: as the rig file says.",
         ),
     ] = None,
+    overwrite: OverwriteCalibration = False,
 ) -> None:
     """Take over calibrations made elsewhere, from the files that the rig file names as `known`."""
     from bodyscan.cli import tables
+    from bodyscan.registration.storage import refuse_existing
     from bodyscan.workflows.import_rig import import_folder
 
     out = out or rig_file.parent / "calibration"
     require_writable(out)
+    refuse_existing(out, overwrite)
     found, saved = import_folder(rig_file, out, sigma_px)
     output.notes(found.notes)
     output.failures(found.failed)
@@ -138,18 +145,29 @@ def check_calibration(
         Path | None,
         typer.Option(help="Write a calibration with the moves corrected into this folder."),
     ] = None,
+    overwrite: OverwriteCalibration = False,
 ) -> None:
     """Say whether anything in the rig has moved, and if so which pair or pole, and how far."""
-    from bodyscan.registration.storage import load_calibration, save_calibration
+    from bodyscan.registration.storage import (
+        keep_former,
+        load_calibration,
+        refuse_existing,
+        save_calibration,
+    )
     from bodyscan.workflows.check_rig import check_rig
 
+    if repair is not None:
+        require_writable(repair)
+        refuse_existing(repair, overwrite)
     rig = load_calibration(calibration)
     with output.stages() as progress:
         found = check_rig(rig, folders, progress)
     output.say(*found.lines, wrong=not found.valid)
     output.figures(valid=found.valid)
     if repair is not None:
-        output.made("repaired", save_calibration(found.repaired(rig), repair))
+        repaired = found.repaired(rig)
+        keep_former(repair)
+        output.made("repaired", save_calibration(repaired, repair))
     output.exit_code = 0 if found.valid else 1
 
 
@@ -167,16 +185,24 @@ def refine_rig(
     ],
     calibration: Calibration,
     out: Annotated[Path, typer.Option(help="Folder for the refined calibration.")],
+    overwrite: OverwriteCalibration = False,
 ) -> None:
     """Bring the pairs closer together on an object they scanned, within what the boards allow."""
     from bodyscan.captures.folder import open_scan
-    from bodyscan.registration.storage import load_calibration, save_calibration
+    from bodyscan.registration.storage import (
+        keep_former,
+        load_calibration,
+        refuse_existing,
+        save_calibration,
+    )
     from bodyscan.workflows.refine_rig import refine_rig as refine
 
     require_writable(out)
+    refuse_existing(out, overwrite)
     rig = load_calibration(calibration)
     with output.stages() as progress:
         found = refine(rig, open_scan(rig.rig, folder), folder.name, progress)
+    keep_former(out)
     saved = save_calibration(found.value, out)
     output.failures(found.failures, "left out")
     output.say(*found.notes)

@@ -27,6 +27,12 @@ Changes = Annotated[
         help="Change a setting, such as mesh.depth=8; repeatable. docs/formats.md has them all.",
     ),
 ]
+OverwriteCalibration = Annotated[
+    bool,
+    typer.Option(
+        "--overwrite", help="Replace the calibration that lies there; it is kept in `history`."
+    ),
+]
 
 Json = Annotated[
     bool, typer.Option("--json", help="Print one JSON document: what was made, notes, verdict.")

@@ -7,6 +7,7 @@ by hand, by a disk or by a copy that broke off without anyone's knowing.
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import asdict, fields, replace
 from itertools import islice
 from pathlib import Path
@@ -17,10 +18,11 @@ from pydantic import TypeAdapter, ValidationError
 
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.errors import CalibrationFileError
-from bodyscan.files.atomic import json_text, write_json, write_npz
+from bodyscan.files.atomic import json_text, write_bytes, write_json, write_npz
 from bodyscan.files.hashing import content_hash, file_hash
 from bodyscan.files.json_file import read_json_object
 from bodyscan.files.npz_file import read_npz
+from bodyscan.files.regular import read_regular
 from bodyscan.geometry.camera_fields import from_fields, to_fields
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.pose_covariance import PoseCovariance
@@ -39,13 +41,40 @@ HASH = "sha256"
 EDITED = "the calibration was edited by hand, and the change accepted"
 MOST_FAULTS = 5  # are named
 FILE_NAME = "calibration.json"
+HISTORY = "history"
 ARRAYS_NAME = "calibration.npz"
 ACCEPT = "if the change is meant, say `bodyscan accept-changed` of its folder"
 CHANGED = f"restore the file from a copy, or calibrate again; {ACCEPT}"
 
 
+def refuse_existing(folder: Path, overwrite: bool) -> None:
+    """Raises CalibrationFileError if a calibration lies in `folder` already and may not be replaced."""
+    if (folder / FILE_NAME).exists() and not overwrite:
+        raise CalibrationFileError(
+            "a calibration lies here already",
+            where=str(folder),
+            remedy="give another --out, or say --overwrite: this one then moves into its "
+            f"`{HISTORY}`, where scans made with it are found again",
+        )
+
+
+def keep_former(folder: Path) -> Path | None:
+    """Copy the calibration in `folder` to `history/HASH` in it, by the hash that scans refer to it
+    with; the copy's folder, None if there is nothing to keep. To be done before it is replaced."""
+    if not (folder / FILE_NAME).exists():
+        return None
+    kept = folder / HISTORY / calibration_id(folder)
+    with suppress(FileNotFoundError):  # one without its arrays is as damaged there as here
+        for name in (ARRAYS_NAME, FILE_NAME):  # the one that vouches for both comes last
+            write_bytes(kept / name, read_regular(folder / name))
+    return kept
+
+
 def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
-    """Write `calibration.json` and `calibration.npz` into `folder`; returns the JSON's path."""
+    """Write `calibration.json` and `calibration.npz` into `folder`; returns the JSON's path.
+
+    Until the JSON has changed, which it does at once, one that `keep_former` kept is what is loaded.
+    """
     arrays: dict[str, Any] = {"placing_covariance": calibration.covariance.matrix}
     for name, pair in calibration.pairs.items():
         arrays[f"{name}/camera_covariance"] = pair.camera_covariance
@@ -103,7 +132,7 @@ def load_calibration(path: Path, *, accept_changed: bool = False) -> RigCalibrat
                 where=str(file),
                 remedy="calibrate again with this version of bodyscan",
             )
-        arrays_file = file.with_name(ARRAYS_NAME)
+        arrays_file = _arrays_of(file, content)
         if not accept_changed:
             _refuse_changed(content, file, arrays_file)
         calibration = _calibration(content, read_npz(arrays_file))
@@ -136,6 +165,18 @@ def accept_calibration(path: Path) -> Path:
     folder = path if path.is_dir() else path.parent
     found = load_calibration(folder, accept_changed=True)
     return save_calibration(replace(found, notes=(*found.notes, EDITED)), folder)
+
+
+def _arrays_of(file: Path, content: dict[str, Any]) -> Path:
+    """The arrays beside the JSON; those kept, if it was being replaced when that broke off."""
+    beside, kept = (
+        file.with_name(ARRAYS_NAME),
+        file.parent / HISTORY / file_hash(file) / ARRAYS_NAME,
+    )
+    ours = content.get("arrays_sha256")
+    if kept.exists() and file_hash(beside) != ours and file_hash(kept) == ours:
+        return kept
+    return beside
 
 
 def _refuse_changed(content: dict[str, Any], file: Path, arrays_file: Path) -> None:

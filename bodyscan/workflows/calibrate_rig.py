@@ -19,7 +19,7 @@ from bodyscan.registration.board_checks import describe_findings
 from bodyscan.registration.rig_calibration import RigCalibration, seen_corners
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
-from bodyscan.registration.storage import save_calibration
+from bodyscan.registration.storage import keep_former, save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.workflows.decode import ViewKey, decode_on_boards
@@ -46,11 +46,13 @@ def calibrate_folder(
     rig_file: Path, folder: Path, progress: Progress = silent
 ) -> tuple[RigCalibration, Path]:
     """As `calibrate_rig`, kept in `folder` as soon as it stands and again with what is said of it;
-    and the path of its JSON. Raises RigFileError and CaptureError besides."""
+    and the path of its JSON. One that lay there moves into its history. Raises RigFileError and
+    CaptureError besides."""
     rig = load_rig(rig_file)
     captures = open_captures(rig, rig_file)
     boards = find_all_boards(rig, captures, progress)
     found = join_rig(rig, captures, boards, progress, folder=Path(rig_file).parent)
+    keep_former(folder)
     save_calibration(found.calibration, folder)
     calibration = remarked(found, progress)
     return calibration, save_calibration(calibration, folder)

@@ -16,7 +16,7 @@ from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.rig_frame import nominal_pose
-from bodyscan.registration.storage import save_calibration
+from bodyscan.registration.storage import keep_former, save_calibration
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
@@ -34,6 +34,7 @@ def import_folder(
     """As `import_rig`, of a rig file and kept in `folder`; and the path of its JSON."""
     rig = load_rig(rig_file)
     found = import_rig(rig, Path(rig_file).parent, sigma_px)
+    keep_former(folder)
     return found, save_calibration(found, folder)
 
 

@@ -8,6 +8,7 @@ import shutil
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from bodyscan.files.hashing import file_hash
 from bodyscan.files.npz_file import read_npz
 from bodyscan.registration.storage import (
     accept_calibration,
+    calibration_id,
+    keep_former,
     load_calibration,
     save_calibration,
 )
@@ -298,3 +301,43 @@ def test_damaged_bytes_raise_nothing_but_our_own_errors(
     (folder / name).write_bytes(damaged)
     with suppress(BodyscanError):
         load_calibration(folder, accept_changed=True)
+
+
+def test_a_calibration_is_replaced_only_when_that_is_said(copy: Path, tmp_path: Path) -> None:
+    before = (copy / "calibration.json").read_bytes()
+    rig = tmp_path / "rig.yaml"  # is not even looked at
+    for command in ("calibrate-rig", "import"):
+        refused = run(command, rig, "--out", copy)
+        assert isinstance(refused.exception, CalibrationFileError)
+        assert "--overwrite" in refused.exception.remedy
+        assert not isinstance(run(command, rig, "--overwrite").exception, CalibrationFileError)
+    assert (copy / "calibration.json").read_bytes() == before
+
+
+def test_one_that_is_replaced_stays_by_the_hash_that_scans_know(copy: Path) -> None:
+    known, former = calibration_id(copy), load_calibration(copy)
+    kept = keep_former(copy)
+    save_calibration(replace(former, notes=("new",)), copy)
+    assert load_calibration(copy).notes == ("new",)
+    assert kept == copy / "history" / known
+    assert calibration_id(kept) == known
+    assert load_calibration(kept).notes == former.notes
+
+
+def test_a_kill_while_it_is_replaced_leaves_one_of_the_two(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    former = load_calibration(copy)
+    new = replace(former, seen={})  # so that the arrays differ
+
+    def killed(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    keep_former(copy)
+    monkeypatch.setattr("bodyscan.registration.storage.write_json", killed)
+    with pytest.raises(KeyboardInterrupt):
+        save_calibration(new, copy)
+    assert sorted(load_calibration(copy).seen) == sorted(former.pairs)
+    monkeypatch.undo()
+    save_calibration(new, copy)
+    assert load_calibration(copy).seen == {}
