@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from bodyscan.cli.console import Output, add_command
-from bodyscan.cli.options import Calibration, Changes, Overwrite, Result, ScanFolder
+from bodyscan.cli.options import Anyway, Calibration, Changes, Overwrite, Result, ScanFolder
 from bodyscan.errors import BadInput, FailedWork
 from bodyscan.files.os_errors import require_writable
 from bodyscan.progress import step
@@ -134,16 +134,19 @@ def measure(
     out: Annotated[
         Path | None, typer.Option(help="Default: `measurements.json` inside the result.")
     ] = None,
+    anyway: Anyway = False,
 ) -> None:
     """Measure a scan's mesh: stature, girths of horizontal slices, volume, area."""
     from bodyscan.files.atomic import write_json
-    from bodyscan.fusion.storage import load_scan
+    from bodyscan.fusion.storage import load_scan, refuse_repeat
     from bodyscan.measurement.measurements import heights_from
     from bodyscan.measurement.measurements import measure as measure_mesh
     from bodyscan.report.measurements import measurements_document, tables
 
     levels = None if heights is None else heights_from(heights)
     stored = load_scan(result)
+    if not anyway:
+        refuse_repeat(result, stored.facts)
     measured = measure_mesh(stored.mesh, levels)
     content = measurements_document(measured, stored.facts)
     path = out or result / "measurements.json"
@@ -169,17 +172,19 @@ def export(
     frame: Annotated[
         str, typer.Option(help="rig, or body: origin under the body, x the way it faces.")
     ] = "rig",
+    anyway: Anyway = False,
 ) -> None:
     """Write a scan's mesh as PLY, OBJ, STL and GLB for other programs."""
     from bodyscan.export.scan import export_scan
-    from bodyscan.fusion.storage import load_scan
+    from bodyscan.fusion.storage import load_scan, refuse_repeat
 
     folder = out or result / ("shared" if deface else "export")
     require_writable(folder)
     with output.stages() as progress, step(progress, "exporting"):
-        written = export_scan(
-            load_scan(result), folder, formats.split(","), deface=deface, frame=frame
-        )
+        stored = load_scan(result)
+        if not anyway:
+            refuse_repeat(result, stored.facts)
+        written = export_scan(stored, folder, formats.split(","), deface=deface, frame=frame)
     for path in written:
         output.made("export", path)
 

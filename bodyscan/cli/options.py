@@ -33,6 +33,9 @@ OverwriteCalibration = Annotated[
         "--overwrite", help="Replace the calibration that lies there; it is kept in `history`."
     ),
 ]
+Anyway = Annotated[
+    bool, typer.Option("--anyway", help="Even of a scan whose verdict is to repeat it.")
+]
 
 Json = Annotated[
     bool, typer.Option("--json", help="Print one JSON document: what was made, notes, verdict.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bodyscan.errors import ResultError, ScanFailed
+from bodyscan.errors import FailedWork, ResultError, ScanFailed
 from bodyscan.files.atomic import write_json
 from bodyscan.files.hashing import file_hash
 from bodyscan.fusion.scan import Scan
@@ -160,6 +161,18 @@ def load_scan(folder: Path) -> StoredScan:
             raise ResultError("was changed or cut short", where=str(file), remedy=REMEDY)
     cloud, mesh = read_ply_cloud(folder / CLOUD_NAME), read_ply_mesh(folder / MESH_NAME)
     return StoredScan(cloud, mesh, facts)
+
+
+def refuse_repeat(folder: Path, facts: Mapping[str, Any]) -> None:
+    """Raises FailedWork for a scan to be repeated: what is made of it would be taken for right."""
+    verdict = facts.get("verdict") or {}
+    if verdict.get("grade") == "repeat":
+        reasons = "".join(f"\n  {reason}" for reason in verdict["reasons"])
+        raise FailedWork(
+            f"this scan is to be repeated:{reasons}",
+            where=str(folder),
+            remedy="scan again; or say --anyway, and take what comes of it for what it is",
+        )
 
 
 def _alignment(scan: Scan) -> dict[str, Any] | None:
