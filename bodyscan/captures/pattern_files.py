@@ -69,7 +69,8 @@ def _folder_names(kinds: tuple[StripeCode, ...]) -> dict[StripeCode, str]:
     """Such as gray-640-horizontal, with a number where that is not enough."""
     names: dict[StripeCode, str] = {}
     for kind in kinds:
-        name = f"{kind.code}-{kind.stripes}-{kind.direction}"
+        ways = "-".join(f"{way.stripes}-{way.direction}" for way in kind.directions)
+        name = f"{kind.code}-{ways}"
         again = sum(taken.startswith(name) for taken in names.values())
         names[kind] = f"{name}-{again + 1}" if again else name
     return names

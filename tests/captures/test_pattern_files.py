@@ -82,3 +82,23 @@ def test_what_cannot_be_shown_is_said_and_nothing_written(
 def test_stripes_of_uneven_width_are_told(tmp_path: Path) -> None:
     done = patterns(RIG, tmp_path, "--width", "30", "--height", "25")
     assert "note: 12 stripes cannot be equally wide on 25 px" in done.output
+
+
+def test_crossing_stripes_are_shown_after_the_others_from_their_first_code(tmp_path: Path) -> None:
+    rig = RIG.replace(
+        "code: gray, stripes: 12", "code: gray, stripes: 12, crossing: {stripes: 10, first_code: 3}"
+    )
+    done = patterns(rig, tmp_path, "--width", "30", "--height", "24")
+    assert done.exit_code == 0, done.output
+    folder = tmp_path / "out" / "gray-12-horizontal-10-vertical"
+    told = json.loads((folder / "patterns.json").read_text())
+    shown = [entry["file"] for entry in told["show"]]
+    assert shown[2:10] == [f"bit0{k}{way}.png" for way in ("", "-inverse") for k in range(4)]
+    assert shown[10:] == [
+        f"crossing-bit0{k}{way}.png" for way in ("", "-inverse") for k in range(4)
+    ]
+    number = np.arange(30) // 3 + 3
+    for bit in range(4):
+        image = cv2.imread(str(folder / f"crossing-bit0{bit}.png"), cv2.IMREAD_UNCHANGED)
+        on = (number ^ (number >> 1)) >> (3 - bit) & 1
+        np.testing.assert_array_equal(image, np.repeat(255 * on[None], 24, axis=0))
