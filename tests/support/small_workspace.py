@@ -10,8 +10,15 @@ from pathlib import Path
 import yaml
 from typer.testing import CliRunner, Result
 
+from bodyscan.boards.view import BoardView
+from bodyscan.calibration.striped_view import BoardBoundaries
+from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.cli.main import app
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation import settings_for, simulate
+from bodyscan.workflows.decode import ViewKey, decode_on_boards
+from bodyscan.workflows.find_boards import find_all_boards
 
 PROJECT = Path(__file__).parents[2]
 SCALE = 0.4
@@ -26,6 +33,24 @@ class Workspace:
 
     folder: Path
     outputs: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Detected:
+    """What the workspace's images show: boards, and the boundaries of stripes on them."""
+
+    rig: Rig
+    captures: Captures
+    boards: tuple[BoardView, ...]
+    boundaries: dict[ViewKey, BoardBoundaries]
+
+
+def detect(workspace: Workspace) -> Detected:
+    rig = load_rig(workspace.folder / "rig.yaml")
+    captures = open_captures(rig, workspace.folder / "rig.yaml")
+    boards = find_all_boards(rig, captures).value
+    boundaries = decode_on_boards(rig, captures, boards).value
+    return Detected(rig, captures, tuple(boards), boundaries)
 
 
 def run(*arguments: object) -> Result:

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 import pytest
-from made_once import folder_made_once
-from small_workspace import Workspace, make_workspace
+from made_once import folder_made_once, value_made_once
+from small_workspace import Detected, Workspace, detect, make_workspace
 
 
 @pytest.fixture(scope="session")
@@ -19,3 +19,9 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     base = folder_made_once(tmp_path_factory, "workspace", make)
     outputs = json.loads((base / "outputs.json").read_text("utf-8"))
     return Workspace(base / "small rig", outputs)
+
+
+@pytest.fixture(scope="session")
+def detected(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Detected:
+    """Boards and stripes found once, for whoever solves with parts of them."""
+    return value_made_once(tmp_path_factory, "detected", lambda: detect(workspace))

@@ -11,14 +11,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from seen_boards import SeenBoards, seen_boards
+from small_workspace import Detected
 
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
+from bodyscan.calibration.striped_view import BoardBoundaries
+from bodyscan.captures.folder import Captures
 from bodyscan.errors import BodyscanError, FailedWork, RigDisconnected
+from bodyscan.outcome import Outcome
+from bodyscan.progress import Progress
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
+from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import RigFrame
+from bodyscan.workflows import calibrate_rig
 from bodyscan.workflows.calibrate_rig import join_rig
+from bodyscan.workflows.decode import ViewKey
 from bodyscan.workflows.rig_remarks import remarked
 
 Views = Sequence[BoardView]
@@ -76,6 +84,12 @@ def cut(views: Views, rng: np.random.Generator) -> Views:
     return [part(view) if rng.random() < 0.3 else view for view in views]
 
 
+def without(data: st.DataObject, names: Sequence[str], what: str) -> set[str]:
+    """Those to be left out: mostly few, at most all but one."""
+    every = st.sets(st.sampled_from(sorted(names)), max_size=len(names) - 1)
+    return data.draw(every, f"{what} left out")
+
+
 @given(data=st.data())
 @settings(max_examples=30)
 def test_any_subset_gives_a_calibration_or_a_refusal(
@@ -83,8 +97,8 @@ def test_any_subset_gives_a_calibration_or_a_refusal(
 ) -> None:
     boards = seen(data.draw(st.integers(3, 6), "cameras"), shots=8)
     shots = sorted({view.shot for view in boards.views})
-    pairs = data.draw(st.sets(st.sampled_from(sorted(boards.placings)), min_size=1), "pairs")
-    kept = data.draw(st.sets(st.sampled_from(shots), min_size=1), "shots")
+    pairs = set(boards.placings) - without(data, sorted(boards.placings), "pairs")
+    kept = set(shots) - without(data, shots, "shots")
     share = data.draw(st.sampled_from([1.0, 0.8, 0.5, 0.3]), "share of the views")
     spoil: Spoiling = data.draw(st.sampled_from([as_they_are, mixed_up, moved, bent, cut]))
     by_board = data.draw(st.booleans(), "a board holds the frame")
@@ -102,6 +116,46 @@ def test_any_subset_gives_a_calibration_or_a_refusal(
     folder = tmp_path_factory.mktemp("stored")
     save_calibration(found, folder)
     assert sorted(load_calibration(folder).pairs) == sorted(found.pairs)
+
+
+@given(data=st.data())
+@settings(max_examples=6)
+def test_any_subset_of_images_with_stripes_does_too(
+    detected: Detected, data: st.DataObject
+) -> None:
+    """The simulated rig's boards and stripes, found once in its images: views without a board,
+    boards without stripes, pairs and shots that took no part."""
+    names = sorted(pair.name for pair in detected.rig.pairs)
+    pairs = set(names) - without(data, names, "pairs")
+    shots = set(detected.captures.shots) - without(data, detected.captures.shots, "shots")
+    seen_share = data.draw(st.sampled_from([1.0, 0.7]), "share of the boards found")
+    striped_share = data.draw(st.sampled_from([1.0, 0.5, 0.1, 0.0]), "share of those with stripes")
+    rng = np.random.default_rng(data.draw(st.integers(0, 99), "seed"))
+    views = [
+        view
+        for view in detected.boards
+        if view.pair in pairs and view.shot in shots and rng.random() < seen_share
+    ]
+    striped = {
+        key: near for key, near in detected.boundaries.items() if rng.random() < striped_share
+    }
+
+    def decoded(
+        _rig: Rig, _captures: Captures, wanted: Views, _progress: Progress
+    ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
+        keys = [(view.pair, view.shot, view.board) for view in wanted]
+        return Outcome({key: striped[key] for key in keys if key in striped})
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(calibrate_rig, "decode_on_boards", decoded)
+        try:
+            joined = join_rig(detected.rig, detected.captures, Outcome(views))
+        except BodyscanError:
+            return
+        found = remarked(joined)
+    assert set(found.pairs) <= pairs
+    assert set(found.pairs) | set(found.failed) == set(names)
+    assert not [note for note in found.notes if "failed with" in note]
 
 
 def test_a_loosely_tied_camera_costs_nothing_but_its_own_sigma() -> None:

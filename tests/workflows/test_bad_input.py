@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from small_workspace import COARSER, Workspace, copy_pairs, run
+from small_workspace import COARSER, Detected, Workspace, copy_pairs, run
 
 from bodyscan.captures.folder import open_captures
 from bodyscan.errors import ResultError
@@ -57,12 +57,10 @@ def test_bad_images_cost_only_themselves(workspace: Workspace, tmp_path: Path) -
     assert sorted(load_calibration(copy / "calibration").pairs) == ["p1-2", "p2-2"]
 
 
-def test_a_pair_with_too_few_poses_is_named_and_left_out(workspace: Workspace) -> None:
-    rig = load_rig(workspace.folder / "rig.yaml")
-    captures = open_captures(rig, workspace.folder / "rig.yaml")
-    views = find_all_boards(rig, captures).value
+def test_a_pair_with_too_few_poses_is_named_and_left_out(detected: Detected) -> None:
+    views = detected.boards
     few = [v for v in views if v.pair != "p2-3"] + [v for v in views if v.pair == "p2-3"][:2]
-    cameras = calibrate_cameras(rig, few)
+    cameras = calibrate_cameras(detected.rig, few)
     assert sorted(cameras.value) == ["p1-2", "p1-3", "p2-2"]
     assert "at least 3" in cameras.failures["p2-3"]
 
