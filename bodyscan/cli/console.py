@@ -21,6 +21,9 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.console import Console, RenderableType
+from rich.measure import Measurement
+from rich.table import Table
+from rich.text import Text
 
 from bodyscan.cli.options import SHARED
 from bodyscan.errors import BodyscanError, FailedWork
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
 CONSOLE = Console() if sys.stdout.isatty() else Console(width=120)
 ERRORS = Console(stderr=True)
 MOST_NOTES = 20  # are shown without --verbose, the first line of each
+WIDEST = 10_000  # columns: no table is as wide
 STYLES = {"good": "green", "usable": "yellow", "bad": "red"}
 
 
@@ -81,7 +85,7 @@ class Output:
     def show(self, *tables: RenderableType) -> None:
         """Tables, which --json leaves to `figures`."""
         if not self.silent:
-            CONSOLE.print(*tables, sep="\n")
+            CONSOLE.print(*map(_fitting, tables), sep="\n")
 
     def figures(self, **values: Any) -> None:
         """Numbers for --json; people see them in tables."""
@@ -216,6 +220,28 @@ class StageClock:
 
     def finish(self) -> None:
         self._close(time.perf_counter())
+
+
+def complain(text: str) -> None:
+    """An error, in red where NO_COLOR does not forbid it (which rich obeys)."""
+    ERRORS.print(text, style="red", highlight=False, markup=False, soft_wrap=True)
+
+
+def _fitting(table: RenderableType) -> RenderableType:
+    """A table that is wider than the screen as a list of its rows: nobody reads folded numbers."""
+    if not isinstance(table, Table):
+        return table
+    whole = CONSOLE.options.update(max_width=WIDEST)
+    if Measurement.get(CONSOLE, whole, table).maximum <= CONSOLE.width:
+        return table
+    headings = [str(column.header) for column in table.columns]
+    lines = [str(table.title)] if table.title else []
+    for row in zip(*(column.cells for column in table.columns), strict=True):
+        name, *values = map(str, row)
+        lines.append(name)
+        named = zip(headings[1:], values, strict=True)
+        lines += [f"  {heading}: {value}" if heading else f"  {value}" for heading, value in named]
+    return Text("\n".join(lines))
 
 
 def _finite(value: Any) -> Any:

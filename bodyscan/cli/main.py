@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 
 from bodyscan.cli import builder, laboratory, operator
+from bodyscan.cli.console import complain
 from bodyscan.cli.interruption import run_interruptibly
 from bodyscan.errors import BodyscanError
 from bodyscan.files.os_errors import in_words
@@ -58,14 +59,14 @@ def _run(arguments: list[str], *, debug: bool) -> int:
     except BodyscanError as error:
         if debug:
             raise
-        typer.secho(f"error: {error}", err=True, fg="red")
+        complain(f"error: {error}")
         code = error.exit_code
     try:
         sys.stdout.flush()
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what is flushed when Python ends
         code = code or 1
-        typer.secho(f"error: {in_words(error)}", err=True, fg="red")
+        complain(f"error: {in_words(error)}")
     return code
 
 

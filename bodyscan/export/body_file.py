@@ -14,6 +14,7 @@ from bodyscan.files.atomic import write_json
 from bodyscan.files.registry import unknown_format
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.slivers import without_slivers
 from bodyscan.mesh.topology import face_areas
 from bodyscan.version import __version__
 
@@ -34,12 +35,15 @@ class Provenance:
 
 
 def write_body(path: Path, body: BodyCloud | BodyMesh, origin: Provenance) -> None:
-    """Write `body` in the format that `path`'s suffix names, and `<path>.json` beside it.
+    """Write `body` in the format that `path`'s suffix names, and `<path>.json` beside it; of a mesh
+    no faces without area.
 
     Raises BadInput for a suffix that is no format of ours, or none for a cloud.
     """
     path = Path(path)
     format_ = _format_for(path, body)
+    if isinstance(body, BodyMesh):
+        body = without_slivers(body)
     format_.write(path, body)
     write_json(path.with_name(f"{path.name}.json"), description(path.name, format_, body, origin))
 

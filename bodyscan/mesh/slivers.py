@@ -1,0 +1,36 @@
+"""Faces without area taken out of a mesh: other programs stumble over them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.topology import directed_edges, drop_unused_vertices
+
+PLACES = 4  # decimals of a millimetre: what text formats write, and far below any sigma
+
+
+def without_slivers(mesh: BodyMesh) -> BodyMesh:
+    """The mesh with every edge drawn together whose ends are one point when written; the faces at it
+    go with it, so that a closed mesh stays closed."""
+    places, edges = np.round(mesh.vertices, PLACES), directed_edges(mesh.faces)
+    edges = edges[(places[edges[:, 0]] == places[edges[:, 1]]).all(axis=1)]
+    if not len(edges):
+        return mesh
+    count = len(mesh.vertices)
+    joined = coo_array((np.ones(len(edges), bool), edges.T), (count, count))
+    _, group = connected_components(joined, directed=False)
+    first = np.unique(group, return_index=True)[1]
+    faces = first[group][mesh.faces]
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    vertices, faces, used = drop_unused_vertices(mesh.vertices, faces[whole])
+    return BodyMesh(
+        vertices,
+        faces,
+        mesh.normals[used],
+        mesh.colours[used],
+        mesh.sigma_mm[used],
+        mesh.filled[whole],
+    )
