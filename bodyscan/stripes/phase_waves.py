@@ -13,6 +13,7 @@ import numpy as np
 from bodyscan.arrays import Floats, Greys, Mask
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.phase_order import PhaseOrder, phase_order
+from bodyscan.stripes.phase_smoothing import smooth_phase
 from bodyscan.stripes.pixel_stripes import pixel_stripe_map
 from bodyscan.stripes.projector_response import (
     PhaseError,
@@ -70,6 +71,7 @@ def decode_waves(
     usable = read.order.certain & ~beside_jumps(halves, read.order.certain)
     s = np.where(usable, read.order.s, np.float32(np.nan))
     sigma = np.where(usable, read.order.sigma, np.float32(np.nan))
+    s, sigma = smooth_phase(s, sigma)
     light = ScanLines(read.white, read.black, lines[:0], None, turned)
     found = pixel_stripe_map(light, lit, s, sigma, read.variance, stripes)
     return replace(found, response=share_of_error(read.errors[0], read.finest, found.sigma))

@@ -78,8 +78,9 @@ def plain(images: np.ndarray, pixels: float) -> np.ndarray:
 
 
 # About a surface that follows the bubbles which the paper throws (0.2 mm high: columns and rows agree
-# on them along the epipolar line): a plain arctangent has 0.45 and 0.28, of which 0.09 and 0.04.
-@pytest.mark.parametrize(("crossing", "rms", "slow"), [(False, 0.45, 0.1), (True, 0.285, 0.06)])
+# on them along the epipolar line): 0.337 and 0.210 stripes, of which 0.086 and 0.038 over 15 x 15 px. A
+# plain arctangent has 0.453 and 0.283, of which 0.087 and 0.039.
+@pytest.mark.parametrize(("crossing", "rms", "slow"), [(False, 0.36, 0.1), (True, 0.23, 0.06)])
 def test_columns_and_rows_are_decoded_exactly(
     opened: Captures, decoded: StripeMap, board: np.ndarray, crossing: bool, rms: float, slow: float
 ) -> None:
@@ -93,7 +94,7 @@ def test_columns_and_rows_are_decoded_exactly(
     assert np.nanmax(np.abs(found.s - by_arctangent)[board]) < 7.0
     assert np.nanstd(off) < rms
     assert systematic(off) < slow
-    assert np.nanstd(off) < 0.995 * np.nanstd(off_surface(by_arctangent, board, 15.0))
+    assert np.nanstd(off) < 0.8 * np.nanstd(off_surface(by_arctangent, board, 15.0))
     # The sigma is what is seen.
     expected = float(np.sqrt(np.nanmean(np.square(found.sigma[board]))))
     assert 0.9 < np.nanstd(off) / expected < 1.15

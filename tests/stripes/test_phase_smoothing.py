@@ -1,0 +1,39 @@
+"""What smoothing takes out of phases, and what it must leave."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bodyscan.stripes.phase_smoothing import LEFT, smooth_phase
+
+V, U = np.mgrid[:80, :100].astype(np.float32)
+SIGMA = np.full(U.shape, 0.1, np.float32)
+
+
+def test_quadratics_and_sharp_ridges_along_lines_or_columns_stay() -> None:
+    smooth = (3 + U + 0.5 * V + 0.003 * U * V - 0.002 * U**2).astype(np.float32)
+    ridge = 0.2 * (U % 7 == 0) + 0.2 * (V % 9 == 0)
+    for s in (smooth, (smooth + ridge).astype(np.float32)):
+        np.testing.assert_allclose(smooth_phase(s, SIGMA)[0], s, atol=2e-5)
+
+
+def test_noise_shrinks_as_the_sigma_says() -> None:
+    noise = np.random.default_rng(3).normal(0.0, 0.1, U.shape).astype(np.float32)
+    s, sigma = smooth_phase((U + noise).astype(np.float32), SIGMA)
+    inner = np.s_[1:-1, 1:-1]
+    np.testing.assert_allclose(sigma[inner], 0.1 * LEFT, rtol=1e-5)
+    assert np.std((s - U)[inner]) < 1.03 * 0.1 * LEFT
+    assert 0.7 < LEFT < 0.75
+
+
+def test_what_is_beside_a_gap_or_no_noise_stays_as_it_is() -> None:
+    s = U.copy()
+    s[40, 50] = np.nan
+    s[20, 30] += 5.0
+    found, sigma = smooth_phase(s, SIGMA)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(s))
+    beside = np.s_[39:42, 49:52]
+    np.testing.assert_array_equal(found[beside], s[beside])
+    np.testing.assert_array_equal(sigma[beside], SIGMA[beside])
+    assert found[20, 30] == s[20, 30]
+    np.testing.assert_array_equal(found[0], s[0])
