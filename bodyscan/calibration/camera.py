@@ -20,6 +20,7 @@ from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 FEWEST_POSES = 3
@@ -47,7 +48,8 @@ class CameraCalibration:
     """camera with the covariance (P, P) of its parameters, and the board's pose in each shot.
 
     rms_px: root mean square distance of corners to their reprojection, robustly weighted.
-    lenses: those tried on held-out boards; empty where the lens was given.
+    lenses: those tried on held-out boards; empty where the lens was given.  rays: how well each
+    pixel's is known; None where nobody asked.
     """
 
     camera: Camera
@@ -56,6 +58,7 @@ class CameraCalibration:
     residuals_px: dict[str, Array]
     rms_px: float
     lenses: tuple[LensTrial, ...] = ()
+    rays: RayUncertainty | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +79,7 @@ class CameraFit:
         """Robustly weighted."""
         return weighted_rms(self.residuals, self.weights)
 
-    def calibration(
-        self, views: Sequence[PlanarView], lenses: tuple[LensTrial, ...] = ()
-    ) -> CameraCalibration:
+    def calibration(self, views: Sequence[PlanarView]) -> CameraCalibration:
         """Of the views it was fitted to."""
         shots = [view.shot for view in views]
         return CameraCalibration(
@@ -87,7 +88,6 @@ class CameraFit:
             dict(zip(shots, self.poses, strict=True)),
             dict(zip(shots, self.residuals, strict=True)),
             self.rms_px,
-            lenses,
         )
 
 

@@ -24,9 +24,11 @@ from bodyscan.calibration.camera import (
     locate_board,
     weighted_rms,
 )
+from bodyscan.calibration.ray_uncertainty import ray_uncertainty
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import RICHEST, family_up_to
+from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform
 
 CLEARLY = 3.0
@@ -43,10 +45,12 @@ picture: they try the lens where it was tried before."""
 
 @dataclass(frozen=True, eq=False)
 class ChosenLens:
-    """The camera fitted with the lens chosen, and how each lens did; no trials: too few places."""
+    """The camera fitted with the lens chosen, and how each lens did; no trials: too few places, or
+    one lens only.  rays: how well the boards know each pixel's."""
 
     fit: CameraFit
     trials: tuple[LensTrial, ...]
+    rays: RayUncertainty
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,23 +71,37 @@ def calibrate_with_best_lens(
 
     Raises DegeneratePoses as it does.
     """
-    start = fit_from_scratch(views, width, height, RICHEST())
-    chosen = choose_lens(start.camera, start.poses, views)
-    return chosen.fit.calibration(views, chosen.trials)
+    return calibrate_with_lenses(FAMILY, views, width, height)
+
+
+def calibrate_with_lenses(
+    kinds: Sequence[type[Lens]], views: Sequence[PlanarView], width: int, height: int
+) -> CameraCalibration:
+    """As `calibrate_camera`, with that of the kinds, the simplest first, that held-out boards choose.
+
+    Raises DegeneratePoses as it does.
+    """
+    start = fit_from_scratch(views, width, height, kinds[-1]())
+    chosen = choose_lens(kinds, start.camera, start.poses, views)
+    return replace(chosen.fit.calibration(views), lenses=chosen.trials, rays=chosen.rays)
 
 
 def choose_lens(
-    camera: Camera, poses: Sequence[RigidTransform], views: Sequence[PlanarView]
+    kinds: Sequence[type[Lens]],
+    camera: Camera,
+    poses: Sequence[RigidTransform],
+    views: Sequence[PlanarView],
 ) -> ChosenLens:
-    """The simplest lens of the family that no richer one clearly beats, up to the camera's own.
+    """The simplest lens that no richer one clearly beats.
 
-    camera: with the richest lens to be tried; poses: `camera_from_board` of each view, about.
+    kinds: simplest first, each with the coefficients of the one before it and more.  camera: with the
+    last of them; poses: `camera_from_board` of each view, about.
     """
-    kinds = family_up_to(type(camera.lens))
-    place = places(views)
-    if len(set(place)) < FEWEST_PLACES:
-        return ChosenLens(_fit(kinds[0], camera, poses, views), ())
     chosen = _fit(kinds[0], camera, poses, views)
+    place = places(views)
+    if len(kinds) == 1 or len(set(place.tolist())) < FEWEST_PLACES:
+        richest = chosen if len(kinds) == 1 else _fit(kinds[1], camera, poses, views)
+        return ChosenLens(chosen, (), ray_uncertainty(chosen.camera, richest, views))
     held = _hold_out(chosen, views, place)
     trials: list[tuple[CameraFit, _HeldOut, float | None]] = [(chosen, held, None)]
     for kind in kinds[1:]:
@@ -99,7 +117,7 @@ def choose_lens(
         LensTrial(fit.camera.lens.kind, weighted_rms(out.residuals, weights), gain, fit is chosen)
         for fit, out, gain in trials
     )
-    return ChosenLens(chosen, told)
+    return ChosenLens(chosen, told, ray_uncertainty(chosen.camera, trials[-1][0], views))
 
 
 def _fit(

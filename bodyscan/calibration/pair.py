@@ -24,6 +24,7 @@ from bodyscan.calibration.striped_view import StripedView, boundaries_on_boards
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.outcome import Outcome
 from bodyscan.stripes.stripe_code import StripeCode
 
@@ -87,6 +88,7 @@ class PairCalibration:
     sheets: LightSheets | None
     quality: PairQuality
     crossing: LightSheets | None = None
+    rays: RayUncertainty | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +96,8 @@ class PlacedPair:
     """A pair whose camera and boards are known: what its light sheets are fitted from.
 
     camera: as all corners of the rig have left it, with the covariance of its parameters.  own: the
-    camera as it was calibrated by itself.  lenses: those that were tried.
+    camera as it was calibrated by itself.  lenses: those that were tried.  rays: how well each pixel's
+    is known.
     views: number of the board views it took part with.  shots: those on which stripes were decoded,
     with `camera_from_board` as the rig's solve has it.  alone: no other pair holds the boards.
     """
@@ -104,6 +107,7 @@ class PlacedPair:
     camera_covariance: Array
     own: CameraCalibration
     lenses: tuple[LensTrial, ...]
+    rays: RayUncertainty | None
     projector: StripeCode | None
     rms_px: float
     views: int
@@ -117,7 +121,9 @@ def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
     camera, projector = pair.camera, pair.projector
     if projector is None:
         return Outcome(
-            PairCalibration(pair.name, camera, pair.camera_covariance, None, quality),
+            PairCalibration(
+                pair.name, camera, pair.camera_covariance, None, quality, rays=pair.rays
+            ),
         )
     notes: tuple[str, ...] = ()
     shots = pair.shots
@@ -137,7 +143,9 @@ def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
         held_out=fit.held_out,
         boards_mm=_mean_and_rms(board_offsets(points, fit.sheets)),
     )
-    found = PairCalibration(pair.name, camera, pair.camera_covariance, fit.sheets, quality)
+    found = PairCalibration(
+        pair.name, camera, pair.camera_covariance, fit.sheets, quality, rays=pair.rays
+    )
     if pair.alone:
         # In a rig of several pairs the boards are held by all cameras together, far better than
         # one pair's stripes could.

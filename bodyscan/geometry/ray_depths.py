@@ -22,6 +22,7 @@ Way = Callable[[Array, Array], tuple[Array, Array, Array]]
 MOST_SIGMA = 1e-3
 """A sheet that leaves a depth uncertain by more than this share of it is as good as none: so far
 from all boards a smooth model only guesses."""
+SAMPLES = 400
 BAND = 16  # rows at a time: what fits into a processor's cache
 
 
@@ -40,6 +41,22 @@ def intersect_rays(sheets: LightSheets, rays: Array, s: Array) -> RayDepths:
     found = _way_to_measure(sheets)(rays.reshape(-1, 3), np.ravel(s))
     unsure = found[2] > (_most_sigma(sheets) * found[0]) ** 2
     return RayDepths(*(np.where(unsure, np.nan, some).reshape(np.shape(s)) for some in found))
+
+
+def stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
+    """How far s changes, at one depth, from a pixel to the next across the stripes: median over some
+    of the pixels that have an s (height, width); 0 where none has."""
+    wanted = np.flatnonzero(np.isfinite(s))
+    some = wanted[:: max(len(wanted) // SAMPLES, 1)]
+    rows, columns = np.unravel_index(some, s.shape)
+    pixels, own = np.column_stack([columns, rows]).astype(float), s.ravel()[some].astype(float)
+    here = intersect_rays(sheets, camera.rays(pixels), own)
+    beside = [intersect_rays(sheets, camera.rays(pixels + step), own) for step in np.eye(2)]
+    # Along its own sheet a ray beside meets another depth: as if s had changed by so much here.
+    changes = [(one.depth - here.depth) / here.per_stripe for one in beside]
+    found = np.hypot(*changes)
+    found = found[np.isfinite(found)]
+    return float(np.median(found)) if found.size else 0.0
 
 
 def triangulate_image(

@@ -9,7 +9,8 @@ from bodyscan.calibration.pair import PairCalibration
 from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
 from bodyscan.geometry.crop import crop_of, ends_of
-from bodyscan.geometry.ray_depths import triangulate_image
+from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.ray_depths import stripes_per_pixel, triangulate_image
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.two_ways import combine
 from bodyscan.stripes.stripe_map import StripeMap
@@ -36,17 +37,30 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
             where=f"pair {pair.name}",
             remedy="scan with the camera settings of the calibration, or calibrate again",
         )
-    points, sigma_mm = triangulate_image(pair.sheets, camera, stripes.s, stripes.sigma)
+    points, sigma_mm = _triangulated(pair, pair.sheets, stripes.s, stripes.sigma)
     agreement = None
     if pair.crossing is not None and stripes.crossing is not None:
         across = stripes.crossing
-        others = triangulate_image(pair.crossing, camera, across.s, across.sigma)
+        others = _triangulated(pair, pair.crossing, across.s, across.sigma)
         # Crossing stripes are decoded wherever they are, not in the scan volume alone.
         alone = np.full(sigma_mm.shape, stripes.beyond is None)
         points, sigma_mm, agreement = combine(points, sigma_mm, *others, alone=alone)
     normals = grid_normals(points, np.isfinite(sigma_mm))
     images = (stripes.lit, stripes.beyond)
     return RangeImage(pair.name, camera, points, normals, sigma_mm, *images, agreement)
+
+
+def _triangulated(
+    pair: PairCalibration, sheets: LightSheets, s: Floats, sigma: Floats
+) -> tuple[Floats, Floats]:
+    """As `triangulate_image`; a ray that is known to so many pixels makes s as uncertain as the
+    stripes are fine there."""
+    camera = pair.camera
+    if pair.rays is not None:
+        finest = stripes_per_pixel(sheets, camera, s)
+        of_rays = np.float32(finest) * pair.rays.image(camera.width, camera.height)
+        sigma = np.hypot(sigma, of_rays)
+    return triangulate_image(sheets, camera, s, sigma)
 
 
 def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:

@@ -7,13 +7,13 @@ lenses in the shape they have.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import LensTrial
 from bodyscan.calibration.lens_choice import choose_lens
-from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import family_up_to
+from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.rig.pair import AUTO
 from bodyscan.rig.rig import Rig
@@ -30,34 +30,40 @@ def lens_notes(trials: Mapping[str, Sequence[LensTrial]]) -> list[str]:
     ]
 
 
-def choose_lenses(
-    rig: Rig, views: Sequence[LocatedView], solution: JointSolution
-) -> tuple[JointSolution, dict[str, tuple[LensTrial, ...]]]:
-    """The solution with the lenses that each camera's own held-out boards choose, and how each lens
-    did; cameras whose lens the rig file names stay as they are.
+@dataclass(frozen=True, eq=False)
+class ChosenLenses:
+    """The solution with the lenses chosen; by camera, how each lens did where its lens was open, and
+    how well each pixel's ray is known by the corners, if those err independently."""
+
+    solution: JointSolution
+    trials: dict[str, tuple[LensTrial, ...]]
+    rays: dict[str, RayUncertainty]
+
+
+def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolution) -> ChosenLenses:
+    """Each camera's own held-out boards choose its lens; one that the rig file names stays.
 
     views: their points where the boards' corners really lie.
     """
-    cameras, trials = dict(solution.cameras), {}
-    for name in _undecided(rig, cameras):
+    cameras = dict(solution.cameras)
+    trials: dict[str, tuple[LensTrial, ...]] = {}
+    rays: dict[str, RayUncertainty] = {}
+    open_lens = {pair.name for pair in rig.pairs if pair.camera.lens == AUTO}
+    for name in sorted(cameras):
         own = [view for view in views if view.pair == name]
+        if not own or cameras[name].prior is not None:
+            continue  # another program knew it
         camera_from_root = solution.root_from_camera[name].inverse()
+        kind = type(cameras[name].lens)
         chosen = choose_lens(
+            family_up_to(kind) if name in open_lens else (kind,),
             cameras[name],
             [camera_from_root @ solution.root_from_board[view.target] for view in own],
             [PlanarView(view.shot, view.points, view.pixels) for view in own],
         )
-        trials[name] = chosen.trials
-        if chosen.fit.camera.lens.kind != cameras[name].lens.kind:
+        rays[name] = chosen.rays
+        if chosen.trials:
+            trials[name] = chosen.trials
+        if type(chosen.fit.camera.lens) is not kind:
             cameras[name] = chosen.fit.camera
-    return replace(solution, cameras=cameras), trials
-
-
-def _undecided(rig: Rig, cameras: Mapping[str, Camera]) -> list[str]:
-    """Pairs whose lens nobody has told, and for which there is a simpler one."""
-    left_open = {pair.name for pair in rig.pairs if pair.camera.lens == AUTO}
-    return sorted(
-        name
-        for name, camera in cameras.items()
-        if name in left_open and camera.prior is None and len(family_up_to(type(camera.lens))) > 1
-    )
+    return ChosenLenses(replace(solution, cameras=cameras), trials, rays)

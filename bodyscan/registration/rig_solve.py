@@ -20,6 +20,7 @@ from bodyscan.calibration.camera import LensTrial
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.registration.board_shape import (
@@ -43,7 +44,7 @@ from bodyscan.registration.inconsistent_views import (
 from bodyscan.registration.joint_solve import JointSolution, solve_jointly
 from bodyscan.registration.normal_equations import CORNERS, normal_equations
 from bodyscan.registration.rig_frame import frame_board_turn, frame_target, rig_from_root
-from bodyscan.registration.rig_lenses import choose_lenses, lens_notes
+from bodyscan.registration.rig_lenses import ChosenLenses, choose_lenses, lens_notes
 from bodyscan.registration.view_graph import (
     Target,
     initial_poses,
@@ -68,7 +69,8 @@ class RigSolution:
     that are not as described, where others' views confirm it.  lenses: those tried on held-out
     boards, by camera; of cameras whose lens was open.  camera_covariances: (P, P) of each camera's
     parameters, where the solve refined them.  excess: by how many times variances are larger than
-    corners that err independently would make them, as the boards' places show.
+    corners that err independently would make them, as the boards' places show.  rays: how well each
+    pixel's is known, by camera.
     """
 
     rig_from_camera: dict[str, RigidTransform]
@@ -81,17 +83,18 @@ class RigSolution:
     lenses: dict[str, tuple[LensTrial, ...]] = field(default_factory=dict)
     camera_covariances: dict[str, Array] = field(default_factory=dict)
     excess: float = 1.0
+    rays: dict[str, RayUncertainty] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
     """judged: the last solve of boards as they are; shaped: that solve with the shapes found for
-    them, and its views; dropped: views left out.  lenses: those tried, by camera."""
+    them, and its views; dropped: views left out.  lenses: if they were chosen."""
 
     judged: ConsistentSolve
     shaped: ShapedSolution
     dropped: list[LocatedView]
-    lenses: dict[str, tuple[LensTrial, ...]]
+    lenses: ChosenLenses | None
 
 
 def solve_rig(
@@ -128,7 +131,7 @@ def solve_rig(
         left_out |= {name: not_together([name]) for name in strangers}
         start = {name: placing for name, placing in start.items() if name not in strangers}
     placed = _placed(rig, solved, len(start) > 1)
-    notes = (*solved.judged.notes, *solved.shaped.notes, *lens_notes(solved.lenses))
+    notes = (*solved.judged.notes, *solved.shaped.notes, *lens_notes(placed.lenses))
     return Outcome(placed, notes, left_out)
 
 
@@ -164,18 +167,19 @@ def _solve(
     )
     judged = solve(resolved, solution, wrong=[view_key(view) for view in gross])
     shaped = ShapedSolution(judged.solution, judged.kept(resolved), {}, ())
-    trials: dict[str, tuple[LensTrial, ...]] = {}
+    lenses: ChosenLenses | None = None
     # With strangers among them all are solved again.
     if several and not _strangers(shaped.views, _dropped(resolved, judged)):
         shaped = with_board_shapes(shaped.views, judged.solution, root=root, refine_cameras=True)
         solution = shaped.solution
         if choose:
-            solution, trials = choose_lenses(rig, shaped.views, solution)
-        if trials or shaped.shapes:
+            lenses = choose_lenses(rig, shaped.views, solution)
+            solution = lenses.solution
+        if shaped.shapes or solution.cameras != shaped.solution.cameras:
             true = [in_shape(view, shaped.shapes) for view in resolved]
             judged = solve(true, solution, wrong=judged.wrong)
             shaped = with_same_shapes(judged.kept(resolved), judged.solution, shaped, root=root)
-    return _Solved(judged, shaped, _dropped(resolved, judged), trials)
+    return _Solved(judged, shaped, _dropped(resolved, judged), lenses)
 
 
 def _dropped(views: Sequence[LocatedView], judged: ConsistentSolve) -> list[LocatedView]:
@@ -226,9 +230,13 @@ def _placed(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
         rms,
         tuple(kept),
         shaped.shapes,
-        solved.lenses,
+        solved.lenses.trials if solved.lenses else {},
         known.cameras,
         known.excess,
+        {
+            name: rays.with_excess(known.excess)
+            for name, rays in (solved.lenses.rays if solved.lenses else {}).items()
+        },
     )
 
 

@@ -26,6 +26,7 @@ from bodyscan.files.regular import read_regular
 from bodyscan.geometry.camera_fields import from_fields, to_fields
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.ray_uncertainty import COLUMNS, ROWS, RayUncertainty
 from bodyscan.geometry.sheet_arrays import from_arrays, to_arrays
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
@@ -84,6 +85,9 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
         if pair.crossing is not None:
             for key, array in to_arrays(pair.crossing).items():
                 arrays[f"{name}/crossing/{key}"] = array
+        if pair.rays is not None:
+            arrays[f"{name}/rays/noise_px"] = pair.rays.noise_px
+            arrays[f"{name}/rays/lens_px"] = pair.rays.lens_px
     for name, seen in calibration.seen.items():
         for part in fields(seen):
             arrays[f"{name}/seen/{part.name}"] = getattr(seen, part.name)
@@ -233,6 +237,7 @@ def _calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCalibrat
             None if part["light"] is None else _light(part["light"], f"{name}/light/", arrays),
             _quality(part["quality"]),
             _light(part["crossing"], f"{name}/crossing/", arrays) if "crossing" in part else None,
+            _rays(name, arrays),
         )
         for name, part in parts.items()
     }
@@ -261,6 +266,16 @@ def _calibration(content: dict[str, Any], arrays: dict[str, Any]) -> RigCalibrat
 
 def _light(content: dict[str, Any], prefix: str, arrays: dict[str, Any]) -> LightSheets:
     return from_arrays(content["kind"], _under(prefix, arrays), content["direction"])
+
+
+def _rays(name: str, arrays: dict[str, Any]) -> RayUncertainty | None:
+    parts = _under(f"{name}/rays/", arrays)
+    if not parts:
+        return None
+    for part in parts.values():
+        if part.shape != (ROWS, COLUMNS) or not np.all(part >= 0.0):
+            raise ValueError(f"the rays of {name} have no standard deviations, {ROWS} x {COLUMNS}")
+    return RayUncertainty(**parts)
 
 
 def _under(prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:

@@ -21,11 +21,11 @@ from bodyscan.calibration.camera import (
     locate_board,
 )
 from bodyscan.calibration.known_pair import read_known_camera
-from bodyscan.calibration.lens_choice import calibrate_with_best_lens
+from bodyscan.calibration.lens_choice import calibrate_with_lenses
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_board_image
 from bodyscan.errors import BodyscanError
-from bodyscan.geometry.lenses import LENSES, RICHEST
+from bodyscan.geometry.lenses import FAMILY, LENSES
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, threaded
 from bodyscan.rig.known import Known
@@ -81,11 +81,10 @@ def calibrate_cameras(
         planar = [planar_view(view, rig.board(view.board)) for view in own]
         if rig.pair(name).known is not None:
             return calibrate_known_camera(planar, read_known_camera(rig.pair(name), folder))
-        if spec.lens != AUTO:
-            return calibrate_camera(planar, spec.width, spec.height, LENSES[spec.lens]())
+        kinds = FAMILY if spec.lens == AUTO else (LENSES[spec.lens],)
         if len(rig.pairs) == 1:
-            return calibrate_with_best_lens(planar, spec.width, spec.height)
-        return calibrate_camera(planar, spec.width, spec.height, RICHEST())
+            return calibrate_with_lenses(kinds, planar, spec.width, spec.height)
+        return calibrate_camera(planar, spec.width, spec.height, kinds[-1]())
 
     names = [pair.name for pair in rig.pairs]
     cameras, errors = attempt_each(

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from small_pair import CAMERA, pair, stripe_map
@@ -5,6 +7,7 @@ from small_pair import CAMERA, pair, stripe_map
 from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.ray_uncertainty import COLUMNS, ROWS, RayUncertainty
 from bodyscan.reconstruction.triangulation import grid_normals, reconstruct_range_image
 from bodyscan.stripes.stripe_map import StripeMap
 
@@ -36,6 +39,27 @@ def test_sigma_follows_from_the_decoding() -> None:
     # One sigma of s moves a point by its sigma, along its ray; crossing into the next plane's
     # interval changes the slope a little.
     assert np.allclose(moved, image.sigma_mm[known], rtol=0.1)
+
+
+def test_a_ray_that_is_not_known_moves_its_point_by_its_sigma() -> None:
+    """Rays half a pixel aside, across the stripes: points move by what that sigma says."""
+    depth = np.full(CAMERA.pixel_rays().shape[:2], 480.0)
+    exact = StripeMap(**{**vars(stripe_map(depth)), "sigma": np.zeros(depth.shape, np.float32)})
+    unsure = np.full((ROWS, COLUMNS), 0.3), np.full((ROWS, COLUMNS), 0.4)
+    known = reconstruct_range_image(pair(), exact)
+    image = reconstruct_range_image(replace(pair(), rays=RayUncertainty(*unsure)), exact)
+    aside = replace(CAMERA, u0=CAMERA.u0 + 0.5), replace(CAMERA, v0=CAMERA.v0 + 0.5)
+    moved = [
+        reconstruct_range_image(replace(pair(), camera=camera), exact).points - known.points
+        for camera in aside
+    ]
+    distance = np.hypot(*(np.linalg.norm(one, axis=-1) for one in moved))
+    both = image.valid & np.isfinite(distance)
+    assert both.mean() > 0.5
+    added = np.sqrt(image.sigma_mm[both] ** 2 - known.sigma_mm[both] ** 2)
+    # One number says how fine the stripes are everywhere, and a ray moves aside as well as along.
+    assert np.median(added / distance[both]) == pytest.approx(1.0, abs=0.15)
+    assert np.percentile(added / distance[both], [5, 95]) == pytest.approx([1.0, 1.0], abs=0.35)
 
 
 def test_normals_of_a_sphere_point_to_the_camera() -> None:

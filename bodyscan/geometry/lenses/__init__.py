@@ -14,7 +14,6 @@ first is taken."""
 
 FAMILY: tuple[type[Lens], ...] = (Radial, Brown, Rational)
 """Those that a camera is tried with, each with all coefficients of the one before it and more."""
-RICHEST = FAMILY[-1]
 
 
 def family_up_to(kind: type[Lens]) -> tuple[type[Lens], ...]:

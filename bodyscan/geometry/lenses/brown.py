@@ -30,7 +30,7 @@ class Brown(Lens):
 
     @property
     def prior_sigmas(self) -> Array:
-        return np.array([0.5, 0.5, 0.02, 0.02, 0.5])
+        return np.array([0.5, 0.5, 0.005, 0.005, 0.2])
 
     @property
     def difference_steps(self) -> Array:

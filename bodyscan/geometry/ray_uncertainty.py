@@ -1,0 +1,45 @@
+"""How well the ray of each pixel is known, beyond what a motion of the whole camera makes up for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from bodyscan.arrays import Array, Floats
+
+ROWS, COLUMNS = 17, 21
+"""Nodes across a picture; between them it changes smoothly."""
+
+
+@dataclass(frozen=True, eq=False)
+class RayUncertainty:
+    """Standard deviations of a coordinate, px, at ROWS x COLUMNS nodes from a picture's first pixel
+    to its last: noise_px from the corners' noise, lens_px from which lens is the right one."""
+
+    noise_px: Array
+    lens_px: Array
+
+    @property
+    def sigma_px(self) -> Array:
+        """(ROWS, COLUMNS), of both."""
+        return np.hypot(self.noise_px, self.lens_px)
+
+    def with_excess(self, variances: float) -> RayUncertainty:
+        """The noise that many times larger, in variances."""
+        return replace(self, noise_px=np.sqrt(variances) * self.noise_px)
+
+    def image(self, width: int, height: int) -> Floats:
+        """sigma_px (height, width) of every pixel, linear between nodes."""
+        v = np.linspace(0.0, ROWS - 1.0, height, dtype=np.float32)
+        u = np.linspace(0.0, COLUMNS - 1.0, width, dtype=np.float32)
+        return cv2.remap(
+            self.sigma_px.astype(np.float32), *np.meshgrid(u, v), interpolation=cv2.INTER_LINEAR
+        )
+
+
+def nodes(width: int, height: int) -> Array:
+    """(ROWS, COLUMNS, 2): the nodes' pixels."""
+    u, v = np.linspace(0.0, width - 1.0, COLUMNS), np.linspace(0.0, height - 1.0, ROWS)
+    return np.stack(np.meshgrid(u, v), axis=-1)

@@ -1,0 +1,93 @@
+"""Where boards were, a pixel's ray is known; beyond, as badly as it is said to be."""
+
+from __future__ import annotations
+
+import numpy as np
+from test_lens_choice import HEIGHT, MIDDLE, NOISE_PX, POINTS, WIDTH
+
+from bodyscan.calibration.board_views import PlanarView
+from bodyscan.calibration.camera import CameraCalibration
+from bodyscan.calibration.lens_choice import calibrate_with_best_lens
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses.rational import Rational
+from bodyscan.geometry.ray_uncertainty import nodes
+from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
+
+FOCAL = 1400.0  # 30 degrees from the axis to the corner
+DEPTH_MM = 900.0
+
+
+def calibrated(lens: Lens, reach: float, seed: int) -> tuple[Camera, CameraCalibration]:
+    """Boards whose middles are within `reach` of the axis, as tangents."""
+    rng = np.random.default_rng(seed)
+    true = Camera(FOCAL, FOCAL + 1.0, -0.5, 645.0, 508.0, lens, WIDTH, HEIGHT)
+    views = []
+    for k in range(14):
+        turn = RigidTransform.from_rotation_vector(rng.normal(0.0, 0.35, 3), np.zeros(3)).rotation
+        where = DEPTH_MM * np.array([*rng.uniform(-reach, reach, 2), 1.0])
+        placed = RigidTransform(turn, where - turn @ MIDDLE).apply(POINTS)
+        noisy = true.project(placed) + rng.normal(0.0, NOISE_PX, (len(POINTS), 2))
+        views.append(PlanarView(f"s{k}", POINTS, noisy))
+    return true, calibrate_with_best_lens(views, WIDTH, HEIGHT)
+
+
+def errors_px(true: Camera, found: Camera, covered: float) -> np.ndarray:
+    """(rows, columns), a coordinate's, less the motion that fits it best within `covered`."""
+    pixels = nodes(WIDTH, HEIGHT)
+    points = true.rays(pixels) * DEPTH_MM
+    apart = found.project(points) - pixels
+    flat = points.reshape(-1, 3)
+    by_motion = found.jacobians(flat)[1] @ twist_jacobian(flat)
+    near = np.all(np.abs(flat[:, :2]) < covered * DEPTH_MM, axis=1)
+    motion = np.linalg.lstsq(
+        by_motion[near].reshape(-1, 6), apart.reshape(-1, 2)[near].ravel(), rcond=None
+    )[0]
+    left = apart.reshape(-1, 2) - by_motion @ motion
+    return np.sqrt(np.mean(left**2, axis=1)).reshape(pixels.shape[:2])
+
+
+def test_a_camera_seen_by_boards_in_its_middle_says_how_little_it_knows_of_its_rim() -> None:
+    """A quarter of the picture is covered. Errors over their sigmas at the rim."""
+    ratios = []
+    for seed in range(6):
+        lens = Radial(-0.25, 0.1) if seed % 2 else Rational(0.2, 0.05, 0.0, 0.0, 0.0, 0.5, 0.1, 0.0)
+        true, found = calibrated(lens, 0.06, seed)
+        assert found.rays is not None
+        sigma = found.rays.sigma_px
+        rim = np.ones(sigma.shape, bool)
+        rim[3:-3, 3:-3] = False
+        assert np.median(sigma[rim]) > 20.0 * np.median(sigma[7:10, 9:12])
+        ratios.append((errors_px(true, found.camera, 0.18) / sigma)[rim])
+    # A rim's errors go together: there are six of them, and these lenses are mild ones.
+    assert 0.05 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+def test_boards_all_over_the_picture_know_it_all() -> None:
+    true, found = calibrated(Radial(-0.25, 0.1), 0.35, 0)
+    assert found.rays is not None
+    errors = errors_px(true, found.camera, 0.35)
+    # Corners err by 0.05 px, 980 of them; the picture's own corners are seen seldom.
+    assert np.median(found.rays.sigma_px) < 0.1
+    assert 0.2 < np.sqrt(np.mean((errors / found.rays.sigma_px) ** 2)) < 1.6
+
+
+def test_an_excess_makes_the_noise_larger_and_not_the_choice() -> None:
+    _, found = calibrated(Radial(-0.25, 0.1), 0.3, 1)
+    assert found.rays is not None
+    larger = found.rays.with_excess(4.0)
+    np.testing.assert_allclose(larger.noise_px, 2.0 * found.rays.noise_px)
+    np.testing.assert_array_equal(larger.lens_px, found.rays.lens_px)
+
+
+def test_the_image_is_the_nodes_between_them() -> None:
+    _, found = calibrated(Radial(-0.25, 0.1), 0.3, 1)
+    assert found.rays is not None
+    image = found.rays.image(WIDTH, HEIGHT)
+    assert image.shape == (HEIGHT, WIDTH)
+    corners = image[[0, 0, -1, -1], [0, -1, 0, -1]]
+    np.testing.assert_allclose(
+        corners, found.rays.sigma_px[[0, 0, -1, -1], [0, -1, 0, -1]], rtol=1e-5
+    )
+    assert image.min() >= found.rays.sigma_px.min() * 0.9999
