@@ -107,12 +107,12 @@ class PlacedPair:
     camera_covariance: Array
     own: CameraCalibration
     lenses: tuple[LensTrial, ...]
-    rays: RayUncertainty | None
     projector: StripeCode | None
     rms_px: float
     views: int
     shots: tuple[StripedView, ...]
     alone: bool
+    rays: RayUncertainty | None = None
 
 
 def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:

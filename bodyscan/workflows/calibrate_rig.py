@@ -171,12 +171,12 @@ def _placed_pair(
         placed.camera_covariances.get(name, own.covariance),
         own,
         placed.lenses.get(name, own.lenses),
-        placed.rays.get(name, own.rays),
         rig.pair(name).projector,
         placed.rms_px[name],
         len(views),
         shots,
         alone=len(placed.cameras) == 1,
+        rays=placed.rays.get(name, own.rays),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from test_lens_choice import HEIGHT, MIDDLE, NOISE_PX, POINTS, WIDTH
+from picture_boards import HEIGHT, MIDDLE, NOISE_PX, POINTS, WIDTH
 
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.camera import CameraCalibration
