@@ -152,7 +152,8 @@ def open_scan(rig: Rig, folder: Path) -> Captures:
     """The captures of one scan.
 
     Raises CaptureError when the folder is not there, its captures.yaml is wrong or says that it is
-    no scan, no image of this rig lies in it, or a symbolic link leads out of it.
+    no scan, no image of this rig lies in it, or a symbolic link leads out of it, where the rig does
+    not follow such.
     """
     return _open(rig, Path(folder), "scan", rig.files, None)
 
@@ -160,7 +161,7 @@ def open_scan(rig: Rig, folder: Path) -> Captures:
 def open_check(rig: Rig, folder: Path) -> tuple[Kind, Captures]:
     """Captures of either kind, for a check: what its captures.yaml says; without one a scan, unless
     more than one shot lies in it. Raises as `open_scan`."""
-    listing = Listing(Path(folder))
+    listing = Listing(Path(folder), follow_links=rig.follow_links)
     file = load_captures_file(Path(folder), rig) if listing.has(FILE_NAME) else None
     kind: Kind = file.kind if file is not None else "scan"
     captures = _open(rig, Path(folder), kind, rig.files, None)
@@ -196,7 +197,7 @@ def join_captures(parts: tuple[Captures, ...]) -> Captures:
 def _open(
     rig: Rig, folder: Path, kind: Kind, template: str, wanted: tuple[str, ...] | None
 ) -> Captures:
-    listing = Listing(folder)
+    listing = Listing(folder, follow_links=rig.follow_links)
     file = load_captures_file(folder, rig) if listing.has(FILE_NAME) else None
     if file is not None and file.kind != kind:
         raise CaptureError(

@@ -10,15 +10,16 @@ from bodyscan.rig.templates import ANYTHING, names_pattern
 
 
 class Listing:
-    """Reads each folder once; refuses symbolic links that lead out of the capture folder."""
+    """Reads each folder once; refuses symbolic links that lead out of the capture folder, unless they
+    are meant."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, follow_links: bool = False) -> None:
         """Raises CaptureError when `root` is no folder."""
         if not root.is_dir():
             what = "is not a folder" if root.exists() else "does not exist"
             remedy = "Check the folder's name, and that the disk it lies on is there."
             raise CaptureError(f"the capture folder {what}", where=str(root), remedy=remedy)
-        self.root = root
+        self.root, self.follow_links = root, follow_links
         self._real_root = os.path.realpath(root)
         self._entries: dict[str, dict[str, bool]] = {}
 
@@ -31,7 +32,8 @@ class Listing:
         if not is_link:
             return True
         path = self.root / relative
-        self._refuse_if_outside(path)
+        if not self.follow_links:
+            self._refuse_if_outside(path)
         return path.exists()
 
     def find(self, relative: str) -> str:
@@ -77,5 +79,6 @@ class Listing:
             raise CaptureError(
                 f"is a symbolic link that leads out of the capture folder, to {real}",
                 where=str(path),
-                remedy="Copy what it points to into the capture folder, or name that folder.",
+                remedy="If it is meant, write `follow_links: true` in the rig file, or say "
+                "--follow-links to `scan`; else copy what it points to here, or name that folder.",
             )

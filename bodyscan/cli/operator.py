@@ -53,6 +53,10 @@ def scan(
         typer.Option(help="Captures of the empty rig: what they show is cut away."),
     ] = None,
     changes: Changes = None,
+    follow_links: Annotated[
+        bool,
+        typer.Option("--follow-links", help="Images may be links that lead out of FOLDER."),
+    ] = False,
     overwrite: Overwrite = False,
     e57: Annotated[
         bool, typer.Option("--e57", help="Write each pair's raw cloud too: `raw.e57` (pye57).")
@@ -76,7 +80,7 @@ def scan(
     )
     with output.stages() as progress:
         found, saved, pictures = scan_folder(
-            folder, calibration, out, settings, progress, empty=empty
+            folder, calibration, out, settings, progress, empty=empty, follow_links=follow_links
         )
     with output.optional("table"):
         output.show(tables.scan_table(found))

@@ -38,7 +38,7 @@ class Rig(Model):
     """The whole rig file.
 
     exposures: what `{exposure}` becomes in file names, the shortest first; () where every image is
-    taken once.
+    taken once.  follow_links: whether symbolic links may lead out of a capture folder.
     """
 
     version: Literal[1] = 1
@@ -48,6 +48,7 @@ class Rig(Model):
     calibration: tuple[CaptureFolder, ...] = ()
     files: str = "{shot}/{pair}/{frame}.png"
     exposures: tuple[ExposureName, ...] = ()
+    follow_links: bool = False
     frames: FrameNames = FrameNames()
     rig_frame: RigFrame = RigFrame()
     volume: Volume = Volume()

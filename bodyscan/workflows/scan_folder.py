@@ -24,15 +24,20 @@ def scan_folder(
     progress: Progress = silent,
     *,
     empty: Path | None = None,
+    follow_links: bool = False,
 ) -> tuple[Scan, Path, Outcome[list[Path]]]:
     """The scan, its scan.json in `out`, and the pictures beside it, drawn once the result is kept.
     A result that lay there goes.
 
-    empty: captures of the rig with nobody in it. Raises ScanFailed after saying so in scan.json.
+    empty: captures of the rig with nobody in it. follow_links: though the calibration's rig file does
+    not say so. Raises ScanFailed after saying so in scan.json.
     """
     rig = load_calibration(calibration)
-    captures = open_scan(rig.rig, folder)
-    nobody = open_scan(rig.rig, empty) if empty else None
+    described = rig.rig
+    if follow_links:
+        described = described.model_copy(update={"follow_links": True})
+    captures = open_scan(described, folder)
+    nobody = open_scan(described, empty) if empty else None
     origin = calibration_id(calibration)
     subject, when, simulated = captures.subject, captures.when, captures.simulated
     try:

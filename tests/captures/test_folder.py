@@ -273,6 +273,10 @@ def test_symbolic_links_out_of_the_folder_are_refused(tmp_path: Path, link: str)
     with pytest.raises(CaptureError, match="symbolic link that leads out") as caught:
         opened(rig_path)
     assert caught.value.where == str(inside)
+    assert "follow_links: true" in caught.value.remedy
+    write(rig_path, rig_path.read_text() + "follow_links: true\n")
+    assert len(opened(rig_path).sequences) == 9
+    assert opened(rig_path).missing() == ()
 
 
 def test_symbolic_links_within_the_folder_and_to_it_are_followed(tmp_path: Path) -> None:
