@@ -18,20 +18,38 @@ from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 
 
+def corner_grid(board: Board) -> tuple[int, int]:
+    """Columns and rows of corners of one face: between squares, or, of an aprilgrid, those of tags."""
+    if board.kind == "aprilgrid":
+        return 2 * board.columns, 2 * board.rows
+    return board.columns - 1, board.rows - 1
+
+
 def corners_per_face(board: Board) -> int:
-    """Number of inner corners of one face."""
-    return (board.columns - 1) * (board.rows - 1)
+    """Number of corners of one face."""
+    columns, rows = corner_grid(board)
+    return columns * rows
 
 
 def corner_points(board: Board) -> Array:
     """Inner corners in the board frame, (N, 3) mm, or (2N, 3) for a board with two faces.
 
     Corner id r * (columns - 1) + c is the crossing of column line c + 1 and row line r + 1; the
-    back's corners, numbered likewise on its own print, follow the front's.
+    back's corners, numbered likewise on its own print, follow the front's.  Of an aprilgrid the
+    corners of all tags, row by row: id r * 2 * columns + c.
     """
-    column, row = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
-    printed = board.square_mm * np.stack([column.ravel(), row.ravel()], axis=-1).astype(float)
+    x, y = np.meshgrid(*(_lines(board, count) for count in (board.columns, board.rows)))
+    printed = np.stack([x.ravel(), y.ravel()], axis=-1)
     return np.concatenate([points_from_print(board, printed, face) for face in range(board.faces)])
+
+
+def _lines(board: Board, count: int) -> Array:
+    """Where corners lie along one side of so many squares or tags, mm."""
+    if board.kind != "aprilgrid":
+        return board.square_mm * np.arange(1.0, count)
+    gap = (board.square_mm - (board.marker_mm or 0.0)) / 2.0
+    starts = board.square_mm * np.arange(count)
+    return np.stack([starts + gap, starts + board.square_mm - gap], axis=-1).ravel()
 
 
 def points_from_print(board: Board, printed: Array, face: int) -> Array:
@@ -94,16 +112,29 @@ def charuco_face(board: Board, face: int = 0) -> cv2.aruco.CharucoBoard:
 
 
 def markers_per_face(board: Board) -> int:
-    """Number of markers of one face of a ChArUco board: one in each white square."""
-    squares = board.columns * board.rows
-    return squares // 2
+    """Number of markers of one face: one in each white square, or all tags of an aprilgrid."""
+    return board.marker_count // board.faces
 
 
 def marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
     """Marker ids (M,) and their four corners on the face's print, (M, 4, 2) mm.
 
-    Corners clockwise as printed, from the marker's own top left, as OpenCV's detector gives them.
+    Corners clockwise as printed, from the marker's own top left, as OpenCV's detector gives them;
+    of an aprilgrid from the print's top left.  Its tags count from the lower left, row by row
+    upwards, as Kalibr prints them.
     """
+    if board.kind == "aprilgrid":
+        return _tag_corners(board, face)
     charuco = charuco_face(board, face)
     corners = np.asarray(charuco.getObjPoints(), float).reshape(-1, 4, 3)[..., :2]
     return np.asarray(charuco.getIds(), np.int64).ravel(), corners
+
+
+def _tag_corners(board: Board, face: int) -> tuple[Indices, Array]:
+    x, y = _lines(board, board.columns), _lines(board, board.rows)
+    columns, rows = np.meshgrid(np.arange(board.columns), np.arange(board.rows)[::-1])
+    column, row = columns.ravel(), rows.ravel()
+    left, right, top, bottom = x[2 * column], x[2 * column + 1], y[2 * row], y[2 * row + 1]
+    corners = np.stack([left, top, right, top, right, bottom, left, bottom], axis=-1)
+    ids = board.first_marker + face * len(column) + np.arange(len(column))
+    return ids.astype(np.int64), corners.reshape(-1, 4, 2)

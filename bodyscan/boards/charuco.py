@@ -9,11 +9,14 @@ import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Indices, Mask
 from bodyscan.boards import board_layout
+from bodyscan.boards.appearance import Appearance
 from bodyscan.boards.board_map import BoardMap, fit_board_map
 from bodyscan.boards.corners import SightedCorners, refine_corners
+from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 
 MIN_CORNERS = 4
+LEAST_AGREEING = 0.6
 MIN_CORNERS_FOR_LENS = 12
 RANSAC_SHARE_OF_SQUARE = 0.15
 ROUNDS = 4
@@ -27,9 +30,11 @@ class Markers:
     corners: Array
 
 
-def detect_markers(image: Bytes, board: Board) -> Markers:
-    """All markers of the board's dictionary in the image (H, W)."""
-    detector = cv2.aruco.ArucoDetector(board_layout.marker_dictionary(board), _parameters())
+def detect_markers(image: Bytes, board: Board, *, border_bits: int = 1) -> Markers:
+    """All markers of the board's dictionary in the image (H, W), their black rim so many bits wide."""
+    parameters = _parameters()
+    parameters.markerBorderBits = border_bits
+    detector = cv2.aruco.ArucoDetector(board_layout.marker_dictionary(board), parameters)
     corners, ids, _ = detector.detectMarkers(image)
     if ids is None or len(ids) == 0:
         return Markers(np.empty(0, np.int64), np.empty((0, 4, 2)))
@@ -43,28 +48,90 @@ def _parameters() -> cv2.aruco.DetectorParameters:
     return parameters
 
 
+@dataclass(frozen=True, eq=False)
+class PlacedMarkers:
+    """Markers that agree on where one face of a board, as described here, appears.
+
+    printed: (K, 4, 2) mm, of those that agree.  seen: how many of the face's markers were seen.
+    """
+
+    board: Board
+    face: int
+    board_map: BoardMap
+    printed: Array
+    seen: int
+
+    @property
+    def agreeing(self) -> int:
+        return len(self.printed)
+
+    @property
+    def believed(self) -> bool:
+        """Most markers agree: on a board with other columns or rows only some rows seem to."""
+        return self.agreeing > LEAST_AGREEING * self.seen
+
+
 def locate_charuco(image: Bytes, board: Board, markers: Markers) -> SightedCorners | None:
-    """The board's corners beside the markers seen, of the face that shows more of them."""
-    found = [_locate_face(image, board, face, markers) for face in range(board.faces)]
-    seen = [corners for corners in found if corners is not None]
-    return max(seen, key=lambda corners: len(corners.ids), default=None)
+    """The board's corners beside the markers seen, of the face and layout that more of them fit;
+    `other_layout` says which layout that is."""
+    placed = place_markers(board, markers)
+    if placed is None or not placed.believed:
+        return None
+    nearby = _corners_beside(board, placed.printed.mean(axis=1))
+    if len(nearby) < MIN_CORNERS:
+        return None
+    pixels, good = _refine(image, board, placed.board_map, nearby, placed.printed)
+    count = board_layout.corners_per_face(board)
+    ids = nearby[good] + placed.face * count
+    appearance = Appearance(
+        other_layout=placed.board.legacy_layout != board.legacy_layout,
+        goes_on=_goes_on(placed, markers),
+    )
+    return SightedCorners(ids, pixels[good], count, appearance)
 
 
-def _locate_face(image: Bytes, board: Board, face: int, markers: Markers) -> SightedCorners | None:
+def _goes_on(placed: PlacedMarkers, markers: Markers) -> bool:
+    """Whether markers lie where a board of more rows would have its next ones."""
+    if placed.board.faces == 2:
+        return False  # the back's markers have the next numbers
+    longer = placed.board.model_copy(update={"rows": placed.board.rows + 2})
+    ends = placed.board.first_marker + board_layout.markers_per_face(placed.board)
+    if not np.any((markers.ids >= ends) & (markers.ids < ends + placed.board.columns)):
+        return False
+    try:
+        more = place_markers(longer, markers)
+    except BadInput:  # the dictionary has no more
+        return False
+    return more is not None and more.agreeing > placed.agreeing
+
+
+def place_markers(board: Board, markers: Markers) -> PlacedMarkers | None:
+    """Where markers say that a board appears: the face and the layout on which most agree."""
+    found = [
+        _place_face(described, face, markers)
+        for described in _layouts(board)
+        for face in range(board.faces)
+    ]
+    return max((one for one in found if one), key=lambda one: one.agreeing, default=None)
+
+
+def _layouts(board: Board) -> list[Board]:
+    """The board as described and, where OpenCV before 4.6 printed it otherwise, as it did."""
+    if board.rows % 2:
+        return [board]
+    return [board, board.model_copy(update={"legacy_layout": not board.legacy_layout})]
+
+
+def _place_face(board: Board, face: int, markers: Markers) -> PlacedMarkers | None:
     face_ids, printed = board_layout.marker_corners(board, face)
     _, seen, of_face = np.intersect1d(markers.ids, face_ids, return_indices=True)
     if len(seen) < 2:
         return None
-    fit = _fit_markers(printed[of_face], markers.corners[seen], board)
+    fit = fit_markers(printed[of_face], markers.corners[seen], board)
     if fit is None:
         return None
     board_map, inliers = fit
-    nearby = _corners_beside(board, printed[of_face[inliers]].mean(axis=1))
-    if len(nearby) < MIN_CORNERS:
-        return None
-    pixels, good = _refine(image, board, board_map, nearby, printed)
-    ids = nearby[good] + face * board_layout.corners_per_face(board)
-    return SightedCorners(ids, pixels[good], board_layout.corners_per_face(board))
+    return PlacedMarkers(board, face, board_map, printed[of_face[inliers]], len(seen))
 
 
 def _refine(
@@ -94,7 +161,7 @@ def _refine(
     return pixels, good
 
 
-def _fit_markers(printed: Array, corners: Array, board: Board) -> tuple[BoardMap, Mask] | None:
+def fit_markers(printed: Array, corners: Array, board: Board) -> tuple[BoardMap, Mask] | None:
     """Where the print appears, and which markers (M,) agree on it; None if no two do.
 
     A homography picks those that agree; a lens that bends the board's far parts away from it is

@@ -39,6 +39,18 @@ def find_checkerboard(image: Bytes, board: Board) -> SightedCorners | None:
     return None
 
 
+def find_quickly(image: Bytes, board: Board) -> SightedCorners | None:
+    """As `find_checkerboard`, by the two quickest detectors only."""
+    size = (board.columns - 1, board.rows - 1)
+    whole = Region(0, 0, image.shape[1], image.shape[0])
+    for detect in (_classic, _adaptive):
+        for candidate in _found(detect, image, size, whole, 1.0):
+            found = _refined(image, board, candidate)
+            if found is not None:
+                return found
+    return None
+
+
 def _refuse_square(board: Board) -> None:
     if board.columns == board.rows:
         raise BadInput(

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.special import erf
 
 from bodyscan.arrays import Array, Bytes, Indices, Mask
+from bodyscan.boards.appearance import AS_PRINTED, Appearance
 from bodyscan.geometry.least_squares import StackedEquations, minimize_each
 from bodyscan.geometry.scaled_systems import solve_scaled
 
@@ -54,6 +55,7 @@ class SightedCorners:
     ids: Indices
     pixels: Array
     printed_count: int
+    appearance: Appearance = AS_PRINTED
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from bodyscan.arrays import Bytes
-from bodyscan.boards.charuco import detect_markers, locate_charuco
+from bodyscan.boards.appearance import AS_PRINTED, OTHERWISE, Appearance
+from bodyscan.boards.aprilgrid import find_aprilgrid
+from bodyscan.boards.charuco import Markers, detect_markers, locate_charuco
 from bodyscan.boards.checkerboard import find_checkerboard
 from bodyscan.boards.corners import SightedCorners
 from bodyscan.boards.view import BoardView
@@ -19,27 +22,51 @@ MIN_CORNERS = 6
 def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) -> list[BoardView]:
     """Every board of `boards` that the image (H, W) shows, in their order; none: an empty list.
 
-    ChArUco boards may be seen in part (at least 6 corners, not on one line), from either face.
+    ChArUco boards and grids of AprilTags may be seen in part (at least 6 corners, not on one line),
+    from either face, and be printed white on black, mirrored, or in OpenCV's other layout: the
+    view's appearance says so.
     A plain checkerboard must be seen whole; its views are `turnable` where the print looks the
     same from both ends, and where it has two faces, which cannot be told apart (its corners are
     then numbered as if it showed its front). Raises BadInput for a board that cannot be found.
     """
     views = []
-    markers = {
-        board.dictionary: detect_markers(image, board)
-        for board in boards
-        if board.kind == "charuco"
-    }
+    seen: dict[tuple[str, Appearance], Markers] = {}
     for board in boards:
-        if board.kind == "charuco":
-            found = locate_charuco(image, board, markers[board.dictionary])
+        if board.kind != "checkerboard":
+            found = _find_marked(image, board, seen)
             turnable = False
         else:
             found = find_checkerboard(image, board)
             turnable = board.faces == 2 or (board.columns + board.rows) % 2 == 0
         if found is not None and _determines_plane(found):
-            views.append(BoardView(pair, shot, board.name, found.ids, found.pixels, turnable))
+            views.append(
+                BoardView(
+                    pair, shot, board.name, found.ids, found.pixels, turnable, found.appearance
+                )
+            )
     return views
+
+
+def _find_marked(
+    image: Bytes, board: Board, seen: dict[tuple[str, Appearance], Markers]
+) -> SightedCorners | None:
+    """The board as printed, or else white on black, or mirrored: markers found once a dictionary."""
+    for appearance in (AS_PRINTED, *OTHERWISE):
+        picture = appearance.as_printed(image)
+        key = board.dictionary, appearance
+        if board.kind == "aprilgrid":
+            found = find_aprilgrid(picture, board, thorough=appearance == AS_PRINTED)
+        else:
+            if key not in seen:
+                seen[key] = detect_markers(picture, board)
+            found = locate_charuco(picture, board, seen[key])
+        if found is not None and _determines_plane(found):
+            pixels = appearance.in_image(found.pixels, image.shape[1])
+            shown = replace(
+                found.appearance, inverted=appearance.inverted, mirrored=appearance.mirrored
+            )
+            return replace(found, pixels=pixels, appearance=shown)
+    return None
 
 
 def _determines_plane(found: SightedCorners) -> bool:

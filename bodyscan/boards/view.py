@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bodyscan.arrays import Array, Indices
+from bodyscan.boards.appearance import AS_PRINTED, Appearance
 
 
 @dataclass(frozen=True, eq=False)
@@ -14,6 +15,7 @@ class BoardView:
     corner_ids: (N,) int, index into `board_layout.corner_points(board)` (front face first, then back).
     pixels: (N, 2) float64, real image coordinates, px.
     turnable: the detector may have numbered this board from its other end.
+    appearance: how a board with markers was printed or seen, where it was not as described.
     """
 
     pair: str
@@ -22,3 +24,4 @@ class BoardView:
     corner_ids: Indices
     pixels: Array
     turnable: bool = False
+    appearance: Appearance = AS_PRINTED

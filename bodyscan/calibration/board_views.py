@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.boards.board_layout import corner_points, corners_per_face
+from bodyscan.boards.board_layout import corner_grid, corner_points, corners_per_face
 from bodyscan.boards.view import BoardView
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
@@ -32,7 +32,8 @@ def planar_view(view: BoardView, board: Board) -> PlanarView:
 def has_enough_corners(view: BoardView, board: Board) -> bool:
     """Enough corners, not all along one line of the board."""
     grid = view.corner_ids % corners_per_face(board)
-    columns, rows = grid % (board.columns - 1), grid // (board.columns - 1)
+    width = corner_grid(board)[0]
+    columns, rows = grid % width, grid // width
     return len(grid) >= FEWEST_CORNERS and len(set(columns)) >= 3 and len(set(rows)) >= 3
 
 

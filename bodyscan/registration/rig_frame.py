@@ -43,7 +43,11 @@ def frame_board_turn(
     at least above the floor.
     """
     target = frame_target(rig)
-    if target is None or target not in root_from_board or rig.board(target[1]).kind == "charuco":
+    if (
+        target is None
+        or target not in root_from_board
+        or rig.board(target[1]).kind != "checkerboard"
+    ):
         return RigidTransform.identity()
 
     def astray(turn: RigidTransform) -> float:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, PositiveFloat
+from pydantic import Field, PositiveFloat, model_validator
 
 from bodyscan.files.model import Model, Name, Problem, did_you_mean
 
@@ -24,16 +24,29 @@ MARKERS_IN = {
 }
 """How many markers each of OpenCV's dictionaries holds: a rig file is checked without OpenCV."""
 
+LARGEST_DICTIONARIES = (
+    "DICT_4X4_1000",
+    "DICT_5X5_1000",
+    "DICT_6X6_1000",
+    "DICT_7X7_1000",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_APRILTAG_36h11",
+    "DICT_ARUCO_MIP_36h12",
+)
+"""One of each family, for telling which one a board was printed with; those of few bits, whose
+markers are found in any texture, left out."""
+
 
 class Board(Model):
-    """A flat checkered board. `columns` x `rows` counts squares, not corners.
+    """A flat board. `columns` x `rows` counts squares, not corners; of an aprilgrid, tags, and
+    `square_mm` is from one tag to the next.
 
     Board frame: origin at the first square's outer corner (of the checkered area), x along the
     columns, y along the rows (down, as printed), z away from whoever looks at the front.
     """
 
     name: Name
-    kind: Literal["checkerboard", "charuco"] = "checkerboard"
+    kind: Literal["checkerboard", "charuco", "aprilgrid"] = "checkerboard"
     columns: Annotated[int, Field(ge=3, le=200)]
     rows: Annotated[int, Field(ge=3, le=200)]
     square_mm: PositiveFloat
@@ -47,8 +60,19 @@ class Board(Model):
 
     @property
     def marker_count(self) -> int:
-        """Markers on all faces of a charuco board: every second square of a face carries one."""
-        return self.faces * (self.columns * self.rows // 2) if self.kind == "charuco" else 0
+        """Markers on all faces: of a charuco board every second square carries one, of an aprilgrid
+        every one."""
+        squares = self.columns * self.rows
+        each = {"checkerboard": 0, "charuco": squares // 2, "aprilgrid": squares}[self.kind]
+        return self.faces * each
+
+    @model_validator(mode="before")
+    @classmethod
+    def _kalibrs_tags(cls, keys: Any) -> Any:
+        """An aprilgrid has Kalibr's tags unless it says otherwise."""
+        if isinstance(keys, dict) and keys.get("kind") == "aprilgrid":
+            return {"dictionary": "DICT_APRILTAG_36h11", **keys}
+        return keys
 
     def problems(self) -> Iterator[Problem]:
         return _problems(self)
@@ -59,13 +83,21 @@ def _problems(board: Board) -> Iterator[Problem]:
         yield ("thickness_mm",), "is for a board with faces: 2 (it is between the two prints)"
     if board.kind == "checkerboard":
         if board.marker_mm is not None:
-            yield ("marker_mm",), "is for kind: charuco; a checkerboard has no markers"
+            yield ("marker_mm",), "is for boards with markers; a checkerboard has none"
         return
     if board.marker_mm is None:
-        yield ("marker_mm",), "is missing: a charuco board needs the side of its markers"
+        yield (
+            ("marker_mm",),
+            f"is missing: a board of kind {board.kind} needs the side of its markers",
+        )
     elif board.marker_mm >= board.square_mm:
         wrong = f"must be less than square_mm ({board.square_mm:g}) (got {board.marker_mm:g})"
         yield ("marker_mm",), wrong
+    if board.kind == "aprilgrid" and board.faces == 2:
+        yield ("faces",), "must be 1: an aprilgrid's back is a board of its own"
+    if board.kind == "aprilgrid" and not board.dictionary.startswith("DICT_APRILTAG"):
+        wrong = f"must be one of AprilTags, such as DICT_APRILTAG_36h11 (got {board.dictionary!r})"
+        yield ("dictionary",), wrong
     if board.dictionary not in MARKERS_IN:
         hint = did_you_mean(board.dictionary, MARKERS_IN)
         yield (

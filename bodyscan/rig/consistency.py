@@ -47,7 +47,7 @@ def rig_problems(parts: RigParts) -> Iterator[Problem]:
 def _marker_overlaps(boards: Sequence[Board | None]) -> Iterator[Problem]:
     taken: list[tuple[Board, range]] = []
     for index, board in enumerate(boards):
-        if board is None or board.kind != "charuco":
+        if board is None or board.kind == "checkerboard":
             continue
         own = range(board.first_marker, board.first_marker + board.marker_count)
         for other, theirs in taken:

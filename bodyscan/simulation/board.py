@@ -54,6 +54,8 @@ class BoardPrint:
 
 def board_print(board: Board, face: int, making: BoardMaking) -> BoardPrint:
     """The print of face 0 (front) or 1 (back); the back's markers follow the front's."""
+    if board.kind == "aprilgrid":
+        raise BadInput("boards of kind aprilgrid are not simulated", where=f"board {board.name}")
     dark = _dark_squares(board)
     markers = _markers(board, face, int((~dark).sum())) if board.kind == "charuco" else None
     modules = 3 if markers is None else markers.shape[1] + 2

@@ -26,6 +26,9 @@ from bodyscan.workflows.decode import ViewKey, decode_on_boards
 from bodyscan.workflows.find_boards import HERE, calibrate_cameras, find_all_boards, locate_views
 from bodyscan.workflows.rig_remarks import JoinedRig, remarked
 
+MOST_SEEN = 3
+"""Images without a board of which an error says what they show instead."""
+
 
 def calibrate_rig(
     rig: Rig, captures: Captures, progress: Progress = silent, *, folder: Path = HERE
@@ -69,7 +72,9 @@ def join_rig(
     """From boards found in images to the calibration, with nothing in it that it stands without."""
     cameras = calibrate_cameras(rig, boards.value, progress, folder=folder)
     if not cameras.value:
-        remedy = describe_findings(rig, boards.value, len(captures.sequences))
+        seen = [note for note in boards.notes if "no board found:" in note][:MOST_SEEN]
+        findings = describe_findings(rig, boards.value, len(captures.sequences))
+        remedy = "\n  ".join([*filter(None, [findings]), *seen])
         raise _nothing_calibrated(rig, cameras.failures, remedy)
     with step(progress, "joining the pairs"):
         located = locate_views(rig, boards.value, cameras.value)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.detection import find_boards
+from bodyscan.boards.unfound import describe_unfound
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import (
     LocatedView,
@@ -15,6 +16,7 @@ from bodyscan.calibration.board_views import (
     planar_view,
 )
 from bodyscan.calibration.camera import (
+    FEWEST_POSES,
     CameraCalibration,
     calibrate_camera,
     calibrate_known_camera,
@@ -28,6 +30,7 @@ from bodyscan.errors import BodyscanError
 from bodyscan.geometry.lenses import FAMILY, LENSES
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, threaded
+from bodyscan.registration.board_appearance import appearance_notes, without_odd_mirrored
 from bodyscan.rig.known import Known
 from bodyscan.rig.pair import AUTO
 from bodyscan.rig.rig import Rig
@@ -37,6 +40,8 @@ NO_POSE_PX = 1.0
 """A view that is farther off its best pose than this, and than NO_POSE_TIMES its camera's usual
 error, shows another board or mixed-up corners: real corners are good to a few tenths of a pixel."""
 NO_POSE_TIMES = 6.0
+LOOKED_AT = 3
+"""Images of a pair without a board that are looked at closely: seconds each."""
 
 
 def find_all_boards(
@@ -46,19 +51,47 @@ def find_all_boards(
     board, are noted."""
 
     def find(sequence: ImageSequence) -> tuple[list[BoardView], str | None]:
-        where = f"{sequence.seen_in} (pair {sequence.pair}, shot {sequence.shot})"
         try:
             image = read_board_image(sequence, rig.pair(sequence.pair))
             found = find_boards(image, rig.boards, pair=sequence.pair, shot=sequence.shot)
         except BodyscanError as error:
             return [], str(error)
-        return found, None if found else f"{where}: no board found"
+        return found, None
 
     results = threaded(find, captures.sequences, stage="finding boards", progress=progress)
-    return Outcome(
-        [view for found, _ in results for view in found],
-        tuple(note for _, note in results if note),
-    )
+    views, odd = without_odd_mirrored([view for found, _ in results for view in found])
+    without = [
+        sequence
+        for sequence, (found, note) in zip(captures.sequences, results, strict=True)
+        if not found and note is None
+    ]
+    looked_at = _look_closer(rig, views, without)
+    missing = [
+        f"{s.seen_in} (pair {s.pair}, shot {s.shot}): no board found"
+        + (f": {looked_at[s]}" if s in looked_at else "")
+        for s in without
+    ]
+    notes = [note for _, note in results if note]
+    return Outcome(views, (*notes, *missing, *odd, *appearance_notes(rig, views)))
+
+
+def _look_closer(
+    rig: Rig, views: Sequence[BoardView], without: Sequence[ImageSequence]
+) -> dict[ImageSequence, str]:
+    """What images without a board do show, of pairs that saw none often enough, or usually do."""
+    chosen: list[ImageSequence] = []
+    for pair in rig.pairs:
+        own = [sequence for sequence in without if sequence.pair == pair.name]
+        seen = sum(view.pair == pair.name for view in views)
+        if seen < FEWEST_POSES or len(own) <= LOOKED_AT:
+            chosen += own[:LOOKED_AT]
+
+    def look(sequence: ImageSequence) -> str:
+        image = read_board_image(sequence, rig.pair(sequence.pair))
+        said = [f"{board.name}: {describe_unfound(image, board)}" for board in rig.boards]
+        return "; ".join(said)
+
+    return dict(zip(chosen, threaded(look, chosen, stage="looking closer"), strict=True))
 
 
 def calibrate_cameras(

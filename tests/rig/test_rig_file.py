@@ -83,7 +83,7 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
         ("square_mm: 30", "square_mm: 1e9999", "boards[0].square_mm: must be a finite number"),
         ("square_mm: 30", "square_mm: ", "boards[0].square_mm: must be a number (got nothing)"),
         (", square_mm: 30", "", "4:5: boards[0].square_mm: is missing"),
-        ("square_mm: 30", "square_mm: 30, marker_mm: 9", "a checkerboard has no markers"),
+        ("square_mm: 30", "square_mm: 30, marker_mm: 9", "is for boards with markers"),
         ("square_mm: 30", "square_mm: 30, thickness_mm: 6", "is for a board with faces: 2"),
         ("square_mm: 30", "square_mm: 30, faces: 3", "boards[0].faces: must be 1 or 2 (got 3)"),
         ("columns: 5", "columns: 2", "boards[0].columns: must be 3 or more (got 2)"),
