@@ -47,7 +47,8 @@ def test_a_marked_board_is_recognised_whichever_way_it_is_seen(
     true = true_corners(MARKED, PLACE)
     image = 255 - picture if inverted else picture
     if mirrored:
-        image, true = np.ascontiguousarray(image[:, ::-1]), [639.0, 0.0] + [-1.0, 1.0] * true
+        image = np.ascontiguousarray(image[:, ::-1])
+        true = np.array([639.0, 0.0]) + np.array([-1.0, 1.0]) * true
     (view,) = found(image, MARKED)
     assert (view.appearance.inverted, view.appearance.mirrored) == (inverted, mirrored)
     assert len(view.corner_ids) >= 50
