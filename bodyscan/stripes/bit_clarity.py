@@ -33,6 +33,14 @@ FINE_BITS = 3
 MOST_BRIGHT = 0.85
 """Of the pixels; half of them would be bright under stripes that are fine."""
 FEWEST = 200
+ONE_SIDED = 0.25
+"""Of the contrast: a dark or lit frame for an inverse makes half of it, drifting exposure a few
+percent."""
+SAME = 0.9
+"""Of the pixels that are equal to the last bit: noise leaves a fifth of them so, a copy all."""
+EVEN = 0.3
+"""Between the quartiles of an even grey, in shares of the contrast; of black and white it is nearly 1.
+Half of the light is a level of 0.5, or 0.73 if grey levels are bent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +97,7 @@ def check_seen(pairs: LitPairs) -> None:
     if clear.shape[1] < FEWEST:
         return
     for bit, share in enumerate(clear.mean(axis=1)):
-        if share < SEEN:
+        if share < SEEN and not (bit >= len(clear) - FINE_BITS and _blurred_away(pairs, bit)):
             raise DecodingFailed(
                 f"pattern and inverse of bit {bit} look alike: the bit shows in {share:.1%} of the lit "
                 "pixels",
@@ -97,18 +105,32 @@ def check_seen(pairs: LitPairs) -> None:
                 "finer than camera or projector can show, leave the finest bit out (half the stripes)",
             )
     finest = len(clear) - 1
-    bright = np.mean(pairs.value[finest][clear[finest]] > 0)
-    flips = pairs.value[max(finest - FINE_BITS, 0)] > 0
-    if (
-        not MOST_BRIGHT > bright > 1.0 - MOST_BRIGHT
-        and MOST_BRIGHT > flips.mean() > 1 - MOST_BRIGHT
-    ):
+    size = np.abs(pairs.value)
+    strong = np.median(size[finest]) > ONE_SIDED * np.median(size.max(axis=0))
+    bright = np.mean(pairs.value[finest] > 0)
+    coarser = np.mean(pairs.value[max(finest - FINE_BITS, 0)] > 0)
+    balanced = MOST_BRIGHT > coarser > 1.0 - MOST_BRIGHT
+    if strong and balanced and not MOST_BRIGHT > bright > 1.0 - MOST_BRIGHT:
         which = "brighter" if bright > 0.5 else "darker"
         raise DecodingFailed(
             f"pattern {finest} is {which} than its inverse nearly everywhere, though it is the finest",
-            remedy="see whether one of the two is missing, another image stands in for it, or they "
-            "were exposed differently",
+            remedy="see whether one of the two is missing, or another image stands in for it",
         )
+
+
+def _blurred_away(pairs: LitPairs, bit: int) -> bool:
+    """Whether a pattern is an even grey between the darkest and the brightest that each pixel sees.
+
+    Then projector or lens could not show its stripes, and the pixels are judged one by one; a
+    pattern that was taken for its own inverse is black and white, or the same to the last bit.
+    """
+    if np.mean(pairs.value[bit] == 0.0) > SAME:
+        return False
+    low = np.minimum(pairs.patterns, pairs.inverses).min(axis=0).astype(np.float32)
+    high = np.maximum(pairs.patterns, pairs.inverses).max(axis=0)
+    level = (pairs.patterns[bit] - low) / np.maximum(high - low, 1.0)
+    first, middle, third = np.percentile(level, [25, 50, 75])
+    return bool(third - first < EVEN and EVEN < middle < 1.0)
 
 
 def check_pairs(pairs: LitPairs) -> None:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
-from bodyscan.stripes.bit_clarity import CLEAR
+from bodyscan.stripes.bit_clarity import CLEAR, FINE_BITS
 from bodyscan.stripes.scan_lines import ScanLines
 
 Words = NDArray[np.uint16]
@@ -15,6 +15,7 @@ Words = NDArray[np.uint16]
 MOST_OF_A_BIT = 2000
 ENOUGH = 600_000
 """Of the pixels lines are taken until there are so many."""
+BESIDE_PX = 4
 EVERY = 61
 """Lines are taken so far apart, then those beside them, so that few tell of the whole picture."""
 
@@ -74,8 +75,34 @@ def _collect(
                         end = max(end, height + 1)
             if end >= at:
                 continue
+            if at >= FINE_BITS and not _lasts(
+                words, patterns[bits - 1 - at], inverses[bits - 1 - at], least2, line, place, flip
+            ):
+                continue
             taken[at] += 1
             found[count, 0], found[count, 1] = words[line, place], words[line, place + 1]
             found[count, 2] = (1 << end) - 1
             count += 1
     return count
+
+
+@compiled
+def _lasts(
+    words: Words,
+    pattern: Greys,
+    inverse: Greys,
+    least2: Floats,
+    line: int,
+    place: int,
+    flip: int,
+) -> bool:
+    """Whether a coarse bit is clear a little off its flip, and still what it was beside it: where it
+    is weak all over, noise turns it to and fro."""
+    for far, near in ((place - BESIDE_PX, place), (place + 1 + BESIDE_PX, place + 1)):
+        if not 0 <= far < words.shape[1] or (words[line, far] ^ words[line, near]) & flip:
+            return False
+        seen, other = pattern[line, far], inverse[line, far]
+        step = np.float32(seen) - np.float32(other)
+        if step * step < least2[np.int64(seen)] + least2[np.int64(other)]:
+            return False
+    return True

@@ -184,3 +184,23 @@ def test_codes_may_count_from_another_number(first: int) -> None:
     assert found.boundary_index.max() < STRIPES
     with pytest.raises(DecodingFailed, match="of the codes lie beyond the last stripe"):
         decode_stripes(spec.model_copy(update={"first_code": 0}), whole.lit, whole.dark, coded)
+
+
+def test_a_finest_bit_that_no_lens_shows_costs_pixels_not_the_capture(good: Sequence) -> None:
+    """Even grey in both: 50 of 100 stripes can be told, and what has a value is right to a stripe."""
+    rng = np.random.default_rng(2)
+    middle = (good.lit.astype(float) + good.dark) / 2.0
+    blurred = with_frame(
+        good, "patterns", BITS - 1, np.rint(rng.normal(middle, 1.0)).astype(np.uint8)
+    )
+    blurred = with_frame(
+        blurred, "inverses", BITS - 1, np.rint(rng.normal(middle, 1.0)).astype(np.uint8)
+    )
+    found = read(blurred)
+    told = np.isfinite(found.s)
+    assert told.mean() > 0.3
+    error = (found.s - good.s)[told]
+    assert np.mean(np.abs(error) < 1.0) > 0.99
+    assert 0.3 < np.sqrt(np.mean((error / found.sigma[told]) ** 2)) < 2.0
+    with pytest.raises(DecodingFailed, match="bit 6 look alike"):
+        read(with_frame(blurred, "inverses", BITS - 1, blurred.patterns[BITS - 1]))
