@@ -75,7 +75,8 @@ def check_boards(
 ) -> BoardCheck:
     """One or more shots of the calibration's boards, as the calibrated rig sees them.
 
-    Raises BoardNotFound if no board is seen by two pairs.
+    A board that one pair alone sees tells whether its stripes measure it where its corners are.
+    Raises BoardNotFound if no board is seen by two pairs, nor striped before one.
     """
     views = find_all_boards(calibration.rig, captures, progress)
     seen_by = locate_views(calibration.rig, views.value, _cameras(calibration))
@@ -87,15 +88,16 @@ def check_boards(
     drift = find_drift(
         poses, calibration.rig_from_camera, calibration.covariance, calibration.rig.poles
     )
-    if not drift.rig_from_board:
+    # Which end of a plain board is which does not matter to its surface.
+    stripes = _stripe_offsets(calibration, captures, views.value, seen_by.value, progress)
+    if not drift.rig_from_board and not stripes.value:
         raise BoardNotFound(
-            "no board is seen by two calibrated pairs at once",
+            "no board is seen by two calibrated pairs at once, and no stripes on one were decoded",
             where=", ".join(str(folder) for folder in captures.folders),
             remedy="show a board whose corners are numbered (ChArUco) to as many cameras as can see "
-            "it together",
+            "it together, or take the stripe sequence on a board",
         )
-    stripes = _stripe_offsets(calibration, captures, views.value, located, progress)
-    seen = tuple(sorted({view.pair for view in located}))
+    seen = tuple(sorted({view.pair for view in (located or seen_by.value)}))
     unseen = tuple(sorted(set(calibration.pairs) - set(seen)))
     notes = (*views.notes, *seen_by.notes, *stripes.notes)
     return BoardCheck(drift, stripes.value, seen, unseen, notes)

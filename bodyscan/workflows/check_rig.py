@@ -66,7 +66,7 @@ def check_rig(
     if kinds == {"scan"}:
         return _of_scans(check_scans(calibration, [one for _, one in captures], progress))
     shots = join_captures(tuple(_named_apart([one for _, one in captures])))
-    return _of_boards(check_boards(calibration, shots, progress))
+    return _of_boards(calibration, check_boards(calibration, shots, progress))
 
 
 def _named_apart(parts: Sequence[Captures]) -> list[Captures]:
@@ -83,24 +83,38 @@ def _named_apart(parts: Sequence[Captures]) -> list[Captures]:
     ]
 
 
-def _of_boards(check: BoardCheck) -> Findings:
+def _or_imported(calibration: RigCalibration, pair: str) -> str:
+    imported = calibration.pairs[pair].quality.imported
+    return f", or {imported} is not its calibration" if imported else ""
+
+
+def _of_boards(calibration: RigCalibration, check: BoardCheck) -> Findings:
     drift = check.drift
+    together = bool(drift.rig_from_board)
+    valid = (
+        "all that see the board agree" if together else "stripes lie where the board's corners are"
+    )
     said = [
-        "valid: all that see the board agree"
+        f"valid: {valid}"
         if check.valid
         else "NOT valid: something moved; --repair writes a calibration with that put right"
+        if drift.moves
+        else "NOT valid: what stripes measure is not where the board is"
     ]
     said += [move_line(move) for move in drift.moves]
     said += [
-        f"projector of {offset.pair} moved against its camera: the board's surface is measured "
+        f"projector of {offset.pair} moved against its camera{_or_imported(calibration, offset.pair)}: "
+        "the board's surface is measured "
         f"{offset.offset_mm:+.2f} mm off, tilted by {offset.turned_mm:+.2f} mm at its ends"
         for offset in check.stripes
         if offset.moved
     ]
-    said.append(
-        f"{len(check.seen)} pairs saw a board; their views are {drift.misfit_before:.1f} sigmas off "
-        f"(root mean square)" + (f", {drift.misfit:.1f} after the moves" if drift.moves else "")
-    )
+    if together:
+        said.append(
+            f"{len(check.seen)} pairs saw a board; their views are {drift.misfit_before:.1f} sigmas "
+            f"off (root mean square)"
+            + (f", {drift.misfit:.1f} after the moves" if drift.moves else "")
+        )
     if check.stripes:
         worst = max(check.stripes, key=lambda offset: abs(offset.offset_mm))
         said.append(

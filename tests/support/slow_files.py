@@ -15,6 +15,7 @@ SLOW = (
     "workflows/test_check_calibration.py",
     "workflows/test_example_scan.py",
     "workflows/test_whole_way.py",
+    "workflows/test_import_rig.py",
     "workflows/test_any_subset.py",
     "examples/test_examples.py",
     "jobs/test_resuming.py",

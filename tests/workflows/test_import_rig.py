@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,8 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.storage import load_calibration
 from bodyscan.report.calibration_verdict import grade_calibration
 from bodyscan.rig.rig_file import load_rig
+from bodyscan.workflows.check_boards import BoardCheck
+from bodyscan.workflows.check_rig import check_rig
 from bodyscan.workflows.import_rig import import_folder, import_rig
 
 CAMERA = np.array([[1400.0, 0.0, 630.0], [0.0, 1410.0, 500.0], [0.0, 0.0, 1.0]])
@@ -356,37 +359,28 @@ def test_a_real_scan_lies_on_the_cloud_that_came_with_it(captures: Path, tmp_pat
     assert (pair.crossing.direction, pair.crossing.stripes) == ("horizontal", 800)
 
 
-def test_the_other_real_calibration_is_read(captures: Path, tmp_path: Path) -> None:
-    content = {
-        "name": "two-frequency",
-        "pairs": [
-            {
-                "name": "slstudio",
-                "camera": {"width": 1688, "height": 1352},
-                "projector": {
-                    "code": "gray", "stripes": 1824, "direction": "vertical",
-                    "crossing": {"stripes": 1140},
-                },
-                "known": {
-                    "file": str(captures.resolve() / "two-frequency" / "calibration.xml"),
-                    "format": "opencv",
-                    "units": "mm",
-                    "camera": {"matrix": "Kc", "distortion": "kc"},
-                    "projector": {
-                        "matrix": "Kp", "distortion": "kp", "rotation": "Rp", "translation": "Tp"
-                    },
-                },
-            }
-        ],
-    }  # fmt: skip
-    pair = import_rig(load_rig(write_rig_file(tmp_path, content)), tmp_path).pairs["slstudio"]
+def test_the_other_real_calibration_is_read_and_held_against_a_board(
+    captures: Path, tmp_path: Path
+) -> None:
+    rig_file = real_rig_file("two-frequency", captures, tmp_path)
+    calibration = import_rig(load_rig(rig_file), tmp_path)
+    pair = calibration.pairs["slstudio"]
     assert pair.camera.alpha == pytest.approx(2195.12036)
     assert isinstance(pair.sheets, LensSheets)
     assert isinstance(pair.crossing, LensSheets)
     # What the middle pixel sees half a metre or so away, columns and rows alike.
     ray = pair.camera.rays(np.array([[843.5, 675.5]]))
-    point = ray * 600.0
     for sheets in (pair.sheets, pair.crossing):
-        s = sheets.stripe(point)
+        s = sheets.stripe(ray * 600.0)
         assert 0 < s[0] < sheets.stripes
         assert sheets.measure(ray, s)[0] == pytest.approx(600.0, rel=1e-9)
+    # One pair alone, one board: a pose of the projector by its corners is 0.3 degrees from the file's.
+    shots = tmp_path / "shots"
+    shutil.copytree(captures / "two-frequency" / "calseq1", shots / "calseq1")
+    (shots / "captures.yaml").write_text("version: 1\nkind: calibration\n")
+    found = check_rig(calibration, [shots])
+    assert not found.valid
+    assert isinstance(found.check, BoardCheck)
+    (offset,) = found.check.stripes
+    assert 0.4 < max(abs(offset.offset_mm), abs(offset.turned_mm)) < 1.5
+    assert "calibration.xml (opencv) is not its calibration" in " ".join(found.lines)
