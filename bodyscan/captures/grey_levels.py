@@ -26,9 +26,16 @@ def full_scale(images: Sequence[Raw], bits: int | None) -> float:
 
     bits: how many the camera tells; None: what the numbers look like. Too few are of no harm: a dim
     sequence is taken for one of fewer bits, and only its unit of brightness is another.
-    Raises ImageError for numbers of 16 bits in which there are only 8, unless bits says so.
+    Raises ImageError for numbers of 16 bits in which there are only 8, unless bits says so, and for
+    files of 8 bits if bits says more.
     """
     if images[0].dtype == np.uint8:
+        if bits is not None and bits > 8:
+            raise ImageError(
+                f"has 8 bits a sample, but the rig file says `bits: {bits}`",
+                remedy=f"Let the camera's software save files of 16 bits, with {bits} in them, or "
+                "leave `bits` out.",
+            )
         return 255.0
     values = [_sample(image) for image in images]
     most = max(int(value.max()) for value in values)

@@ -24,7 +24,14 @@ CHANCE = 1e-4
 MOST_SIGMAS = 4.5
 """Between two waves of one pixel: once in 150,000 by noise, else the pixel sees two surfaces."""
 
+TOLD = -2.0 * math.log(CHANCE)
+"""By how much chi squared of the next best order must be greater."""
+
+EASY = 3.0
+"""Times that, where nothing but noise is amiss: such pixels are told for certain."""
+
 ENOUGH = 100
+MOST_SAMPLED = 100_000
 COMBINED = 2.0
 """Waves up to so many times as long as the finest help it to tell s; longer ones would bring in
 more of what is wrong with them than they take of its noise."""
@@ -34,9 +41,9 @@ more of what is wrong with them than they take of its noise."""
 class PhaseOrder:
     """s and its standard deviation (L, P), stripes; `certain` where its order is.
 
-    agreed: the share of the pixels asked for whose waves agree.  apart: by how many turns of the
-    finest wave each other one is off on the whole.  misfit: how many sigmas they are off, 1 if
-    noise explains it.
+    agreed: the share of pixels whose waves agree, of those that noise lets tell their order.  apart:
+    by how many turns of the finest wave each other one is off on the whole.  misfit: how many sigmas
+    they are off, 1 if noise explains it.
     """
 
     s: Floats
@@ -54,13 +61,16 @@ def phase_order(
     periods = np.array([wave.wave.period for wave in waves])
     turns = np.stack([wave.turn[usable] for wave in waves])
     doubts = np.stack([sigma[usable] for sigma in sigmas])
-    orders, _, _ = _best_orders(turns, doubts, periods, float(stripes))
-    growth = _beyond_noise(turns, doubts, periods, orders)
+    some = slice(None, None, max(1, turns.shape[1] // MOST_SAMPLED))
+    sample = turns[:, some], doubts[:, some].copy()
+    tellable = _least_gap(sample[1], periods, float(stripes)) >= EASY * TOLD
+    orders, _, _ = _best_orders(*sample, periods, float(stripes))
+    growth = _beyond_noise(*sample, periods, orders)
     doubts *= growth[:, None]
     orders, best, second = _best_orders(turns, doubts, periods, float(stripes))
     off, off_sigma = _apart(turns, doubts, periods, orders)
     agree = np.all(np.abs(off) <= MOST_SIGMAS * off_sigma, axis=0)
-    told = second - best >= -2.0 * math.log(CHANCE)
+    told = second - best >= TOLD
     s, sigma = _combined(turns, doubts, periods, orders, off)
     inside = (s > MOST_SIGMAS * sigma) & (s < stripes - MOST_SIGMAS * sigma)
     certain = agree & told & inside
@@ -69,12 +79,14 @@ def phase_order(
     whole_certain = np.zeros(usable.shape, bool)
     whole_certain[usable] = certain
     apart = tuple(_middle(off * (periods[1:, None] / periods[0])))
-    agreed, misfit = _share(agree & told), float(growth.max())
+    agreed, misfit = _share((agree & told)[some], tellable), float(growth.max())
     return PhaseOrder(whole_s, whole_sigma, whole_certain, agreed, apart, misfit)
 
 
-def _share(agree: Mask) -> float:
-    return float(np.mean(agree)) if agree.size else 0.0
+def _share(agree: Mask, tellable: Mask) -> float:
+    """Of a dim background's pixels most may be too noisy to tell; they say nothing of the images."""
+    judged = agree[tellable] if np.count_nonzero(tellable) >= ENOUGH else agree
+    return float(np.mean(judged)) if judged.size else 0.0
 
 
 def _middle(values: Floats) -> list[float]:
@@ -111,6 +123,26 @@ def _combined(
     total = np.sum(weights, axis=0)
     s = (turns[0] + orders) * periods[0] + moved / total
     return s.astype(np.float32), (1.0 / np.sqrt(total)).astype(np.float32)
+
+
+@compiled
+def _least_gap(sigmas: Floats, periods: Array, stripes: float) -> Array:
+    """(M,) by how much chi squared of any other order is greater where waves have no error."""
+    count = sigmas.shape[1]
+    least = np.full(count, np.inf)
+    ratios = periods[0] / periods
+    for pixel in range(count):
+        order = 1
+        while order * periods[0] < stripes:
+            cost = 0.0
+            for wave in range(1, periods.size):
+                off = order * ratios[wave]
+                off -= math.floor(off + 0.5)
+                doubt2 = sigmas[wave, pixel] ** 2 + (sigmas[0, pixel] * ratios[wave]) ** 2
+                cost += off * off / doubt2
+            least[pixel] = min(least[pixel], cost)
+            order += 1
+    return least
 
 
 @compiled

@@ -31,7 +31,7 @@ SHORTEST_PX = 1.5
 LEAST_SHOWN = 0.05
 """Of what the best determined wave of the error shows in second differences."""
 
-MOST_PLACES = 300_000
+MOST_PLACES = 100_000
 FEWEST_PLACES = 3_000
 STEEP_PX = 4
 OUTLYING = 5.0

@@ -80,6 +80,12 @@ def test_eight_bits_in_sixteen_are_read_if_the_rig_file_says_so(tmp_path: Path) 
         np.testing.assert_array_equal(read_image(path, camera), NOISE)
 
 
+def test_eight_bits_where_more_are_said_are_named(tmp_path: Path) -> None:
+    camera = CameraSpec(width=40, height=30, bits=12)
+    with pytest.raises(ImageError, match="has 8 bits a sample, but the rig file says `bits: 12`"):
+        read_image(write(tmp_path / "x.png", encoded(NOISE)), camera)
+
+
 def test_a_video_is_named_with_the_command_that_unpacks_it() -> None:
     said = list(template_faults("{shot}/{pair}.mp4", many_pairs=False, needs_frame=False))
     assert len(said) == 1

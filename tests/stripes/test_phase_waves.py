@@ -192,6 +192,32 @@ def test_parts_of_grey_levels_are_used(keys: dict[str, Any]) -> None:
     assert rms(errors(whole, s)) > 1.2 * rms(off)  # rounding adds 0.29 of a grey level
 
 
+def test_a_dim_background_does_not_condemn_a_subject() -> None:
+    """Of 160 lines 30 are bright; the others show waves, but too dimly to tell their order."""
+
+    def bright_below(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.where(v < 130, 0.1, 1.0)
+
+    lit, coded, s = captured(HIERARCHICAL, albedo=bright_below)
+    seen = read(HIERARCHICAL, lit, coded)
+    assert np.isfinite(seen.s[134:-3, 3:-10]).mean() > 0.97
+    known = np.isfinite(seen.s) & np.isfinite(s)
+    assert np.mean(np.abs(seen.s - s)[known] > 8.0) < 5e-4
+    with pytest.raises(DecodingFailed, match="were exchanged"):
+        read(HIERARCHICAL, lit, changed("exchanged", coded))
+
+
+def test_a_small_subject_is_decoded_where_two_images_are_alike() -> None:
+    """At s = 40 the wave of 240 stripes is as bright in image 0 as in image 1."""
+
+    def small(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return 36.0 + 0.04 * u + 0.005 * v
+
+    lights = code_light("phase-shift", STRIPES, **HIERARCHICAL)
+    lit, _, coded, s = render(small, lights, stripes=STRIPES, shape=(160, 200), ambient=10.0)
+    assert len(errors(read(HIERARCHICAL, lit, coded), s)) > 0.97 * inner(s).size
+
+
 def test_one_wave_that_covers_all_needs_nothing_else() -> None:
     keys = {"period": 240, "steps": 8}
     lit, coded, s = captured(keys)
