@@ -89,6 +89,7 @@ __all__ = [
     "Verdict",
     "calibrate_rig",
     "export_scan",
+    "import_calibration",
     "load_calibration",
     "load_rig",
     "load_scan",
@@ -125,6 +126,17 @@ def calibrate_rig(rig_file: AnyPath, *, progress: Progress = silent) -> RigCalib
     rig = load_rig(rig_file)
     captures = open_captures(rig, Path(rig_file))
     return calibrate(rig, captures, progress, folder=Path(rig_file).parent)
+
+
+def import_calibration(rig_file: AnyPath, *, sigma_px: float | None = None) -> RigCalibration:
+    """What other programs calibrated, from the files that a rig file names as `known`.
+
+    sigma_px: by how much its pixels may be off, instead of what the rig file says; without either
+    how exact it is is not known. Raises RigFileError; CalibrationFileError if no pair is left.
+    """
+    from bodyscan.workflows.import_rig import import_rig
+
+    return import_rig(load_rig(rig_file), Path(rig_file).parent, sigma_px)
 
 
 def save_calibration(calibration: RigCalibration, folder: AnyPath) -> Path:

@@ -7,6 +7,7 @@ import json
 import re
 import tomllib
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -56,6 +57,31 @@ def test_the_same_cameras_are_read_back(tmp_path: Path, kind: str) -> None:
         world = rig_from_camera if kind in WORLDS else first.inverse() @ rig_from_camera
         read = RigidTransform(pose.rotation, pose.translation * scale).inverse()
         np.testing.assert_allclose(read.matrix, world.matrix, rtol=0, atol=1e-8)
+
+
+COEFFICIENTS = {
+    "brown": np.array([-0.2, 0.1, 1e-3, -2e-3, 0.05]),
+    "rational": np.array([0.4, 0.2, 1e-3, -2e-3, 0.05, 0.5, 0.3, 0.02]),
+}
+
+
+@pytest.mark.parametrize("lens", COEFFICIENTS)
+@pytest.mark.parametrize("kind", RIG_FORMATS.names())
+def test_every_lens_that_a_format_has_is_read_back(tmp_path: Path, kind: str, lens: str) -> None:
+    form, cameras = RIG_FORMATS.find(kind), dict(ring())
+    name = "p2-1"
+    own = replace(cameras[name][0], lens=lens_from_opencv(COEFFICIENTS[lens]))
+    assert own.lens.kind == lens
+    cameras[name] = own, cameras[name][1]
+    if kind == "kalibr":
+        with pytest.raises(BadInput, match=f"pair {name}: Kalibr has no lens like '{lens}'"):
+            form.write(cameras, tmp_path / form.path)
+        assert not list(tmp_path.iterdir())
+        return
+    found = form.read(form.write(cameras, tmp_path / form.path))[name]
+    read = found.camera(own.width, own.height)
+    assert read.lens.kind == lens
+    np.testing.assert_allclose(read.parameters, own.parameters, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", RIG_FORMATS.names())

@@ -17,6 +17,7 @@ from ring import looking_at
 from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
+import bodyscan
 from bodyscan.arrays import Array, Mask
 from bodyscan.calibration.known_pair import parameter_sigmas
 from bodyscan.cli.main import app
@@ -128,6 +129,14 @@ def test_what_is_scanned_lies_where_it_is(folder: Path) -> None:
         assert shown.sum() > 200
         np.testing.assert_allclose(found[shown], points[shown], rtol=0, atol=1e-6)
     assert calibration.covariance.names == ("a", "b")
+
+
+def test_python_users_import_too(folder: Path) -> None:
+    rig_file = write_rig_file(folder, described("a"))
+    found = bodyscan.import_calibration(rig_file, sigma_px=0.5)
+    assert found.pairs["a"].quality.imported_sigma_px == 0.5
+    bodyscan.save_calibration(found, folder / "kept")
+    assert bodyscan.load_calibration(folder / "kept").pairs["a"].camera == found.pairs["a"].camera
 
 
 def test_units_and_inverse_poses(folder: Path) -> None:
