@@ -139,6 +139,7 @@ def check_codes(
     sampled = contrast[some, some]
     # Darker pixels are misread too often by themselves to tell anything.
     good = contrast >= np.median(sampled[sampled >= MIN_CONTRAST])
+    some = slice(None, None, 2 * step)
     shown, pairs = good[some, some], None
     seen = words[some, some][shown]
     if images.inverses is not None:
@@ -166,7 +167,7 @@ def check_codes(
     if pairs is not None and not causes:
         check_pairs(pairs)
     if not wrong:
-        _check_folds(code.stripes(words[::step]), good[::step])
+        _check_folds(code.stripes(words[some]), good[some])
         return
     found = [f"{beyond:.0%} of the codes lie beyond the last stripe"] if beyond > 0.01 else []
     if failing:
