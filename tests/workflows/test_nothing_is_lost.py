@@ -72,7 +72,7 @@ def test_a_report_goes_on_after_a_section_that_fails(
     assert "KeyError" in told["The rig"]
     assert "KeyError" in told["How well each place is known"]
     assert sum("KeyError: 'p2-2'" in blocks for blocks in told.values()) == 3  # and in the notes
-    assert "p1-1" in told["Pairs"]
+    assert "'c1'" in told["Pairs"]
     render(page)
 
 
