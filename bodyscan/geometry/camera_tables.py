@@ -33,11 +33,11 @@ def projection_table(camera: Camera) -> Table:
     """
     u, v = (np.linspace(-MARGIN_PX, n - 1.0 + MARGIN_PX, 33) for n in (camera.width, camera.height))
     ideal = camera.rays(np.stack(np.meshgrid(u, v), axis=-1)).reshape(-1, 3)[:, :2]
-    reach = camera.lens.reach
+    fold_radius = camera.lens.fold_radius
 
     def pixels(normalized: Array) -> Array:
         found = camera.pixels_from_normalized(camera.lens.distort(normalized))
-        one_to_one = np.linalg.norm(normalized, axis=-1, keepdims=True) < reach
+        one_to_one = np.linalg.norm(normalized, axis=-1, keepdims=True) < fold_radius
         return np.where(one_to_one, found, np.nan)
 
     low, high = np.nanmin(ideal, axis=0), np.nanmax(ideal, axis=0)

@@ -12,7 +12,7 @@ def in_image(camera: Camera, points: Array, margin_px: float = 0.0) -> Mask:
     """Points (..., 3), camera frame -> (...) whether they lie ahead and inside the image.
 
     Far outside its image a lens model folds back: such points project inside though
-    the camera cannot see them. They are ruled out by the lens's reach and by the rays of the
+    the camera cannot see them. They are ruled out by where the lens folds and by the rays of the
     image's own rim.
     """
     u, v = np.linspace(0.0, camera.width - 1.0, 9), np.linspace(0.0, camera.height - 1.0, 9)
@@ -22,7 +22,7 @@ def in_image(camera: Camera, points: Array, margin_px: float = 0.0) -> Mask:
     safe = np.where(ahead[..., None], points, [0.0, 0.0, 1.0])
     ideal = safe[..., :2] / safe[..., 2:3]
     low, high = np.nanmin(rim, axis=0) - 0.01, np.nanmax(rim, axis=0) + 0.01
-    one_to_one = np.linalg.norm(ideal, axis=-1) < camera.lens.reach
+    one_to_one = np.linalg.norm(ideal, axis=-1) < camera.lens.fold_radius
     pixels = camera.project(safe)
     last = np.array([camera.width - 1.0, camera.height - 1.0]) - margin_px
     inside = np.all((pixels >= margin_px) & (pixels <= last), axis=-1)

@@ -27,7 +27,7 @@ def seen(lens: Lens, *, shots: int = 12, seed: int = 0, again: int = 1) -> list[
         placed = RigidTransform(tilt.rotation, where - tilt.rotation @ MIDDLE).apply(POINTS)
         pixels = camera.project(placed)
         inside = np.all((pixels > 3.0) & (pixels < [WIDTH - 4.0, HEIGHT - 4.0]), axis=1)
-        inside &= np.linalg.norm(placed[:, :2] / placed[:, 2:], axis=1) < lens.reach
+        inside &= np.linalg.norm(placed[:, :2] / placed[:, 2:], axis=1) < lens.fold_radius
         if inside.sum() < 30:
             continue
         for _ in range(again):

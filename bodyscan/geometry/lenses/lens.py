@@ -88,32 +88,34 @@ class Lens(ABC):
         return lens
 
     @property
-    def reach(self) -> float:
+    def fold_radius(self) -> float:
         """Radius round the axis, of ideal points, within which the lens is one to one: where it
         first folds back in any direction; infinite if it does not."""
-        return _reach(self)
+        return _fold_radius(self)
 
     def undistort(self, real: Array) -> Array:
         """Real to ideal points, (..., 2), by Newton's method from the real ones.
 
-        Good to rounding within `reach`; NaN where no ideal point within it belongs to a real one.
+        Good to rounding within `fold_radius`; NaN where no ideal point within it belongs to a real one.
         """
         start = np.array(real, np.float64)
         with np.errstate(all="ignore"):
-            ideal = _at_most(start, 0.9 * self.reach)
+            ideal = _at_most(start, 0.9 * self.fold_radius)
             for _ in range(NEWTON_STEPS):
                 (a, b), (c, d) = np.moveaxis(self.by_point(ideal), (-2, -1), (0, 1))
                 x, y = np.moveaxis(self.distort(ideal) - real, -1, 0)
                 step = np.stack([d * x - b * y, a * y - c * x], -1) / (a * d - b * c)[..., None]
-                ideal = _at_most(ideal - step, 0.5 * (self.reach + np.linalg.norm(ideal, axis=-1)))
+                ideal = _at_most(
+                    ideal - step, 0.5 * (self.fold_radius + np.linalg.norm(ideal, axis=-1))
+                )
                 if settled(step):
                     break
-            return self.within_reach(ideal, real)
+            return self.before_fold(ideal, real)
 
-    def within_reach(self, ideal: Array, real: Array) -> Array:
-        """Ideal points (..., 2), NaN where they are beyond `reach` or not those of `real`."""
+    def before_fold(self, ideal: Array, real: Array) -> Array:
+        """Ideal points (..., 2), NaN where they are beyond `fold_radius` or not those of `real`."""
         seen = np.linalg.norm(self.distort(ideal) - real, axis=-1) < NOT_FOUND
-        seen &= np.linalg.norm(ideal, axis=-1) < self.reach
+        seen &= np.linalg.norm(ideal, axis=-1) < self.fold_radius
         return np.where(seen[..., None], ideal, np.nan)
 
     def opencv(self) -> Array:
@@ -144,7 +146,7 @@ def settled(step: Array) -> bool:
 
 
 @lru_cache(256)
-def _reach(lens: Lens) -> float:
+def _fold_radius(lens: Lens) -> float:
     turns = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     around = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
 

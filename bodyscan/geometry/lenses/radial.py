@@ -47,8 +47,8 @@ class Radial(Lens):
         return scaled_by_point(ideal, factor, self.k1 + 2.0 * r2 * self.k2)
 
     @property
-    def reach(self) -> float:
-        """As `Lens.reach`: the least r > 0 with 1 + 3 k1 r^2 + 5 k2 r^4 = 0."""
+    def fold_radius(self) -> float:
+        """As `Lens.fold_radius`: the least r > 0 with 1 + 3 k1 r^2 + 5 k2 r^4 = 0."""
         bend = 9.0 * self.k1**2 - 20.0 * self.k2
         per_r2 = 0.5 * (np.sqrt(bend) - 3.0 * self.k1) if bend >= 0.0 else 0.0
         return float(1.0 / np.sqrt(per_r2)) if per_r2 > 0.0 else np.inf
@@ -66,7 +66,7 @@ class Radial(Lens):
                 if settled(step):
                     break
             scale = np.divide(ideal, radius, out=np.ones_like(radius), where=radius > 0)
-            return self.within_reach(real * scale, real)
+            return self.before_fold(real * scale, real)
 
     def opencv(self) -> Array:
         return np.array([self.k1, self.k2, 0.0, 0.0, 0.0])
