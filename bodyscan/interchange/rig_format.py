@@ -22,7 +22,8 @@ Unit = Literal["mm", "cm", "m"]
 MILLIMETRES: dict[Unit, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 """In one of a unit."""
 Nodes: TypeAlias = Mapping[str, str]
-"""Names of a file's nodes, by what they hold: matrix, distortion, size, rotation, translation."""
+"""Names of a file's nodes, by what they hold: matrix, distortion, size or width and height, rotation,
+translation."""
 
 
 @dataclass(frozen=True)

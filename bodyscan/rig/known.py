@@ -18,9 +18,9 @@ WITH_NODES = "opencv"
 class KnownCamera(Model):
     """A camera, or a projector described as one, in a file of another program.
 
-    file: if it is not that of the pair.  name: the camera's in the file.  matrix, distortion, size,
-    rotation, translation: names of OpenCV's nodes.  inverse: rotation and translation take the
-    camera's coordinates to the world's, not the other way.
+    file: if it is not that of the pair.  name: the camera's in the file.  matrix, distortion, size
+    (or width and height), rotation, translation: names of OpenCV's nodes.  inverse: rotation and
+    translation take the camera's coordinates to the world's, not the other way.
     """
 
     file: Text | None = None
@@ -28,6 +28,8 @@ class KnownCamera(Model):
     matrix: Text | None = None
     distortion: Text | None = None
     size: Text | None = None
+    width: Text | None = None
+    height: Text | None = None
     rotation: Text | None = None
     translation: Text | None = None
     inverse: bool = False
@@ -39,6 +41,8 @@ class KnownCamera(Model):
             "matrix": self.matrix,
             "distortion": self.distortion,
             "size": self.size,
+            "width": self.width,
+            "height": self.height,
             "rotation": self.rotation,
             "translation": self.translation,
         }
@@ -48,6 +52,11 @@ class KnownCamera(Model):
         if (self.rotation is None) != (self.translation is None):
             absent = "rotation" if self.rotation is None else "translation"
             yield (absent,), "is missing: a pose is a rotation and a translation"
+        if (self.width is None) != (self.height is None):
+            absent = "width" if self.width is None else "height"
+            yield (absent,), "is missing: a picture has a width and a height"
+        if self.size is not None and self.width is not None:
+            yield ("size",), "is said twice: give it, or width and height"
         if self.nodes and self.matrix is None:
             yield ("matrix",), "is missing: the node that holds the camera matrix"
         if self.nodes and self.name is not None:

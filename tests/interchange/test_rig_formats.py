@@ -370,6 +370,15 @@ def test_numbers_that_cannot_be_are_named(tmp_path: Path) -> None:
         read_nodes(tmp_path / "nowhere.yaml", NODES)
 
 
+def test_a_size_may_stand_in_two_nodes(tmp_path: Path) -> None:
+    path = tmp_path / "any.yaml"
+    path.write_text(storage("yaml") + "w: 1280\nh: 720\nhalf: 0.5\n")
+    apart = {what: name for what, name in NODES.items() if what != "size"}
+    assert read_nodes(path, apart | {"width": "w", "height": "h"}).size == (1280, 720)
+    with pytest.raises(CalibrationFileError, match="w: is not the size of a picture"):
+        read_nodes(path, apart | {"width": "w", "height": "half"})
+
+
 def test_a_file_of_another_camera_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "any.yaml"
     path.write_text(storage("yaml"))

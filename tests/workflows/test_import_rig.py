@@ -244,6 +244,11 @@ def test_a_mirrored_or_endless_pose_is_named(folder: Path) -> None:
         ({"camera": {"distortion": "D"}}, r"pairs\[0\].known.camera.matrix: is missing"),
         ({"camera": {"matrix": "K", "rotation": "R"}}, r"known.camera.translation: is missing"),
         ({"camera": {"matrix": "K", "name": "a"}}, r"known.camera.name: is for files that name"),
+        ({"camera": {"matrix": "K", "width": "w"}}, r"known.camera.height: is missing"),
+        (
+            {"camera": {"matrix": "K", "size": "s", "width": "w", "height": "h"}},
+            r"known.camera.size: is said twice",
+        ),
         ({"camera": {"matrx": "K"}}, r"known.camera.matrx: is not a key.*did you mean 'matrix'"),
         ({"projector": {}}, r"known.projector: does not say which"),
     ],

@@ -87,8 +87,8 @@ def read_opencv(path: Path) -> dict[str, FoundCamera]:
 
 
 def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
-    """The camera whose numbers stand in these nodes: matrix; distortion, size, rotation and
-    translation if they are given."""
+    """The camera whose numbers stand in these nodes: matrix; distortion, size (or width and
+    height), rotation and translation if they are given."""
     file = ForeignFile.read(path)
     store = _opened(file)
 
@@ -96,6 +96,8 @@ def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
         return _values(file, _node(file, store, nodes[what]), nodes[what])
 
     size = file.size(values("size"), nodes["size"]) if "size" in nodes else None
+    if "width" in nodes:
+        size = file.size([values("width"), values("height")], nodes["width"])
     pose = None
     if "rotation" in nodes:
         words = nodes["rotation"], nodes["translation"]
