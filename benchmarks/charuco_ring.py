@@ -93,7 +93,8 @@ all in our hands), their own corners, none left out: 0.28 px and 0.24 mm (calisc
 {chr(10).join(_shot_rows(ours.shots, placed_ours.shots))}
 
 Lenses that held-out boards choose, all {len(shots)} shots given: RMS of held-out corners (px), and
-by how many standard errors each lens beats the one chosen before. Views used: {len(whole.views)} of {len(found)}.
+by how many standard errors each lens beats the one chosen before. Views used:
+{len(whole.views)} of {len(found)}.
 
 | camera | lens | held-out px | standard errors | chosen |
 |---|---|---|---|---|
