@@ -86,8 +86,9 @@ def check(
     captures = [part for part in (calibration, *scanned) if part is not None]
 
     sequences = [sequence for part in captures for sequence in part.sequences]
+    known = {path for part in captures for path in part.corners}
     with ThreadPoolExecutor(_READERS) as pool:
-        bad_of = dict(pool.map(lambda s: (s, _bad_images(rig, s)), sequences))
+        bad_of = dict(pool.map(lambda s: (s, _bad_images(rig, s, known)), sequences))
     good = [s for s in (calibration.sequences if calibration else ()) if not bad_of[s]]
     counts = tuple(_count(pair, good) for pair in rig.pairs)
     place = {pair.name: index for index, pair in enumerate(rig.pairs)}
@@ -146,7 +147,8 @@ def _attempt(errors: list[str], work: Callable[..., Captures], *args: object) ->
         return None
 
 
-def _bad_images(rig: Rig, sequence: ImageSequence) -> tuple[BadImage, ...]:
+def _bad_images(rig: Rig, sequence: ImageSequence, known: set[Path]) -> tuple[BadImage, ...]:
+    """Of those in which corners are `known` none is needed."""
     camera = rig.pair(sequence.pair).camera
     missing = set(sequence.missing)
     faults = (
@@ -155,6 +157,7 @@ def _bad_images(rig: Rig, sequence: ImageSequence) -> tuple[BadImage, ...]:
             absence(path) if path in missing else header_fault(path, camera.width, camera.height),
         )
         for path in sequence.paths
+        if path not in known
     )
     return tuple(
         BadImage(path, sequence.pair, sequence.shot, fault) for path, fault in faults if fault

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+from bodyscan.arrays import Array
 from bodyscan.captures.captures_file import FILE_NAME, ShotEntry, load_captures_file
 from bodyscan.captures.listing import Listing
 from bodyscan.errors import CaptureError
+from bodyscan.files.corners_vnl import read_corners
 from bodyscan.files.relative_text import relative_text
 from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.pair import Pair
@@ -78,7 +80,9 @@ class MissingImage:
 class Captures:
     """What one or more capture folders hold. `shots` in order; `sequences` by shot, then by pair.
 
-    when, subject, simulated: of a scan, as its captures.yaml says.  base: the folder that kept messages
+    when, subject, simulated: of a scan, as its captures.yaml says.  corners: of the board in images in
+    which it was found elsewhere, (N, 2) px, (0, 2) where it is not.  base: the folder that kept
+    messages
     are relative to; that of the rig file, or of the scan.
     """
 
@@ -90,6 +94,7 @@ class Captures:
     subject: str | None = None
     simulated: bool = False
     base: Path = Path()
+    corners: Mapping[Path, Array] = field(default_factory=dict)
 
     @cached_property
     def _by_pair_and_shot(self) -> dict[tuple[str, str], ImageSequence]:
@@ -137,8 +142,19 @@ def open_captures(rig: Rig, rig_path: Path) -> Captures:
 
 def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
     """The captures of one folder of the rig file's `calibration` list. Raises as `open_scan`."""
-    folder = capture_path(rig_path, entry)
-    return _open(rig, folder, "calibration", entry.files or rig.files, entry.shots)
+    folder, template = capture_path(rig_path, entry), entry.files or rig.files
+    if entry.corners is None:
+        return _open(rig, folder, "calibration", template, entry.shots)
+    named = _corners_by_path(read_corners(Path(rig_path).parent / entry.corners), template)
+    captures = _open(rig, folder, "calibration", template, entry.shots, tuple(named))
+    return replace(captures, corners={folder / name: own for name, own in named.items()})
+
+
+def _corners_by_path(corners: Mapping[str, Array], template: str) -> dict[str, Array]:
+    """By paths as the template makes them: wherever the images lay when corners were found in them,
+    their last parts are the same."""
+    parts = template.count("/") + 1
+    return {"/".join(name.split("/")[-parts:]): own for name, own in corners.items()}
 
 
 def capture_path(rig_path: Path, entry: CaptureFolder) -> Path:
@@ -191,13 +207,21 @@ def join_captures(parts: tuple[Captures, ...]) -> Captures:
     sequences = [sequence for part in parts for sequence in part.sequences]
     sequences.sort(key=lambda sequence: (shots.index(sequence.shot), order[sequence.pair]))
     folders = tuple(folder for part in parts for folder in part.folders)
-    return replace(parts[0], folders=folders, shots=shots, sequences=tuple(sequences))
+    corners = {path: own for part in parts for path, own in part.corners.items()}
+    return replace(
+        parts[0], folders=folders, shots=shots, sequences=tuple(sequences), corners=corners
+    )
 
 
 def _open(
-    rig: Rig, folder: Path, kind: Kind, template: str, wanted: tuple[str, ...] | None
+    rig: Rig,
+    folder: Path,
+    kind: Kind,
+    template: str,
+    wanted: tuple[str, ...] | None,
+    named: tuple[str, ...] = (),
 ) -> Captures:
-    listing = Listing(folder, follow_links=rig.follow_links)
+    listing = Listing(folder, follow_links=rig.follow_links, named=named)
     file = load_captures_file(folder, rig) if listing.has(FILE_NAME) else None
     if file is not None and file.kind != kind:
         raise CaptureError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from bodyscan.errors import CaptureError
@@ -13,9 +14,20 @@ class Listing:
     """Reads each folder once; refuses symbolic links that lead out of the capture folder, unless they
     are meant."""
 
-    def __init__(self, root: Path, *, follow_links: bool = False) -> None:
-        """Raises CaptureError when `root` is no folder."""
-        if not root.is_dir():
+    def __init__(
+        self, root: Path, *, follow_links: bool = False, named: Iterable[str] = ()
+    ) -> None:
+        """named: files that count as being there, such as images whose corners are known.
+
+        Raises CaptureError when `root` is no folder, unless there are such.
+        """
+        self._named: dict[str, dict[str, bool]] = {}
+        for path in named:
+            while path:
+                folder, _, name = path.rpartition("/")
+                self._named.setdefault(folder, {})[name] = False
+                path = folder
+        if not root.is_dir() and not (self._named and not root.exists()):
             what = "is not a folder" if root.exists() else "does not exist"
             remedy = "Check the folder's name, and that the disk it lies on is there."
             raise CaptureError(f"the capture folder {what}", where=str(root), remedy=remedy)
@@ -60,7 +72,8 @@ class Listing:
         """Name -> whether it is a symbolic link, for what a folder holds."""
         if relative not in self._entries:
             there = relative == "" or self.has(relative)
-            self._entries[relative] = self._scan(self.root / relative) if there else {}
+            found = self._scan(self.root / relative) if there else {}
+            self._entries[relative] = self._named.get(relative, {}) | found
         return self._entries[relative]
 
     def _scan(self, folder: Path) -> dict[str, bool]:
@@ -69,6 +82,10 @@ class Listing:
                 return {entry.name: entry.is_symlink() for entry in entries}
         except NotADirectoryError:
             return {}
+        except FileNotFoundError:
+            if self._named:
+                return {}
+            raise CaptureError("is not there any more", where=str(folder)) from None
         except OSError as error:
             what = f"cannot be read: {error.strerror}"
             raise CaptureError(what, where=str(folder), remedy="Check its permissions.") from None

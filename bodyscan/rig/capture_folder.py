@@ -11,11 +11,16 @@ from bodyscan.files.model import Model, Name, Problem, duplicates
 
 
 class CaptureFolder(Model):
-    """A folder of captures; relative to the rig file. `shots` overrides its captures.yaml."""
+    """A folder of captures; relative to the rig file. `shots` overrides its captures.yaml.
+
+    corners: a corners.vnl, relative to the rig file, whose corners of the rig's only board are taken
+    in place of those in the images that it names; these need not be there.
+    """
 
     folder: Annotated[str, Field(min_length=1)]
     files: str | None = None
     shots: tuple[Name, ...] | None = None
+    corners: Annotated[str, Field(min_length=1)] | None = None
 
     def problems(self) -> Iterator[Problem]:
         for index, name in duplicates(self.shots or ()):

@@ -13,6 +13,7 @@ from bodyscan.calibration.pair import PairCalibration, PlacedPair, calibrate_pai
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.errors import BadInput, BodyscanError, FailedWork, plainly
+from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, step
 from bodyscan.registration.board_checks import describe_findings
@@ -23,7 +24,13 @@ from bodyscan.registration.storage import keep_former, save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.workflows.decode import ViewKey, decode_on_boards
-from bodyscan.workflows.find_boards import HERE, calibrate_cameras, find_all_boards, locate_views
+from bodyscan.workflows.find_boards import (
+    HERE,
+    calibrate_cameras,
+    find_all_boards,
+    locate_views,
+    write_found_corners,
+)
 from bodyscan.workflows.rig_remarks import JoinedRig, remarked
 
 MOST_SEEN = 3
@@ -57,7 +64,11 @@ def calibrate_folder(
     found = join_rig(rig, captures, boards, progress, folder=Path(rig_file).parent)
     keep_former(folder)
     save_calibration(found.calibration, folder)
+    unsaid: list[str] = []
+    with optional("corners.vnl", unsaid.append):
+        write_found_corners(folder / "corners.vnl", rig, captures, boards.value)
     calibration = remarked(found, progress)
+    calibration = replace(calibration, notes=(*calibration.notes, *unsaid))
     return calibration, save_calibration(calibration, folder)
 
 

@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.detection import find_boards
+from bodyscan.boards.numbered_corners import number_corners
 from bodyscan.boards.unfound import describe_unfound
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import (
@@ -26,7 +30,8 @@ from bodyscan.calibration.known_pair import read_known_camera
 from bodyscan.calibration.lens_choice import calibrate_with_lenses
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_board_image
-from bodyscan.errors import BodyscanError
+from bodyscan.errors import BadInput, BodyscanError
+from bodyscan.files.corners_vnl import write_corners
 from bodyscan.geometry.lenses import FAMILY, LENSES
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, threaded
@@ -52,6 +57,8 @@ def find_all_boards(
 
     def find(sequence: ImageSequence) -> tuple[list[BoardView], str | None]:
         try:
+            if sequence.seen_in in captures.corners:
+                return _given_view(rig, captures, sequence), None
             image = read_board_image(sequence, rig.pair(sequence.pair))
             found = find_boards(image, rig.boards, pair=sequence.pair, shot=sequence.shot)
         except BodyscanError as error:
@@ -63,7 +70,7 @@ def find_all_boards(
     without = [
         sequence
         for sequence, (found, note) in zip(captures.sequences, results, strict=True)
-        if not found and note is None
+        if not found and note is None and sequence.seen_in not in captures.corners
     ]
     looked_at = _look_closer(rig, views, without)
     missing = [
@@ -73,6 +80,54 @@ def find_all_boards(
     ]
     notes = [note for _, note in results if note]
     return Outcome(views, (*notes, *missing, *odd, *appearance_notes(rig, views)))
+
+
+def _given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[BoardView]:
+    """The board whose corners were found elsewhere, [] if that found none.
+
+    Raises BadInput when the rig has several boards: whose corners they are is not said.
+    """
+    if len(rig.boards) != 1:
+        raise BadInput(
+            f"corners are given, but the rig has {len(rig.boards)} boards",
+            where=f"rig {rig.name}",
+            remedy="Corners found elsewhere are those of one board: describe that one alone.",
+        )
+    camera = rig.pair(sequence.pair).camera
+    pixels = captures.corners[sequence.seen_in]
+    view = number_corners(
+        pixels,
+        rig.boards[0],
+        (camera.width, camera.height),
+        pair=sequence.pair,
+        shot=sequence.shot,
+        where=str(sequence.seen_in),
+    )
+    return [] if view is None else [view]
+
+
+def write_found_corners(
+    path: Path, rig: Rig, captures: Captures, views: Sequence[BoardView]
+) -> None:
+    """A corners.vnl of the rig's only board as it was found in every image, by its path in the capture
+    folder; of a rig with several boards there is none."""
+    if len(rig.boards) != 1:
+        return
+    count = len(corner_points(rig.boards[0]))
+    seen = {(view.pair, view.shot): view for view in views}
+
+    def row(sequence: ImageSequence) -> tuple[str, Array]:
+        image = sequence.seen_in
+        inside = [folder for folder in captures.folders if image.is_relative_to(folder)]
+        name = image.relative_to(inside[0]).as_posix() if inside else image.name
+        view = seen.get((sequence.pair, sequence.shot))
+        if view is None:
+            return name, np.empty((0, 2))
+        pixels = np.full((count, 2), np.nan)
+        pixels[view.corner_ids] = view.pixels
+        return name, pixels
+
+    write_corners(path, map(row, captures.sequences))
 
 
 def _look_closer(

@@ -1,0 +1,109 @@
+"""corners.vnl: board corners as mrgingham writes and mrcal reads them.
+
+A text table (vnlog) of `filename x y level`: for every image all corners of its grid, row by row; `-`
+for x and y where no board was found; `-` or a negative number for the level of a corner that is not
+to be used. Levels above 0 were found on a picture reduced by 2**level.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from bodyscan.arrays import Array
+from bodyscan.errors import CaptureError
+from bodyscan.files.atomic import write_text
+from bodyscan.files.regular import read_regular
+
+COLUMNS = ("filename", "x", "y", "level")
+MOST_BYTES = 200_000_000
+"""A thousand images of a board of two thousand corners."""
+
+
+def read_corners(path: Path) -> dict[str, Array]:
+    """By an image's name, as the file has it: (N, 2) px, NaN where a corner is not to be used; (0, 2)
+    where there is no board.
+
+    Raises CaptureError, with the line, for what is no such table.
+    """
+    try:
+        lines = read_regular(path, MOST_BYTES).decode("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise CaptureError(
+            f"cannot be read as text: {error}", where=str(path), remedy=_remedy()
+        ) from None
+    order: list[int] = []
+    found: dict[str, list[tuple[float, float]]] = {}
+    for number, line in enumerate(lines, start=1):
+        words = line.split()
+        if not words or line.startswith("##"):
+            continue
+        where = f"{path}:{number}"
+        if words[0].startswith("#"):
+            order = order or _columns(line.lstrip("#").split(), where)
+            continue
+        if not order:
+            raise CaptureError("stands before the line of columns", where=where, remedy=_remedy())
+        name, corner = _corner(words, order, where)
+        corners = found.setdefault(name, [])
+        if corner is not None:
+            corners.append(corner)
+    if not found:
+        raise CaptureError("holds no corner", where=str(path), remedy=_remedy())
+    return {name: np.array(corners).reshape(-1, 2) for name, corners in found.items()}
+
+
+def write_corners(path: Path, corners: Iterable[tuple[str, Array]]) -> None:
+    """By an image's name: (N, 2) px, NaN for what was not found; (0, 2) for no board. The file appears
+    whole or not at all."""
+    lines = ["# " + " ".join(COLUMNS)]
+    for name, pixels in corners:
+        if any(letter.isspace() for letter in name):
+            raise CaptureError(
+                f"the name {name!r} has a space in it, which corners.vnl cannot hold",
+                where=str(path),
+                remedy="Rename the image.",
+            )
+        if not len(pixels):
+            lines.append(f"{name} - - -")
+        for x, y in pixels:
+            lines.append(f"{name} {x:.6f} {y:.6f} 0" if x == x else f"{name} 0 0 -")
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _columns(names: list[str], where: str) -> list[int]:
+    """The places of COLUMNS in a row; -1 for a level that the table does not have."""
+    if any(name not in names for name in COLUMNS[:3]):
+        raise CaptureError(f"has the columns {' '.join(names)}", where=where, remedy=_remedy())
+    return [names.index(name) if name in names else -1 for name in COLUMNS]
+
+
+def _corner(
+    words: list[str], order: list[int], where: str
+) -> tuple[str, tuple[float, float] | None]:
+    """An image's name and its next corner; None for one without a board."""
+    name, x, y, level = (words[place] if 0 <= place < len(words) else None for place in order)
+    if name is None or x is None or y is None:
+        raise CaptureError(f"has {len(words)} columns, too few", where=where, remedy=_remedy())
+    if "-" in (x, y):
+        return name, None
+    try:
+        corner, used = (float(x), float(y)), level in (None, "-") or float(level or 0) >= 0.0
+    except ValueError:
+        raise CaptureError(
+            f"holds what is no number: {' '.join(words)}", where=where, remedy=_remedy()
+        ) from None
+    if level == "-" or not used:
+        return name, (math.nan, math.nan)
+    if not all(map(math.isfinite, corner)):
+        raise CaptureError(
+            f"holds what is no pixel: {' '.join(words)}", where=where, remedy=_remedy()
+        )
+    return name, corner
+
+
+def _remedy() -> str:
+    return "A corners.vnl has a line `# filename x y level` and below it a line for each corner."
