@@ -6,6 +6,8 @@ on which the work did not succeed (exit 1).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 
 class BodyscanError(Exception):
     """Root of the tree. `what` went wrong, `where` (file, line, pair, shot), `remedy`: what to do."""
@@ -24,6 +26,14 @@ class BodyscanError(Exception):
 def plainly(error: BodyscanError) -> str:
     """What went wrong and what to do, where the place is said already."""
     return f"{error.what}\n  {error.remedy}" if error.remedy else error.what
+
+
+def listed(reasons: Mapping[str, str]) -> str:
+    """Why each of several failed, a line each; what to do, once, however many it would help."""
+    parts = {name: reason.partition("\n") for name, reason in reasons.items()}
+    first = [f"\n  {name}: {what}" for name, (what, _, _) in parts.items()]
+    rest = dict.fromkeys(remedy for _, _, remedy in parts.values())
+    return "".join(first + [f"\n{remedy}" for remedy in rest if remedy])
 
 
 class BadInput(BodyscanError):

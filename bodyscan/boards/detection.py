@@ -34,11 +34,10 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
     for board in boards:
         if board.kind != "checkerboard":
             found = _find_marked(image, board, seen)
-            turnable = False
         else:
             found = find_checkerboard(image, board)
-            turnable = board.faces == 2 or (board.columns + board.rows) % 2 == 0
         if found is not None and _determines_plane(found):
+            turnable = board.looks_same_turned
             views.append(
                 BoardView(
                     pair, shot, board.name, found.ids, found.pixels, turnable, found.appearance

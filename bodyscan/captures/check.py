@@ -13,6 +13,7 @@ from bodyscan.captures.image_faults import absence, header_fault
 from bodyscan.captures.unlisted_images import find_unlisted_images
 from bodyscan.errors import CaptureError
 from bodyscan.files.model import did_you_mean
+from bodyscan.rig.board import Board
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
@@ -96,10 +97,12 @@ def check(
     for part in captures:
         errors += [f"{part.folders[0]}: shot {shot}: no image" for shot in _empty_shots(part)]
     if calibration:
-        errors += _frame_errors(calibration)
+        errors += _frame_errors(calibration, good)
+        errors += _untied(rig, good)
         errors += filter(None, map(_too_few, rig.pairs, counts))
     warnings = [] if rig.calibration else [f"{rig_path}: names no calibration captures"]
     warnings += filter(None, map(_unlisted_images, captures))
+    warnings += map(_turned, filter(lambda board: board.looks_same_turned, rig.boards))
     warnings += filter(None, map(_few, rig.pairs, counts)) if calibration else ()
     return CheckReport(
         rig_path=Path(rig_path),
@@ -207,10 +210,44 @@ def _unlisted_images(captures: Captures) -> str | None:
     )
 
 
-def _frame_errors(calibration: Captures) -> list[str]:
-    shot = calibration.rig.rig_frame.shot
-    if shot is None or shot in calibration.shots:
+def _turned(board: Board) -> str:
+    count = f"{board.columns} x {board.rows} squares"
+    why = "its two faces are alike" if board.faces == 2 else f"it has {count}, an even sum"
+    return (
+        f"board {board.name} looks the same turned round ({why}): cameras may number its corners from "
+        "different ends; better is an odd number of columns with an even one of rows, or ChArUco"
+    )
+
+
+def _untied(rig: Rig, good: list[ImageSequence]) -> list[str]:
+    """Groups of pairs that took no shot in common: nothing can join them in one frame."""
+    groups: list[tuple[set[str], set[str]]] = []  # pairs and their shots
+    for pair in rig.pairs:
+        pairs, shots = {pair.name}, {s.shot for s in good if s.pair == pair.name}
+        if not shots:
+            continue
+        tied = [group for group in groups if group[1] & shots]
+        for group in tied:
+            groups.remove(group)
+            pairs, shots = pairs | group[0], shots | group[1]
+        groups.append((pairs, shots))
+    if len(groups) < 2:
         return []
+    named = " | ".join(", ".join(sorted(pairs)) for pairs, _ in groups)
+    return [
+        f"nothing ties these groups of pairs together, for no shot is theirs in common: {named}; "
+        "take shots in which cameras of both see a board"
+    ]
+
+
+def _frame_errors(calibration: Captures, good: list[ImageSequence]) -> list[str]:
+    shot = calibration.rig.rig_frame.shot
+    if shot is None:
+        return []
+    if shot in calibration.shots:
+        if any(sequence.shot == shot for sequence in good):
+            return []
+        return [f"rig_frame.shot: no pair has its images of '{shot}', which fixes the rig frame"]
     hint = did_you_mean(shot, calibration.shots)
     return [f"rig_frame.shot: there is no shot '{shot}'{hint} in the calibration captures"]
 

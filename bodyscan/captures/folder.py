@@ -22,6 +22,9 @@ from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import SHOT, fill, has_field, shot_pattern, with_exposure
 
+SUFFIXES = {".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
+"""Of images, whatever takes them."""
+
 Kind = Literal["calibration", "scan"]
 
 
@@ -247,12 +250,22 @@ def _open(
         raise CaptureError(
             f"holds no image of rig {rig.name} by the template {template}",
             where=str(folder),
-            remedy=f"An image should be named such as {example}; correct `files` in the rig file.",
+            remedy=f"An image should be named such as {example}{_some_image(folder)}; correct "
+            "`files` in the rig file (capitals and small letters count).",
         )
     captures = Captures(rig, (folder,), names, sequences, base=folder)
     if file is None:
         return captures
     return replace(captures, when=file.when, subject=file.subject, simulated=bool(file.simulated))
+
+
+def _some_image(folder: Path) -> str:
+    """What an image there is named, to be compared with what it should be."""
+    for place, _, names in os.walk(folder):
+        for name in sorted(names):
+            if Path(name).suffix.lower() in SUFFIXES:
+                return f", but one is named {os.path.relpath(os.path.join(place, name), folder)}"
+    return ""
 
 
 def _some_frame(rig: Rig) -> str:

@@ -34,7 +34,13 @@ def absence(path: Path) -> str:
     fitting = sorted(found.name for found in path.parent.glob(_plain(path.name)))
     if ANYTHING in path.name and len(fitting) > 1:
         return f"fits {len(fitting)} files, {fitting[0]} and {fitting[1]} among them"
-    return "is missing"
+    return "is there with other capitals" if _spelt_otherwise(path) else "is missing"
+
+
+def _spelt_otherwise(path: Path) -> bool:
+    """Whether a name beside it is the same but for capitals, such as `.PNG` for `.png`."""
+    beside = path.parent.iterdir() if path.parent.is_dir() else ()
+    return any(other.name.casefold() == path.name.casefold() for other in beside)
 
 
 def _plain(name: str) -> str:
@@ -52,6 +58,8 @@ def image_error(what: str, path: Path, pair: str, shot: str, *, remedy: str = ""
 def _remedy(what: str) -> str:
     if what.startswith("fits "):
         return "Keep one of them, or say more of the name in `files` or `frames` of the rig file."
+    if "capitals" in what:
+        return "Rename it, or write `files` and `frames` of the rig file as the files are named."
     if what == "is missing":
         return "Copy it here, take the shot again, or leave it out of captures.yaml."
     if "the rig file says" in what:

@@ -6,9 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from bodyscan.captures.folder import Captures
-
-SUFFIXES = {".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
+from bodyscan.captures.folder import SUFFIXES, Captures
 
 
 def find_unlisted_images(captures: Captures) -> list[Path]:

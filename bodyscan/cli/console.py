@@ -104,8 +104,11 @@ class Output:
     def failures(self, failures: Mapping[str, str], what: str = "failed") -> None:
         """Pairs that were lost, with the reason."""
         self._failures |= failures
-        for name, reason in failures.items():
-            self._print(f"{what}: {name}: {reason}", style="red")
+        parts = {name: reason.partition("\n") for name, reason in failures.items()}
+        for name, (said, _, _) in parts.items():
+            self._print(f"{what}: {name}: {said}", style="red")
+        for remedy in dict.fromkeys(remedy for _, _, remedy in parts.values() if remedy):
+            self._print(remedy, style="red")  # once, however many it would help
 
     def optional(self, what: str) -> AbstractContextManager[None]:
         """For what the command's result stands without: a block that fails is a note."""

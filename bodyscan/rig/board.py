@@ -59,6 +59,12 @@ class Board(Model):
     thickness_mm: Annotated[float, Field(ge=0)] = 0.0
 
     @property
+    def looks_same_turned(self) -> bool:
+        """Whether a picture does not tell which end, or which face, of the print it shows."""
+        alike = self.faces == 2 or (self.columns + self.rows) % 2 == 0
+        return self.kind == "checkerboard" and alike
+
+    @property
     def marker_count(self) -> int:
         """Markers on all faces: of a charuco board every second square carries one, of an aprilgrid
         every one."""

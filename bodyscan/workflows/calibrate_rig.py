@@ -12,7 +12,7 @@ from bodyscan.calibration.camera import CameraCalibration, locate_board
 from bodyscan.calibration.pair import PairCalibration, PlacedPair, calibrate_pair
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.captures.folder import Captures, open_captures
-from bodyscan.errors import BadInput, BodyscanError, FailedWork, plainly
+from bodyscan.errors import BadInput, BodyscanError, FailedWork, listed, plainly
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, step
@@ -116,9 +116,8 @@ def join_rig(
 
 
 def _nothing_calibrated(rig: Rig, failed: Mapping[str, str], remedy: str = "") -> FailedWork:
-    reasons = "".join(f"\n  {name}: {reason}" for name, reason in failed.items())
     return FailedWork(
-        f"no pair could be calibrated:{reasons}", where=f"rig {rig.name}", remedy=remedy
+        f"no pair could be calibrated:{listed(failed)}", where=f"rig {rig.name}", remedy=remedy
     )
 
 

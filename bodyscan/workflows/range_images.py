@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 
 from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.errors import BodyscanError, ScanFailed
+from bodyscan.errors import BodyscanError, ScanFailed, listed
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.reconstruction.range_image import RangeImage
@@ -52,7 +52,6 @@ def reconstruct_range_images(
     )
     failed |= {s.pair: captures.relative(str(error)) for s, error in errors.items()}
     if not images:
-        reasons = "\n".join(f"  {name}: {reason}" for name, reason in failed.items())
-        raise ScanFailed(f"no pair gave a range image:\n{reasons}")
+        raise ScanFailed(f"no pair gave a range image:{listed(failed)}")
     notes = [f"{i.pair}: {i.agreement}" for i in images.values() if i.agreement is not None]
     return Outcome(list(images.values()), (*notes, *response_notes(responses)), failed)

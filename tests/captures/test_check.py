@@ -217,3 +217,57 @@ def test_the_same_fault_in_many_shots_is_one_line(rig_path: Path) -> None:
     (line,) = lines_with(rig_path, "error: pair p1, ")
     assert f"{len(shots)} shots: " in line
     assert f"and {len(shots) - 1} more" in line
+
+
+@pytest.mark.parametrize(
+    ("board", "turned"),
+    [
+        ("columns: 5, rows: 4", False),
+        ("columns: 9, rows: 7", True),
+        ("columns: 5, rows: 4, faces: 2", True),
+        ("kind: charuco, columns: 9, rows: 7, marker_mm: 20", False),
+    ],
+)
+def test_a_board_that_looks_the_same_turned_round_is_named(
+    rig_path: Path, board: str, turned: bool
+) -> None:
+    write(rig_path, RIG.replace("columns: 5, rows: 4", board))
+    assert len(lines_with(rig_path, "board board looks the same turned round")) == turned
+
+
+def test_pairs_that_no_shot_ties_together_are_named(rig_path: Path) -> None:
+    for shot in ("b1", "b2", "b3"):
+        folder = rig_path.parent / "captures" / shot / "p2"
+        shutil.copytree(folder, rig_path.parent / "captures" / f"c{shot}" / "p2")
+        shutil.rmtree(folder)
+    (line,) = lines_with(rig_path, "nothing ties")
+    assert "p2 | cam, p1;" in line
+    assert not check(rig_path).ok
+
+
+def test_a_shot_that_is_to_fix_the_rig_frame_must_be_whole(rig_path: Path) -> None:
+    write(rig_path, RIG + "rig_frame: {shot: b2}\n")
+    assert check(rig_path).ok
+    for pair in ("p1", "p2", "cam"):
+        image(rig_path, "b2", pair, "lit").write_bytes(b"damaged")
+    assert lines_with(rig_path, "no pair has its images of 'b2', which fixes the rig frame")
+
+
+def test_names_whose_capitals_differ_are_told(rig_path: Path) -> None:
+    wanted = image(rig_path, "b2", "p1", "bit02")
+    wanted.rename(wanted.with_suffix(".PNG"))
+    if wanted.exists():
+        pytest.skip("capitals do not count on this disk")
+    (line,) = lines_with(rig_path, "is there with other capitals")
+    assert str(wanted) in line
+
+
+def test_captures_that_are_named_otherwise_are_shown(rig_path: Path) -> None:
+    for path in (rig_path.parent / "captures").rglob("*.png"):
+        path.rename(path.with_suffix(".PNG"))
+    if image(rig_path, "b1", "p1", "lit").exists():
+        pytest.skip("capitals do not count on this disk")
+    (line,) = check(rig_path).errors
+    assert "should be named such as" in line
+    assert "but one is named b" in line
+    assert ".PNG" in line
