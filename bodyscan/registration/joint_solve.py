@@ -201,8 +201,8 @@ def _adjust(
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = loss_px
-    options.ceres.solver_options.gradient_tolerance = 1e-10
-    options.ceres.solver_options.function_tolerance = 1e-12
+    options.ceres.solver_options.gradient_tolerance = 1e-6
+    options.ceres.solver_options.function_tolerance = 1e-6  # `full_solve` ends it
     options.ceres.solver_options.num_threads = 2
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.images:
