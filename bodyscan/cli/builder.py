@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +17,9 @@ from bodyscan.cli.options import (
 )
 from bodyscan.files.os_errors import require_writable
 from bodyscan.settings import RigExportSettings
+
+if TYPE_CHECKING:  # loads Open3D
+    from bodyscan.registration.rig_calibration import RigCalibration
 
 PANEL = "Builder: calibrate a rig"
 
@@ -86,22 +89,11 @@ def calibrate_rig(
     overwrite: OverwriteCalibration = False,
 ) -> None:
     """Calibrate every pair of a rig and join them in one frame."""
-    from bodyscan.cli import tables
-    from bodyscan.registration.storage import refuse_existing
     from bodyscan.workflows.calibrate_rig import calibrate_folder
 
-    out = out or rig_file.parent / "calibration"
-    require_writable(out)
-    refuse_existing(out, overwrite)
+    out = _calibration_folder(rig_file, out, overwrite)
     with output.stages() as progress:
-        found, saved = calibrate_folder(rig_file, out, progress)
-    output.notes(found.notes)
-    output.failures(found.failed)
-    with output.optional("table"):
-        output.show(tables.calibration_table(found))
-        output.figures(**tables.calibration_figures(found))
-    output.say(*found.advice)
-    output.made("calibration", saved)
+        _say_calibration(output, *calibrate_folder(rig_file, out, progress))
 
 
 def import_(
@@ -120,18 +112,30 @@ def import_(
     overwrite: OverwriteCalibration = False,
 ) -> None:
     """Take over calibrations made elsewhere, from the files that the rig file names as `known`."""
-    from bodyscan.cli import tables
-    from bodyscan.registration.storage import refuse_existing
     from bodyscan.workflows.import_rig import import_folder
 
-    out = out or rig_file.parent / "calibration"
-    require_writable(out)
-    refuse_existing(out, overwrite)
-    found, saved = import_folder(rig_file, out, sigma_px)
+    out = _calibration_folder(rig_file, out, overwrite)
+    _say_calibration(output, *import_folder(rig_file, out, sigma_px))
+
+
+def _calibration_folder(rig_file: Path, out: Path | None, overwrite: bool) -> Path:
+    from bodyscan.registration.storage import refuse_existing
+
+    folder = out or rig_file.parent / "calibration"
+    require_writable(folder)
+    refuse_existing(folder, overwrite)
+    return folder
+
+
+def _say_calibration(output: Output, found: RigCalibration, saved: Path) -> None:
+    from bodyscan.cli import tables
+
     output.notes(found.notes)
     output.failures(found.failed)
-    output.show(tables.calibration_table(found))
-    output.figures(**tables.calibration_figures(found))
+    with output.optional("table"):
+        output.show(tables.calibration_table(found))
+        output.figures(**tables.calibration_figures(found))
+    output.say(*found.advice)
     output.made("calibration", saved)
 
 
