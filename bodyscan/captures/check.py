@@ -9,7 +9,7 @@ from itertools import groupby
 from pathlib import Path
 
 from bodyscan.captures.folder import Captures, ImageSequence, join_captures, open_folder, open_scan
-from bodyscan.captures.image_faults import absence, header_fault
+from bodyscan.captures.image_faults import NO_INVERSES, absence, header_fault
 from bodyscan.captures.unlisted_images import find_unlisted_images
 from bodyscan.errors import CaptureError
 from bodyscan.files.model import did_you_mean
@@ -100,7 +100,9 @@ def check(
         errors += _frame_errors(calibration, good)
         errors += _untied(rig, good)
         errors += filter(None, map(_too_few, rig.pairs, counts))
-    warnings = [] if rig.calibration else [f"{rig_path}: names no calibration captures"]
+    silent = rig.calibration or rig.is_known
+    warnings = [] if silent else [f"{rig_path}: names no calibration captures"]
+    warnings += [NO_INVERSES] if any(map(_lacks_inverses, sequences)) else []
     warnings += filter(None, map(_unlisted_images, captures))
     warnings += map(_turned, filter(lambda board: board.looks_same_turned, rig.boards))
     warnings += filter(None, map(_few, rig.pairs, counts)) if calibration else ()
@@ -192,6 +194,11 @@ def _few(pair: Pair, count: PairCount) -> str | None:
     if not FEWEST_SHOTS <= have < ENOUGH_SHOTS:
         return None
     return f"pair {pair.name}: {have} board poses will do, {ENOUGH_SHOTS} or more are better"
+
+
+def _lacks_inverses(sequence: ImageSequence) -> bool:
+    """Whether all inverses are missing, and nothing else."""
+    return bool(sequence.missing) and set(sequence.missing) == set(sequence.inverses)
 
 
 def _empty_shots(captures: Captures) -> list[str]:

@@ -9,18 +9,19 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from bodyscan.arrays import Array
 from bodyscan.captures.captures_file import FILE_NAME, ShotEntry, load_captures_file
 from bodyscan.captures.listing import Listing
 from bodyscan.errors import CaptureError
-from bodyscan.files.corners_vnl import read_corners
 from bodyscan.files.relative_text import relative_text
 from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import SHOT, fill, has_field, shot_pattern, with_exposure
+
+if TYPE_CHECKING:
+    from bodyscan.arrays import Array
 
 SUFFIXES = {".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
 """Of images, whatever takes them."""
@@ -34,8 +35,9 @@ class ImageSequence:
 
     coded: the images of the stripe code, in the order of `FrameNames.of_code`; () where only the
     lit image, or that of the board, was taken. lit, dark, board: None where there is no such image.
-    missing: those of the paths that are not there.  exposure: its name, where the rig file names
-    several; longer: the same images of the longer ones, in their order.
+    missing: those of the paths that are not there.  inverses: those of `coded`.
+    exposure: its name, where the rig file names several; longer: the same images of the
+    longer ones, in their order.
     """
 
     pair: str
@@ -47,6 +49,7 @@ class ImageSequence:
     board: Path | None = None
     exposure: str = ""
     longer: tuple[ImageSequence, ...] = ()
+    inverses: tuple[Path, ...] = ()
 
     @property
     def has_stripes(self) -> bool:
@@ -137,7 +140,9 @@ def open_captures(rig: Rig, rig_path: Path) -> Captures:
         raise CaptureError(
             "the rig file names no calibration captures",
             where=str(rig_path),
-            remedy="Add `calibration:` with a folder; docs/formats.md shows how.",
+            remedy="All its pairs are `known`: take them as they are with `bodyscan import`."
+            if rig.is_known
+            else "Add `calibration:` with a folder; docs/formats.md shows how.",
         )
     parts = tuple(open_folder(rig, rig_path, entry) for entry in rig.calibration)
     return replace(join_captures(parts), base=Path(rig_path).parent)
@@ -148,6 +153,8 @@ def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
     folder, template = capture_path(rig_path, entry), entry.files or rig.files
     if entry.corners is None:
         return _open(rig, folder, "calibration", template, entry.shots)
+    from bodyscan.files.corners_vnl import read_corners
+
     named = _corners_by_path(read_corners(Path(rig_path).parent / entry.corners), template)
     captures = _open(rig, folder, "calibration", template, entry.shots, tuple(named))
     return replace(captures, corners={folder / name: own for name, own in named.items()})
@@ -246,6 +253,13 @@ def _open(
         sequence for shot in shots for sequence in _sequences(rig, listing, template, shot)
     )
     if not sequences:
+        above = _folder_above(rig, folder, template)
+        if above is not None:
+            raise CaptureError(
+                f"is one shot of rig {rig.name}, by the template {template}",
+                where=str(folder),
+                remedy=f"Give the folder above it, {above}, or take {{shot}}/ out of `files`.",
+            )
         example = fill(first, shot="SHOT", pair=rig.pairs[0].name, frame=_some_frame(rig))
         raise CaptureError(
             f"holds no image of rig {rig.name} by the template {template}",
@@ -257,6 +271,15 @@ def _open(
     if file is None:
         return captures
     return replace(captures, when=file.when, subject=file.subject, simulated=bool(file.simulated))
+
+
+def _folder_above(rig: Rig, folder: Path, template: str) -> Path | None:
+    """The folder that holds this one, if the template fits there and this one is a shot of it."""
+    here = Path(os.path.abspath(folder))
+    if not (template.startswith("{shot}/") and re.fullmatch(SHOT, here.name)):
+        return None
+    listing, shot = Listing(here.parent, follow_links=rig.follow_links), ShotEntry(name=here.name)
+    return here.parent if any(_sequences(rig, listing, template, shot)) else None
 
 
 def _some_image(folder: Path) -> str:
@@ -366,7 +389,11 @@ def _sequence(rig: Rig, listing: Listing, template: str, shot: str, pair: Pair) 
     dark_name = frames.dark if any(way.uses_dark for way in code.directions) else None
     lit, dark, board = map(files.path, (frames.lit, dark_name, frames.board))
     coded = tuple(filter(None, map(files.path, frames.of_code(code))))
-    return ImageSequence(pair.name, shot, lit, dark, coded, tuple(files.missing), board)
+    counts = [each for way in code.directions for each in way.image_counts.items()]
+    kinds = [kind.name for kind, count in counts for _ in range(count)]
+    inverses = tuple(p for p, kind in zip(coded, kinds, strict=True) if kind == "inverse")
+    missing = tuple(files.missing)
+    return ImageSequence(pair.name, shot, lit, dark, coded, missing, board, inverses=inverses)
 
 
 def _exposed(

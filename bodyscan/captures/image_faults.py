@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from bodyscan.captures.image_header import NoImage, read_header
 from bodyscan.errors import BadInput, ImageError
 from bodyscan.rig.templates import ANYTHING
+
+NO_INVERSES = (
+    "All inverses and nothing else are missing: if none were projected, write `inverses: false` below "
+    "`projector` (lit and dark images are needed then)."
+)
 
 
 def header_fault(path: Path, width: int, height: int) -> str | None:
@@ -53,6 +59,20 @@ def image_error(what: str, path: Path, pair: str, shot: str, *, remedy: str = ""
     taken = ", ".join(f"{kind} {name}" for kind, name in (("pair", pair), ("shot", shot)) if name)
     where = f"{path} ({taken})" if taken else str(path)
     return ImageError(what, where=where, remedy=remedy or _remedy(what))
+
+
+def missing_error(
+    missing: Sequence[Path], inverses: Sequence[Path], pair: str, shot: str
+) -> ImageError:
+    """An ImageError for one image or more that are not there, the first of them named.
+
+    inverses: those of the sequence, missing or not.
+    """
+    what = absence(missing[0])
+    remedy = NO_INVERSES if set(missing) == set(inverses) else _remedy(what)
+    if len(missing) > 1:
+        what += f", and {len(missing) - 1} more of this shot cannot be found"
+    return image_error(what, missing[0], pair, shot, remedy=remedy)
 
 
 def _remedy(what: str) -> str:

@@ -15,7 +15,7 @@ from bodyscan.captures.exposures import merge_exposures
 from bodyscan.captures.folder import ImageSequence
 from bodyscan.captures.grey_levels import Raw, as_greys, full_scale
 from bodyscan.captures.grey_png import decode_grey_png
-from bodyscan.captures.image_faults import header_fault, image_error
+from bodyscan.captures.image_faults import header_fault, image_error, missing_error
 from bodyscan.captures.image_header import png_damage
 from bodyscan.errors import ImageError
 from bodyscan.files.regular import read_regular
@@ -103,6 +103,9 @@ def _read_stack(sequence: ImageSequence, camera: CameraSpec, workers: int) -> Gr
     """(F, H, W) grey levels of one exposure: lit and dark, if there are such, and those of the code."""
     taken = [path for path in (sequence.lit, sequence.dark) if path is not None]
     paths = (*taken, *sequence.coded)
+    missing = [path for path in paths if path in sequence.missing]
+    if missing:
+        raise missing_error(missing, sequence.inverses, sequence.pair, sequence.shot)
     first = _read_raw(paths[0], camera, sequence.pair, sequence.shot)
     stack = np.empty((len(paths), *first.shape), first.dtype)
     stack[0] = first

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.merging import merge
@@ -83,5 +85,6 @@ def fuse(
         calibration.rig.volume,
         fused.contradicted,
         unjudged=[name for name, pair in calibration.pairs.items() if pair.quality.unjudged],
+        cameras=np.array([at.translation for at in calibration.rig_from_camera.values()]),
     )
     return Scan(cloud, surface, alignment, points, failed, verdict, tuple(seen), placing)

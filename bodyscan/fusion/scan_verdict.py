@@ -9,6 +9,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from bodyscan.alignment.icp import Alignment
+from bodyscan.arrays import Array
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.rings import rings
 from bodyscan.mesh.topology import face_areas
@@ -31,6 +32,8 @@ SOME_OUTSIDE, MOST_OUTSIDE = 0.01, 0.2
 RIM_MM, AT_RIM = 10.0, 3e-4
 BAND_MM = 50.0
 SOLES_MM = 50.0
+ONE_SIDE = 0.7
+"""Cosine to the cameras' mean direction: within 45 degrees of it all of them see the same half."""
 UNKNOWN_BAND = 0.5
 
 
@@ -42,10 +45,13 @@ def grade_scan(
     volume: Volume,
     contradicted: float = 0.0,
     unjudged: Sequence[str] = (),
+    cameras: Array | None = None,
 ) -> Verdict:
     """The worst of all findings decides; the reasons come worst first. contradicted: see `merge`.
 
     unjudged: pairs whose calibration was imported and says nothing of how exact it is.
+    cameras: (N, 3) where those of the whole rig stand; None for all round.  What none of them could
+    see is no reason to repeat.
 
     A check that fails by itself leaves the scan usable at best, and says so.
     """
@@ -58,7 +64,7 @@ def grade_scan(
         "cuts": lambda: _cuts(cloud, volume),
         "omissions": lambda: _omissions(cloud, mesh),
         "contacts": lambda: _contacts(mesh),
-        "gaps": lambda: _gaps(mesh),
+        "gaps": lambda: _other_side(mesh) if _see_one_side(cloud, cameras) else _gaps(mesh),
     }
     findings: list[Finding] = []
     failures: list[str] = []
@@ -175,6 +181,24 @@ def _contacts(mesh: BodyMesh) -> Iterator[Finding]:
             f"parts of the body touch: a closed ring on the {side} from {ring.low_mm:.0f} to "
             f"{ring.high_mm:.0f} mm (a hand on the hip?); girths there hold both parts",
         )
+
+
+def _see_one_side(cloud: BodyCloud, cameras: Array | None) -> bool:
+    """Whether all cameras stand on the same side of what was measured."""
+    if cameras is None:
+        return False
+    way = cameras - cloud.points.mean(axis=0)
+    way = way / np.linalg.norm(way, axis=1, keepdims=True)
+    middle = way.sum(axis=0)
+    return bool(np.all(way @ middle >= ONE_SIDE * np.linalg.norm(middle)))
+
+
+def _other_side(mesh: BodyMesh) -> Iterator[Finding]:
+    yield (
+        "usable",
+        "one side only was seen, as the cameras stand: the mesh's other side is filled "
+        f"({mesh.filled_share:.0%} of its surface)",
+    )
 
 
 def _gaps(mesh: BodyMesh) -> Iterator[Finding]:

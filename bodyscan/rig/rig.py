@@ -62,6 +62,12 @@ class Rig(Model):
         return {board.name: board for board in self.boards}[name]
 
     @property
+    def is_known(self) -> bool:
+        """Whether another program calibrated all of it, projectors too."""
+        known = [(pair.known, pair.projector) for pair in self.pairs]
+        return all(own and (own.projector or not projector) for own, projector in known)
+
+    @property
     def poles(self) -> dict[str, str]:
         """The pole of each pair that stands on one."""
         return {pair.name: pair.pole for pair in self.pairs if pair.pole}

@@ -14,6 +14,7 @@ from bodyscan.captures.captures_file import (
     load_captures_file,
     write_captures_file,
 )
+from bodyscan.captures.check import check
 from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import CaptureError
 from bodyscan.rig.rig_file import load_rig
@@ -261,6 +262,36 @@ def test_folders_that_are_not_there_or_hold_nothing(tmp_path: Path) -> None:
     with_rig(tmp_path, RIG.replace("calibration:\n  - folder: captures\n", ""))
     with pytest.raises(CaptureError, match="names no calibration captures"):
         opened(rig_path)
+
+
+def test_a_shots_own_folder_is_told_from_the_one_above(tmp_path: Path) -> None:
+    rig = load_rig(write_small_captures(tmp_path))
+    above = tmp_path / "captures"
+    with pytest.raises(CaptureError, match=f"Give the folder above it, {above}, or") as caught:
+        open_scan(rig, above / "b1")
+    assert "correct `files`" not in caught.value.remedy
+    write(tmp_path / "other" / "b1" / "x.png", b"")
+    with pytest.raises(CaptureError, match="correct `files`"):
+        open_scan(rig, tmp_path / "other" / "b1")
+
+
+def test_a_rig_that_is_known_is_imported(tmp_path: Path) -> None:
+    rig_path = with_rig(tmp_path, KNOWN)
+    with pytest.raises(CaptureError, match="`bodyscan import`"):
+        opened(rig_path)
+    assert check(rig_path).warnings == ()
+    with_rig(tmp_path, KNOWN.replace(", projector: {matrix: Kp}", ""))
+    assert "names no calibration captures" in check(rig_path).warnings[0]
+
+
+KNOWN = """\
+name: one
+pairs:
+  - name: only
+    camera: {width: 40, height: 30}
+    projector: {stripes: 12, direction: horizontal}
+    known: {file: c.yaml, format: opencv, units: mm, camera: {matrix: Kc}, projector: {matrix: Kp}}
+"""
 
 
 @pytest.mark.parametrize("link", ["b1/p1/lit.png", "b1/p1", "b1", "captures.yaml"])

@@ -308,3 +308,26 @@ def test_a_named_pipe_among_the_images_is_not_waited_for(tmp_path: Path) -> None
     with pytest.raises(BadInput, match="is not a regular file"):
         load_rig(tmp_path / "pipe.yaml")
     assert "is not a regular file" in "".join(report_lines(check(tmp_path / "rig.yaml")))
+
+
+def test_all_that_is_missing_is_counted_and_absent_inverses_are_told(tmp_path: Path) -> None:
+    sequence = first_sequence(tmp_path)
+    assert len(sequence.inverses) == BITS
+    for path in sequence.inverses:
+        path.unlink()
+    with pytest.raises(ImageError, match=f"and {BITS - 1} more") as caught:
+        read_sequence(reopened(tmp_path), CAMERA)
+    assert str(sequence.inverses[0]) in caught.value.where
+    assert "`inverses: false`" in caught.value.remedy
+    assert any("`inverses: false`" in line for line in report_lines(check(tmp_path / "rig.yaml")))
+    sequence.coded[0].unlink()
+    with pytest.raises(ImageError, match=f"and {BITS} more") as caught:
+        read_sequence(reopened(tmp_path), CAMERA)
+    assert "inverses" not in caught.value.remedy
+
+
+def reopened(folder: Path) -> ImageSequence:
+    rig_path = folder / "rig.yaml"
+    sequence = open_captures(load_rig(rig_path), rig_path).sequence("p1", "b1")
+    assert sequence is not None
+    return sequence

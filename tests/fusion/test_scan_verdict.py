@@ -140,6 +140,18 @@ def test_half_the_pairs_give_half_a_body(images: list[RangeImage]) -> None:
     assert "of the surface is filled" in said(scan)
 
 
+def test_what_no_camera_of_the_rig_could_see_is_no_reason_to_repeat(
+    images: list[RangeImage],
+) -> None:
+    """A rig that stands on one side: the mesh's other half is filled in every scan of it."""
+    one_side = {name: at for name, at in placings().items() if name in ("p2-2", "p2-3")}
+    scan = fused([image for image in images if image.pair in one_side], placed=one_side)
+    assert scan.verdict.grade == "usable"
+    assert "one side only was seen" in said(scan)
+    assert "of the surface is filled" not in said(scan)
+    assert "stature" not in said(scan)
+
+
 def test_cut_off_at_the_top_of_the_volume(images: list[RangeImage]) -> None:
     low = RIG.volume.model_copy(update={"top_mm": 1500.0})
     scan = fused(images, volume=low)
