@@ -26,6 +26,7 @@ from bodyscan.rig.rig_file import load_rig
 from bodyscan.workflows.decode import ViewKey, decode_on_boards
 from bodyscan.workflows.find_boards import (
     HERE,
+    FoundBoards,
     calibrate_cameras,
     find_all_boards,
     locate_views,
@@ -75,16 +76,18 @@ def calibrate_folder(
 def join_rig(
     rig: Rig,
     captures: Captures,
-    boards: Outcome[list[BoardView]],
+    boards: FoundBoards,
     progress: Progress = silent,
     *,
     folder: Path = HERE,
 ) -> JoinedRig:
     """From boards found in images to the calibration, with nothing in it that it stands without."""
     cameras = calibrate_cameras(rig, boards.value, progress, folder=folder)
+    cameras = replace(cameras, failures=boards.blamed_on_images(cameras.failures, captures))
+    searched = len(captures.sequences) - len(boards.refused)
     if not cameras.value:
         seen = [note for note in boards.notes if "no board found:" in note][:MOST_SEEN]
-        findings = describe_findings(rig, boards.value, len(captures.sequences))
+        findings = describe_findings(rig, boards.value, searched)
         remedy = "\n  ".join([*filter(None, [findings]), *seen])
         raise _nothing_calibrated(rig, cameras.failures, remedy)
     with step(progress, "joining the pairs"):
@@ -112,7 +115,7 @@ def join_rig(
         tuple(captures.relative(note) for note in notes),
         seen=seen_corners(placed, pairs),
     )
-    return JoinedRig(calibration, placed, boards.value, len(captures.sequences))
+    return JoinedRig(calibration, placed, boards.value, searched)
 
 
 def _nothing_calibrated(rig: Rig, failed: Mapping[str, str], remedy: str = "") -> FailedWork:

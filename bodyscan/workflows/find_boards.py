@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -49,28 +51,47 @@ LOOKED_AT = 3
 """Images of a pair without a board that are looked at closely: seconds each."""
 
 
-def find_all_boards(
-    rig: Rig, captures: Captures, progress: Progress = silent
-) -> Outcome[list[BoardView]]:
+@dataclass(frozen=True, eq=False)
+class FoundBoards(Outcome[list[BoardView]]):
+    """refused: images in which no board could be looked for, each with the error."""
+
+    refused: Mapping[ImageSequence, BodyscanError] = field(default_factory=dict)
+
+    def blamed_on_images(self, failures: Mapping[str, str], captures: Captures) -> dict[str, str]:
+        """The failures of cameras; of those that too few images could be used of, why."""
+        return {name: self._refusal(name, captures) or why for name, why in failures.items()}
+
+    def _refusal(self, pair: str, captures: Captures) -> str:
+        taken = sum(sequence.pair == pair for sequence in captures.sequences)
+        errors = [error for sequence, error in self.refused.items() if sequence.pair == pair]
+        if not errors or taken - len(errors) >= FEWEST_POSES:
+            return ""
+        # The commonest: of few images, one may be bad for a reason of its own.
+        usual = Counter(error.what for error in errors).most_common(1)[0][0]
+        error = next(error for error in errors if error.what == usual)
+        return f"{len(errors)} of its {taken} images cannot be used: {error}"
+
+
+def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -> FoundBoards:
     """Boards in all lit images, or those taken for the board; images that cannot be read, or show no
     board, are noted."""
 
-    def find(sequence: ImageSequence) -> tuple[list[BoardView], str | None]:
+    def find(sequence: ImageSequence) -> tuple[list[BoardView], BodyscanError | None]:
         try:
             if sequence.seen_in in captures.corners:
                 return _given_view(rig, captures, sequence), None
             image = read_board_image(sequence, rig.pair(sequence.pair))
             found = find_boards(image, rig.boards, pair=sequence.pair, shot=sequence.shot)
         except BodyscanError as error:
-            return [], str(error)
+            return [], error
         return found, None
 
     results = threaded(find, captures.sequences, stage="finding boards", progress=progress)
     views, odd = without_odd_mirrored([view for found, _ in results for view in found])
     without = [
         sequence
-        for sequence, (found, note) in zip(captures.sequences, results, strict=True)
-        if not found and note is None and sequence.seen_in not in captures.corners
+        for sequence, (found, error) in zip(captures.sequences, results, strict=True)
+        if not found and error is None and sequence.seen_in not in captures.corners
     ]
     looked_at = _look_closer(rig, views, without)
     missing = [
@@ -78,8 +99,13 @@ def find_all_boards(
         + (f": {looked_at[s]}" if s in looked_at else "")
         for s in without
     ]
-    notes = [note for _, note in results if note]
-    return Outcome(views, (*notes, *missing, *odd, *appearance_notes(rig, views)))
+    refused = {
+        sequence: error
+        for sequence, (_, error) in zip(captures.sequences, results, strict=True)
+        if error is not None
+    }
+    notes = (*map(str, refused.values()), *missing, *odd, *appearance_notes(rig, views))
+    return FoundBoards(views, notes, refused=refused)
 
 
 def _given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[BoardView]:

@@ -20,7 +20,7 @@ from bodyscan.registration.rig_solve import RigSolution
 @dataclass(frozen=True, eq=False)
 class JoinedRig:
     """A calibration as it stands, and what remarks on it come from: the joint solve, which holds
-    pairs that failed later too, all boards that were found, and in how many images."""
+    pairs that failed later too, all boards that were found, and how many images could be searched."""
 
     calibration: RigCalibration
     placed: RigSolution

@@ -15,8 +15,8 @@ from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.outcome import Outcome
 from bodyscan.rig.rig import Rig
+from bodyscan.workflows.find_boards import FoundBoards
 
 CAMERA = Camera(1510.0, 1512.0, -0.5, 645.0, 508.0, Radial(-0.1, 0.05), 1280, 1024)
 NOISE_PX = 0.03
@@ -40,8 +40,8 @@ class SeenBoards:
         )
         return Captures(self.rig, (Path(),), tuple(sorted({s for s, _ in keys})), sequences)
 
-    def found(self, views: Iterable[BoardView]) -> Outcome[list[BoardView]]:
-        return Outcome(list(views))
+    def found(self, views: Iterable[BoardView]) -> FoundBoards:
+        return FoundBoards(list(views))
 
 
 def seen_boards(

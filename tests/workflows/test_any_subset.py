@@ -27,6 +27,7 @@ from bodyscan.rig.rig_frame import RigFrame
 from bodyscan.workflows import calibrate_rig
 from bodyscan.workflows.calibrate_rig import join_rig
 from bodyscan.workflows.decode import ViewKey
+from bodyscan.workflows.find_boards import FoundBoards
 from bodyscan.workflows.rig_remarks import remarked
 
 Views = Sequence[BoardView]
@@ -149,7 +150,7 @@ def test_any_subset_of_images_with_stripes_does_too(
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(calibrate_rig, "decode_on_boards", decoded)
         try:
-            joined = join_rig(detected.rig, detected.captures, Outcome(views))
+            joined = join_rig(detected.rig, detected.captures, FoundBoards(views))
         except BodyscanError:
             return
         found = remarked(joined)
