@@ -29,18 +29,21 @@ Group = dict[str, RigidTransform]
 class RelativePose:
     """What the boards shared by two groups of pairs say of their relative pose.
 
-    votes: how many shared targets agree with it.  rivals: votes of the best contradicting pose,
+    agreeing: the shared targets that agree with it.  rivals: votes of the best contradicting pose,
     which only boards with an ambiguous numbering (or wrong views) can have.  ambiguous: whether any
     of the boards may be numbered in more than one way.
     """
 
     first_from_second: RigidTransform
     targets: tuple[Target, ...]
-    votes: int
+    agreeing: tuple[Target, ...]
     rivals: int
     corners: int
-
     ambiguous: bool
+
+    @property
+    def votes(self) -> int:
+        return len(self.agreeing)
 
     @property
     def decided(self) -> bool:
@@ -219,8 +222,10 @@ def _tie(
     clearest = sorted(proposals, key=lambda target: -corners[target])[:MOST_CANDIDATES]
     candidates = [p for target in clearest for p in proposals[target]]
     gaps = np.array([_gaps(candidate, everything, reach) for candidate in candidates])
-    votes = [len(set(owner[gap < 2.0 * AGREEMENT * reach])) for gap in gaps]
+    voters = [np.unique(owner[gap < 2.0 * AGREEMENT * reach]) for gap in gaps]
+    votes = [len(own) for own in voters]
     best = int(np.argmax(votes))
+    shared = tuple(proposals)
     rivals = [
         count
         for count, candidate in zip(votes, candidates, strict=True)
@@ -228,8 +233,8 @@ def _tie(
     ]
     return RelativePose(
         candidates[best],
-        tuple(proposals),
-        votes[best],
+        shared,
+        tuple(shared[number] for number in voters[best]),
         max(rivals, default=0),
         sum(corners.values()),
         ambiguous,
@@ -261,11 +266,26 @@ def _refuse_disconnected(graph: nx.Graph) -> None:
 
 
 def _open_tie(first: Group, second: Group, tie: RelativePose) -> RigDisconnected:
-    shots = ", ".join(sorted({shot for shot, _ in tie.targets})[:6])
+    remedy = (
+        "capture one or two more shots that both see, the board tilted differently; or use a ChArUco "
+        "board, or one whose columns and rows differ in parity"
+    )
+    found = f"shots {_shots(tie.targets)}"
+    if 1 < tie.votes < len(tie.targets):
+        # Shots that agree with no other, whichever end they are numbered from, may be wrong.
+        found += f"; at best {_shots(tie.agreeing)} agree"
+        remedy = (
+            "look whether the pictures of the other shots were taken together and bear each other's "
+            f"names (two shots exchanged, say): correct these or leave them out. Else {remedy}"
+        )
     return RigDisconnected(
         f"the relative pose of {', '.join(sorted(first))} and {', '.join(sorted(second))} stays open: "
         "their shared board may be numbered from either end, and their views do not settle which "
-        f"(shots {shots})",
-        remedy="capture one or two more shots that both see, the board tilted differently; or use "
-        "a ChArUco board, or one whose columns and rows differ in parity",
+        f"({found})",
+        remedy=remedy,
     )
+
+
+def _shots(targets: Iterable[Target]) -> str:
+    """Their names, the first six."""
+    return ", ".join(sorted({shot for shot, _ in targets})[:6])

@@ -114,6 +114,26 @@ def test_an_ambiguous_board_seen_once_is_not_guessed() -> None:
         solve_rig(rig, views, cameras)
 
 
+def test_exchanged_shots_of_an_ambiguous_board_are_told_from_the_others() -> None:
+    board = Board(name="plain", columns=9, rows=7, square_mm=70)
+    placings, cameras = ring_of_cameras(poles=1, heights=(900, 1100))
+    views, _ = ring_views(placings, cameras, shots=60, board=board)
+    seen = [{view.shot for view in views if view.pair == name} for name in placings]
+    a, b, c, d, *_ = shots = sorted(seen[0] & seen[1])[:6]
+    # Of six shots four bear each other's names, in one camera.
+    names = {a: b, b: c, c: d, d: a}
+    views = [
+        replace(view, shot=names.get(view.shot, view.shot)) if view.pair == "p1-1" else view
+        for view in views
+        if view.shot in shots
+    ]
+    rig = ring_rig(placings).model_copy(update={"boards": (board,)})
+    with pytest.raises(RigDisconnected) as caught:
+        solve_rig(rig, views, cameras)
+    assert f"at best {shots[4]}, {shots[5]} agree" in str(caught.value)
+    assert "two shots exchanged" in str(caught.value)
+
+
 def test_the_board_can_fix_the_frame() -> None:
     placings, cameras = ring_of_cameras()
     views, truth = ring_views(placings, cameras)
