@@ -76,6 +76,10 @@ class DecodingFailed(FailedWork):
     """The images of a stripe sequence do not add up to a stripe code."""
 
 
+class WrongDirection(DecodingFailed):
+    """Stripes run the other way than the rig file says."""
+
+
 class DegeneratePoses(FailedWork):
     """The board poses cannot determine the camera (too few, or a pure translation)."""
 

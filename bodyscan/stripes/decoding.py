@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from bodyscan.arrays import Greys
-from bodyscan.errors import DecodingFailed
+from bodyscan.errors import DecodingFailed, WrongDirection
 from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap
@@ -33,13 +33,26 @@ def decode_stripes(
     Raises DecodingFailed, naming the image where it can be told, if they do not add up.
     """
     try:
-        maps = [
-            _decode(way, lit, dark, images, limits if way is code else None)
-            for way, images in zip(code.directions, images_by_kind(code, coded), strict=True)
-        ]
+        own, *others = images_by_kind(code, coded)
+        found = _decode(code, lit, dark, own, limits)
+        if code.crossing is None:
+            return found
+        return replace(found, crossing=_decode_crossing(code.crossing, lit, dark, others[0]))
     except DecodingFailed as error:
         raise DecodingFailed(error.what, where=where, remedy=error.remedy) from error
-    return maps[0] if len(maps) == 1 else replace(maps[0], crossing=maps[1])
+
+
+def _decode_crossing(
+    way: StripeCode, lit: Greys | None, dark: Greys | None, coded: Mapping[ImageKind, Greys]
+) -> StripeMap:
+    """The map of the stripes that cross. What is wrong with them is said to be wrong with these."""
+    try:
+        return _decode(way, lit, dark, coded, None)
+    except DecodingFailed as error:
+        remedy = error.remedy
+        if isinstance(error, WrongDirection):
+            remedy = "exchange the lists of frames and of `crossing`, or correct `direction`"
+        raise DecodingFailed(f"stripes of `crossing`: {error.what}", remedy=remedy) from error
 
 
 def _decode(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
-from bodyscan.errors import DecodingFailed
+from bodyscan.errors import DecodingFailed, WrongDirection
 from bodyscan.stripes.bit_clarity import FINE_BITS, LitPairs, check_pairs, check_seen
 from bodyscan.stripes.bit_words import WordCode
 from bodyscan.stripes.clear_changes import clear_changes
@@ -199,7 +199,7 @@ def _check_folds(stripes: NDArray[np.int32], good: Mask) -> None:
 
 
 def check_direction(numbers: NDArray[Any], good: Mask, turned: bool) -> None:
-    """Raises DecodingFailed if stripes change from line to line rather than along lines.
+    """Raises WrongDirection if stripes change from line to line rather than along lines.
 
     numbers: (L, P) code words or stripes.  turned: see `ScanLines`.
     """
@@ -208,9 +208,10 @@ def check_direction(numbers: NDArray[Any], good: Mask, turned: bool) -> None:
     ]
     if flips[0] > WRONG_WAY * flips[1]:
         seen, said = ("vertical", "horizontal") if turned else ("horizontal", "vertical")
-        raise DecodingFailed(
+        raise WrongDirection(
             f"the stripes run {seen}ly in the picture, not {said}ly",
-            remedy=f"write `direction: {seen}` in the rig file if this camera stands so",
+            remedy=f"write `direction: {seen}` in the rig file if this camera stands so; with "
+            "`crossing`, see first whether its frames and the others are exchanged",
         )
 
 

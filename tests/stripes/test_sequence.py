@@ -11,6 +11,7 @@ from stripe_rendering import Sequence, decode_gray, render_sequence
 from bodyscan.arrays import Bytes
 from bodyscan.errors import DecodingFailed
 from bodyscan.geometry.light_planes import Axis
+from bodyscan.stripes.codes import stripe_code
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_map import StripeMap
@@ -204,3 +205,17 @@ def test_a_finest_bit_that_no_lens_shows_costs_pixels_not_the_capture(good: Sequ
     assert 0.3 < np.sqrt(np.mean((error / found.sigma[told]) ** 2)) < 2.0
     with pytest.raises(DecodingFailed, match="bit 6 look alike"):
         read(with_frame(blurred, "inverses", BITS - 1, blurred.patterns[BITS - 1]))
+
+
+def test_what_is_wrong_with_crossing_stripes_is_said_of_them(good: Sequence) -> None:
+    """Rows twice: the second time as if they were columns; and the other way about."""
+    coded = np.concatenate([good.patterns, good.inverses])
+    for direction, said in (("horizontal", "stripes of `crossing`: the"), ("vertical", "^the")):
+        code = stripe_code(
+            {"code": "gray", "stripes": STRIPES, "direction": direction}
+            | {"crossing": {"stripes": STRIPES}}
+        )
+        with pytest.raises(DecodingFailed, match=f"{said} stripes run horizontally") as caught:
+            decode_stripes(code, good.lit, good.dark, np.concatenate([coded, coded]))
+        assert "exchange" in caught.value.remedy
+        assert ("direction: horizontal" in caught.value.remedy) == (direction == "vertical")
