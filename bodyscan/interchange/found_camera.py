@@ -5,12 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from bodyscan.arrays import Array
 from bodyscan.errors import CalibrationFileError
 from bodyscan.files.model import did_you_mean
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.transforms import RigidTransform
+
+SHIFTED = 0.5
+"""In pictures: how far beside its picture the axis of a camera of known size may lie: a shift lens
+moves it by less."""
+STEPS = np.linspace(0.25, 0.75, 5)
+INNER = np.stack(np.meshgrid(STEPS, STEPS), axis=-1)
+"""Where every lens has rays; one that was fitted without boards in the corners may fold there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +40,8 @@ class FoundCamera:
     def camera(self, width: int, height: int) -> Camera:
         """With a picture of that size, px.
 
-        Raises CalibrationFileError if the file says another, or its axis is beside such a picture.
+        Raises CalibrationFileError if the file says another, its axis is beside such a picture, or
+        its lens folds inside of it.
         """
         told = "calibrate that camera as it is used now, or correct the size in the rig file"
         if self.size is not None and self.size != (width, height):
@@ -42,7 +52,11 @@ class FoundCamera:
                 remedy=told,
             )
         u0, v0 = float(self.matrix[0, 2]), float(self.matrix[1, 2])
-        if self.size is None and not (0.0 < u0 < width and 0.0 < v0 < height):
+        aside = SHIFTED if self.size else 0.0
+        if not (
+            -aside * width < u0 < (1.0 + aside) * width
+            and -aside * height < v0 < (1.0 + aside) * height
+        ):
             raise CalibrationFileError(
                 f"has its principal point at ({u0:.1f}, {v0:.1f}), outside of a picture of "
                 f"{width} x {height} px: it is of another camera, or of pictures of another size",
@@ -52,12 +66,25 @@ class FoundCamera:
         return self.projector(width, height)
 
     def projector(self, width: int, height: int) -> Camera:
-        """With a picture of that size, px; many projectors shine upwards, their axis beside it."""
+        """With a picture of that size, px; many projectors shine upwards, their axis beside it.
+
+        Raises CalibrationFileError if the lens folds inside of it.
+        """
         a = self.matrix
-        return Camera(
+        camera = Camera(
             float(a[0, 0]), float(a[1, 1]), float(a[0, 1]), float(a[0, 2]), float(a[1, 2]),
             self.lens, width, height,
         )  # fmt: skip
+        inner = INNER * [width - 1.0, height - 1.0]
+        if not np.isfinite(camera.rays(inner)).all():
+            raise CalibrationFileError(
+                f"has a lens that folds inside a picture of {width} x {height} px: distortion and "
+                "matrix do not belong together, or both to another device",
+                where=self.where,
+                remedy="name each device's own matrix and distortion in the rig file: are camera and "
+                "projector exchanged?",
+            )
+        return camera
 
 
 def camera_named(cameras: Mapping[str, FoundCamera], name: str, where: str) -> FoundCamera:

@@ -131,6 +131,36 @@ def test_what_is_scanned_lies_where_it_is(folder: Path) -> None:
     assert calibration.covariance.names == ("a", "b")
 
 
+def test_a_lens_that_is_not_the_cameras_is_named(folder: Path) -> None:
+    """A camera given a distortion that folds its picture: no ray anywhere, and no numpy warning."""
+    content = described("a")
+    store = cv2.FileStorage(str(folder / "folds.yaml"), cv2.FILE_STORAGE_WRITE)
+    for key, value in (("K", CAMERA), ("D", np.array([-9.0, 0.0, 0.0, 0.0, 0.0]))):
+        store.write(key, value)
+    store.release()
+    content["pairs"][0]["known"]["camera"] = {"matrix": "K", "distortion": "D"}
+    content["pairs"][0]["known"]["file"] = "folds.yaml"
+    content["pairs"][0]["known"]["projector"]["file"] = "foreign.yaml"
+    rig_file = write_rig_file(folder, content)
+    with pytest.raises(CalibrationFileError, match=r"folds.yaml.*folds inside a picture"):
+        import_rig(load_rig(rig_file), folder)
+
+
+def test_an_axis_far_beside_the_picture_is_named_though_the_size_fits(folder: Path) -> None:
+    shifted = CAMERA.copy()
+    shifted[0, 2] = 5000.0
+    store = cv2.FileStorage(str(folder / "far.yaml"), cv2.FILE_STORAGE_WRITE)
+    store.write("K", shifted)
+    store.write("S", np.array(SIZES["camera"]))
+    store.release()
+    content = described("a")
+    content["pairs"][0]["known"]["camera"] = {"matrix": "K", "size": "S"}
+    content["pairs"][0]["known"]["file"] = "far.yaml"
+    content["pairs"][0]["known"]["projector"]["file"] = "foreign.yaml"
+    with pytest.raises(CalibrationFileError, match="principal point"):
+        import_rig(load_rig(write_rig_file(folder, content)), folder)
+
+
 def test_python_users_import_too(folder: Path) -> None:
     rig_file = write_rig_file(folder, described("a"))
     found = bodyscan.import_calibration(rig_file, sigma_px=0.5)
