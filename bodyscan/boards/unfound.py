@@ -49,6 +49,12 @@ def _describe_markers(image: Bytes, board: Board) -> str:
         return f"{said}, which do not lie as on {board.columns} columns x {board.rows} rows"
     agreeing, fewest_rows, columns = better
     rows = -fewest_rows
+    exchanged = board.model_copy(update={"columns": board.rows, "rows": board.columns})
+    if _agreeing(exchanged, most) >= agreeing:
+        return (
+            f"{said}; {agreeing} of them fit with columns and rows exchanged: {board.rows} columns x "
+            f"{board.columns} rows"
+        )
     return (
         f"{said}; {agreeing} of them lie as on a board of {columns} columns x {rows} rows, not "
         f"{board.columns} x {board.rows}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -34,6 +35,7 @@ from bodyscan.workflows.find_boards import (
 )
 from bodyscan.workflows.rig_remarks import JoinedRig, remarked
 
+COUNTED = re.compile(r"\d+ (?=markers of|of)")
 MOST_SEEN = 3
 """Images without a board of which an error says what they show instead."""
 
@@ -83,12 +85,20 @@ def join_rig(
 ) -> JoinedRig:
     """From boards found in images to the calibration, with nothing in it that it stands without."""
     cameras = calibrate_cameras(rig, boards.value, progress, folder=folder)
-    cameras = replace(cameras, failures=boards.blamed_on_images(cameras.failures, captures))
     searched = len(captures.sequences) - len(boards.refused)
+    failures = cameras.failures
+    if searched and not boards.value:
+        # More poses of a board that is not as described would not help.
+        failures = {name: reason.partition("\n")[0] for name, reason in failures.items()}
+    cameras = replace(cameras, failures=boards.blamed_on_images(failures, captures))
     if not cameras.value:
-        seen = [note for note in boards.notes if "no board found:" in note][:MOST_SEEN]
+        shown = [note for note in boards.notes if "no board found:" in note]
+        # One image for each thing that images show instead, however many markers were counted.
+        seen: dict[str, str] = {}
+        for note in shown:
+            seen.setdefault(COUNTED.sub("", note.partition("no board found:")[2]), note)
         findings = describe_findings(rig, boards.value, searched)
-        remedy = "\n  ".join([*filter(None, [findings]), *seen])
+        remedy = "\n  ".join([*filter(None, [findings]), *list(seen.values())[:MOST_SEEN]])
         raise _nothing_calibrated(rig, cameras.failures, remedy)
     with step(progress, "joining the pairs"):
         located = locate_views(rig, boards.value, cameras.value)

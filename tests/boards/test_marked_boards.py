@@ -71,6 +71,13 @@ def test_a_column_too_many_is_refused_and_the_right_number_named(picture: Bytes)
     assert "board of 9 columns x 8 rows, not 10 x 8" in describe_unfound(picture, described)
 
 
+def test_columns_and_rows_that_are_exchanged_are_named(picture: Bytes) -> None:
+    described = MARKED.model_copy(update={"columns": 8, "rows": 9})
+    assert found(picture, described) == []
+    said = describe_unfound(picture, described)
+    assert "columns and rows exchanged: 9 columns x 8 rows" in said
+
+
 def test_rows_that_are_not_there_or_not_described_are_named(picture: Bytes) -> None:
     for rows, said in ((10, "fewer than 10 rows"), (6, "more than 6 rows")):
         described = MARKED.model_copy(update={"rows": rows})

@@ -1,4 +1,4 @@
-"""Cameras that fail because their images cannot be used are not told that the board is at fault."""
+"""Cameras that fail are told the cause once: images that cannot be used, or the board's description."""
 
 from __future__ import annotations
 
@@ -59,3 +59,11 @@ def test_a_camera_whose_images_have_another_size_is_told_so(tmp_path: Path) -> N
     assert "is 32 x 24 pixels, but the rig file says 64 x 48" in said
     assert "camera's width and height" in said
     assert "found in none of 4 images" in said  # those of R alone were searched
+
+
+def test_what_images_show_instead_of_a_board_is_said_once(tmp_path: Path) -> None:
+    blank = BLANK.astype(np.uint8)
+    said = refusal(tmp_path, blank, blank)
+    assert "found in none of 8 images" in said
+    assert said.count("no board found") == 1
+    assert "more poses" not in said
