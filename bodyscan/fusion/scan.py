@@ -86,5 +86,6 @@ def fuse(
         fused.contradicted,
         unjudged=[name for name, pair in calibration.pairs.items() if pair.quality.unjudged],
         cameras=np.array([at.translation for at in calibration.rig_from_camera.values()]),
+        agreements={image.pair: image.agreement for image in images if image.agreement},
     )
     return Scan(cloud, surface, alignment, points, failed, verdict, tuple(seen), placing)

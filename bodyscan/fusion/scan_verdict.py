@@ -14,6 +14,7 @@ from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.rings import rings
 from bodyscan.mesh.topology import face_areas
 from bodyscan.optional import optional
+from bodyscan.reconstruction.two_ways import Agreement
 from bodyscan.rig.rig import Volume
 from bodyscan.verdict import Grade, Verdict
 
@@ -46,6 +47,7 @@ def grade_scan(
     contradicted: float = 0.0,
     unjudged: Sequence[str] = (),
     cameras: Array | None = None,
+    agreements: Mapping[str, Agreement] | None = None,
 ) -> Verdict:
     """The worst of all findings decides; the reasons come worst first. contradicted: see `merge`.
 
@@ -53,11 +55,14 @@ def grade_scan(
     cameras: (N, 3) where those of the whole rig stand; None for all round.  What none of them could
     see is no reason to repeat.
 
+    agreements: of pairs that project stripes of two directions.
+
     A check that fails by itself leaves the scan usable at best, and says so.
     """
     checks: dict[str, Callable[[], Iterator[Finding]]] = {
         "pairs": lambda: _pairs(failed, alignment),
         "calibration": lambda: _calibration(unjudged),
+        "directions": lambda: _directions(agreements or {}),
         "motion": lambda: _motion(alignment),
         "contradictions": lambda: _contradictions(contradicted),
         "pieces": lambda: _company(cloud),
@@ -95,6 +100,16 @@ def _calibration(unjudged: Sequence[str]) -> Iterator[Finding]:
             f"the calibration of {', '.join(unjudged)} was made elsewhere and does not say how exact "
             "it is: sigmas hold the decoding alone",
         )
+
+
+def _directions(agreements: Mapping[str, Agreement]) -> Iterator[Finding]:
+    for name, agreement in agreements.items():
+        if agreement.moderate:
+            yield (
+                "usable",
+                f"pair {name}: stripes of both directions disagree by {agreement.words}: its "
+                "calibration is off by that, which sigmas do not hold",
+            )
 
 
 def _motion(alignment: Alignment | None) -> Iterator[Finding]:

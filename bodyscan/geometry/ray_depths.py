@@ -59,6 +59,19 @@ def stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
     return float(np.median(found)) if found.size else 0.0
 
 
+def stripes_apart(sheets: LightSheets, camera: Camera, s: Floats, points: Floats) -> float:
+    """How far s (height, width) is from the sheets in which points (height, width, 3) lie, stripes:
+    median over some of the pixels that have both; NaN where none has."""
+    wanted = np.flatnonzero(np.isfinite(s) & np.isfinite(points[..., 2]))
+    some = wanted[:: max(len(wanted) // SAMPLES, 1)]
+    rows, columns = np.unravel_index(some, s.shape)
+    rays = camera.rays(np.column_stack([columns, rows]).astype(float))
+    found = intersect_rays(sheets, rays, s.ravel()[some].astype(float))
+    off = np.abs((points[rows, columns, 2] - found.depth) / found.per_stripe)
+    off = off[np.isfinite(off)]
+    return float(np.median(off)) if off.size else np.nan
+
+
 def triangulate_image(
     sheets: LightSheets, camera: Camera, s: Floats, sigma: Floats
 ) -> tuple[Floats, Floats]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from bodyscan.arrays import Floats, Mask
@@ -10,13 +12,16 @@ from bodyscan.compiled import compiled
 from bodyscan.errors import BadInput
 from bodyscan.geometry.crop import crop_of, ends_of
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.ray_depths import stripes_per_pixel, triangulate_image
+from bodyscan.geometry.ray_depths import stripes_apart, stripes_per_pixel, triangulate_image
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.reconstruction.two_ways import combine
+from bodyscan.reconstruction.two_ways import ROBUST, Agreement, combine
 from bodyscan.stripes.stripe_map import StripeMap
 
 NORMAL_WINDOW_PX = 5
 REACH = NORMAL_WINDOW_PX // 2
+MANY, FEW_MEET = 1000, 0.01
+"""Pixels that saw both directions, and the share of them that must have both depths: all of a right
+calibration but for wrong codes."""
 ZERO, ONE = np.float32(0.0), np.float32(1.0)  # a float64 among them would make all of it float64
 
 
@@ -24,7 +29,8 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
     """Points, normals and sigma on the camera's pixel grid, camera frame, mm; of stripes of both
     directions where they were projected and calibrated.
 
-    Raises BadInput if the pair has no projector or the image size is another.
+    Raises BadInput if the pair has no projector, the image size is another, or stripes of both
+    directions contradict each other as those of a wrong calibration do.
     """
     camera = pair.camera
     if pair.sheets is None:
@@ -44,10 +50,55 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
         others = _triangulated(pair, pair.crossing, across.s, across.sigma)
         # Crossing stripes are decoded wherever they are, not in the scan volume alone.
         alone = np.full(sigma_mm.shape, stripes.beyond is None)
+        apart, counted = _apart(pair, stripes, (points, sigma_mm), others)
         points, sigma_mm, agreement = combine(points, sigma_mm, *others, alone=alone)
+        if agreement is not None:
+            agreement = replace(agreement, apart_stripes=apart, stripes=counted)
+        _require_fit(pair, stripes, agreement)
     normals = grid_normals(points, np.isfinite(sigma_mm))
     images = (stripes.lit, stripes.beyond)
     return RangeImage(pair.name, camera, points, normals, sigma_mm, *images, agreement)
+
+
+def _apart(
+    pair: PairCalibration,
+    stripes: StripeMap,
+    one: tuple[Floats, Floats],
+    other: tuple[Floats, Floats],
+) -> tuple[float, int]:
+    """How far the way that tells depth less is from the points of the better one, in its stripes
+    (robust sigma), and their number."""
+    assert pair.sheets is not None
+    assert pair.crossing is not None
+    assert stripes.crossing is not None
+    both = np.isfinite(one[1]) & np.isfinite(other[1])
+    better = not both.any() or np.median(one[1][both]) <= np.median(other[1][both])
+    sheets, s = (pair.crossing, stripes.crossing.s) if better else (pair.sheets, stripes.s)
+    points = np.where(both[..., None], one[0] if better else other[0], np.float32(np.nan))
+    return ROBUST * stripes_apart(sheets, pair.camera, s, points), sheets.stripes
+
+
+def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement | None) -> None:
+    """Raises BadInput where no right calibration leaves both directions so far apart. One from
+    elsewhere knows its sheets wherever there are stripes: where the two meet nowhere, it is wrong."""
+    assert stripes.crossing is not None
+    decoded = np.count_nonzero(np.isfinite(stripes.s) & np.isfinite(stripes.crossing.s))
+    meet = agreement.pixels if agreement else 0
+    imported = pair.quality.imported is not None
+    if agreement is not None and agreement.impossible:
+        why = f"both directions are apart by {agreement.words}"
+    elif imported and decoded >= MANY and meet < FEW_MEET * decoded:
+        why = f"{decoded} pixels saw stripes of both directions, and their sheets meet at {meet}"
+    else:
+        return
+    raise BadInput(
+        f"its calibration does not fit these stripes: {why}",
+        where=f"pair {pair.name}",
+        remedy="are R and T the other way round (`inverse`), is the sign of `shift` or the number of "
+        "stripes another?"
+        if imported
+        else "calibrate again: camera or projector were moved, or `stripes` was changed",
+    )
 
 
 def _triangulated(

@@ -19,23 +19,52 @@ BELIEVED = 2.0
 calibration made elsewhere lack all of its own error), and cannot say what each way is worth."""
 FEWEST = 100
 ROBUST = 1.4826
+SOME_APART = 2e-3
+"""Of the projector's picture: calibrations reproject to half a pixel or one of some 1000, a
+thousandth; twice that is no noise of theirs."""
+MOST_APART = 2e-2
+"""Of the projector's picture, about half a degree: no calibration is off by that, a wrong pose, sign
+or number of stripes is by more."""
 
 
 @dataclass(frozen=True)
 class Agreement:
     """How far the two ways were apart along the rays of `pixels` that have both: robust sigma, mm,
     and the same in the sigmas that both depths claim.  dropped: pixels beyond MOST_OFF of those, or
-    of the claimed ones if these are larger, which have no point."""
+    of the claimed ones if these are larger, which have no point.  apart_stripes: the same in the
+    stripes, of so many, of the way that tells depth less."""
 
     pixels: int
     apart_mm: float
     apart_sigmas: float
     dropped: int
+    apart_stripes: float = np.nan
+    stripes: int = 0
+
+    @property
+    def moderate(self) -> bool:
+        """Whether a calibration, not noise, is off by more than calibrations are."""
+        return self._beyond(SOME_APART)
+
+    @property
+    def impossible(self) -> bool:
+        """Whether no calibration that is right is off by so much."""
+        return self._beyond(MOST_APART)
+
+    @property
+    def words(self) -> str:
+        return (
+            f"{self.apart_stripes:.1f} of {self.stripes} stripes of the direction that tells depth "
+            f"less ({self.apart_sigmas:.1f} of their sigmas)"
+        )
+
+    def _beyond(self, share: float) -> bool:
+        return self.apart_sigmas > BELIEVED and self.apart_stripes > share * self.stripes
 
     def __str__(self) -> str:
         return (
-            f"stripes of both directions agree to {self.apart_mm:.2f} mm ({self.apart_sigmas:.1f} of "
-            f"their sigmas) at {self.pixels} pixels; {self.dropped} that do not were left out"
+            f"stripes of both directions agree to {self.words} at {self.pixels} pixels; "
+            f"{self.dropped} that do not were left out"
         )
 
 

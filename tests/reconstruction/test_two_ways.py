@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.pair import PairCalibration, PairQuality
+from bodyscan.errors import BadInput
+from bodyscan.fusion.scan_verdict import _directions
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import Axis
@@ -144,3 +147,40 @@ def test_ways_that_differ_by_more_than_their_sigmas_are_not_averaged() -> None:
     swapped, sigma_mm, _ = combine(wrong, rough, points, fine, alone=nowhere)
     np.testing.assert_allclose(swapped, points, rtol=1e-6)
     np.testing.assert_allclose(sigma_mm, fine, rtol=1e-6)
+
+
+def shifted(stripes_off: float) -> StripeMap:
+    """Rows that far from where the calibration has them."""
+    seen = stripes()
+    assert seen.crossing is not None
+    s = seen.crossing.s + np.float32(stripes_off)
+    return replace(seen, crossing=replace(seen.crossing, s=s))
+
+
+@pytest.mark.parametrize(("off", "moderate"), [(0.05, False), (2.0, True)])
+def test_what_a_calibration_is_off_is_told_in_stripes(off: float, moderate: bool) -> None:
+    """Limits are 0.3 and 3 of 160 rows."""
+    agreement = reconstruct_range_image(pair(), shifted(off)).agreement
+    assert agreement is not None
+    assert agreement.moderate == moderate
+    assert f"{agreement.apart_stripes:.1f} of 160 stripes" in str(agreement)
+    if moderate:  # 1.48 medians, and columns' noise
+        assert abs(agreement.apart_stripes / (1.4826 * off) - 1.0) < 0.05
+        (grade, reason), *_ = _directions({"p": agreement})
+        assert grade == "usable"
+        assert "disagree by" in reason
+
+
+def test_a_calibration_that_is_wrong_is_refused() -> None:
+    with pytest.raises(BadInput, match="does not fit these stripes"):
+        reconstruct_range_image(pair(), shifted(20.0))
+
+
+def test_sheets_of_an_import_that_meet_nowhere_are_refused() -> None:
+    """Rows' light that shines the other way has no sheet before the camera."""
+    light = Camera(FOCAL, FOCAL, 0.0, *CENTRE, Radial(0.0, 0.0), *SIZE)
+    away = RigidTransform(PLACE.rotation, np.array([0.0, 0.0, -9000.0]))
+    rows = sheets_of_projector(light, away, np.array([0.0, 0.0, 700.0]), SIZE[1], "horizontal")
+    known = PairQuality(None, 0, imported="its file")
+    with pytest.raises(BadInput, match=r"does not fit these stripes.*meet at 0\n.*inverse"):
+        reconstruct_range_image(replace(pair(), crossing=rows, quality=known), stripes())
