@@ -34,8 +34,10 @@ def start(work: str) -> subprocess.Popen[str]:
         "    return 7\n"
         "sys.exit(run_interruptibly(work))\n"
     )
+    # Started in a shell's background, as CI may be, processes inherit that Ctrl-C is ignored.
+    heard = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     return subprocess.Popen(
-        [sys.executable, "-c", program],
+        [sys.executable, "-c", heard + program],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

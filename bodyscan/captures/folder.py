@@ -9,19 +9,17 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from bodyscan.captures.captures_file import FILE_NAME, ShotEntry, load_captures_file
 from bodyscan.captures.listing import Listing
 from bodyscan.errors import CaptureError
+from bodyscan.files.corners_vnl import Corners, read_corners
 from bodyscan.files.relative_text import relative_text
 from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import SHOT, fill, has_field, shot_pattern, with_exposure
-
-if TYPE_CHECKING:
-    from bodyscan.arrays import Array
 
 SUFFIXES = {".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
 """Of images, whatever takes them."""
@@ -87,7 +85,7 @@ class Captures:
     """What one or more capture folders hold. `shots` in order; `sequences` by shot, then by pair.
 
     when, subject, simulated: of a scan, as its captures.yaml says.  corners: of the board in images in
-    which it was found elsewhere, (N, 2) px, (0, 2) where it is not.  base: the folder that kept
+    which it was found elsewhere, px, () where it is not.  base: the folder that kept
     messages
     are relative to; that of the rig file, or of the scan.
     """
@@ -100,7 +98,7 @@ class Captures:
     subject: str | None = None
     simulated: bool = False
     base: Path = Path()
-    corners: Mapping[Path, Array] = field(default_factory=dict)
+    corners: Mapping[Path, Corners] = field(default_factory=dict)
 
     @cached_property
     def _by_pair_and_shot(self) -> dict[tuple[str, str], ImageSequence]:
@@ -153,14 +151,13 @@ def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
     folder, template = capture_path(rig_path, entry), entry.files or rig.files
     if entry.corners is None:
         return _open(rig, folder, "calibration", template, entry.shots)
-    from bodyscan.files.corners_vnl import read_corners
 
     named = _corners_by_path(read_corners(Path(rig_path).parent / entry.corners), template)
     captures = _open(rig, folder, "calibration", template, entry.shots, tuple(named))
     return replace(captures, corners={folder / name: own for name, own in named.items()})
 
 
-def _corners_by_path(corners: Mapping[str, Array], template: str) -> dict[str, Array]:
+def _corners_by_path(corners: Mapping[str, Corners], template: str) -> dict[str, Corners]:
     """By paths as the template makes them: wherever the images lay when corners were found in them,
     their last parts are the same."""
     parts = template.count("/") + 1

@@ -10,22 +10,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TypeAlias
 
-import numpy as np
-
-from bodyscan.arrays import Array
 from bodyscan.errors import CaptureError
 from bodyscan.files.atomic import write_text
 from bodyscan.files.regular import read_regular
+
+Corners: TypeAlias = tuple[tuple[float, float], ...]
+"""Of one image, px; NaN for what is not to be used. Plain numbers, since `check` loads no NumPy."""
 
 COLUMNS = ("filename", "x", "y", "level")
 MOST_BYTES = 200_000_000
 """A thousand images of a board of two thousand corners."""
 
 
-def read_corners(path: Path) -> dict[str, Array]:
-    """By an image's name, as the file has it: (N, 2) px, NaN where a corner is not to be used; (0, 2)
-    where there is no board.
+def read_corners(path: Path) -> dict[str, Corners]:
+    """By an image's name, as the file has it; () where there is no board.
 
     Raises CaptureError, with the line, for what is no such table.
     """
@@ -53,12 +53,11 @@ def read_corners(path: Path) -> dict[str, Array]:
             corners.append(corner)
     if not found:
         raise CaptureError("holds no corner", where=str(path), remedy=_remedy())
-    return {name: np.array(corners).reshape(-1, 2) for name, corners in found.items()}
+    return {name: tuple(corners) for name, corners in found.items()}
 
 
-def write_corners(path: Path, corners: Iterable[tuple[str, Array]]) -> None:
-    """By an image's name: (N, 2) px, NaN for what was not found; (0, 2) for no board. The file appears
-    whole or not at all."""
+def write_corners(path: Path, corners: Iterable[tuple[str, Corners]]) -> None:
+    """By an image's name. The file appears whole or not at all."""
     lines = ["# " + " ".join(COLUMNS)]
     for name, pixels in corners:
         if any(letter.isspace() for letter in name):

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.numbered_corners import number_corners
@@ -33,7 +32,7 @@ from bodyscan.calibration.lens_choice import calibrate_with_lenses
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_board_image
 from bodyscan.errors import BadInput, BodyscanError
-from bodyscan.files.corners_vnl import write_corners
+from bodyscan.files.corners_vnl import Corners, write_corners
 from bodyscan.geometry.lenses import FAMILY, LENSES
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, threaded
@@ -120,7 +119,7 @@ def _given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[B
             remedy="Corners found elsewhere are those of one board: describe that one alone.",
         )
     camera = rig.pair(sequence.pair).camera
-    pixels = captures.corners[sequence.seen_in]
+    pixels = np.array(captures.corners[sequence.seen_in]).reshape(-1, 2)
     view = number_corners(
         pixels,
         rig.boards[0],
@@ -142,16 +141,16 @@ def write_found_corners(
     count = len(corner_points(rig.boards[0]))
     seen = {(view.pair, view.shot): view for view in views}
 
-    def row(sequence: ImageSequence) -> tuple[str, Array]:
+    def row(sequence: ImageSequence) -> tuple[str, Corners]:
         image = sequence.seen_in
         inside = [folder for folder in captures.folders if image.is_relative_to(folder)]
         name = image.relative_to(inside[0]).as_posix() if inside else image.name
         view = seen.get((sequence.pair, sequence.shot))
         if view is None:
-            return name, np.empty((0, 2))
+            return name, ()
         pixels = np.full((count, 2), np.nan)
         pixels[view.corner_ids] = view.pixels
-        return name, pixels
+        return name, tuple(map(tuple, pixels.tolist()))
 
     write_corners(path, map(row, captures.sequences))
 
