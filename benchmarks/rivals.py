@@ -17,7 +17,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 
@@ -109,7 +109,7 @@ def _camera(ours: Camera, matrix: Array, lens: Array) -> Camera:
         gamma=0.0,
         u0=matrix[0, 2],
         v0=matrix[1, 2],
-        lens=Radial().with_coefficients(lens[:2]),
+        lens=lens_from_opencv(np.pad(lens, (0, max(0, 5 - len(lens))))),  # radial gives four
     )
 
 
@@ -128,11 +128,14 @@ def _corners(
         chosen = [number[tuple(point)] for point in (np.round(view.points, 4) + 0.0).tolist()]
         pixels[names.index(view.pair), shots.index(view.shot), chosen] = view.pixels
     own = [cameras[name] for name in names]
+    lenses = np.zeros((len(own), max(len(camera.lens.opencv()) for camera in own)))
+    for row, camera in zip(lenses, own, strict=True):  # OpenCV takes missing coefficients for 0
+        row[: len(camera.lens.opencv())] = camera.lens.opencv()
     return {
         "pixels": pixels,
         "points": points,
         "grid": np.array([board.columns, board.rows, board.square_mm]),
         "size": np.array([own[0].width, own[0].height]),
         "matrices": np.array([c.matrix * [[1, 0, 1], [1, 1, 1], [1, 1, 1]] for c in own]),
-        "lenses": np.array([c.lens.opencv() for c in own]),
+        "lenses": lenses,
     }
