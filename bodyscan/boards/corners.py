@@ -21,6 +21,7 @@ from scipy.special import erf
 from bodyscan.arrays import Array, Bytes, Indices, Mask
 from bodyscan.boards.appearance import AS_PRINTED, Appearance
 from bodyscan.geometry.least_squares import StackedEquations, minimize_each
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.scaled_systems import solve_scaled
 
 MAX_MOVE_PX = 1.5
@@ -184,7 +185,7 @@ def _common_light(fit: _Fit) -> _Light:
     slope = fit.state[:, 7:]
     mean = np.median(slope, axis=0)
     told = np.median(np.einsum("nii->ni", fit.covariance)[:, 7:], axis=0)
-    seen = (1.4826 * np.median(np.abs(slope - mean), axis=0)) ** 2
+    seen = (SIGMAS_PER_MEDIAN * np.median(np.abs(slope - mean), axis=0)) ** 2
     differs = np.maximum(seen - told, LEAST_OF_SEEN * seen + 1e-12)
     return _Light(mean, fit.variance[:, None] / differs)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Floats, Greys
 from bodyscan.errors import ImageError
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 
 FULL, NONE = 215.0, 245.0
 """Grey levels between which an exposure's weight falls to nothing: sensors bend before white."""
@@ -92,5 +93,5 @@ def _line(x: Array, y: Array) -> tuple[float, float]:
     for _ in range(ROUNDS):
         slope, offset = np.polyfit(x[near], y[near], 1)
         off = np.abs(y - offset - slope * x)
-        near = off <= OUTLYING * 1.4826 * max(float(np.median(off)), 0.1)
+        near = off <= OUTLYING * SIGMAS_PER_MEDIAN * max(float(np.median(off)), 0.1)
     return float(offset), float(slope)

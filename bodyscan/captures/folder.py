@@ -85,8 +85,7 @@ class Captures:
     """What one or more capture folders hold. `shots` in order; `sequences` by shot, then by pair.
 
     when, subject, simulated: of a scan, as its captures.yaml says.  corners: of the board in images in
-    which it was found elsewhere, px, () where it is not.  base: the folder that kept
-    messages
+    which it was found elsewhere, px, () where it is not.  base: the folder that kept messages
     are relative to; that of the rig file, or of the scan.
     """
 

@@ -13,8 +13,9 @@ from bodyscan.errors import BadInput
 from bodyscan.geometry.crop import crop_of, ends_of
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.ray_depths import stripes_apart, stripes_per_pixel, triangulate_image
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.reconstruction.two_ways import ROBUST, Agreement, combine
+from bodyscan.reconstruction.two_ways import Agreement, combine
 from bodyscan.stripes.stripe_map import StripeMap
 
 NORMAL_WINDOW_PX = 5
@@ -75,7 +76,7 @@ def _apart(
     better = not both.any() or np.median(one[1][both]) <= np.median(other[1][both])
     sheets, s = (pair.crossing, stripes.crossing.s) if better else (pair.sheets, stripes.s)
     points = np.where(both[..., None], one[0] if better else other[0], np.float32(np.nan))
-    return ROBUST * stripes_apart(sheets, pair.camera, s, points), sheets.stripes
+    return SIGMAS_PER_MEDIAN * stripes_apart(sheets, pair.camera, s, points), sheets.stripes
 
 
 def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement | None) -> None:

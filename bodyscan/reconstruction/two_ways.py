@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Floats, Mask
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 
 MOST_OFF = 5.0
 """Sigmas: noise alone does not get there; a wrong code does, or a pixel that saw two surfaces."""
@@ -18,7 +19,6 @@ BELIEVED = 2.0
 """Sigmas that the ways may commonly be apart: beyond, sigmas lack most of what is wrong (those of a
 calibration made elsewhere lack all of its own error), and cannot say what each way is worth."""
 FEWEST = 100
-ROBUST = 1.4826
 SOME_APART = 2e-3
 """Of the projector's picture: calibrations reproject to half a pixel or one of some 1000, a
 thousandth; twice that is no noise of theirs."""
@@ -90,7 +90,7 @@ def combine(
     variance, variance_too = sigma_mm[both] ** 2, crossing_mm[both] ** 2
     along = np.linalg.norm(one, axis=1) - np.linalg.norm(other, axis=1)
     off = along / np.sqrt(variance + variance_too)
-    sigmas = ROBUST * float(np.median(np.abs(off)))
+    sigmas = SIGMAS_PER_MEDIAN * float(np.median(np.abs(off)))
     wrong = np.abs(off) > MOST_OFF * max(sigmas, 1.0)
     share = variance / (variance + variance_too)  # of the other: weights are 1 / variance
     if sigmas > BELIEVED:
@@ -98,5 +98,5 @@ def combine(
     points[both] = one + share[:, None] * (other - one)
     merged = np.sqrt((1.0 - share) ** 2 * variance + share**2 * variance_too)
     sigma_mm[both] = np.where(wrong, np.float32(np.nan), merged)
-    apart = ROBUST * float(np.median(np.abs(along)))
+    apart = SIGMAS_PER_MEDIAN * float(np.median(np.abs(along)))
     return points, sigma_mm, Agreement(pixels, apart, sigmas, int(np.count_nonzero(wrong)))

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.stripe_coordinates import REACH_PX, SMOOTHERS
 
 FEWEST, ENOUGH = 1000, 20_000
 CLEARLY = 1.2
 """Sigmas that claim so much too little are put right: less may be the surface."""
-ROBUST = 1.4826
 
 
 def scatter(boundaries: Boundaries) -> float:
@@ -38,5 +38,5 @@ def scatter(boundaries: Boundaries) -> float:
         share = weight - (k == middle)
         off += share * boundaries.position[first + k]
         variance += (share * boundaries.sigma_px[first + k]) ** 2
-    found = ROBUST * float(np.median(np.abs(off) / np.sqrt(variance)))
+    found = SIGMAS_PER_MEDIAN * float(np.median(np.abs(off) / np.sqrt(variance)))
     return found if found > CLEARLY else 1.0

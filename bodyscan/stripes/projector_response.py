@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodyscan.arrays import Array, Floats, Mask
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.stripes.stripe_map import ResponseShare
 from bodyscan.stripes.waves import WaveSeen
 
@@ -169,7 +170,7 @@ def _fitted(shapes: Array, seen: Array, steps: int) -> PhaseError | None:
     for _ in range(ROUNDS):
         found = np.linalg.lstsq(shapes[near], seen[near], rcond=LEAST_SHOWN)[0]
         off = np.abs(seen - shapes @ found)
-        near = off <= OUTLYING * 1.4826 * np.median(off)
+        near = off <= OUTLYING * SIGMAS_PER_MEDIAN * np.median(off)
     variance = np.var(seen[near] - shapes[near] @ found)
     chi2 = np.sum(np.square(shapes[near] @ found)) / variance / len(found)
     # Where too few different phases are seen to tell a wave of the error, it could be anything.

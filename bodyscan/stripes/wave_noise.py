@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from bodyscan.arrays import Array, Floats, Greys, Indices, Mask
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.stripes.grey_noise import fitted_variance
 from bodyscan.stripes.waves import WaveSeen
 
@@ -66,5 +67,5 @@ def _beside_the_wave(wave: WaveSeen, images: Greys, some: Indices) -> Array:
 def _spread2(misfit: Array) -> float:
     """Variance about the mean, without what lies far off (a surface's edge, where things moved)."""
     off = np.abs(misfit - np.median(misfit))
-    near = misfit[off <= OUTLYING * 1.4826 * max(float(np.median(off)), 1e-3)]
+    near = misfit[off <= OUTLYING * SIGMAS_PER_MEDIAN * max(float(np.median(off)), 1e-3)]
     return float(np.var(near))

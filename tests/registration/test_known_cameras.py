@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
+from ring import as_found, ring_of_cameras, ring_rig, ring_views
 
-from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.known_pair import read_known_camera
 from bodyscan.errors import CalibrationFileError
@@ -28,17 +27,7 @@ KNOWN = "p1-1"
 @pytest.fixture(scope="module")
 def views() -> list[BoardView]:
     found, _ = ring_views(PLACINGS, CAMERAS, shots=25, seed=3)
-    corners = {tuple(p): k for k, p in enumerate(np.round(corner_points(CHARUCO), 6).tolist())}
-    return [
-        BoardView(
-            view.pair,
-            view.shot,
-            view.board,
-            np.array([corners[tuple(p)] for p in np.round(view.points, 6).tolist()]),
-            view.pixels,
-        )
-        for view in found
-    ]
+    return as_found(found)
 
 
 def rig_with(folder: Path, *, off_px: float, sigma_px: float | None) -> Rig:

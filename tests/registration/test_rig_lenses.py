@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
+from ring import as_found, ring_of_cameras, ring_rig, ring_views
 
-from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.pose_covariance import position_sigma
@@ -37,17 +36,7 @@ def views() -> list[BoardView]:
     cameras = CAMERAS | {BENT: replace(CAMERAS[BENT], lens=lens)}
     rng = np.random.default_rng(5)
     found, _ = ring_views(PLACINGS, cameras, shots=40, seed=int(rng.integers(9)))
-    corners = {tuple(p): k for k, p in enumerate(np.round(corner_points(CHARUCO), 6).tolist())}
-    return [
-        BoardView(
-            view.pair,
-            view.shot,
-            view.board,
-            np.array([corners[tuple(p)] for p in np.round(view.points, 6).tolist()]),
-            view.pixels,
-        )
-        for view in found
-    ]
+    return as_found(found)
 
 
 def test_each_camera_gets_its_own_lens_and_no_view_is_lost(views: list[BoardView]) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView, PlanarView, board_symmetries
 from bodyscan.calibration.camera import locate_board
 from bodyscan.geometry.camera import Camera
@@ -121,3 +122,18 @@ def ring_views(
             pose, _ = locate_board(camera, view)
             views.append(LocatedView(name, shot, board.name, view.points, noisy, pose, symmetries))
     return views, truth
+
+
+def as_found(views: Sequence[LocatedView]) -> list[BoardView]:
+    """The same views of CHARUCO as a detector gives them: corners by number, no pose."""
+    corners = {tuple(p): k for k, p in enumerate(np.round(corner_points(CHARUCO), 6).tolist())}
+    return [
+        BoardView(
+            view.pair,
+            view.shot,
+            view.board,
+            np.array([corners[tuple(p)] for p in np.round(view.points, 6).tolist()]),
+            view.pixels,
+        )
+        for view in views
+    ]
