@@ -7,6 +7,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
+from bodyscan.captures.timing import Timing, timing_problems
 from bodyscan.errors import CaptureError
 from bodyscan.files.atomic import write_text
 from bodyscan.files.model import Model, Name, Problem, did_you_mean, duplicates
@@ -42,6 +43,7 @@ class CapturesFile(Model):
     """The whole captures.yaml.
 
     simulated: what the simulator says of its images, and reports then say too.
+    timing: when each frame was taken, if that is known.
     """
 
     version: Literal[1] = 1
@@ -50,6 +52,7 @@ class CapturesFile(Model):
     subject: Name | None = None
     simulated: bool | None = None
     shots: tuple[ShotEntry, ...] | None = None
+    timing: Timing | None = None
 
     def problems(self) -> Iterator[Problem]:
         if self.subject is not None and self.kind != "scan":
@@ -69,7 +72,7 @@ def load_captures_file(folder: Path, rig: Rig) -> CapturesFile:
         CapturesFile,
         CaptureError,
         remedy=_REMEDY,
-        also=lambda file: _unknown_names(file, rig),
+        also=lambda file: (*_unknown_names(file, rig), *_wrong_timing(file, rig)),
     )
 
 
@@ -90,3 +93,8 @@ def _unknown_names(captures: CapturesFile, rig: Rig) -> Iterator[Problem]:
                     yield where, f"names no pair of rig {rig.name}{hint} (got {name!r})"
                 elif key == "stripes" and pairs[name].projector is None:
                     yield where, f"names a camera without projector (got {name!r}): list it in lit"
+
+
+def _wrong_timing(captures: CapturesFile, rig: Rig) -> Iterator[Problem]:
+    for where, text in timing_problems(captures.timing, rig) if captures.timing else ():
+        yield ("timing", *where), text

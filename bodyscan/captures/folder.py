@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
@@ -13,6 +13,7 @@ from typing import Literal
 
 from bodyscan.captures.captures_file import FILE_NAME, ShotEntry, load_captures_file
 from bodyscan.captures.listing import Listing
+from bodyscan.captures.timing import FrameTimes, Timing, times_of_frames
 from bodyscan.errors import CaptureError
 from bodyscan.files.corners_vnl import Corners, read_corners
 from bodyscan.files.relative_text import relative_text
@@ -86,7 +87,8 @@ class Captures:
 
     when, subject, simulated: of a scan, as its captures.yaml says.  corners: of the board in images in
     which it was found elsewhere, px, () where it is not.  base: the folder that kept messages
-    are relative to; that of the rig file, or of the scan.
+    are relative to; that of the rig file, or of the scan.  times: when frames were taken, where the
+    captures say so; described_in: the files in which they say that and all else.
     """
 
     rig: Rig
@@ -98,6 +100,8 @@ class Captures:
     simulated: bool = False
     base: Path = Path()
     corners: Mapping[Path, Corners] = field(default_factory=dict)
+    times: FrameTimes = field(default_factory=dict)
+    described_in: tuple[Path, ...] = ()
 
     @cached_property
     def _by_pair_and_shot(self) -> dict[tuple[str, str], ImageSequence]:
@@ -114,6 +118,19 @@ class Captures:
     def of_shot(self, shot: str) -> tuple[ImageSequence, ...]:
         """What was taken in that shot, in the order of the rig's pairs."""
         return tuple(sequence for sequence in self.sequences if sequence.shot == shot)
+
+    def frame_ms(self, shot: str, pair: str) -> dict[str, float] | None:
+        """When the pair took each frame of that shot, by the frame's name, in the order taken: ms from
+        when the first pair began to the middle of the exposure. None where nothing says so."""
+        times = self.times.get((shot, pair))
+        return None if times is None else dict(times)
+
+    def middle_ms(self, shot: str, pair: str, frames: Iterable[str]) -> float | None:
+        """The middle of the time in which the pair took these frames of that shot; None where nothing
+        says it."""
+        times = self.times.get((shot, pair), {})
+        taken = [times[name] for name in frames if name in times]
+        return (min(taken) + max(taken)) / 2.0 if taken else None
 
     def relative(self, text: str) -> str:
         """A message with its paths relative to `base`, as it may be kept."""
@@ -213,9 +230,14 @@ def join_captures(parts: tuple[Captures, ...]) -> Captures:
     sequences = [sequence for part in parts for sequence in part.sequences]
     sequences.sort(key=lambda sequence: (shots.index(sequence.shot), order[sequence.pair]))
     folders = tuple(folder for part in parts for folder in part.folders)
-    corners = {path: own for part in parts for path, own in part.corners.items()}
     return replace(
-        parts[0], folders=folders, shots=shots, sequences=tuple(sequences), corners=corners
+        parts[0],
+        folders=folders,
+        shots=shots,
+        sequences=tuple(sequences),
+        corners={path: own for part in parts for path, own in part.corners.items()},
+        times={key: own for part in parts for key, own in part.times.items()},
+        described_in=tuple(path for part in parts for path in part.described_in),
     )
 
 
@@ -266,7 +288,38 @@ def _open(
     captures = Captures(rig, (folder,), names, sequences, base=folder)
     if file is None:
         return captures
-    return replace(captures, when=file.when, subject=file.subject, simulated=bool(file.simulated))
+    times, own_file = _times(captures, listing, file.timing)
+    return replace(
+        captures,
+        when=file.when,
+        subject=file.subject,
+        simulated=bool(file.simulated),
+        times=times,
+        described_in=(folder / FILE_NAME, *own_file),
+    )
+
+
+def _times(
+    captures: Captures, listing: Listing, timing: Timing | None
+) -> tuple[FrameTimes, tuple[Path, ...]]:
+    """When frames were taken, and the file that says so if it is one of its own."""
+    if timing is None:
+        return {}, ()
+    if timing.times is not None and not listing.has(timing.times):
+        raise CaptureError(
+            f"names the file of times {timing.times}, which is not there",
+            where=str(listing.root / FILE_NAME),
+            remedy="Copy it into the capture folder, or take `timing` out.",
+        )
+    frames = captures.rig.frames
+    taken = {
+        (one.shot, one.pair): frames.of_sequence(captures.rig.pair(one.pair).projector)
+        if one.has_stripes
+        else frames.of_sequence(None)
+        for one in captures.sequences
+    }
+    own_file = () if timing.times is None else (listing.root / timing.times,)
+    return times_of_frames(timing, captures.rig, taken, listing.root), own_file
 
 
 def _folder_above(rig: Rig, folder: Path, template: str) -> Path | None:

@@ -25,6 +25,9 @@ M = TypeVar("M", bound=Model)
 
 _MOST_SHOWN = 30
 
+_UNION_MEMBERS = ("tuple[", "dict[", "literal[")
+"""How pydantic's names of the members of a union begin."""
+
 _MUST_BE = {
     "string_type": "text",
     "int_type": "a whole number",
@@ -225,7 +228,7 @@ def _true_location(loc: Where, document: Document) -> Where:
     for part in loc:
         inside = document.at(where)
         of_list = isinstance(inside, list) and isinstance(part, int)
-        if of_list or (isinstance(inside, dict) and not str(part).startswith("tuple[")):
+        if of_list or (isinstance(inside, dict) and not str(part).startswith(_UNION_MEMBERS)):
             where = (*where, part)
     return where
 

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import BadInput, CalibrationFileError, CaptureError
 from bodyscan.files.hashing import files_below
@@ -164,7 +163,7 @@ def _rig_of(calibration: Path) -> Rig:
 
 
 def _images(captures: Captures, base: Path) -> dict[str, Path]:
-    """Every image that is there, and the captures.yaml beside them, by path relative to `base`."""
+    """Every image that is there, and what is said of them beside them, by path relative to `base`."""
     paths = [p for s in captures.sequences for p in s.paths if p not in set(s.missing)]
-    paths += [f / CAPTURES for f in captures.folders if (f / CAPTURES).exists()]
+    paths += captures.described_in
     return {f"captures/{Path(os.path.relpath(path, base)).as_posix()}": path for path in paths}

@@ -23,6 +23,7 @@ class RangeImage:
     beyond: (height, width) bool, where the camera saw something behind the scan volume; None if all
     that was seen has a point.
     agreement: of stripes of two directions, if such were projected.
+    time_ms: the one moment for which the depths stand, ms since the scan began; None if not known.
     """
 
     pair: str
@@ -33,6 +34,7 @@ class RangeImage:
     colours: Bytes
     beyond: Mask | None = None
     agreement: Agreement | None = None
+    time_ms: float | None = None
 
     @property
     def valid(self) -> Mask:

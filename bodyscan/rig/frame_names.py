@@ -125,6 +125,14 @@ class FrameNames(ImageNames):
             for name in own.of_one_way(way)
         )
 
+    def of_sequence(self, code: StripeCode | None) -> tuple[str, ...]:
+        """Names of all images of a whole sequence, in the order in which they are taken if nothing
+        else is said; of a camera without projector its board image."""
+        if code is None:
+            return tuple(filter(None, [self.board_image]))
+        dark = self.dark if any(way.uses_dark for way in code.directions) else None
+        return (*filter(None, (self.lit, dark, self.board)), *self.of_code(code))
+
     def problems(self) -> Iterator[Problem]:
         wrong = list(super().problems())
         single = {"lit": self.lit, "dark": self.dark, "board": self.board}

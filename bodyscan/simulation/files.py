@@ -12,9 +12,11 @@ import cv2
 
 from bodyscan.arrays import Bytes
 from bodyscan.captures.captures_file import CapturesFile, ShotEntry, write_captures_file
+from bodyscan.captures.timing import Timing
 from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
+from bodyscan.simulation.settings import Pace
 
 WHEN = datetime(2026, 11, 21, 10, 0, 0)
 """The date written into captures.yaml: always the same, so that the bytes are too."""
@@ -55,14 +57,28 @@ def write_captures(
     kind: Literal["calibration", "scan"],
     shots: Sequence[tuple[str, Sequence[str], Sequence[str]]],
     subject: str | None = None,
+    pace: Pace | None = None,
 ) -> None:
-    """captures.yaml: each shot's name, the pairs that took stripes, the pairs that took lit."""
+    """captures.yaml: each shot's name, the pairs that took stripes, the pairs that took lit; when,
+    if a pace is given."""
     entries = tuple(
         ShotEntry(name=name, stripes=tuple(stripes) or None, lit=tuple(lit) or None)
         for name, stripes, lit in shots
     )
-    captures = CapturesFile(kind=kind, when=WHEN, subject=subject, simulated=True, shots=entries)
+    captures = CapturesFile(
+        kind=kind,
+        when=WHEN,
+        subject=subject,
+        simulated=True,
+        shots=entries,
+        timing=None if pace is None else timing_of(pace),
+    )
     write_captures_file(folder, captures)
+
+
+def timing_of(pace: Pace) -> Timing:
+    """As captures.yaml says it."""
+    return Timing(frame_ms=pace.frame_ms, order=pace.order or None, start=pace.start)
 
 
 def write_image(path: Path, image: Bytes) -> None:

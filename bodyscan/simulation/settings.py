@@ -139,6 +139,19 @@ class Person:
 
 
 @dataclass(frozen=True)
+class Pace:
+    """When frames of a person are taken. Each is as short as nothing moves in it.
+
+    frame_ms: from one frame to the next; 120 a second.  start: of the pairs; as `timing` of
+    captures.yaml.  order: names of frames as they are taken, () as `bodyscan patterns` lists them.
+    """
+
+    frame_ms: float = 1000.0 / 120.0
+    start: Literal["one-after-another", "together", "poles"] = "one-after-another"
+    order: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Room:
     """Floor at z = 0 and four walls, so that stripes fall behind the board too.
 
@@ -170,5 +183,6 @@ class SimulationSettings:
     noise: Noise = field(default_factory=Noise)
     board: BoardMaking = field(default_factory=BoardMaking)
     person: Person = field(default_factory=Person)
+    pace: Pace = field(default_factory=Pace)
     room: Room = field(default_factory=Room)
     inter_reflection: InterReflection = field(default_factory=InterReflection)

@@ -87,7 +87,7 @@ def simulate(
         striped = [name for name, pair in truth.pairs.items() if pair.has_stripes]
         alone = [name for name in truth.pairs if name not in striped]
         shots = [(PERSON_SHOT, striped, alone)]
-        files.write_captures(out / PERSON, "scan", shots, truth.subject)
+        files.write_captures(out / PERSON, "scan", shots, truth.subject, settings.pace)
         body.save_truth(truth.person, out / "truth" / "subject.ply")
     write_json(out / "truth" / "truth.json", describe(truth))
 

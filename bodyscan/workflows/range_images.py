@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import replace
 
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.errors import BodyscanError, ScanFailed, listed
@@ -45,7 +46,9 @@ def reconstruct_range_images(
         spec = calibration.rig.pair(sequence.pair)
         stripes = decode_sequence(sequence, spec, limits=limits)
         responses[sequence.pair] += responses_in(stripes)
-        return reconstruct_range_image(pair, stripes)
+        coded = spec.projector and calibration.rig.frames.of_code(spec.projector)
+        time_ms = captures.middle_ms(sequence.shot, sequence.pair, coded or ())
+        return replace(reconstruct_range_image(pair, stripes), time_ms=time_ms)
 
     images, errors = attempt_each(
         reconstruct, sequences, BodyscanError, stage="range images", progress=progress

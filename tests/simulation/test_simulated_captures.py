@@ -13,6 +13,7 @@ import open3d as o3d
 import pytest
 import yaml
 
+from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BadInput
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation import SimulationSettings, settings_for, simulate
@@ -68,6 +69,19 @@ def test_the_rig_file_is_the_given_one_scaled(simulated: Path) -> None:
     assert rig.boards == given.boards
     assert rig.rig_frame == given.rig_frame
     assert [pair.nominal for pair in rig.pairs] == [pair.nominal for pair in given.pairs]
+
+
+def test_captures_say_when_frames_were_taken(simulated: Path) -> None:
+    rig = load_rig(simulated / "rig.yaml")
+    scan = open_scan(rig, simulated / "captures" / "person")
+    starts = []
+    for pair in rig.pairs:
+        times = scan.frame_ms("s01", pair.name)
+        assert times is not None
+        assert np.diff(list(times.values())) == pytest.approx(1000 / 120)
+        starts.append(times["lit"] - 1000 / 240)
+    # Lit, dark, six bits and their inverses of one pair after those of the other.
+    assert starts == pytest.approx(14 * 1000 / 120 * np.arange(12))
 
 
 def test_images_have_the_size_of_the_rig_file_and_show_something(simulated: Path) -> None:
