@@ -46,6 +46,7 @@ from bodyscan.settings import (
 from bodyscan.verdict import Verdict
 
 if TYPE_CHECKING:
+    from bodyscan.arrays import Bytes
     from bodyscan.fusion.scan import Scan
     from bodyscan.fusion.storage import StoredScan
     from bodyscan.measurement.measurements import Measurements
@@ -94,6 +95,7 @@ __all__ = [
     "load_rig",
     "load_scan",
     "measure",
+    "put_image",
     "save_calibration",
     "save_scan",
     "scan",
@@ -137,6 +139,26 @@ def import_calibration(rig_file: AnyPath, *, sigma_px: float | None = None) -> R
     from bodyscan.workflows.import_rig import import_rig
 
     return import_rig(load_rig(rig_file), Path(rig_file).parent, sigma_px)
+
+
+def put_image(
+    inbox: AnyPath,
+    calibration: RigCalibration,
+    scan: str,
+    pair: str,
+    frame: str,
+    image: Bytes,
+    *,
+    shot: str = "s01",
+) -> Path:
+    """Hand an image in memory to `bodyscan watch`, as a file of its inbox; returns the file.
+
+    image: (height, width) uint8 or uint16.  scan: the folder's name, which becomes the job's.
+    Raises BadInput for a pair that the rig does not have.
+    """
+    from bodyscan.jobs.inbox import put_image as put
+
+    return put(Path(inbox), calibration.rig, scan, pair, frame, image, shot=shot)
 
 
 def save_calibration(calibration: RigCalibration, folder: AnyPath) -> Path:

@@ -14,7 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from bodyscan.cli.console import Output, add_command
-from bodyscan.cli.options import Anyway, Calibration, Changes, Overwrite, Result, ScanFolder
+from bodyscan.cli.options import (
+    Anyway,
+    Calibration,
+    Changes,
+    OutFolder,
+    Overwrite,
+    Result,
+    ScanFolder,
+)
 from bodyscan.errors import BadInput, FailedWork
 from bodyscan.files.os_errors import require_writable
 from bodyscan.progress import step
@@ -30,7 +38,7 @@ PANEL = "Operator: scan people"
 
 def register(app: typer.Typer) -> None:
     """Add these commands to the command line, in the order of a day."""
-    for command in (scan, report, measure, export, batch, verify, forget):
+    for command in (scan, report, measure, export, batch, watch, verify, forget):
         add_command(app, PANEL, command)
 
 
@@ -309,6 +317,56 @@ def _run(
         sys.stdout.flush()
         typer.secho("stopped; run the same command again to go on", err=True)
         os._exit(130)  # the jobs' processes end with this one
+    output.exit_code = 1 if summary["set_aside"] or summary["repeat"] else 0
+
+
+def watch(
+    output: Output,
+    inbox: Annotated[
+        Path, typer.Argument(metavar="INBOX", help="Folder in which a folder a scan appears.")
+    ],
+    calibration: Calibration,
+    out: OutFolder,
+    pipeline: Annotated[
+        Path | None, typer.Option(metavar="PIPELINE.YAML", help="Settings, as `batch` takes them.")
+    ] = None,
+    changes: Changes = None,
+    quiet_s: Annotated[
+        float,
+        typer.Option(
+            "--quiet-s", min=1.0, help="A scan is taken as it is when nothing came for so long."
+        ),
+    ] = 30.0,
+    once: Annotated[
+        bool, typer.Option("--once", help="End when all that lies in INBOX is done.")
+    ] = False,
+) -> None:
+    """Fuse scans while their images arrive; the verdict comes seconds after the last one.
+
+    Stopped at any moment and started again, it goes on where it was. docs/inbox.md is the protocol.
+    """
+    from bodyscan.files.model_file import apply_settings
+    from bodyscan.jobs import display
+    from bodyscan.jobs.pipeline import Pipeline, load_pipeline
+    from bodyscan.jobs.watching import Watched
+    from bodyscan.jobs.watching import watch as watch_inbox
+
+    require_writable(out)
+    output.tell_events()
+    settings = (
+        load_pipeline(pipeline, changes or ())
+        if pipeline
+        else apply_settings(Pipeline(name="watch", kind="fuse"), changes or (), BadInput)
+    )
+    watched = Watched(inbox, out, calibration, settings, quiet_s)
+    show = display.json_lines if output.json else display.silence if output.quiet else display.lines
+    try:
+        with show() as listen:
+            summary = watch_inbox(watched, listen, once=once)
+    except KeyboardInterrupt:
+        sys.stdout.flush()
+        typer.secho("stopped; run the same command again to go on", err=True)
+        os._exit(130)
     output.exit_code = 1 if summary["set_aside"] or summary["repeat"] else 0
 
 

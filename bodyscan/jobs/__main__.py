@@ -1,7 +1,11 @@
-"""The job's process: `python -m bodyscan.jobs FOLDER`; a batch starts it, nobody needs to type it."""
+"""A process of jobs: `python -m bodyscan.jobs FOLDER`, or `--resident CALIBRATION`; a batch or `watch`
+starts it, nobody needs to type it."""
 
 import sys
 
-from bodyscan.jobs.worker import main
+if sys.argv[1] == "--resident":
+    from bodyscan.jobs.resident import main
+else:
+    from bodyscan.jobs.worker import main
 
 sys.exit(main())

@@ -42,7 +42,7 @@ def run_batch(
         except OSError as error:
             raise BadInput(f"cannot be written: {error.strerror}", where=str(out)) from error
         with file_lock(out / BATCH_LOCK, wait=False):
-            _sweep(out)
+            sweep(out)
             listen({"event": "batch", "jobs": [job.name for job in jobs]})
             outcomes: dict[str, JobResult] = {}
             ready = []
@@ -102,7 +102,7 @@ def run_locally(
     return run
 
 
-def _sweep(out: Path) -> None:
+def sweep(out: Path) -> None:
     """Take away what a batch was writing when it was killed."""
     for path in (*out.glob(".summary.*.tmp.csv"), *out.glob(".manifest.*.tmp.json")):
         path.unlink(missing_ok=True)

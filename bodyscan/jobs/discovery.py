@@ -30,15 +30,16 @@ def find_jobs(
         raise BadInput("there is no such folder", where=str(scans), remedy="check --scans")
     if pipeline.kind == "fuse":
         sources, what = _scans(scans, out), "scan folder"
-        calibration = calibration or _nearest_calibration(scans)
+        calibration = calibration or nearest_calibration(scans)
     else:
         sources, what, calibration = _rigs(scans, out), f"folder with a {RIG_FILE}", None
     if not sources:
         raise BadInput(f"holds no {what}", where=str(scans), remedy="check --scans")
-    return [_job(path, pipeline, out, calibration, until) for path in sources]
+    return [job_of(path, pipeline, out, calibration, until) for path in sources]
 
 
-def _job(path: Path, pipeline: Pipeline, out: Path, calibration: Path | None, until: str) -> Job:
+def job_of(path: Path, pipeline: Pipeline, out: Path, calibration: Path | None, until: str) -> Job:
+    """The job of one scan's (or rig's) folder."""
     name, subject = job_name(path.name), _captures_content(path).get("subject")
     subject = subject if isinstance(subject, str) else None
     return Job(name, out.absolute() / name, path, calibration, pipeline, until, subject)
@@ -83,7 +84,8 @@ def _captures_content(folder: Path) -> dict[str, Any]:
     return data if isinstance(data, dict) else {}
 
 
-def _nearest_calibration(scans: Path) -> Path:
+def nearest_calibration(scans: Path) -> Path:
+    """The `calibration` folder in that of the scans, beside or above it. Raises BadInput."""
     absolute = scans.absolute()
     for above in (absolute, *list(absolute.parents)[:2]):
         if (above / "calibration" / CALIBRATION).exists():

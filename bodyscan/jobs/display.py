@@ -15,6 +15,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.text import Text
 
 from bodyscan.jobs.supervision import Listen
+from bodyscan.verdict import MARKS
+
+_STYLES = {"good": "green", "usable": "yellow", "bad": "red"}
 
 
 @contextmanager
@@ -48,6 +51,21 @@ def screen() -> Iterator[Listen]:
     )
     with Progress(*columns, console=Console(stderr=True)) as bars:
         yield _Screen(bars)
+
+
+@contextmanager
+def lines() -> Iterator[Listen]:
+    """One line a scan as soon as its verdict is known, one when its job has ended."""
+    console = Console()
+
+    def listen(event: dict[str, Any]) -> None:
+        if event["event"] == "verdict":
+            console.print(_verdict_text(event), soft_wrap=True)
+        elif event["event"] == "job" and event["state"] in ("done", "set aside"):
+            style = "dim" if event["state"] == "done" else "red"
+            console.print(Text(ending(event), style=style), soft_wrap=True)
+
+    yield listen
 
 
 class _Screen:
@@ -96,6 +114,9 @@ class _Screen:
         style = "" if state == "done" else "red"
         self._bars.console.print(Text(ending(event), style=style), soft_wrap=True)
 
+    def _verdict(self, event: dict[str, Any]) -> None:
+        self._bars.console.print(_verdict_text(event), soft_wrap=True)
+
     def _stage(self, event: dict[str, Any]) -> None:
         if event["job"] in self._running:
             self._bars.update(
@@ -104,6 +125,12 @@ class _Screen:
                 completed=event.get("done", 0),
                 total=event.get("total"),
             )
+
+
+def _verdict_text(event: dict[str, Any]) -> Text:
+    """A scan's verdict with its worst reason."""
+    said = ": ".join([event["job"], event["grade"], *event["reasons"][:1]])
+    return Text(said, style=_STYLES[MARKS.get(event["grade"], "bad")])
 
 
 def ending(event: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import BadInput, CalibrationFileError, CaptureError
@@ -16,6 +17,13 @@ from bodyscan.jobs.job import STAGE, Job
 from bodyscan.progress import Progress, step
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
+from bodyscan.verdict import Verdict
+
+if TYPE_CHECKING:
+    from bodyscan.workflows.resident import Resident
+
+Announce = Callable[[Verdict], None]
+"""Takes a scan's verdict as soon as it is known, before anything is drawn or handed on."""
 
 
 @dataclass(frozen=True)
@@ -24,14 +32,15 @@ class Stage:
 
     version: raised whenever the same input would give other results than before.
     sections: of the pipeline file that it obeys.  inputs: the files it reads, each under a name
-    that says what it is for.  run: writes its results into an empty folder.
+    that says what it is for.  run: writes its results into an empty folder, and announces a verdict
+    where it comes to one.
     """
 
     name: str
     version: int
     sections: tuple[str, ...]
     inputs: Callable[[Job], dict[str, Path]]
-    run: Callable[[Job, Path, Progress], None]
+    run: Callable[[Job, Path, Progress, Announce], None]
 
 
 Kinds = Mapping[str, tuple[Stage, ...]]
@@ -55,24 +64,37 @@ def scan_inputs(job: Job) -> dict[str, Path]:
             where=str(job.source),
             remedy="copy what it points to into the scans' folder",
         )
-    calibration = _calibration(job)
-    files = _images(open_scan(_rig_of(calibration), job.source), job.source)
+    calibration = calibration_of(job)
+    files = _images(open_scan(rig_of(calibration), job.source), job.source)
     return files | {
         f"calibration/{name}": calibration / name for name in (CALIBRATION, "calibration.npz")
     }
 
 
-def run_scan(job: Job, out: Path, progress: Progress) -> None:
-    """As `bodyscan scan` does: cloud, mesh, what they are, pictures."""
+def run_scan(
+    job: Job, out: Path, progress: Progress, announce: Announce, resident: Resident | None = None
+) -> None:
+    """As `bodyscan scan` does: cloud, mesh, what they are, pictures.
+
+    resident: what a process that stays has loaded and decoded before.
+    """
     from bodyscan.workflows.scan_folder import scan_folder
 
     settings = job.pipeline.scan
-    *_, pictures = scan_folder(job.source, _calibration(job), out, settings, progress)
+    *_, pictures = scan_folder(
+        job.source,
+        calibration_of(job),
+        out,
+        settings,
+        progress,
+        resident=resident,
+        announce=announce,
+    )
     for note in pictures.notes:
         print(note, flush=True)  # into the job's log
 
 
-def run_export(job: Job, out: Path, progress: Progress) -> None:
+def run_export(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
     """As `bodyscan export` does."""
     from bodyscan.export.scan import export_scan
     from bodyscan.fusion.storage import load_scan
@@ -83,7 +105,7 @@ def run_export(job: Job, out: Path, progress: Progress) -> None:
         export_scan(scan, out, settings.formats, settings.versions, deface=settings.deface)
 
 
-def run_report(job: Job, out: Path, progress: Progress) -> None:
+def run_report(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
     """As `bodyscan report` does."""
     from bodyscan.files.atomic import write_text
     from bodyscan.report.page import render
@@ -101,14 +123,14 @@ def rig_inputs(job: Job) -> dict[str, Path]:
     return {"rig.yaml": rig_file, **_images(open_captures(rig, rig_file), job.source)}
 
 
-def run_calibrate(job: Job, out: Path, progress: Progress) -> None:
+def run_calibrate(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
     """As `bodyscan calibrate-rig` does."""
     from bodyscan.workflows.calibrate_rig import calibrate_folder
 
     calibrate_folder(job.source / RIG_FILE, out, progress)
 
 
-def run_rig_export(job: Job, out: Path, progress: Progress) -> None:
+def run_rig_export(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
     """As `bodyscan export-rig` does."""
     from bodyscan.export.rig import export_rig
     from bodyscan.registration.storage import load_calibration
@@ -143,13 +165,14 @@ KINDS: Kinds = {
 }
 
 
-def _calibration(job: Job) -> Path:
+def calibration_of(job: Job) -> Path:
+    """The folder that `calibrate-rig` wrote. Raises BadInput for a job that names none."""
     if job.calibration is None:
         raise BadInput("the job names no calibration", where=str(job.folder))
     return job.calibration if job.calibration.is_dir() else job.calibration.parent
 
 
-def _rig_of(calibration: Path) -> Rig:
+def rig_of(calibration: Path) -> Rig:
     """The rig file's content that a calibration keeps; its arrays are not loaded."""
     path = calibration / CALIBRATION
     try:

@@ -58,7 +58,7 @@ def supervise_job(job: Job, process: JobProcess, listen: Listen = ignore_events)
     reason = ""
     for attempt in range(1, ATTEMPTS + 1):
         listen({"event": "job", "job": path.name, "state": "running", "attempt": attempt})
-        _note(path, {"state": "running", "attempts": attempt, "reason": reason})
+        note_state(path, {"state": "running", "attempts": attempt, "reason": reason})
         reason, ran = _attempt(job, process, listen)
         stages += ran
         if not reason:
@@ -71,7 +71,7 @@ def supervise_job(job: Job, process: JobProcess, listen: Listen = ignore_events)
         round(time.monotonic() - since, 1),
         reason,
     )
-    _note(path, asdict(outcome))
+    note_state(path, asdict(outcome))
     return outcome
 
 
@@ -79,7 +79,7 @@ def _attempt(job: Job, how: JobProcess, listen: Listen) -> tuple[str, tuple[str,
     """Why it failed, "" if it did not; and the stages that ran."""
     folder, minutes = job.folder, job.pipeline.resources.limit_minutes
     try:
-        log = _open_log(folder / LOG)
+        log = open_log(folder / LOG)
     except OSError as error:
         return f"its log cannot be written: {error.strerror}", ()
     with log:
@@ -89,7 +89,7 @@ def _attempt(job: Job, how: JobProcess, listen: Listen) -> tuple[str, tuple[str,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
-                env=_environment(how.threads),
+                env=environment(how.threads),
                 start_new_session=True,
             )
         except OSError as error:
@@ -110,7 +110,7 @@ def _attempt(job: Job, how: JobProcess, listen: Listen) -> tuple[str, tuple[str,
         return said, ran
     if not in_time:
         return f"was stuck: it took longer than {minutes:g} minutes", ran
-    return _how_it_died(status, folder / LOG), ran
+    return how_it_died(status, folder / LOG), ran
 
 
 def _listen_to(
@@ -130,12 +130,15 @@ def _listen_to(
                 reason = printable(told["failed"])
             if "why" in told:
                 ran.append(told["stage"])
+            if "grade" in told:
+                listen({"event": "verdict", "job": job, **told})
             if "stage" in told:
                 listen({"event": "stage", "job": job, **told})
     return reason, tuple(ran)
 
 
-def _how_it_died(status: int, log: Path) -> str:
+def how_it_died(status: int, log: Path) -> str:
+    """What a process that said nothing died of: its exit status, and the last line of its log."""
     how = f"its process ended with {status}"
     if status < 0:
         with suppress(ValueError):
@@ -154,7 +157,7 @@ def _how_it_died(status: int, log: Path) -> str:
 _HEADING = "-- "
 
 
-def _open_log(path: Path) -> Any:
+def open_log(path: Path) -> Any:
     """To append to; never through a link, which might lead anywhere."""
     handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o600)
     stream = os.fdopen(handle, "ab", buffering=0)
@@ -163,7 +166,7 @@ def _open_log(path: Path) -> Any:
     return stream
 
 
-def _environment(threads: int) -> dict[str, str]:
+def environment(threads: int) -> dict[str, str]:
     """Threads of the libraries; BLAS gets one, stages share the rest out themselves."""
     return os.environ | {
         "OMP_NUM_THREADS": str(threads),
@@ -173,7 +176,7 @@ def _environment(threads: int) -> dict[str, str]:
     }
 
 
-def _note(folder: Path, state: dict[str, Any]) -> None:
-    """state.json is for people and --explain; a full disk must not end the batch for it."""
+def note_state(folder: Path, state: dict[str, Any]) -> None:
+    """Write state.json; it is for people and --explain; a full disk must not end the batch for it."""
     with suppress(OSError):
         write_json(folder / STATE, state | {"when": time.strftime("%Y-%m-%dT%H:%M:%S%z")})

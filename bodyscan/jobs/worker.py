@@ -18,6 +18,7 @@ import threading
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from bodyscan.jobs.job import LOCK, MANIFEST, STAGE, Job, read_job
 from bodyscan.jobs.plan import Origin, origin_of, reason_to_run, result_hashes
 from bodyscan.jobs.stages import KINDS, Kinds, Stage, stages_until
 from bodyscan.memory import keep_freed_memory
+from bodyscan.verdict import Verdict
 
 Tell = Callable[..., None]
 
@@ -38,26 +40,46 @@ _BEING_MADE, _TAKEN_AWAY = ".making-", ".old-"
 
 def main(kinds: Kinds = KINDS) -> int:
     """Work on the job of the folder on the command line; 0: done, 2: bad input, 1: failed."""
+    tell = become_worker()
+    _end_with_parent()
+    failure = attempt(Path(sys.argv[1]), kinds, tell)
+    if failure is not None:
+        tell(failed=failure.reason)
+    return failure.exit_code if failure else 0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a job failed, and what its process should end with."""
+
+    reason: str
+    exit_code: int
+
+
+def attempt(folder: Path, kinds: Kinds, tell: Tell) -> Failure | None:
+    """`work`; None if all went well."""
+    try:
+        with for_owner_only():
+            work(folder, kinds, tell)
+    except BodyscanError as error:
+        return Failure(str(error), error.exit_code)
+    except Exception as error:
+        full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+        named = str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        with suppress(OSError):  # the log lies on that same disk
+            traceback.print_exc()
+        return Failure("the disk is full: make room, then start again" if full else named, 1)
+    return None
+
+
+def become_worker() -> Tell:
+    """What every process of jobs begins with; returns what tells its parent."""
     keep_freed_memory()
     logging.basicConfig(format="%(message)s")  # on standard error, which is the job's log
     logging.getLogger("bodyscan").setLevel(logging.DEBUG)
     tell = _take_over_output()
-    _end_with_parent()
     _be_the_first_to_go()
-    try:
-        with for_owner_only():
-            work(Path(sys.argv[1]), kinds, tell)
-    except BodyscanError as error:
-        tell(failed=str(error))
-        return error.exit_code
-    except Exception as error:
-        full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-        named = str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
-        tell(failed="the disk is full: make room, then start again" if full else named)
-        with suppress(OSError):  # the log lies on that same disk
-            traceback.print_exc()
-        return 1
-    return 0
+    return tell
 
 
 def work(folder: Path, kinds: Kinds, tell: Tell) -> None:
@@ -85,8 +107,11 @@ def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
     def progress(part: str, done: int, total: int) -> None:
         tell(stage=stage.name, part=part, done=done, total=total)
 
+    def announce(verdict: Verdict) -> None:
+        tell(grade=verdict.grade, reasons=verdict.reasons)
+
     try:
-        stage.run(job, made, progress)
+        stage.run(job, made, progress, announce)
         if file_hashes(stage.inputs(job)) != before.inputs:
             raise CaptureError(
                 "changed while it was read",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.errors import BodyscanError, ScanFailed, listed
@@ -16,13 +18,38 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.stripes.stripe_map import ResponseShare
 from bodyscan.workflows.decode import decode_sequence, response_notes, responses_in
 
+Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...]]
+"""A range image, and what the projector's response was found to be on the way."""
+
+
+def reconstruct_sequence(
+    calibration: RigCalibration, captures: Captures, sequence: ImageSequence
+) -> Reconstructed:
+    """What one calibrated pair saw in one shot, within the scan volume and a little around it.
+
+    Raises ImageError and DecodingFailed as `decode_sequence` does.
+    """
+    pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
+    limits = stripes_in_volume(pair, at, calibration.rig.volume)
+    spec = calibration.rig.pair(sequence.pair)
+    stripes = decode_sequence(sequence, spec, limits=limits)
+    coded = spec.projector and calibration.rig.frames.of_code(spec.projector)
+    time_ms = captures.middle_ms(sequence.shot, sequence.pair, coded or ())
+    image = replace(reconstruct_range_image(pair, stripes), time_ms=time_ms)
+    return image, tuple(responses_in(stripes))
+
 
 def reconstruct_range_images(
-    calibration: RigCalibration, captures: Captures, progress: Progress = silent
+    calibration: RigCalibration,
+    captures: Captures,
+    progress: Progress = silent,
+    *,
+    made: Mapping[ImageSequence, Reconstructed] = MappingProxyType({}),
 ) -> Outcome[list[RangeImage]]:
     """The range image of every calibrated pair; pairs that gave none are failures.
 
-    They show the scan volume and a little around it. Raises ScanFailed if no pair gives one.
+    They show the scan volume and a little around it. made: those of sequences that were made while
+    others still arrived. Raises ScanFailed if no pair gives one.
     """
     failed = {
         pair.name: calibration.failed.get(pair.name, "is not calibrated")
@@ -38,23 +65,18 @@ def reconstruct_range_images(
     }
     sequences = [s for s in captures.sequences if s.has_stripes and s.pair not in failed]
 
-    responses: dict[str, list[ResponseShare]] = defaultdict(list)
+    def reconstruct(sequence: ImageSequence) -> Reconstructed:
+        return made.get(sequence) or reconstruct_sequence(calibration, captures, sequence)
 
-    def reconstruct(sequence: ImageSequence) -> RangeImage:
-        pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
-        limits = stripes_in_volume(pair, at, calibration.rig.volume)
-        spec = calibration.rig.pair(sequence.pair)
-        stripes = decode_sequence(sequence, spec, limits=limits)
-        responses[sequence.pair] += responses_in(stripes)
-        coded = spec.projector and calibration.rig.frames.of_code(spec.projector)
-        time_ms = captures.middle_ms(sequence.shot, sequence.pair, coded or ())
-        return replace(reconstruct_range_image(pair, stripes), time_ms=time_ms)
-
-    images, errors = attempt_each(
+    found, errors = attempt_each(
         reconstruct, sequences, BodyscanError, stage="range images", progress=progress
     )
     failed |= {s.pair: captures.relative(str(error)) for s, error in errors.items()}
-    if not images:
+    if not found:
         raise ScanFailed(f"no pair gave a range image:{listed(failed)}")
-    notes = [f"{i.pair}: {i.agreement}" for i in images.values() if i.agreement is not None]
-    return Outcome(list(images.values()), (*notes, *response_notes(responses)), failed)
+    images = [image for image, _ in found.values()]
+    responses: dict[str, list[ResponseShare]] = defaultdict(list)
+    for image, shares in found.values():
+        responses[image.pair] += shares
+    notes = [f"{image.pair}: {image.agreement}" for image in images if image.agreement is not None]
+    return Outcome(images, (*notes, *response_notes(responses)), failed)

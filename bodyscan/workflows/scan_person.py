@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from bodyscan.captures.folder import Captures
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.fusion.scan import Scan, fuse
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
-from bodyscan.workflows.range_images import reconstruct_range_images
+from bodyscan.workflows.range_images import Reconstructed, reconstruct_range_images
 
 
 def scan_person(
@@ -17,12 +20,14 @@ def scan_person(
     progress: Progress = silent,
     *,
     empty: Captures | None = None,
+    made: Mapping[ImageSequence, Reconstructed] = MappingProxyType({}),
 ) -> Scan:
     """Person images in, body model and mesh out.
 
     empty: captures of the rig without anybody in it, whose surfaces are no part of the subject.
+    made: see `reconstruct_range_images`.
     Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left.
     """
-    images = reconstruct_range_images(calibration, captures, progress)
+    images = reconstruct_range_images(calibration, captures, progress, made=made)
     background = reconstruct_range_images(calibration, empty, progress).value if empty else ()
     return fuse(calibration, images, settings, progress, empty=background)

@@ -20,9 +20,10 @@ from bodyscan.jobs.discovery import find_jobs
 from bodyscan.jobs.display import json_lines
 from bodyscan.jobs.job import Job
 from bodyscan.jobs.pipeline import load_pipeline
-from bodyscan.jobs.stages import Stage, results_of
+from bodyscan.jobs.stages import Announce, Stage, results_of
 from bodyscan.jobs.worker import main
 from bodyscan.progress import Progress
+from bodyscan.verdict import Verdict
 
 COMMAND = (__file__,)
 PIPELINE = Path(__file__).parents[2] / "pipelines" / "fuse.yaml"
@@ -32,7 +33,7 @@ def inputs(job: Job) -> dict[str, Path]:
     return {path.name: path for path in sorted(job.source.iterdir())}
 
 
-def scan(job: Job, out: Path, progress: Progress) -> None:
+def scan(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
     """Two files made slowly from what lies in the scan's folder; or what `do.txt` says."""
     text = "".join(path.read_text() for path in sorted(job.source.iterdir()))
     seed = f"{text} {job.pipeline.fusion.points}".encode()
@@ -41,10 +42,11 @@ def scan(job: Job, out: Path, progress: Progress) -> None:
         (out / f"{number}.bin").write_bytes(hashlib.sha256(seed).digest() * 2000)
         seed += b"."
         _do(job)
+    announce(Verdict("good"))
     print("made a scan", flush=True)
 
 
-def export(job: Job, out: Path, progress: Progress) -> None:
+def export(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
     _, *rest = sorted((job.folder / "scan").glob("*.bin"))
     (out / "body.bin").write_bytes(rest[0].read_bytes()[::-1])
     time.sleep(0.02)

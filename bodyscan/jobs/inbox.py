@@ -1,0 +1,146 @@
+"""An inbox: a folder a scan, whose images are still being written.
+
+An image is whole when it ends as its format does, or when it has not changed for a while; a pair is,
+when all its images are; a scan is complete when all pairs are, or `done` lies in its folder, or
+nothing has come for long. docs/inbox.md is the protocol.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+
+from bodyscan.arrays import Bytes
+from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
+from bodyscan.captures.folder import ImageSequence, open_scan
+from bodyscan.errors import BadInput, CaptureError
+from bodyscan.files.atomic import write_bytes
+from bodyscan.files.hashing import files_below
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.templates import ANYTHING, fill
+
+DONE = "done"
+SHOT = "s01"
+SETTLED_S = 0.5
+"""An image without an end of its own is whole when it has not grown for so long: cameras' drivers
+write a file in one go, in hundredths of a second."""
+
+_ENDS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+"""The last bytes of a file that is whole."""
+
+
+_LOSSLESS = (".png", ".tif", ".tiff", ".bmp", ".pgm")
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """What has come of a scan. whole: pairs whose images are all there.  complete: nothing more has to
+    be waited for."""
+
+    whole: tuple[str, ...]
+    complete: bool
+
+
+@dataclass(frozen=True)
+class _Seen:
+    size: int
+    changed_ns: int
+    since_s: float
+    whole: bool
+
+
+def put_image(
+    inbox: Path, rig: Rig, scan: str, pair: str, frame: str, image: Bytes, *, shot: str = SHOT
+) -> Path:
+    """An image that a program has in memory, put where `watch` takes it for that frame; its path.
+
+    image: (height, width) uint8 or uint16. It is there whole or not at all. Raises BadInput for a
+    pair or a template of `files` that no image can be named after.
+    """
+    if pair not in {own.name for own in rig.pairs}:
+        raise BadInput(f"rig {rig.name} has no pair {pair}", where=f"scan {scan}, frame {frame}")
+    name = fill(rig.files, shot=shot, pair=pair, frame=frame)
+    if ANYTHING in name or Path(name).suffix.lower() not in _LOSSLESS:
+        raise BadInput(
+            f"`files` is {rig.files}, by which no image can be written",
+            where=f"rig {rig.name}",
+            remedy=f"calibrate with a template that has no * and ends in one of {_LOSSLESS}",
+        )
+    path = Path(inbox) / scan / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    quickly = [cv2.IMWRITE_PNG_COMPRESSION, 1] if path.suffix.lower() == ".png" else []
+    write_bytes(path, cv2.imencode(path.suffix, image, quickly)[1].tobytes())
+    return path
+
+
+class IncomingScan:
+    """One scan's folder, looked at again and again."""
+
+    def __init__(self, folder: Path, rig: Rig) -> None:
+        self.folder, self.rig = folder, rig
+        self._files: dict[Path, _Seen] = {}
+        self._changed_s: float | None = None
+
+    def look(self, now_s: float, quiet_s: float) -> Arrival:
+        """What is there now. now_s: of a clock that never goes back.
+
+        quiet_s: a scan to which nothing has been added for so long is taken as it is.
+        """
+        if self._look_for_changes(now_s) or self._changed_s is None:
+            self._changed_s = now_s
+        try:
+            sequences = open_scan(self.rig, self.folder).sequences
+        except CaptureError:
+            sequences = ()  # nothing yet, or what only the scan itself can complain of
+        striped = [sequence for sequence in sequences if sequence.has_stripes]
+        whole = {sequence.pair for sequence in striped if self._is_whole(sequence, now_s)}
+        all_there = bool(whole) and self._expected(striped) <= whole
+        complete = all_there or self._is_marked() or now_s - self._changed_s >= quiet_s
+        return Arrival(tuple(sorted(whole)), complete)
+
+    def _expected(self, striped: list[ImageSequence]) -> set[str]:
+        """Pairs that have to come: those of captures.yaml, or all that have a projector."""
+        if (self.folder / CAPTURES).exists():
+            return {sequence.pair for sequence in striped}
+        return {pair.name for pair in self.rig.pairs if pair.projector is not None}
+
+    def _is_marked(self) -> bool:
+        return (self.folder / DONE).exists()
+
+    def _is_whole(self, sequence: ImageSequence, now_s: float) -> bool:
+        if sequence.missing:
+            return False
+        seen = [self._files[path] for path in sequence.paths if path in self._files]
+        settled = [own.whole or now_s - own.since_s >= SETTLED_S for own in seen]
+        return len(seen) == len(sequence.paths) and all(settled)
+
+    def _look_for_changes(self, now_s: float) -> bool:
+        """Every file of the folder; whether one came, went or changed."""
+        before, self._files = self._files, {}
+        for path in files_below(self.folder):
+            try:
+                found = os.stat(path)
+            except OSError:
+                continue
+            stamp = (found.st_size, found.st_mtime_ns)
+            seen = before.get(path)
+            if seen is None or stamp != (seen.size, seen.changed_ns):
+                seen = _Seen(*stamp, now_s, _ends_as_it_should(path, found.st_size))
+            self._files[path] = seen
+        return before != self._files
+
+
+def _ends_as_it_should(path: Path, size: int) -> bool:
+    """Whether the file's last bytes say that it is whole; no for formats that do not say."""
+    end = _ENDS.get(path.suffix.lower())
+    if end is None or size < len(end) or not path.is_file():
+        return False
+    try:
+        with path.open("rb") as stream:
+            stream.seek(-len(end), os.SEEK_END)
+            return stream.read() == end
+    except OSError:
+        return False

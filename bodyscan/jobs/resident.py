@@ -1,0 +1,87 @@
+"""The process that stays: `python -m bodyscan.jobs --resident CALIBRATION`; `watch` starts it.
+
+It is asked, a JSON object a line on its standard input, to decode pairs of a scan that is still
+arriving, or to work on a job as a process of its own would; the same stages, locks and manifests.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+from bodyscan.errors import BodyscanError
+from bodyscan.jobs.job import LOG
+from bodyscan.jobs.stages import KINDS, Kinds, run_scan
+from bodyscan.jobs.supervision import open_log
+from bodyscan.jobs.worker import attempt, become_worker
+from bodyscan.workflows.resident import Resident
+
+
+def main() -> int:
+    """Answer requests until nobody is left to ask; 2 if the calibration cannot be used."""
+    tell = become_worker()
+    requests = _requests()
+    try:
+        resident = Resident(Path(sys.argv[2]))
+    except BodyscanError as error:
+        tell(unusable=str(error))
+        return error.exit_code
+    kinds = _kinds(resident)
+    tell(ready=True)
+    while True:
+        request = requests.get()
+        folder = Path(request["folder"])
+        if "pairs" in request:
+            resident.prepare(folder, request["pairs"])
+            continue
+        with _log_of(folder):
+            failure = attempt(folder, kinds, tell)
+        tell(ended=request["folder"], failed=failure.reason if failure else "")
+
+
+def _kinds(resident: Resident) -> Kinds:
+    """Stages as ever, but for the scan, which takes what is resident."""
+    scan, *others = KINDS["fuse"]
+    return {"fuse": (replace(scan, run=partial(run_scan, resident=resident)), *others)}
+
+
+def _requests() -> SimpleQueue[dict[str, Any]]:
+    """Filled by a thread; when the other end is closed the process ends, whatever it is at."""
+    requests: SimpleQueue[dict[str, Any]] = SimpleQueue()
+
+    def read() -> None:
+        for line in sys.stdin:
+            requests.put(json.loads(line))
+        os._exit(1)
+
+    threading.Thread(target=read, daemon=True).start()
+    return requests
+
+
+@contextmanager
+def _log_of(folder: Path) -> Iterator[None]:
+    """What is printed meanwhile goes into the job's log."""
+    before = os.dup(2)
+    try:
+        with open_log(folder / LOG) as log:
+            _send_output_to(log.fileno())
+            yield
+    finally:
+        _send_output_to(before)
+        os.close(before)
+
+
+def _send_output_to(handle: int) -> None:
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.dup2(handle, 1)
+    os.dup2(handle, 2)

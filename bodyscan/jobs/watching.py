@@ -1,0 +1,316 @@
+"""Scans fused while they arrive: an inbox looked at, and one process that stays and does the work.
+
+The jobs are those of a batch: the same folders, stages, states and manifests, so that a batch, or
+`verify`, takes them for its own, and what is done is never done twice.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from bodyscan.errors import BadInput, BodyscanError, FailedWork
+from bodyscan.files.locking import file_lock, for_owner_only
+from bodyscan.jobs.batch import finish, sweep
+from bodyscan.jobs.discovery import RESULTS, job_of
+from bodyscan.jobs.inbox import IncomingScan
+from bodyscan.jobs.job import (
+    BATCH_LOCK,
+    LOG,
+    STATE,
+    Job,
+    job_name,
+    printable,
+    read_record,
+    write_job,
+)
+from bodyscan.jobs.pipeline import Pipeline
+from bodyscan.jobs.stages import KINDS, rig_of
+from bodyscan.jobs.supervision import (
+    ATTEMPTS,
+    COMMAND,
+    JobResult,
+    Listen,
+    environment,
+    how_it_died,
+    ignore_events,
+    note_state,
+)
+
+POLL_S = 0.1
+"""An image is found so long after it was written, at most: a twentieth of the time to a verdict."""
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What is watched and what becomes of it.
+
+    quiet_s: a scan with images missing is taken as it is when nothing has come for so long.
+    threads: of the process that does the work.
+    """
+
+    inbox: Path
+    out: Path
+    calibration: Path
+    pipeline: Pipeline
+    quiet_s: float = 30.0
+    threads: int = 2
+    command: Sequence[str] = COMMAND
+
+
+def watch(
+    watched: Watched, listen: Listen = ignore_events, *, once: bool = False
+) -> dict[str, Any]:
+    """Fuse every scan of the inbox as its images arrive; until interrupted, or, with `once`, until
+    all that lies there is done. Returns the event that ends a batch.
+
+    A job that fails twice is set aside with its reason, the others go on. Raises BadInput when the
+    inbox is no folder, a batch or another watch works in `out`, or the calibration cannot be used.
+    """
+    if not watched.inbox.is_dir():
+        raise BadInput("there is no such folder", where=str(watched.inbox), remedy="make it first")
+    rig = rig_of(watched.calibration)
+    with for_owner_only():
+        watched.out.mkdir(parents=True, exist_ok=True)
+        with file_lock(watched.out / BATCH_LOCK, wait=False):
+            sweep(watched.out)
+            watching = _Watching(watched, listen)
+            try:
+                watching.process.start()
+                while True:
+                    for folder in watching.folders():
+                        scan = watching.scans.setdefault(folder, IncomingScan(folder, rig))
+                        watching.look_at(scan)
+                    watching.hear()
+                    if once and not watching.scans:
+                        return watching.summary()
+            finally:
+                watching.process.stop()
+
+
+@dataclass
+class _Watching:
+    """scans: not ended yet.  running: jobs handed over, in order, with when and how often."""
+
+    watched: Watched
+    listen: Listen
+    scans: dict[Path, IncomingScan] = field(default_factory=dict)
+    prepared: dict[Path, set[str]] = field(default_factory=dict)
+    running: dict[Path, tuple[Job, int]] = field(default_factory=dict)
+    stages: dict[Path, list[str]] = field(default_factory=dict)
+    jobs: dict[Path, Job] = field(default_factory=dict)
+    ended: dict[Path, JobResult] = field(default_factory=dict)
+    started_s: float = 0.0
+    is_ready: bool = False
+
+    def __post_init__(self) -> None:
+        own = self.watched
+        self.process = _Resident(own.calibration, own.threads, own.command)
+
+    def folders(self) -> list[Path]:
+        """Of scans that are not done: what an earlier watch or batch did stays done."""
+        own = self.watched
+        found = []
+        for path in sorted(own.inbox.absolute().iterdir()):
+            hidden = path.name.startswith(".") or not path.is_dir() or path == own.out.absolute()
+            if hidden or path in self.ended or any((path / name).exists() for name in RESULTS):
+                continue
+            if path not in self.scans and (outcome := self._earlier(path)):
+                self.jobs[path] = self._job(path)
+                self.ended[path] = outcome
+                continue
+            found.append(path)
+        return found
+
+    def look_at(self, scan: IncomingScan) -> None:
+        """Have decoded what has come, and the job done once all has."""
+        path = scan.folder
+        if path in self.running:
+            return
+        arrival = scan.look(time.monotonic(), self.watched.quiet_s)
+        known = self.prepared.setdefault(path, set())
+        new = sorted(set(arrival.whole) - known)
+        if new:
+            known.update(new)
+            self.process.ask(folder=str(path), pairs=new)
+        if arrival.complete:
+            self._hand_over(path, attempt=1)
+
+    def hear(self) -> None:
+        """What the process has to say; waits for it a little."""
+        for told in self.process.told(POLL_S):
+            if "unusable" in told:
+                raise BadInput(told["unusable"])
+            self.is_ready |= "ready" in told
+            path = next(iter(self.running), None)
+            if path is None:
+                continue
+            job, attempt = self.running[path]
+            if "grade" in told:
+                self.listen({"event": "verdict", "job": job.name, **told})
+            if "why" in told:
+                self.stages.setdefault(path, []).append(told["stage"])
+            if "stage" in told:
+                self.listen({"event": "stage", "job": job.name, **told})
+            if "ended" in told:
+                self._end(path, attempt, printable(told["failed"]))
+        status, limit_s = (
+            self.process.status(),
+            60.0 * self.watched.pipeline.resources.limit_minutes,
+        )
+        if status is None and self.running and time.monotonic() - self.started_s > limit_s:
+            self.process.stop()
+        elif status is not None:
+            self._begin_again(status)
+
+    def _begin_again(self, status: int) -> None:
+        """The process died: of the job that ran, which is tried once more, or of an image; those that
+        are there are decoded by their jobs alone, which count how often they fail."""
+        if not self.is_ready:
+            raise FailedWork(
+                f"the process that fuses scans does not start: it ended with {status}",
+                where=str(self.watched.calibration),
+                remedy="try `bodyscan scan` on one of the scans: it says more",
+            )
+        self.is_ready = False
+        for path in self.scans:
+            self.prepared[path] = {pair.name for pair in self.scans[path].rig.pairs}
+        waiting = list(self.running.items())
+        self.running.clear()
+        self.process.start()
+        for number, (path, (job, attempt)) in enumerate(waiting):
+            if number == 0:
+                self.running[path] = (job, attempt)
+                self._end(path, attempt, how_it_died(status, job.folder / LOG))
+            else:
+                self._hand_over(path, attempt)
+
+    def _hand_over(self, path: Path, attempt: int) -> None:
+        job = self._job(path)
+        try:
+            write_job(job)
+        except (BodyscanError, OSError) as error:
+            self.running[path] = (job, ATTEMPTS)
+            self._end(path, ATTEMPTS, str(error))
+            return
+        if not self.running:
+            self.started_s = time.monotonic()
+        self.running[path] = (job, attempt)
+        self.jobs[path] = job
+        note_state(job.folder, {"state": "running", "attempts": attempt, "reason": ""})
+        self.listen({"event": "job", "job": job.name, "state": "running", "attempt": attempt})
+        self.process.ask(folder=str(job.folder))
+
+    def _end(self, path: Path, attempt: int, reason: str) -> None:
+        job, _ = self.running.pop(path)
+        seconds = round(time.monotonic() - self.started_s, 1)
+        self.started_s = time.monotonic()
+        if reason and attempt < ATTEMPTS:
+            self._hand_over(path, attempt + 1)
+            return
+        ran = tuple(dict.fromkeys(self.stages.pop(path, [])))
+        state = "set aside" if reason else "done"
+        outcome = JobResult(job.name, state, attempt, ran, seconds, reason)
+        self.scans.pop(path, None)
+        self.prepared.pop(path, None)
+        self.jobs[path], self.ended[path] = job, outcome
+        note_state(job.folder, asdict(outcome))
+        self.listen({"event": "job", **asdict(outcome)})
+        self.listen(self.summary())
+
+    def summary(self) -> dict[str, Any]:
+        """The table and the manifest over all jobs, written anew."""
+        if not self.ended:
+            return {"event": "summary", "jobs": 0, "set_aside": [], "repeat": []}
+        jobs = [self.jobs[path] for path in self.ended]
+        return finish(jobs, list(self.ended.values()), self.watched.out)
+
+    def _job(self, path: Path) -> Job:
+        own = self.watched
+        last = KINDS["fuse"][-1].name
+        return job_of(path, own.pipeline, own.out, own.calibration.absolute(), last)
+
+    def _earlier(self, path: Path) -> JobResult | None:
+        """How the scan's job ended before this watch began, unless its folder was changed since."""
+        folder = self.watched.out / job_name(path.name)
+        state = read_record(folder / STATE)
+        if state.get("state") not in ("done", "set aside"):
+            return None
+        since = (folder / STATE).stat().st_mtime_ns
+        if any(p.stat().st_mtime_ns > since for p in (path, *path.iterdir())):
+            return None
+        names = ("job", "state", "attempts", "stages", "seconds", "reason")
+        known = {name: state[name] for name in names if name in state}
+        return JobResult(**{**known, "stages": tuple(known.get("stages", ()))})
+
+
+class _Resident:
+    """The process that does the work, and what it says."""
+
+    def __init__(self, calibration: Path, threads: int, command: Sequence[str]) -> None:
+        self._line = [sys.executable, *command, "--resident", str(calibration)]
+        self._threads = threads
+        self._process: subprocess.Popen[str] | None = None
+        self._said: SimpleQueue[dict[str, Any]] = SimpleQueue()
+
+    def start(self) -> None:
+        self.stop()
+        self._said = SimpleQueue()
+        self._process = subprocess.Popen(
+            self._line,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment(self._threads),
+            start_new_session=True,
+        )
+        threading.Thread(target=self._read, args=(self._process, self._said), daemon=True).start()
+
+    def ask(self, **request: Any) -> None:
+        """One that died while it was asked is noticed by `status`."""
+        assert self._process is not None
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(json.dumps(request) + "\n")
+            self._process.stdin.flush()
+        except OSError:
+            pass
+
+    def told(self, wait_s: float) -> list[dict[str, Any]]:
+        """What was said since the last time; waits so long for the first word."""
+        found = []
+        try:
+            found.append(self._said.get(timeout=wait_s))
+            while True:
+                found.append(self._said.get_nowait())
+        except Empty:
+            return found
+
+    def status(self) -> int | None:
+        """What it ended with; None while it runs, or still has something to say."""
+        if self._process is None or not self._said.empty():
+            return None
+        return self._process.poll()
+
+    def stop(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+    @staticmethod
+    def _read(process: subprocess.Popen[str], said: SimpleQueue[dict[str, Any]]) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            try:
+                said.put(json.loads(line))
+            except ValueError:
+                continue

@@ -1,0 +1,86 @@
+"""What a process that stays between scans keeps: the calibration, and range images made early.
+
+A pair's images are decoded as soon as they are there, while other pairs still take theirs; what is
+left after the last image is its own pair and what joins them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from bodyscan.captures.captures_file import FILE_NAME
+from bodyscan.captures.folder import Captures, ImageSequence, open_scan
+from bodyscan.errors import BodyscanError
+from bodyscan.progress import attempt_each
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.registration.storage import load_calibration
+from bodyscan.workflows.range_images import Reconstructed, reconstruct_sequence
+
+Stamp = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """stamps: size and time of change of every file, as they were when it was made of them."""
+
+    range_image: Reconstructed
+    stamps: tuple[Stamp, ...]
+
+
+class Resident:
+    """One calibration, loaded once, and the range images of scans that are still arriving."""
+
+    def __init__(self, calibration: Path) -> None:
+        """Raises CalibrationFileError as `load_calibration` does."""
+        self.calibration: RigCalibration = load_calibration(calibration)
+        self._made: dict[Path, dict[ImageSequence, _Made]] = {}
+
+    def prepare(self, folder: Path, pairs: Collection[str]) -> None:
+        """Decode what these pairs took, if all of it is there.
+
+        What is amiss is left to the scan, which tries again and says so; nothing is raised for it.
+        """
+        try:
+            captures = open_scan(self.calibration.rig, folder)
+        except BodyscanError:
+            return
+        wanted = [s for s in captures.sequences if s.pair in pairs and self._can(s)]
+
+        def make(sequence: ImageSequence) -> _Made:
+            stamps = _stamps(captures, sequence)
+            return _Made(reconstruct_sequence(self.calibration, captures, sequence), stamps)
+
+        made, _ = attempt_each(make, wanted, BodyscanError, stage="range images")
+        self._made.setdefault(folder, {}).update(made)
+
+    def made_of(self, captures: Captures) -> dict[ImageSequence, Reconstructed]:
+        """The range images made of these captures whose files have stayed as they were; they are
+        given away, so that none is kept twice."""
+        made: dict[ImageSequence, _Made] = {}
+        for folder in captures.folders:
+            made |= self._made.pop(folder, {})
+        return {
+            sequence: own.range_image
+            for sequence, own in made.items()
+            if _stamps(captures, sequence) == own.stamps
+        }
+
+    def _can(self, sequence: ImageSequence) -> bool:
+        calibrated = sequence.pair in self.calibration.pairs
+        return calibrated and sequence.has_stripes and not sequence.missing
+
+
+def _stamps(captures: Captures, sequence: ImageSequence) -> tuple[Stamp, ...]:
+    """Of the images, and of captures.yaml, which says when they were taken; (0, 0) for a file that is
+    not there."""
+    stamps = []
+    for path in (*(folder / FILE_NAME for folder in captures.folders), *sequence.paths):
+        try:
+            found = path.stat()
+        except OSError:
+            stamps.append((0, 0))
+        else:
+            stamps.append((found.st_size, found.st_mtime_ns))
+    return tuple(stamps)

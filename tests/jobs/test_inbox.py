@@ -1,0 +1,109 @@
+"""When an image, a pair and a scan are taken to be there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bodyscan.errors import BadInput
+from bodyscan.jobs.inbox import SETTLED_S, IncomingScan, put_image
+from bodyscan.rig.rig import Rig
+
+QUIET_S = 30.0
+IMAGE = np.arange(64, dtype=np.uint8).reshape(8, 8)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """Two pairs with Gray code of 4 stripes and inverses: 6 images each."""
+    board = {"name": "b", "kind": "checkerboard", "columns": 5, "rows": 4, "square_mm": 30}
+    pair = {
+        "camera": {"width": 8, "height": 8},
+        "projector": {"code": "gray", "stripes": 4, "direction": "vertical"},
+    }
+    return Rig.model_validate(
+        {
+            "version": 1,
+            "name": "two",
+            "boards": [board],
+            "pairs": [{"name": name, **pair} for name in ("a", "b")],
+            "files": "{shot}/{pair}/{frame}.png",
+        }
+    )
+
+
+def frames(rig: Rig) -> list[str]:
+    projector = rig.pairs[0].projector
+    assert projector is not None
+    return ["lit", "dark", *rig.frames.of_code(projector)]
+
+
+def test_pairs_are_whole_one_by_one_and_then_the_scan(rig: Rig, tmp_path: Path) -> None:
+    scan = IncomingScan(tmp_path / "anna", rig)
+    assert not scan.look(0.0, QUIET_S).complete  # the folder is not even there
+    *first, last = frames(rig)
+    for frame in first:
+        put_image(tmp_path, rig, "anna", "a", frame, IMAGE)
+        found = scan.look(0.1, QUIET_S)
+        assert (found.whole, found.complete) == ((), False)
+    put_image(tmp_path, rig, "anna", "a", last, IMAGE)
+    found = scan.look(0.1, QUIET_S)
+    assert (found.whole, found.complete) == (("a",), False)
+    for frame in frames(rig):
+        put_image(tmp_path, rig, "anna", "b", frame, IMAGE)
+    found = scan.look(0.1, QUIET_S)
+    assert (found.whole, found.complete) == (("a", "b"), True)
+
+
+def test_half_an_image_is_waited_for(rig: Rig, tmp_path: Path) -> None:
+    """One that does not end as it should counts once it has not grown for a while: its scan says
+    what is wrong with it."""
+    scan = IncomingScan(tmp_path / "anna", rig)
+    path = [put_image(tmp_path, rig, "anna", "a", frame, IMAGE) for frame in frames(rig)][-1]
+    content = path.read_bytes()
+    path.write_bytes(content[:-20])
+    assert scan.look(0.0, QUIET_S).whole == ()
+    path.write_bytes(content[:-10])
+    assert scan.look(SETTLED_S + 0.1, QUIET_S).whole == ()
+    assert scan.look(2 * SETTLED_S + 0.2, QUIET_S).whole == ("a",)
+    path.write_bytes(content)
+    assert scan.look(2 * SETTLED_S + 0.3, QUIET_S).whole == ("a",)
+
+
+def test_a_scan_with_images_missing_is_taken_when_marked_or_quiet(rig: Rig, tmp_path: Path) -> None:
+    scan = IncomingScan(tmp_path / "anna", rig)
+    put_image(tmp_path, rig, "anna", "a", "lit", IMAGE)
+    assert not scan.look(0.0, QUIET_S).complete
+    put_image(tmp_path, rig, "anna", "a", "dark", IMAGE)
+    assert not scan.look(20.0, QUIET_S).complete
+    assert not scan.look(20.0 + QUIET_S - 0.1, QUIET_S).complete, "it was quiet for less"
+    assert scan.look(20.0 + QUIET_S, QUIET_S).complete
+    other = IncomingScan(tmp_path / "bert", rig)
+    put_image(tmp_path, rig, "bert", "a", "lit", IMAGE)
+    assert not other.look(0.0, QUIET_S).complete
+    (tmp_path / "bert" / "done").touch()
+    assert other.look(0.0, QUIET_S).complete
+
+
+def test_pairs_that_captures_yaml_leaves_out_are_not_waited_for(rig: Rig, tmp_path: Path) -> None:
+    folder = tmp_path / "anna"
+    folder.mkdir()
+    listed = "version: 1\nkind: scan\nshots: [{name: s01, stripes: [a]}]\n"
+    (folder / "captures.yaml").write_text(listed)
+    scan = IncomingScan(folder, rig)
+    for frame in frames(rig):
+        assert not scan.look(0.0, QUIET_S).complete
+        put_image(tmp_path, rig, "anna", "a", frame, IMAGE)
+    assert scan.look(0.0, QUIET_S).complete
+
+
+def test_images_for_pairs_or_names_that_are_not_there_are_refused(rig: Rig, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="no pair c"):
+        put_image(tmp_path, rig, "anna", "c", "lit", IMAGE)
+    for template in ("{shot}/{pair}/*{frame}.png", "{shot}/{pair}/{frame}.jpg"):
+        other = rig.model_copy(update={"files": template})
+        with pytest.raises(BadInput, match="no image can be written"):
+            put_image(tmp_path, other, "anna", "a", "lit", IMAGE)
+    assert not list(tmp_path.iterdir())
