@@ -4,7 +4,7 @@
 # make coverage     all tests again, with the lines of the package that they run
 # make wheel        build the wheel, install it into an empty environment, scan something small there
 # make check        format, lint, types and the directions of imports
-# make bench        speed and accuracy at full size, written to docs/results.md
+# make bench        speed and accuracy at full size, written to docs/results.md, old sections marked
 
 PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 	"$$p" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' 2>/dev/null \

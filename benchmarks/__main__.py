@@ -10,11 +10,14 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import platform
+import re
+import subprocess
 import sys
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 
-from benchmarks import charuco_ring, codes, full_size, fusion, lens, png, procam, rig
+from benchmarks import charuco_ring, codes, full_size, fusion, lens, png, procam, rig, seconds
 from bodyscan.files.atomic import write_text
 
 PROJECT = Path(__file__).parents[1]
@@ -24,6 +27,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "four-pole": full_size.four_pole,
     "sway": full_size.sway,
     "fusion": fusion.report,
+    "seconds": seconds.report,
     "png": png.report,
     "rig": rig.report,
     "procam": procam.report,
@@ -34,19 +38,62 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
 
 
 def main() -> None:
-    """Sections that are not run keep what the last run found."""
+    """Sections that are not run keep what the last run found, and say how old it is."""
     named = sys.argv[1:] or list(BENCHMARKS)
     sections = _sections()
     for name in named:
-        sections[name] = BENCHMARKS[name]().strip()
+        found, load = BENCHMARKS[name]().strip(), os.getloadavg()[1]
+        title, _, rest = found.partition("\n")
+        sections[name] = f"{title}\n\n{_origin(load)}\n{rest}"
         print(sections[name], flush=True)
     head = (
-        "# Results\n\nWritten by `make bench` (`python -m benchmarks`); each section says how it was "
-        f"got.\nMachine: {os.cpu_count()} cores, {platform.machine()}, "
-        f"Python {platform.python_version()}; load average {os.getloadavg()[1]:.1f}.\n"
+        "# Results\n\nWritten by `make bench` (`python -m benchmarks`); each section says how, when, "
+        "on what and of which\ncommit it was got, and whether the code has changed since.\n"
     )
-    body = [f"<!-- {name} -->\n{sections[name]}\n" for name in BENCHMARKS if name in sections]
+    body = [
+        f"<!-- {name} -->\n{_aged(sections[name])}\n" for name in BENCHMARKS if name in sections
+    ]
     write_text(RESULTS, "\n".join([head, *body]))
+
+
+def _origin(load: float) -> str:
+    """The line that says where a section comes from."""
+    commit = _git("rev-parse", "--short=7", "HEAD")
+    changed = (
+        " with changes that are not committed" if _git("status", "--porcelain", "bodyscan") else ""
+    )
+    machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
+    today = datetime.now(UTC).date().isoformat()
+    return f"*Commit {commit}{changed}, {today}; {machine}; load average at its end {load:.1f}.*"
+
+
+_ORIGIN = re.compile(r"^\*Commit ([0-9a-f]{7,})[^*]*\*", re.MULTILINE)
+_AGE = re.compile(r"\n\*\*Older than the code\*\*[^\n]*\n")
+
+
+def _aged(section: str) -> str:
+    """The section with a line on how many commits have changed the package since, if any have."""
+    section = _AGE.sub("\n", section)
+    origin = _ORIGIN.search(section)
+    if origin is None:
+        title, _, rest = section.partition("\n")
+        return f"{title}\n\n**Older than the code**: made before sections said of which commit.\n{rest}"
+    since = _git("rev-list", "--count", f"{origin[1]}..HEAD", "--", "bodyscan", "benchmarks")
+    if since in ("", "0"):
+        return section
+    said = f"\n\n**Older than the code**: {since} commits have changed it since.\n"
+    return section[: origin.end()] + said + section[origin.end() :].lstrip("\n")
+
+
+def _git(*arguments: str) -> str:
+    """What git says of this project; "" where it cannot."""
+    try:
+        done = subprocess.run(
+            ["git", *arguments], capture_output=True, text=True, cwd=PROJECT, check=False
+        )
+    except OSError:
+        return ""
+    return done.stdout.strip()
 
 
 def _sections() -> dict[str, str]:
