@@ -37,9 +37,22 @@ def simulate(
         Literal["mirror", "pinhole"],
         typer.Option(help="A laser and a rotating mirror, or a projector with a lens."),
     ] = "mirror",
+    subject_preset: Annotated[
+        Literal["mannequin", "standing", "restless", "child"],
+        typer.Option(help="How the subject moves while frames are taken."),
+    ] = "mannequin",
     sway_mm: Annotated[
-        float, typer.Option(min=0.0, help="How far the person moves between the pairs' captures.")
+        float,
+        typer.Option(min=0.0, help="How far the person moves, rigid, between the pairs' captures."),
     ] = 0.0,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Change a number, such as person.breath_mm=5; repeatable. truth/truth.json shows all.",
+        ),
+    ] = None,
     board_shots: Annotated[
         int | None, typer.Option(min=3, help="Number of board poses; 40 for twelve pairs.")
     ] = None,
@@ -63,7 +76,9 @@ def simulate(
             subject=subject,
             scale=scale,
             seed=seed,
-            settings=settings_for(projector, sway_mm=sway_mm),
+            settings=settings_for(
+                projector, subject=subject_preset, sway_mm=sway_mm, changes=changes or ()
+            ),
             board_shots=board_shots,
             progress=progress,
         )

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -19,6 +18,7 @@ from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation import files
 from bodyscan.simulation.layout import TruePair
+from bodyscan.simulation.presets import settings_of
 from bodyscan.simulation.render import View
 from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Surface, grid_surface
@@ -47,7 +47,7 @@ def open_workspace(workspace: Path) -> SimulatedRig:
     remedy = "give a folder that this version of `bodyscan simulate` wrote"
     try:
         truth = json.loads((workspace / "truth" / "truth.json").read_text("utf-8"))
-        settings, seed = _settings(truth["settings"]), int(truth["seed"])
+        settings, seed = settings_of(truth["settings"]), int(truth["seed"])
         placings = {name: pair["rig_from_camera"] for name, pair in truth["pairs"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise BadInput(
@@ -130,19 +130,3 @@ def _in_picture(
     points = points[points[:, 2] > 1.0]
     u, v = pair.camera.image(points).T
     return bool(np.any((u >= 0) & (v >= 0) & (u < pair.camera.width) & (v < pair.camera.height)))
-
-
-def _settings(values: dict[str, Any]) -> SimulationSettings:
-    """What `dataclasses.asdict` made of the settings, read back."""
-    defaults = SimulationSettings()
-    parts = {}
-    for field in fields(SimulationSettings):
-        kind = type(getattr(defaults, field.name))
-        own = values.get(field.name, {})
-        parts[field.name] = kind(
-            **{
-                key: tuple(value) if isinstance(value, list) else value
-                for key, value in own.items()
-            }
-        )
-    return SimulationSettings(**parts)

@@ -31,7 +31,7 @@ def load_subject(path: Path, person: Person, rng: np.random.Generator) -> Surfac
     mesh = mesh.subdivide_loop(person.subdivisions)
     mesh.compute_vertex_normals()
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    vertices = np.asarray(mesh.vertices) @ turn.T * 1000.0
+    vertices = np.asarray(mesh.vertices) @ turn.T * (1000.0 * person.size)
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     vertices -= [middle[0], middle[1], vertices[:, 2].min()]
     return Surface(

@@ -12,7 +12,7 @@ import cv2
 
 from bodyscan.arrays import Bytes
 from bodyscan.captures.captures_file import CapturesFile, ShotEntry, write_captures_file
-from bodyscan.captures.timing import Timing
+from bodyscan.captures.timing import Timing, times_of_frames
 from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
@@ -79,6 +79,13 @@ def write_captures(
 def timing_of(pace: Pace) -> Timing:
     """As captures.yaml says it."""
     return Timing(frame_ms=pace.frame_ms, order=pace.order or None, start=pace.start)
+
+
+def times_of_person(rig: Rig, shot: str, pace: Pace) -> dict[str, dict[str, float]]:
+    """By pair, then by frame, ms since the first pair began."""
+    taken = {(shot, pair.name): rig.frames.of_sequence(pair.projector) for pair in rig.pairs}
+    times = times_of_frames(timing_of(pace), rig, taken, Path())
+    return {pair: dict(times[shot, pair]) for shot, pair in taken}
 
 
 def write_image(path: Path, image: Bytes) -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Floats
+from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.gray import LightTable, light_table, table_index
 from bodyscan.simulation.inter_reflection import LitFacets, light_facets
@@ -46,6 +47,25 @@ class View:
         bands = [(cut, sample_directions(camera, optics.samples, rng, cut)) for cut in cuts]
         return View(camera, optics, tuple(bands))
 
+    def rays_of(self, chosen: Mask) -> Floats:
+        """Rays (pixels * samples, 3) of the pixels chosen (H, W)."""
+        samples = self.optics.samples**2
+        parts = [rays.reshape(-1, samples, 3)[chosen[rows].ravel()] for rows, rays in self.bands]
+        return np.concatenate(parts).reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """What moves while a sequence is taken.
+
+    surfaces: so many do, the first of the scene's.  at: the scene when a frame of that name is
+    taken.  reach_mm: how far anything goes from where it is in the scene that all else is seen in.
+    """
+
+    surfaces: int
+    at: Callable[[str], Scene]
+    reach_mm: float
+
 
 @dataclass(frozen=True, eq=False)
 class PixelTruth:
@@ -70,47 +90,146 @@ def render_pair(
     code: StripeCode | None = None,
     sequence: bool = True,
     inter_reflection: InterReflection | None = None,
+    moving: Moving | None = None,
 ) -> dict[str, Floats]:
     """Images without sensor noise, (height, width) float32 grey levels, by frame name.
 
-    scene: in the camera's frame.  rng: for the laser's jitter and speckle.
+    scene: in the camera's frame.  rng: for the laser's jitter and speckle.  moving: pixels near it are
+    cast anew for every frame; shadows that it throws on what is still stay where they are.
     With `sequence` the whole stripe sequence (lit, dark and those of the code: Gray with inverses
     if none is given), else lit alone. The dark image of a stripe-index rig, which its instrument
     keeps to itself, is named "". `sensor.expose` makes 8-bit images of them.
     """
     frames = frames or FrameNames()
     code = code or Gray(stripes=projector.stripes, direction="vertical")
-    tables = _tables(code, projection, rng, frames, sequence)
-    shape = (view.camera.height, view.camera.width)
-    laser = {name: np.zeros(shape, np.float32) for name in tables}
-    ambient, depth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    between = None
-    if inter_reflection is not None and inter_reflection.facet_mm > 0:
-        between = _Between.of(scene, projector, lamps, projection, tables, inter_reflection)
-    samples = view.optics.samples**2
-    for rows, directions in view.bands:
-        hits = scene.cast(directions)
-        weight, s = laser_light(scene, hits, projector, lamps)
-        index = table_index(s, projector.stripes, _blur_rows(hits, projection, lamps))
-        for name, table in tables.items():
-            laser[name][rows] = _pixels(weight, table.at(index), samples).reshape(-1, shape[1])
-        white = np.full_like(s, lamps.ambient_grey)
-        ambient[rows] = _pixels(hits.albedo, white, samples).reshape(-1, shape[1])
-        if between is not None:
-            albedo = _pixels(hits.albedo, np.ones_like(s), samples)
-            for name, light in between.at(hits, samples).items():
-                laser[name][rows] += (albedo * light).reshape(-1, shape[1])
-        depth[rows] = hits.depth.reshape(-1, samples).min(axis=1).reshape(-1, shape[1])
+    lit = _tables(code, projection, rng, frames, sequence)
     dark = frames.dark if code.uses_dark else None if code.is_projected else ""
-    if sequence and dark is not None:
-        laser[dark] = np.zeros(shape, np.float32)
-    shading, focus = shade(view.camera, view.optics), off_focus(depth, lamps.focus_mm)
+    unlit = () if dark is None or not sequence else (dark,)
+    source = _Source(projector, lamps, projection, view.optics.samples**2)
+    seen = _see(scene, view, source, lit, unlit, moving.surfaces if moving else 0)
+    if moving is not None:
+        _see_again(seen, view, source, lit, moving)
+    if inter_reflection is not None and inter_reflection.facet_mm > 0:
+        between = _Between.of(scene, source, lit, inter_reflection)
+        between.add_to(seen.laser, scene, view)
+    shading, focus = shade(view.camera, view.optics), off_focus(seen.depth, lamps.focus_mm)
     return {
         name: blur(
-            (add_speckle(light, projection.speckle, rng) + ambient) * shading, view.optics, focus
+            (add_speckle(light, projection.speckle, rng) + seen.ambient[name]) * shading,
+            view.optics,
+            focus,
         )
-        for name, light in laser.items()
+        for name, light in seen.laser.items()
     }
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """What lights the ends of rays, of which each pixel has several."""
+
+    projector: Projector
+    lamps: Lamps
+    projection: Projection
+    samples: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What a camera sees before its lens blurs it: grey levels (H, W).
+
+    laser, ambient: by frame, of the projector's light and of the room's.  depth: (H, W) mm, the least
+    in each pixel.  near: (H, W) where something shows that moves.
+    """
+
+    laser: dict[str, Floats]
+    ambient: dict[str, Floats]
+    depth: Floats
+    near: Mask
+
+
+def _see(
+    scene: Scene,
+    view: View,
+    source: _Source,
+    lit: Mapping[str, LightTable],
+    unlit: tuple[str, ...],
+    moving_surfaces: int,
+) -> _Seen:
+    """Every frame of a scene in which nothing moves; its first surfaces will."""
+    shape = (view.camera.height, view.camera.width)
+    laser = {name: np.zeros(shape, np.float32) for name in (*lit, *unlit)}
+    ambient, depth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    near = np.zeros(shape, bool)
+    for rows, directions in view.bands:
+        rays = _LitRays.of(scene, directions, source)
+        for name, table in lit.items():
+            laser[name][rows] = rays.light(table).reshape(-1, shape[1])
+        ambient[rows] = rays.ambient(source.lamps).reshape(-1, shape[1])
+        depth[rows] = rays.nearest().reshape(-1, shape[1])
+        near[rows] = rays.on_first(moving_surfaces).reshape(-1, shape[1])
+    return _Seen(laser, dict.fromkeys(laser, ambient), depth, near)
+
+
+def _see_again(
+    seen: _Seen, view: View, source: _Source, lit: Mapping[str, LightTable], moving: Moving
+) -> None:
+    """What moves, and what it covers and uncovers, as it is when each frame is taken."""
+    near = _reached(seen.near, seen.depth, moving.reach_mm, view.camera)
+    directions = view.rays_of(near)
+    for name in seen.laser:
+        rays = _LitRays.of(moving.at(name), directions, source)
+        seen.ambient[name] = seen.ambient[name].copy()
+        seen.ambient[name][near] = rays.ambient(source.lamps)
+        if name in lit:
+            seen.laser[name][near] = rays.light(lit[name])
+
+
+@dataclass(frozen=True, eq=False)
+class _LitRays:
+    """Rays of some pixels, several each, with the projector's light where they end.
+
+    weight: (rays,) grey level under full light.  index: into a table of light.
+    """
+
+    hits: Hits
+    weight: Floats
+    index: NDArray[np.int32]
+    samples: int
+
+    @staticmethod
+    def of(scene: Scene, directions: Floats, source: _Source) -> _LitRays:
+        hits = scene.cast(directions)
+        weight, s = laser_light(scene, hits, source.projector, source.lamps)
+        blurs = _blur_rows(hits, source.projection, source.lamps)
+        index = table_index(s, source.projector.stripes, blurs)
+        return _LitRays(hits, weight, index, source.samples)
+
+    def light(self, table: LightTable) -> Floats:
+        """(pixels,) grey level of one frame."""
+        return _pixels(self.weight, table.at(self.index), self.samples)
+
+    def ambient(self, lamps: Lamps) -> Floats:
+        """(pixels,) grey level by the room's own light."""
+        white = np.full_like(self.weight, lamps.ambient_grey)
+        return _pixels(self.hits.albedo, white, self.samples)
+
+    def nearest(self) -> Floats:
+        """(pixels,) the least depth, mm."""
+        return self.hits.depth.reshape(-1, self.samples).min(axis=1)
+
+    def on_first(self, surfaces: int) -> Mask:
+        """(pixels,) whether any ray ends on one of the first surfaces."""
+        return np.asarray((self.hits.surface < surfaces).reshape(-1, self.samples).any(axis=1))
+
+
+def _reached(near: Mask, depth: Floats, reach_mm: float, camera: TrueCamera) -> Mask:
+    """Pixels that something may come to which shows at those `near` (H, W), at most so far away."""
+    if not near.any():
+        return near
+    pixels = int(np.ceil(reach_mm * camera.alpha / float(depth[near].min()))) + 2
+    kernel = np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)
+    grown = np.asarray(cv2.dilate(near.astype(np.uint8), kernel), np.uint8)
+    return grown.astype(bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,23 +243,26 @@ class _Between:
     @staticmethod
     def of(
         scene: Scene,
-        projector: Projector,
-        lamps: Lamps,
-        projection: Projection,
+        source: _Source,
         tables: Mapping[str, LightTable],
         chosen: InterReflection,
     ) -> _Between:
-        facets = light_facets(scene, projector, lamps, chosen.facet_mm)
-        blur = _blur_rows(facets.samples, projection, lamps)
-        index = table_index(facets.s, projector.stripes, blur)
+        facets = light_facets(scene, source.projector, source.lamps, chosen.facet_mm)
+        blur = _blur_rows(facets.samples, source.projection, source.lamps)
+        index = table_index(facets.s, source.projector.stripes, blur)
         light = np.stack([facets.radiosity(table.at(index)) for table in tables.values()])
         return _Between(tuple(tables), facets, light)
 
-    def at(self, hits: Hits, samples: int) -> dict[str, Floats]:
-        """By frame, what white pixels get (pixels,): it changes slowly, one sample of each tells."""
-        middle = Hits(*(getattr(hits, f.name)[samples // 2 :: samples] for f in fields(Hits)))
-        found = self.facets.irradiance(middle, self.radiosity)
-        return dict(zip(self.names, found, strict=True))
+    def add_to(self, laser: dict[str, Floats], scene: Scene, view: View) -> None:
+        """What pixels get of it, to every frame (H, W): it changes slowly, one sample of each tells."""
+        samples = view.optics.samples**2
+        for rows, directions in view.bands:
+            hits = scene.cast(directions)
+            middle = Hits(*(getattr(hits, f.name)[samples // 2 :: samples] for f in fields(Hits)))
+            albedo = _pixels(hits.albedo, np.ones_like(hits.albedo), samples)
+            found = self.facets.irradiance(middle, self.radiosity)
+            for name, light in zip(self.names, found, strict=True):
+                laser[name][rows] += (albedo * light).reshape(-1, view.camera.width)
 
 
 def _pixels(weight: Floats, light: Floats, samples: int) -> Floats:

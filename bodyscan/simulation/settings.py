@@ -130,12 +130,26 @@ class Person:
     """skin: mean albedo.  skin_variation: how much it varies over the body, relative.
     sway_mm: while the pairs capture one after another, in the rig file's order, the person moves
     as a whole, by this much at the farthest and at head height.
-    subdivisions: Loop subdivisions of the subject's mesh."""
+    subdivisions: Loop subdivisions of the subject's mesh.
+    size: factor on the subject's mesh.
+    All that follows happens while frames are taken, each at its own moment, and is smooth and random;
+    `presets.SUBJECTS` has what people do.
+    sway_mm_s: an upside-down pendulum on the ankles; speed of the top of the head, RMS.
+    breath_mm, breath_s: how far chest and belly come forward from breathed out to breathed in, and
+    how long a breath takes.
+    arms_deg, head_deg: each arm about its shoulder and the head about the neck turn by so much, RMS.
+    """
 
     skin: float = 0.62
     skin_variation: float = 0.10
     sway_mm: float = 0.0
     subdivisions: int = 2
+    size: float = 1.0
+    sway_mm_s: float = 0.0
+    breath_mm: float = 0.0
+    breath_s: float = 3.5
+    arms_deg: float = 0.0
+    head_deg: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Lock
 
@@ -20,14 +20,15 @@ from bodyscan.simulation.board import make_board
 from bodyscan.simulation.instrument import instrument_images
 from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import TruePair, build_pairs
+from bodyscan.simulation.living import LivingBody, bring_to_life, moves, save_body
 from bodyscan.simulation.patterns import refuse_unknown_code, refuse_unknown_frames
 from bodyscan.simulation.plan import default_shots, plan_boards
-from bodyscan.simulation.render import View, render_pair
+from bodyscan.simulation.render import Moving, View, render_pair
 from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Scene, Surface
 from bodyscan.simulation.sensor import expose, exposure
 from bodyscan.simulation.settings import SimulationSettings
-from bodyscan.simulation.truth import Truth, describe
+from bodyscan.simulation.truth import Motion, Truth, describe
 
 CALIBRATION, PERSON = "captures/calibration", "captures/person"
 PERSON_SHOT = "s01"
@@ -35,13 +36,17 @@ PERSON_SHOT = "s01"
 _BRIGHT_AT = 0.85
 """Where a surface is as bright as `Lighting.laser_grey` says, in working distances."""
 
-_PAIRS, _BOARDS, _PLAN, _SKIN, _SWAY, _RAYS, _NOISE = range(1, 8)
+_PAIRS, _BOARDS, _PLAN, _SKIN, _SWAY, _RAYS, _NOISE, _LIFE = range(1, 9)
 """What a random number is drawn for: each has a stream of its own, whatever the others draw."""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One pair's images of one shot: what stands there besides the room, and where."""
+    """One pair's images of one shot: what stands there besides the room, and where.
+
+    frames_ms: of what does not stand still, when each frame is taken; it is then `body`, which
+    surfaces show at the middle of that time.
+    """
 
     number: int
     shot: str
@@ -50,6 +55,8 @@ class Task:
     rig_from_surfaces: RigidTransform
     bright_grey: float
     sequence: bool
+    body: LivingBody | None = None
+    frames_ms: Mapping[str, float] = field(default_factory=dict)
 
 
 def simulate(
@@ -89,6 +96,11 @@ def simulate(
         shots = [(PERSON_SHOT, striped, alone)]
         files.write_captures(out / PERSON, "scan", shots, truth.subject, settings.pace)
         body.save_truth(truth.person, out / "truth" / "subject.ply")
+    if truth.motion is not None:
+        living, moment = truth.motion.body, truth.motion.moment_ms
+        at_mean_breath = living.surface(moment, breathing=False)
+        body.save_truth(at_mean_breath, out / "truth" / "subject-mean-breath.ply")
+        save_body(living, out / "truth" / "body.npz")
     write_json(out / "truth" / "truth.json", describe(truth))
 
 
@@ -112,8 +124,18 @@ def _decide(
     height = float(person.vertices[:, 2].max())
     sways = body.draw_sways(settings.person, height, len(pairs), stream(_SWAY))
     by_pair = dict(zip(pairs, sways, strict=True))
+    motion = None
+    if moves(settings.person):
+        living = bring_to_life(person, settings.person, stream(_LIFE))
+        times = files.times_of_person(rig, PERSON_SHOT, settings.pace)
+        every = [ms for own in times.values() for ms in own.values()]
+        motion = Motion(living, times, (min(every) + max(every)) / 2.0, by_pair)
+        person = living.surface(motion.moment_ms)
+        by_pair = {name: motion.trunk(name) for name in by_pair}
     pseudonym = f"sim-{subject.stem.replace('_', '-')}"
-    return Truth(rig.name, seed, settings, pairs, boards, tuple(plan), pseudonym, person, by_pair)
+    return Truth(
+        rig.name, seed, settings, pairs, boards, tuple(plan), pseudonym, person, by_pair, motion
+    )
 
 
 def true_pairs(rig: Rig, settings: SimulationSettings, seed: int) -> dict[str, TruePair]:
@@ -138,12 +160,28 @@ def _tasks(truth: Truth, pair: str) -> list[Task]:
         if pair in (*shot.stripes, *shot.lit)
     ]
     if truth.person is not None:
-        still, has_stripes = truth.sways[pair], truth.pairs[pair].has_stripes
-        number, shown = len(truth.plan), (truth.person,)
-        tasks.append(
-            Task(number, PERSON_SHOT, PERSON, shown, still, light.person_grey, has_stripes)
+        task = Task(
+            number=len(truth.plan),
+            shot=PERSON_SHOT,
+            folder=PERSON,
+            surfaces=(truth.person,),
+            rig_from_surfaces=truth.sways[pair],
+            bright_grey=light.person_grey,
+            sequence=truth.pairs[pair].has_stripes,
         )
+        tasks.append(_at_their_times(task, truth.motion, pair) if truth.motion else task)
     return tasks
+
+
+def _at_their_times(task: Task, motion: Motion, pair: str) -> Task:
+    """The task with the person as that pair finds him, frame by frame."""
+    return replace(
+        task,
+        surfaces=(motion.body.surface(motion.middle_ms(pair)),),
+        rig_from_surfaces=motion.stances[pair],
+        body=motion.body,
+        frames_ms=motion.times[pair],
+    )
 
 
 def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progress) -> None:
@@ -191,10 +229,21 @@ def render_task(
     """One pair, one shot: cast, expose, write."""
     camera_from_rig = pair.rig_from_camera.inverse()
     camera_from_surfaces = camera_from_rig @ task.rig_from_surfaces
-    scene = Scene(
-        [surface.moved(camera_from_surfaces) for surface in task.surfaces]
-        + [surface.moved(camera_from_rig) for surface in room]
-    )
+    around = [surface.moved(camera_from_rig) for surface in room]
+
+    def scene_with(surfaces: Sequence[Surface]) -> Scene:
+        return Scene([*(surface.moved(camera_from_surfaces) for surface in surfaces), *around])
+
+    def scene_at(frame: str) -> Scene:
+        # What an instrument takes for itself has no times: it is quick.
+        assert task.body is not None
+        taken = task.frames_ms.get(frame)
+        return scene if taken is None else scene_with((task.body.surface(taken),))
+
+    scene, moving = scene_with(task.surfaces), None
+    if task.body is not None:
+        reach = _reach(task.body, list(task.frames_ms.values()))
+        moving = Moving(len(task.surfaces), scene_at, reach)
     light, reach = settings.lighting, pair.reach_mm
     lamps = Lamps(light.laser_grey, light.ambient_grey, _BRIGHT_AT * reach, reach)
     code = rig.pair(pair.name).projector
@@ -209,6 +258,7 @@ def render_task(
         code=code,
         sequence=task.sequence,
         inter_reflection=settings.inter_reflection,
+        moving=moving,
     )
     length = exposure(images[rig.frames.lit or "lit"], task.bright_grey, light)
     exposed = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}
@@ -217,3 +267,10 @@ def render_task(
     for frame, image in exposed.items():
         name = fill(rig.files, shot=task.shot, pair=pair.name, frame=frame)
         files.write_image(out / task.folder / name, image)
+
+
+def _reach(body: LivingBody, moments_ms: Sequence[float]) -> float:
+    """How far anything goes meanwhile from where it is in the middle, mm. Motion is smooth: a few
+    moments tell, with something added."""
+    first, last = min(moments_ms), max(moments_ms)
+    return 1.3 * body.farthest((first + last) / 2.0, np.linspace(first, last, 5))

@@ -11,6 +11,7 @@ import numpy as np
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.simulation.board import MadeBoard
 from bodyscan.simulation.layout import AnyProjector, TruePair
+from bodyscan.simulation.living import LivingBody, describe_motion
 from bodyscan.simulation.plan import BoardShot
 from bodyscan.simulation.projector import MirrorProjector
 from bodyscan.simulation.scene import Surface
@@ -30,7 +31,33 @@ KEYS = {
     "back), if the board is not perfect",
     "settings": "see bodyscan/simulation/settings.py for the meaning and unit of each",
     "subject": "pseudonym; its surface is subject.ply, mm, rig frame",
+    "motion": "of a living person: subject.ply shows moment_ms since the scan began, "
+    "subject-mean-breath.ply the same at mean breath; bodyscan.simulation.living.load_body tells "
+    "where each vertex was at any time from this and body.npz; swayed_from_still is the trunk's motion "
+    "from moment_ms to the middle of the pair's frames",
 }
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A living person and when each frame is taken.
+
+    times: by pair, then by frame, ms.  moment_ms: the middle of all, which the truth's surface shows.
+    stances: by pair, where the person stands besides (`body.draw_sways`).
+    """
+
+    body: LivingBody
+    times: Mapping[str, Mapping[str, float]]
+    moment_ms: float
+    stances: Mapping[str, RigidTransform]
+
+    def middle_ms(self, pair: str) -> float:
+        """Of the time in which a pair takes its frames."""
+        return (min(self.times[pair].values()) + max(self.times[pair].values())) / 2.0
+
+    def trunk(self, pair: str) -> RigidTransform:
+        """`swayed_from_still` of the trunk at the middle of a pair's frames."""
+        return self.stances[pair] @ self.body.swayed(self.middle_ms(pair), self.moment_ms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +66,7 @@ class Truth:
 
     person: the subject's surface in the rig frame, standing still.
     sways: by pair, `swayed_from_still` of the person when that pair captures.
+    motion: what the person does meanwhile, None for one who does nothing.
     """
 
     rig: str
@@ -50,11 +78,12 @@ class Truth:
     subject: str | None
     person: Surface | None
     sways: Mapping[str, RigidTransform]
+    motion: Motion | None = None
 
 
 def describe(truth: Truth) -> dict[str, Any]:
     """The truth as JSON values, but for the subject's surface."""
-    making = truth.settings.board
+    making, motion = truth.settings.board, truth.motion
     perfect = making.bow_mm == 0 and making.print_error_mm == 0
     return {
         "version": 1,
@@ -71,7 +100,7 @@ def describe(truth: Truth) -> dict[str, Any]:
         if perfect
         else {name: {"corners_mm": board.corners} for name, board in truth.boards.items()},
         "settings": asdict(truth.settings),
-    }
+    } | ({"motion": describe_motion(motion.body, motion.moment_ms)} if motion else {})
 
 
 def _pair(pair: TruePair, sway: RigidTransform | None) -> dict[str, Any]:

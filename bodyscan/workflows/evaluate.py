@@ -13,7 +13,8 @@ import open3d as o3d
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import BadInput
-from bodyscan.evaluation.body import coverage_of_seen, girth_errors, sway_residual
+from bodyscan.evaluation.body import GirthErrors, coverage_of_seen, girth_errors, sway_residual
+from bodyscan.evaluation.comparison import fit_to_surface
 from bodyscan.evaluation.surface import Deviation, deviation, normalized_errors, signed_distances
 from bodyscan.export.scan import transform_mesh
 from bodyscan.files.atomic import write_bytes
@@ -49,11 +50,13 @@ class RigDeviation:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The simulator's truth: facts is truth.json; the subject's surface in mm, rig frame."""
+    """The simulator's truth: facts is truth.json; the subject's surface in mm, rig frame; of one who
+    moved, at mid-scan, and the same at mean breath."""
 
     facts: dict[str, Any]
     vertices: Array | None
     faces: Indices | None
+    at_mean_breath: Array | None = None
 
 
 def load_truth(folder: Path) -> Truth:
@@ -72,7 +75,11 @@ def load_truth(folder: Path) -> Truth:
     if not surface.exists():
         return Truth(facts, None, None)
     mesh = o3d.io.read_triangle_mesh(str(surface))
-    return Truth(facts, np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int64))
+    faces = np.asarray(mesh.triangles).astype(np.int64)
+    breathing = folder / "subject-mean-breath.ply"
+    mean = o3d.io.read_triangle_mesh(str(breathing)).vertices if breathing.exists() else None
+    at_mean_breath = None if mean is None else np.asarray(mean)
+    return Truth(facts, np.asarray(mesh.vertices), faces, at_mean_breath)
 
 
 def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
@@ -135,7 +142,9 @@ def _scan_lines(
     surface, pairs = (truth.vertices, truth.faces), truth.facts["pairs"]
     place = sway_residual(_placings(stored, calibration), pairs, truth.vertices)
     still_from_rig = RigidTransform.identity()
-    if truth.facts["settings"]["person"]["sway_mm"]:
+    if "motion" in truth.facts:  # laid onto the body as it was at mid-scan
+        still_from_rig = fit_to_surface(stored.cloud.points, *surface)
+    elif truth.facts["settings"]["person"]["sway_mm"]:
         still_from_rig = place.rig_from_still.inverse()  # who sways stands nowhere in particular
     own, body = stored.mesh, transform_mesh(stored.mesh, still_from_rig)
     points = still_from_rig.apply(stored.cloud.points)
@@ -164,12 +173,11 @@ def _scan_lines(
             f"{shape.volume_mm3 / 1e6:.2f} litres"
         )
     with part("torso girths"):
-        girths = girth_errors(body, *surface)
-        lines.append(
-            f"  torso girths (tape)     RMS {girths.rms_mm:.2f}, worst {girths.worst_mm:.2f} mm at "
-            f"{girths.worst_at_mm:.0f} mm, {girths.heights} heights; stature "
-            f"{girths.stature_mm:+.2f} mm"
-        )
+        lines.append(f"  torso girths (tape)     {_girth_figures(girth_errors(body, *surface))}")
+    if truth.at_mean_breath is not None:
+        with part("torso girths at mean breath"):
+            girths = girth_errors(body, truth.at_mean_breath, truth.faces)
+            lines.append(f"  ... against mean breath {_girth_figures(girths)}")
     with part("coverage"):
         seen, covered = coverage_of_seen(points, *surface, pairs)
         lines.append(
@@ -197,6 +205,13 @@ def _placings(stored: StoredScan, calibration: RigCalibration) -> dict[str, Rigi
     return {
         name: RigidTransform.from_matrix(alignment["rig_from_camera"][name]) for name in measured
     }
+
+
+def _girth_figures(girths: GirthErrors) -> str:
+    return (
+        f"RMS {girths.rms_mm:.2f}, worst {girths.worst_mm:.2f} mm at {girths.worst_at_mm:.0f} mm, "
+        f"{girths.heights} heights; stature {girths.stature_mm:+.2f} mm"
+    )
 
 
 def _figures(d: Deviation) -> str:

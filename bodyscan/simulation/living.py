@@ -1,0 +1,260 @@
+"""The person as a function of time: sways on the ankles, breathes, moves arms and head."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from bodyscan.arrays import Array
+from bodyscan.files.atomic import atomic_replacement
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.simulation.scene import Surface
+from bodyscan.simulation.settings import Person
+
+SLOWEST_HZ, FASTEST_HZ, WAVES = 0.15, 1.2, 6
+"""Of sway and of limbs held still: postural sway has nearly all its power below 1 Hz
+(Winter 1995, Gait and Posture 3)."""
+
+# In statures; of adults, ANSUR II.
+ANKLE, FOOT = 0.055, 0.035
+"""The whole body turns above the ankle, nothing below the foot's back."""
+NECK, CHIN = 0.835, 0.885
+ELBOW_SIDE, SHOULDER = 0.36, 0.46
+"""Along the skin from the fingertips: all arm, and no arm any more."""
+CHEST, BELLY, BREATHING = 0.72, 0.60, 0.065
+"""Heights of the two, and the standard deviation of what rises with each."""
+SIDEWAYS = 0.25
+"""Of how far the front comes forward, how far each side goes out."""
+BELLY_LATE = 0.6
+"""Radians of a breath by which the belly follows the chest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Wander:
+    """A smooth random function of time of several components: sums of cosines.
+
+    hz: (K,).  sizes, phases: (K, n), of n components.
+    """
+
+    hz: Array
+    sizes: Array
+    phases: Array
+
+    def at(self, ms: float) -> Array:
+        """(n,)"""
+        turns = 2.0 * np.pi * self.hz[:, None] * (ms / 1000.0)
+        return np.sum(self.sizes * np.cos(turns + self.phases), axis=0)
+
+
+def draw_wander(rms: float, components: int, rng: np.random.Generator, *, speed: bool) -> Wander:
+    """All components together are `rms` in the long run; or with `speed`, change by that a second.
+
+    Sizes fall with frequency, so that slow ones lead.
+    """
+    hz = np.geomspace(SLOWEST_HZ, FASTEST_HZ, WAVES) * rng.uniform(0.9, 1.1, WAVES)
+    sizes = rng.standard_normal((WAVES, components)) / hz[:, None] ** 1.5
+    rate = 2.0 * np.pi * hz[:, None] if speed else 1.0
+    sizes = sizes * (rms / np.sqrt(0.5 * np.sum((sizes * rate) ** 2)))
+    return Wander(hz, sizes, rng.uniform(0.0, 2.0 * np.pi, (WAVES, components)))
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Part of a body that turns. weights: (N,) 1 for what turns with it.  pivot: (3,) mm.
+    turn: rotation vector, radians."""
+
+    weights: Array
+    pivot: Array
+    turn: Wander
+
+    def carry(self, vertices: Array, ms: float) -> Array:
+        """Where it takes vertices (N, 3)."""
+        moved = self.motion(ms).apply(vertices)
+        return vertices + self.weights[:, None] * (moved - vertices)
+
+    def motion(self, ms: float) -> RigidTransform:
+        """Of all that turns with it."""
+        turn = RigidTransform.from_rotation_vector(self.turn.at(ms), np.zeros(3)).rotation
+        return RigidTransform(turn, self.pivot - turn @ self.pivot)
+
+
+@dataclass(frozen=True)
+class Breath:
+    """mm: from breathed out to breathed in.  period_s; phases: of chest and belly at 0, radians."""
+
+    mm: float
+    period_s: float
+    phases: tuple[float, float]
+
+    def at(self, ms: float) -> Array:
+        """(2,) how far chest and belly stand out, mm; 0 in the mean over a breath."""
+        turns = 2.0 * np.pi * ms / 1000.0 / self.period_s
+        return 0.5 * self.mm * np.sin(turns + np.array(self.phases))
+
+
+@dataclass(frozen=True, eq=False)
+class LivingBody:
+    """A person who stands as people do.
+
+    rest: at mean breath, upright.  limbs: arms and head, against the trunk.  swells: (N, 3, 2) where
+    chest and belly go, for each mm of breath.  ankles: the whole body's sway.
+    """
+
+    rest: Surface
+    limbs: tuple[Joint, ...]
+    swells: Array
+    breath: Breath
+    ankles: Joint
+
+    def vertices(self, ms: float, *, breathing: bool = True) -> Array:
+        """(N, 3) mm, rig frame, at a moment since the scan began; without breathing, at mean breath."""
+        placed = self.rest.vertices
+        for limb in self.limbs:
+            placed = limb.carry(placed, ms)
+        if breathing:
+            placed = placed + self.swells @ self.breath.at(ms)
+        return self.ankles.carry(placed, ms)
+
+    def surface(self, ms: float, *, breathing: bool = True) -> Surface:
+        """Its skin then. Normals are those at rest: nothing turns by more than a degree or so."""
+        return replace(self.rest, vertices=self.vertices(ms, breathing=breathing))
+
+    def farthest(self, from_ms: float, moments_ms: Iterable[float]) -> float:
+        """How far any vertex is at some moments from where it is at another, mm."""
+        start = self.vertices(from_ms)
+        away = [np.linalg.norm(self.vertices(ms) - start, axis=1).max() for ms in moments_ms]
+        return float(max(away))
+
+    def swayed(self, ms: float, since_ms: float) -> RigidTransform:
+        """The trunk's motion between two moments, rig frame."""
+        return self.ankles.motion(ms) @ self.ankles.motion(since_ms).inverse()
+
+
+def moves(person: Person) -> bool:
+    """Whether anything of the person moves while frames are taken."""
+    return any((person.sway_mm_s, person.breath_mm, person.arms_deg, person.head_deg))
+
+
+def bring_to_life(still: Surface, person: Person, rng: np.random.Generator) -> LivingBody:
+    """The person who stands as `still` in the mean."""
+    vertices = still.vertices
+    height = float(vertices[:, 2].max())
+    z = vertices[:, 2] / height
+    arms = [_arm_weights(still, side, height) for side in (-1.0, 1.0)]
+    head = _rising(z, NECK, CHIN) * (1.0 - arms[0]) * (1.0 - arms[1])
+    limbs = [(own, np.radians(person.arms_deg)) for own in arms]
+    limbs += [(head, np.radians(person.head_deg))]
+    joints = tuple(
+        Joint(own, _border(vertices, own), draw_wander(rms, 3, rng, speed=False))
+        for own, rms in limbs
+    )
+    # A lean to the front is a turn about y, one to the left a turn about -x; none about z.
+    pivot = np.array([0.0, 0.0, ANKLE * height])
+    lean = draw_wander(person.sway_mm_s / (height - pivot[2]), 2, rng, speed=True)
+    flat = np.zeros((WAVES, 1))
+    sway = Wander(lean.hz, np.hstack([lean.sizes, flat]), np.hstack([lean.phases, flat]))
+    start = float(rng.uniform(0.0, 2.0 * np.pi))
+    breath = Breath(
+        person.breath_mm,
+        person.breath_s * float(rng.uniform(0.95, 1.05)),
+        (start, start - BELLY_LATE),
+    )
+    trunk = (1.0 - arms[0]) * (1.0 - arms[1])
+    swells = _swells(vertices, trunk, height)
+    return LivingBody(still, joints, swells, breath, Joint(_rising(z, FOOT, ANKLE), pivot, sway))
+
+
+def _rising(values: Array, low: float, high: float) -> Array:
+    """0 below, 1 above, smooth between."""
+    t = np.clip((values - low) / (high - low), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def _arm_weights(still: Surface, side: float, height: float) -> Array:
+    """(N,) 1 on the arm that reaches out farthest to y's positive (side 1) or negative side."""
+    fingertip = int(np.argmax(side * still.vertices[:, 1]))
+    along = dijkstra(_edges(still), indices=[fingertip], limit=0.6 * height)[0]
+    return 1.0 - _rising(along / height, ELBOW_SIDE, SHOULDER)
+
+
+def _edges(surface: Surface) -> csr_matrix:
+    """(N, N) lengths of the edges between vertices, mm; on a closed surface each is there both ways,
+    from the triangle on either side."""
+    ends = surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    lengths = np.linalg.norm(np.diff(surface.vertices[ends], axis=1)[:, 0], axis=1)
+    count = len(surface.vertices)
+    return csr_matrix((lengths, (ends[:, 0], ends[:, 1])), shape=(count, count))
+
+
+def _border(vertices: Array, weights: Array) -> Array:
+    """(3,) the middle of where a limb ends: its joint."""
+    return vertices[(weights > 0.3) & (weights < 0.7)].mean(axis=0)
+
+
+def _swells(vertices: Array, trunk: Array, height: float) -> Array:
+    """(N, 3, 2) where chest and belly go, for each mm that the farthest of them stands out: the front
+    forward, the sides outward, the back nowhere."""
+    heights = np.array([CHEST, BELLY]) * height
+    spread = BREATHING * height
+    rises = np.exp(-0.5 * ((vertices[:, 2:] - heights) / spread) ** 2)
+    level = np.linspace(heights.min(), heights.max(), 50)[:, None]
+    rises = rises / np.exp(-0.5 * ((level - heights) / spread) ** 2).sum(axis=1).max()
+    inside = (trunk > 0.99) & (rises.sum(axis=1) > 0.1)
+    back, front = np.percentile(vertices[inside, 0], [2.0, 98.0])
+    wide = np.percentile(np.abs(vertices[inside, 1]), 98.0)
+    forward = _rising((vertices[:, 0] - back) / (front - back), 0.3, 1.0)
+    outward = SIDEWAYS * np.clip(vertices[:, 1] / wide, -1.5, 1.5)
+    ways = np.stack([forward, outward, np.zeros(len(vertices))], axis=1) * trunk[:, None]
+    return ways[:, :, None] * rises[:, None, :]
+
+
+def describe_motion(body: LivingBody, moment_ms: float) -> dict[str, Any]:
+    """For truth.json: which moment the truth's surface shows, and the motion's own numbers."""
+
+    def wander(one: Wander) -> dict[str, Any]:
+        return {"hz": one.hz, "sizes": one.sizes, "phases": one.phases}
+
+    return {
+        "moment_ms": moment_ms,
+        "breath": asdict(body.breath),
+        "joints": [
+            {"pivot": joint.pivot, **wander(joint.turn)} for joint in (*body.limbs, body.ankles)
+        ],
+    }
+
+
+def save_body(body: LivingBody, path: Path) -> None:
+    """What does not fit truth.json, for `load_body`; float32 but for places."""
+    weights = [joint.weights for joint in (*body.limbs, body.ankles)]
+    with atomic_replacement(path) as temporary, temporary.open("wb") as stream:
+        np.savez(
+            stream,
+            vertices=body.rest.vertices,
+            triangles=body.rest.triangles.astype(np.int32),
+            weights=np.array(weights, np.float32),
+            swells=body.swells.astype(np.float32),
+        )
+
+
+def load_body(motion: dict[str, Any], path: Path) -> LivingBody:
+    """The body of a simulated workspace from `motion` of its truth.json and truth/body.npz: where each
+    vertex of truth/subject.ply was at any time."""
+    with np.load(path) as stored:
+        kept = {name: stored[name] for name in stored.files}
+    joints = [
+        Joint(own.astype(float), np.array(one["pivot"]), _wander(one))
+        for one, own in zip(motion["joints"], kept["weights"], strict=True)
+    ]
+    breath = Breath(**{**motion["breath"], "phases": tuple(motion["breath"]["phases"])})
+    rest = Surface(kept["vertices"], kept["triangles"].astype(np.int64))
+    return LivingBody(rest, tuple(joints[:-1]), kept["swells"].astype(float), breath, joints[-1])
+
+
+def _wander(fields: dict[str, Any]) -> Wander:
+    return Wander(*(np.array(fields[name], float) for name in ("hz", "sizes", "phases")))

@@ -1,0 +1,209 @@
+"""A person who sways, breathes and moves arms and head while frames are taken."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from small_view import CRISP, LAMPS, projector, view, wall
+
+from bodyscan.arrays import Array, Floats
+from bodyscan.errors import BadInput
+from bodyscan.evaluation.body import girth_errors
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyMesh
+from bodyscan.simulation import SimulationSettings, settings_for, simulate
+from bodyscan.simulation.body import load_subject
+from bodyscan.simulation.living import LivingBody, bring_to_life, draw_wander, load_body, moves
+from bodyscan.simulation.presets import SUBJECTS
+from bodyscan.simulation.render import Moving, render_pair
+from bodyscan.simulation.scene import Scene
+from bodyscan.simulation.settings import Person
+
+PROJECT = Path(__file__).parents[2]
+SUBJECT = PROJECT / "data" / "subjects" / "man_average.ply"
+STANDING = Person(subdivisions=0, **SUBJECTS["standing"])
+
+
+def body_of(person: Person, seed: int = 0) -> LivingBody:
+    rng = np.random.default_rng(seed)
+    return bring_to_life(load_subject(SUBJECT, person, rng), person, rng)
+
+
+@pytest.fixture(scope="module")
+def living() -> LivingBody:
+    return body_of(STANDING)
+
+
+def speeds(places: Array, step_ms: float) -> Array:
+    """RMS over time, mm/s, of places (T, N, 3)."""
+    moved = np.diff(places, axis=0) / (step_ms / 1000.0)
+    return np.sqrt(np.mean(np.sum(moved**2, axis=-1), axis=0))
+
+
+def test_a_wander_moves_as_fast_as_it_is_told_to() -> None:
+    for seed in range(5):
+        wander = draw_wander(7.0, 2, np.random.default_rng(seed), speed=True)
+        path = np.array([wander.at(ms) for ms in np.arange(0, 600_000, 50.0)])
+        # Ten minutes are ninety periods of the slowest wave.
+        assert speeds(path[:, None], 50.0)[0] == pytest.approx(7.0, rel=0.05)
+        still = draw_wander(7.0, 2, np.random.default_rng(seed), speed=False)
+        path = np.array([still.at(ms) for ms in np.arange(0, 600_000, 50.0)])
+        assert np.sqrt(np.mean(np.sum(path**2, axis=1))) == pytest.approx(7.0, rel=0.05)
+
+
+def test_sway_is_a_pole_on_its_ankles() -> None:
+    body = body_of(Person(subdivisions=0, sway_mm_s=7.0))
+    vertices = body.rest.vertices
+    top, foot = int(np.argmax(vertices[:, 2])), int(np.argmin(vertices[:, 2]))
+    middle = int(np.argmin(np.abs(vertices[:, 2] - 0.5 * vertices[top, 2])))
+    path = np.array(
+        [body.vertices(ms)[[top, middle, foot], :2] for ms in np.arange(0, 60_000, 200.0)]
+    )
+    head, half, sole = speeds(path, 200.0)
+    assert head == pytest.approx(7.0, rel=0.2)  # a minute is nine periods of the slowest wave
+    assert half == pytest.approx(head * (0.5 - 0.055) / (1.0 - 0.055), rel=0.03)
+    assert sole == 0.0
+
+
+def test_breath_comes_and_goes_on_chest_and_belly_alone() -> None:
+    body = body_of(Person(subdivisions=0, breath_mm=4.0))
+    moments = np.linspace(0.0, 1000.0 * body.breath.period_s, 60, endpoint=False)
+    path = np.array([body.vertices(ms) for ms in moments])
+    reach = np.ptp(path[..., 0], axis=0)
+    height = body.rest.vertices[:, 2] / body.rest.vertices[:, 2].max()
+    assert reach.max() == pytest.approx(4.0, rel=0.15)  # its two places are added up
+    assert 0.55 < height[np.argmax(reach)] < 0.78
+    assert np.abs(np.mean(path, axis=0) - body.vertices(0.0, breathing=False)).max() < 1e-9
+    still = (height < 0.4) | (height > 0.95)
+    assert reach[still].max() < 0.05
+    back = body.rest.vertices[:, 0] < np.percentile(body.rest.vertices[:, 0], 10)
+    assert reach[back & (height > 0.5)].max() < 0.2
+
+
+def test_a_breath_moves_a_torso_girth_by_millimetres() -> None:
+    body = body_of(Person(subdivisions=0, breath_mm=4.0))
+    moments = np.linspace(0.0, 1000.0 * body.breath.period_s, 24, endpoint=False)
+    chest = [body.breath.at(ms)[0] for ms in moments]
+    breathed = [body.vertices(moments[int(k)]) for k in (np.argmax(chest), np.argmin(chest))]
+    faces = body.rest.triangles.astype(np.int64)
+    count = len(breathed[0])
+    mesh = BodyMesh(
+        breathed[0], faces, np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8),
+        np.zeros(count, np.float32), np.zeros(len(faces), bool),
+    )  # fmt: skip
+    # A girth grows by the outward part of what moves, over the angle it turns by: 4 cos^2 over the
+    # front half and 1 sin^2 all round make 3 pi mm, more or less as a trunk is no ellipse.
+    worst = girth_errors(mesh, breathed[1], faces).worst_mm
+    assert worst == pytest.approx(3.0 * np.pi, rel=0.2)
+
+
+def test_arms_turn_about_shoulders_and_the_head_about_the_neck() -> None:
+    body = body_of(Person(subdivisions=0, arms_deg=0.5, head_deg=0.3))
+    vertices = body.rest.vertices
+    hands = [int(np.argmin(vertices[:, 1])), int(np.argmax(vertices[:, 1]))]
+    crown = int(np.argmax(vertices[:, 2]))
+    trunk = (np.abs(vertices[:, 1]) < 100) & (vertices[:, 2] < 1300)
+    path = np.array([body.vertices(ms) for ms in np.arange(0, 40_000, 1000.0)])
+    away = np.sqrt(np.mean(np.sum((path - vertices) ** 2, axis=-1), axis=0))
+    arm = np.linalg.norm(vertices[hands[1]] - body.limbs[1].pivot)
+    # Two of three axes turn it; the third is its own. Forty seconds are few periods.
+    for hand in hands:
+        assert away[hand] == pytest.approx(np.radians(0.5) * arm * np.sqrt(2 / 3), rel=0.5)
+    assert 0.3 < away[crown] < 2.0
+    assert away[trunk].max() == 0.0
+    assert [joint.weights[hands[0]] for joint in body.limbs] == [1.0, 0.0, 0.0]
+
+
+def test_it_is_smooth_in_time(living: LivingBody) -> None:
+    path = np.array([living.vertices(ms) for ms in (0.0, 8.0, 16.0, 24.0)])
+    bent = np.abs(np.diff(path, 2, axis=0)).max()
+    # 1.2 Hz at most: a wave of 5 mm bends by 5 (2 pi 1.2 0.008)^2 = 0.02 mm.
+    assert bent < 0.03
+    assert np.linalg.norm(np.diff(path, axis=0), axis=-1).max() < 1.0
+
+
+def test_the_same_seed_is_the_same_motion(living: LivingBody) -> None:
+    assert np.array_equal(body_of(STANDING).vertices(123.0), living.vertices(123.0))
+    assert not np.array_equal(body_of(STANDING, 1).vertices(123.0), living.vertices(123.0))
+
+
+def test_only_a_mannequin_stands_still() -> None:
+    still = {name: moves(Person(**person)) for name, person in SUBJECTS.items()}
+    assert still == {"mannequin": False, "standing": True, "restless": True, "child": True}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("person.breath=5", r"breath is not a setting \(did you mean 'breath_m?m?s?'"),
+        ("persons.breath_mm=5", r"persons is not a setting \(did you mean 'person'"),
+        ("person.breath_mm=deep", r"person.breath_mm: .*valid number.*deep"),
+        ("pace.start=later", "pace.start: .*one-after-another"),
+        ("breath_mm=5", "is not a change"),
+        ("person.breath_mm", "is not a change"),
+    ],
+)
+def test_a_wrong_change_is_named(change: str, message: str) -> None:
+    with pytest.raises(BadInput, match=message):
+        settings_for("mirror", changes=[change])
+
+
+def test_every_number_can_be_changed() -> None:
+    changes = ["person.breath_mm=5", "pace.start=poles", "projection.mirror_offset_mm=[1, 2]"]
+    settings = settings_for("pinhole", subject="restless", changes=changes)
+    assert settings.person.breath_mm == 5.0
+    assert settings.person.sway_mm_s == 14.0
+    assert settings.pace.start == "poles"
+    assert settings.projection.mirror_offset_mm == (1.0, 2.0)
+    assert settings.projection.kind == "pinhole"
+
+
+def test_what_moves_is_seen_where_it_is_when_each_frame_is_taken() -> None:
+    """A white square before a dark wall: frame by frame its image is that of a still one there."""
+    square = wall(900.0, 300.0, albedo=0.8)
+    behind = wall(1500.0, albedo=0.1)
+    rays = view()
+
+    def scene(x: float) -> Scene:
+        return Scene([square.moved(RigidTransform(np.eye(3), np.array([x, 0.0, x]))), behind])
+
+    def render(at: float, moving: Moving | None = None) -> dict[str, Floats]:
+        rng = np.random.default_rng(1)
+        return render_pair(scene(at), rays, projector(), LAMPS, CRISP, rng, moving=moving)
+
+    places = {name: 5.0 * k for k, name in enumerate(render(0.0))}
+    images = render(0.0, Moving(1, lambda frame: scene(places[frame]), 70.0))
+    for frame, place in places.items():
+        expected = render(place)[frame]
+        # The wall under the square's shadow is lit as where the square was at first.
+        there = render(place)["dark"] > 5.0  # ambient 8 on the square, 1 on the wall
+        assert there.any()
+        np.testing.assert_allclose(images[frame][there], expected[there], atol=1e-4)
+        assert np.count_nonzero((images["dark"] > 5.0) != there) > 0 or frame == "dark"
+
+
+def test_a_scan_of_a_living_person_with_its_truth(tmp_path: Path) -> None:
+    rig = PROJECT / "rigs" / "three-pole-12.yaml"
+    settings = replace(SimulationSettings(), person=STANDING)
+    simulate(rig, tmp_path, subject=SUBJECT, scale=0.05, settings=settings, board_shots=3)
+    truth = json.loads((tmp_path / "truth" / "truth.json").read_text())
+    body = load_body(truth["motion"], tmp_path / "truth" / "body.npz")
+    moment = truth["motion"]["moment_ms"]
+
+    def surface(name: str) -> Array:
+        path = tmp_path / "truth" / f"{name}.ply"
+        return np.asarray(o3d.io.read_triangle_mesh(str(path)).vertices)
+
+    # Weights are kept to seven digits: a micrometre over limbs that move by millimetres.
+    assert np.abs(surface("subject") - body.vertices(moment)).max() < 1e-4
+    mean = body.vertices(moment, breathing=False)
+    assert np.abs(surface("subject-mean-breath") - mean).max() < 1e-4
+    # Twelve pairs of lit, dark, five bits and their inverses, 120 a second.
+    assert moment == pytest.approx(12 * 12 / 120 * 1000 / 2)
+    first, last = (np.array(truth["pairs"][name]["swayed_from_still"]) for name in ("p1-1", "p3-4"))
+    assert np.abs(first - last)[:3, 3].max() > 0.01
