@@ -67,6 +67,9 @@ def _origin(load: float) -> str:
     return f"*Commit {commit}{changed}, {today}; {machine}; load average at its end {load:.1f}.*"
 
 
+MEASURED = ("bodyscan", "benchmarks")
+"""The folders whose commits make a section old."""
+
 _ORIGIN = re.compile(r"^\*Commit ([0-9a-f]{7,})[^*]*\*", re.MULTILINE)
 _AGE = re.compile(r"\n\*\*Older than the code\*\*[^\n]*\n")
 
@@ -74,15 +77,17 @@ _AGE = re.compile(r"\n\*\*Older than the code\*\*[^\n]*\n")
 def _aged(section: str) -> str:
     """The section with a line on how many commits have changed the package since, if any have."""
     section = _AGE.sub("\n", section)
+    title, _, rest = section.partition("\n")
     origin = _ORIGIN.search(section)
+    since = _git("rev-list", "--count", f"{origin[1]}..HEAD", "--", *MEASURED) if origin else ""
     if origin is None:
-        title, _, rest = section.partition("\n")
-        return f"{title}\n\n**Older than the code**: made before sections said of which commit.\n{rest}"
-    since = _git("rev-list", "--count", f"{origin[1]}..HEAD", "--", "bodyscan", "benchmarks")
-    if since in ("", "0"):
-        return section
-    said = f"\n\n**Older than the code**: {since} commits have changed it since.\n"
-    return section[: origin.end()] + said + section[origin.end() :].lstrip("\n")
+        parts = [title, "**Older than the code**: made before sections said of which commit.", rest]
+    elif since in ("", "0"):
+        parts = [title, rest]
+    else:
+        said = f"**Older than the code**: {since} commits have changed it since."
+        parts = [title, origin[0], said, rest.replace(origin[0], "", 1)]
+    return "\n\n".join(part.strip() for part in parts)
 
 
 def _git(*arguments: str) -> str:
