@@ -470,8 +470,8 @@ def _of_depths(state: _State[Sheets], boards: Sequence[StripedBoard], covariance
     """(P, P) of the sheets as a depth sees them: with the rays that meet them.
 
     A camera that is a little wrong turns rays and sheets together. Its rays' part is written as a
-    motion of the sheets that changes the depths on the boards as much (what is left of it, a lens, is in the
-    rays' own sigma), so that both add up with the sign that they have.
+    motion of the sheets that changes the depths on the boards as much (what is left of it, a lens, is
+    in the rays' own sigma), so that both add up with the sign that they have.
     """
     own = np.arange(state.first_sheet, state.first_form)
     there = _depths_by_sheets(state.camera, state.sheets, boards)
