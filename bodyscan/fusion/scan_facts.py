@@ -36,7 +36,6 @@ class _Overlap(_Part):
     points: int
     rms_before_mm: float | None
     rms_after_mm: float | None
-    expected_mm: float | None = None
 
 
 class _Alignment(_Part):

@@ -19,7 +19,6 @@ from bodyscan.settings import (
     Resources,
     RigExportSettings,
     ScanSettings,
-    UseLimits,
 )
 
 _REMEDY = "Correct the pipeline file; docs/formats.md explains every key."
@@ -30,7 +29,7 @@ class PipelineError(BadInput):
 
 
 SECTIONS = {
-    "fuse": ("alignment", "fusion", "mesh", "use", "export"),
+    "fuse": ("alignment", "fusion", "mesh", "export"),
     "calibrate": ("rig_export",),
 }
 
@@ -48,7 +47,6 @@ class Pipeline(Model):
     alignment: AlignmentSettings = AlignmentSettings()
     fusion: FusionSettings = FusionSettings()
     mesh: MeshSettings = MeshSettings()
-    use: UseLimits = UseLimits()
     export: ExportSettings = ExportSettings()
     rig_export: RigExportSettings = RigExportSettings()
 
@@ -63,9 +61,7 @@ class Pipeline(Model):
     @property
     def scan(self) -> ScanSettings:
         """What decides what a scan comes out as."""
-        return ScanSettings(
-            alignment=self.alignment, fusion=self.fusion, mesh=self.mesh, use=self.use
-        )
+        return ScanSettings(alignment=self.alignment, fusion=self.fusion, mesh=self.mesh)
 
     def section(self, name: str) -> dict[str, Any]:
         """One section as plain data."""

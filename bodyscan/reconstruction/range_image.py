@@ -8,6 +8,7 @@ import numpy as np
 
 from bodyscan.arrays import Bytes, Floats, Mask
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.velocity import Velocity
 from bodyscan.reconstruction.two_ways import Agreement
 
 
@@ -24,6 +25,7 @@ class RangeImage:
     that was seen has a point.
     agreement: of stripes of two directions, if such were projected.
     time_ms: the one moment for which the depths stand, ms since the scan began; None if not known.
+    velocity: of the body at that moment; None where the stripes or the times do not tell it.
     """
 
     pair: str
@@ -35,6 +37,7 @@ class RangeImage:
     beyond: Mask | None = None
     agreement: Agreement | None = None
     time_ms: float | None = None
+    velocity: Velocity | None = None
 
     @property
     def valid(self) -> Mask:

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from bodyscan.arrays import Floats, Greys
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.albedo_edges import Brightness, without_edges_across
-from bodyscan.stripes.bit_words import WordCode
+from bodyscan.stripes.bit_words import WordCode, bit_that_flips
 from bodyscan.stripes.boundaries import find_boundaries
 from bodyscan.stripes.boundary_scatter import scatter
 from bodyscan.stripes.code_lines import fill_from_codes
 from bodyscan.stripes.grey_noise import noise_variance
+from bodyscan.stripes.one_moment import Moments, carry_to_moment
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.sequence_checks import check_codes, check_exposure
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
@@ -32,9 +33,15 @@ not exposed alike: boundaries would move by as much of their blur, a tenth of a 
 
 
 def decode_bits(
-    code: WordCode, images: ScanLines, lit: Greys, stripes: int, limits: StripeLimits | None
+    code: WordCode,
+    images: ScanLines,
+    lit: Greys,
+    stripes: int,
+    limits: StripeLimits | None,
+    moments: Moments | None = None,
 ) -> StripeMap:
-    """The stripe map of `bit_lines`.  lit: (H, W) as the camera has it.
+    """The stripe map of `bit_lines`.  lit: (H, W) as the camera has it.  moments: when its images
+    were taken, if boundaries are to be carried to one moment.
 
     Raises DecodingFailed if the images do not add up.
     """
@@ -51,13 +58,19 @@ def decode_bits(
         images, brightness, codes, usable, variance, code.finest_run, code.first
     )
     sigma_px = np.hypot(boundaries.sigma_px, code.doubt_px)
-    boundaries = replace(boundaries, sigma_px=sigma_px)
-    boundaries = replace(boundaries, sigma_px=scatter(boundaries) * sigma_px)
-    s, sigma = interpolate_stripes(boundaries, codes, usable)
+    boundaries, motion, carried = replace(boundaries, sigma_px=sigma_px), None, 0.0
+    if moments is not None:
+        times = moments.of_bits[bit_that_flips(boundaries.index + code.first, len(images.patterns))]
+        boundaries, motion, carried = carry_to_moment(
+            boundaries, times, moments, turned=images.turned
+        )
+    boundaries = replace(boundaries, sigma_px=scatter(boundaries) * boundaries.sigma_px)
+    s, sigma = interpolate_stripes(boundaries, codes, usable, carried)
     if code.single:  # of others, codes at boundaries are misread by any number
         fill_from_codes(s, sigma, codes, shown)
     s, sigma = without_edges_across(s, sigma, brightness, boundaries.blur2)
-    return stripe_map(images, lit, s, sigma, boundaries, stripes, beyond)
+    found = stripe_map(images, lit, s, sigma, boundaries, stripes, beyond)
+    return replace(found, motion=motion)
 
 
 def bit_lines(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from bodyscan.arrays import Greys
 from bodyscan.errors import DecodingFailed, WrongDirection
+from bodyscan.stripes.one_moment import Moments
 from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap
@@ -21,6 +22,7 @@ def decode_stripes(
     coded: Greys,
     *,
     limits: StripeLimits | None = None,
+    moments: Sequence[Moments] = (),
     where: str = "",
 ) -> StripeMap:
     """The stripe coordinate of every pixel, from one pair's images of one shot.
@@ -29,25 +31,33 @@ def decode_stripes(
     coded: (F, H, W), the images of the code in the order of its `image_counts`, then those of the
     stripes that cross, which give the map's `crossing`.
     limits: the stripes that matter; others get no s.
+    moments: of the code's images, then of those of the stripes that cross, if what moved meanwhile
+    is to be told and taken out.
 
     Raises DecodingFailed, naming the image where it can be told, if they do not add up.
     """
     try:
         own, *others = images_by_kind(code, coded)
-        found = _decode(code, lit, dark, own, limits)
+        seen, across = (*moments, None, None)[:2]
+        found = _decode(code, lit, dark, own, limits, seen)
         if code.crossing is None:
             return found
-        return replace(found, crossing=_decode_crossing(code.crossing, lit, dark, others[0]))
+        crossing = _decode_crossing(code.crossing, lit, dark, others[0], across)
+        return replace(found, crossing=crossing)
     except DecodingFailed as error:
         raise DecodingFailed(error.what, where=where, remedy=error.remedy) from error
 
 
 def _decode_crossing(
-    way: StripeCode, lit: Greys | None, dark: Greys | None, coded: Mapping[ImageKind, Greys]
+    way: StripeCode,
+    lit: Greys | None,
+    dark: Greys | None,
+    coded: Mapping[ImageKind, Greys],
+    moments: Moments | None,
 ) -> StripeMap:
     """The map of the stripes that cross. What is wrong with them is said to be wrong with these."""
     try:
-        return _decode(way, lit, dark, coded, None)
+        return _decode(way, lit, dark, coded, None, moments)
     except DecodingFailed as error:
         remedy = error.remedy
         if isinstance(error, WrongDirection):
@@ -61,6 +71,7 @@ def _decode(
     dark: Greys | None,
     coded: Mapping[ImageKind, Greys],
     limits: StripeLimits | None,
+    moments: Moments | None,
 ) -> StripeMap:
     """The map of stripes that run one way."""
     shape = next(iter(coded.values())).shape[1:]
@@ -70,7 +81,7 @@ def _decode(
         raise DecodingFailed(f"images of {shape} px, lit frame of {lit.shape} px")
     if dark is not None and dark.shape != shape:
         raise DecodingFailed(f"dark frame of {dark.shape} px, lit frame of {lit.shape} px")
-    found = way.decode(SequenceImages(lit, dark, coded), limits)
+    found = way.decode(SequenceImages(lit, dark, coded, moments), limits)
     if limits is None or found.beyond is not None:
         return found
     return restrict(found, limits)

@@ -23,6 +23,7 @@ from bodyscan.files.model import Model, Problem
 
 if TYPE_CHECKING:
     from bodyscan.arrays import Array, Greys
+    from bodyscan.stripes.one_moment import Moments
     from bodyscan.stripes.stripe_limits import StripeLimits
     from bodyscan.stripes.stripe_map import StripeMap
 
@@ -49,12 +50,14 @@ class SequenceImages:
     """What a camera saw of a sequence, grey levels.
 
     lit, dark: (H, W); no dark where none was taken.  coded: (n, H, W) of each kind.  All of one type:
-    uint8, or float32 where parts of grey levels are known.
+    uint8, or float32 where parts of grey levels are known.  moments: when they were taken, if what
+    moved meanwhile is to be told and taken out by codes that can.
     """
 
     lit: Greys
     dark: Greys | None
     coded: Mapping[ImageKind, Greys]
+    moments: Moments | None = None
 
 
 class StripeCode(Model):
@@ -109,6 +112,11 @@ class StripeCode(Model):
     def image_counts(self) -> Mapping[ImageKind, int]:
         """How many images of each kind are shown, in their order, besides lit and dark; those of
         `crossing`, which follow, left out."""
+
+    def moment(self, times: Mapping[str, Array]) -> float:
+        """The moment for which its stripe map stands, in the unit of the images' times (n,) by kind."""
+        first = min(float(each.min()) for each in times.values())
+        return (first + max(float(each.max()) for each in times.values())) / 2.0
 
     @abstractmethod
     def intensity(self, kind: ImageKind, s: Array) -> Array:

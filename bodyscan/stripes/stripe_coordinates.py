@@ -30,9 +30,10 @@ MAX_PULL = 0.05
 
 
 def interpolate_stripes(
-    boundaries: Boundaries, codes: NDArray[np.int32], usable: Mask
+    boundaries: Boundaries, codes: NDArray[np.int32], usable: Mask, carried: float = 0.0
 ) -> tuple[Floats, Floats]:
-    """s and its standard deviation, (L, P) each, NaN where there is none.
+    """s and its standard deviation, (L, P) each, NaN where there is none.  carried: how far boundaries
+    may have been carried from where the codes change, stripes.
 
     Between two boundaries s is a cubic with the slopes that the boundaries around them tell
     (Hermite's). Past the last boundary of a run it goes on with the slope there, a little way.
@@ -43,7 +44,8 @@ def interpolate_stripes(
         found = _Segments.of(boundaries)
         segments = (found.start, found.width, found.index, found.rise, found.sigma)
         bends = (found.slope_in, found.slope_out, found.pull)
-        _fill(s, sigma, codes, usable, boundaries.line, boundaries.before, segments, bends)
+        slack, places = SLACK + carried, (boundaries.line, boundaries.before)
+        _fill(s, sigma, codes, usable, *places, segments, bends, slack)
     return s, sigma
 
 
@@ -90,11 +92,13 @@ def _fill(
     before: Indices,
     segments: tuple[Array, ...],
     bends: tuple[Array, ...],
+    slack: float,
 ) -> None:
     """Writes s and sigma (L, P) of usable pixels from the segments they lie in; beyond a run's
     ends from the run's last one, the one before the pixel rather than the one behind.
 
-    line, before: (N,) of the boundaries. segments, bends: (N - 1,) each, see `_Segments`.
+    line, before: (N,) of the boundaries. segments, bends: (N - 1,) each, see `_Segments`.  slack: by
+    how many stripes s may leave the code's stripe.
     """
     last, count = -1, line.size
     for row in range(codes.shape[0]):
@@ -108,17 +112,22 @@ def _fill(
             code, passed = codes[row, place], last >= 0 and line[last] == row
             value, doubt = np.nan, np.nan
             if passed and last + 1 < count:
-                value, doubt = _within(place, code, last, segments, bends)
+                value, doubt = _within(place, code, last, segments, bends, slack)
             if passed and last >= 1 and math.isnan(value):
-                value, doubt = _beside(place, code, last - 1, segments, bends)
+                value, doubt = _beside(place, code, last - 1, segments, bends, slack)
             if last + 2 < count and line[last + 1] == row and math.isnan(value):
-                value, doubt = _beside(place, code, last + 1, segments, bends)
+                value, doubt = _beside(place, code, last + 1, segments, bends, slack)
             s[row, place], sigma[row, place] = value, doubt
 
 
 @compiled
 def _within(
-    place: int, code: int, k: int, segments: tuple[Array, ...], bends: tuple[Array, ...]
+    place: int,
+    code: int,
+    k: int,
+    segments: tuple[Array, ...],
+    bends: tuple[Array, ...],
+    slack: float,
 ) -> tuple[float, float]:
     """s and its standard deviation at a place (px) between the boundaries of segment k, or NaN."""
     start, width, index, rise, sigma = segments
@@ -127,12 +136,17 @@ def _within(
     square = (3.0 * secant - 2.0 * slope_in[k] - slope_out[k]) / width[k]
     cube = (slope_in[k] + slope_out[k] - 2.0 * secant) / (width[k] * width[k])
     value = ((cube * x + square) * x + slope_in[k]) * x + index[k] - pull[k]
-    return _credible(value, sigma[k], code, index[k] + 0.5 * rise[k])
+    return _credible(value, sigma[k], code, index[k] + 0.5 * rise[k], slack)
 
 
 @compiled
 def _beside(
-    place: int, code: int, k: int, segments: tuple[Array, ...], bends: tuple[Array, ...]
+    place: int,
+    code: int,
+    k: int,
+    segments: tuple[Array, ...],
+    bends: tuple[Array, ...],
+    slack: float,
 ) -> tuple[float, float]:
     """s and its standard deviation at a place (px) before or behind segment k, or NaN: its bend
     goes on, and s is doubted by as much as that adds."""
@@ -143,14 +157,16 @@ def _beside(
         x, base, slope = x - width[k], base + rise[k], slope_out[k]
     bending = 0.5 * x * x * (slope_out[k] - slope_in[k]) / width[k]
     doubt = math.sqrt((BEYOND_DOUBT * sigma[k]) ** 2 + bending * bending)
-    return _credible(base + x * slope + bending, doubt, code, index[k] + 0.5 * rise[k])
+    return _credible(base + x * slope + bending, doubt, code, index[k] + 0.5 * rise[k], slack)
 
 
 @compiled
-def _credible(value: float, doubt: float, code: int, middle: float) -> tuple[float, float]:
+def _credible(
+    value: float, doubt: float, code: int, middle: float, slack: float
+) -> tuple[float, float]:
     """Both, or NaN where the pixel's code says otherwise or the segment (its middle's s is given)
     is left by more than a part of a stripe."""
-    if abs(value - code - 0.5) < 0.5 + SLACK and abs(value - middle) < 0.5 + BEYOND:
+    if abs(value - code - 0.5) < 0.5 + slack and abs(value - middle) < 0.5 + BEYOND:
         return value, doubt
     return np.nan, np.nan
 

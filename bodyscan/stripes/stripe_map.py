@@ -9,6 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Floats, Greys, Indices, Mask, whole_grey
 from bodyscan.stripes.boundaries import Boundaries
+from bodyscan.stripes.one_moment import StripeMotion
 from bodyscan.stripes.scan_lines import ScanLines
 
 
@@ -46,6 +47,7 @@ class StripeMap:
     were wanted. s is NaN there (see `StripeLimits`).
     crossing: the map of the stripes that run the other way, where such were projected.
     response: what the projector's response did, of codes that tell it; None where noise explains all.
+    motion: what moved while the images were taken, of codes that tell it where their moments are given.
     """
 
     s: Floats
@@ -58,6 +60,7 @@ class StripeMap:
     beyond: Mask | None = None
     crossing: StripeMap | None = None
     response: ResponseShare | None = None
+    motion: StripeMotion | None = None
 
 
 def stripe_map(

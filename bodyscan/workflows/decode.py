@@ -15,6 +15,7 @@ from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.one_moment import Moments
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import ResponseShare, StripeMap
 
@@ -28,9 +29,14 @@ Failure = tuple[ImageSequence, BodyscanError]
 
 
 def decode_sequence(
-    sequence: ImageSequence, pair: Pair, *, limits: StripeLimits | None = None, workers: int = 1
+    sequence: ImageSequence,
+    pair: Pair,
+    *,
+    limits: StripeLimits | None = None,
+    moments: Sequence[Moments] = (),
+    workers: int = 1,
 ) -> StripeMap:
-    """Read and decode what `pair` took in one shot; limits: see `decode_stripes`.
+    """Read and decode what `pair` took in one shot; limits, moments: see `decode_stripes`.
 
     Raises ImageError for bad files, DecodingFailed (naming pair and shot) for frames that do not
     add up or a pair without projector.
@@ -40,7 +46,7 @@ def decode_sequence(
         raise DecodingFailed("this pair has no projector", where=where)
     images = read_sequence(sequence, pair.camera, workers=workers)
     frames = (images.lit, images.dark, images.coded)
-    return decode_stripes(pair.projector, *frames, limits=limits, where=where)
+    return decode_stripes(pair.projector, *frames, limits=limits, moments=moments, where=where)
 
 
 def decode_on_boards(

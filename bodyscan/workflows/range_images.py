@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -13,13 +13,15 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.scan_volume import stripes_in_volume
+from bodyscan.reconstruction.sequence_moments import MS, sequence_moments
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.stripes.one_moment import Moments, StripeMotion
 from bodyscan.stripes.stripe_map import ResponseShare
 from bodyscan.workflows.decode import decode_sequence, response_notes, responses_in
 
-Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...]]
-"""A range image, and what the projector's response was found to be on the way."""
+Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...], StripeMotion | None]
+"""A range image, and what was found on the way: the projector's response, and what moved."""
 
 
 def reconstruct_sequence(
@@ -32,11 +34,16 @@ def reconstruct_sequence(
     pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
     limits = stripes_in_volume(pair, at, calibration.rig.volume)
     spec = calibration.rig.pair(sequence.pair)
-    stripes = decode_sequence(sequence, spec, limits=limits)
-    coded = spec.projector and calibration.rig.frames.of_code(spec.projector)
-    time_ms = captures.middle_ms(sequence.shot, sequence.pair, coded or ())
-    image = replace(reconstruct_range_image(pair, stripes), time_ms=time_ms)
-    return image, tuple(responses_in(stripes))
+    moments: tuple[Moments, ...] = ()
+    frame_ms = captures.frame_ms(sequence.shot, sequence.pair)
+    if spec.projector is not None:
+        moments = sequence_moments(pair, spec.projector, calibration.rig.frames, frame_ms)
+    stripes = decode_sequence(sequence, spec, limits=limits, moments=moments)
+    image, motion = reconstruct_range_image(pair, stripes), stripes.motion
+    if frame_ms is not None and moments:
+        velocity = None if motion is None else motion.velocity
+        image = replace(image, time_ms=MS * moments[0].moment, velocity=velocity)
+    return image, tuple(responses_in(stripes)), motion
 
 
 def reconstruct_range_images(
@@ -74,9 +81,33 @@ def reconstruct_range_images(
     failed |= {s.pair: captures.relative(str(error)) for s, error in errors.items()}
     if not found:
         raise ScanFailed(f"no pair gave a range image:{listed(failed)}")
-    images = [image for image, _ in found.values()]
+    images = [image for image, *_ in found.values()]
     responses: dict[str, list[ResponseShare]] = defaultdict(list)
-    for image, shares in found.values():
+    motions: dict[str, StripeMotion] = {}
+    for image, shares, motion in found.values():
         responses[image.pair] += shares
+        if motion is not None:
+            motions[image.pair] = motion
     notes = [f"{image.pair}: {image.agreement}" for image in images if image.agreement is not None]
+    notes += motion_notes(motions, timed=bool(captures.times))
     return Outcome(images, (*notes, *response_notes(responses)), failed)
+
+
+def motion_notes(motions: Mapping[str, StripeMotion], *, timed: bool) -> Iterator[str]:
+    """What pairs saw the subject do while each saw it.  timed: whether speeds are per second; otherwise
+    they are from one image to the next."""
+    moved = {pair: motion for pair, motion in motions.items() if motion.is_significant}
+    if not moved:
+        return
+    unit = "mm/s" if timed else "mm from image to image"
+    most = max(moved, key=lambda pair: moved[pair].speed_mm)
+    yield (
+        f"moved by up to {moved[most].speed_mm:.2g} {unit} in depth while a pair saw it ({most});"
+        f" what {len(moved)} of {len(motions)} pairs saw was carried to one moment each"
+    )
+    unclear = max(moved, key=lambda pair: moved[pair].doubt_mm)
+    if moved[unclear].doubt_mm > 0.0:
+        yield (
+            f"up to {moved[unclear].doubt_mm:.2g} {unit} of it are no smooth motion ({unclear}): these"
+            " went into the sigmas"
+        )

@@ -73,6 +73,11 @@ class _NumberedStripes(StripeCode):
         inverse = {INVERSE: self.bits} if self.inverses else {}
         return {PATTERN: self.bits} | inverse
 
+    def moment(self, times: Mapping[str, Array]) -> float:
+        """That of the finest pattern and its inverse, which show half of all boundaries."""
+        finest = [float(each[-1]) for each in times.values()]
+        return sum(finest) / len(finest)
+
     def intensity(self, kind: ImageKind, s: Array) -> Array:
         import numpy as np
 
@@ -84,7 +89,8 @@ class _NumberedStripes(StripeCode):
 
         patterns, inverses = images.coded[PATTERN], images.coded.get(INVERSE)
         lines = bit_lines(images.lit, images.dark, patterns, inverses, self.direction)
-        return decode_bits(self.word_code, lines, images.lit, self.stripes, limits)
+        code, lit = self.word_code, images.lit
+        return decode_bits(code, lines, lit, self.stripes, limits, images.moments)
 
 
 class Gray(_NumberedStripes):

@@ -1,0 +1,59 @@
+"""When a pair saw what, and how its sheets tell motion from that: what decoding needs to show a body at
+one moment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+
+from bodyscan.arrays import Array
+from bodyscan.calibration.pair import PairCalibration
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.reconstruction.told_motion import tell_motion
+from bodyscan.rig.frame_names import FrameNames, ImageNames
+from bodyscan.stripes.comb import Comb
+from bodyscan.stripes.one_moment import Moments, StripeMotion
+from bodyscan.stripes.stripe_code import StripeCode
+
+MS = 1000.0
+
+
+def sequence_moments(
+    pair: PairCalibration,
+    code: StripeCode,
+    frames: FrameNames,
+    frame_ms: Mapping[str, float] | None,
+) -> tuple[Moments, ...]:
+    """Of the stripes, and of those that cross them, which are wanted at the same moment.
+
+    frame_ms: when each image was taken, by its name. Times are in seconds then. Where it is not known,
+    images are taken to have come one after the other in the code's order, and times are counted in
+    images: motion can be taken out by that as well, only its speed is not known.
+    """
+    if frame_ms is None:
+        frame_ms = {name: MS * place for place, name in enumerate(frames.of_code(code))}
+    found: list[Moments] = []
+    ways = zip(
+        code.directions, (frames, frames.crossing), (pair.sheets, pair.crossing), strict=False
+    )
+    for way, names, sheets in ways:
+        times = _times(way, names, frame_ms)
+        moment = found[0].moment if found else way.moment(times)
+        told = partial(_told, pair.camera, sheets)
+        found.append(Moments(times, moment, told))
+    return tuple(found)
+
+
+def _times(way: StripeCode, names: ImageNames, frame_ms: Mapping[str, float]) -> dict[str, Array]:
+    """Of the images of each kind, s."""
+    return {
+        kind.name: np.array([frame_ms[name] for name in names.of_kind(kind, count)]) / MS
+        for kind, count in way.image_counts.items()
+    }
+
+
+def _told(camera: Camera, sheets: LightSheets | None, comb: Comb) -> StripeMotion | None:
+    return None if sheets is None else tell_motion(camera, sheets, comb)

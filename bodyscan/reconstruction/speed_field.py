@@ -1,0 +1,158 @@
+"""A smooth field of speed along the rays of one camera, no larger than the evidence asks for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.geometry.scaled_systems import gram, invert_scaled, solve_scaled
+from bodyscan.reconstruction.surface_cells import Cells
+
+KNOT_MM, REACH_MM = 80.0, 150.0
+"""From knot to knot, about a limb's width, and over which speeds are akin (a part of a trunk)."""
+SIZES = np.geomspace(0.02, 50.0, 40)
+"""Standard deviations of the field that are tried, mm per unit of time; before them, none."""
+SIGMAS = 3.0
+"""Evidence counts where noise alone gives it once in some hundred times."""
+
+
+@dataclass(frozen=True, eq=False)
+class CellSpeeds:
+    """What the cells tell, (cells,) each: speed along the rays, mm per unit of time, its weight
+    (1/variance; 0 where nothing is known), and its derivatives by a twist (cells, 6)."""
+
+    speed: Array
+    weight: Array
+    by_twist: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Knots:
+    """columns (C,), rows (R,): px, places of the knots.  share: (cells, knots in use) of each in the
+    cells' middles, linear between.  used: flat numbers of those with evidence (of R * C).
+    akin: (used, used), correlation of their speeds before anything is seen."""
+
+    columns: Array
+    rows: Array
+    share: Array
+    used: Indices
+    akin: Array
+
+    @staticmethod
+    def over(cells: Cells, known: Mask, mm_per_px: float) -> Knots:
+        """For an image whose pixels are as wide on the surface.  known: (cells,) where speeds are."""
+        step = KNOT_MM / mm_per_px
+        columns, rows = (
+            np.arange(np.ceil(size / step) + 1.0) * step for size in (cells.width, cells.height)
+        )
+        across, down = (
+            np.maximum(1.0 - np.abs((middles[:, None] - places) / step), 0.0)
+            for middles, places in zip(cells.middles, (columns, rows), strict=True)
+        )
+        share = np.einsum("ij,kl->ikjl", down, across).reshape(cells.count, -1)
+        used: Indices = np.flatnonzero(share[known].sum(axis=0) > 0.0)
+        place = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)[used] * mm_per_px
+        apart = np.linalg.norm(place[:, None] - place, axis=-1)
+        return Knots(columns, rows, share[:, used], used, np.exp(-apart / REACH_MM))
+
+    def spread(self, values: Array) -> Array:
+        """(R, C) of values (used,); NaN at other knots."""
+        grid = np.full(len(self.rows) * len(self.columns), np.nan)
+        grid[self.used] = values
+        return grid.reshape(len(self.rows), len(self.columns))
+
+
+@dataclass(frozen=True, eq=False)
+class FieldFit:
+    """A twist (6,) and speeds of the knots (K,), with the covariance of both (6 + K, 6 + K).
+
+    explained: by how much the twist lowers chi-square.  is_bent: whether there is a field at all.
+    """
+
+    twist: Array
+    field: Array
+    covariance: Array
+    explained: float
+    is_bent: bool
+
+    def speed(self, cells: CellSpeeds, knots: Knots) -> Array:
+        """(cells,), mm per unit of time."""
+        return np.asarray(cells.by_twist @ self.twist + knots.share @ self.field, np.float64)
+
+    def variance(self, cells: CellSpeeds, knots: Knots) -> Array:
+        """(cells,) of it."""
+        jacobian = np.hstack([cells.by_twist, knots.share])
+        return np.asarray(np.sum((jacobian @ self.covariance) * jacobian, axis=1), np.float64)
+
+
+def fit_field(cells: CellSpeeds, knots: Knots, twist_sigmas: Array) -> FieldFit:
+    """Twist and field together; the field is 0 where there is no evidence of one.
+
+    twist_sigmas: (6,) of the twist's prior. The field's size is the one under which what was seen is
+    likeliest (its other unknowns integrated out).
+    """
+    problem = _Problem.of(cells, knots, twist_sigmas)
+    gains = problem.gains(SIZES)
+    best = int(np.argmax(gains))
+    is_bent = bool(2.0 * gains[best] > SIGMAS**2)
+    normal, used = problem.normal, slice(0, None if is_bent else 6)
+    if is_bent:
+        normal = normal.copy()
+        normal[6:, 6:] += invert_scaled(knots.akin * SIZES[best] ** 2)
+    covariance, found = np.zeros(normal.shape), np.zeros(len(normal))
+    covariance[used, used] = invert_scaled(normal[used, used])
+    found[used] = covariance[used, used] @ problem.right[used]
+    explained = problem.right[:6] @ solve_scaled(problem.normal[:6, :6], problem.right[:6])
+    return FieldFit(found[:6], found[6:], covariance, float(explained), is_bent)
+
+
+def unexplained(cells: CellSpeeds, knots: Knots, left: Array) -> Array:
+    """(cells,) variance of speed, (mm per unit of time)^2, that what is `left` over (cells,) shows
+    around each cell beyond noise."""
+    known = cells.weight > 0.0
+    share, weight = knots.share[known], cells.weight[known]
+    count = share.sum(axis=0)
+    square = share.T @ (weight * left[known] ** 2)
+    beyond = square - count > SIGMAS * np.sqrt(2.0 * count)
+    variance = np.where(beyond, (square - count) / np.maximum(share.T @ weight, 1e-300), 0.0)
+    return np.asarray(knots.share @ variance, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Normal equations of twist and field, the field's prior left out; the knots' correlations."""
+
+    normal: Array
+    right: Array
+    akin: Array
+
+    @staticmethod
+    def of(cells: CellSpeeds, knots: Knots, twist_sigmas: Array) -> _Problem:
+        known = cells.weight > 0.0
+        jacobian = np.hstack([cells.by_twist[known], knots.share[known]])
+        weighted = jacobian * cells.weight[known, None]
+        normal = gram(weighted, jacobian)
+        normal[range(6), range(6)] += twist_sigmas**-2.0
+        return _Problem(normal, weighted.T @ cells.speed[known], knots.akin)
+
+    def gains(self, sizes: Array) -> Array:
+        """Logarithms of how much likelier what was seen is under fields of these sizes than none."""
+        rest, power = self._beside_twist
+        variance = sizes[:, None] ** 2
+        seen = 1.0 + variance * power
+        return np.asarray(0.5 * np.sum(variance * rest**2 / seen - np.log(seen), axis=1))
+
+    @cached_property
+    def _beside_twist(self) -> tuple[Array, Array]:
+        """Of the field's independent parts, the twist projected out: gradient and curvature (K,)."""
+        by_twist = solve_scaled(self.normal[:6, :6], self.normal[:6].T).T
+        normal = self.normal[6:, 6:] - self.normal[6:, :6] @ by_twist[:, 6:]
+        right = self.right[6:] - self.normal[6:, :6] @ solve_scaled(
+            self.normal[:6, :6], self.right[:6]
+        )
+        root = np.linalg.cholesky(self.akin)
+        power, parts = np.linalg.eigh(root.T @ normal @ root)
+        return parts.T @ root.T @ right, np.maximum(power, 0.0)

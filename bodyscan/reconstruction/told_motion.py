@@ -1,0 +1,171 @@
+"""A body's motion while one pair saw it, from the comb of its stripe boundaries (`stripes.comb`).
+
+At a pixel that stays where it is, a surface p.P = 1 that moves by V is seen to change its depth z by
+p.V z. V is a rigid motion, and besides it a smooth field of speed along the rays, as large as the
+evidence asks for (limbs, breath). What a rigid motion does within the surface itself is not seen, and
+stays as wide as people's motions are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
+from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.ray_depths import intersect_rays
+from bodyscan.geometry.transforms import RigidTransform, adjoint
+from bodyscan.geometry.velocity import SpeedField, Velocity
+from bodyscan.reconstruction.speed_field import CellSpeeds, FieldFit, Knots, fit_field, unexplained
+from bodyscan.reconstruction.surface_cells import Cells, fit_planes
+from bodyscan.stripes.comb import Comb
+from bodyscan.stripes.one_moment import StripeMotion
+
+CELLS_ACROSS, CELL_WINDOWS = 80, 1.2
+"""Of a picture, and the least length of a cell in windows: with less it would not know its slope."""
+FEWEST = 200
+"""Windows: fewer tell a speed worse than people move."""
+TWIST_SIGMAS = np.array([0.05] * 3 + [30.0] * 3)
+"""Prior about the middle of what is seen, radians and mm per unit of time: in a second several times
+what people who stand do, so that it rules only where nothing is seen."""
+SETTLED = 1e-3
+"""Variances: a thirtieth of a sigma."""
+TEETH_NOISE = Noise("teeth", cauchy=3.0)
+SIGMAS = 3.0
+"""A chi-square counts where it exceeds what noise alone does by so many of its own deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Teeth:
+    """What windows (N,) tell: their cell, speed in depth (mm per unit of time), its sigma, and dz/ds.
+
+    by_twist: (cells, 6), how a twist about `middle` changes the depth.
+    common: standard deviation of speed that all windows share.
+    """
+
+    cell: Indices
+    speed: Array
+    sigma: Array
+    per_stripe: Array
+    by_twist: Array
+    middle: Array
+    common: float
+
+
+def tell_motion(camera: Camera, sheets: LightSheets, comb: Comb) -> StripeMotion | None:
+    """None where too little was seen. Units of time are those of the comb."""
+    if len(comb.speed) < FEWEST:
+        return None
+    cells = _cells(camera, comb)
+    teeth = _teeth(camera, sheets, comb, cells)
+    if len(teeth.speed) < FEWEST:
+        return None
+    speeds = _by_cell(cells, teeth, _weights(teeth))
+    known = speeds.weight > 0.0
+    knots = Knots.over(cells, known, teeth.middle[2] / camera.alpha)
+    fit = fit_field(speeds, knots, TWIST_SIGMAS)
+    speed = fit.speed(speeds, knots)
+    lost = unexplained(speeds, knots, speeds.speed - speed)
+    doubt = np.sqrt(fit.variance(speeds, knots) + lost)
+    per_stripe = _mean_by(teeth.cell, teeth.per_stripe, np.ones(len(teeth.cell)), cells.count)
+    per_stripe[~known] = np.nan
+    grid = np.stack([speed, doubt]) / per_stripe
+    filled = _filled(grid.reshape(2, *cells.shape))
+    return StripeMotion(
+        speed=filled[0],
+        doubt=np.abs(filled[1]),
+        cell_px=cells.px,
+        velocity=_velocity(fit, knots, teeth),
+        speed_mm=_rms(speed[known]),
+        doubt_mm=_rms(np.sqrt(lost[known])),
+        is_significant=_rms(speed[known]) > SIGMAS * teeth.common
+        and (fit.is_bent or fit.explained > 6.0 + SIGMAS * np.sqrt(12.0)),
+    )
+
+
+def _cells(camera: Camera, comb: Comb) -> Cells:
+    """From the middle of one half of a window to that of the other is half its length."""
+    window = 2.0 * float(np.median(np.linalg.norm(comb.pixels[:, 1] - comb.pixels[:, 0], axis=1)))
+    cell_px = round(max(camera.width / CELLS_ACROSS, CELL_WINDOWS * window))
+    return Cells(camera.width, camera.height, cell_px)
+
+
+def _teeth(camera: Camera, sheets: LightSheets, comb: Comb, cells: Cells) -> _Teeth:
+    """Of the windows whose cells have a plane."""
+    rays = camera.rays(comb.pixels)
+    found = intersect_rays(sheets, rays, comb.s)
+    seen = np.isfinite(found.depth).all(axis=1) & np.isfinite(comb.sigma)
+    places = (
+        comb.pixels[seen].reshape(-1, 2),
+        rays[seen].reshape(-1, 3),
+        found.depth[seen].ravel(),
+    )
+    planes, points = fit_planes(cells, *places)
+    known: Mask = np.isfinite(planes[:, 2])
+    middle = np.median(points[known], axis=0) if known.any() else np.array([0.0, 0.0, 1.0])
+    facing = planes * points[:, 2:]
+    by_twist = np.hstack([np.cross(points - middle, facing), facing])
+    cell = cells.of(comb.pixels.mean(axis=1))
+    seen &= known[cell]
+    per_stripe = found.per_stripe[seen].mean(axis=1)
+    speed, size = comb.speed[seen] * per_stripe, np.abs(per_stripe)
+    common = float(np.median(comb.common[seen] * size)) if seen.any() else 0.0
+    sigma = np.maximum(comb.sigma[seen] * size, 1e-12)
+    return _Teeth(cell[seen], speed, sigma, per_stripe, by_twist, middle, common)
+
+
+def _weights(teeth: _Teeth) -> Array:
+    """(N,) 1/variance of the windows' speeds, less for those that are far off a rigid motion."""
+    by_twist = teeth.by_twist[teeth.cell]
+
+    def blocks(twist: Array) -> tuple[Block, ...]:
+        left, prior = by_twist @ twist - teeth.speed, twist / TWIST_SIGMAS
+        every = slice(0, 6)
+        return (
+            Block(left, lambda: by_twist, every, TEETH_NOISE, teeth.sigma),
+            Block(prior, lambda: np.diag(1.0 / TWIST_SIGMAS), every, EXACT),
+        )
+
+    found = minimize(np.zeros(6), blocks, np.add, unknowns=6, settled=SETTLED)
+    return found.weights[0] / (teeth.sigma * found.spreads[0]) ** 2
+
+
+def _by_cell(cells: Cells, teeth: _Teeth, weights: Array) -> CellSpeeds:
+    weight = np.asarray(np.bincount(teeth.cell, weights, cells.count), np.float64)
+    by_twist = np.where(weight[:, None] > 0.0, teeth.by_twist, 0.0)
+    return CellSpeeds(_mean_by(teeth.cell, teeth.speed, weights, cells.count), weight, by_twist)
+
+
+def _mean_by(cell: Indices, values: Array, weights: Array, count: int) -> Array:
+    """(count,) weighted means of values (N,) by their cells; 0 where there are none."""
+    total = np.maximum(np.bincount(cell, weights, count), 1e-300)
+    return np.asarray(np.bincount(cell, weights * values, count) / total, np.float64)
+
+
+def _filled(grid: Array) -> Array:
+    """A grid (K, rows, columns) with NaN replaced by the nearest cell that is known."""
+    unknown = np.isnan(grid[0])
+    row, column = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+    return np.asarray(grid[:, row, column], np.float64)
+
+
+def _velocity(fit: FieldFit, knots: Knots, teeth: _Teeth) -> Velocity:
+    """About the camera's centre; what all windows share is a motion along the middle's ray."""
+    about_camera = adjoint(RigidTransform(np.eye(3), teeth.middle))
+    shared = np.append(np.zeros(3), teeth.common * teeth.middle / teeth.middle[2])
+    twist = about_camera @ fit.twist
+    covariance = fit.covariance[:6, :6] + np.outer(shared, shared)
+    covariance = about_camera @ covariance @ about_camera.T
+    if not fit.is_bent:
+        return Velocity(twist, covariance)
+    sigma = np.sqrt(np.diagonal(fit.covariance)[6:])
+    field = SpeedField(knots.columns, knots.rows, knots.spread(fit.field), knots.spread(sigma))
+    return Velocity(twist, covariance, field)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))

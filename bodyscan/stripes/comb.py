@@ -1,0 +1,92 @@
+"""The comb that motion makes of stripe boundaries: what moved while a sequence was taken shows it.
+
+In a bit code, boundaries of neighbouring stripes are seen in different images: every other one in the
+finest pattern, a quarter of them in the next, and so on. A boundary's place belongs to the moment of
+its own images, so that on a moving surface neighbours stand out against each other like teeth, by
+the speed times how far apart they were seen. No smooth surface does that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.arrays import Array, Indices
+from bodyscan.stripes.boundaries import Boundaries
+
+TEETH = 8
+"""Boundaries of a window: half of them of the finest pattern, one at least of the fourth finest."""
+DEGREE = 3
+"""Of s along a window of the still surface: what bends more within so little (12 mm) is an edge."""
+
+ENOUGH = 16_000
+"""Windows, evenly chosen: they tell a rigid speed to some 0.05 mm/s, all of them hardly better."""
+LEAST_TOLD = 1e-6
+"""Of the variance of times: what rounding leaves where they are a cubic of the index."""
+COMMON_PX = 1e-3
+"""By so much may boundaries of one pattern lie beside those of another though nothing moves, all over
+a picture: on the boards of procam-board, which stood still, 0.0007 to 0.0017."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comb:
+    """What windows of neighbouring boundaries of one scan line tell of motion.
+
+    s, pixels: (N, 2) and (N, 2, 2), stripe coordinates and places, px, of the first and the second
+    half of each window.  speed: (N,) how fast s changes at a pixel that stays where it is, stripes per
+    unit of time.  sigma: (N,) its standard deviation by those of the boundaries.  common: (N,) another
+    one that all windows share.
+    """
+
+    s: Array
+    pixels: Array
+    speed: Array
+    sigma: Array
+    common: Array
+
+
+def find_comb(boundaries: Boundaries, times: Array, *, turned: bool) -> Comb:
+    """times: (N,) when each boundary was seen.  turned: scan lines are the camera image's columns.
+
+    In each window place over index is a cubic and a speed times the time, by least squares. Windows
+    in which time does not differ from a cubic tell nothing and are left out.
+    """
+    window = _window_starts(boundaries)[:, None] + np.arange(TEETH)
+    still = _smooth_part()
+    place, when = boundaries.position[window], times[window]
+    teeth, clock = place - place @ still, when - when @ still
+    told = np.sum(clock**2, axis=1)
+    shown = told > LEAST_TOLD * np.var(times) if len(times) else told > 0.0
+    window, place, teeth, clock = (each[shown] for each in (window, place, teeth, clock))
+    told = told[shown]
+    per_time = np.sum(clock * teeth, axis=1) / told
+    variance = np.sum((clock * boundaries.sigma_px[window]) ** 2, axis=1) / told**2
+    index = boundaries.index[window].astype(float)
+    slope = (index[:, -1] - index[:, 0]) / (place[:, -1] - place[:, 0])
+    along, beside, s = (
+        each.reshape(-1, 2, TEETH // 2).mean(axis=2)
+        for each in (place, boundaries.line_position[window], index)
+    )
+    pixels = np.stack([beside, along] if turned else [along, beside], axis=-1)
+    sigma, common = np.abs(slope) * np.sqrt(variance), np.abs(slope) * COMMON_PX / np.std(times)
+    return Comb(s, pixels, -slope * per_time, sigma, common)
+
+
+def _window_starts(boundaries: Boundaries) -> Indices:
+    """First boundaries of windows that lie end to end along every unbroken run that counts one way."""
+    count = len(boundaries.line)
+    begins = np.flatnonzero(np.append(True, ~boundaries.joined)) if count else np.empty(0, np.int64)
+    lengths = np.diff(np.append(begins, count))
+    place = np.arange(count) - np.repeat(begins, lengths)
+    first = np.flatnonzero((place % TEETH == 0) & (place + TEETH <= np.repeat(lengths, lengths)))
+    climb = boundaries.index[first + TEETH - 1] - boundaries.index[first]
+    first = first[np.abs(climb) == TEETH - 1]
+    return np.asarray(first[:: 1 + len(first) // ENOUGH], np.int64)
+
+
+def _smooth_part() -> Array:
+    """(TEETH, TEETH): takes values of a window to their cubic."""
+    powers = np.vander(np.linspace(-1.0, 1.0, TEETH), DEGREE + 1)
+    basis, _ = np.linalg.qr(powers)
+    return np.asarray(basis @ basis.T, np.float64)

@@ -1,0 +1,120 @@
+"""Stripe boundaries that were seen at different moments, carried to one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.compiled import compiled
+from bodyscan.geometry.velocity import Velocity
+from bodyscan.stripes.boundaries import Boundaries
+from bodyscan.stripes.comb import Comb, find_comb
+
+
+@dataclass(frozen=True, eq=False)
+class StripeMotion:
+    """How fast s changes at pixels that stay where they are, and the body's motion behind that.
+
+    speed, doubt: (rows, columns) at the middles of cells of `cell_px` x `cell_px` camera pixels, linear
+    between: stripes per unit of time, and the standard deviation of what is not known of it.
+    velocity: of the body, per the same unit of time.  speed_mm: how fast it moved in depth, RMS.
+    doubt_mm: of that, what neither a rigid motion nor the field explains, RMS over the cells.
+    is_significant: whether noise does not explain it.
+    """
+
+    speed: Array
+    doubt: Array
+    cell_px: int
+    velocity: Velocity
+    speed_mm: float
+    doubt_mm: float
+    is_significant: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """When the images of a sequence were taken, the moment at which the body is wanted, and who tells
+    its motion from the comb.
+
+    times: of each image (n,) by the name of its kind, any unit.  told: None where the comb tells
+    nothing.
+    """
+
+    times: Mapping[str, Array]
+    moment: float
+    told: Callable[[Comb], StripeMotion | None]
+
+    @property
+    def of_bits(self) -> Array:
+        """(bits,) when the boundaries of each bit's pattern are seen.
+
+        Where pattern and inverse are equally bright s has passed as far before the boundary in one as
+        behind it in the other: that is the middle of both moments, however far apart they are.
+        """
+        patterns = self.times["pattern"]
+        return np.asarray((patterns + self.times.get("inverse", patterns)) / 2.0, np.float64)
+
+
+def carry_to_moment(
+    boundaries: Boundaries, times: Array, moments: Moments, *, turned: bool
+) -> tuple[Boundaries, StripeMotion | None, float]:
+    """The boundaries as they would have been seen at the moment, what moved them, and the farthest
+    that s had to be carried, stripes. times: (N,) when each boundary was seen.
+
+    What noise explains leaves them untouched.
+    """
+    motion = moments.told(find_comb(boundaries, times, turned=turned))
+    if motion is None or not motion.is_significant:
+        return boundaries, motion, 0.0
+    late = times - moments.moment
+    place = [boundaries.line_position, boundaries.position]
+    column, row = place if turned else place[::-1]
+    grid = np.stack([motion.speed, motion.doubt])
+    speed, doubt = _at_places(grid, motion.cell_px, column, row)
+    widths = _stripe_widths(boundaries.position, boundaries.index, boundaries.joined)
+    position = boundaries.position + speed * late * widths
+    doubt_px = doubt * late * widths
+    pixels = int(np.max(boundaries.before, initial=0)) + 2
+    before = np.clip(np.floor(position).astype(np.int64), 0, pixels - 2)
+    before = np.maximum.accumulate(boundaries.line * pixels + before) - boundaries.line * pixels
+    carried = replace(
+        boundaries,
+        position=position,
+        before=before,
+        sigma_px=np.hypot(boundaries.sigma_px, doubt_px),
+    )
+    return carried, motion, float(np.abs(speed * late).max(initial=0.0))
+
+
+@compiled
+def _at_places(grid: Array, cell_px: int, column: Array, row: Array) -> Array:
+    """(2, N): a grid (2, rows, columns) at places (N,), px; beyond its outermost middles as there."""
+    found = np.empty((2, column.size))
+    rows, columns = grid.shape[1:]
+    for n in range(column.size):
+        x = min(max((column[n] + 0.5) / cell_px - 0.5, 0.0), columns - 1.0)
+        y = min(max((row[n] + 0.5) / cell_px - 0.5, 0.0), rows - 1.0)
+        left, top = min(int(x), max(columns - 2, 0)), min(int(y), max(rows - 2, 0))
+        right, below = min(left + 1, columns - 1), min(top + 1, rows - 1)
+        x, y = x - left, y - top
+        for k in range(2):
+            upper = grid[k, top, left] + x * (grid[k, top, right] - grid[k, top, left])
+            lower = grid[k, below, left] + x * (grid[k, below, right] - grid[k, below, left])
+            found[k, n] = upper + y * (lower - upper)
+    return found
+
+
+@compiled
+def _stripe_widths(position: Array, index: Indices, joined: Mask) -> Array:
+    """(N,) px a stripe along the scan line, below 0 where s falls; from the neighbours that are
+    joined, 0 where none is."""
+    widths = np.zeros(position.size)
+    for k in range(position.size):
+        first = k - 1 if k > 0 and joined[k - 1] else k
+        last = k + 1 if k < joined.size and joined[k] else k
+        if index[last] != index[first]:
+            widths[k] = (position[last] - position[first]) / (index[last] - index[first])
+    return widths
