@@ -54,6 +54,12 @@ docs: setup
 bench: setup
 	$(BIN)/python -m benchmarks
 
+# Deliberate faults that the tests should see; those that survive are listed. Takes an hour or two.
+.PHONY: mutants
+mutants: setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'cosmic-ray>=8.4'
+	$(BIN)/python -m benchmarks mutants
+
 setup: $(VENV)/.ready
 
 $(VENV)/.ready: pyproject.toml data/set-up.sh

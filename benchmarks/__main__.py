@@ -17,7 +17,18 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
-from benchmarks import charuco_ring, codes, full_size, fusion, lens, png, procam, rig, seconds
+from benchmarks import (
+    charuco_ring,
+    codes,
+    full_size,
+    fusion,
+    lens,
+    mutants,
+    png,
+    procam,
+    rig,
+    seconds,
+)
 from bodyscan.files.atomic import write_text
 
 PROJECT = Path(__file__).parents[1]
@@ -34,12 +45,15 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "charuco-ring": charuco_ring.report,
     "codes": codes.report,
     "lens": lens.report,
+    "mutants": mutants.report,
 }
+SLOW = ("mutants",)
+"""Run when named, not with all."""
 
 
 def main() -> None:
     """Sections that are not run keep what the last run found, and say how old it is."""
-    named = sys.argv[1:] or list(BENCHMARKS)
+    named = sys.argv[1:] or [name for name in BENCHMARKS if name not in SLOW]
     sections = _sections()
     for name in named:
         found, load = BENCHMARKS[name]().strip(), os.getloadavg()[1]

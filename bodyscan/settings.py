@@ -12,11 +12,12 @@ why it is what it is.  What cannot be changed from outside is a constant where i
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from bodyscan.files.model import Model
+from bodyscan.files.model import Model, Problem
 from bodyscan.progress import THREADS
 
 Millimetres = Annotated[float, Field(gt=0)]
@@ -99,12 +100,31 @@ class MeshSettings(Model):
     a cell at depth 9; with another depth scale it alike."""
 
 
+class UseLimits(Model):
+    """What a scan is used for: how wrong a girth of the trunk may be (`fusion.scan_verdict`).
+
+    A surface that stands 1 mm off all round makes a girth wrong by 6.3 mm, so these come to 0.32 and
+    0.64 mm between the surfaces of two pairs.
+    """
+
+    good_girth_mm: Millimetres = 2.0
+    """mm; ISO 20685-1 allows 4 mm of small girths and 9 of large ones, for all errors together."""
+
+    usable_girth_mm: Millimetres = 4.0
+    """mm; beyond it a scan is to be repeated."""
+
+    def problems(self) -> Iterator[Problem]:
+        if self.usable_girth_mm < self.good_girth_mm:
+            yield ("usable_girth_mm",), f"is less than good_girth_mm, {self.good_girth_mm:g}"
+
+
 class ScanSettings(Model):
     """All that decides what a scan comes out as."""
 
     alignment: AlignmentSettings = AlignmentSettings()
     fusion: FusionSettings = FusionSettings()
     mesh: MeshSettings = MeshSettings()
+    use: UseLimits = UseLimits()
 
 
 class ExportSettings(Model):

@@ -2,21 +2,24 @@
 
 A multiway ICP: matches between all pairs, then one solve for the small motions of all of them
 together with the prior, so the ring closes and only what the boards leave open is improved.  Pairs
-without overlap stay where the boards put them.
+that share hardly more than a rim are tied by that rim, believed less.  Pairs without overlap stay
+where the boards put them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import permutations
 from typing import TypeVar
 
+import networkx as nx
 import numpy as np
 
 from bodyscan.alignment.matching import (
+    SEAM_RIM_PX,
     AlignmentPoints,
     Matches,
     alignment_points,
@@ -35,13 +38,31 @@ Result = TypeVar("Result")
 
 COARSE = 4  # only one in so many points takes part
 FINE_ROUNDS = 2  # at the end, with all of them
-UNKNOWN = 0, float("nan")
+UNKNOWN = 0, float("nan"), float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What takes part of one range image: its inner part, and nearly up to its rims, for those with
+    which it shares no more."""
+
+    inner: AlignmentPoints
+    whole: AlignmentPoints
+
+    @staticmethod
+    def of(image: RangeImage, spacing_mm: float) -> _Seen:
+        return _Seen(
+            alignment_points(image, spacing_mm), alignment_points(image, spacing_mm, SEAM_RIM_PX)
+        )
+
+    def subsample(self, step: int) -> _Seen:
+        return _Seen(self.inner.subsample(step), self.whole.subsample(step))
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """source and target pairs, about how many points they share, and how far apart those lie before
-    and after, mm.
+    """source and target pairs, about how many points they share, how far apart those lie before and
+    after, mm, and how far noise alone would put them.
     """
 
     source: str
@@ -49,12 +70,14 @@ class Overlap:
     points: int
     rms_before_mm: float
     rms_after_mm: float
+    expected_mm: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """rig_from_camera after alignment; motion_mm of each pair at the body's centre; pairs refused
-    because they wanted to move farther than the prior allows, in sigmas; overlaps.
+    """rig_from_camera after alignment; motion_mm, at the body's centre, of each pair that overlaps tie
+    to the largest group of them: how far others moved nobody saw; pairs refused because they wanted
+    to move farther than the prior allows, in sigmas; overlaps.
     """
 
     rig_from_camera: dict[str, RigidTransform]
@@ -69,6 +92,11 @@ class Alignment:
     @property
     def rms_after_mm(self) -> float:
         return _pool_rms([(o.points, o.rms_after_mm) for o in self.overlaps])
+
+    @property
+    def expected_mm(self) -> float:
+        """What `rms_after_mm` would be of noise alone."""
+        return _pool_rms([(o.points, o.expected_mm) for o in self.overlaps])
 
 
 def align(
@@ -87,11 +115,11 @@ def align(
     start = [rig_from_camera[name] for name in names]
     motion = np.zeros((len(names), 6))
     reach, scale = settings.reach_mm, 1.0
-    sway = SwayPrior(settings.sway_mm, settings.sway_deg, settings.least_sway, settings.most_sway)
+    sway = SwayPrior.of(settings)
     equations = partial(OverlapEquations.of, correlated=settings.correlated)
     with ThreadPoolExecutor(workers) as pool:
-        clouds = list(pool.map(lambda image: alignment_points(image, settings.spacing_mm), images))
-        coarse = [p.subsample(COARSE) for p in clouds]
+        clouds = list(pool.map(lambda image: _Seen.of(image, settings.spacing_mm), images))
+        coarse = [seen.subsample(COARSE) for seen in clouds]
         for left in range(settings.rounds, 0, -1):
             moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
             taken = clouds if left <= FINE_ROUNDS else coarse
@@ -106,14 +134,15 @@ def align(
             _each_overlap(_gap, pool, coarse, placings, settings.least_reach_mm, settings)
             for placings in (start, moved)
         )
-    shift = np.linalg.norm(centre_shifts(motion), axis=1)
+    shift = np.linalg.norm(centre_shifts(motion), axis=1).tolist()
+    tied = _largest_group(now)
     return Alignment(
         dict(zip(names, moved, strict=True)),
-        dict(zip(names, shift.tolist(), strict=True)),
+        {name: shift[k] for k, name in enumerate(names) if k in tied},
         refused,
         tuple(
-            Overlap(names[i], names[j], COARSE * count, was.get((i, j), UNKNOWN)[1], rms_mm)
-            for (i, j), (count, rms_mm) in now.items()
+            Overlap(names[i], names[j], COARSE * count, was.get((i, j), UNKNOWN)[1], *apart)
+            for (i, j), (count, *apart) in now.items()
         ),
     )
 
@@ -121,18 +150,21 @@ def align(
 def _each_overlap(
     measure: Callable[[Matches], Result],
     pool: ThreadPoolExecutor,
-    clouds: Sequence[AlignmentPoints],
+    clouds: Sequence[_Seen],
     placings: Sequence[RigidTransform],
     reach_mm: float,
     settings: AlignmentSettings,
 ) -> dict[tuple[int, int], Result]:
-    """What the matches of every two pairs say, if they are enough; both ways, so that what one way
-    gets wrong on curves cancels."""
+    """What the matches of every two pairs say, if they are enough, of their rims where their inner
+    parts are not; both ways, so that what one way gets wrong on curves cancels."""
     match = match_projected if settings.matching == "projected" else match_nearest
 
     def of_two(both: tuple[int, int]) -> Result | None:
-        i, j = both
-        matches = match(clouds[i], clouds[j], placings[i], placings[j], reach_mm)
+        one, other = clouds[both[0]], clouds[both[1]]
+        here, there = placings[both[0]], placings[both[1]]
+        matches = match(one.inner, other.inner, here, there, reach_mm)
+        if len(matches.distances) < settings.fewest:
+            matches = match(one.whole, other.whole, here, there, reach_mm).of_seam
         return measure(matches) if len(matches.distances) >= settings.fewest else None
 
     every_two = list(permutations(range(len(clouds)), 2))
@@ -140,9 +172,16 @@ def _each_overlap(
     return {both: said for both, said in found if said is not None}
 
 
-def _gap(matches: Matches) -> tuple[int, float]:
-    """How many matches, and their RMS distance, mm."""
-    return len(matches.distances), float(np.sqrt(np.mean(matches.distances**2)))
+def _largest_group(overlaps: Iterable[tuple[int, int]]) -> set[int]:
+    """Of the images that overlaps tie together; those that nothing ties are none."""
+    groups = sorted(nx.connected_components(nx.Graph(list(overlaps))), key=min)
+    return max(groups, key=len, default=set())
+
+
+def _gap(matches: Matches) -> tuple[int, float, float]:
+    """How many matches, their RMS distance, and what that would be by their sigmas, mm."""
+    apart, sigma = matches.distances, matches.sigma_mm
+    return len(apart), float(np.sqrt(np.mean(apart**2))), float(np.sqrt(np.mean(sigma**2)))
 
 
 def _pool_rms(parts: Sequence[tuple[int, float]]) -> float:

@@ -25,6 +25,8 @@ FACING = 0.7  # least cosine between the normals of what may be one spot
 EDGE_ON = 0.3  # least cosine between a normal and the viewing ray
 NEAREST_MM = 100.0
 RIM_PX = 4
+SEAM_RIM_PX = 2  # blur is narrower than this; its bias is what is left
+SEAM_BIAS_MM = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +68,16 @@ class Matches:
     distances: Array
     sigma_mm: Array
 
+    @property
+    def of_seam(self) -> Matches:
+        """With what rims are lifted by in their sigmas."""
+        return replace(self, sigma_mm=np.hypot(self.sigma_mm, SEAM_BIAS_MM))
 
-def alignment_points(image: RangeImage, spacing_mm: float) -> AlignmentPoints:
+
+def alignment_points(image: RangeImage, spacing_mm: float, rim_px: int = RIM_PX) -> AlignmentPoints:
     """Points of every so many rows and columns, about `spacing_mm` apart where a surface faces the
     camera; what is seen edge-on takes no part."""
-    window = np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)
+    window = np.ones((2 * rim_px + 1, 2 * rim_px + 1), np.uint8)
     valid = image.valid
     inner = cv2.erode(valid.view(np.uint8), window) > 0
     depth = image.points[::8, ::8, 2][valid[::8, ::8]]

@@ -6,7 +6,7 @@ prior lets it, besides what the boards left open.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import RigidTransform, adjoint
-from bodyscan.settings import BODY_CENTRE_MM
+from bodyscan.settings import BODY_CENTRE_MM, AlignmentSettings
 
 BODY_CENTRE = np.array(BODY_CENTRE_MM)
 SWAY_ROOM = 1.5  # standard deviations are believed this much larger than what was found
@@ -32,6 +32,12 @@ class SwayPrior:
     least: float
     most: float
 
+    @staticmethod
+    def of(settings: AlignmentSettings) -> SwayPrior:
+        return SwayPrior(
+            settings.sway_mm, settings.sway_deg, settings.least_sway, settings.most_sway
+        )
+
     def scale(self, motion: Array) -> float:
         """How much the subject moved by motions (P, 6), in multiples of `shift_mm`.
 
@@ -44,12 +50,22 @@ class SwayPrior:
 
     def covariance(self, names: Sequence[str], boards: PoseCovariance, scale: float = 1.0) -> Array:
         """(6P, 6P): the calibration's covariance, plus for each pair a sway `scale` times the usual."""
-        order = np.concatenate([6 * boards.names.index(name) + np.arange(6) for name in names])
+        return boards.among(names) + np.kron(np.eye(len(names)), self.of_one(scale))
+
+    def of_one(self, scale: float = 1.0) -> Array:
+        """(6, 6): of one pair's sway, rig frame."""
         rotation, translation = scale * np.radians(self.rotation_deg), scale * self.shift_mm
         own = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
         carry = adjoint(RigidTransform(np.eye(3), BODY_CENTRE))
-        each = np.kron(np.eye(len(names)), carry @ own @ carry.T)
-        return boards.matrix[np.ix_(order, order)] + each
+        return np.asarray(carry @ own @ carry.T)
+
+    def loosen(self, boards: PoseCovariance, untied: Collection[str]) -> PoseCovariance:
+        """The calibration's covariance, and the sway of the pairs that no overlap ties."""
+        matrix, own = boards.matrix.copy(), self.of_one()
+        for name in untied:
+            here = slice(6 * boards.names.index(name), 6 * boards.names.index(name) + 6)
+            matrix[here, here] += own
+        return PoseCovariance(boards.names, matrix)
 
 
 def centre_shifts(motion: Array) -> Array:

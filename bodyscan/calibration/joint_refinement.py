@@ -8,18 +8,21 @@ parameters are unknowns like any other.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Indices
+from bodyscan.calibration.board_form import POWERS, BoardForm
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import BoundaryPoints, rays_on_board
+from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, rays_on_board
 from bodyscan.calibration.camera import known_beforehand
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
+from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
+from bodyscan.geometry.light_planes import Axis
+from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
@@ -31,6 +34,14 @@ SETTLED = 1e-2
 CORNERS = Noise("corners, px", group=2, cauchy=4.0, least=1e-3)
 STRIPES = Noise("stripes, in sigmas", cauchy=4.0, least=1e-2)
 FLOOR_PX = 0.02
+BENDS = 2
+"""Times that a ray's point is lifted to where the board is bent: the first is off by what the board
+rises over a few tenths of a millimetre."""
+LEAST_SHOWN = 1e-6
+"""Share of what is best known of a print, below which nothing is."""
+SPREADS_MM = np.append(0.0, np.geomspace(1e-3, 1.0, 121))
+AS_WELL = 1e-7
+"""Of a depth: to this share of it sheets stand for turned rays before their prior is felt."""
 TWIST_STEPS = (*[1e-6] * 3, *[1e-3] * 3)
 """Radians and mm, for derivatives of a boundary point by its board's motion."""
 
@@ -38,7 +49,7 @@ TWIST_STEPS = (*[1e-6] * 3, *[1e-3] * 3)
 @dataclass(frozen=True, eq=False)
 class StripedBoard:
     """One shot: its corners, and the stripe boundaries on it: pixels (N, 2), index (N,) with s = i,
-    sigma_px (N,) and across (2,), the unit vector across the stripes in the image.
+    sigma_px (N,) and across (2,), the unit vector across the stripes in the image.  board: its name.
     """
 
     view: PlanarView
@@ -46,11 +57,13 @@ class StripedBoard:
     index: Array
     sigma_px: Array
     across: Array
+    board: str
 
 
 @dataclass(frozen=True, eq=False)
 class JointFit(Generic[Sheets]):
-    """What fits corners and stripes together; covariance (P, P) of the camera.
+    """What fits corners and stripes together; covariance (P, P) of the camera.  forms: of the boards
+    by name.
 
     corners_rms_px and stripes_rms_px are robustly weighted.
     """
@@ -61,6 +74,7 @@ class JointFit(Generic[Sheets]):
     camera_covariance: Array
     corners_rms_px: float
     stripes_rms_px: float
+    forms: dict[str, BoardForm]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +82,7 @@ class _State(Generic[Sheets]):
     camera: Camera
     poses: tuple[RigidTransform, ...]
     sheets: Sheets
+    forms: dict[str, BoardForm]
 
     @property
     def first_pose(self) -> int:
@@ -78,17 +93,37 @@ class _State(Generic[Sheets]):
     def first_sheet(self) -> int:
         return self.first_pose + 6 * len(self.poses)
 
+    @property
+    def first_form(self) -> int:
+        return self.first_sheet + self.sheets.prior()[1].shape[1]
+
+    @property
+    def of_form(self) -> dict[str, Indices]:
+        """Which unknowns are each board's form."""
+        found, first = {}, self.first_form
+        for name, form in self.forms.items():
+            found[name] = np.arange(first, first + form.count)
+            first += form.count
+        return found
+
+    @property
+    def unknowns(self) -> int:
+        return self.first_form + sum(form.count for form in self.forms.values())
+
     def moved(self, step: Array) -> _State[Sheets]:
         twists = step[self.first_pose : self.first_sheet].reshape(-1, 6)
         poses = tuple(p.moved(twist) for p, twist in zip(self.poses, twists, strict=True))
         camera = self.camera.moved(step[: self.first_pose])
-        return _State(camera, poses, self.sheets.retract(step[self.first_sheet :]))
+        sheets = self.sheets.retract(step[self.first_sheet : self.first_form])
+        of_form = self.of_form
+        forms = {name: form.moved(step[of_form[name]]) for name, form in self.forms.items()}
+        return _State(camera, poses, sheets, forms)
 
 
 def striped_board(
-    view: PlanarView, camera: Camera, data: BoundaryPoints, number: int
+    view: PlanarView, camera: Camera, data: BoundaryPoints, number: int, board: str
 ) -> StripedBoard:
-    """The (binned) boundary points of one board as image measurements again."""
+    """The (binned) boundary points of one board as image measurements again; board: its name."""
     own = data.board == number
     across = np.median(
         camera.project(data.points[own] + data.per_pixel[own]) - camera.project(data.points[own]),
@@ -100,6 +135,21 @@ def striped_board(
         data.index[own].astype(float),
         np.hypot(data.sigma_px[own], FLOOR_PX),
         across / np.linalg.norm(across),
+        board,
+    )
+
+
+def carried(
+    camera: Camera,
+    camera_from_board: RigidTransform,
+    board: StripedBoard,
+    number: int,
+    direction: Axis,
+) -> BoundaryPoints:
+    """The boundary points of a flat board, as a camera and a pose have them."""
+    index, place = board.index.astype(np.int64), camera_from_board @ _face(board)
+    return boundary_points(
+        camera, place, index, board.pixels, board.sigma_px, board=number, direction=direction
     )
 
 
@@ -108,62 +158,153 @@ def refine_jointly(
     camera_from_board: Mapping[str, RigidTransform],
     sheets: Sheets,
     boards: Sequence[StripedBoard],
+    forms: Mapping[str, BoardForm],
+    *,
+    bent: bool = True,
+    steps: int = STEPS,
 ) -> JointFit[Sheets]:
     """Least squares from a camera, poses and sheets found one after the other.
 
-    Boards of which only corners are known take part with empty pixels.
+    Boards of which only corners are known take part with empty pixels.  bent: whether boards may have
+    another form than `forms` says; if not, that they may is in the covariance alone.
     """
-    start = _State(camera, tuple(camera_from_board[b.view.shot] for b in boards), sheets)
-    first, last = start.first_pose, start.first_sheet
-    unknowns = last + sheets.prior()[1].shape[1]
-    solution = minimize(
-        start,
-        lambda state: _blocks(state, boards, unknowns),
+    poses = tuple(camera_from_board[b.view.shot] for b in boards)
+    fitted = forms if bent else {name: form.exact for name, form in forms.items()}
+    state = _solve(_State(camera, poses, sheets, dict(fitted)), boards, steps).state
+    if not bent:
+        state = replace(state, forms=dict(forms))
+    solution = _solve(state, boards, 0)
+    return _fit(solution, boards, solution.covariance)
+
+
+def known_apart(
+    camera: Camera,
+    camera_from_board: Mapping[str, RigidTransform],
+    sheets: Sheets,
+    boards: Sequence[StripedBoard],
+    forms: Mapping[str, BoardForm],
+) -> JointFit[Sheets]:
+    """The same unknowns where they are, camera and boards known by corners alone, the sheets by the
+    stripes on such boards: with what is uncertain in the former in the latter's covariance."""
+    poses = tuple(camera_from_board[b.view.shot] for b in boards)
+    solution = _solve(_State(camera, poses, sheets, dict(forms)), boards, 0)
+    state = solution.state
+    of_sheets = np.arange(state.first_sheet, state.first_form)
+    others = np.setdiff1d(np.arange(state.unknowns), of_sheets)
+    first = invert_scaled(solution.normal([CORNERS, EXACT])[np.ix_(others, others)])
+    striped = solution.normal([STRIPES, EXACT])
+    own = invert_scaled(striped[np.ix_(of_sheets, of_sheets)])
+    follow = -own @ striped[np.ix_(of_sheets, others)]
+    covariance = np.zeros((state.unknowns, state.unknowns))
+    covariance[np.ix_(others, others)] = first
+    covariance[np.ix_(of_sheets, others)] = follow @ first
+    covariance[np.ix_(others, of_sheets)] = (follow @ first).T
+    covariance[np.ix_(of_sheets, of_sheets)] = own + follow @ first @ follow.T
+    return _fit(solution, boards, covariance)
+
+
+def print_errors(fit: JointFit[Sheets], boards: Sequence[StripedBoard]) -> dict[str, float]:
+    """How far corners of each board were printed off, mm, as likely as can be for what `fit` found.
+
+    In the directions in which corners and stripes know the corners' places each by itself, those found
+    are as wide as the print's errors and the noise together.
+    """
+    poses = tuple(fit.camera_from_board[b.view.shot] for b in boards)
+    state = _State(fit.camera, poses, fit.sheets, fit.forms)
+    normal = _solve(state, boards, 0).normal([CORNERS, STRIPES, EXACT])
+    found = {}
+    for name, own in state.of_form.items():
+        form, of_print = fit.forms[name], own[len(POWERS) :]
+        rest = np.setdiff1d(np.arange(state.unknowns), of_print)
+        known = 1.0 / form.print_mm**2
+        cross = normal[np.ix_(of_print, rest)]
+        information = normal[np.ix_(of_print, of_print)] - known * np.eye(len(of_print))
+        information -= cross @ invert_scaled(normal[np.ix_(rest, rest)]) @ cross.T
+        values, vectors = np.linalg.eigh(information)
+        shown = values > LEAST_SHOWN * values[-1]
+        values = values[shown]
+        places = (vectors.T @ form.printed.ravel())[shown] * (values + known) / values
+        found[name] = _likeliest_spread(places, 1.0 / values)
+    return found
+
+
+def _likeliest_spread(values: Array, variances: Array) -> float:
+    """Standard deviation of what `values` (N,), seen with noise of `variances` (N,), scatter by."""
+    total = SPREADS_MM[:, None] ** 2 + variances
+    misfit = np.sum(np.log(total) + values**2 / total, axis=1)
+    return float(SPREADS_MM[np.argmin(misfit)])
+
+
+def _solve(
+    state: _State[Sheets], boards: Sequence[StripedBoard], steps: int
+) -> Solution[_State[Sheets]]:
+    return minimize(
+        state,
+        lambda state: _blocks(state, boards),
         lambda state, step: state.moved(step),
-        unknowns=unknowns,
-        steps=STEPS,
+        unknowns=state.unknowns,
+        steps=steps,
         settled=SETTLED,
         damping=1e-6,
     )
-    state, covariance = solution.state, solution.covariance
+
+
+def _fit(
+    solution: Solution[_State[Sheets]], boards: Sequence[StripedBoard], covariance: Array
+) -> JointFit[Sheets]:
+    state = solution.state
+    first = state.first_pose
     corners = np.concatenate([_corner_residuals(state, k, b) for k, b in enumerate(boards)])
     offsets = [
-        _offsets(state.sheets, pose, b, _rays(state.camera, b)) * b.sigma_px
-        for pose, b in zip(state.poses, boards, strict=True)
+        _offsets(state, k, b, _rays(state.camera, b)) * b.sigma_px for k, b in enumerate(boards)
     ]
     return JointFit(
         state.camera,
         {b.view.shot: pose for b, pose in zip(boards, state.poses, strict=True)},
-        state.sheets.with_covariance(covariance[last:, last:]),
+        state.sheets.with_covariance(_of_depths(state, boards, covariance)),
         covariance[:first, :first],
         _weighted_rms(corners, CORNERS) * np.sqrt(2.0),
         _weighted_rms(np.concatenate(offsets), STRIPES),
+        state.forms,
     )
 
 
-def _blocks(
-    state: _State[Sheets], boards: Sequence[StripedBoard], unknowns: int
-) -> Iterator[Block]:
-    """Of each board its corners and its stripes; last what is known of camera and sheets
+def _blocks(state: _State[Sheets], boards: Sequence[StripedBoard]) -> Iterator[Block]:
+    """Of each board its corners and its stripes; last what is known of camera, sheets and boards
     beforehand."""
-    camera, sheets = np.arange(state.first_pose), np.arange(state.first_sheet, unknowns)
+    camera, sheets = np.arange(state.first_pose), np.arange(state.first_sheet, state.first_form)
+    of_form = state.of_form
     with np.errstate(all="ignore"):
         for k, board in enumerate(boards):
-            pose = state.first_pose + 6 * k + np.arange(6)
+            pose, form = state.first_pose + 6 * k + np.arange(6), of_form[board.board]
             corners, rays = _corner_residuals(state, k, board), _rays(state.camera, board)
-            stripes = _offsets(state.sheets, state.poses[k], board, rays)
+            stripes = _offsets(state, k, board, rays)
             of_corners = partial(_corner_jacobian, state, k, board)
             of_stripes = partial(_stripe_jacobian, state, k, board, rays)
-            yield Block(corners, of_corners, np.concatenate([camera, pose]), CORNERS)
-            yield Block(stripes, of_stripes, np.concatenate([camera, pose, sheets]), STRIPES)
+            yield Block(corners, of_corners, np.concatenate([camera, pose, form]), CORNERS)
+            bent = form[: len(POWERS)]
+            yield Block(stripes, of_stripes, np.concatenate([camera, pose, sheets, bent]), STRIPES)
     if state.camera.prior is not None:
         yield known_beforehand(state.camera, camera)
     known, jacobian = state.sheets.prior()
     yield Block(known, lambda: jacobian, sheets, EXACT)
+    for name, own in state.forms.items():
+        yield Block(own.unknowns / own.prior_sigmas, partial(_of_prior, own), of_form[name], EXACT)
+
+
+def _of_prior(form: BoardForm) -> Array:
+    return np.diag(1.0 / form.prior_sigmas)
+
+
+def _corners_of(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
+    """(N, 3) mm, camera frame: where the corners of the k-th board lie."""
+    form = state.forms[board.board]
+    points = board.view.points
+    return state.poses[k].apply(form.applied(points, form.numbers(points)))
 
 
 def _corner_residuals(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
-    seen = state.camera.project(state.poses[k].apply(board.view.points))
+    seen = state.camera.project(_corners_of(state, k, board))
     return (seen - board.view.pixels).ravel()
 
 
@@ -181,19 +322,39 @@ def _ray_slopes(camera: Camera, rays: Array) -> Array:
     return -(inverse @ by_parameter).reshape(*rays.shape[:2], 2, -1)
 
 
-def _offsets(
-    sheets: Sheets, camera_from_board: RigidTransform, board: StripedBoard, rays: Array
+def _offsets(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
+    """Offsets of the k-th board's boundaries from their sheets, over their sigma, (N,); rays:
+    `_rays`."""
+    points, across = _on_board(state, k, board, rays)
+    return _over_sigma(state.sheets, state.sheets.at(board.index), board, points, across)
+
+
+def _over_sigma(
+    sheets: SmoothSheets, at: Any, board: StripedBoard, points: Array, across: Array
 ) -> Array:
-    """Offsets of one board's boundaries from their sheets, over their sigma, (N,); rays: `_rays`."""
-    points, across = _on_board(camera_from_board, board, rays)
-    offset = sheets.offset(points, sheets.at(board.index))
+    offset = sheets.offset(points, at)
     return np.asarray(offset.value / _sigma(board, points, across, offset.by_point), np.float64)
 
 
-def _on_board(camera_from_board: RigidTransform, board: StripedBoard, rays: Array) -> Array:
+def _on_board(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
     """(2, N, 3) mm: where rays meet the face on which the stripes were seen."""
-    height = RigidTransform(np.eye(3), np.array([0.0, 0.0, board.view.points[0, 2]]))
-    return rays_on_board(rays, camera_from_board @ height)
+    camera_from_face = state.poses[k] @ _face(board)
+    points, form = rays_on_board(rays, camera_from_face), state.forms[board.board]
+    if form.heights.any():
+        flat, board_from_camera = points, camera_from_face.inverse()
+        for _ in range(BENDS):
+            height = form.height(board_from_camera.apply(points)[..., :2])
+            points = flat + _lifts(rays, camera_from_face, height)
+    return points
+
+
+def _face(board: StripedBoard) -> RigidTransform:
+    return RigidTransform(np.eye(3), np.array([0.0, 0.0, board.view.points[0, 2]]))
+
+
+def _lifts(rays: Array, camera_from_face: RigidTransform, height: Array) -> Array:
+    """How far points on rays (..., 3) move along them where the board stands so high over its plane."""
+    return np.asarray(rays * (height / (rays @ camera_from_face.rotation[:, 2]))[..., None])
 
 
 def _sigma(board: StripedBoard, points: Array, across: Array, by_point: Array) -> Array:
@@ -203,38 +364,122 @@ def _sigma(board: StripedBoard, points: Array, across: Array, by_point: Array) -
 
 
 def _corner_jacobian(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
-    points = state.poses[k].apply(board.view.points)
+    """(2N, ...) by camera, this board's pose, and its form."""
+    points, form = _corners_of(state, k, board), state.forms[board.board]
     by_parameter, by_point = state.camera.jacobians(points)
-    jacobian = np.concatenate([by_parameter, by_point @ twist_jacobian(points)], axis=2)
+    in_board = by_point @ state.poses[k].rotation
+    lifted = in_board[:, :, 2:] * form.basis(board.view.points[:, :2])[:, None, :]
+    printed = np.zeros((len(points), 2, len(form.points), 2))
+    each = np.arange(len(points))
+    printed[each, :, form.numbers(board.view.points)] = in_board[:, :, :2]
+    parts = [by_parameter, by_point @ twist_jacobian(points), lifted]
+    jacobian = np.concatenate([*parts, printed.reshape(len(points), 2, -1)], axis=2)
     return jacobian.reshape(-1, jacobian.shape[2])
 
 
 def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
-    """Of the offsets over their sigma (N, ...), by camera, this board's pose, and sheets.
+    """Of the offsets over their sigma (N, ...), by camera, this board's pose, sheets, and the board's
+    heights.
 
     By differences for camera and pose, since the sigma changes too: left out of the derivative, noise
     would pull the focal lengths up.
     """
-    pose, slopes = state.poses[k], _ray_slopes(state.camera, rays)
-    points, across = _on_board(pose, board, rays)
-    offset = state.sheets.offset(points, state.sheets.at(board.index), parameters=True)
+    pose, slopes, face = state.poses[k], _ray_slopes(state.camera, rays), _face(board)
+    points, across = both = _on_board(state, k, board, rays)
+    at = state.sheets.at(board.index)
+    offset = state.sheets.offset(points, at, parameters=True)
     assert offset.by_parameter is not None
     sigma = _sigma(board, points, across, offset.by_point)
+    # A board rises by a thousandth of the way along it: as high as here, it is bent enough.
+    height = state.forms[board.board].height((pose @ face).inverse().apply(both)[..., :2])
+
+    def there(rays: Array, pose: RigidTransform) -> Array:
+        place = pose @ face
+        found = rays_on_board(rays, place) + _lifts(rays, place, height)
+        return _over_sigma(state.sheets, at, board, found[0], found[1])
 
     def turned(column: int, step: float) -> Array:
         turn = np.zeros_like(rays)
         turn[..., :2] = step * slopes[..., column]
-        return _offsets(state.sheets, pose, board, rays + turn)
+        return there(rays + turn, pose)
 
     def moved(column: int, step: float) -> Array:
-        return _offsets(state.sheets, pose.moved(step * np.eye(6)[column]), board, rays)
+        return there(rays, pose.moved(step * np.eye(6)[column]))
 
     by_place = [
         (change(column, size) - change(column, -size)) / (2.0 * size)
         for change, sizes in ((turned, state.camera.difference_steps), (moved, TWIST_STEPS))
         for column, size in enumerate(sizes)
     ]
-    return np.column_stack([*by_place, offset.by_parameter / sigma[:, None]])
+    along = np.sum(offset.by_point * rays[0], axis=1) / (rays[0] @ pose.rotation[:, 2])
+    basis = state.forms[board.board].basis(pose.inverse().apply(points)[:, :2])
+    by_height = (along / sigma)[:, None] * basis
+    return np.column_stack([*by_place, offset.by_parameter / sigma[:, None], by_height])
+
+
+def allowing_for(
+    fit: JointFit[Sheets], other: JointFit[Sheets], boards: Sequence[StripedBoard]
+) -> JointFit[Sheets]:
+    """The same, with what another fit finds otherwise, which may be right, in its covariances."""
+    there = _depths_by_sheets(fit.camera, fit.sheets, boards)
+    rays = other.camera.rays(np.concatenate([board.pixels for board in boards]))
+    depth = other.sheets.depth(rays, np.concatenate([board.index for board in boards]))
+    motion = _motion_of_sheets(fit.sheets, there.by_sheets, depth[:, None] / there.depth - 1.0)
+    changed = (other.camera.parameters - fit.camera.parameters)[:, None]
+    return replace(
+        fit,
+        sheets=fit.sheets.with_covariance(fit.sheets.covariance + motion @ motion.T),
+        camera_covariance=fit.camera_covariance + changed @ changed.T,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Depths:
+    """depth: (N, 1) of boundary points on boards.  Relative changes of it, (N, P) by the sheets'
+    unknowns and (N, C) by those of the camera, whose rays turn while their pixels stay."""
+
+    depth: Array
+    by_sheets: Array
+    by_camera: Array
+
+
+def _depths_by_sheets(
+    camera: Camera, sheets: SmoothSheets, boards: Sequence[StripedBoard]
+) -> _Depths:
+    index = np.concatenate([board.index for board in boards])
+    rays = camera.rays(np.concatenate([board.pixels for board in boards]))[None]
+    with np.errstate(all="ignore"):
+        depth = sheets.depth(rays[0], index)[:, None]
+        offset = sheets.offset(rays[0] * depth, sheets.at(index), parameters=True)
+        assert offset.by_parameter is not None
+        along = np.sum(offset.by_point * rays[0], axis=1)[:, None]
+        turned = np.einsum("nk,nkp->np", offset.by_point[:, :2], _ray_slopes(camera, rays)[0])
+        return _Depths(depth, -offset.by_parameter / along / depth, -turned / along)
+
+
+def _motion_of_sheets(sheets: SmoothSheets, by_sheets: Array, changes: Array) -> Array:
+    """(P, K): the sheets' unknowns that change depths relatively by `changes` (N, K), nearly."""
+    known = np.isfinite(by_sheets).all(axis=1) & np.isfinite(changes).all(axis=1)
+    prior = AS_WELL * np.sqrt(np.count_nonzero(known)) * sheets.prior()[1]
+    matrix = np.concatenate([by_sheets[known], prior])
+    right = np.concatenate([changes[known], np.zeros((len(prior), changes.shape[1]))])
+    return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0], np.float64)
+
+
+def _of_depths(state: _State[Sheets], boards: Sequence[StripedBoard], covariance: Array) -> Array:
+    """(P, P) of the sheets as a depth sees them: with the rays that meet them.
+
+    A camera that is a little wrong turns rays and sheets together. Its rays' part is written as a
+    motion of the sheets that changes the depths on the boards as much (what is left of it, a lens, is
+    in the rays' own sigma), so that both add up with the sign that they have.
+    """
+    own = np.arange(state.first_sheet, state.first_form)
+    there = _depths_by_sheets(state.camera, state.sheets, boards)
+    motion = _motion_of_sheets(state.sheets, there.by_sheets, there.by_camera)
+    carried = np.concatenate([motion, np.eye(len(own))], axis=1)
+    columns = np.concatenate([np.arange(state.first_pose), own])
+    total = carried @ covariance[np.ix_(columns, columns)] @ carried.T
+    return np.asarray(0.5 * (total + total.T), np.float64)
 
 
 def _weighted_rms(residuals: Array, noise: Noise) -> float:

@@ -15,7 +15,6 @@ import numpy as np
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.camera import (
-    CORNERS,
     CameraCalibration,
     CameraFit,
     LensTrial,
@@ -24,6 +23,7 @@ from bodyscan.calibration.camera import (
     locate_board,
     weighted_rms,
 )
+from bodyscan.calibration.held_out import CLEARLY, Compared, gain, shared_weights
 from bodyscan.calibration.ray_uncertainty import ray_uncertainty
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import FAMILY
@@ -31,8 +31,6 @@ from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform
 
-CLEARLY = 3.0
-"""Standard errors by which a richer lens has to do better: by chance once in 700 cameras."""
 FEWEST_PLACES = 4
 """Without one of them a camera still has the three that it needs."""
 MOST_FOLDS = 6
@@ -60,8 +58,9 @@ class _HeldOut:
     residuals: tuple[Array, ...]
 
     @property
-    def spread(self) -> float:
-        return CORNERS.spread_of(np.concatenate(self.residuals).ravel())
+    def stacked(self) -> Array:
+        """(N, 2) of all views."""
+        return np.concatenate(self.residuals)
 
 
 def calibrate_with_best_lens(
@@ -104,18 +103,21 @@ def choose_lens(
         return ChosenLens(chosen, (), ray_uncertainty(chosen.camera, richest, views))
     held = _hold_out(chosen, views, place)
     trials: list[tuple[CameraFit, _HeldOut, float | None]] = [(chosen, held, None)]
+    of_corner = np.repeat(place, [len(view.points) for view in views])
     for kind in kinds[1:]:
         tried = _fit(kind, camera, poses, views)
         out = _hold_out(tried, views, place)
-        gain = _gain(held, out, place)
-        trials.append((tried, out, gain))
-        if gain < CLEARLY:
+        better_by = gain(Compared(held.stacked, out.stacked, of_corner))
+        trials.append((tried, out, better_by))
+        if better_by < CLEARLY:
             break  # the next has all coefficients of this one, and more
         chosen, held = tried, out
-    weights = _weights([out for _, out, _ in trials])
+    weights = [shared_weights([out.stacked for _, out, _ in trials])]
     told = tuple(
-        LensTrial(fit.camera.lens.kind, weighted_rms(out.residuals, weights), gain, fit is chosen)
-        for fit, out, gain in trials
+        LensTrial(
+            fit.camera.lens.kind, weighted_rms([out.stacked], weights), better_by, fit is chosen
+        )
+        for fit, out, better_by in trials
     )
     return ChosenLens(chosen, told, ray_uncertainty(chosen.camera, trials[-1][0], views))
 
@@ -170,28 +172,3 @@ def _hold_out(fit: CameraFit, views: Sequence[PlanarView], place: Indices) -> _H
         for k in np.flatnonzero(fold == number).tolist():
             residuals[k] = locate_board(others, views[k], fit.poses[k])[1]
     return _HeldOut(tuple(residuals))
-
-
-def _weights(held: Sequence[_HeldOut]) -> list[Array]:
-    """(N,) of each view's corners: those that no lens explains count for less."""
-    spread = min(one.spread for one in held)
-    least = [
-        np.min([np.sum(one.residuals[k] ** 2, axis=1) for one in held], axis=0)
-        for k in range(len(held[0].residuals))
-    ]
-    return [CORNERS.weights(np.repeat(np.sqrt(own / 2.0), 2) / spread)[::2] for own in least]
-
-
-def _gain(simple: _HeldOut, rich: _HeldOut, place: Indices) -> float:
-    """By how many standard errors the richer lens lowers the squares of what is held out.
-
-    With residuals s = r + d the squares differ by d^2 + 2 r d: the first is what the lenses differ,
-    the second what the corners' noise adds, whose standard error is that of the places' sums: they
-    err independently, the corners of one board do not.
-    """
-    gained, noise = 0.0, np.zeros(place.max() + 1)
-    weights = _weights([simple, rich])
-    for s, r, weight, number in zip(simple.residuals, rich.residuals, weights, place, strict=True):
-        gained += float(np.sum(weight[:, None] * (s**2 - r**2)))
-        noise[number] += float(np.sum(weight[:, None] * 2.0 * r * (s - r)))
-    return gained / max(float(np.sqrt(np.sum(noise**2))), 1e-12)

@@ -81,7 +81,7 @@ def fit_light_sheets(
     candidates.append(_planes_candidate(stripes, direction))
     fold = folds(few)
     tried = [hold_out(candidate, few, fold) for candidate in candidates]
-    chosen, figures = select_model(candidates, tried, few.board)
+    chosen, figures = select_model(candidates, tried, few)
     error = tried[chosen].board_error_mm(few)
     fit: SheetFit[SmoothSheets] | PlaneFit
     sheets: LightSheets
@@ -145,11 +145,11 @@ def _smooth_candidate(name: str, start: SmoothSheets) -> Candidate:
     def fit(data: BoundaryPoints) -> LightSheets:
         return fit_sheets(start, data, board_error_mm=1.0, most_steps=FOLD_STEPS).sheets
 
-    return Candidate(name, start.kind, fit)
+    return Candidate(name, fit)
 
 
 def _planes_candidate(stripes: int, direction: Axis) -> Candidate:
     def fit(data: BoundaryPoints) -> LightSheets:
         return fit_planes(data, stripes, direction, 1.0).planes
 
-    return Candidate("free planes", "planes", fit, everywhere=False)
+    return Candidate("free planes", fit, everywhere=False)

@@ -9,16 +9,17 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.calibration.boundary_points import BoundaryPoints, board_errors, select
+from bodyscan.calibration.held_out import CLEARLY, Compared, gain
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, spread
 
 MOST_FOLDS = 6
-AS_GOOD = 1.15
-"""A simpler kind of model is taken if its error is at most this many times the best one's: boards
-held out differ by as much among themselves."""
 CAP = 30.0
 """No point counts for more than this many times the best model's median."""
+THIRDS = (-0.6, 0.6)
+"""Cut a board in three along an axis, in standard deviations of its points' places there."""
 OUTLIER = 4.0 * SIGMAS_PER_MEDIAN
+TRIMS = 3
 LEAST_SHARE = 0.01
 """Boards are never taken for known so well that less than this share of the squared held-out
 distances is theirs."""
@@ -26,14 +27,13 @@ distances is theirs."""
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model to try; candidates are listed simplest first, those of a kind together.
+    """A model to try; candidates are listed simplest first.
 
     fit: sheets from points, with the covariance of boards 1 mm out of place.
     everywhere: gives sheets for every s, so that a ray it cannot measure counts against it.
     """
 
     name: str
-    kind: str
     fit: Callable[[BoundaryPoints], LightSheets]
     everywhere: bool = True
 
@@ -42,9 +42,10 @@ class Candidate:
 class HeldOutModel:
     """How well one model measured boards that it was not fitted to, mm from the board.
 
-    mean_mm: of the absolute distances, outliers capped, board by board: what the choice is made by.
-    median_mm: of all absolute distances.  rms_mm: without outliers.  measured: share of the points
-    that got a depth.  chosen: whether this model is used.
+    mean_mm: of the absolute distances, outliers capped, board by board.  median_mm: of all absolute
+    distances.  rms_mm: without outliers.  measured: share of the points that got a depth.  chosen:
+    whether this model is used.  gain: by how many standard errors it beat the model chosen among those
+    before it, which it had to by three; None for the first.
     """
 
     model: str
@@ -53,6 +54,7 @@ class HeldOutModel:
     rms_mm: float
     measured: float
     chosen: bool = False
+    gain: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,41 +115,76 @@ def hold_out(candidate: Candidate, data: BoundaryPoints, fold: Indices) -> HeldO
 
 
 def select_model(
-    candidates: Sequence[Candidate], tried: Sequence[HeldOutErrors], board: Indices
+    candidates: Sequence[Candidate], tried: Sequence[HeldOutErrors], data: BoundaryPoints
 ) -> tuple[int, tuple[HeldOutModel, ...]]:
     """The number of the model to use, and the figures of all that measured anything.
 
-    Of the models that measure everywhere the best of the simplest kind that is as good as the best
-    of all. The others, which give no depth where a stripe was seen too seldom, are compared with it
-    only where they do, and must be clearly better.
+    Each is compared with the one chosen so far, and taken where it is clearly better.  How a held-out
+    board lies is fitted to either, so that nothing but the light differs.  Models that give no depth
+    where a stripe was seen too seldom are compared only where they do.
+
+    data: the points held out.
     """
-    distances = [np.abs(errors.distances) for errors in tried]
-    medians = [_median(d) for d in distances]
+    medians = [_median(np.abs(errors.distances)) for errors in tried]
     cap = CAP * min(medians)
-    everywhere = [i for i, c in enumerate(candidates) if c.everywhere]
-    capped = [np.minimum(np.nan_to_num(d, nan=cap), cap) for d in distances]
-    means = [_mean_of_boards(c, board, np.ones(len(c), bool)) for c in capped]
-    best = min(means[i] for i in everywhere)
-    kind = next(candidates[i].kind for i in everywhere if means[i] <= AS_GOOD * best)
-    chosen = min((i for i in everywhere if candidates[i].kind == kind), key=means.__getitem__)
-    for i in sorted(set(range(len(candidates))) - set(everywhere)):
-        known = np.isfinite(distances[i])
-        means[i] = _mean_of_boards(capped[i], board, known)
-        if AS_GOOD * means[i] < _mean_of_boards(capped[chosen], board, known):
-            chosen = i
+    part, effects, board = parts_of_boards(data), board_errors(data).effects, data.board
+    seen = [
+        np.isfinite(errors.distances) | candidate.everywhere
+        for candidate, errors in zip(candidates, tried, strict=True)
+    ]
+    chosen = 0
+    gains: list[float | None] = [None] * len(candidates)
+    for i in range(1, len(candidates)):
+        known = seen[i]
+        if not np.isfinite(medians[i]):
+            continue
+        rich, simple = (
+            without_motion(_capped(tried[k].distances[known], cap), effects[known], board[known])
+            for k in (i, chosen)
+        )
+        better_by = gain(Compared(simple[:, None], rich[:, None], part[known]))
+        gains[i] = better_by
+        chosen = i if better_by >= CLEARLY else chosen
     figures = tuple(
         HeldOutModel(
             candidate.name,
-            means[i],
+            _mean_of_boards(np.abs(_capped(errors.distances, cap)), board, seen[i]),
             medians[i],
-            _rms(distances[i]),
-            float(np.isfinite(distances[i]).mean()),
+            _rms(np.abs(errors.distances)),
+            float(np.isfinite(errors.distances).mean()),
             i == chosen,
+            gains[i],
         )
-        for i, candidate in enumerate(candidates)
+        for i, (candidate, errors) in enumerate(zip(candidates, tried, strict=True))
         if np.isfinite(medians[i])
     )
     return chosen, figures
+
+
+def parts_of_boards(data: BoundaryPoints) -> Indices:
+    """(N,) number of the ninth of its board in which each point lies."""
+    across, down = (np.digitize(place, THIRDS) for place in board_errors(data).effects[:, 1:].T)
+    _, board = np.unique(data.board, return_inverse=True)
+    return np.asarray(9 * board + 3 * across + down, np.int64)
+
+
+def without_motion(distances: Array, effects: Array, board: Indices) -> Array:
+    """Distances (N,) less the shift and tilts (`BoardErrors.effects`) that fit each board best."""
+    left = distances.copy()
+    for number in np.unique(board):
+        own = board == number
+        kept = np.ones(np.count_nonzero(own), bool)
+        for _ in range(TRIMS):
+            motion = np.linalg.lstsq(effects[own][kept], distances[own][kept], rcond=None)[0]
+            left[own] = distances[own] - effects[own] @ motion
+            off = np.abs(left[own])
+            kept = off <= OUTLIER * max(float(np.median(off)), 1e-9)
+    return left
+
+
+def _capped(distances: Array, cap: float) -> Array:
+    """What was not measured counts as far off."""
+    return np.asarray(np.clip(np.nan_to_num(distances, nan=cap), -cap, cap), np.float64)
 
 
 def _mean_of_boards(values: Array, board: Indices, known: Mask) -> float:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import BoundaryPoints, bin_points
+from bodyscan.calibration.boundary_points import BoundaryPoints, bin_points, subsample
 from bodyscan.calibration.camera import CameraCalibration, LensTrial
 from bodyscan.calibration.joint_refinement import striped_board
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.model_selection import HeldOutModel
-from bodyscan.calibration.refinement_choice import refine_where_better
+from bodyscan.calibration.refinement_choice import (
+    REFINED_BINS,
+    RefinementTrial,
+    refine_where_better,
+)
 from bodyscan.calibration.stripe_agreement import (
     ProjectorMotion,
     board_offsets,
@@ -39,7 +43,9 @@ class PairQuality:
     or the boards stood in too few places.
     held_out: every model of the light tried on boards it was not fitted to, simplest first.
     refinement: of a pair by itself, whether camera, boards and light were refined together and why;
-    flatness_mm: RMS of held-out boards about their own planes, before and after.
+    ways: every way that was tried on held-out boards; flatness_mm: their RMS about the boards, of the
+    first and of the one taken.  bent_mm: from the lowest to the highest corner of
+    each board, where boards turned out bent.
     boards_mm: mean and RMS over the boards of how far the stripes measure them from where the
     corners of all cameras put them.
     imported: where another program's calibration was taken from, "" if it is our own; with
@@ -55,6 +61,8 @@ class PairQuality:
     held_out: tuple[HeldOutModel, ...] = ()
     refinement: str = ""
     flatness_mm: tuple[float, float] | None = None
+    ways: tuple[RefinementTrial, ...] = ()
+    bent_mm: dict[str, float] = field(default_factory=dict)
     boards_mm: tuple[float, float] | None = None
     lenses: tuple[LensTrial, ...] = ()
     imported: str = ""
@@ -206,31 +214,45 @@ def _refined(
     """Camera, boards and light of a pair by itself in one solve, where held-out boards gain; and its
     shots with the boards where that puts them."""
     assert pair.sheets is not None
-    data = bin_points(points, pair.camera, pair.sheets.direction)
+    data = subsample(bin_points(points, pair.camera, pair.sheets.direction), REFINED_BINS)
     boards = [
         striped_board(
-            PlanarView(shot.view.shot, shot.view.points, shot.view.pixels), pair.camera, data, k
+            PlanarView(shot.view.shot, shot.view.points, shot.view.pixels),
+            pair.camera,
+            data,
+            k,
+            shot.view.board,
         )
         for k, shot in enumerate(shots)
     ]
-    choice = refine_where_better(own, pair.sheets, boards, data)
-    quality = replace(pair.quality, refinement=choice.reason, flatness_mm=choice.flatness_mm)
-    joint = choice.joint
-    if joint is None:
+    flatness = {shot.view.board: shot.board.believed_flatness_mm for shot in shots}
+    choice = refine_where_better(own, pair.sheets, boards, data, flatness)
+    quality = replace(
+        pair.quality,
+        refinement=choice.reason,
+        flatness_mm=choice.flatness_mm,
+        ways=choice.trials,
+    )
+    fit = choice.fit
+    if fit is None:
         return replace(pair, quality=quality), tuple(shots)
+    bent = {name: form.out_of_plane_mm for name, form in fit.forms.items() if form.heights.any()}
     refined = replace(
         pair,
-        camera=joint.camera,
-        camera_covariance=joint.camera_covariance,
-        sheets=joint.sheets,
-        quality=replace(quality, corners_rms_px=joint.corners_rms_px),
+        camera=fit.camera,
+        camera_covariance=fit.camera_covariance,
+        sheets=fit.sheets,
+        quality=replace(quality, bent_mm=bent),
     )
-    poses = joint.camera_from_board
+    if not choice.taken:
+        return refined, tuple(shots)
+    poses = fit.camera_from_board
     placed = (
         replace(shot, view=replace(shot.view, camera_from_board=poses[shot.view.shot]))
         for shot in shots
     )
-    return refined, tuple(placed)
+    quality = replace(refined.quality, corners_rms_px=fit.corners_rms_px)
+    return replace(refined, quality=quality), tuple(placed)
 
 
 def _mean_and_rms(values: Array) -> tuple[float, float] | None:

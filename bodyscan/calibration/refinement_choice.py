@@ -2,40 +2,77 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyscan.calibration.boundary_points import BoundaryPoints, select
-from bodyscan.calibration.camera import CameraCalibration
+from bodyscan.arrays import Array
+from bodyscan.calibration.board_form import BoardForm
+from bodyscan.calibration.boundary_points import BoundaryPoints, board_errors, concatenate
+from bodyscan.calibration.camera import CameraCalibration, fit_camera, locate_board
+from bodyscan.calibration.held_out import CLEARLY, Compared, gain, shared_weights
 from bodyscan.calibration.joint_refinement import (
     JointFit,
     StripedBoard,
+    allowing_for,
+    carried,
+    known_apart,
+    print_errors,
     refine_jointly,
 )
+from bodyscan.calibration.model_selection import (
+    CAP,
+    MOST_FOLDS,
+    parts_of_boards,
+    without_motion,
+)
 from bodyscan.calibration.sheet_fit import fit_sheets
-from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 FEWEST_BOARDS = 3
-MOST_DRIFT = 24.3
-"""Chi-squared of seven intrinsics exceeded once in a thousand: a board that is not flat, taken for
-flat, pulls the camera away from what its corners say."""
-FLATTEST_SHARE = 0.95
+REFINED_BINS = 6000
+"""So many bins of boundaries know camera, boards and sheets as well as all of them, to a tenth."""
+FOLD_STEPS = 5
+"""From the solution with all boards a fold's lies less than a standard deviation away."""
+PRINT_MM = 0.05
+"""How far a corner may be printed off, before images say it: what office printers and plotters do."""
+WAYS = APART, TOGETHER, BENT = (
+    "corners, then stripes",
+    "joint solve",
+    "joint solve with bent boards",
+)
+
+
+@dataclass(frozen=True)
+class RefinementTrial:
+    """One way to solve for a pair.  rms_mm: of held-out boards' stripes about the boards, their own
+    motion taken out.  gain: by how many standard errors it beat the way chosen among those before it,
+    which it had to by three; None for the first."""
+
+    way: str
+    rms_mm: float
+    gain: float | None = None
+    chosen: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """joint: None where it was not taken.  reason: why it was taken or not.  flatness_mm: of held-out
-    boards, RMS about their own planes, before and after; None if it was not tried.
+    """fit: camera, boards and sheets of the way chosen, None where none could be tried; taken: whether
+    they are others than before.  reason: of it, in words.
     """
 
-    joint: JointFit[SmoothSheets] | None
+    fit: JointFit[SmoothSheets] | None
+    taken: bool
     reason: str
-    flatness_mm: tuple[float, float] | None = None
+    trials: tuple[RefinementTrial, ...] = ()
+
+    @property
+    def flatness_mm(self) -> tuple[float, float] | None:
+        """RMS of held-out boards' stripes the first way and the one chosen."""
+        chosen = [trial.rms_mm for trial in self.trials if trial.chosen]
+        return (self.trials[0].rms_mm, chosen[0]) if chosen else None
 
 
 def refine_where_better(
@@ -43,53 +80,147 @@ def refine_where_better(
     sheets: LightSheets,
     boards: Sequence[StripedBoard],
     data: BoundaryPoints,
+    flatness_mm: Mapping[str, float],
 ) -> Refinement:
-    """Refine jointly if that makes boards flatter that took no part with their stripes.
+    """Refine jointly if that shows boards better that took no part with their stripes.
 
     boards: in the order of `data.board`; data: binned boundary points of the unrefined calibration.
+    flatness_mm: what boards may be bent, by name.
     """
     if not isinstance(sheets, SmoothSheets):
-        return Refinement(None, "free planes are not refined")
+        return Refinement(None, False, "free planes are not refined")
+    camera, poses = calibration.camera, calibration.camera_from_board
+    forms = {name: _flat(name, boards, mm) for name, mm in sorted(flatness_mm.items())}
+    first = refine_jointly(camera, poses, sheets, boards, forms)
+    printed = print_errors(first, boards)
+    forms = {name: replace(form, print_mm=printed[name]) for name, form in forms.items()}
+    apart = known_apart(camera, poses, sheets, boards, forms)
     if len(boards) < FEWEST_BOARDS:
-        return Refinement(None, f"{len(boards)} boards with stripes are too few")
-    poses = calibration.camera_from_board
-    before, after = [], []
-    for held in range(len(boards)):
-        others = fit_sheets(sheets, select(data, data.board != held)).sheets
-        before.append(_flatness(calibration.camera, others, boards[held]))
-        partly = [
-            replace(b, pixels=b.pixels[:0], index=b.index[:0], sigma_px=b.sigma_px[:0])
-            if k == held
-            else b
-            for k, b in enumerate(boards)
-        ]
-        joint = refine_jointly(calibration.camera, poses, others, partly)
-        after.append(_flatness(joint.camera, joint.sheets, boards[held]))
-    was, now = float(np.sqrt(np.mean(np.square(before)))), float(np.sqrt(np.mean(np.square(after))))
-    if not now < FLATTEST_SHARE * was:
-        return Refinement(None, "held-out boards did not become flatter", (was, now))
-    joint = refine_jointly(calibration.camera, poses, sheets, boards)
-    drift = _drift(calibration, joint.camera)
-    if drift > MOST_DRIFT:
-        return Refinement(None, f"it contradicts the corners (chi-squared {drift:.0f})", (was, now))
-    return Refinement(joint, "held-out boards became flatter", (was, now))
+        return Refinement(apart, False, f"{len(boards)} boards with stripes are too few")
+    found = {name: replace(form, print_mm=printed[name]) for name, form in first.forms.items()}
+    fits = [
+        apart,
+        refine_jointly(camera, poses, sheets, boards, forms, bent=False),
+        refine_jointly(first.camera, first.camera_from_board, first.sheets, boards, found),
+    ]
+    held = _hold_out(fits, boards, data)
+    parts = (
+        parts_of_boards(data),
+        np.repeat(np.arange(len(boards)), [len(board.view.points) for board in boards]),
+    )
+    chosen = 0
+    gains: list[float | None] = [None] * len(fits)
+    for i in range(1, len(fits)):
+        gains[i] = better_by = gain(
+            Compared(held[chosen].stripes, held[i].stripes, parts[0]),
+            Compared(held[chosen].corners, held[i].corners, parts[1]),
+        )
+        chosen = i if better_by >= CLEARLY else chosen
+    weights = shared_weights([one.stripes for one in held])
+    trials = tuple(
+        RefinementTrial(
+            way,
+            float(np.sqrt(np.average(one.stripes[:, 0] ** 2, weights=weights))),
+            better_by,
+            i == chosen,
+        )
+        for i, (way, one, better_by) in enumerate(zip(WAYS, held, gains, strict=True))
+    )
+    fit = fits[chosen] if chosen == len(fits) - 1 else allowing_for(fits[chosen], fits[-1], boards)
+    return Refinement(fit, chosen > 0, _said(trials), trials)
 
 
-def _flatness(camera: Camera, sheets: LightSheets, board: StripedBoard) -> float:
-    """RMS (mm) of the board's boundary points about their own best plane, outliers aside."""
-    rays = camera.rays(board.pixels)
-    points = rays * sheets.depth(rays, board.index)[:, None]
-    points = points[np.isfinite(points[:, 0])]
-    for _ in range(3):
-        centred = points - points.mean(axis=0)
-        normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
-        off = np.abs(centred @ normal)
-        points = points[off <= max(6.0 * float(np.median(off)), 1e-9)]
-    centred = points - points.mean(axis=0)
-    return float(np.sqrt(np.linalg.eigvalsh(centred.T @ centred)[0] / len(centred)))
+def _flat(name: str, boards: Sequence[StripedBoard], flatness_mm: float) -> BoardForm:
+    points = np.concatenate([board.view.points for board in boards if board.board == name])
+    return BoardForm.flat(points, flatness_mm, PRINT_MM)
 
 
-def _drift(calibration: CameraCalibration, camera: Camera) -> float:
-    """Squared distance of the refined intrinsics in the covariance that the corners gave them."""
-    change = camera.parameters - calibration.camera.parameters
-    return float(change @ solve_scaled(calibration.covariance, change))
+def _said(trials: Sequence[RefinementTrial]) -> str:
+    """Which way was chosen, and by how much each was better than the one before."""
+    chosen = next(trial.way for trial in trials if trial.chosen)
+    others = "; ".join(
+        f"{trial.way}: {trial.gain:+.1f} standard errors on held-out boards"
+        for trial in trials
+        if trial.gain is not None
+    )
+    return f"{chosen} ({others})"
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldOut:
+    """What one way left of boards held out.  stripes: (N, 1) mm off the boards, whose own motion is
+    taken out, in the order of the data.  corners: (M, 2) px, board by board."""
+
+    stripes: Array
+    corners: Array
+
+
+def _hold_out(
+    fits: Sequence[JointFit[SmoothSheets]], boards: Sequence[StripedBoard], data: BoundaryPoints
+) -> list[_HeldOut]:
+    """Each board, or one of MOST_FOLDS groups of them, in turn left out; of so few that the camera
+    needs them all, their stripes alone."""
+    stripes = [np.empty(len(data.index)) for _ in fits]
+    corners = [[np.empty((0, 2))] * len(boards) for _ in fits]
+    folds = min(len(boards), MOST_FOLDS)
+    for number in range(folds):
+        held = range(number, len(boards), folds)
+        rest = [board for k, board in enumerate(boards) if k not in held]
+        if len(rest) < FEWEST_BOARDS:
+            rest += [_unlit(boards[k]) for k in held]
+        for way, (name, fit) in enumerate(zip(WAYS, fits, strict=True)):
+            one = _without(name, fit, rest)
+            for k in held:
+                off, corners[way][k] = _off_board(one, boards[k], fit)
+                stripes[way][data.board == k] = off
+    effects = board_errors(data).effects
+    cap = CAP * min(float(np.nanmedian(np.abs(values))) for values in stripes)
+    capped = (np.clip(np.nan_to_num(values, nan=cap), -cap, cap) for values in stripes)
+    still = [without_motion(values, effects, data.board)[:, None] for values in capped]
+    return [_HeldOut(s, np.concatenate(c)) for s, c in zip(still, corners, strict=True)]
+
+
+def _without(
+    way: str, fit: JointFit[SmoothSheets], rest: Sequence[StripedBoard]
+) -> JointFit[SmoothSheets]:
+    """As `fit`, from the rest of the boards."""
+    poses = [fit.camera_from_board[board.view.shot] for board in rest]
+    if way != APART:
+        return refine_jointly(
+            fit.camera,
+            fit.camera_from_board,
+            fit.sheets,
+            rest,
+            fit.forms,
+            bent=way == BENT,
+            steps=FOLD_STEPS,
+        )
+    camera = fit_camera(fit.camera, poses, [board.view for board in rest])
+    parts = [
+        carried(camera.camera, pose, board, k, fit.sheets.direction)
+        for k, (pose, board) in enumerate(zip(camera.poses, rest, strict=True))
+        if len(board.index)
+    ]
+    sheets = fit_sheets(fit.sheets, concatenate(parts), most_steps=FOLD_STEPS).sheets
+    return replace(fit, camera=camera.camera, sheets=sheets)
+
+
+def _unlit(board: StripedBoard) -> StripedBoard:
+    """The board with its corners alone."""
+    return replace(
+        board, pixels=board.pixels[:0], index=board.index[:0], sigma_px=board.sigma_px[:0]
+    )
+
+
+def _off_board(
+    one: JointFit[SmoothSheets], board: StripedBoard, start: JointFit[SmoothSheets]
+) -> tuple[Array, Array]:
+    """(N,) mm: how far a board's boundary points, as camera and sheets measure them, lie off it; and
+    its corners' residuals (M, 2) px, the board placed by them."""
+    form, view = one.forms[board.board], board.view
+    really = replace(view, points=form.applied(view.points, form.numbers(view.points)))
+    pose, residuals = locate_board(one.camera, really, start.camera_from_board[view.shot])
+    rays = one.camera.rays(board.pixels)
+    points = rays * one.sheets.depth(rays, board.index)[:, None]
+    seen = pose.inverse().apply(points)
+    return seen[:, 2] - view.points[0, 2] - form.height(seen[:, :2]), residuals

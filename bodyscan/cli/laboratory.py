@@ -37,6 +37,10 @@ def simulate(
         Literal["mirror", "pinhole"],
         typer.Option(help="A laser and a rotating mirror, or a projector with a lens."),
     ] = "mirror",
+    preset: Annotated[
+        Literal["ideal", "workshop"],
+        typer.Option(help="Devices without faults, or as people build them."),
+    ] = "ideal",
     subject_preset: Annotated[
         Literal["mannequin", "standing", "restless", "child"],
         typer.Option(help="How the subject moves while frames are taken."),
@@ -77,7 +81,11 @@ def simulate(
             scale=scale,
             seed=seed,
             settings=settings_for(
-                projector, subject=subject_preset, sway_mm=sway_mm, changes=changes or ()
+                projector,
+                preset=preset,
+                subject=subject_preset,
+                sway_mm=sway_mm,
+                changes=changes or (),
             ),
             board_shots=board_shots,
             progress=progress,

@@ -69,6 +69,10 @@ def calibration_figures(calibration: RigCalibration) -> dict[str, Any]:
             "lens": pair.camera.lens.kind,
             "lenses_tried": [asdict(tried) for tried in pair.quality.lenses],
             "light_model": pair.quality.light_model,
+            "light_tried": [asdict(tried) for tried in pair.quality.held_out],
+            "solved": pair.quality.refinement or None,
+            "ways_tried": [asdict(tried) for tried in pair.quality.ways],
+            "boards_bent_mm": pair.quality.bent_mm,
             "sheets_rms_mm": pair.quality.planes_rms_mm,
             "stripes_calibrated": pair.quality.stripes_calibrated,
             "imported": pair.quality.imported or None,
@@ -90,10 +94,10 @@ def scan_table(scan: Scan) -> Table:
     table.add_row("faces of the mesh", f"{len(surface.faces):,}")
     table.add_row("of its surface filled", f"{100.0 * surface.filled_share:.1f} %")
     if scan.alignment is not None:
-        farthest = max(scan.alignment.motion_mm.items(), key=lambda item: item[1])
         before, after = scan.alignment.rms_before_mm, scan.alignment.rms_after_mm
         table.add_row("overlaps before, after alignment", f"{before:.3f}, {after:.3f} mm RMS")
-        table.add_row("farthest moved", f"{farthest[0]}, {farthest[1]:.2f} mm")
+        for name, motion in sorted(scan.alignment.motion_mm.items(), key=lambda item: -item[1])[:1]:
+            table.add_row("farthest moved", f"{name}, {motion:.2f} mm")
         for name, sigmas in scan.alignment.refused.items():
             table.add_row("left where it was", f"{name} (would have moved by {sigmas:.1f} sigmas)")
     return table

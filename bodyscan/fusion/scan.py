@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.alignment.icp import Alignment, align
+from bodyscan.alignment.sway import SwayPrior
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.pose_variance import add_pose_variance
 from bodyscan.fusion.scan_verdict import grade_scan
+from bodyscan.fusion.seams import judge_seams
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.outcome import Outcome
@@ -64,17 +66,21 @@ def fuse(
         cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume, empty=empty)
         seen = require_subject(cleaned)
     placing = dict(calibration.rig_from_camera)
-    alignment = None
+    alignment, known = None, calibration.covariance
     if settings.alignment.matching != "none" and len(seen) > 1:
         with step(progress, "aligning"):
             alignment = align(seen, placing, calibration.covariance, settings.alignment)
             placing |= alignment.rig_from_camera
+            untied = {image.pair for image in seen} - alignment.motion_mm.keys()
+            known = SwayPrior.of(settings.alignment).loosen(known, untied)
     with step(progress, "merging"):
         fused = merge(seen, placing, settings.fusion)
         there = {image.pair: placing[image.pair] for image in seen}
-        cloud = add_pose_variance(fused.cloud, there, calibration.covariance)
+        cloud = add_pose_variance(fused.cloud, there, known)
     with step(progress, "meshing"):
         surface = mesh(cloud, settings.mesh, images, placing)
+    with step(progress, "judging"):
+        seams = judge_seams(seen, there, calibration.rig.poles)
     points = {image.pair: int(image.valid.sum()) for image in cleaned}
     failed = dict(measured.failures)
     verdict = grade_scan(
@@ -83,6 +89,8 @@ def fuse(
         alignment,
         failed,
         calibration.rig.volume,
+        settings.use,
+        seams,
         fused.contradicted,
         unjudged=[name for name, pair in calibration.pairs.items() if pair.quality.unjudged],
         cameras=np.array([at.translation for at in calibration.rig_from_camera.values()]),

@@ -36,6 +36,7 @@ class _Overlap(_Part):
     points: int
     rms_before_mm: float | None
     rms_after_mm: float | None
+    expected_mm: float | None = None
 
 
 class _Alignment(_Part):

@@ -10,19 +10,23 @@ from scipy.spatial import cKDTree
 
 from bodyscan.alignment.icp import Alignment
 from bodyscan.arrays import Array
+from bodyscan.fusion.seams import SeamReport, find_misfits
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.rings import rings
 from bodyscan.mesh.topology import face_areas
 from bodyscan.optional import optional
 from bodyscan.reconstruction.two_ways import Agreement
 from bodyscan.rig.rig import Volume
+from bodyscan.settings import UseLimits
 from bodyscan.verdict import Grade, Verdict
 
 Finding = tuple[Grade, str]
 GRADES: tuple[Grade, ...] = ("good", "usable", "repeat")
 
 SOME_FILLED, MOST_FILLED = 0.12, 0.5
-SOME_DISAGREEMENT_MM, MOST_DISAGREEMENT_MM = 0.4, 0.8
+SOME_DISAGREEMENT_MM, DISAGREEMENT_SIGMAS = 0.4, 2.0
+GIRTH_PER_MM = 2.0 * np.pi
+"""mm that a girth is wrong by, where its surface stands 1 mm off all round"""
 SOME_CONTRADICTED, MOST_CONTRADICTED = 0.005, 0.05  # below 0.001 where all is well
 SOME_MOTION_MM, MOST_MOTION_MM = 3.0, 6.0
 CELL_MM = 50.0
@@ -44,12 +48,15 @@ def grade_scan(
     alignment: Alignment | None,
     failed: Mapping[str, str],
     volume: Volume,
+    use: UseLimits,
+    seams: SeamReport | None = None,
     contradicted: float = 0.0,
     unjudged: Sequence[str] = (),
     cameras: Array | None = None,
     agreements: Mapping[str, Agreement] | None = None,
 ) -> Verdict:
-    """The worst of all findings decides; the reasons come worst first. contradicted: see `merge`.
+    """The worst of all findings decides; the reasons come worst first. use: how wrong a girth may
+    be. seams: see `judge_seams`. contradicted: see `merge`.
 
     unjudged: pairs whose calibration was imported and says nothing of how exact it is.
     cameras: (N, 3) where those of the whole rig stand; None for all round.  What none of them could
@@ -63,6 +70,8 @@ def grade_scan(
         "pairs": lambda: _pairs(failed, alignment),
         "calibration": lambda: _calibration(unjudged),
         "directions": lambda: _directions(agreements or {}),
+        "seams": lambda: _seams(seams, use),
+        "disagreement": lambda: _disagreement(alignment),
         "motion": lambda: _motion(alignment),
         "contradictions": lambda: _contradictions(contradicted),
         "pieces": lambda: _company(cloud),
@@ -112,16 +121,42 @@ def _directions(agreements: Mapping[str, Agreement]) -> Iterator[Finding]:
             )
 
 
-def _motion(alignment: Alignment | None) -> Iterator[Finding]:
+def _seams(seams: SeamReport | None, use: UseLimits) -> Iterator[Finding]:
+    """Poles and pairs whose surfaces do not go on where the others' end."""
+    if seams is None:
+        return
+    for misfit in find_misfits(seams.seams, seams.groups, use.good_girth_mm / GIRTH_PER_MM):
+        yield (
+            "repeat" if misfit.step_mm * GIRTH_PER_MM > use.usable_girth_mm else "usable",
+            f"{misfit.name} does not fit the others: where their surfaces meet it stands "
+            f"{misfit.step_mm:.2g} mm off; was it moved since the calibration, is it from another "
+            "scan or another person, were cables or folders exchanged?",
+        )
+    for group in seams.untied:
+        yield (
+            "usable",
+            f"nothing ties {', '.join(group)} to the others: they share no surface, so that a person "
+            "who moved in between, or a pole that did, would not be seen",
+        )
+
+
+def _disagreement(alignment: Alignment | None) -> Iterator[Finding]:
+    """Seams are judged free of noise; this is about noise that sigmas do not hold."""
     if alignment is None:
         return
-    rms = alignment.rms_after_mm
-    if rms > SOME_DISAGREEMENT_MM:
+    rms, expected = alignment.rms_after_mm, alignment.expected_mm
+    if rms > max(SOME_DISAGREEMENT_MM, DISAGREEMENT_SIGMAS * expected):
         yield (
-            "repeat" if rms > MOST_DISAGREEMENT_MM else "usable",
-            f"the pairs disagree by {rms:.2f} mm where they overlap: is this the calibration of "
-            "this rig, has nothing moved since, did the person stand still?",
+            "usable",
+            f"the pairs disagree by {rms:.2f} mm where they overlap, {expected:.2f} mm is what their "
+            "sigmas say: is this the calibration of this rig, has nothing moved since, did the "
+            "person stand still?",
         )
+
+
+def _motion(alignment: Alignment | None) -> Iterator[Finding]:
+    if alignment is None or not alignment.motion_mm:
+        return
     name, motion = max(alignment.motion_mm.items(), key=lambda item: item[1])
     if motion > SOME_MOTION_MM:
         yield (

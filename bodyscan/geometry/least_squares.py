@@ -15,7 +15,7 @@ weights: Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, 3.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Generic, Literal, TypeVar
@@ -131,6 +131,16 @@ class Solution(Generic[State]):
         """(P, P) of the unknowns, the residuals' spread taken for their noise."""
         normal, _ = _equations(self.blocks, self.weights, self.spreads, self.unknowns)
         return invert_scaled(normal)
+
+    def normal(self, kinds: Collection[Noise]) -> Array:
+        """(P, P) of the unknowns, J^T W J over variances, of the blocks of these kinds alone."""
+        own = [k for k, block in enumerate(self.blocks) if block.noise in kinds]
+        return _equations(
+            [self.blocks[k] for k in own],
+            [self.weights[k] for k in own],
+            [self.spreads[k] for k in own],
+            self.unknowns,
+        )[0]
 
     @property
     def variance(self) -> float:

@@ -19,6 +19,7 @@ from bodyscan.settings import (
     Resources,
     RigExportSettings,
     ScanSettings,
+    UseLimits,
 )
 
 _REMEDY = "Correct the pipeline file; docs/formats.md explains every key."
@@ -29,7 +30,7 @@ class PipelineError(BadInput):
 
 
 SECTIONS = {
-    "fuse": ("alignment", "fusion", "mesh", "export"),
+    "fuse": ("alignment", "fusion", "mesh", "use", "export"),
     "calibrate": ("rig_export",),
 }
 
@@ -47,6 +48,7 @@ class Pipeline(Model):
     alignment: AlignmentSettings = AlignmentSettings()
     fusion: FusionSettings = FusionSettings()
     mesh: MeshSettings = MeshSettings()
+    use: UseLimits = UseLimits()
     export: ExportSettings = ExportSettings()
     rig_export: RigExportSettings = RigExportSettings()
 
@@ -61,7 +63,9 @@ class Pipeline(Model):
     @property
     def scan(self) -> ScanSettings:
         """What decides what a scan comes out as."""
-        return ScanSettings(alignment=self.alignment, fusion=self.fusion, mesh=self.mesh)
+        return ScanSettings(
+            alignment=self.alignment, fusion=self.fusion, mesh=self.mesh, use=self.use
+        )
 
     def section(self, name: str) -> dict[str, Any]:
         """One section as plain data."""

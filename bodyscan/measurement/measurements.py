@@ -11,6 +11,7 @@ from bodyscan.arrays import Array, Mask
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
+from bodyscan.measurement.outline import Range, holds_middle, outline
 from bodyscan.measurement.slices import Loop, loops_at
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import face_areas, signed_volume
@@ -27,6 +28,9 @@ class Girth:
     part: trunk (neck and head too), left leg, right leg, left arm, right arm.  girth_mm: along the
     surface.  tape_mm: as a tape runs (convex hull).  width_mm, depth_mm: extent to the side and
     forward.  centre_mm: (x, y), body frame.  measured: share of girth_mm that was measured, not filled.
+    girth_range_mm, tape_range_mm: what they may be, given what was not: see `Outline`.
+
+    A trunk that filled surface joins to arms is cut there, and closed straight.
     """
 
     part: str
@@ -37,6 +41,8 @@ class Girth:
     area_mm2: float
     centre_mm: tuple[float, float]
     measured: float
+    girth_range_mm: Range
+    tape_range_mm: Range
 
 
 @dataclass(frozen=True)
@@ -132,7 +138,7 @@ def name_parts(loops: Sequence[Loop]) -> list[str]:
     none does, the largest on each side is a leg.
     """
     reach = [(loop.segments[..., 1].min(), loop.segments[..., 1].max()) for loop in loops]
-    is_trunk = [min(high, -low) > 0.15 * (high - low) for low, high in reach]
+    is_trunk = [holds_middle(loop.segments[..., 1]) for loop in loops]
     names: list[str] = []
     for (low, high), trunk in zip(reach, is_trunk, strict=True):
         side = "left" if low + high > 0 else "right"
@@ -141,7 +147,9 @@ def name_parts(loops: Sequence[Loop]) -> list[str]:
     return names
 
 
-def _girth(part: str, loop: Loop) -> Girth:
+def _girth(part: str, meshed: Loop) -> Girth:
+    found = outline(meshed)
+    loop = found.loop
     corners = loop.segments[:, 0]
     depth, width = np.ptp(corners, axis=0)
     x, y = loop.centre
@@ -154,4 +162,6 @@ def _girth(part: str, loop: Loop) -> Girth:
         loop.area_mm2,
         (float(x), float(y)),
         loop.measured_share,
+        found.girth_range_mm,
+        found.tape_range_mm,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,11 +18,13 @@ class Loop:
     """One closed curve of a slice, mm.
 
     segments: (N, 2, 2) from (x, y) to (x, y), in no order, each with the body on its left seen
-    from above.  measured: (N,) whether the segment runs across a measured face.
+    from above.  measured: (N,) whether the segment runs across a measured face.  ends: (N, 2), the
+    numbers of the mesh's edges that each starts and ends on; its neighbours have the same.
     """
 
     segments: Array
     measured: Mask
+    ends: Indices
 
     @property
     def lengths(self) -> Array:
@@ -36,10 +39,7 @@ class Loop:
     @property
     def tape_mm(self) -> float:
         """As a tape runs, straight across hollows: the perimeter of the convex hull."""
-        try:
-            return float(ConvexHull(self.segments[:, 0]).area)
-        except QhullError:  # a speck: all in one line
-            return self.girth_mm
+        return hull_mm(self.segments[:, 0])
 
     @property
     def area_mm2(self) -> float:
@@ -61,6 +61,82 @@ class Loop:
         return float(self.lengths[self.measured].sum() / max(self.girth_mm, 1e-12))
 
 
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A stretch of a loop that was measured, or not.  segments: (N,) which of the loop's, in no order.
+    first, last: those where it begins and where it ends."""
+
+    measured: bool
+    segments: Indices
+    first: int
+    last: int
+
+
+def hull_mm(points: Array) -> float:
+    """Perimeter of the convex hull of points (N, 2)."""
+    try:
+        return float(ConvexHull(points).area)
+    except QhullError:  # a speck: all in one line
+        return 2.0 * float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def runs_of(loop: Loop, shortest_gap_mm: float) -> tuple[Run, ...]:
+    """A loop's stretches, one after the other; what was not measured for less than `shortest_gap_mm`
+    counts as measured."""
+    nodes, number = np.unique(loop.ends, return_inverse=True)
+    ends = number.reshape(-1, 2)
+    label = _stretches(ends, loop.measured, len(nodes))
+    lengths = np.bincount(label, loop.lengths)
+    measured = loop.measured | (lengths[label] < shortest_gap_mm)
+    label = _stretches(ends, measured, len(nodes))
+    runs = [_run(ends, np.flatnonzero(label == k), measured) for k in range(label.max() + 1)]
+    begins = {int(ends[run.first, 0]): k for k, run in enumerate(runs)}
+    order = [0]
+    while len(order) < len(runs):
+        order.append(begins[int(ends[runs[order[-1]].last, 1])])
+    return tuple(runs[k] for k in order)
+
+
+def joined(loop: Loop, runs: Sequence[Run]) -> Loop:
+    """A loop of stretches of another one, closed straight from each to the next."""
+    following = [*runs[1:], runs[0]]
+    here = np.array([run.last for run in runs])
+    there = np.array([run.first for run in following])
+    apart = loop.ends[here, 1] != loop.ends[there, 0]
+    here, there = here[apart], there[apart]
+    own = np.concatenate([run.segments for run in runs])
+    across = np.stack([loop.segments[here, 1], loop.segments[there, 0]], axis=1)
+    numbers = np.stack([loop.ends[here, 1], loop.ends[there, 0]], axis=1)
+    return Loop(
+        np.concatenate([loop.segments[own], across]),
+        np.concatenate([loop.measured[own], np.zeros(len(across), bool)]),
+        np.concatenate([loop.ends[own], numbers]),
+    )
+
+
+def _run(ends: Indices, own: Indices, measured: Mask) -> Run:
+    """own: its segments.  A whole loop begins and ends anywhere."""
+    first = own[~np.isin(ends[own, 0], ends[own, 1])]
+    last = own[~np.isin(ends[own, 1], ends[own, 0])]
+    if not (first.size and last.size):
+        first, last = own[:1], own[ends[own, 1] == ends[own[0], 0]]
+    return Run(bool(measured[own[0]]), own, int(first[0]), int(last[0]))
+
+
+def _stretches(ends: Indices, measured: Mask, count: int) -> Indices:
+    """(N,) numbers from 0 of the stretches of segments (N, 2) that were measured, or were not."""
+    label = np.empty(len(ends), np.int64)
+    taken = 0
+    for state in (True, False):
+        own = np.flatnonzero(measured == state)
+        graph = coo_array((np.ones(len(own), np.int8), tuple(ends[own].T)), shape=(count, count))
+        nodes = connected_components(graph, directed=False)[1]
+        _, label[own] = np.unique(nodes[ends[own, 0]], return_inverse=True)
+        label[own] += taken
+        taken = int(label[own].max(initial=taken - 1)) + 1
+    return label
+
+
 def loops_at(
     vertices: Array, faces: Indices, height_mm: float, filled: Mask | None = None
 ) -> tuple[Loop, ...]:
@@ -80,11 +156,12 @@ def loops_at(
     corner, one, other = (faces[crossed, (lone + k) % 3] for k in range(3))
     start, end = np.where(alone_above, one, other), np.where(alone_above, other, one)
     segments = np.stack([_crossing(vertices, corner, way, height_mm) for way in (start, end)], 1)
-    labels = _label_loops(corner, start, end, len(vertices))
+    ends = _edge_numbers(corner, start, end, len(vertices))
+    labels = _label_loops(ends)
     measured = np.ones(crossed.size, bool) if filled is None else ~filled[crossed]
     order = np.argsort(labels, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
-    loops = [Loop(segments[part], measured[part]) for part in parts]
+    loops = [Loop(segments[part], measured[part], ends[part]) for part in parts]
     return tuple(sorted(loops, key=lambda loop: -loop.area_mm2))
 
 
@@ -95,10 +172,15 @@ def _crossing(vertices: Array, a: Indices, b: Indices, height_mm: float) -> Arra
     return low[:, :2] + share[:, None] * (high[:, :2] - low[:, :2])
 
 
-def _label_loops(corner: Indices, start: Indices, end: Indices, count: int) -> Indices:
-    """(N,) number of the loop of each segment: neighbours share the edge that they end on."""
+def _edge_numbers(corner: Indices, start: Indices, end: Indices, count: int) -> Indices:
+    """(N, 2) from 0: of the mesh's edges on which segments start and end."""
     keys = [np.minimum(corner, x) * count + np.maximum(corner, x) for x in (start, end)]
-    edges, number = np.unique(np.concatenate(keys), return_inverse=True)
-    here, there = np.split(number, 2)
-    graph = coo_array((np.ones(len(here), np.int8), (here, there)), shape=(edges.size, edges.size))
-    return connected_components(graph, directed=False)[1][here].astype(np.int64)
+    _, number = np.unique(np.stack(keys, axis=-1), return_inverse=True)
+    return number.reshape(-1, 2).astype(np.int64)
+
+
+def _label_loops(ends: Indices) -> Indices:
+    """(N,) number of the loop of each segment: neighbours share the edge that they end on."""
+    size = int(ends.max()) + 1
+    graph = coo_array((np.ones(len(ends), np.int8), tuple(ends.T)), shape=(size, size))
+    return connected_components(graph, directed=False)[1][ends[:, 0]].astype(np.int64)

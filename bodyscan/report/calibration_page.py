@@ -164,8 +164,27 @@ def _lens_lines(calibration: RigCalibration) -> Iterator[str]:
 
 
 def _lens_figure(tried: LensTrial) -> str:
-    gain = "" if tried.gain is None else f" ({tried.gain:+.1f} standard errors better)"
+    gain = "" if tried.gain is None else f" ({_better(tried.gain)} better)"
     return f"{tried.kind} {tried.rms_px:.3f} px{gain}"
+
+
+def _choice_lines(calibration: RigCalibration) -> Iterator[str]:
+    """What was taken and refused on boards that took no part, and by how much."""
+    for name, pair in calibration.pairs.items():
+        quality = pair.quality
+        light = [
+            f"{one.model} ({_better(one.gain)})" for one in quality.held_out if one.gain is not None
+        ]
+        if light:
+            yield f"{name}: light {quality.light_model}; tried: {'; '.join(light)}"
+        if quality.refinement:
+            yield f"{name}: solved by {quality.refinement}"
+        for board, mm in quality.bent_mm.items():
+            yield f"{name}: board {board} is bent by {mm:.3f} mm, lowest to highest corner"
+
+
+def _better(gain: float) -> str:
+    return f"{gain:+.1f} standard errors"
 
 
 def _advice(calibration: RigCalibration) -> Section:
@@ -215,10 +234,11 @@ def _planes(calibration: RigCalibration) -> Section:
             Picture(
                 "Models of the light on held-out boards",
                 "Each model was fitted without a board and tried on it; mean distance from that board "
-                "(mm, outliers capped). Filled: the model in use, the simplest that is as good as "
-                "the best within 15 %.",
+                "(mm, outliers capped). Filled: the model in use, the simplest that none after it "
+                "beats by three standard errors at the same points.",
                 draw.held_out_chart(calibration),
             ),
+            Lines(tuple(_choice_lines(calibration))),
         ],
     )
 

@@ -9,10 +9,13 @@ from typing import Any
 from rich.table import Table
 
 from bodyscan.measurement.measurements import Measurements
+from bodyscan.measurement.outline import Range
 from bodyscan.version import __version__
 
 MOSTLY = 0.5
 LITTLE = 0.95
+TAPE_MM = 4.0
+"""What two measurers with a tape differ by (ISO 20685-1)."""
 
 
 def tables(measured: Measurements) -> Iterator[Table]:
@@ -34,14 +37,20 @@ def tables(measured: Measurements) -> Iterator[Table]:
             slices.add_row(
                 f"{level.height_mm:.0f}",
                 girth.part,
-                f"{girth.tape_mm:.1f}",
-                f"{girth.girth_mm:.1f}",
+                _told(girth.tape_mm, girth.tape_range_mm),
+                _told(girth.girth_mm, girth.girth_range_mm),
                 f"{girth.width_mm:.1f}",
                 f"{girth.depth_mm:.1f}",
                 f"{100.0 * girth.measured:.0f} %",
                 style="" if girth.measured >= LITTLE else "yellow",
             )
     yield slices
+
+
+def _told(value: float, between: Range) -> str:
+    """A range where what was not measured leaves more open than a tape does."""
+    low, high = between
+    return f"{low:.0f} to {high:.0f}" if high - low > TAPE_MM else f"{value:.1f}"
 
 
 def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> dict[str, Any]:

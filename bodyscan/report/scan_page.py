@@ -147,7 +147,7 @@ def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
     alignment = facts.get("alignment")
     if alignment is None:
         return [Number("overlaps", "not aligned", "", "pairs stand where the boards put them")]
-    farthest, motion = max(alignment["motion_mm"].items(), key=lambda item: item[1])
+    motions = sorted(alignment["motion_mm"].items(), key=lambda item: -item[1])
     return [
         Number(
             "overlap residual",
@@ -162,14 +162,17 @@ def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
             "mm RMS",
             "the same with the poses of the calibration alone",
         ),
-        Number(
-            "sway",
-            motion,
-            "mm",
-            "how far the subject moved between pairs at most, as the alignment found it: pair "
-            f"{farthest}, at the body's middle",
-            limits.SOME_MOTION_MM,
-            digits=2,
+        *(
+            Number(
+                "sway",
+                motion,
+                "mm",
+                "how far the subject moved between pairs at most, as the alignment found it: pair "
+                f"{farthest}, at the body's middle",
+                limits.SOME_MOTION_MM,
+                digits=2,
+            )
+            for farthest, motion in motions[:1]
         ),
     ]
 
@@ -238,7 +241,9 @@ def _pairs(facts: Mapping[str, Any]) -> Section:
     if lost:
         blocks.append(Lines(tuple(lost)))
     if overlaps:
-        blocks += [_overlap_picture(overlaps), _sway_picture(motion)]
+        blocks += [_overlap_picture(overlaps)]
+    if motion:
+        blocks += [_sway_picture(motion)]
     return Section("Pairs and their overlaps", blocks)
 
 

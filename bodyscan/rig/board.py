@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
@@ -36,6 +37,9 @@ LARGEST_DICTIONARIES = (
 """One of each family, for telling which one a board was printed with; those of few bits, whose
 markers are found in any texture, left out."""
 
+FLATNESS = 5e-4
+"""Half a millimetre in a metre: a print glued to a sheet of aluminium composite."""
+
 
 class Board(Model):
     """A flat board. `columns` x `rows` counts squares, not corners; of an aprilgrid, tags, and
@@ -57,6 +61,15 @@ class Board(Model):
     margin_mm: Annotated[float, Field(ge=0)] = 0.0
     faces: Literal[1, 2] = 1
     thickness_mm: Annotated[float, Field(ge=0)] = 0.0
+    flatness_mm: Annotated[float, Field(ge=0)] | None = None
+
+    @property
+    def believed_flatness_mm(self) -> float:
+        """By how much its lowest and highest corners may differ, one standard deviation, before any
+        image: `flatness_mm`, or FLATNESS of its diagonal."""
+        if self.flatness_mm is not None:
+            return self.flatness_mm
+        return FLATNESS * self.square_mm * math.hypot(self.columns, self.rows)
 
     @property
     def looks_same_turned(self) -> bool:

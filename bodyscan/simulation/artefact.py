@@ -23,7 +23,7 @@ from bodyscan.simulation.render import View
 from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Surface, grid_surface
 from bodyscan.simulation.settings import SimulationSettings
-from bodyscan.simulation.simulate import Task, render_task, true_pairs
+from bodyscan.simulation.simulate import Task, render_task, sensor_of, true_pairs
 
 ALBEDO = 0.7
 RINGS = 200
@@ -110,11 +110,12 @@ def capture_artefact(
     def work(pair: TruePair) -> None:
         rays = np.random.default_rng([simulated.seed, _RAYS, order[pair.name]])
         view = View.of(pair.camera, settings.optics, rays)
+        fixed = sensor_of(pair.camera, settings, simulated.seed, order[pair.name])
         for k, name in enumerate(names):
             seed = [simulated.seed, _NOISE, order[pair.name], number, k]
             task = Task(k, name, out.name, tuple(surfaces), rig_from_artefact, GREY, True)
             noise = np.random.default_rng(seed)
-            render_task(rig, pair, view, room, task, settings, out.parent, noise)
+            render_task(rig, pair, view, room, task, settings, out.parent, noise, fixed)
 
     threaded(work, taking, stage=f"simulating {out.name}", progress=progress)
     striped = [pair.name for pair in taking]

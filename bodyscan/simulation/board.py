@@ -104,10 +104,11 @@ def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> M
     """The board of the rig file, with what went wrong in making it."""
     width, height = board.columns * board.square_mm, board.rows * board.square_mm
     surfaces, corners = [], []
+    sheet = _draw_sheet(making, rng)
     for face in range(board.faces):
         error = _print_error(board, making, rng)
-        places = _places(board, flat=making.bow_mm == 0 and making.print_error_mm == 0)
-        vertices = _on_sheet(places.reshape(-1, 2), board, face, error, making.bow_mm)
+        places = _places(board, flat=sheet.flat and making.print_error_mm == 0)
+        vertices = _on_sheet(places.reshape(-1, 2), board, face, error, sheet)
         triangles = grid_triangles(places.shape[1] - 1, places.shape[0] - 1)
         printed = board_print(board, face, making)
         surfaces.append(
@@ -121,7 +122,7 @@ def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> M
         )
         c, r = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
         inner = np.stack([c.ravel(), r.ravel()], axis=1).astype(float) * board.square_mm
-        corners.append(_on_sheet(inner, board, face, error, making.bow_mm))
+        corners.append(_on_sheet(inner, board, face, error, sheet))
     surfaces += _sides(board, width, height, making)
     return MadeBoard(tuple(surfaces), np.concatenate(corners))
 
@@ -140,7 +141,40 @@ def _places(board: Board, flat: bool) -> Array:
     return np.stack(np.meshgrid(line(board.columns), line(board.rows)), axis=-1)
 
 
-def _on_sheet(places: Array, board: Board, face: int, error: Array, bow_mm: float) -> Array:
+@dataclass(frozen=True)
+class _Sheet:
+    """How far what a board is glued to is from a plane, mm: a bowl, bent along each side,
+    twisted."""
+
+    bowl: float
+    across: float = 0.0
+    down: float = 0.0
+    twist: float = 0.0
+
+    @property
+    def flat(self) -> bool:
+        return not any((self.bowl, self.across, self.down, self.twist))
+
+    def height(self, across: Array, down: Array) -> Array:
+        """Towards the front, at places from -1/2 to 1/2 along each side."""
+        bowl = self.bowl * (1.0 - 2.0 * (across**2 + down**2))
+        if not any((self.across, self.down, self.twist)):
+            return bowl
+        return bowl + self.across * across**2 + self.down * down**2 + self.twist * across * down
+
+
+def _draw_sheet(making: BoardMaking, rng: np.random.Generator) -> _Sheet:
+    low, high = making.warp_mm
+    if high <= 0:
+        return _Sheet(making.bow_mm)
+    size = float(np.exp(rng.uniform(*np.log([max(low, 1e-3), high]))))
+    shape = _Sheet(0.0, *(float(value) for value in rng.standard_normal(3)))
+    heights = shape.height(*np.meshgrid(np.linspace(-0.5, 0.5, 21), np.linspace(-0.5, 0.5, 21)))
+    grown = size / float(np.ptp(heights))
+    return _Sheet(making.bow_mm, grown * shape.across, grown * shape.down, grown * shape.twist)
+
+
+def _on_sheet(places: Array, board: Board, face: int, error: Array, sheet: _Sheet) -> Array:
     """Places on the print (N, 2) -> board frame (N, 3): printing error, turning over, bow."""
     square = board.square_mm
     grid = np.clip(places / square, 0.0, [board.columns, board.rows])[:, ::-1].T
@@ -149,8 +183,8 @@ def _on_sheet(places: Array, board: Board, face: int, error: Array, bow_mm: floa
     if face == 1:
         x = board.columns * square - x
     across, down = x / (board.columns * square) - 0.5, y / (board.rows * square) - 0.5
-    bow = bow_mm * (1.0 - 2.0 * (across**2 + down**2))
-    return np.stack([x, y, face * board.thickness_mm - bow], axis=1)
+    height = sheet.height(across, down)
+    return np.stack([x, y, face * board.thickness_mm - height], axis=1)
 
 
 def _print_error(board: Board, making: BoardMaking, rng: np.random.Generator) -> Array:

@@ -97,7 +97,11 @@ def draw_camera(width: int, height: int, optics: Optics, rng: np.random.Generato
     k2 = optics.k2 + optics.k2_spread * float(np.clip(rng.standard_normal(), -2, 2))
     u0, v0 = u0 + (width - 1) / 2.0, v0 + (height - 1) / 2.0
     alpha, beta, gamma, u0, v0 = (float(value) for value in (alpha, beta, gamma, u0, v0))
-    return TrueCamera(alpha, beta, gamma, u0, v0, k1, k2, width, height)
+    p1 = p2 = k3 = 0.0
+    if optics.p_spread or optics.k3_spread:
+        p1, p2 = (float(p) for p in optics.p_spread * rng.standard_normal(2))
+        k3 = optics.k3_spread * float(np.clip(rng.standard_normal(), -2, 2))
+    return TrueCamera(alpha, beta, gamma, u0, v0, k1, k2, width, height, p1, p2, k3)
 
 
 def rig_from_view(placing: NominalPose) -> RigidTransform:

@@ -12,11 +12,16 @@ import numpy as np
 from bodyscan.arrays import Array, Floats
 
 _TABLE = 1 << 15
+_NEWTON = 6
+"""Steps: a lens bends by a tenth; each step squares what is left."""
 
 
 @dataclass(frozen=True)
 class TrueCamera:
-    """Intrinsics in px, (u, v) = (column, row), whole numbers at pixel centres; camera frame mm."""
+    """Intrinsics in px, (u, v) = (column, row), whole numbers at pixel centres; camera frame mm.
+
+    p1, p2, k3: what the chapter's lens does not have: an axis off centre, and the next power.
+    """
 
     alpha: float
     beta: float
@@ -27,12 +32,20 @@ class TrueCamera:
     k2: float
     width: int
     height: int
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
 
     def image(self, points: Array) -> Array:
         """Points (..., 3) in front of the camera -> where the lens images them, (..., 2) px.
 
         Eq. 3 and 4 as they stand: the ideal point is pushed away from [u0, v0].
         """
+        if self._off_centre:
+            moved = self._bent(points[..., :2] / points[..., 2:])
+            x, y = moved[..., 0], moved[..., 1]
+            u = self.alpha * x + self.gamma * y + self.u0
+            return np.stack([u, self.beta * y + self.v0], axis=-1)
         x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
         u = self.alpha * x + self.gamma * y + self.u0
         v = self.beta * y + self.v0
@@ -48,6 +61,9 @@ class TrueCamera:
         """
         y = (pixels[..., 1] - self.v0) / self.beta
         x = (pixels[..., 0] - self.u0 - self.gamma * y) / self.alpha
+        if self._off_centre:
+            ideal = self._unbent(np.stack([x, y], axis=-1))
+            return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
         real = np.hypot(x, y)
         ideal = np.linspace(0.0, 1.5 * max(float(real.max(initial=0.0)), 0.1), _TABLE)
         table = ideal * (1.0 + self.k1 * ideal**2 + self.k2 * ideal**4)
@@ -58,6 +74,35 @@ class TrueCamera:
         grown = np.interp(real, table[:end], ideal[:end])
         ratio = np.divide(grown, real, out=np.ones_like(real), where=real > 0)
         return np.stack([x * ratio, y * ratio, np.ones_like(x)], axis=-1)
+
+    @property
+    def _off_centre(self) -> bool:
+        return bool(self.p1 or self.p2 or self.k3)
+
+    def _bent(self, ideal: Array) -> Array:
+        """Normalized coordinates (..., 2) behind the lens (Brown 1966)."""
+        x, y = ideal[..., 0], ideal[..., 1]
+        square = x**2 + y**2
+        grown = 1.0 + square * (self.k1 + square * (self.k2 + square * self.k3))
+        aside = 2.0 * self.p1 * x * y + self.p2 * (square + 2.0 * x**2)
+        down = self.p1 * (square + 2.0 * y**2) + 2.0 * self.p2 * x * y
+        return np.stack([x * grown + aside, y * grown + down], axis=-1)
+
+    def _unbent(self, real: Array) -> Array:
+        """What the lens bends to `real` (..., 2), by Newton's method, slopes by differences."""
+        ideal, step = real.copy(), 1e-6
+        for _ in range(_NEWTON):
+            bent = self._bent(ideal)
+            by_x = (self._bent(ideal + [step, 0.0]) - bent) / step
+            by_y = (self._bent(ideal + [0.0, step]) - bent) / step
+            short = real - bent
+            size = by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0]
+            if np.any(size <= 0):
+                raise ValueError("the lens folds the image over: no ray belongs to its corners")
+            dx = (short[..., 0] * by_y[..., 1] - short[..., 1] * by_y[..., 0]) / size
+            dy = (short[..., 1] * by_x[..., 0] - short[..., 0] * by_x[..., 1]) / size
+            ideal = ideal + np.stack([dx, dy], axis=-1)
+        return ideal
 
     def grid(self, rows: slice | None = None) -> Array:
         """Pixel centres of some rows (all by default), (rows, width, 2)."""

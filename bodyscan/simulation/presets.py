@@ -1,17 +1,17 @@
-"""Settings by name: whom to scan, and by which projector; and every number by itself."""
+"""Settings by name: whom to scan, and by which devices; and every number by itself."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
 from bodyscan.errors import BadInput
 from bodyscan.files.model import alternatives, did_you_mean
-from bodyscan.simulation.settings import Projection, SimulationSettings
+from bodyscan.simulation.settings import SimulationSettings
 
 SUBJECTS: Mapping[str, Mapping[str, Any]] = {
     # Nobody stands like that.
@@ -39,33 +39,84 @@ SUBJECTS: Mapping[str, Mapping[str, Any]] = {
 }
 
 
+IDEAL, WORKSHOP = "ideal", "workshop"
+
+_WORKSHOP: Mapping[str, Mapping[str, Any]] = {
+    "optics": {
+        # 8 mm at f/2.8 and 1.3 m: the circle of confusion at half the distance is 3 px wide, as
+        # wide as a Gaussian of a quarter of that.
+        "defocus_px": 0.8,
+        # Natural light loss of a lens, a little of it corrected.
+        "vignetting": 0.8,
+        # Half a pixel in the corners, as calibrations of machine-vision lenses find.
+        "p_spread": 3e-4,
+        "k3_spread": 0.01,
+    },
+    "lighting": {
+        # A window, and lamps with ballasts at 50 Hz mains.
+        "window_grey": 6.0,
+        "mains_depth": 0.2,
+    },
+    "noise": {
+        # 12,000 electrons at white, EMVA 1288 figures of common sensors.
+        "photons": 1.0 / 3.0,
+        "pixel_gain": 0.005,
+        "pixel_grey": 0.3,
+        "gain_flicker": 0.003,
+    },
+    "board": {
+        # An aluminium composite sheet of 0.6 to 1 m, and a large-format printer.
+        "warp_mm": (0.1, 1.0),
+        "print_error_mm": 0.02,
+    },
+}
+"""A scanner as people build it: what the laboratory's real light has, and more."""
+
+_WORKSHOP_LIGHT: Mapping[str, Mapping[str, Any]] = {
+    # The laboratory's real light: a galvanometer's jitter, the bow of a laser's line, speckle
+    # averaged over a pixel, a sheet that is sharp at one distance.
+    "mirror": {
+        "jitter_stripes": 0.01,
+        "smile_stripes": 0.2,
+        "speckle": 0.06,
+        "defocus_stripes": 1.0,
+        "flicker": 0.005,
+    },
+    # No speckle and nothing that turns, but the gamma of video.
+    "pinhole": {"defocus_stripes": 1.0, "flicker": 0.005, "gamma": 2.2},
+}
+
+
 def settings_for(
     projector: str,
     *,
+    preset: str = IDEAL,
     subject: str = "mannequin",
     sway_mm: float = 0.0,
     changes: Iterable[str] = (),
 ) -> SimulationSettings:
-    """Settings with one kind of projector, `mirror` or `pinhole`, a person of `SUBJECTS`, and
-    `changes` such as `person.breath_mm=5`.
+    """Settings with one kind of projector, `mirror` or `pinhole`, the devices of a preset (`ideal` or
+    `workshop`), a person of `SUBJECTS`, and `changes` such as `person.breath_mm=5`.
 
     Raises BadInput for names and values that there are not.
     """
-    if projector not in ("mirror", "pinhole"):
-        raise BadInput(
-            f"there is no projector of kind {projector!r} to simulate",
-            remedy="Choose mirror or pinhole.",
-        )
-    if subject not in SUBJECTS:
-        raise BadInput(
-            f"there is no subject {subject!r} to simulate",
-            remedy=f"Choose {alternatives(SUBJECTS)}.",
-        )
-    settings = SimulationSettings()
-    if projector == "pinhole":
-        settings = replace(settings, projection=Projection(kind="pinhole"))
-    person = replace(settings.person, sway_mm=sway_mm, **SUBJECTS[subject])
-    return with_changes(replace(settings, person=person), changes)
+    for what, name, known in (
+        ("projector of kind", projector, _WORKSHOP_LIGHT),
+        ("preset", preset, (IDEAL, WORKSHOP)),
+        ("subject", subject, SUBJECTS),
+    ):
+        if name not in known:
+            raise BadInput(
+                f"there is no {what} {name!r} to simulate", remedy=f"Choose {alternatives(known)}."
+            )
+    values = asdict(SimulationSettings())
+    values["projection"]["kind"] = projector
+    values["person"] |= {"sway_mm": sway_mm, **SUBJECTS[subject]}
+    if preset == WORKSHOP:
+        for part, own in _WORKSHOP.items():
+            values[part] |= own
+        values["projection"] |= _WORKSHOP_LIGHT[projector]
+    return with_changes(settings_of(values), changes)
 
 
 def with_changes(settings: SimulationSettings, changes: Iterable[str]) -> SimulationSettings:

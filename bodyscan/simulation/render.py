@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.rig.frame_names import FrameNames
+from bodyscan.simulation.flicker import Brightness
 from bodyscan.simulation.gray import LightTable, light_table, table_index
 from bodyscan.simulation.inter_reflection import LitFacets, light_facets
-from bodyscan.simulation.lamps import Lamps, laser_light
+from bodyscan.simulation.lamps import Lamps, laser_light, room_light
 from bodyscan.simulation.lens import TrueCamera, sample_directions
 from bodyscan.simulation.patterns import projected_patterns
 from bodyscan.simulation.projector import Projector
@@ -91,11 +92,13 @@ def render_pair(
     sequence: bool = True,
     inter_reflection: InterReflection | None = None,
     moving: Moving | None = None,
+    flicker: Mapping[str, Brightness] | None = None,
 ) -> dict[str, Floats]:
     """Images without sensor noise, (height, width) float32 grey levels, by frame name.
 
     scene: in the camera's frame.  rng: for the laser's jitter and speckle.  moving: pixels near it are
-    cast anew for every frame; shadows that it throws on what is still stay where they are.
+    cast anew for every frame; shadows that it throws on what is still stay where they are.  flicker:
+    of frames that are not as bright as the others (its gain is left to `sensor.expose`).
     With `sequence` the whole stripe sequence (lit, dark and those of the code: Gray with inverses
     if none is given), else lit alone. The dark image of a stripe-index rig, which its instrument
     keeps to itself, is named "". `sensor.expose` makes 8-bit images of them.
@@ -112,6 +115,10 @@ def render_pair(
     if inter_reflection is not None and inter_reflection.facet_mm > 0:
         between = _Between.of(scene, source, lit, inter_reflection)
         between.add_to(seen.laser, scene, view)
+    for name, now in (flicker or {}).items():
+        if name in seen.laser:
+            seen.laser[name] *= np.float32(now.laser)
+            seen.ambient[name] = seen.ambient[name] * np.float32(now.room)
     shading, focus = shade(view.camera, view.optics), off_focus(seen.depth, lamps.focus_mm)
     return {
         name: blur(
@@ -210,8 +217,7 @@ class _LitRays:
 
     def ambient(self, lamps: Lamps) -> Floats:
         """(pixels,) grey level by the room's own light."""
-        white = np.full_like(self.weight, lamps.ambient_grey)
-        return _pixels(self.hits.albedo, white, self.samples)
+        return _pixels(self.hits.albedo, room_light(self.hits, lamps), self.samples)
 
     def nearest(self) -> Floats:
         """(pixels,) the least depth, mm."""
@@ -294,7 +300,8 @@ def _tables(
     if projection.jitter_stripes <= 0:
         steady = _steady_tables(code, frames, projection)
         return dict(steady if sequence else steady[:1])
-    lights = _lights(code, frames) if sequence else _lights(code, frames)[:1]
+    lights = _lights(code, frames, projection.gamma)
+    lights = lights if sequence else lights[:1]
     strays = projection.jitter_stripes * rng.standard_normal((len(lights), code.stripes + 1))
     blurs = _blurs(projection)
     return {
@@ -311,13 +318,16 @@ def _steady_tables(
     blurs = _blurs(projection)
     return tuple(
         (name, light_table(light, blurs, parts=len(light) // code.stripes))
-        for name, light in _lights(code, frames)
+        for name, light in _lights(code, frames, projection.gamma)
     )
 
 
-def _lights(code: StripeCode, frames: FrameNames) -> list[tuple[str, Array]]:
+def _lights(code: StripeCode, frames: FrameNames, gamma: float) -> list[tuple[str, Array]]:
     """Lit and the code's images: name, and light along the sweep."""
-    return [(frames.lit or "lit", np.ones(code.stripes)), *projected_patterns(code, frames).items()]
+    coded = projected_patterns(code, frames)
+    if gamma != 1.0:
+        coded = {name: light**gamma for name, light in coded.items()}
+    return [(frames.lit or "lit", np.ones(code.stripes)), *coded.items()]
 
 
 def _blurs(projection: Projection) -> Array:

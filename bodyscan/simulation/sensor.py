@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -18,8 +20,33 @@ def exposure(lit: Floats, grey: float, lighting: Lighting) -> float:
     return float(np.clip(grey / bright, lighting.shortest, lighting.longest))
 
 
-def expose(image: Floats, noise: Noise, rng: np.random.Generator) -> Bytes:
-    """What the sensor makes of a noiseless image: shot and read noise, 8 bits."""
+@dataclass(frozen=True, eq=False)
+class FixedPattern:
+    """What each pixel of a sensor does in every image. gain: (H, W), 1 on the mean.  grey: (H, W)."""
+
+    gain: Floats
+    grey: Floats
+
+
+def fixed_pattern(
+    camera: TrueCamera, noise: Noise, rng: np.random.Generator
+) -> FixedPattern | None:
+    """Of a camera's sensor; None for one whose pixels are all alike."""
+    if noise.pixel_gain <= 0 and noise.pixel_grey <= 0:
+        return None
+    gain, grey = rng.standard_normal((2, camera.height, camera.width), dtype=np.float32)
+    one = np.float32(1.0)
+    return FixedPattern(
+        one + np.float32(noise.pixel_gain) * gain, np.float32(noise.pixel_grey) * grey
+    )
+
+
+def expose(
+    image: Floats, noise: Noise, rng: np.random.Generator, fixed: FixedPattern | None = None
+) -> Bytes:
+    """What the sensor makes of a noiseless image: shot and read noise, its pixels' own, 8 bits."""
+    if fixed is not None:
+        image = image * fixed.gain + fixed.grey
     electrons = noise.electrons_per_grey * noise.photons
     spread = np.sqrt(np.maximum(image, 0.0) / electrons + noise.read_grey**2)
     noisy = image + spread * rng.standard_normal(image.shape, dtype=np.float32)

@@ -15,6 +15,8 @@ class Optics:
     focal_spread, aspect_spread: relative standard deviations of alpha, and of beta / alpha.
     skew_px: gamma.  centre_px: standard deviation of the principal point about the middle.
     k1, k2 and their standard deviations: Eq. 3-4, in normalized coordinates.
+    p_spread, k3_spread: standard deviations of what a real lens has besides, p1 and p2 (an axis off
+    centre) and k3, as OpenCV numbers them.
     blur_px: standard deviation of the lens's point spread, px of the image as it is (not scaled).
     defocus_px: what is added to it (in quadrature) at half the working distance; it
     grows as |working distance / distance - 1|.
@@ -33,6 +35,8 @@ class Optics:
     k1_spread: float = 0.03
     k2: float = 0.05
     k2_spread: float = 0.02
+    p_spread: float = 0.0
+    k3_spread: float = 0.0
     blur_px: float = 0.6
     defocus_px: float = 0.0
     vignetting: float = 0.0
@@ -58,6 +62,8 @@ class Projection:
     jitter_stripes: standard deviation of each stripe boundary's place, drawn anew for each frame.
     smile_stripes: how far a stripe's ends are bowed from its middle.
     speckle: standard deviation of the laser's brightness, relative, drawn anew for each frame.
+    flicker: standard deviation of each frame's brightness, relative.
+    gamma: of the light that a grey value becomes; what is black and white it leaves alone.
     k1, k2: lens of the pinhole kind.
     """
 
@@ -74,6 +80,8 @@ class Projection:
     jitter_stripes: float = 0.0
     smile_stripes: float = 0.0
     speckle: float = 0.0
+    flicker: float = 0.0
+    gamma: float = 1.0
     k1: float = -0.12
     k2: float = 0.05
 
@@ -84,6 +92,9 @@ class Lighting:
 
     laser_grey: of a perfectly white surface that faces the projector at 0.85 working distances.
     ambient_grey: what the room's own light adds to a perfectly white surface.
+    window_grey: what a large window adds where a white surface faces it, so large that it throws no
+    shadows with edges.  window_from: where it is, seen from the rig's centre.
+    mains_hz, mains_depth: how often lamps pulse, and how far, relative (that of `ambient_grey`).
     board_grey, person_grey: each pair sets its exposure for each shot, so that the brightest
     thousandth of the lit image begins at this grey level.
     shortest, longest: exposures it can set.
@@ -91,6 +102,10 @@ class Lighting:
 
     laser_grey: float = 240.0
     ambient_grey: float = 10.0
+    window_grey: float = 0.0
+    window_from: tuple[float, float, float] = (0.5, -0.8, 0.4)
+    mains_hz: float = 100.0
+    mains_depth: float = 0.0
     board_grey: float = 235.0
     person_grey: float = 230.0
     shortest: float = 0.4
@@ -101,11 +116,17 @@ class Lighting:
 class Noise:
     """The sensor. electrons_per_grey: photo-electrons that make a grey level (shot noise at grey
     200 is then sqrt(200 / 140) = 1.2).  photons: scales the number of photons, not the brightness.
-    read_grey: read noise, grey levels. Grey levels are rounded to 0..255."""
+    read_grey: read noise, grey levels. Grey levels are rounded to 0..255.
+    pixel_gain, pixel_grey: standard deviations of each pixel's own gain, relative, and of what it
+    shows in the dark: the same in all of a camera's images.
+    gain_flicker: standard deviation of each frame's gain, relative."""
 
     electrons_per_grey: float = 140.0
     photons: float = 1.0
     read_grey: float = 0.7
+    pixel_gain: float = 0.0
+    pixel_grey: float = 0.0
+    gain_flicker: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -113,6 +134,8 @@ class BoardMaking:
     """How well the board is made.
 
     white, black, side: albedo.  bow_mm: its middle stands out by this much, towards the front.
+    warp_mm: besides, each board is bent and twisted, by between the lower and the higher, from its
+    highest to its lowest place.
     print_error_mm: standard deviation, for each axis, of where a corner of a square was printed.
     print_error: `smooth` (a slow wave over the board) or `corner` (each corner on its own).
     """
@@ -121,6 +144,7 @@ class BoardMaking:
     black: float = 0.06
     side: float = 0.3
     bow_mm: float = 0.0
+    warp_mm: tuple[float, float] = (0.0, 0.0)
     print_error_mm: float = 0.0
     print_error: Literal["smooth", "corner"] = "smooth"
 

@@ -17,16 +17,18 @@ from bodyscan.rig.rig_file import load_rig, write_rig
 from bodyscan.rig.templates import fill
 from bodyscan.simulation import body, files
 from bodyscan.simulation.board import make_board
+from bodyscan.simulation.flicker import Brightness, draw_flicker
 from bodyscan.simulation.instrument import instrument_images
 from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import TruePair, build_pairs
+from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.living import LivingBody, bring_to_life, moves, save_body
 from bodyscan.simulation.patterns import refuse_unknown_code, refuse_unknown_frames
 from bodyscan.simulation.plan import default_shots, plan_boards
 from bodyscan.simulation.render import Moving, View, render_pair
 from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Scene, Surface
-from bodyscan.simulation.sensor import expose, exposure
+from bodyscan.simulation.sensor import FixedPattern, expose, exposure, fixed_pattern
 from bodyscan.simulation.settings import SimulationSettings
 from bodyscan.simulation.truth import Motion, Truth, describe
 
@@ -36,7 +38,7 @@ PERSON_SHOT = "s01"
 _BRIGHT_AT = 0.85
 """Where a surface is as bright as `Lighting.laser_grey` says, in working distances."""
 
-_PAIRS, _BOARDS, _PLAN, _SKIN, _SWAY, _RAYS, _NOISE, _LIFE = range(1, 9)
+_PAIRS, _BOARDS, _PLAN, _SKIN, _SWAY, _RAYS, _NOISE, _LIFE, _PIXELS = range(1, 10)
 """What a random number is drawn for: each has a stream of its own, whatever the others draw."""
 
 
@@ -194,12 +196,20 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
         number, pair = numbered
         rays = np.random.default_rng([truth.seed, _RAYS, number])
         view = View.of(pair.camera, truth.settings.optics, rays)
+        fixed = sensor_of(pair.camera, truth.settings, truth.seed, number)
         for task in tasks[pair.name]:
             noise = np.random.default_rng([truth.seed, _NOISE, number, task.number])
-            render_task(rig, pair, view, room, task, truth.settings, out, noise)
+            render_task(rig, pair, view, room, task, truth.settings, out, noise, fixed)
             tell()
 
     threaded(work, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
+
+
+def sensor_of(
+    camera: TrueCamera, settings: SimulationSettings, seed: int, number: int
+) -> FixedPattern | None:
+    """What the pixels of the camera of that number do in every image, wherever they are asked for."""
+    return fixed_pattern(camera, settings.noise, np.random.default_rng([seed, _PIXELS, number]))
 
 
 def _counter(stage: str, total: int, progress: Progress) -> Callable[[], None]:
@@ -225,8 +235,9 @@ def render_task(
     settings: SimulationSettings,
     out: Path,
     rng: np.random.Generator,
+    fixed: FixedPattern | None = None,
 ) -> None:
-    """One pair, one shot: cast, expose, write."""
+    """One pair, one shot: cast, expose, write. fixed: of the camera's sensor."""
     camera_from_rig = pair.rig_from_camera.inverse()
     camera_from_surfaces = camera_from_rig @ task.rig_from_surfaces
     around = [surface.moved(camera_from_rig) for surface in room]
@@ -245,8 +256,18 @@ def render_task(
         reach = _reach(task.body, list(task.frames_ms.values()))
         moving = Moving(len(task.surfaces), scene_at, reach)
     light, reach = settings.lighting, pair.reach_mm
-    lamps = Lamps(light.laser_grey, light.ambient_grey, _BRIGHT_AT * reach, reach)
+    window = camera_from_rig.rotate(np.array(light.window_from) / np.linalg.norm(light.window_from))
+    lamps = Lamps(
+        light.laser_grey,
+        light.ambient_grey,
+        _BRIGHT_AT * reach,
+        reach,
+        light.window_grey,
+        tuple(window.tolist()),
+    )
     code = rig.pair(pair.name).projector
+    taken = settings.pace.order or rig.frames.of_sequence(code)
+    flicker = draw_flicker(taken, settings, rng.spawn(1)[0])
     images = render_pair(
         scene,
         view,
@@ -259,9 +280,18 @@ def render_task(
         sequence=task.sequence,
         inter_reflection=settings.inter_reflection,
         moving=moving,
+        flicker=flicker,
     )
     length = exposure(images[rig.frames.lit or "lit"], task.bright_grey, light)
-    exposed = {name: expose(image * length, settings.noise, rng) for name, image in images.items()}
+    exposed = {
+        name: expose(
+            image * length * np.float32(flicker.get(name, Brightness()).gain),
+            settings.noise,
+            rng,
+            fixed,
+        )
+        for name, image in images.items()
+    }
     if code and not code.is_projected and task.sequence:
         exposed = instrument_images(exposed, code, rig.frames)
     for frame, image in exposed.items():

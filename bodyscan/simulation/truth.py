@@ -11,6 +11,7 @@ import numpy as np
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.simulation.board import MadeBoard
 from bodyscan.simulation.layout import AnyProjector, TruePair
+from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.living import LivingBody, describe_motion
 from bodyscan.simulation.plan import BoardShot
 from bodyscan.simulation.projector import MirrorProjector
@@ -18,7 +19,8 @@ from bodyscan.simulation.scene import Surface
 from bodyscan.simulation.settings import SimulationSettings
 
 KEYS = {
-    "pairs.*.camera": "alpha, beta, gamma, u0, v0 (px), k1, k2 (Eq. 1-5), width, height (px)",
+    "pairs.*.camera": "alpha, beta, gamma, u0, v0 (px), k1, k2 (Eq. 1-5), width, height (px); of a "
+    "lens that has more (brown) p1, p2, k3, as OpenCV numbers them",
     "pairs.*.rig_from_camera": "4x4, camera coordinates to rig coordinates, mm",
     "pairs.*.projector": "see bodyscan/simulation/projector.py; vectors in the camera frame, mm",
     "pairs.*.projector.kind": "mirror or pinhole",
@@ -84,7 +86,7 @@ class Truth:
 def describe(truth: Truth) -> dict[str, Any]:
     """The truth as JSON values, but for the subject's surface."""
     making, motion = truth.settings.board, truth.motion
-    perfect = making.bow_mm == 0 and making.print_error_mm == 0
+    perfect = not any((making.bow_mm, making.warp_mm[1], making.print_error_mm))
     return {
         "version": 1,
         "keys": KEYS,
@@ -105,7 +107,7 @@ def describe(truth: Truth) -> dict[str, Any]:
 
 def _pair(pair: TruePair, sway: RigidTransform | None) -> dict[str, Any]:
     document: dict[str, Any] = {
-        "camera": asdict(pair.camera),
+        "camera": _camera(pair.camera),
         "rig_from_camera": pair.rig_from_camera.matrix,
         "projector": _projector(pair.projector),
     }
@@ -115,6 +117,14 @@ def _pair(pair: TruePair, sway: RigidTransform | None) -> dict[str, Any]:
     if sway is not None:
         document["swayed_from_still"] = sway.matrix
     return document
+
+
+def _camera(camera: TrueCamera) -> dict[str, Any]:
+    """As calibrations have it: the lens's kind is left out where it is the chapter's."""
+    values, more = asdict(camera), ("p1", "p2", "k3")
+    if any(values[name] for name in more):
+        return {"lens": "brown"} | values
+    return {name: value for name, value in values.items() if name not in more}
 
 
 def _projector(projector: AnyProjector) -> dict[str, Any]:

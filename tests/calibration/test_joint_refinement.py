@@ -1,8 +1,12 @@
 """Corners and stripes in one solve: what it must better, on the chapter's own camera."""
 
+from functools import cache
+
 import numpy as np
+import pytest
 from lit_boards import Mirror, Scene
 
+from bodyscan.calibration.board_form import BoardForm
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import bin_points, boundary_points, concatenate
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
@@ -38,6 +42,7 @@ POSES = [
 ]
 
 
+@cache
 def calibrated(seed: int) -> tuple[CameraCalibration, SmoothSheets, list[StripedBoard]]:
     """Camera, sheets and striped boards found one after the other, from noisy measurements."""
     rng = np.random.default_rng(seed)
@@ -64,7 +69,15 @@ def calibrated(seed: int) -> tuple[CameraCalibration, SmoothSheets, list[Striped
     bins = bin_points(concatenate(parts), camera.camera, "vertical")
     sheets = fit_light_sheets(bins, 254, "vertical", camera.camera).sheets
     assert isinstance(sheets, SmoothSheets)
-    return camera, sheets, [striped_board(v, camera.camera, bins, k) for k, v in enumerate(views)]
+    return (
+        camera,
+        sheets,
+        [striped_board(v, camera.camera, bins, k, "board") for k, v in enumerate(views)],
+    )
+
+
+def forms(boards: list[StripedBoard], flatness_mm: float = 0.0) -> dict[str, BoardForm]:
+    return {"board": BoardForm.flat(boards[0].view.points, flatness_mm, 0.0)}
 
 
 def flatness_rms_mm(camera: Camera, sheets: LightSheets) -> float:
@@ -82,7 +95,9 @@ def test_a_plane_becomes_flatter() -> None:
     before, after = [], []
     for seed in range(3):
         camera, sheets, boards = calibrated(seed)
-        joint = refine_jointly(camera.camera, camera.camera_from_board, sheets, boards)
+        joint = refine_jointly(
+            camera.camera, camera.camera_from_board, sheets, boards, forms(boards)
+        )
         before.append(flatness_rms_mm(camera.camera, sheets))
         after.append(flatness_rms_mm(joint.camera, joint.sheets))
         # Corners stay explained to their noise of 0.015 px in each coordinate, 0.021 in both.
@@ -92,20 +107,27 @@ def test_a_plane_becomes_flatter() -> None:
     assert np.mean(after) < 0.5 * np.mean(before)
 
 
-def test_derivatives_by_the_camera_are_those_of_the_offsets() -> None:
+@pytest.mark.parametrize(("bow", "within"), [(0.0, 1e-5), (1.0, 2e-2)])
+def test_derivatives_are_those_of_the_offsets(bow: float, within: float) -> None:
     """Rays turned by their slopes, against the camera moved and its lens undone anew."""
     camera, sheets, boards = calibrated(0)
     poses = tuple(camera.camera_from_board[board.view.shot] for board in boards)
-    state = _State(camera.camera, poses, sheets)
+    bent = forms(boards, 0.1)["board"]
+    heights = bow * np.array([0.08, -0.03, 0.05, 0.02, 0.0, -0.01, 0.0])
+    bent = bent.moved(np.append(heights, np.zeros(96)))
+    state = _State(camera.camera, poses, sheets, {"board": bent})
     found = _stripe_jacobian(state, 0, boards[0], _rays(camera.camera, boards[0]))
-    for column, size in enumerate(camera.camera.difference_steps):
-        step = size * np.eye(len(camera.camera.parameters))[column]
+    unknowns = [*range(state.first_pose + 6), *range(state.first_sheet, state.first_form + 7)]
+    sizes = [*camera.camera.difference_steps, *[1e-6] * 3, *[1e-3] * 3, *[1e-6] * 24, *[1e-3] * 7]
+    for column, (unknown, size) in enumerate(zip(unknowns, sizes, strict=True)):
+        step = size * np.eye(state.unknowns)[unknown]
         ahead, behind = (
-            _offsets(sheets, poses[0], boards[0], _rays(camera.camera.moved(way * step), boards[0]))
-            for way in (1.0, -1.0)
+            _offsets(moved, 0, boards[0], _rays(moved.camera, boards[0]))
+            for moved in (state.moved(way * step) for way in (1.0, -1.0))
         )
         slope = (ahead - behind) / (2.0 * size)
-        # Central differences both: what is left is of third order in steps of 1e-5 and less.
-        np.testing.assert_allclose(
-            found[:, column], slope, rtol=1e-5, atol=1e-6 * np.abs(slope).max()
-        )
+        # Central differences by camera and pose; left out are that a bent board's height changes along
+        # it too (it rises by 0.08 mm in 35, 0.5 % of the way of a ray that meets it at 30 degrees)
+        # and, by sheets and heights, that sigmas change: residuals times a share of them.
+        most = within if unknown < state.first_sheet else 2e-2
+        np.testing.assert_allclose(found[:, column], slope, rtol=most, atol=most * abs(slope).max())

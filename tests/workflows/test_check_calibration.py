@@ -69,11 +69,9 @@ def test_a_scan_of_a_person_is_checked_too(workspace: Workspace) -> None:
     person = workspace.folder / "captures" / "person"
     result = run("check-calibration", person, "--calibration", workspace.folder / "calibration")
     assert "overlaps in 1 scan:" in result.output
-    # The small rig's two poles stand on either side of the person and see no common surface.
-    assert result.exit_code == 1
-    words = " ".join(result.output.split())
-    assert "undecided: no surface is seen by more than one of these groups of pairs" in words
-    assert "p2-2, p2-3; p1-2, p1-3" in words
+    # The small rig's two poles stand on either side of the person and share no more than rims.
+    assert result.exit_code == 0, result.output
+    assert "no surface is seen by more than one" not in " ".join(result.output.split())
 
 
 def test_boards_and_people_are_not_mixed(workspace: Workspace, board_shots: Path) -> None:

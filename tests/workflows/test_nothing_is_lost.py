@@ -16,6 +16,7 @@ from bodyscan.registration.storage import load_calibration
 from bodyscan.report import calibration_page, pictures
 from bodyscan.report.page import render
 from bodyscan.rig.rig import Volume
+from bodyscan.settings import UseLimits
 from bodyscan.workflows import calibrate_rig, rig_remarks
 from bodyscan.workflows.write_report import write_report
 
@@ -101,9 +102,9 @@ def test_a_verdict_that_misses_a_check_is_not_good(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scan = make_scan(tmp_path / "scan")
-    whole = grade_scan(scan.cloud, scan.mesh, None, {}, Volume())
+    whole = grade_scan(scan.cloud, scan.mesh, None, {}, Volume(), UseLimits())
     monkeypatch.setattr("bodyscan.fusion.scan_verdict.rings", broken)
-    missed = grade_scan(scan.cloud, scan.mesh, None, {}, Volume())
+    missed = grade_scan(scan.cloud, scan.mesh, None, {}, Volume(), UseLimits())
     said = set(missed.reasons) - set(whole.reasons)
     assert len(said) == 1
     assert "verdict on contacts" in said.pop()

@@ -9,7 +9,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import PlanarView, planar_view
-from bodyscan.calibration.boundary_points import bin_points
+from bodyscan.calibration.boundary_points import bin_points, subsample
 from bodyscan.calibration.camera import (
     CameraCalibration,
     calibrate_camera,
@@ -17,7 +17,7 @@ from bodyscan.calibration.camera import (
 from bodyscan.calibration.joint_refinement import striped_board
 from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
 from bodyscan.calibration.light_sheets import fit_light_sheets
-from bodyscan.calibration.refinement_choice import refine_where_better
+from bodyscan.calibration.refinement_choice import REFINED_BINS, refine_where_better
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.captures import TARGET, ChapterCaptures
@@ -86,19 +86,21 @@ def _ours(
 ) -> tuple[Approach, Array, str, str]:
     """As `bodyscan calibrate-rig` does a pair by itself: the model of the light that held-out boards
     choose, and one solve for all where they gain by it."""
-    projector = TARGET.projector
-    data = bin_points(boards.points, boards.camera, projector.direction)
+    projector, board = TARGET.projector, TARGET.board
+    bins = bin_points(boards.points, boards.camera, projector.direction)
+    data = subsample(bins, REFINED_BINS)
     fit = fit_light_sheets(boards.points, projector.stripes, projector.direction, boards.camera)
     striped = [
-        striped_board(planar_view(shot.view, TARGET.board), boards.camera, data, number)
+        striped_board(planar_view(shot.view, board), boards.camera, data, number, board.name)
         for number, shot in enumerate(captures.boards)
     ]
-    refined = refine_where_better(reference, fit.sheets, striped, data)
-    if refined.joint is None:
+    flatness = {board.name: board.believed_flatness_mm}
+    refined = refine_where_better(reference, fit.sheets, striped, data, flatness)
+    if refined.fit is None:
         approach = Approach("ours", boards.camera, fit.sheets)
         return approach, reference.covariance, fit.model, refined.reason
-    approach = Approach("ours", refined.joint.camera, refined.joint.sheets)
-    return approach, refined.joint.camera_covariance, fit.model, refined.reason
+    approach = Approach("ours", refined.fit.camera, refined.fit.sheets)
+    return approach, refined.fit.camera_covariance, fit.model, refined.reason
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,121 @@
+"""The form of a board as unknowns: how its sheet is bent, and where its corners were printed.
+
+A sheet stands over its plane by a polynomial of second and third degree; its corners lie in it a
+little beside where they should.  Both are known beforehand to some extent, so what boards in few
+poses cannot show stays as uncertain as it was, and is part of every covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from bodyscan.arrays import Array, Indices
+
+# Of x and y; `_powers` has them in this order.
+POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+FALL = 0.3
+"""A coefficient of third degree is expected to be so many times as large as one of second."""
+DIGITS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class BoardForm:
+    """points: (N, 3) mm, the corners as the board is described.  heights: (7,) mm, coefficients of
+    POWERS, each less its own best plane; x and y are -1 and 1 at the outermost corners.
+    printed: (N, 2) mm, how far corners lie beside `points`.
+
+    flatness_mm, print_mm: standard deviations of what is bent and printed, before any image.
+    """
+
+    points: Array
+    heights: Array
+    printed: Array
+    flatness_mm: float
+    print_mm: float
+
+    @staticmethod
+    def flat(points: Array, flatness_mm: float, print_mm: float) -> BoardForm:
+        """As described, all corners (M, 3) of any views given."""
+        known = np.unique(np.round(points, DIGITS) + 0.0, axis=0)
+        return BoardForm(
+            known, np.zeros(len(POWERS)), np.zeros((len(known), 2)), flatness_mm, print_mm
+        )
+
+    @property
+    def count(self) -> int:
+        """How many unknowns there are: heights, then corners' x and y."""
+        return len(self.heights) + self.printed.size
+
+    @property
+    def prior_sigmas(self) -> Array:
+        """(count,) mm; 1 nm at least, so that a board said to be exact is."""
+        bent = [self.flatness_mm * (1.0 if sum(power) == 2 else FALL) for power in POWERS]
+        return np.maximum([*bent, *[self.print_mm] * self.printed.size], 1e-6)
+
+    @property
+    def exact(self) -> BoardForm:
+        """The same, known to be so."""
+        return replace(self, flatness_mm=0.0, print_mm=0.0)
+
+    @property
+    def unknowns(self) -> Array:
+        """(count,) mm."""
+        return np.concatenate([self.heights, self.printed.ravel()])
+
+    @property
+    def out_of_plane_mm(self) -> float:
+        """From the lowest to the highest corner."""
+        return float(np.ptp(self.basis(self.points[:, :2]) @ self.heights))
+
+    def moved(self, step: Array) -> BoardForm:
+        """With a step (count,) added."""
+        bent, printed = step[: len(POWERS)], step[len(POWERS) :]
+        return replace(
+            self, heights=self.heights + bent, printed=self.printed + printed.reshape(-1, 2)
+        )
+
+    def basis(self, places: Array) -> Array:
+        """(..., 7): how high each unit of `heights` lifts places (..., 2) mm of the board."""
+        powers, plane = self._powers(places)
+        return np.asarray(powers - plane @ self._planes, np.float64)
+
+    def height(self, places: Array) -> Array:
+        """(...) mm over the plane at places (..., 2) mm of the board."""
+        powers, plane = self._powers(places)
+        return np.asarray(powers @ self.heights - plane @ (self._planes @ self.heights), np.float64)
+
+    def numbers(self, points: Array) -> Indices:
+        """(M,) of corners (M, 3) among `points`."""
+        place = {key: k for k, key in enumerate(map(tuple, self.points.tolist()))}
+        rounded = np.round(points, DIGITS) + 0.0
+        return np.array([place[key] for key in map(tuple, rounded.tolist())], np.int64)
+
+    def applied(self, points: Array, numbers: Indices) -> Array:
+        """Corners (M, 3) as described -> where they lie."""
+        return np.column_stack(
+            [points[:, :2] + self.printed[numbers], points[:, 2] + self.height(points[:, :2])]
+        )
+
+    @cached_property
+    def _middle(self) -> Array:
+        return np.asarray((self.points.min(axis=0) + self.points.max(axis=0))[:2] / 2.0)
+
+    @cached_property
+    def _half(self) -> Array:
+        return np.asarray(np.ptp(self.points, axis=0)[:2] / 2.0)
+
+    @cached_property
+    def _planes(self) -> Array:
+        """(3, 7): the best plane of each power at the corners."""
+        powers, plane = self._powers(self.points[:, :2])
+        return np.asarray(np.linalg.lstsq(plane, powers, rcond=None)[0])
+
+    def _powers(self, places: Array) -> tuple[Array, Array]:
+        """(..., 7) POWERS and (..., 3) 1, x, y of places (..., 2) mm."""
+        x, y = np.moveaxis((places - self._middle) / self._half, -1, 0)
+        xx, yy = x * x, y * y
+        powers = np.stack([xx, x * y, yy, xx * x, xx * y, x * yy, yy * y], axis=-1)
+        return powers, np.stack([np.ones_like(x), x, y], axis=-1)

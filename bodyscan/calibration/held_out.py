@@ -1,0 +1,56 @@
+"""Whether a richer model shows boards that took no part better than a simpler one, by more than chance.
+
+With residuals r of the richer model and r + d of the simpler one the squares differ by d^2 + 2 r d:
+the first is what the models themselves differ by, the second what noise adds, whose standard error is
+seen in its sums over parts that err independently.  So lenses, models of the light, bent boards and
+joint solves are all chosen by differences at the same points, never by a ratio of noisy totals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.arrays import Array, Indices
+from bodyscan.geometry.robust import cauchy_weights, spread
+
+CLEARLY = 3.0
+"""Standard errors by which a richer model has to do better: by chance once in 700 times."""
+CAUCHY_SIGMAS = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """simple, rich: (N, D) residuals of the same points.  part: (N,) of several that err independently;
+    what errs together, as the corners of one board do, is in one."""
+
+    simple: Array
+    rich: Array
+    part: Indices
+
+
+def shared_weights(tried: Sequence[Array]) -> Array:
+    """(N,) of points with residuals (N, D) in each model: what no model explains counts for less."""
+    size = tried[0].shape[1]
+    least = np.min([np.sum(residuals**2, axis=1) for residuals in tried], axis=0)
+    sigma = min(spread(residuals.ravel()) for residuals in tried)
+    each = np.repeat(np.sqrt(least / size), size) / sigma
+    return np.asarray(cauchy_weights(each, size, CAUCHY_SIGMAS)[::size], np.float64)
+
+
+def gain(*compared: Compared) -> float:
+    """By how many standard errors the richer model lowers the squares of what is held out; of several
+    kinds of points each counts in its own spread."""
+    gained, squares = 0.0, 0.0
+    for one in compared:
+        per_square = shared_weights([one.simple, one.rich]) / _least_spread(one) ** 2
+        gained += float(np.sum(per_square * np.sum(one.simple**2 - one.rich**2, axis=1)))
+        crossed = per_square * np.sum(2.0 * one.rich * (one.simple - one.rich), axis=1)
+        squares += float(np.sum(np.bincount(one.part, crossed) ** 2))
+    return gained / max(float(np.sqrt(squares)), 1e-12)
+
+
+def _least_spread(one: Compared) -> float:
+    return min(spread(residuals.ravel()) for residuals in (one.simple, one.rich))

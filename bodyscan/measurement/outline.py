@@ -1,0 +1,84 @@
+"""A slice's outline where nobody measured it: cut where filled surface joins two limbs, and how long
+it may be.
+
+A web between arm and trunk is filled in front and behind. Cut there, with the trunk closed along
+itself, the outline is that of the trunk; as meshed it is that of trunk and arms together. Which of
+the two is nearer to the body was not seen: both are given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from bodyscan.arrays import Array
+from bodyscan.measurement.slices import Loop, Run, joined, runs_of
+
+SHORTEST_GAP_MM = 15.0
+"""A straight line across less, on a limb, is shorter than the limb's curve by less than 0.5 mm."""
+LIMB = 2.0 / np.pi
+"""Chord over arc of half a circle: a limb goes round by more, the trunk's own side by less."""
+INSIDE = 0.15
+"""of its width: how far inside a trunk the body's middle lies (y = 0)"""
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """loop: cut where filled surface joins limbs.  girth_range_mm, tape_range_mm: from closed
+    straight across all that was not measured, to as meshed.
+    """
+
+    loop: Loop
+    girth_range_mm: Range
+    tape_range_mm: Range
+
+
+def outline(loop: Loop) -> Outline:
+    """Of a loop of a slice, body frame."""
+    runs = runs_of(loop, SHORTEST_GAP_MM)
+    kept = _trunk_alone(loop, runs) if holds_middle(loop.segments[..., 1]) else runs
+    own = joined(loop, kept) if len(kept) < len(runs) else loop
+    known = joined(loop, [run for run in kept if run.measured] or kept)
+    girths = own.girth_mm, known.girth_mm, loop.girth_mm
+    tapes = own.tape_mm, known.tape_mm, loop.tape_mm
+    return Outline(own, (min(girths), max(girths)), (min(tapes), max(tapes)))
+
+
+def holds_middle(y: Array) -> bool:
+    """Whether an outline's points, y to the left, lie on both sides of the body's middle."""
+    low, high = float(y.min()), float(y.max())
+    return min(high, -low) > INSIDE * (high - low)
+
+
+def _trunk_alone(loop: Loop, runs: Sequence[Run]) -> Sequence[Run]:
+    """The runs of an outline without the limbs that two filled runs join to it."""
+    for trunk, limb in _in_two(runs):
+        if _on_both_sides(loop, trunk) and _is_limb(loop, limb):
+            return _trunk_alone(loop, trunk)
+    return runs
+
+
+def _in_two(runs: Sequence[Run]) -> Iterator[tuple[Sequence[Run], Sequence[Run]]]:
+    """Both ways round, every cut from one filled run to another; these belong to neither part."""
+    gaps = [k for k, run in enumerate(runs) if not run.measured]
+    for one, other in combinations(gaps, 2):
+        inner, outer = runs[one + 1 : other], [*runs[other + 1 :], *runs[:one]]
+        if inner and outer:
+            yield inner, outer
+            yield outer, inner
+
+
+def _is_limb(loop: Loop, runs: Sequence[Run]) -> bool:
+    """Whether it lies on one side of the middle, and goes round more than half way."""
+    arc = sum(loop.lengths[run.segments].sum() for run in runs)
+    across = loop.segments[runs[0].first, 0] - loop.segments[runs[-1].last, 1]
+    return bool(np.linalg.norm(across) < LIMB * arc) and not _on_both_sides(loop, runs)
+
+
+def _on_both_sides(loop: Loop, runs: Sequence[Run]) -> bool:
+    return holds_middle(loop.segments[np.concatenate([run.segments for run in runs]), :, 1])

@@ -1,0 +1,109 @@
+"""Each figure that the verdict goes by, on both sides of its limit, on a scan otherwise good."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_scan import MadeScan, make_scan
+
+from bodyscan.alignment.icp import Alignment, Overlap
+from bodyscan.fusion.scan_verdict import grade_scan
+from bodyscan.fusion.seams import Seam, SeamReport
+from bodyscan.rig.rig import Volume
+from bodyscan.settings import UseLimits
+from bodyscan.verdict import Verdict
+
+GROUPS = {"pair p1": frozenset(["p1"]), "pair p2": frozenset(["p2"])}
+NO_LIMITS = UseLimits(good_girth_mm=100.0, usable_girth_mm=200.0)
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> MadeScan:
+    return make_scan(tmp_path_factory.mktemp("scan"))
+
+
+def aligned(motion_mm: float = 0.1, rms_mm: float = 0.1, expected_mm: float = 0.1) -> Alignment:
+    overlap = Overlap("p1", "p2", 1000, rms_mm, rms_mm, expected_mm)
+    return Alignment({}, {"p1": motion_mm, "p2": 0.0}, {}, (overlap,))
+
+
+def graded(
+    scan: MadeScan,
+    alignment: Alignment | None = None,
+    step_mm: float | None = None,
+    untied: tuple[tuple[str, ...], ...] = (),
+    use: UseLimits = UseLimits(),  # noqa: B008  (frozen)
+    contradicted: float = 0.0,
+) -> Verdict:
+    seams = (Seam(("p1", "p2"), np.full(9, step_mm), np.zeros(9)),) if step_mm else ()
+    report = SeamReport(seams, GROUPS, untied)
+    volume = Volume()
+    return grade_scan(
+        scan.cloud, scan.mesh, alignment, {}, volume, use, report, contradicted=contradicted
+    )
+
+
+def test_this_scan_is_good(scan: MadeScan) -> None:
+    assert graded(scan, aligned()) == Verdict("good")
+
+
+@pytest.mark.parametrize(
+    ("motion_mm", "grade"), [(2.9, "good"), (3.1, "usable"), (5.9, "usable"), (6.1, "repeat")]
+)
+def test_how_far_the_person_moved(scan: MadeScan, motion_mm: float, grade: str) -> None:
+    verdict = graded(scan, aligned(motion_mm))
+    assert verdict.grade == grade
+    assert (f"the person moved by {motion_mm:.1f} mm (pair p1)" in str(verdict)) == (
+        grade != "good"
+    )
+
+
+def test_nothing_is_said_of_motion_that_nobody_saw(scan: MadeScan) -> None:
+    assert graded(scan, Alignment({}, {}, {}, ())).grade == "good"
+
+
+@pytest.mark.parametrize(
+    ("step_mm", "grade"), [(0.31, "good"), (0.33, "usable"), (0.63, "usable"), (0.65, "repeat")]
+)
+def test_a_step_counts_by_the_girth_it_costs(scan: MadeScan, step_mm: float, grade: str) -> None:
+    """2 and 4 mm of girth, over 2 pi."""
+    assert graded(scan, aligned(), step_mm).grade == grade
+
+
+def test_the_operator_says_what_is_good_enough(scan: MadeScan) -> None:
+    assert graded(scan, aligned(), 5.0, use=NO_LIMITS).grade == "good"
+
+
+def test_noise_that_sigmas_hold_is_no_reason_to_repeat(scan: MadeScan) -> None:
+    """A still person, a perfect calibration, 0.8 mm of noise in each of two pairs: 1.1 mm apart."""
+    assert graded(scan, aligned(rms_mm=1.13, expected_mm=1.13)).grade == "good"
+
+
+@pytest.mark.parametrize(
+    ("rms_mm", "expected_mm", "grade"),
+    [(0.39, 0.1, "good"), (0.41, 0.1, "usable"), (0.41, 0.21, "good"), (1.0, 0.49, "usable")],
+)
+def test_disagreement_beyond_sigmas_is_told(
+    scan: MadeScan, rms_mm: float, expected_mm: float, grade: str
+) -> None:
+    assert graded(scan, aligned(rms_mm=rms_mm, expected_mm=expected_mm)).grade == grade
+
+
+def test_pairs_that_nothing_ties_are_named(scan: MadeScan) -> None:
+    verdict = graded(scan, aligned(), untied=(("p3-1", "p3-2"),))
+    assert verdict.grade == "usable"
+    assert "nothing ties p3-1, p3-2 to the others" in str(verdict)
+
+
+@pytest.mark.parametrize(
+    ("share", "grade"), [(0.004, "good"), (0.006, "usable"), (0.049, "usable"), (0.051, "repeat")]
+)
+def test_pairs_that_see_through_each_other(scan: MadeScan, share: float, grade: str) -> None:
+    assert graded(scan, aligned(), contradicted=share).grade == grade
+
+
+def test_a_pair_that_does_not_fit_is_to_be_repeated(scan: MadeScan) -> None:
+    found = Alignment({}, {"p1": 0.1}, {"p2": 7.0}, ())
+    verdict = graded(scan, found)
+    assert verdict.grade == "repeat"
+    assert "pair p2 does not fit the others" in str(verdict)

@@ -1,0 +1,166 @@
+"""A pole that does not belong: moved, from another scan, of another person. No cloud, no mesh: range
+images at half size (a pixel is 1.4 mm), aligned and judged as `fuse` does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from ray_cast_scan import BODY, cast_scan, load_body, load_rig, nominal_placings
+
+from bodyscan.alignment.icp import Alignment, align
+from bodyscan.arrays import Array
+from bodyscan.fusion.cleaning import clean
+from bodyscan.fusion.seams import Seam, SeamReport, find_misfits, judge_seams
+from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.settings import AlignmentSettings
+
+RIG = load_rig()
+PLACED = nominal_placings(RIG)
+AXIS = RigidTransform(np.eye(3), np.array([0.0, 0.0, 900.0]))
+LIMIT_MM = 2.0 / (2.0 * np.pi)  # 2 mm of girth
+
+
+@pytest.fixture(scope="module")
+def woman() -> list[RangeImage]:
+    return cast_scan(load_body(subdivisions=1), RIG, scale=0.5, noise_mm=0.1).range_images
+
+
+@pytest.fixture(scope="module")
+def man() -> list[RangeImage]:
+    body = load_body(BODY.with_name("man_average.ply"), subdivisions=1)
+    return cast_scan(body, RIG, scale=0.5, noise_mm=0.1, seed=2).range_images
+
+
+def moved(pole: str, shift: Array, turn_deg: Array) -> dict[str, RigidTransform]:
+    by = AXIS @ RigidTransform.from_rotation_vector(np.radians(turn_deg), shift) @ AXIS.inverse()
+    return {name: by @ at if name.startswith(pole) else at for name, at in PLACED.items()}
+
+
+def judged(
+    images: list[RangeImage], placed: Mapping[str, RigidTransform] = PLACED
+) -> tuple[SeamReport, Alignment]:
+    sigmas = np.tile([2e-5] * 3 + [0.05] * 3, len(placed))
+    covariance = PoseCovariance(tuple(placed), np.diag(sigmas**2))
+    seen = [image for image in clean(images, dict(placed), RIG.volume) if image.valid.any()]
+    aligned = align(seen, placed, covariance, AlignmentSettings())
+    return judge_seams(seen, aligned.rig_from_camera, RIG.poles), aligned
+
+
+def said(report: SeamReport) -> dict[str, float]:
+    found = find_misfits(report.seams, report.groups, LIMIT_MM)
+    return {misfit.name: misfit.step_mm for misfit in found}
+
+
+def test_what_belongs_together_fits(woman: list[RangeImage]) -> None:
+    report, aligned = judged(woman)
+    assert not said(report)
+    assert not report.untied
+    # Pole 2 shares hardly more than rims with the others: they tie it.
+    assert set(aligned.motion_mm) == set(PLACED)
+
+
+def test_a_person_who_sways_still_fits(woman: list[RangeImage]) -> None:
+    rng = np.random.default_rng(4)
+    shifts = {name: rng.normal(0.0, 2.0, 3) for name in PLACED}
+    placed = {n: RigidTransform(t.rotation, t.translation + shifts[n]) for n, t in PLACED.items()}
+    report, _ = judged(woman, placed)
+    assert not said(report)
+
+
+def test_a_pole_off_by_little_is_brought_back(woman: list[RangeImage]) -> None:
+    """Its rims tie it, so that alignment finds the 2 mm, and no step is left."""
+    report, aligned = judged(woman, moved("p2", np.array([-2.0, 0.0, 0.0]), np.zeros(3)))
+    apart = [
+        aligned.rig_from_camera[name].translation - PLACED[name].translation
+        for name in ("p1-2", "p2-2", "p3-2")
+    ]
+    assert np.linalg.norm(np.ptp(apart, axis=0)) < 0.5
+    assert not said(report)
+
+
+@pytest.mark.parametrize("pole", ["p1", "p2"])
+@pytest.mark.parametrize(
+    ("shift", "turn_deg"),
+    [
+        ([25.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
+        ([0.0, 25.0, 0.0], [0.0, 0.0, 0.0]),
+        ([0.0, 0.0, 0.0], [0.0, 0.0, 4.0]),
+        ([0.0, 0.0, 0.0], [0.0, 0.0, 8.0]),
+        ([0.0, 0.0, 0.0], [4.0, 4.0, 0.0]),
+    ],
+)
+def test_a_pole_that_stands_wrong_is_named(
+    woman: list[RangeImage], pole: str, shift: list[float], turn_deg: list[float]
+) -> None:
+    """Farther than alignment reaches: it is moved by it, or it is named and nothing else is."""
+    report, aligned = judged(woman, moved(pole, np.array(shift), np.array(turn_deg)))
+    found = said(report)
+    if not found:
+        assert max(aligned.motion_mm.values()) > 6.0
+        return
+    (name, step) = next(iter(found.items()))
+    assert name == f"pole {pole}"
+    assert len(found) == 1
+    assert step > 1.0
+
+
+def test_the_step_grows_with_the_fault(woman: list[RangeImage]) -> None:
+    steps = [
+        said(judged(woman, moved("p2", np.array([-mm, 0.0, 0.0]), np.zeros(3)))[0])["pole p2"]
+        for mm in (15.0, 25.0, 40.0)
+    ]
+    # 60 degrees from the pole a shift outwards shows with half its size.
+    assert np.allclose(steps, [7.5, 12.5, 20.0], rtol=0.15)
+
+
+@pytest.mark.parametrize("pole", ["p1", "p2"])
+def test_another_person_is_told(woman: list[RangeImage], man: list[RangeImage], pole: str) -> None:
+    mixed = [m if w.pair.startswith(pole) else w for w, m in zip(woman, man, strict=True)]
+    found = said(judged(mixed)[0])
+    assert next(iter(found)) == f"pole {pole}"
+    assert found[f"pole {pole}"] > 2.0
+
+
+def test_what_shares_no_surface_is_not_tied(woman: list[RangeImage]) -> None:
+    """The lowest and the highest pair of two poles: legs and head, nothing between."""
+    two = {name: PLACED[name] for name in ("p1-1", "p2-4")}
+    images = [image for image in woman if image.pair in two]
+    report, aligned = judged(images, two)
+    assert len(report.untied) == 1
+    assert not aligned.motion_mm
+
+
+def seam(one: str, other: str, apart_mm: float, patches: int = 10, sigma_mm: float = 0.1) -> Seam:
+    return Seam((one, other), np.full(patches, apart_mm), np.full(patches, sigma_mm))
+
+
+SINGLE = {f"pair {name}": frozenset([name]) for name in ("a1", "a2", "b1", "b2", "c1", "c2")}
+POLES = SINGLE | {f"pole {p}": frozenset([f"{p}1", f"{p}2"]) for p in "abc"}
+
+
+def test_the_fewest_pairs_that_explain_the_steps_are_named() -> None:
+    fits = [
+        seam("a1", "a2", 0.0),
+        seam("b1", "b2", 0.0),
+        seam("c1", "c2", 0.0),
+        seam("b1", "c1", 0),
+    ]
+    pole = [*fits, seam("a1", "b1", 3.0), seam("a2", "c2", 2.0)]
+    (found,) = find_misfits(pole, POLES, LIMIT_MM)
+    assert found.name == "pole a"
+    assert found.step_mm == pytest.approx(3.0, abs=0.1)
+    one = [*fits, seam("a1", "b1", 0.0), seam("b2", "a1", 3.0), seam("b2", "c2", 3.0, 30)]
+    assert [misfit.name for misfit in find_misfits(one, POLES, LIMIT_MM)] == ["pair b2"]
+
+
+def test_noise_makes_no_step() -> None:
+    """Medians that scatter as their sigmas say; three times as far they do not."""
+    rng = np.random.default_rng(1)
+    apart = np.abs(rng.normal(0.0, 0.6, 400))
+    for sigma, steps in ((0.6, 0), (0.2, 1)):
+        seams = [Seam(("a1", "b1"), apart, np.full(400, sigma))]
+        assert len(find_misfits(seams, POLES, LIMIT_MM)) == steps

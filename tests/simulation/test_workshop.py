@@ -1,0 +1,132 @@
+"""Devices as people build them: what the preset `workshop` adds, one fault at a time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_view import CAMERA, CRISP, LAMPS, projector, view, wall
+
+from bodyscan.errors import BadInput
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.brown import Brown
+from bodyscan.rig.board import Board
+from bodyscan.simulation import SimulationSettings, settings_for
+from bodyscan.simulation.board import make_board
+from bodyscan.simulation.flicker import Brightness, draw_flicker
+from bodyscan.simulation.lens import TrueCamera
+from bodyscan.simulation.render import render_pair
+from bodyscan.simulation.scene import Scene
+from bodyscan.simulation.sensor import expose, fixed_pattern
+from bodyscan.simulation.settings import BoardMaking, Lighting, Noise, Pace
+
+DECENTRED = TrueCamera(
+    1510.0, 1512.0, -0.5, 645.0, 508.0, -0.1, 0.05, 1280, 1024, 4e-4, -3e-4, 0.01
+)
+
+
+def test_a_workshop_is_not_ideal_and_every_number_stays_free() -> None:
+    ideal, workshop = (settings_for("mirror", preset=name) for name in ("ideal", "workshop"))
+    assert ideal == SimulationSettings()
+    for part in ("optics", "projection", "lighting", "noise", "board"):
+        assert getattr(ideal, part) != getattr(workshop, part)
+    assert workshop.person == ideal.person
+    changed = settings_for("pinhole", preset="workshop", changes=["board.warp_mm=[0, 0]"])
+    assert changed.board.warp_mm == (0.0, 0.0)
+    assert changed.projection.gamma == 2.2
+    with pytest.raises(BadInput, match="no preset 'garage' to simulate"):
+        settings_for("mirror", preset="garage")
+
+
+def test_a_lens_off_centre_is_browns() -> None:
+    """Two independent writings of one formula, and its inverse."""
+    rng = np.random.default_rng(0)
+    points = np.append(rng.uniform([-0.4, -0.32], [0.4, 0.32], (200, 2)), np.ones((200, 1)), 1)
+    lens = Brown(-0.1, 0.05, 4e-4, -3e-4, 0.01)
+    camera = Camera(1510.0, 1512.0, -0.5, 645.0, 508.0, lens, 1280, 1024)
+    pixels = DECENTRED.image(points)
+    np.testing.assert_allclose(pixels, camera.project(points), atol=1e-9)
+    np.testing.assert_allclose(DECENTRED.directions(pixels), points, atol=1e-12)
+    straight = replace(DECENTRED, p1=0.0, p2=0.0, k3=0.0)
+    np.testing.assert_allclose(DECENTRED.image(points), straight.image(points), atol=3.0)
+    assert np.abs(DECENTRED.image(points) - straight.image(points)).max() > 0.3
+
+
+def test_a_lens_off_centre_that_folds_is_refused() -> None:
+    folding = replace(DECENTRED, k1=-3.0, k2=0.0)
+    with pytest.raises(ValueError, match="folds"):
+        folding.directions(folding.grid())
+
+
+def test_boards_are_bent_and_twisted_by_what_is_asked() -> None:
+    board = Board(name="b", columns=12, rows=9, square_mm=60.0)
+    sizes = []
+    for seed in range(30):
+        making = BoardMaking(warp_mm=(0.1, 1.0))
+        made = make_board(board, making, np.random.default_rng(seed))
+        front = made.surfaces[0].vertices
+        sizes.append(np.ptp(front[:, 2]))
+        assert np.ptp(made.corners[:, 2]) <= sizes[-1]
+        # A sheet of second order: what a plane and its bends do not explain is nothing.
+        x, y, z = (front - front.mean(axis=0)).T
+        terms = np.stack([x, y, x * x, x * y, y * y, np.ones_like(x)], axis=1)
+        assert np.abs(z - terms @ np.linalg.lstsq(terms, z, rcond=None)[0]).max() < 1e-9
+    assert 0.1 <= min(sizes) < 0.2
+    assert 0.6 < max(sizes) <= 1.0001
+    flat = make_board(board, BoardMaking(), np.random.default_rng(0))
+    assert np.ptp(flat.surfaces[0].vertices[:, 2]) == 0.0
+
+
+def test_pixels_are_their_own_in_every_image() -> None:
+    noise = Noise(pixel_gain=0.02, pixel_grey=0.5, read_grey=0.01, photons=1e6)
+    fixed = fixed_pattern(CAMERA, noise, np.random.default_rng(0))
+    assert fixed is not None
+    grey = np.full((CAMERA.height, CAMERA.width), 100.0, np.float32)
+    first, second = (
+        expose(grey, noise, np.random.default_rng(k), fixed).astype(float) for k in (1, 2)
+    )
+    assert np.mean(first != second) < 0.1  # they differ where noise tips the rounding
+    assert first.std() == pytest.approx(np.hypot(100 * 0.02, 0.5), rel=0.05)
+    assert fixed_pattern(CAMERA, Noise(), np.random.default_rng(0)) is None
+
+
+def test_lamps_on_mains_beat_with_the_frames() -> None:
+    names = [f"f{k}" for k in range(24)]
+    lamps = replace(
+        SimulationSettings(), lighting=Lighting(mains_hz=100.0, mains_depth=0.5),
+        pace=Pace(frame_ms=1000.0 / 120.0),
+    )  # fmt: skip
+    drawn = draw_flicker(names, lamps, np.random.default_rng(0))
+    room = np.array([drawn[name].room for name in names])
+    # 100 Hz in frames of 1/120 s: six frames a beat; a frame sees sin(x) / x of the depth.
+    np.testing.assert_allclose(room[:18], room[6:], atol=1e-9)
+    seen = 0.5 * np.sin(np.pi * 100 / 120) / (np.pi * 100 / 120)
+    assert np.ptp(room) == pytest.approx(2.0 * seen, rel=0.15)
+    synchronous = replace(lamps, pace=Pace(frame_ms=10.0))
+    drawn = draw_flicker(names, synchronous, np.random.default_rng(0))
+    assert max(abs(one.room - 1.0) for one in drawn.values()) < 1e-12  # whole pulses
+    assert draw_flicker(names, SimulationSettings(), np.random.default_rng(0)) == {}
+
+
+def test_flicker_changes_one_frames_light_and_a_window_adds_its_own() -> None:
+    scene, rays, source = Scene([wall(900.0, albedo=0.5)]), view(), projector()
+
+    def rendered(**more: object) -> dict[str, np.ndarray]:
+        rng = np.random.default_rng(0)
+        return render_pair(scene, rays, source, LAMPS, CRISP, rng, **more)  # type: ignore[arg-type]
+
+    plain = rendered()
+    flickered = rendered(flicker={"bit01": Brightness(laser=1.1, room=0.5)})
+    laser = plain["bit01"] - plain["dark"]
+    np.testing.assert_allclose(
+        flickered["bit01"], 1.1 * laser + 0.5 * plain["dark"], rtol=1e-5, atol=1e-4
+    )
+    np.testing.assert_array_equal(flickered["bit02"], plain["bit02"])
+    facing = replace(LAMPS, window_grey=20.0, window_way=(0.0, 0.0, -1.0))
+    aside = replace(LAMPS, window_grey=20.0, window_way=(1.0, 0.0, 0.0))
+    for lamps, share in ((facing, 1.0), (aside, 0.5)):
+        lit = render_pair(scene, rays, source, lamps, CRISP, np.random.default_rng(0))
+        # The wall reflects half, and a window half round the side shines half as bright.
+        more = lit["dark"] - plain["dark"]
+        np.testing.assert_allclose(more, 0.5 * 20.0 * share, rtol=1e-4)
