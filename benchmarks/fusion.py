@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import full_size
+from bodyscan.arrays import Array, Indices
 from bodyscan.memory import keep_freed_memory
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.settings import ScanSettings
@@ -374,10 +375,21 @@ def multiway(seen: Any, placed: Any, voxel_mm: float) -> Any:
     return merged.voxel_down_sample(voxel_mm)
 
 
+def poisson(points: Array, normals: Array, depth: int) -> tuple[Array, Indices]:
+    """Vertices and faces of Open3D's screened Poisson surface (Kazhdan and Hoppe 2013), in one
+    thread: more would add up in another order each time."""
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.normals = o3d.utility.Vector3dVector(normals)
+    surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+        cloud, depth=depth, n_threads=1
+    )
+    return np.asarray(surface.vertices), np.asarray(surface.triangles).astype(np.int64)
+
+
 def _open3d_poisson(depth: int) -> Callable[[Path, Path], Step]:
     def step(workspace: Path, folder: Path) -> Step:
-        from bodyscan.fusion.meshing import poisson
-
         points, normals = _kept(folder / "voxels")
         return lambda: poisson(points, normals, depth), lambda mesh: _near(workspace, points, *mesh)
 

@@ -93,11 +93,16 @@ class MeshSettings(Model):
     """How a cloud becomes a closed mesh (`fusion.meshing`)."""
 
     depth: int = Field(default=9, ge=5, le=12)
-    """of the octree; one more halves the cells, which are 3.5 mm at 9 for a standing person."""
+    """of the grid that the surface is found on; one more halves its cells, which are 3.6 mm at 9."""
 
     reach_mm: Millimetres = 4.0
     """mm; points within this have a say about a vertex, without any it was measured by nobody: about
     a cell at depth 9; with another depth scale it alike."""
+
+    @property
+    def cell_mm(self) -> float:
+        """mm from node to node of the grid: a quarter of a finger at depth 9."""
+        return 3.6 * 2.0 ** (9 - self.depth)
 
 
 class UseLimits(Model):

@@ -2,6 +2,7 @@
 
 Read in this order: scan (all of it), cleaning (what is not the subject goes), merging (smoothing,
 with quadratics and robust_windows; thinning; comparing; brightness; averaging), pose_variance (what
-the rig adds to each point's sigma), meshing (carving, with free_space; support), scan_verdict (is it
+the rig adds to each point's sigma), meshing (signed_distances, hole_filling
+with harmonic_filling and free_space, support with point_columns), scan_verdict (is it
 good), storage.
 """

@@ -9,12 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
+from bodyscan.fusion.point_columns import PointColumns
 from bodyscan.mesh.body import BodyCloud
-from bodyscan.progress import THREADS
 
 NEIGHBOURS = 8
 # Shares of the reach: 2, 1 and 0.5 mm of 4.
@@ -22,6 +21,7 @@ RANGE = 0.5
 LIFTED = 0.25
 TORN = 0.125
 LEAST_WEIGHT = 0.3  # of a point right at the vertex: one point is 3 mm away
+LEAST_SHARE = 1 / 6  # of what the middle vertex has: at a straight rim it is a half
 
 STEEPEST_TURN = 0.3  # cosine of the angle by which a face may turn
 
@@ -31,7 +31,8 @@ class Support:
     """Of V vertices by the points within a reach.
 
     nearest: (V,) the nearest point.  sigma_mm: (V,) its standard deviation.
-    weight: (V,) of the nearest points together, 1 for one at the vertex itself, 0 if there is none.
+    weight: (V,) of the nearest points together, 1 for one at the vertex itself that faces as it does,
+    0 if there is none.
     shift_mm: (V,) from the vertex along its normal to where those points' tangent planes lie on the
     average.  spread_mm: (V,) RMS of the planes about that average.
     """
@@ -47,26 +48,24 @@ class Support:
     def measured(self) -> Mask:
         """(V,) whether a vertex lies where the points say, and these agree.
 
-        Not beyond the rim of what was seen (too little weight), not where Poisson's smoothness
-        lifts the surface off the points (fingertips), not where points of different surfaces meet
-        (between toes, at the corner of an eye).
+        Not beyond the rim of what was seen (too little weight), not where the grid's cells lift the
+        surface off the points (fingertips), not where points of different surfaces meet (between
+        toes, at the corner of an eye).
         """
         lifted = np.abs(self.shift_mm) > np.maximum(LIFTED * self.reach_mm, 4.0 * self.sigma_mm)
         torn = self.spread_mm > np.maximum(TORN * self.reach_mm, 2.0 * self.sigma_mm)
-        return np.asarray((self.weight > LEAST_WEIGHT) & ~lifted & ~torn)
+        enough = max(LEAST_WEIGHT, LEAST_SHARE * float(np.median(self.weight)))
+        return np.asarray((self.weight > enough) & ~lifted & ~torn)
 
 
-def support(
-    vertices: Array, normals: Floats, cloud: BodyCloud, tree: cKDTree, reach_mm: float
-) -> Support:
-    """Of vertices (V, 3) with unit normals (V, 3) by a cloud, whose points the tree holds."""
-    found = tree.query(vertices, NEIGHBOURS, distance_upper_bound=reach_mm, workers=THREADS)
-    distance, near = (np.asarray(part) for part in found)
+def support(vertices: Array, normals: Floats, cloud: BodyCloud, reach_mm: float) -> Support:
+    """Of vertices (V, 3) with unit normals (V, 3) by a cloud."""
+    distance, near = PointColumns.of(cloud.points, reach_mm).nearest(vertices, NEIGHBOURS)
     weight, shift, spread = _average_planes(
         np.ascontiguousarray(vertices),
         np.ascontiguousarray(normals),
         distance,
-        near.astype(np.int64),
+        near,
         cloud.points,
         cloud.normals,
         RANGE * reach_mm,
@@ -131,14 +130,14 @@ def _average_planes(
             one = np.exp(-0.5 * (distance[v, known] / scale_mm) ** 2)
             planes[known], weights[known] = plane, one
             facing = one * max(alike, 0.0) ** 2
-            total += facing
+            total += one
             mean += facing * plane
-            weight[v] += one
+            weight[v] += facing
             known += 1
-        if total > 0.0:
-            shift[v] = mean / total
+        if weight[v] > 0.0:
+            shift[v] = mean / weight[v]
         for j in range(known):
             spread[v] += weights[j] * (planes[j] - shift[v]) ** 2
         if known > 0:
-            spread[v] = np.sqrt(spread[v] / weight[v])
+            spread[v] = np.sqrt(spread[v] / total)
     return weight, shift, spread

@@ -91,15 +91,17 @@ def refine_to_tolerance(
     full = NearestSurface(full_vertices, full_faces)
     places, distance, _ = full.nearest(vertices)
     vertices = np.where((distance > limit_mm)[:, None], places, vertices)
-    concerned, targets = np.ones(len(faces), bool), full_vertices
+    concerned, again = np.ones(len(faces), bool), np.arange(len(full_vertices))
+    distance, face = np.empty(len(full_vertices)), np.empty(len(full_vertices), np.int64)
     for _ in range(ROUNDS):
-        _, distance, face = NearestSurface(vertices, faces).nearest(targets)
+        surface = NearestSurface(vertices, faces)
+        _, distance[again], face[again] = surface.nearest(full_vertices[again])
         stray = _strays(vertices, faces, concerned, full, limit_mm)
         edges, across = _longest_edges(vertices, faces, stray)
         start, end = (faces.ravel()[edges], np.roll(faces, -1, axis=1).ravel()[edges])
         middles = full.nearest(0.5 * (vertices[start] + vertices[end]))[0]
         far, missed = _farthest(distance, face, len(faces), limit_mm)
-        stray[across // 3] = True
+        stray[edges // 3] = stray[across // 3] = True
         alone = ~stray[missed]
         far, missed = far[alone], missed[alone]
         stray[missed] = True
@@ -110,8 +112,8 @@ def refine_to_tolerance(
         concerned = np.concatenate([stray, np.ones(added, bool)])
         faces = _split_edges(faces, edges, across, len(vertices))
         faces = _split_faces(faces, missed, len(vertices) + len(edges))
-        vertices = np.concatenate([vertices, middles, targets[far]])
-        targets = targets[stray[face]]
+        vertices = np.concatenate([vertices, middles, full_vertices[far]])
+        again = np.flatnonzero(stray[face])
     return vertices, faces
 
 

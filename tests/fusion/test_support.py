@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 import pytest
-from scipy.spatial import cKDTree
 
 from bodyscan.fusion.support import Support, fit_to_points, support
 from bodyscan.mesh.body import BodyCloud
@@ -36,7 +35,7 @@ def asked(cloud: BodyCloud, vertices: list[list[float]]) -> Support:
     """Vertices that look up."""
     places = np.array(vertices, float)
     normals = np.broadcast_to(UP, places.shape).astype(np.float32)
-    return support(places, normals, cloud, cKDTree(cloud.points), REACH_MM)
+    return support(places, normals, cloud, REACH_MM)
 
 
 def test_a_vertex_over_a_plane_knows_how_far() -> None:
@@ -110,7 +109,7 @@ def test_a_surface_settles_on_its_points() -> None:
     cloud = cloud_of(50.0 * ways, ways)
     bumpy = vertices * (1.0 + 0.01 * np.sin(vertices[:, :1] / 3.0))
     normals = vertex_normals(bumpy, faces)
-    around = support(bumpy, normals, cloud, cKDTree(cloud.points), REACH_MM)
+    around = support(bumpy, normals, cloud, REACH_MM)
     moved = fit_to_points(bumpy, faces, normals, around)
     off = np.abs(np.linalg.norm(bumpy, axis=1) - 50.0).max()
     assert off > 0.4
