@@ -15,6 +15,7 @@ from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.pose_variance import add_pose_variance
 from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.seams import judge_seams
+from bodyscan.fusion.surface_check import check_surface
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.outcome import Outcome
@@ -81,6 +82,7 @@ def fuse(
         surface = mesh(cloud, settings.mesh, images, placing)
     with step(progress, "judging"):
         seams = judge_seams(seen, there, calibration.rig.poles)
+        held = check_surface(surface, cleaned, placing)
     points = {image.pair: int(image.valid.sum()) for image in cleaned}
     failed = dict(measured.failures)
     verdict = grade_scan(
@@ -91,6 +93,7 @@ def fuse(
         calibration.rig.volume,
         settings.use,
         seams,
+        held,
         fused.contradicted,
         unjudged=[name for name, pair in calibration.pairs.items() if pair.quality.unjudged],
         cameras=np.array([at.translation for at in calibration.rig_from_camera.values()]),

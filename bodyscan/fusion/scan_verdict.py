@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 from bodyscan.alignment.icp import Alignment
 from bodyscan.arrays import Array
 from bodyscan.fusion.seams import SeamReport, find_misfits
+from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.rings import rings
-from bodyscan.mesh.topology import face_areas
 from bodyscan.optional import optional
 from bodyscan.reconstruction.two_ways import Agreement
 from bodyscan.rig.rig import Volume
@@ -40,6 +40,10 @@ SOLES_MM = 50.0
 ONE_SIDE = 0.7
 """Cosine to the cameras' mean direction: within 45 degrees of it all of them see the same half."""
 UNKNOWN_BAND = 0.5
+SOME_SATURATED = 0.05
+"""of the skin: highlights on nose and forehead are less"""
+LEAST_YIELD = 0.6
+"""of the skin: shadows of arms and chin leave 0.85 and more"""
 
 
 def grade_scan(
@@ -50,13 +54,14 @@ def grade_scan(
     volume: Volume,
     use: UseLimits,
     seams: SeamReport | None = None,
+    surface: SurfaceCheck | None = None,
     contradicted: float = 0.0,
     unjudged: Sequence[str] = (),
     cameras: Array | None = None,
     agreements: Mapping[str, Agreement] | None = None,
 ) -> Verdict:
     """The worst of all findings decides; the reasons come worst first. use: how wrong a girth may
-    be. seams: see `judge_seams`. contradicted: see `merge`.
+    be. seams: see `judge_seams`. surface: see `check_surface`. contradicted: see `merge`.
 
     unjudged: pairs whose calibration was imported and says nothing of how exact it is.
     cameras: (N, 3) where those of the whole rig stand; None for all round.  What none of them could
@@ -78,7 +83,8 @@ def grade_scan(
         "cuts": lambda: _cuts(cloud, volume),
         "omissions": lambda: _omissions(cloud, mesh),
         "contacts": lambda: _contacts(mesh),
-        "gaps": lambda: _other_side(mesh) if _see_one_side(cloud, cameras) else _gaps(mesh),
+        "yields": lambda: _yields(surface),
+        "gaps": lambda: _other_side(mesh) if _see_one_side(cloud, cameras) else _gaps(surface),
     }
     findings: list[Finding] = []
     failures: list[str] = []
@@ -251,18 +257,40 @@ def _other_side(mesh: BodyMesh) -> Iterator[Finding]:
     )
 
 
-def _gaps(mesh: BodyMesh) -> Iterator[Finding]:
+def _yields(surface: SurfaceCheck | None) -> Iterator[Finding]:
+    """Pairs that gave less than they looked at: what others measured beside them shows it."""
+    if surface is None:
+        return
+    for name, share in surface.saturated.items():
+        if share > SOME_SATURATED:
+            yield (
+                "usable",
+                f"pair {name} is overexposed: {share:.0%} of the skin that it looks at is white in its "
+                "lit image; shorten its exposure or dim its projector",
+            )
+    for name, share in surface.yields.items():
+        if share < LEAST_YIELD and surface.saturated[name] <= SOME_SATURATED:
+            yield (
+                "usable",
+                f"pair {name} measured {share:.0%} of the skin that it looks at and others measured: "
+                "is it too dark, out of focus, in the wrong place or upside down, is something before "
+                "it?",
+            )
+
+
+def _gaps(surface: SurfaceCheck | None) -> Iterator[Finding]:
     """The made-up share of all, and of each height."""
-    area = face_areas(mesh.vertices, mesh.faces)
-    filled = mesh.filled_share
+    if surface is None:
+        return
+    filled = surface.filled_share
     if filled > SOME_FILLED:
         yield (
             "repeat" if filled > MOST_FILLED else "usable",
             f"{filled:.0%} of the surface is filled: nothing was measured there",
         )
-    height = mesh.vertices[mesh.faces, 2].mean(axis=1)
-    band = np.maximum(height / BAND_MM, 0.0).astype(np.int64)
-    share = np.bincount(band, area * mesh.filled) / np.maximum(np.bincount(band, area), 1e-9)
+    area = surface.areas_mm2
+    band = np.maximum(surface.heights_mm / BAND_MM, 0.0).astype(np.int64)
+    share = np.bincount(band, area * surface.filled) / np.maximum(np.bincount(band, area), 1e-9)
     unknown = (share > UNKNOWN_BAND) & (BAND_MM * np.arange(len(share)) >= SOLES_MM)
     starts = np.flatnonzero(unknown & ~np.roll(unknown, 1))
     ends = np.flatnonzero(unknown & ~np.roll(unknown, -1)) + 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import open3d as o3d
@@ -80,6 +81,7 @@ def fused(
     failed: dict[str, str] | None = None,
     volume: Volume = RIG.volume,
     empty: Sequence[RangeImage] = (),
+    settings: ScanSettings = SETTINGS,
 ) -> Scan:
     """What `bodyscan scan` makes of range images, with a calibration good to 0.05 mm."""
     placed = placed or placings()
@@ -87,7 +89,7 @@ def fused(
     covariance = PoseCovariance(tuple(placed), np.diag(sigmas**2))
     rig = RIG.model_copy(update={"volume": volume})
     calibration = RigCalibration(rig, {}, placed, covariance, {}, {}, ())
-    return fuse(calibration, Outcome(images, failures=failed or {}), SETTINGS, empty=empty)
+    return fuse(calibration, Outcome(images, failures=failed or {}), settings, empty=empty)
 
 
 def said(scan: Scan) -> str:
@@ -223,3 +225,32 @@ def test_alignment_takes_no_part_if_not_wanted(images: list[RangeImage]) -> None
     scan = fuse(calibration, Outcome(images), boards_alone)
     assert scan.alignment is None
     assert scan.verdict.grade == "good"
+
+
+@pytest.mark.parametrize("points", [5_000, 66_000])
+def test_how_much_is_filled_does_not_depend_on_the_points_asked_for(
+    images: list[RangeImage], points: int
+) -> None:
+    """5,000 points lie 20 mm apart: by them next to nothing of the mesh was measured."""
+    settings = SETTINGS.model_copy(update={"fusion": FusionSettings(points=points)})
+    scan = fused(images, settings=settings)
+    assert scan.verdict.grade == "good", said(scan)
+
+
+def test_a_pair_that_gives_less_than_it_looks_at_is_named(images: list[RangeImage]) -> None:
+    """Half of its picture is dark; white where it was overexposed."""
+    rng = np.random.default_rng(2)
+    for white, words in ((False, "pair p1-2 measured"), (True, "pair p1-2 is overexposed")):
+        scan = fused([_half(image, rng, white) for image in images])
+        assert scan.verdict.grade == "usable"
+        assert words in said(scan)
+        assert "p1-3" not in said(scan)
+
+
+def _half(image: RangeImage, rng: np.random.Generator, white: bool) -> RangeImage:
+    if image.pair != "p1-2":
+        return image
+    gone = np.kron(rng.random((16, 20)) < 0.5, np.ones((16, 16))) > 0
+    sigma = np.where(gone, np.float32(np.nan), image.sigma_mm)
+    grey = np.where(gone & white, np.uint8(255), image.colours).astype(np.uint8)
+    return replace(image, sigma_mm=sigma, colours=grey)

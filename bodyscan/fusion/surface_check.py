@@ -1,0 +1,94 @@
+"""The mesh held against the range images: what of it was measured, and what each pair should have seen.
+
+The cloud is thinned to as many points as were asked for; what was measured does not depend on that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.arrays import Array, Mask
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.topology import face_areas
+from bodyscan.reconstruction.range_image import RangeImage
+
+SPOTS = 20_000
+REACH_MM = 10.0
+"""A mesh of few points strays from what was measured by that; webs and soles lie farther off."""
+FACING = 0.5
+"""Cosine from which on a camera that looks at skin should measure it, 60 degrees."""
+FEWEST_SPOTS = 50
+WHITE = 254
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceCheck:
+    """Some faces: heights (N,) mm, areas (N,) mm2 they stand for, and whether nobody measured them.
+
+    yields: of each pair, the share of what others measured, and what it looks at, that it measured
+    something of; pairs that look at next to nothing are left out.  saturated: of each pair, the share
+    of what it measured, or looked at in vain, that is white in its lit image.
+    """
+
+    heights_mm: Array
+    areas_mm2: Array
+    filled: Mask
+    yields: Mapping[str, float]
+    saturated: Mapping[str, float]
+
+    @property
+    def filled_share(self) -> float:
+        return float(self.areas_mm2[self.filled].sum() / max(self.areas_mm2.sum(), 1e-12))
+
+
+def check_surface(
+    mesh: BodyMesh, images: Sequence[RangeImage], rig_from_camera: Mapping[str, RigidTransform]
+) -> SurfaceCheck:
+    """images: cleaned, of all pairs that gave some."""
+    some = slice(None, None, max(1, len(mesh.faces) // SPOTS))
+    corners = mesh.vertices[mesh.faces[some]]
+    places = corners.mean(axis=1)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    looks = [_Look.at(places, normals, image, rig_from_camera[image.pair]) for image in images]
+    count = np.sum([look.measured for look in looks], axis=0)
+    yields, saturated = {}, {}
+    for image, look in zip(images, looks, strict=True):
+        # What this pair alone says of itself is no witness.
+        asked = look.faces & (count - look.measured > 0)
+        if np.count_nonzero(asked) >= FEWEST_SPOTS:
+            yields[image.pair] = float(np.mean(look.shown[asked]))
+            saturated[image.pair] = float(np.mean(look.white[asked]))
+    areas = face_areas(mesh.vertices, mesh.faces)[some]
+    return SurfaceCheck(places[:, 2], areas, count == 0, yields, saturated)
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """One camera at N spots: which face it inside its picture, at which it measured something, at
+    which it measured the spot itself, and which are white."""
+
+    faces: Mask
+    shown: Mask
+    measured: Mask
+    white: Mask
+
+    @staticmethod
+    def at(places: Array, normals: Array, image: RangeImage, at: RigidTransform) -> _Look:
+        camera_from_rig = at.inverse()
+        seen, turned = camera_from_rig.apply(places), camera_from_rig.rotate(normals)
+        ahead = seen[:, 2] > 1.0
+        u, v = image.camera.project(np.where(ahead[:, None], seen, 1.0)).T
+        inside = ahead & (u > -0.5) & (v > -0.5)
+        inside &= (u < image.camera.width - 0.5) & (v < image.camera.height - 0.5)
+        column = np.where(inside, np.rint(u), 0).astype(np.intp)
+        row = np.where(inside, np.rint(v), 0).astype(np.intp)
+        facing = -np.sum(seen * turned, axis=1) > FACING * np.linalg.norm(seen, axis=1)
+        shown = inside & image.valid[row, column]
+        apart = np.abs(np.sum((image.points[row, column] - seen) * turned, axis=1))
+        white = inside & (image.colours[row, column] >= WHITE)
+        return _Look(inside & facing, shown, shown & (apart < REACH_MM), white)
