@@ -20,6 +20,7 @@ from pathlib import Path
 from benchmarks import (
     charuco_ring,
     codes,
+    faults,
     full_size,
     fusion,
     lens,
@@ -38,6 +39,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "four-pole": full_size.four_pole,
     "sway": full_size.sway,
     "fusion": fusion.report,
+    "faults": faults.report,
     "seconds": seconds.report,
     "png": png.report,
     "rig": rig.report,
