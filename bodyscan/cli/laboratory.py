@@ -195,13 +195,20 @@ def reproduce(
     quick: Annotated[
         bool, typer.Option("--quick", help="Render coarsely, with fewer shots.")
     ] = False,
+    boards: Annotated[
+        int, typer.Option(min=3, max=10, help="Poses of the board; the chapter has three.")
+    ] = 3,
 ) -> None:
     """Simulate the chapter's own set-up: its Tables 1 and 2, its Fig. 6 and 7, and all rivals."""
-    from bodyscan.laboratory.reproduce import FIGURES, TEXT
+    from bodyscan.laboratory.chapter.text import figure_names, text_name
     from bodyscan.laboratory.reproduce import reproduce as run
 
     require_writable(out)
     with output.stages() as progress:
-        text = run(out, seed=seed, quick=quick, real_light=real_light, progress=progress)
+        text = run(
+            out, seed=seed, quick=quick, real_light=real_light, boards=boards, progress=progress
+        )
     output.say(*text.splitlines())
-    output.made("written", *(out / name for name in (TEXT, *FIGURES)))
+    output.made(
+        "written", *(out / name for name in (text_name(real_light), *figure_names(real_light)))
+    )

@@ -21,7 +21,12 @@ from bodyscan.laboratory.chapter.measuring import (
     true_approach,
 )
 from bodyscan.laboratory.chapter.point_sigma import point_sigma
-from bodyscan.laboratory.chapter.text import Reproduction, reproduction_text
+from bodyscan.laboratory.chapter.text import (
+    Reproduction,
+    figure_names,
+    reproduction_text,
+    text_name,
+)
 from bodyscan.laboratory.rivals.approaches import Approach
 from bodyscan.progress import Progress, silent
 from bodyscan.reconstruction.triangulation import grid_normals
@@ -32,8 +37,6 @@ if TYPE_CHECKING:
 
 SEEDS, STAGE_STOPS, SAMPLES = 250, 7, 5
 QUICK_SEEDS, QUICK_STAGE_STOPS, QUICK_SAMPLES = 5, 3, 3
-FIGURES = ("fig6-projector.png", "fig7-range-data.png")
-TEXT = "reproduction.md"
 
 
 def reproduce(
@@ -42,25 +45,27 @@ def reproduce(
     seed: int = 0,
     quick: bool = False,
     real_light: bool = False,
+    boards: int = apparatus.BOARDS,
     progress: Progress = silent,
 ) -> str:
     """Simulate, calibrate every approach, measure; the text that is also written into `out`,
     beside the figures.
 
     seed: of all noise.  quick: coarser rendering and fewer shots, to try it out.  real_light: a
-    bowed board, speckle and all else that an ideal simulation leaves out.
+    bowed board, speckle and all else that an ideal simulation leaves out.  boards: poses of the board,
+    3 as in the chapter to 10.
     """
     settings = (apparatus.real_settings if real_light else apparatus.ideal_settings)(
         QUICK_SAMPLES if quick else SAMPLES
     )
     setup = apparatus.chapter_setup(settings, seed)
     stops = QUICK_STAGE_STOPS if quick else STAGE_STOPS
-    captures = take_captures(setup, stage_stops=stops, progress=progress)
+    captures = take_captures(setup, boards=boards, stage_stops=stops, progress=progress)
     calibrated = calibrate_all(captures)
     found = _measure_all(captures, calibrated, seed, quick, real_light, progress)
     text = reproduction_text(found)
-    draw(captures, calibrated, Path(out))
-    write_text(Path(out) / TEXT, text)
+    draw(captures, calibrated, Path(out), figure_names(real_light))
+    write_text(Path(out) / text_name(real_light), text)
     return text
 
 
@@ -91,6 +96,7 @@ def _measure_all(
     return Reproduction(
         seed=seed,
         real_light=real_light,
+        boards=len(captures.boards),
         calibrated=calibrated,
         trial=sigma_trial(QUICK_SEEDS if quick else SEEDS, seed),
         whole=results[0],
@@ -103,8 +109,10 @@ def _measure_all(
     )
 
 
-def draw(captures: ChapterCaptures, calibrated: Calibrations, out: Path) -> None:
-    """Fig. 6 and Fig. 7 into the folder `out`."""
+def draw(
+    captures: ChapterCaptures, calibrated: Calibrations, out: Path, names: tuple[str, str]
+) -> None:
+    """Fig. 6 and Fig. 7 into the folder `out`, in files of these names."""
     # Matplotlib takes a second to import: only whoever draws waits for it.
     from bodyscan.laboratory.figures import PlaneCurve, draw_projector, draw_range_data
 
@@ -121,10 +129,10 @@ def draw(captures: ChapterCaptures, calibrated: Calibrations, out: Path) -> None
         true,
         distances[np.isfinite(distances)],
         apparatus.PROJECTOR.direction,
-        out / FIGURES[0],
+        out / names[0],
     )
     wanted = [by_name[name] for name in ("(i)", "(ii)", "(iii)", "ours")]
-    draw_range_data([_range_data(approach, captures) for approach in wanted], out / FIGURES[1])
+    draw_range_data([_range_data(approach, captures) for approach in wanted], out / names[1])
 
 
 def _range_data(approach: Approach, captures: ChapterCaptures) -> RangeData:

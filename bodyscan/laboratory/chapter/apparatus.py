@@ -41,6 +41,26 @@ SWEPT_MM = (375.0, 400.0, 430.0)
 """The stripes cover the picture at these distances, and no more."""
 BOARD_TURNS = ((0.0, 0.45, 0.02), (0.42, -0.1, -0.03), (-0.3, -0.38, 0.02))
 BOARD_MIDDLES = ((-11.0, -17.0, 400.0), (-11.0, -17.0, 405.0), (-11.0, -17.0, 400.0))
+MORE_TURNS = (
+    (0.35, 0.3, 0.1),
+    (-0.4, 0.25, -0.2),
+    (0.1, -0.5, 0.4),
+    (-0.1, 0.55, -0.35),
+    (0.5, -0.35, 0.15),
+    (0.0, 0.05, 0.8),
+    (-0.25, -0.2, -0.6),
+)
+"""Of further boards, where three are not thought enough."""
+MORE_MIDDLES = (
+    (-20.0, -10.0, 380.0),
+    (5.0, -25.0, 420.0),
+    (-15.0, -20.0, 430.0),
+    (-5.0, -10.0, 390.0),
+    (-25.0, -20.0, 415.0),
+    (-11.0, -17.0, 410.0),
+    (0.0, -25.0, 395.0),
+)
+BOARDS, MOST_BOARDS = len(BOARD_TURNS), len(BOARD_TURNS) + len(MORE_TURNS)
 STAGE_TURN = (0.12, -0.16, 0.02)
 STAGE_MIDDLE = (-11.0, -17.0, 400.0)
 STAGE_MM = (-60.0, -40.0, -20.0, 0.0, 20.0, 40.0, 60.0)
@@ -126,9 +146,10 @@ def true_planes(setup: ChapterSetup) -> Array:
     return planes * np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
 
 
-def board_poses() -> list[RigidTransform]:
-    """camera_from_board of the three poses."""
-    return [place_about(m, t) for m, t in zip(BOARD_MIDDLES, BOARD_TURNS, strict=True)]
+def board_poses(count: int = BOARDS) -> list[RigidTransform]:
+    """camera_from_board of the three poses, or of so many."""
+    middles, turns = (*BOARD_MIDDLES, *MORE_MIDDLES), (*BOARD_TURNS, *MORE_TURNS)
+    return [place_about(m, t) for m, t in zip(middles[:count], turns[:count], strict=True)]
 
 
 def stage_readings(count: int = len(STAGE_MM)) -> Array:

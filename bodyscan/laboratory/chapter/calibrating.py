@@ -39,7 +39,8 @@ class Calibrations:
     """reference: Zhang's camera.  planes: the chapter's fit of its free planes.
 
     camera, camera_covariance: ours, after the joint solve if held-out boards took it.
-    model, refinement: what ours chose.  approaches: (i), (i) mended, (ii), (iii), ours.
+    model, refinement: what ours chose.  approaches: (i), (i) mended, (ii), (ii) with skew, (iii),
+    ours.
     by_stage, by_reference: every model of the projector, calibrated either way.
     """
 
@@ -58,13 +59,15 @@ def calibrate_all(captures: ChapterCaptures) -> Calibrations:
     """Everything that is to be compared, from the same shots."""
     reference, reference_boards = by_reference_plane(TARGET, captures.boards)
     _, stage = by_slide_stage(TARGET, captures.stage, captures.readings)
+    _, skewed = by_slide_stage(TARGET, captures.stage, captures.readings, skewed=True)
     projector = TARGET.projector
     planes = fit_light_planes(reference_boards.points, projector.stripes, projector.direction)
     ours, covariance, model, refinement = _ours(captures, reference, reference_boards)
     approaches = (
         pinhole_by_stage(TARGET, captures.stage, captures.readings),
         mended_pinhole_by_stage(TARGET, stage),
-        planes_by_stage_camera(TARGET, stage, captures.boards),
+        planes_by_stage_camera("(ii)", TARGET, stage, captures.boards),
+        planes_by_stage_camera("(ii) with skew", TARGET, skewed, captures.boards),
         Approach("(iii)", reference_boards.camera, planes.planes),
         ours,
     )

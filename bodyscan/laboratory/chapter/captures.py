@@ -39,7 +39,8 @@ class SceneCapture:
 
 @dataclass(frozen=True, eq=False)
 class ChapterCaptures:
-    """boards: the three poses.  stage, readings: a board on a slide stage, and its readings (mm).
+    """boards: the three poses, or as many as were asked for.
+    stage, readings: a board on a slide stage, and its readings (mm).
 
     owner: (H, W) number of the sphere that a pixel's centre sees and the projector lights, or -1.
     on_plate: (H, W) pixels on the plate, clear of its rim.
@@ -56,16 +57,20 @@ class ChapterCaptures:
 
 
 def take_captures(
-    setup: ChapterSetup, *, stage_stops: int = 7, progress: Progress = silent
+    setup: ChapterSetup,
+    *,
+    boards: int = apparatus.BOARDS,
+    stage_stops: int = 7,
+    progress: Progress = silent,
 ) -> ChapterCaptures:
     """Render, expose and decode all of it. Raises BoardNotFound if a board is not found."""
     readings = apparatus.stage_readings(stage_stops)
-    boards, stage = apparatus.board_poses(), apparatus.stage_poses(readings, setup.seed)
-    total = len(boards) + len(stage) + 2
+    places, stage = apparatus.board_poses(boards), apparatus.stage_poses(readings, setup.seed)
+    total = boards + len(stage) + 2
     progress("rendering", 0, total)
     shots = []
-    for number, place in enumerate([*boards, *stage]):
-        of_stage = number - len(boards)
+    for number, place in enumerate([*places, *stage]):
+        of_stage = number - boards
         stream = _STAGE + of_stage if of_stage >= 0 else _BOARDS + number
         name = f"stage{of_stage + 1}" if of_stage >= 0 else f"board{number + 1}"
         shots.append(_board_shot(setup, place, name, stream))
@@ -76,8 +81,8 @@ def take_captures(
     progress("rendering", total, total)
     return ChapterCaptures(
         setup,
-        tuple(shots[: len(boards)]),
-        tuple(shots[len(boards) :]),
+        tuple(shots[:boards]),
+        tuple(shots[boards:]),
         readings,
         spheres,
         plate,

@@ -47,13 +47,13 @@ def mended_pinhole_by_stage(target: Target, stage: LocatedBoards) -> Approach:
 
 
 def planes_by_stage_camera(
-    target: Target, stage: LocatedBoards, shots: Sequence[StripedShot]
+    name: str, target: Target, stage: LocatedBoards, shots: Sequence[StripedShot]
 ) -> Approach:
     """Approach (ii): Tsai's camera from the slide stage, planes from the reference plane.
 
     So the chapter's text has it, though it is headed `calibrated by slide stage`.
     """
-    return _fit("(ii)", locate_again(target, shots, stage.camera), target, free_planes)
+    return _fit(name, locate_again(target, shots, stage.camera), target, free_planes)
 
 
 Model = Callable[[BoundaryPoints, int, Axis], LightPlanes]

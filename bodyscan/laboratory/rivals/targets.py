@@ -65,13 +65,14 @@ def by_reference_plane(
 
 
 def by_slide_stage(
-    target: Target, shots: Sequence[StripedShot], readings: Array
+    target: Target, shots: Sequence[StripedShot], readings: Array, *, skewed: bool = False
 ) -> tuple[TsaiCamera, LocatedBoards]:
-    """Tsai's camera from a board that slid along its normal to `readings` (shots,) mm."""
+    """Tsai's camera from a board that slid along its normal to `readings` (shots,) mm; with a skew if
+    wanted."""
     height, width = shots[0].stripes.s.shape
     points, pixels = stage_points(target.board, shots, readings)
     middle = np.array([(width - 1) / 2.0, (height - 1) / 2.0])
-    tsai = calibrate_tsai(points, pixels, middle)
+    tsai = calibrate_tsai(points, pixels, middle, skewed=skewed)
     poses = {
         shot.view.shot: tsai.camera_from_points @ _slid(float(reading))
         for shot, reading in zip(shots, readings, strict=True)

@@ -23,6 +23,7 @@ from bodyscan.geometry.transforms import RigidTransform
 class TsaiCamera:
     """focal (px of a row), aspect (px of a column each), centre (2,) px, kappa for places in units
     of the focal length.  camera_from_points: where the camera stands.  rms_px: of the residuals.
+    skew: px, gamma of Eq. 1, which Tsai's own model has not.
     """
 
     focal: float
@@ -31,6 +32,7 @@ class TsaiCamera:
     kappa: float
     camera_from_points: RigidTransform
     rms_px: float
+    skew: float = 0.0
 
     def camera(self, width: int, height: int) -> Camera:
         """As the chapter's camera: the radial lens that undoes kappa best over the image."""
@@ -46,7 +48,7 @@ class TsaiCamera:
         return Camera(
             alpha=self.focal * self.aspect,
             beta=self.focal,
-            gamma=0.0,
+            gamma=self.skew,
             u0=float(self.centre[0]),
             v0=float(self.centre[1]),
             lens=Radial().with_coefficients(coefficients),
@@ -55,8 +57,12 @@ class TsaiCamera:
         )
 
 
-def calibrate_tsai(points: Array, pixels: Array, centre: Array) -> TsaiCamera:
+def calibrate_tsai(
+    points: Array, pixels: Array, centre: Array, *, skewed: bool = False
+) -> TsaiCamera:
     """From points (N, 3) mm, not in one plane, their pixels (N, 2) and a rough image centre (2,).
+
+    skewed: columns may stand askew on rows.
 
     The centre is taken where radial alignment is best (Lenz and Tsai 1988), then all is refined.
     """
@@ -70,7 +76,7 @@ def calibrate_tsai(points: Array, pixels: Array, centre: Array) -> TsaiCamera:
     start = np.concatenate(
         [
             RigidTransform(rotation, np.zeros(3)).rotation_vector,
-            [*across, depth, focal, aspect, *found, 0.0],
+            [*across, depth, focal, aspect, *found, 0.0, *[0.0] * skewed],
         ]
     )
     solved = least_squares(_residuals, start, x_scale="jac", args=(points, pixels))
@@ -78,7 +84,13 @@ def calibrate_tsai(points: Array, pixels: Array, centre: Array) -> TsaiCamera:
     rms = float(np.sqrt(2.0 * np.mean(solved.fun**2)))
     place = RigidTransform.from_rotation_vector(values[:3], values[3:6])
     return TsaiCamera(
-        float(values[6]), float(values[7]), values[8:10], float(values[10]), place, rms
+        float(values[6]),
+        float(values[7]),
+        values[8:10],
+        float(values[10]),
+        place,
+        rms,
+        float(values[11]) if skewed else 0.0,
     )
 
 
@@ -125,5 +137,7 @@ def _residuals(values: Array, points: Array, pixels: Array) -> Array:
     seen = RigidTransform.from_rotation_vector(values[:3], values[3:6]).apply(points)
     scale = np.array([focal * aspect, focal])
     real = (pixels - centre) / scale
+    if len(values) > 11:
+        real[:, 0] -= values[11] / scale[0] * real[:, 1]
     ideal = real * (1.0 + kappa * np.sum(real**2, axis=1, keepdims=True))
     return ((seen[:, :2] / seen[:, 2:] - ideal) * scale).ravel()
