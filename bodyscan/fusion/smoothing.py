@@ -26,6 +26,7 @@ Numbers = NDArray[np.int32]
 
 JUMP_PX = 8.0  # in depth between neighbours, in widths of a pixel: steeper than STEEPEST_COSINE
 STEEPEST_COSINE = 0.17  # a surface seen at more than 80 degrees is not worth having
+OWN_SHARE = np.float32(0.01)  # of a pixel's sigma is its own: what rounding leaves of a difference
 EVERY = 4  # row that is looked at to learn how large a pixel is
 
 
@@ -36,7 +37,8 @@ class SmoothSurface:
     corner: (column, row) of the crop's first pixel in the camera's image.
     number: (h, w) int32, of the point that a pixel shows, row by row; -1 where it shows none.
     points, normals: (n, 3) float32, mm, unit and towards the camera.
-    sigma_mm: (n,) float32, standard deviation of the smoothed point along its normal.
+    sigma_mm: (n,) float32, standard deviation of the smoothed point along its normal: what smoothing
+    leaves of the pixels' own noise, and all that they share.
     rim: (n,) float32, rises from near 0 at the rim to 1 well inside.
     weight: (n,) float32, rim/sigma^2.
     colours: (n,) uint8.
@@ -65,16 +67,19 @@ def smooth(
     box = crop_of(image.valid)
     if box is None:
         return None
-    inverse, noise = _inverse_depths(image.points, image.sigma_mm, ends_of(box))
+    common = np.zeros((1, 1), np.float32) if image.common_mm is None else image.common_mm
+    common = np.broadcast_to(common, image.sigma_mm.shape)
+    inverse, noise = _inverse_depths(image.points, image.sigma_mm, common, ends_of(box))
     some = inverse[::EVERY]
     pixel_mm = float(np.median(1.0 / some[some > 0])) / image.camera.alpha
     reach = int(np.clip(round(0.5 * window_mm / pixel_mm), 2, 6))
     fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm)
-    return _surface(image, rig_from_camera, box, fit, fitted, reach)
+    return _surface(image, common, rig_from_camera, box, fit, fitted, reach)
 
 
 def _surface(
     image: RangeImage,
+    common: Floats,
     rig_from_camera: RigidTransform,
     box: tuple[slice, slice],
     fit: Fit,
@@ -86,7 +91,7 @@ def _surface(
     points, normals = np.empty((most, 3), np.float32), np.empty((most, 3), np.float32)
     sigma = np.empty(most, np.float32)
     count = _lay_out(
-        image.points,
+        (image.points, common),
         ends_of(box),
         (fit.value, fit.slope_u, fit.slope_v, fit.sigma),
         fitted,
@@ -123,9 +128,10 @@ def _distance_to_rim(depth: Floats, jump: float) -> Floats:
 
 @compiled
 def _inverse_depths(
-    points: Floats, sigma_mm: Floats, ends: tuple[int, int, int, int]
+    points: Floats, sigma_mm: Floats, common_mm: Floats, ends: tuple[int, int, int, int]
 ) -> tuple[Floats, Floats]:
-    """1/z and its standard deviation (h, w), 0 where nothing was measured, within `ends`."""
+    """1/z and its standard deviation (h, w), less what neighbours share, 0 where nothing was measured,
+    within `ends`."""
     top, bottom, left, right = ends
     inverse = np.zeros((bottom - top, right - left), np.float32)
     noise = np.zeros_like(inverse)
@@ -135,7 +141,8 @@ def _inverse_depths(
             if np.isfinite(sigma):
                 x, y, z = points[row, column, 0], points[row, column, 1], points[row, column, 2]
                 # Along the ray a point moves by its length over z times dz.
-                share = sigma / np.sqrt(x * x + y * y + z * z)
+                own = max(sigma**2 - common_mm[row, column] ** 2, (OWN_SHARE * sigma) ** 2)
+                share = np.sqrt(own / (x * x + y * y + z * z))
                 inverse[row - top, column - left] = 1.0 / z
                 noise[row - top, column - left] = share / z
     return inverse, noise
@@ -143,7 +150,7 @@ def _inverse_depths(
 
 @compiled
 def _lay_out(
-    seen: Floats,
+    measured: tuple[Floats, Floats],
     ends: tuple[int, int, int, int],
     fit: tuple[Floats, Floats, Floats, Floats],
     fitted: Mask,
@@ -154,10 +161,12 @@ def _lay_out(
 ) -> int:
     """Fill in depth and number (h, w), and points, normals and sigmas; how many there are.
 
-    seen: (height, width, 3) measured points, camera frame.  fit: value, slopes, sigma of 1/z.
+    measured: points (height, width, 3), camera frame, and the common part of their sigmas.  fit: value,
+    slopes, sigma of 1/z.
     rig_from_camera: rotation and translation.
     """
     value, slope_u, slope_v, fit_sigma = fit
+    seen, common_mm = measured
     rotation, translation = rig_from_camera
     depth, number = images
     points, normals, sigma = surface
@@ -179,7 +188,8 @@ def _lay_out(
                 points[n, k] = along * z + translation[k]
                 normals[n, k] = rotation[k, 0] * a + rotation[k, 1] * b + rotation[k, 2] * c
             # Along the ray a point moves by length * dz; along the normal by its cosine's share.
-            sigma[n] = fit_sigma[row, column] * z * z * length * cosine
+            own, shared = fit_sigma[row, column] * z * z * length, common_mm[i, j]
+            sigma[n] = np.sqrt(own * own + shared * shared) * cosine
             n += 1
     return n
 

@@ -73,21 +73,28 @@ def stripes_apart(sheets: LightSheets, camera: Camera, s: Floats, points: Floats
 
 
 def triangulate_image(
-    sheets: LightSheets, camera: Camera, s: Floats, sigma: Floats
-) -> tuple[Floats, Floats]:
-    """Points (height, width, 3), camera frame, mm, and sigma_mm (height, width) along the viewing
-    rays, of stripe coordinates s with standard deviations sigma (height, width); NaN where no depth
-    can be trusted."""
+    sheets: LightSheets, camera: Camera, s: Floats, sigma: Floats, shared: Floats | None = None
+) -> tuple[Floats, Floats, Floats]:
+    """Points (height, width, 3), camera frame, mm, and along the viewing rays their sigma_mm and of
+    that common_mm (height, width), the part that neighbours share; of stripe coordinates s with
+    standard deviations sigma, which pixels have by themselves, and `shared`, if any (height, width).
+    NaN where no depth can be trusted.
+    """
     way, pixels = _way_to_measure(sheets), ray_table(camera)
     points, sigma_mm = np.empty((*s.shape, 3), np.float32), np.empty(s.shape, np.float32)
+    common_mm = np.empty(s.shape, np.float32)
+    shared = np.zeros((1, 1), np.float32) if shared is None else shared
+    shared = np.broadcast_to(shared, s.shape)
     most_sigma = _most_sigma(sheets)
     for first in range(0, len(s), BAND):
         rows = slice(first, first + BAND)
         wanted = np.isfinite(s[rows])
         rays = rays_through(pixels, wanted, first)
         found = way(rays, s[rows][wanted].astype(np.float64))
-        _place(wanted, rays, found, sigma[rows], most_sigma, points[rows], sigma_mm[rows])
-    return points, sigma_mm
+        uncertain = sigma[rows], shared[rows]
+        made = points[rows], sigma_mm[rows], common_mm[rows]
+        _place(wanted, rays, found, uncertain, most_sigma, made)
+    return points, sigma_mm, common_mm
 
 
 def _most_sigma(sheets: LightSheets) -> float:
@@ -116,17 +123,20 @@ def _place(
     wanted: Mask,
     rays: Array,
     found: tuple[Array, Array, Array],
-    sigma: Floats,
+    uncertain: tuple[Floats, Floats],
     most_sigma: float,
-    points: Floats,
-    sigma_mm: Floats,
+    made: tuple[Floats, Floats, Floats],
 ) -> None:
-    """Points (rows, W, 3) and sigma_mm (rows, W) of the N pixels `wanted` (rows, W), else NaN.
+    """Fills in points (rows, W, 3), sigma_mm and common_mm (rows, W) of the N pixels `wanted`
+    (rows, W), NaN elsewhere.
 
-    rays: (N, 3).  found: depth, dz/ds and variance, each (N,).  sigma: (rows, W), of s.
+    rays: (N, 3).  found: depth, dz/ds and variance, each (N,).  uncertain: sigma and what neighbours
+    share of s (rows, W).
     """
     depths, slopes, variances = found
-    points[:], sigma_mm[:] = np.nan, np.nan
+    sigma, shared = uncertain
+    points, sigma_mm, common_mm = made
+    points[:], sigma_mm[:], common_mm[:] = np.nan, np.nan, np.nan
     n = 0
     for v in range(wanted.shape[0]):
         for u in range(wanted.shape[1]):
@@ -134,8 +144,10 @@ def _place(
                 continue
             x, y, depth = rays[n, 0], rays[n, 1], depths[n]
             decoding, variance = slopes[n] * sigma[v, u], variances[n]
-            along = np.sqrt((decoding * decoding + variance) * (x * x + y * y + 1.0))
+            calibrated, longer = slopes[n] * shared[v, u], x * x + y * y + 1.0
+            common = variance + calibrated * calibrated
+            along = np.sqrt((decoding * decoding + common) * longer)
             n += 1
             if variance <= (most_sigma * depth) ** 2 and along < np.inf:
                 points[v, u, 0], points[v, u, 1], points[v, u, 2] = x * depth, y * depth, depth
-                sigma_mm[v, u] = along
+                sigma_mm[v, u], common_mm[v, u] = along, np.sqrt(common * longer)

@@ -44,21 +44,26 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
             where=f"pair {pair.name}",
             remedy="scan with the camera settings of the calibration, or calibrate again",
         )
-    points, sigma_mm = _triangulated(pair, pair.sheets, stripes.s, stripes.sigma)
+    points, sigma_mm, common_mm = _triangulated(pair, pair.sheets, stripes.s, stripes.sigma)
     agreement = None
     if pair.crossing is not None and stripes.crossing is not None:
         across = stripes.crossing
-        others = _triangulated(pair, pair.crossing, across.s, across.sigma)
+        *others, common_too = _triangulated(pair, pair.crossing, across.s, across.sigma)
         # Crossing stripes are decoded wherever they are, not in the scan volume alone.
         alone = np.full(sigma_mm.shape, stripes.beyond is None)
-        apart, counted = _apart(pair, stripes, (points, sigma_mm), others)
+        apart, counted = _apart(pair, stripes, (points, sigma_mm), (others[0], others[1]))
+        share = common_mm / sigma_mm, common_too / others[1]
         points, sigma_mm, agreement = combine(points, sigma_mm, *others, alone=alone)
+        # Each way's calibration is as much of its own sigma; of both together, of the larger share.
+        common_mm = sigma_mm * np.fmax(*share)
         if agreement is not None:
             agreement = replace(agreement, apart_stripes=apart, stripes=counted)
         _require_fit(pair, stripes, agreement)
     normals = grid_normals(points, np.isfinite(sigma_mm))
     images = (stripes.lit, stripes.beyond)
-    return RangeImage(pair.name, camera, points, normals, sigma_mm, *images, agreement)
+    return RangeImage(
+        pair.name, camera, points, normals, sigma_mm, *images, agreement, common_mm=common_mm
+    )
 
 
 def _apart(
@@ -104,15 +109,14 @@ def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement
 
 def _triangulated(
     pair: PairCalibration, sheets: LightSheets, s: Floats, sigma: Floats
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, Floats, Floats]:
     """As `triangulate_image`; a ray that is known to so many pixels makes s as uncertain as the
-    stripes are fine there."""
-    camera = pair.camera
+    stripes are fine there, and its neighbours' alike."""
+    camera, of_rays = pair.camera, None
     if pair.rays is not None:
         finest = stripes_per_pixel(sheets, camera, s)
         of_rays = np.float32(finest) * pair.rays.image(camera.width, camera.height)
-        sigma = np.hypot(sigma, of_rays)
-    return triangulate_image(sheets, camera, s, sigma)
+    return triangulate_image(sheets, camera, s, sigma, of_rays)
 
 
 def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:

@@ -72,7 +72,7 @@ def test_an_image_is_measured_as_its_rays_are(planes: SmoothSheets) -> None:
     s[rng.random(shape) < 0.1] = np.nan
     sigma = rng.uniform(0.01, 0.03, shape).astype(np.float32)
     sigma[rng.random(shape) < 0.05] = np.nan
-    points, sigma_mm = triangulate_image(planes, CAMERA, s, sigma)
+    points, sigma_mm, _ = triangulate_image(planes, CAMERA, s, sigma)
     assert points.dtype == sigma_mm.dtype == np.float32
 
     rays, wide = CAMERA.pixel_rays(), s.astype(float)

@@ -81,7 +81,7 @@ def test_all_that_lies_in_the_volume_is_wanted(
     wanted = limits_of(one, at)
     s = some_s(seed, rising)
     assert one.sheets is not None
-    points, _ = triangulate_image(one.sheets, one.camera, s, np.full_like(s, 0.01))
+    points, *_ = triangulate_image(one.sheets, one.camera, s, np.full_like(s, 0.01))
     x, y, z = np.moveaxis(at.apply(points.astype(np.float64)), -1, 0)
     there = (np.hypot(x, y) < VOLUME.radius_mm) & (z > VOLUME.bottom_mm) & (z < VOLUME.top_mm)
     standing = there & (z > VOLUME.bottom_mm + LAYER_MM)

@@ -57,6 +57,10 @@ def test_a_ray_that_is_not_known_moves_its_point_by_its_sigma() -> None:
     both = image.valid & np.isfinite(distance)
     assert both.mean() > 0.5
     added = np.sqrt(image.sigma_mm[both] ** 2 - known.sigma_mm[both] ** 2)
+    assert image.common_mm is not None
+    assert known.common_mm is not None
+    shared = np.hypot(known.common_mm[both], added)
+    assert np.allclose(image.common_mm[both], shared, rtol=1e-3, atol=1e-5)
     # One number says how fine the stripes are everywhere, and a ray moves aside as well as along.
     assert np.median(added / distance[both]) == pytest.approx(1.0, abs=0.15)
     assert np.percentile(added / distance[both], [5, 95]) == pytest.approx([1.0, 1.0], abs=0.35)

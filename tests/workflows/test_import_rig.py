@@ -312,12 +312,12 @@ def test_how_exact_it_is_is_not_made_up(folder: Path) -> None:
     assert isinstance(pair.sheets, LensSheets)
     shape = pair.camera.height, pair.camera.width
     s, sigma = np.full(shape, 200.0, np.float32), np.zeros(shape, np.float32)
-    points, along = triangulate_image(pair.sheets, pair.camera, s, sigma)
+    points, along, _ = triangulate_image(pair.sheets, pair.camera, s, sigma)
     seen = np.isfinite(along)
     # No boards were seen, so that there is no place that is far from them: all of it has a sigma.
     plain = unknown.pairs["a"].sheets
     assert plain is not None
-    _, without = triangulate_image(plain, pair.camera, s, sigma)
+    _, without, _ = triangulate_image(plain, pair.camera, s, sigma)
     np.testing.assert_array_equal(seen, np.isfinite(without))
     rays = points[seen][::1000].astype(float)
     rays /= rays[:, 2:]
@@ -389,7 +389,7 @@ def test_a_real_scan_lies_on_the_cloud_that_came_with_it(captures: Path, tmp_pat
     assert pair.sheets is not None
     # Code 0 is the projector's column 0, and the middle of that lies at s = 1/2.
     s = np.where(told, number + 0.5, np.nan).astype(np.float32)
-    points, sigma = triangulate_image(pair.sheets, pair.camera, s, np.full_like(s, 0.3))
+    points, sigma, _ = triangulate_image(pair.sheets, pair.camera, s, np.full_like(s, 0.3))
     found = points[np.isfinite(sigma)].astype(float)
     assert len(found) > 0.99 * told.sum()
     cloud = o3d.io.read_point_cloud(str(folder / "scan_0020_cloud.ply"))
