@@ -26,8 +26,8 @@ class RangeImage:
     agreement: of stripes of two directions, if such were projected.
     time_ms: the one moment for which the depths stand, ms since the scan began; None if not known.
     velocity: of the body at that moment; None where the stripes or the times do not tell it.
-    common_mm: (height, width) float32, of sigma_mm the part that neighbours share, since it comes of the
-    calibration: it does not shrink where they are averaged. None: there is none.
+    common_mm: (height, width) float32, of sigma_mm the part that neighbours share, since it comes of
+    the calibration: it does not shrink where they are averaged. None: there is none.
     """
 
     pair: str
