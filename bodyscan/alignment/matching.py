@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from bodyscan.arrays import Array, Floats, Mask
+from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.geometry.camera_tables import projection_table
 from bodyscan.geometry.quadratic_table import Table, look_up
@@ -60,13 +60,15 @@ class AlignmentPoints:
 @dataclass(frozen=True, eq=False)
 class Matches:
     """M spots seen twice, rig frame: points (M, 3) of the source, normals (M, 3), distances (M,) mm
-    from the target's surface to the source along the normal, their expected sigmas (M,) mm.
+    from the target's surface to the source along the normal, their expected sigmas (M,) mm; source:
+    (M,) which of the source's points.
     """
 
     points: Array
     normals: Array
     distances: Array
     sigma_mm: Array
+    source: Indices
 
     @property
     def of_seam(self) -> Matches:
@@ -109,20 +111,21 @@ def match_projected(
     target_from_source = rig_from_target.inverse() @ rig_from_source
     size, image = len(source.points), target.image
     points, normals = np.empty((size, 3)), np.empty((size, 3))
-    distances, sigma_mm = np.empty(size), np.empty(size)
+    distances, sigma_mm, number = np.empty(size), np.empty(size), np.empty(size, np.int64)
     found = _match_projected(
         np.ascontiguousarray(target_from_source.matrix[:3]),
         projection_table(image.camera),
         (source.points, source.normals, source.sigma_mm, source.rim),
         (image.points, image.normals, image.sigma_mm, target.inner),
         reach_mm,
-        (points, normals, distances, sigma_mm),
+        (points, normals, distances, sigma_mm, number),
     )
     return Matches(
         rig_from_target.apply(points[:found]),
         rig_from_target.rotate(normals[:found]),
         distances[:found],
         sigma_mm[:found],
+        number[:found],
     )
 
 
@@ -133,7 +136,7 @@ def _match_projected(
     source: tuple[Array, Array, Array, Mask],
     target: tuple[Floats, Floats, Floats, Mask],
     reach_mm: float,
-    matches: tuple[Array, Array, Array, Array],
+    matches: tuple[Array, Array, Array, Array, Indices],
 ) -> int:
     """How many of the source's points were matched; what of them `matches` holds, target frame.
 
@@ -143,7 +146,7 @@ def _match_projected(
     """
     source_points, source_normals, source_sigma, rim = source
     target_points, target_normals, target_sigma, inner = target
-    points, normals, distances, sigma_mm = matches
+    points, normals, distances, sigma_mm, number = matches
     height, width = inner.shape
     found = 0
     for n in range(len(source_points)):
@@ -177,6 +180,7 @@ def _match_projected(
             continue
         ours, theirs = source_sigma[n], target_sigma[row, column] * _dot(point, across) / far
         distances[found], sigma_mm[found] = distance, np.sqrt(ours * ours + theirs * theirs)
+        number[found] = n
         found += 1
     return found
 
@@ -227,7 +231,8 @@ def match_nearest(
     mean = normals[i] + across[j]
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     distance = np.sum((points[i] - there[j]) * mean, axis=1)
-    return Matches(points[i], mean, distance, np.hypot(source.sigma_mm[i], target.sigma_mm[j]))
+    sigma_mm = np.hypot(source.sigma_mm[i], target.sigma_mm[j])
+    return Matches(points[i], mean, distance, sigma_mm, i.astype(np.int64))
 
 
 def _cloud(points: Array) -> o3d.geometry.PointCloud:

@@ -100,6 +100,9 @@ def scan_table(scan: Scan) -> Table:
             table.add_row("farthest moved", f"{name}, {motion:.2f} mm")
         for name, sigmas in scan.alignment.refused.items():
             table.add_row("left where it was", f"{name} (would have moved by {sigmas:.1f} sigmas)")
+    if scan.person is not None:
+        for line in scan.person.lines:
+            table.add_row("the person", line)
     return table
 
 

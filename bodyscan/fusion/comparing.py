@@ -60,6 +60,7 @@ def compare(
         surface.corner,
         projection_table(surface.camera),
         (camera_from_rig.rotation, camera_from_rig.translation),
+        surface.bent,
         (agreement_mm, double_mm),
         (index, at, shift, against_index, against_at),
     )
@@ -80,14 +81,15 @@ def _compare(
     corner: tuple[int, int],
     projection: Table,
     camera_from_rig: tuple[Array, Array],
+    bent: bool,
     limits_mm: tuple[float, float],
     evidence: tuple[Numbers, Numbers, Floats, Numbers, Numbers],
 ) -> tuple[int, int]:
     """Fill in the evidence; how many samples are agreed with and how many contradicted.
 
     samples: points and normals.  own: range of samples that are the surface's own.  surface:
-    points, normals and the image of their numbers, which begins at `corner`.  limits_mm: of
-    agreement, and of a second skin.
+    points, normals and the image of their numbers, which begins at `corner`.  bent: its points are
+    no longer seen at their pixels.  limits_mm: of agreement, and of a second skin.
     """
     points, normals = samples
     surface_points, surface_normals, numbers = surface
@@ -107,6 +109,15 @@ def _compare(
         there = numbers[row, column]
         if there < 0:
             continue
+        if bent:
+            x, y, z = _in_camera(surface_points[there], camera_from_rig)
+            at_u, at_v = look_up(projection, x / z, y / z)
+            column, row = column + int(np.rint(u - at_u)), row + int(np.rint(v - at_v))
+            if not (0 <= column < numbers.shape[1] and 0 <= row < numbers.shape[0]):
+                continue
+            there = numbers[row, column]
+            if there < 0:
+                continue
         alike = outward = 0.0
         for k in range(3):
             normal = surface_normals[there, k]

@@ -1,4 +1,4 @@
-"""What a point's error bar owes to the rig: how well the pairs that see it are placed."""
+"""What a point's error bar owes to how well pairs are placed, and a moving person is followed."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from bodyscan.alignment.following import Followed
 from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
 from bodyscan.geometry.pose_covariance import PoseCovariance
@@ -44,6 +45,14 @@ def add_pose_variance(
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(fill, ends[:-1], ends[1:]))
     return replace(cloud, sigma_mm=np.hypot(cloud.sigma_mm, placing_mm).astype(np.float32))
+
+
+def add_motion_variance(cloud: BodyCloud, followed: Followed) -> BodyCloud:
+    """The cloud with sigmas that allow for what is not known of the person's motion, and of the
+    pairs' poses, after both were found together."""
+    cell = followed.cells.find_many(cloud.points, cloud.normals.astype(np.float64))
+    sigma_mm = np.hypot(cloud.sigma_mm, followed.sigma_mm[cell]).astype(np.float32)
+    return replace(cloud, sigma_mm=sigma_mm)
 
 
 @compiled

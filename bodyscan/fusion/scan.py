@@ -7,12 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bodyscan.alignment.bending import at_once
+from bodyscan.alignment.body_parts import PersonMotion
+from bodyscan.alignment.following import follow
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.sway import SwayPrior
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import mesh
-from bodyscan.fusion.pose_variance import add_pose_variance
+from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
 from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.seams import judge_seams
 from bodyscan.fusion.surface_check import check_surface
@@ -30,7 +33,8 @@ from bodyscan.verdict import Verdict
 class Scan:
     """A body model, how it came about and whether it is good.  measured: points of each pair's
     cleaned range image.  failed: pairs that gave none, with the reason.  range_images: cleaned, of
-    the pairs that saw the subject; rig_from_camera: where each stood to it, after alignment.
+    the pairs that saw the subject, carried to one moment; rig_from_camera: where each stood to it,
+    after alignment.  person: how a body that moved did, part by part.
     """
 
     cloud: BodyCloud
@@ -41,6 +45,7 @@ class Scan:
     verdict: Verdict
     range_images: tuple[RangeImage, ...]
     rig_from_camera: dict[str, RigidTransform]
+    person: PersonMotion | None = None
 
     @property
     def agreements(self) -> tuple[str, ...]:
@@ -67,22 +72,31 @@ def fuse(
         cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume, empty=empty)
         seen = require_subject(cleaned)
     placing = dict(calibration.rig_from_camera)
-    alignment, known = None, calibration.covariance
+    alignment, followed, known = None, None, calibration.covariance
     if settings.alignment.matching != "none" and len(seen) > 1:
         with step(progress, "aligning"):
-            alignment = align(seen, placing, calibration.covariance, settings.alignment)
+            found = align(seen, placing, known, settings.alignment)
+            alignment, followed = follow(seen, placing, found, known, settings.alignment)
             placing |= alignment.rig_from_camera
+            seen = at_once(seen, placing, followed)
             untied = {image.pair for image in seen} - alignment.motion_mm.keys()
             known = SwayPrior.of(settings.alignment).loosen(known, untied)
     with step(progress, "merging"):
         fused = merge(seen, placing, settings.fusion)
         there = {image.pair: placing[image.pair] for image in seen}
-        cloud = add_pose_variance(fused.cloud, there, known)
+        cloud = (
+            add_motion_variance(fused.cloud, followed)
+            if followed
+            else add_pose_variance(fused.cloud, there, known)
+        )
     with step(progress, "meshing"):
         surface = mesh(cloud, settings.mesh, images, placing)
     with step(progress, "judging"):
         seams = judge_seams(seen, there, calibration.rig.poles)
-        held = check_surface(surface, cleaned, placing)
+        carried = {image.pair: image for image in seen}
+        at_once_or_empty = [carried.get(image.pair, image) for image in cleaned]
+        held = check_surface(surface, at_once_or_empty, placing)
+    person = PersonMotion.of(followed) if followed else None
     points = {image.pair: int(image.valid.sum()) for image in cleaned}
     failed = dict(measured.failures)
     verdict = grade_scan(
@@ -98,5 +112,6 @@ def fuse(
         unjudged=[name for name, pair in calibration.pairs.items() if pair.quality.unjudged],
         cameras=np.array([at.translation for at in calibration.rig_from_camera.values()]),
         agreements={image.pair: image.agreement for image in images if image.agreement},
+        person=person,
     )
-    return Scan(cloud, surface, alignment, points, failed, verdict, tuple(seen), placing)
+    return Scan(cloud, surface, alignment, points, failed, verdict, tuple(seen), placing, person)

@@ -48,6 +48,19 @@ class _Alignment(_Part):
     overlaps: list[_Overlap] = []
 
 
+class _PartMotion(_Part):
+    name: str
+    moved_mm: float
+    left_mm: float
+    seen_once: float
+
+
+class _Person(_Part):
+    parts: list[_PartMotion]
+    breathed_mm: float | None
+    timed: bool
+
+
 class _Hashes(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
     cloud: str = Field(alias="cloud.ply")
@@ -68,6 +81,7 @@ class _Facts(_Part):
     measured: dict[str, int] = {}
     failed: dict[str, str] = {}
     alignment: _Alignment | None = None
+    person: _Person | None = None
 
 
 def read_facts(folder: Path) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.icp import Alignment
 from bodyscan.arrays import Array
 from bodyscan.fusion.seams import SeamReport, find_misfits
@@ -29,6 +30,7 @@ GIRTH_PER_MM = 2.0 * np.pi
 """mm that a girth is wrong by, where its surface stands 1 mm off all round"""
 SOME_CONTRADICTED, MOST_CONTRADICTED = 0.005, 0.05  # below 0.001 where all is well
 SOME_MOTION_MM, MOST_MOTION_MM = 3.0, 6.0
+SOME_LEFT_MM, MOST_LEFT_MM = 0.6, 2.0  # standard deviations; 4 and 13 mm of a girth
 CELL_MM = 50.0
 SIDE_BY_SIDE = 0.4  # of the taller one's height
 SMALL_PIECE = 0.01
@@ -59,6 +61,7 @@ def grade_scan(
     unjudged: Sequence[str] = (),
     cameras: Array | None = None,
     agreements: Mapping[str, Agreement] | None = None,
+    person: PersonMotion | None = None,
 ) -> Verdict:
     """The worst of all findings decides; the reasons come worst first. use: how wrong a girth may
     be. seams: see `judge_seams`. surface: see `check_surface`. contradicted: see `merge`.
@@ -67,7 +70,7 @@ def grade_scan(
     cameras: (N, 3) where those of the whole rig stand; None for all round.  What none of them could
     see is no reason to repeat.
 
-    agreements: of pairs that project stripes of two directions.
+    agreements: of pairs that project stripes of two directions.  person: how a body that moved did.
 
     A check that fails by itself leaves the scan usable at best, and says so.
     """
@@ -77,7 +80,7 @@ def grade_scan(
         "directions": lambda: _directions(agreements or {}),
         "seams": lambda: _seams(seams, use),
         "disagreement": lambda: _disagreement(alignment),
-        "motion": lambda: _motion(alignment),
+        "motion": lambda: _motion(alignment, person),
         "contradictions": lambda: _contradictions(contradicted),
         "pieces": lambda: _company(cloud),
         "cuts": lambda: _cuts(cloud, volume),
@@ -160,8 +163,16 @@ def _disagreement(alignment: Alignment | None) -> Iterator[Finding]:
         )
 
 
-def _motion(alignment: Alignment | None) -> Iterator[Finding]:
-    if alignment is None or not alignment.motion_mm:
+def _motion(alignment: Alignment | None, person: PersonMotion | None) -> Iterator[Finding]:
+    """Of a person who was followed, what that left; of others, how far the pairs were moved."""
+    for part in person.parts if person else ():
+        if part.left_mm > SOME_LEFT_MM:
+            yield (
+                "repeat" if part.left_mm > MOST_LEFT_MM else "usable",
+                f"the {part.name} moved by {part.moved_mm:.1f} mm while it was scanned; corrected "
+                f"to {part.left_mm:.1f} mm: repeat if you need it better",
+            )
+    if person or alignment is None or not alignment.motion_mm:
         return
     name, motion = max(alignment.motion_mm.items(), key=lambda item: item[1])
     if motion > SOME_MOTION_MM:

@@ -42,6 +42,7 @@ class SmoothSurface:
     rim: (n,) float32, rises from near 0 at the rim to 1 well inside.
     weight: (n,) float32, rim/sigma^2.
     colours: (n,) uint8.
+    bent: whether points were carried away from the pixels that show them.
     """
 
     pair: str
@@ -55,6 +56,7 @@ class SmoothSurface:
     rim: Floats
     weight: Floats
     colours: Bytes
+    bent: bool = False
 
 
 def smooth(
@@ -115,6 +117,7 @@ def _surface(
         rim,
         rim / (sigma * sigma),
         image.colours[box][there],
+        image.bent,
     )
 
 

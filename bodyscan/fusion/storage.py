@@ -99,6 +99,7 @@ def save_scan(
             "measured": scan.measured,
             "failed": scan.failed,
             "alignment": _alignment(scan),
+            "person": asdict(scan.person) if scan.person else None,
         },
     )
     return folder / FILE_NAME

@@ -28,6 +28,7 @@ class RangeImage:
     velocity: of the body at that moment; None where the stripes or the times do not tell it.
     common_mm: (height, width) float32, of sigma_mm the part that neighbours share, since it comes of
     the calibration: it does not shrink where they are averaged. None: there is none.
+    bent: whether points were since carried to another moment, off the rays of their pixels.
     """
 
     pair: str
@@ -41,6 +42,7 @@ class RangeImage:
     time_ms: float | None = None
     velocity: Velocity | None = None
     common_mm: Floats | None = None
+    bent: bool = False
 
     @property
     def valid(self) -> Mask:

@@ -187,7 +187,9 @@ def test_the_normal_equations_are_those_of_the_distances_jacobian() -> None:
     rng = np.random.default_rng(5)
     points, normals = rng.uniform(-300.0, 300.0, (200, 3)), rng.standard_normal((200, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    matches = Matches(points, normals, rng.normal(0.0, 0.5, 200), rng.uniform(0.1, 0.3, 200))
+    matches = Matches(
+        points, normals, rng.normal(0.0, 0.5, 200), rng.uniform(0.1, 0.3, 200), np.arange(200)
+    )
     jacobian = np.empty((200, 6))
     for k, step in enumerate(1e-6 * np.eye(6)):
         moved = RigidTransform.identity().moved(step).apply(points)

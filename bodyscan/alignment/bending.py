@@ -1,0 +1,147 @@
+"""Range images carried to one moment: every pixel by the motion of its cell of the body."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.alignment.body_cells import BodyCells, seen_from
+from bodyscan.alignment.following import Followed
+from bodyscan.arrays import Array, Floats, Mask
+from bodyscan.compiled import compiled
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import THREADS
+from bodyscan.reconstruction.range_image import RangeImage
+
+Numbers = NDArray[np.int32]
+
+BLOCK_MM = 8.0  # a quarter of a cell
+SAME_SURFACE_MM = 40.0  # in depth; an arm is farther in front of the trunk, or moves alike
+
+
+def at_once(
+    images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    followed: Followed | None,
+    *,
+    workers: int = THREADS,
+) -> list[RangeImage]:
+    """All range images as of the middle of the scan, if the person moved."""
+    if followed is None:
+        return list(images)
+
+    def one(image: RangeImage) -> RangeImage:
+        there = rig_from_camera[image.pair]
+        return bend(image, there, followed.cells, followed.bends[image.pair])
+
+    with ThreadPoolExecutor(workers) as pool:
+        return list(pool.map(one, images))
+
+
+def bend(
+    image: RangeImage, rig_from_camera: RigidTransform, cells: BodyCells, field: Array
+) -> RangeImage:
+    """The range image with points and normals displaced by a field (C, 12) of the rig frame.
+
+    Which cell a pixel belongs to is looked up for one in each block of pixels, and goes smoothly
+    from block to block.
+    """
+    valid = image.valid
+    if not valid.any():
+        return image
+    pixel_mm = float(np.median(image.points[::8, ::8, 2][valid[::8, ::8]])) / image.camera.alpha
+    size = max(1, round(BLOCK_MM / pixel_mm)) if np.isfinite(pixel_mm) else 1
+    rows, columns, block = _one_in_each_block(valid, size)
+    chosen = image.points[rows, columns].astype(np.float64)
+    normals = image.normals[rows, columns].astype(np.float64)
+    ahead = -chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
+    normals = np.where(np.isfinite(normals), normals, ahead)
+    found = cells.find(rig_from_camera.apply(chosen), rig_from_camera.rotate(normals))
+    cell, depth = np.full(block.shape, -1, np.int32), np.zeros(block.shape, np.float32)
+    at = np.nonzero(block)
+    cell[at], depth[at] = found, chosen[:, 2]
+    points, turned = image.points.copy(), image.normals.copy()
+    camera_from_rig = rig_from_camera.inverse()
+    _bend(
+        points,
+        turned,
+        valid,
+        size,
+        (cell, depth),
+        (camera_from_rig.apply(cells.centres), seen_from(field, rig_from_camera)),
+    )
+    return replace(image, points=points, normals=turned, bent=True)
+
+
+def _one_in_each_block(valid: Mask, size: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Mask]:
+    """Rows and columns of the valid pixel nearest to the middle of each block, and which blocks
+    have one (h, w)."""
+    rows, columns = np.nonzero(valid)
+    wide = -(-valid.shape[1] // size)
+    high = -(-valid.shape[0] // size)
+    key = (rows // size) * wide + columns // size
+    off = np.hypot(rows % size - 0.5 * (size - 1), columns % size - 0.5 * (size - 1))
+    order = np.lexsort((off, key))
+    first = order[np.unique(key[order], return_index=True)[1]]
+    there = np.zeros(high * wide, bool)
+    there[key[first]] = True
+    return rows[first], columns[first], there.reshape(high, wide)
+
+
+@compiled
+def _bend(
+    points: Floats,
+    normals: Floats,
+    valid: Mask,
+    size: int,
+    blocks: tuple[Numbers, Floats],
+    motion: tuple[Array, Array],
+) -> None:
+    """Displaces valid points (H, W, 3) and their normals.
+
+    blocks: their cells (h, w), -1 for none, and depths.  motion: cells' centres (C, 3) and fields
+    (C, 12), camera frame.  A pixel mixes those of the four blocks around it by how near they are.
+    """
+    cell, depth = blocks
+    centres, fields = motion
+    high, wide = cell.shape
+    shift, slope = np.empty(3), np.empty((3, 3))
+    for v in range(valid.shape[0]):
+        y = (v + 0.5) / size - 0.5
+        top = int(np.floor(y))
+        for u in range(valid.shape[1]):
+            if not valid[v, u]:
+                continue
+            x = (u + 0.5) / size - 0.5
+            left = int(np.floor(x))
+            total = 0.0
+            shift[:] = 0.0
+            slope[:, :] = 0.0
+            for corner in range(4):
+                row, column = top + corner // 2, left + corner % 2
+                if row < 0 or column < 0 or row >= high or column >= wide:
+                    continue
+                there = cell[row, column]
+                own = row == v // size and column == u // size
+                near = abs(depth[row, column] - points[v, u, 2]) < SAME_SURFACE_MM
+                if there < 0 or not (own or near):
+                    continue
+                weight = (1.0 - abs(y - row)) * (1.0 - abs(x - column))
+                total += weight
+                for k in range(3):
+                    shift[k] += weight * fields[there, k]
+                    for axis in range(3):
+                        gradient = weight * fields[there, 3 + 3 * axis + k]
+                        slope[axis, k] += gradient
+                        shift[k] += gradient * (points[v, u, axis] - centres[there, axis])
+            if total == 0.0:
+                continue
+            a, b, c = normals[v, u]
+            for k in range(3):
+                points[v, u, k] += shift[k] / total
+                # A surface's normal is carried by the inverse of its transpose, here to first order.
+                normals[v, u, k] -= (slope[k, 0] * a + slope[k, 1] * b + slope[k, 2] * c) / total

@@ -1,0 +1,190 @@
+"""How a person's surface moved between the pairs' moments, from all overlaps together.
+
+Three kinds of motion share what the overlaps ask for: the whole body sways, parts of it shift and
+turn, its surface bulges with breath. Each is a Gaussian process over surface and time, as large as
+the evidence says; beside them stands what the boards left open of the pairs' poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri
+
+from bodyscan.alignment.body_cells import BodyCells, modulated, normal_field, rigid_fields
+from bodyscan.alignment.cell_evidence import CellEvidence
+from bodyscan.alignment.moments import Courses, of_breath, of_stance
+from bodyscan.alignment.sway import BODY_CENTRE
+from bodyscan.arrays import Array, Indices
+from bodyscan.geometry.scaled_systems import invert_scaled
+
+PART_MM = 350.0  # how far what moves as one reaches: an arm, a thigh, a shoulder girdle
+BULGE_MM = 130.0  # a chest that rises, a belly
+LEAST_PART, LEAST_BULGE = 0.02, 0.01
+ARM_MM = 400.0  # at which a part's turn displaces as much as its shift
+FIRST_MM = 1.0
+SMALLEST_MM = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Kind:
+    """One kind of motion: displacement fields (C, 12, M), mm, each along J courses.
+
+    size: standard deviation of their amplitudes before anything was seen; precision: (M J, M J), in
+    its place, where it is known.
+    """
+
+    name: str
+    fields: Array
+    courses: Courses
+    size: float = FIRST_MM
+    precision: Array | None = None
+
+    @property
+    def count(self) -> int:
+        return self.fields.shape[2] * self.courses.count
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is the person's, not the pairs'."""
+        return self.precision is None
+
+    @property
+    def prior(self) -> Array:
+        return np.eye(self.count) / self.size**2 if self.precision is None else self.precision
+
+    def during(self, pair: int) -> Array:
+        """(J,) courses from the middle to a pair's moment; of the pairs' own errors at that moment."""
+        return self.courses.values[pair] - self.courses.middle
+
+
+@dataclass(frozen=True, eq=False)
+class BodyMotion:
+    """amplitudes: (n,) of all kinds' fields and courses; covariance: (n, n) of them. usual: (6,) the
+    sway that its unit is."""
+
+    kinds: tuple[Kind, ...]
+    usual: Array
+    amplitudes: Array
+    covariance: Array
+
+    @staticmethod
+    def start(
+        cells: BodyCells, seconds: Sequence[float | None], boards: Array, sway: Array
+    ) -> BodyMotion:
+        """Nothing moved yet. boards: (6P, 6P) covariance of the pairs' poses; sway: (6,) standard
+        deviations of a usual turn (radians) and shift (mm) about the body's centre."""
+        stance, pairs = Courses.of(of_stance, seconds), len(seconds)
+        by_freedom = np.arange(6 * pairs).reshape(pairs, 6).T.ravel()
+        known = invert_scaled(boards)[np.ix_(by_freedom, by_freedom)]
+        part = rigid_fields(cells, cells.centres.mean(axis=0), ARM_MM)
+        limbs = modulated(part, cells, cells.alike(PART_MM, LEAST_PART))
+        bulge = modulated(normal_field(cells), cells, cells.alike(BULGE_MM, LEAST_BULGE))
+        kinds = (
+            Kind("pose", rigid_fields(cells, np.zeros(3), 1.0), Courses.steady(pairs), 1.0, known),
+            Kind("sway", rigid_fields(cells, BODY_CENTRE, 1.0) * sway, stance, 2.0),
+            Kind("parts", limbs, stance),
+            Kind("bulge", bulge, Courses.of(of_breath, seconds)),
+        )
+        count = sum(kind.count for kind in kinds)
+        return BodyMotion(kinds, sway, np.zeros(count), np.zeros((count, count)))
+
+    @cached_property
+    def slices(self) -> tuple[slice, ...]:
+        """Where each kind's amplitudes stand."""
+        ends = np.cumsum([0, *(kind.count for kind in self.kinds)]).tolist()
+        return tuple(slice(a, b) for a, b in pairwise(ends))
+
+    @cached_property
+    def fields(self) -> Array:
+        return np.concatenate([kind.fields for kind in self.kinds], axis=2)
+
+    def kind(self, name: str) -> Kind:
+        return next(kind for kind in self.kinds if kind.name == name)
+
+    def of(self, name: str, course: Array) -> Array:
+        """(M, ...) amplitudes of one kind's fields along courses (J, ...)."""
+        k = self.kinds.index(self.kind(name))
+        return np.asarray(self.amplitudes[self.slices[k]].reshape(-1, len(course)) @ course)
+
+    def displacements(self, names: Sequence[str], *, from_middle: bool = False) -> Array:
+        """(P, C, 12) mm: what those kinds come to at each pair's moment."""
+        first = self.kinds[0]
+        total = np.zeros((first.fields.shape[0] * 12, len(first.courses.values)))
+        for kind in self.kinds:
+            if kind.name in names:
+                middle = kind.courses.middle if from_middle else 0.0
+                course = (kind.courses.values - middle).T
+                total += kind.fields.reshape(len(total), -1) @ self.of(kind.name, course)
+        return total.T.reshape(total.shape[1], -1, 12)
+
+    def solved(self, evidence: Mapping[tuple[int, int], CellEvidence]) -> BodyMotion:
+        """One step of all amplitudes; every round matches anew. evidence: by pairs (a, b)."""
+        names = [kind.name for kind in self.kinds]
+        now = self.displacements(names)
+        asked = [self._asked(e, now[a] - now[b]) for (a, b), e in evidence.items()]
+        squares, pulls = zip(*asked, strict=True)
+        square, pull = np.array(squares), np.array(pulls)
+        first, second = np.array(list(evidence)).T
+        ends = np.cumsum([0, *(kind.fields.shape[2] for kind in self.kinds)])
+        apart = [k.courses.values[first] - k.courses.values[second] for k in self.kinds]
+        normal, right = np.zeros((len(self.amplitudes),) * 2), np.zeros(len(self.amplitudes))
+        for g, kind in enumerate(self.kinds):
+            own, rows = slice(ends[g], ends[g + 1]), self.slices[g]
+            right[rows] = (pull[:, own].T @ apart[g]).ravel()
+            for h, other in enumerate(self.kinds[: g + 1]):
+                block = square[:, own, ends[h] : ends[h + 1]]
+                normal[rows, self.slices[h]] = _products(block, apart[g], apart[h]).reshape(
+                    kind.count, other.count
+                )
+            normal[rows, rows] += kind.prior
+        return self._settled(normal, right)
+
+    def _asked(self, seen: CellEvidence, apart: Array) -> tuple[Array, Array]:
+        """What an overlap asks of the fields, (M, M) and (M,); apart: (C, 12) of its two pairs now."""
+        fields = self.fields[seen.cells]
+        basis = fields.reshape(-1, fields.shape[2])
+        wanted = np.einsum("cij,cj->ci", seen.information, apart[seen.cells]) - seen.gradient
+        return basis.T @ (seen.information @ fields).reshape(basis.shape), basis.T @ wanted.ravel()
+
+    def _settled(self, normal: Array, right: Array) -> BodyMotion:
+        """With the solution of normal equations of which the lower triangle counts."""
+        size = 1.0 / np.sqrt(np.diag(normal))
+        factor = cho_factor(normal * size[:, None] * size, lower=True, check_finite=False)
+        lower = np.tril(dpotri(factor[0], lower=True)[0])
+        covariance = (lower + np.tril(lower, -1).T) * size[:, None] * size
+        return replace(
+            self, amplitudes=size * cho_solve(factor, size * right), covariance=covariance
+        )
+
+    def resized(self) -> BodyMotion:
+        """Each kind as large as the evidence says (MacKay 1992): what it does not ask for shrinks."""
+        kinds = []
+        for kind, some in zip(self.kinds, self.slices, strict=True):
+            told = kind.count - np.trace(self.covariance[some, some]) / kind.size**2
+            size = np.sqrt(np.sum(self.amplitudes[some] ** 2) / max(told, 1e-6))
+            kinds.append(replace(kind, size=max(float(size), SMALLEST_MM)) if kind.moves else kind)
+        return replace(self, kinds=tuple(kinds))
+
+
+def _products(block: Array, first: Array, second: Array) -> Array:
+    """(M, J, N, K): sums over overlaps of (O, M, N) times courses (O, J) and (O, K)."""
+    flat = block.reshape(len(block), -1)
+    courses = (first[:, :, None] * second[:, None, :]).reshape(len(block), -1)
+    shape = (*block.shape[1:], first.shape[1], second.shape[1])
+    return np.asarray((flat.T @ courses).reshape(shape).transpose(0, 2, 1, 3))
+
+
+def observed(motion: BodyMotion, pair: int, cells: Indices, normals: Array) -> Array:
+    """(c, n): how each amplitude displaces cells along their normals (c, 3) as a pair saw them,
+    against the middle."""
+    rows = []
+    for kind in motion.kinds:
+        along = np.einsum("cim,ci->cm", kind.fields[cells, :3], normals)
+        rows.append((along[:, :, None] * kind.during(pair)).reshape(len(cells), -1))
+    return np.hstack(rows)

@@ -1,0 +1,88 @@
+"""What the overlap of two pairs asks of the body's cells: normal equations of an affine motion each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.alignment.matching import Matches
+from bodyscan.alignment.overlap_equations import LEAST_SPREAD_MM
+from bodyscan.arrays import Array, Indices
+from bodyscan.compiled import compiled
+from bodyscan.geometry.robust import spread
+
+
+@dataclass(frozen=True, eq=False)
+class CellEvidence:
+    """cells: (c,) in which two pairs overlap.  information (c, 12, 12) = J^T W J and gradient
+    (c, 12) = J^T W d, d the distances from the second's surface to the first's and J their Jacobian
+    by the first's displacement field in a cell (see `rigid_fields`)."""
+
+    cells: Indices
+    information: Array
+    gradient: Array
+
+    @staticmethod
+    def of(matches: Matches, cell: Indices, centres: Array, correlated: float) -> CellEvidence:
+        """cell: (M,) of each match.  Weights as in `OverlapEquations`."""
+        cells, number = np.unique(cell, return_inverse=True)
+        information = np.zeros((len(cells), 12, 12))
+        gradient = np.zeros((len(cells), 12))
+        distances = matches.distances
+        _accumulate(
+            number,
+            (matches.points - centres[cell], matches.normals),
+            distances,
+            matches.sigma_mm,
+            spread(distances, LEAST_SPREAD_MM),
+            (information, gradient),
+        )
+        information += np.swapaxes(np.tril(information, -1), 1, 2)
+        return CellEvidence(cells, information / correlated, gradient / correlated)
+
+    def turned(self) -> CellEvidence:
+        """The same with first and second exchanged."""
+        return CellEvidence(self.cells, self.information, -self.gradient)
+
+    @staticmethod
+    def total(parts: Sequence[CellEvidence]) -> CellEvidence:
+        cells = np.unique(np.concatenate([part.cells for part in parts]))
+        information = np.zeros((len(cells), 12, 12))
+        gradient = np.zeros((len(cells), 12))
+        for part in parts:
+            at = np.searchsorted(cells, part.cells)
+            information[at] += part.information
+            gradient[at] += part.gradient
+        return CellEvidence(cells, information, gradient)
+
+
+@compiled
+def _accumulate(
+    cell: Indices,
+    places: tuple[Array, Array],
+    distances: Array,
+    sigma_mm: Array,
+    spread_mm: float,
+    equations: tuple[Array, Array],
+) -> None:
+    """Adds M distances to their cells' lower triangles and gradients.
+
+    places: of each, how far it lies from its cell's centre (M, 3), and its normal (M, 3).
+    """
+    off, normals = places
+    information, gradient = equations
+    jacobian = np.empty(12)
+    for n in range(len(distances)):
+        for k in range(3):
+            jacobian[k] = normals[n, k]
+            for axis in range(3):
+                jacobian[3 + 3 * axis + k] = off[n, axis] * normals[n, k]
+        variance = sigma_mm[n] ** 2 + spread_mm**2
+        weight = 1.0 / (variance + 0.25 * distances[n] ** 2)
+        for i in range(12):
+            weighted = weight * jacobian[i]
+            gradient[cell[n], i] += weighted * distances[n]
+            for j in range(i + 1):
+                information[cell[n], i, j] += weighted * jacobian[j]

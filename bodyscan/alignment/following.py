@@ -1,0 +1,278 @@
+"""One body out of many moments: a person followed while pair after pair sees them.
+
+Alignment places each pair by one rigid motion. Who breathes, or moves an arm, needs more: each pair's
+surface is carried, cell by cell of the body, to where it was in the middle of the scan. Only a
+person whose overlaps ask for it is; a mannequin is left as alignment has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import permutations
+from typing import TypeVar
+
+import numpy as np
+
+from bodyscan.alignment.body_cells import BodyCells, displaced
+from bodyscan.alignment.body_motion import BodyMotion, observed
+from bodyscan.alignment.cell_evidence import CellEvidence
+from bodyscan.alignment.icp import COARSE, Alignment
+from bodyscan.alignment.matching import (
+    SEAM_RIM_PX,
+    AlignmentPoints,
+    Matches,
+    alignment_points,
+    match_nearest,
+    match_projected,
+)
+from bodyscan.alignment.sway import BODY_CENTRE, SwayPrior, centre_shifts
+from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import THREADS
+from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.settings import AlignmentSettings
+
+Result = TypeVar("Result")
+
+BENDING = ("parts", "bulge")
+MOVING = ("sway", *BENDING)
+BLEND_MM = 60.0
+ROUNDS = 4  # the last with all points
+STILL_MM = 0.1
+"""RMS of what no rigid motion explains; less does no harm, and calibrations bend by half of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """A person's motion, in cells of the body (see `BodyCells`).
+
+    bends: by pair, (C, 12) displacement fields from where the pair's placing has the surface to
+    where it was in the middle of the scan.  moved: (P, C, 3) mm, by pair, all that the
+    person moved between its moment and the middle.
+    seen: (P, C) which pairs saw which cells.  sigma_mm: (C,), of a cell's surface along its normal,
+    from what is not known of the motion and of the pairs' poses.
+    timed: whether the pairs' moments were known; if not, the middle is the mean.
+    """
+
+    cells: BodyCells
+    bends: dict[str, Array]
+    moved: Array
+    seen: Mask
+    sigma_mm: Array
+    timed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """What one pair adds: points that take part, and each one's cell; whole: the same points nearly
+    up to the rims, for pairs with which it shares no more."""
+
+    start: RigidTransform
+    points: AlignmentPoints
+    whole: AlignmentPoints
+    cell: Indices
+
+    @staticmethod
+    def of(start: RigidTransform, image: RangeImage, spacing_mm: float) -> _View:
+        points = alignment_points(image, spacing_mm)
+        whole = alignment_points(image, spacing_mm, SEAM_RIM_PX)
+        return _View(start, points, whole, np.zeros(len(points.points), np.int64))
+
+    def among(self, cell: Indices) -> _View:
+        """With the cell of each point; without the points that lie in none."""
+        return replace(self, cell=cell).some(cell >= 0)
+
+    def some(self, chosen: Mask | slice) -> _View:
+        points, whole = (
+            replace(
+                part,
+                points=part.points[chosen].copy(),
+                normals=part.normals[chosen].copy(),
+                sigma_mm=part.sigma_mm[chosen].copy(),
+                rim=part.rim[chosen].copy(),
+            )
+            for part in (self.points, self.whole)
+        )
+        return _View(self.start, points, whole, self.cell[chosen].copy())
+
+
+def follow(
+    images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    aligned: Alignment,
+    prior: PoseCovariance,
+    settings: AlignmentSettings,
+    *,
+    workers: int = THREADS,
+) -> tuple[Alignment, Followed | None]:
+    """The alignment with a moving person's sway along time, and what else moved; None, and the
+    alignment as it was, for who stood still or if too little overlaps to tell.
+
+    images, rig_from_camera, prior, settings: what `align` got; aligned: what it made of them.
+    """
+    if not aligned.overlaps or not settings.sway_mm or aligned.refused:
+        return aligned, None
+    names = [image.pair for image in images]
+    seconds = [None if image.time_ms is None else 1e-3 * image.time_ms for image in images]
+    with ThreadPoolExecutor(workers) as pool:
+        views = list(
+            pool.map(
+                lambda image: _View.of(rig_from_camera[image.pair], image, settings.spacing_mm),
+                images,
+            )
+        )
+        both = [(aligned.rig_from_camera[n], v.points) for n, v in zip(names, views, strict=True)]
+        cells, cell = BodyCells.of(
+            np.concatenate([place.apply(cloud.points) for place, cloud in both]),
+            np.concatenate([place.rotate(cloud.normals) for place, cloud in both]),
+        )
+        ends = np.cumsum([len(cloud.points) for _, cloud in both])[:-1]
+        views = [view.among(own) for view, own in zip(views, np.split(cell, ends), strict=True)]
+        seen = np.array(
+            [np.bincount(view.cell, minlength=len(cells.centres)) > 0 for view in views]
+        )
+        usual = np.repeat([np.radians(settings.sway_deg), settings.sway_mm], 3)
+        boards = SwayPrior(0.0, 0.0, 0.0, 0.0).covariance(names, prior)
+        motion = BodyMotion.start(cells, seconds, boards, usual)
+        asks = partial(CellEvidence.of, centres=cells.centres, correlated=settings.correlated)
+        coarse, reach = [view.some(slice(None, None, COARSE)) for view in views], settings.reach_mm
+        for left in range(ROUNDS, 0, -1):
+            taken = coarse if left > 1 else views
+            said = _each_overlap(asks, pool, taken, (motion, cells), reach, settings)
+            if not said:
+                return aligned, None
+            if left < ROUNDS:
+                motion = motion.resized()
+            motion = motion.solved(_both_ways(said))
+            reach = max(reach / 2.0, settings.least_reach_mm)
+            if left == ROUNDS - 1 and _stands_still(motion, seen, settings):
+                return aligned, None
+        gaps = _each_overlap(_gap, pool, coarse, (motion, cells), reach, settings)
+    followed = Followed(
+        cells,
+        dict(zip(names, motion.displacements(BENDING, from_middle=True), strict=True)),
+        motion.displacements(MOVING, from_middle=True)[..., :3],
+        seen,
+        _cell_sigmas(motion, cells, seen),
+        all(second is not None for second in seconds),
+    )
+    return _placed(aligned, names, views, motion, gaps), followed
+
+
+def _rigid(motion: BodyMotion, pair: int, *, from_middle: bool = False) -> Array:
+    """(6,) a pair's own error and the person's sway, as one motion about the rig's origin."""
+    twist = motion.of("pose", motion.kind("pose").during(pair)).copy()
+    sway = motion.kind("sway")
+    course = sway.during(pair) if from_middle else sway.courses.values[pair]
+    turn, shift = (motion.of("sway", course) * motion.usual).reshape(2, 3)
+    twist[:3] += turn
+    twist[3:] += shift - np.cross(turn, BODY_CENTRE)
+    return twist
+
+
+def _each_overlap(
+    measure: Callable[[Matches, Indices], Result],
+    pool: ThreadPoolExecutor,
+    views: Sequence[_View],
+    person: tuple[BodyMotion, BodyCells],
+    reach_mm: float,
+    settings: AlignmentSettings,
+) -> dict[tuple[int, int], Result]:
+    """What the matches of every two pairs, and their cells, say, the person as followed so far."""
+    motion, cells = person
+    match = match_projected if settings.matching == "projected" else match_nearest
+    placed = [view.start.moved(_rigid(motion, k)) for k, view in enumerate(views)]
+    bends = motion.displacements(BENDING)
+
+    def of_two(both: tuple[int, int]) -> Result | None:
+        """The source carried to where it was when the target was seen."""
+        (i, j), view = both, views[both[0]]
+        points, away = placed[i].apply(view.points.points), bends[i] - bends[j]
+        points += displaced(away[view.cell], points - cells.centres[view.cell])
+        carried = {"points": points, "normals": placed[i].rotate(view.points.normals)}
+        here, there = RigidTransform.identity(), placed[j]
+        inner, whole = replace(view.points, **carried), replace(view.whole, **carried)
+        found = match(inner, views[j].points, here, there, reach_mm)
+        if len(found.distances) < settings.fewest:
+            found = match(whole, views[j].whole, here, there, reach_mm).of_seam
+        few = len(found.distances) < settings.fewest
+        return None if few else measure(found, view.cell[found.source])
+
+    every_two = list(permutations(range(len(views)), 2))
+    said = zip(every_two, pool.map(of_two, every_two), strict=True)
+    return {both: result for both, result in said if result is not None}
+
+
+def _both_ways(said: Mapping[tuple[int, int], CellEvidence]) -> dict[tuple[int, int], CellEvidence]:
+    """What one way gets wrong on curves cancels."""
+    gathered: dict[tuple[int, int], list[CellEvidence]] = {}
+    for (i, j), evidence in said.items():
+        one = evidence if i < j else evidence.turned()
+        gathered.setdefault((min(i, j), max(i, j)), []).append(one)
+    return {both: CellEvidence.total(parts) for both, parts in gathered.items()}
+
+
+def _stands_still(motion: BodyMotion, seen: Mask, settings: AlignmentSettings) -> bool:
+    """Whether nothing moved that a rigid placing of each pair does not see to as well."""
+    bends = motion.displacements(BENDING, from_middle=True)[seen][:, :3]
+    sway = motion.displacements(("sway",), from_middle=True)[seen][:, :3]
+    bent, swayed = (np.sqrt(np.mean(np.sum(moved**2, axis=1))) for moved in (bends, sway))
+    return bool(bent < STILL_MM and swayed < settings.least_sway * settings.sway_mm)
+
+
+def _gap(matches: Matches, cell: Indices) -> float:
+    return float(np.sqrt(np.mean(matches.distances**2)))
+
+
+def _placed(
+    aligned: Alignment,
+    names: Sequence[str],
+    views: Sequence[_View],
+    motion: BodyMotion,
+    gaps: Mapping[tuple[int, int], float],
+) -> Alignment:
+    twists = np.array([_rigid(motion, k, from_middle=True) for k in range(len(views))])
+    shift = np.linalg.norm(centre_shifts(twists), axis=1)
+    placed = [view.start.moved(twist) for view, twist in zip(views, twists, strict=True)]
+    left = {(names[i], names[j]): rms_mm for (i, j), rms_mm in gaps.items()}
+    return replace(
+        aligned,
+        rig_from_camera=dict(zip(names, placed, strict=True)),
+        motion_mm={
+            name: mm
+            for name, mm in zip(names, shift.tolist(), strict=True)
+            if name in aligned.motion_mm
+        },
+        overlaps=tuple(
+            replace(o, rms_after_mm=left.get((o.source, o.target), o.rms_after_mm))
+            for o in aligned.overlaps
+        ),
+    )
+
+
+def _cell_sigmas(motion: BodyMotion, cells: BodyCells, seen: Mask) -> Array:
+    """(C,) mm along the normals, of what is not known of the shape: a motion of the whole does not
+    count.  Looked at in the landmarks, from which it changes slowly."""
+    pair, mark = np.nonzero(seen[:, cells.landmarks])
+    there = cells.landmarks[mark]
+    rows = np.concatenate(
+        [
+            observed(motion, k, there[pair == k], cells.normals[there[pair == k]])
+            for k in np.unique(pair)
+        ]
+    )
+    off, normals = cells.centres[there] - BODY_CENTRE, cells.normals[there]
+    whole = np.linalg.qr(np.hstack([np.cross(off, normals), normals]))[0]
+    rows -= whole @ (whole.T @ rows)
+    variance = np.sum((rows @ motion.covariance) * rows, axis=1)
+    size = len(cells.landmarks)
+    mean = np.bincount(mark, variance, size) / np.maximum(np.bincount(mark, minlength=size), 1)
+    near = (
+        np.exp(-0.5 * (cells.away / BLEND_MM) ** 2)
+        * (np.bincount(mark, minlength=size) > 0)[:, None]
+    )
+    return np.sqrt(mean @ near / np.maximum(near.sum(axis=0), 1e-12))
