@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -193,7 +193,10 @@ def _each_overlap(
         (i, j), view = both, views[both[0]]
         points, away = placed[i].apply(view.points.points), bends[i] - bends[j]
         points += displaced(away[view.cell], points - cells.centres[view.cell])
-        carried = {"points": points, "normals": placed[i].rotate(view.points.normals)}
+        carried: dict[str, Any] = {
+            "points": points,
+            "normals": placed[i].rotate(view.points.normals),
+        }
         here, there = RigidTransform.identity(), placed[j]
         inner, whole = replace(view.points, **carried), replace(view.whole, **carried)
         found = match(inner, views[j].points, here, there, reach_mm)
