@@ -17,6 +17,7 @@ from bodyscan.rig.board import Board
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
+from bodyscan.rig.sizes import odd_sizes
 
 FEWEST_SHOTS = 3
 ENOUGH_SHOTS = 6
@@ -102,6 +103,7 @@ def check(
         errors += filter(None, map(_too_few, rig.pairs, counts))
     silent = rig.calibration or rig.is_known
     warnings = [] if silent else [f"{rig_path}: names no calibration captures"]
+    warnings += odd_sizes(rig)
     warnings += [NO_INVERSES] if any(map(_lacks_inverses, sequences)) else []
     warnings += filter(None, map(_unlisted_images, captures))
     warnings += map(_turned, filter(lambda board: board.looks_same_turned, rig.boards))

@@ -17,7 +17,7 @@ from bodyscan.errors import BadInput, BodyscanError, FailedWork, listed, plainly
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, step
-from bodyscan.registration.board_checks import describe_findings
+from bodyscan.registration.board_checks import check_board_size, describe_findings
 from bodyscan.registration.rig_calibration import RigCalibration, seen_corners
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
@@ -104,6 +104,7 @@ def join_rig(
         located = locate_views(rig, boards.value, cameras.value)
         joined = _join_pairs(rig, located.value, cameras)
     placed = joined.value
+    sized = check_board_size(rig, placed.rig_from_camera)
     decoded = decode_on_boards(rig, captures, _of_views(placed, boards.value), progress)
     lost = {**cameras.failures, **joined.failures, **decoded.failures}
     fitted = _fit_sheets(rig, placed, cameras.value, decoded, progress)
@@ -114,7 +115,7 @@ def join_rig(
     for pair in pairs.values():
         placed = update_poses(rig, placed, pair)
     stages = (boards, cameras, located, decoded, fitted, joined)
-    notes = [note for stage in stages for note in stage.notes]
+    notes = [*sized, *(note for stage in stages for note in stage.notes)]
     calibration = RigCalibration(
         rig,
         pairs,

@@ -11,7 +11,7 @@ from bodyscan.calibration.pair import PairCalibration
 from bodyscan.optional import optional
 from bodyscan.progress import Progress, silent, step
 from bodyscan.registration.advice import advise
-from bodyscan.registration.board_checks import boards_not_found, check_board_size
+from bodyscan.registration.board_checks import boards_not_found
 from bodyscan.registration.halves import compare_halves
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.rig_solve import RigSolution
@@ -38,8 +38,6 @@ def remarked(found: JoinedRig, progress: Progress = silent) -> RigCalibration:
         notes += coverage_notes(own.rig, found.views)
     with optional("boards that were not found", notes.append):
         notes += boards_not_found(own.rig, found.views, found.images)
-    with optional("size of the boards", notes.append):
-        notes += check_board_size(own.rig, placed.rig_from_camera)
     if len(placed.rig_from_camera) > 1 and not own.failed:
         with step(progress, "advice"):
             with optional("advice", notes.append):
