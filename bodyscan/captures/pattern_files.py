@@ -102,10 +102,12 @@ def _write_kind(
 
 
 def _in_order(frames: FrameNames, kind: StripeCode, coded: Bytes) -> Iterator[tuple[str, Bytes]]:
-    """Name and image (H, W): lit and dark if they are taken, then those of the code."""
+    """Name and image (H, W): lit and dark if they are taken, then those of the code as they are best
+    shown."""
     blank = np.zeros(coded.shape[1:], np.uint8)
     if frames.lit is not None:
         yield frames.lit, blank + 255
     if frames.dark is not None and any(way.uses_dark for way in kind.directions):
         yield frames.dark, blank
-    yield from zip(frames.of_code(kind), coded, strict=True)
+    images = dict(zip(frames.of_code(kind), coded, strict=True))
+    yield from ((name, images[name]) for name in frames.as_shown(kind))

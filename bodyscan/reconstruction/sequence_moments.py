@@ -4,6 +4,7 @@ one moment."""
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -29,12 +30,24 @@ def sequence_moments(
 ) -> tuple[Moments, ...]:
     """Of the stripes, and of those that cross them, which are wanted at the same moment.
 
-    frame_ms: when each image was taken, by its name. Times are in seconds then. Where it is not known,
-    images are taken to have come one after the other in the code's order, and times are counted in
-    images: motion can be taken out by that as well, only its speed is not known.
+    frame_ms: when each image was taken, by its name; times are in seconds then. Where it is not known,
+    images are taken to have come one after the other in the code's order or in that in which they are
+    best shown, and times are counted in images: motion can be taken out by that as well, only its speed
+    is not known.
     """
-    if frame_ms is None:
-        frame_ms = {name: MS * place for place, name in enumerate(frames.of_code(code))}
+    if frame_ms is not None:
+        return _moments(pair, code, frames, frame_ms)
+    orders = frames.of_code(code), frames.as_shown(code)
+    counted = [{name: MS * place for place, name in enumerate(names)} for names in orders]
+    usual, shown = (_moments(pair, code, frames, each) for each in counted)
+    if orders[0] == orders[1]:
+        return usual
+    return tuple(replace(one, instead=other) for one, other in zip(usual, shown, strict=True))
+
+
+def _moments(
+    pair: PairCalibration, code: StripeCode, frames: FrameNames, frame_ms: Mapping[str, float]
+) -> tuple[Moments, ...]:
     found: list[Moments] = []
     ways = zip(
         code.directions, (frames, frames.crossing), (pair.sheets, pair.crossing), strict=False

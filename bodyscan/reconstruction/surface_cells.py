@@ -47,18 +47,21 @@ class Cells:
         return np.asarray(row * columns + column, np.int64)
 
 
-def fit_planes(cells: Cells, pixels: Array, rays: Array, depth: Array) -> tuple[Array, Array]:
+def fit_planes(
+    cells: Cells, pixels: Array, rays: Array, depth: Array, weights: Array
+) -> tuple[Array, Array]:
     """(cells, 3) each: p of each cell's plane p.P = 1, camera frame, 1/mm, and P in the middle of
     what was seen of it; NaN where none is known.
 
     From places (N, 2) px with rays (N, 3), z = 1, and depths (N,) mm: 1/z = p.x along the ray x, so
-    that the fit is linear.
+    that the fit is linear.  weights: (N,), of what else is averaged over the same places.
     """
     cell = cells.of(pixels)
-    count = np.maximum(np.bincount(cell, minlength=cells.count), 1.0)
+    count = np.bincount(cell, minlength=cells.count)
+    total = np.maximum(np.bincount(cell, weights, cells.count), 1e-300)
 
     def mean(values: Array) -> Array:
-        return np.asarray(np.bincount(cell, values, cells.count) / count, np.float64)
+        return np.asarray(np.bincount(cell, weights * values, cells.count) / total, np.float64)
 
     x, y, inverse = mean(rays[:, 0]), mean(rays[:, 1]), mean(1.0 / depth)
     across, down, off = rays[:, 0] - x[cell], rays[:, 1] - y[cell], 1.0 / depth - inverse[cell]

@@ -125,6 +125,11 @@ class FrameNames(ImageNames):
             for name in own.of_one_way(way)
         )
 
+    def as_shown(self, code: StripeCode) -> tuple[str, ...]:
+        """Names as `of_code`, in the order in which they are best shown (`StripeCode.show_order`)."""
+        ways = zip((self, self.crossing), code.directions, strict=False)
+        return tuple(own.of_one_way(way)[k] for own, way in ways for k in way.show_order)
+
     def of_sequence(self, code: StripeCode | None) -> tuple[str, ...]:
         """Names of all images of a whole sequence, in the order in which they are taken if nothing
         else is said; of a camera without projector its board image."""

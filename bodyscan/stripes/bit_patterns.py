@@ -60,9 +60,9 @@ def decode_bits(
     sigma_px = np.hypot(boundaries.sigma_px, code.doubt_px)
     boundaries, motion, carried = replace(boundaries, sigma_px=sigma_px), None, 0.0
     if moments is not None:
-        times = moments.of_bits[bit_that_flips(boundaries.index + code.first, len(images.patterns))]
+        bit = bit_that_flips(boundaries.index + code.first, len(images.patterns))
         boundaries, motion, carried = carry_to_moment(
-            boundaries, times, moments, turned=images.turned
+            boundaries, bit, moments, turned=images.turned
         )
     boundaries = replace(boundaries, sigma_px=scatter(boundaries) * boundaries.sigma_px)
     s, sigma = interpolate_stripes(boundaries, codes, usable, carried)

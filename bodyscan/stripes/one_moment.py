@@ -22,6 +22,7 @@ class StripeMotion:
     between: stripes per unit of time, and the standard deviation of what is not known of it.
     velocity: of the body, per the same unit of time.  speed_mm: how fast it moved in depth, RMS.
     doubt_mm: of that, what neither a rigid motion nor the field explains, RMS over the cells.
+    explained: by how much the rigid motion lowers chi-square.
     is_significant: whether noise does not explain it.
     """
 
@@ -31,6 +32,7 @@ class StripeMotion:
     velocity: Velocity
     speed_mm: float
     doubt_mm: float
+    explained: float
     is_significant: bool
 
 
@@ -40,12 +42,13 @@ class Moments:
     its motion from the comb.
 
     times: of each image (n,) by the name of its kind, any unit.  told: None where the comb tells
-    nothing.
+    nothing.  instead: another order in which they may have come, where nobody says.
     """
 
     times: Mapping[str, Array]
     moment: float
     told: Callable[[Comb], StripeMotion | None]
+    instead: Moments | None = None
 
     @property
     def of_bits(self) -> Array:
@@ -59,17 +62,25 @@ class Moments:
 
 
 def carry_to_moment(
-    boundaries: Boundaries, times: Array, moments: Moments, *, turned: bool
+    boundaries: Boundaries, bit: Indices, moments: Moments, *, turned: bool
 ) -> tuple[Boundaries, StripeMotion | None, float]:
     """The boundaries as they would have been seen at the moment, what moved them, and the farthest
-    that s had to be carried, stripes. times: (N,) when each boundary was seen.
+    that s had to be carried, stripes.  bit: (N,) in whose images each boundary was seen.
 
-    What noise explains leaves them untouched.
+    What noise explains leaves them untouched. Of two orders the one that explains more is believed.
     """
-    motion = moments.told(find_comb(boundaries, times, turned=turned))
+
+    def told(seen: Moments) -> StripeMotion | None:
+        return seen.told(find_comb(boundaries, seen.of_bits[bit], turned=turned))
+
+    motion = told(moments)
     if motion is None or not motion.is_significant:
         return boundaries, motion, 0.0
-    late = times - moments.moment
+    if moments.instead is not None:
+        other = told(moments.instead)
+        if other is not None and other.explained > motion.explained:
+            moments, motion = moments.instead, other
+    late = moments.of_bits[bit] - moments.moment
     place = [boundaries.line_position, boundaries.position]
     column, row = place if turned else place[::-1]
     grid = np.stack([motion.speed, motion.doubt])

@@ -113,6 +113,11 @@ class StripeCode(Model):
         """How many images of each kind are shown, in their order, besides lit and dark; those of
         `crossing`, which follow, left out."""
 
+    @property
+    def show_order(self) -> tuple[int, ...]:
+        """Its images, numbered as in `image_counts`, in the order in which they are best shown."""
+        return tuple(range(sum(self.image_counts.values())))
+
     def moment(self, times: Mapping[str, Array]) -> float:
         """The moment for which its stripe map stands, in the unit of the images' times (n,) by kind."""
         first = min(float(each.min()) for each in times.values())

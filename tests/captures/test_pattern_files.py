@@ -30,12 +30,16 @@ def test_projectors_of_one_kind_share_one_folder(tmp_path: Path) -> None:
     assert told["pairs"] == ["p1", "p2"]
     assert (told["width"], told["height"]) == (30, 24)
     shown = [entry["file"] for entry in told["show"]]
+    # The finest in the middle, each beside its inverse.
     assert shown == [
-        "lit.png", "dark.png", *(f"bit0{k}.png" for k in range(4)),
-        *(f"bit0{k}-inverse.png" for k in range(4)),
+        "lit.png", "dark.png",
+        *(f"bit0{k}{inverse}.png" for k in (1, 3, 2, 0) for inverse in ("", "-inverse")),
     ]  # fmt: skip
     assert {path.name for path in folder.iterdir()} == {*shown, "patterns.json"}
-    lit, dark, *bits = (cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED) for name in shown)
+    by_code = [f"bit0{k}{inverse}.png" for inverse in ("", "-inverse") for k in range(4)]
+    lit, dark, *bits = (
+        cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED) for name in (*shown[:2], *by_code)
+    )
     assert lit.shape == (24, 30)
     assert lit.min() == 255
     assert dark.max() == 0
@@ -93,10 +97,9 @@ def test_crossing_stripes_are_shown_after_the_others_from_their_first_code(tmp_p
     folder = tmp_path / "out" / "gray-12-horizontal-10-vertical"
     told = json.loads((folder / "patterns.json").read_text())
     shown = [entry["file"] for entry in told["show"]]
-    assert shown[2:10] == [f"bit0{k}{way}.png" for way in ("", "-inverse") for k in range(4)]
-    assert shown[10:] == [
-        f"crossing-bit0{k}{way}.png" for way in ("", "-inverse") for k in range(4)
-    ]
+    order = [f"bit0{k}{way}.png" for k in (1, 3, 2, 0) for way in ("", "-inverse")]
+    assert shown[2:10] == order
+    assert shown[10:] == [f"crossing-{name}" for name in order]
     number = np.arange(30) // 3 + 3
     for bit in range(4):
         image = cv2.imread(str(folder / f"crossing-bit0{bit}.png"), cv2.IMREAD_UNCHANGED)

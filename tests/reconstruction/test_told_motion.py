@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -18,12 +20,16 @@ TIMES = np.linspace(1.0 - BITS, 0.0, BITS) / 60.0
 STILL = np.zeros(3)
 
 
-def carry(seen: Boundaries, times: Array = TIMES) -> tuple[Boundaries, StripeMotion | None, float]:
+def carry(
+    seen: Boundaries, times: Array = TIMES, instead: Array | None = None
+) -> tuple[Boundaries, StripeMotion | None, float]:
     def told(comb: Comb) -> StripeMotion | None:
         return tell_motion(CAMERA, sheets(), comb)
 
     moments = Moments({"pattern": times}, float(times[-1]), told)
-    return carry_to_moment(seen, times[bit_of(seen.index)], moments, turned=True)
+    if instead is not None:
+        moments = replace(moments, instead=Moments({"pattern": instead}, float(instead[-1]), told))
+    return carry_to_moment(seen, bit_of(seen.index), moments, turned=True)
 
 
 def errors(carried: Boundaries) -> Array:
@@ -61,7 +67,9 @@ def test_what_a_ball_does_about_its_own_middle_is_not_seen_and_not_claimed() -> 
     _, motion, _ = carry(seen_boundaries(np.array([0.0, 0.0, 8.0]), TIMES))
     assert motion is not None
     turn = np.sqrt(np.diagonal(motion.velocity.covariance)[:3])
-    assert np.all(turn > 0.02)  # the prior's 0.05 rad/s; half of it at least is left
+    assert np.all(
+        turn > 0.015
+    )  # of the prior's 0.05 rad/s; a velocity of 8 mm/s would be 0.009 off
 
 
 def test_a_ball_that_stands_still_keeps_its_boundaries_to_the_bit() -> None:
@@ -94,6 +102,16 @@ def test_without_a_clock_the_order_is_enough() -> None:
     # Priors per image are wider than per second, and rule nothing here.
     np.testing.assert_allclose(by_order.position, by_clock.position, atol=4e-3)
     assert motion.velocity.at(CENTRE)[2] == pytest.approx(8.0 / 60.0, rel=0.1)
+
+
+def test_of_two_orders_the_one_that_explains_the_teeth_is_believed() -> None:
+    places = np.array([5.0, 3.0, 1.0, 0.0, 2.0, 4.0, 6.0])  # no line of the bits' numbers
+    seen = seen_boundaries(np.array([0.0, 0.0, 8.0]), (places - places[-1]) / 60.0)
+    by_number = np.arange(BITS, dtype=float)
+    for usual, instead in ((by_number, places), (places, by_number)):
+        carried, _, _ = carry(seen, usual, instead)
+        # With the other order alone 0.03 px and more.
+        assert np.sqrt(np.mean(errors(carried) ** 2)) < 0.0205
 
 
 def test_teeth_that_no_smooth_motion_explains_go_into_the_sigmas() -> None:

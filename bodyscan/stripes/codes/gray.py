@@ -73,6 +73,19 @@ class _NumberedStripes(StripeCode):
         inverse = {INVERSE: self.bits} if self.inverses else {}
         return {PATTERN: self.bits} | inverse
 
+    @property
+    def show_order(self) -> tuple[int, ...]:
+        """The finest pattern in the middle, coarser ones before and behind it in turn, inverses beside.
+
+        Half of all boundaries are of the finest and a quarter of the next: so what moves meanwhile sets
+        them apart least.
+        """
+        finest_first = range(self.bits - 1, -1, -1)
+        bits = (*finest_first[2::2][::-1], finest_first[0], *finest_first[1::2])
+        if not self.inverses:
+            return bits
+        return tuple(image for bit in bits for image in (bit, self.bits + bit))
+
     def moment(self, times: Mapping[str, Array]) -> float:
         """That of the finest pattern and its inverse, which show half of all boundaries."""
         finest = [float(each[-1]) for each in times.values()]
