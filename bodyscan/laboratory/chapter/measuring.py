@@ -123,7 +123,7 @@ class TrueSheets:
         light = self.setup.projector.stripe
         further = first + SECANT_MM
         off = light(rays * first[..., None]) - s
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", divide="ignore"):
             for _ in range(SECANT_STEPS):
                 off_further = light(rays * further[..., None]) - s
                 change = off_further - off
