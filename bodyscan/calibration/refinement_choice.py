@@ -43,13 +43,17 @@ WAYS = APART, TOGETHER, BENT = (
     "joint solve",
     "joint solve with bent boards",
 )
+NEEDED = (0.0, 0.0, CLEARLY)
+"""Standard errors by which each has to do better than the one before. A joint solve has no more unknowns
+than corners and stripes one after the other, only more evidence on them: it is refused where held-out
+boards become worse. Boards that are bent are a richer model."""
 
 
 @dataclass(frozen=True)
 class RefinementTrial:
     """One way to solve for a pair.  rms_mm: of held-out boards' stripes about the boards, their own
-    motion taken out.  gain: by how many standard errors it beat the way chosen among those before it,
-    which it had to by three; None for the first."""
+    motion taken out.  gain: by how many standard errors it beat the way chosen among those before it
+    (see NEEDED); None for the first."""
 
     way: str
     rms_mm: float
@@ -115,7 +119,7 @@ def refine_where_better(
             Compared(held[chosen].stripes, held[i].stripes, parts[0]),
             Compared(held[chosen].corners, held[i].corners, parts[1]),
         )
-        chosen = i if better_by >= CLEARLY else chosen
+        chosen = i if better_by >= NEEDED[i] else chosen
     weights = shared_weights([one.stripes for one in held])
     trials = tuple(
         RefinementTrial(

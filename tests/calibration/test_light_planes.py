@@ -102,7 +102,7 @@ def pulls(
     believed_mm: float,
     seeds: int = 12,
 ) -> float:
-    """RMS of how far fitted planes are off at a point amid the boards, over what their covariance says."""
+    """RMS of how far fitted planes are off amid the boards, over what their covariance says."""
     planes, found = true_planes(), []
     for seed in range(seeds):
         rng = np.random.default_rng([7, seed])
