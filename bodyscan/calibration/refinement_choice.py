@@ -44,9 +44,9 @@ WAYS = APART, TOGETHER, BENT = (
     "joint solve with bent boards",
 )
 NEEDED = (0.0, 0.0, CLEARLY)
-"""Standard errors by which each has to do better than the one before. A joint solve has no more unknowns
-than corners and stripes one after the other, only more evidence on them: it is refused where held-out
-boards become worse. Boards that are bent are a richer model."""
+"""Standard errors by which each has to do better than the one before. A joint solve has no more
+unknowns than corners and stripes one after the other, only more evidence on them: it is refused where
+held-out boards become worse. Boards that are bent are a richer model."""
 
 
 @dataclass(frozen=True)
