@@ -45,6 +45,10 @@ def simulate(
         Literal["mannequin", "standing", "restless", "child"],
         typer.Option(help="How the subject moves while frames are taken."),
     ] = "mannequin",
+    look: Annotated[
+        Literal["matt", "skin", "dressed"],
+        typer.Option(help="Matt all over, like skin, or with dark hair and shorts too."),
+    ] = "matt",
     sway_mm: Annotated[
         float,
         typer.Option(min=0.0, help="How far the person moves, rigid, between the pairs' captures."),
@@ -84,6 +88,7 @@ def simulate(
                 projector,
                 preset=preset,
                 subject=subject_preset,
+                look=look,
                 sway_mm=sway_mm,
                 changes=changes or (),
             ),

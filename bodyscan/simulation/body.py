@@ -11,15 +11,19 @@ from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.simulation.clothing import dress
 from bodyscan.simulation.scene import Surface
-from bodyscan.simulation.settings import Person
+from bodyscan.simulation.settings import Person, Skin
 
 
-def load_subject(path: Path, person: Person, rng: np.random.Generator) -> Surface:
+def load_subject(
+    path: Path, person: Person, rng: np.random.Generator, covered_by: Skin | None = None
+) -> Surface:
     """A subject's PLY (metres, z up, facing -y) as a smooth surface in the rig frame, mm.
 
     The mesh is subdivided by Loop's rule, turned to face +x and put with its middle over the
-    rig's centre. The surface returned is itself the truth.
+    rig's centre. The surface returned is itself the truth.  covered_by: skin, hair and cloth; matt
+    skin all over if not given.
     """
     mesh = o3d.io.read_triangle_mesh(str(path)) if path.is_file() else o3d.geometry.TriangleMesh()
     if not mesh.has_triangles():
@@ -34,12 +38,13 @@ def load_subject(path: Path, person: Person, rng: np.random.Generator) -> Surfac
     vertices = np.asarray(mesh.vertices) @ turn.T * (1000.0 * person.size)
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     vertices -= [middle[0], middle[1], vertices[:, 2].min()]
-    return Surface(
+    bare = Surface(
         vertices,
         np.asarray(mesh.triangles).astype(np.int64),
         albedo=skin(vertices, person, rng),
         normals=np.asarray(mesh.vertex_normals) @ turn.T,
     )
+    return bare if covered_by is None else dress(bare, covered_by, rng)
 
 
 def skin(vertices: Array, person: Person, rng: np.random.Generator) -> Array:

@@ -93,7 +93,8 @@ def light_facets(scene: Scene, projector: Projector, lamps: Lamps, facet_mm: flo
     """Facets of about facet_mm x facet_mm: the samples of a surface in one cell of a grid that face
     the light alike."""
     samples, share = _samples(scene, facet_mm)
-    weight, s = laser_light(scene, samples, projector, lamps, seen=False)
+    light = laser_light(scene, samples, projector, lamps, seen=False)
+    weight, s = light.weight, light.s
     towards = projector.source(np.nan_to_num(s)) - samples.points
     side = np.where(dot(towards, samples.normals) < 0.0, np.float32(-1.0), np.float32(1.0))
     normals = samples.normals * (side / np.sqrt(dot(samples.normals, samples.normals)))[:, None]

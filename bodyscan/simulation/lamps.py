@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -10,6 +10,8 @@ from bodyscan.arrays import Floats
 from bodyscan.simulation.gray import PAD
 from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene, dot
+from bodyscan.simulation.settings import Skin
+from bodyscan.simulation.skin import came_in_at, highlight
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,7 @@ class Lamps:
     focus_mm: distance at which the projector and the camera are focused.
     window_grey: what a large window makes of a white surface that faces it.  window_way: (3,) unit,
     where it is, camera frame.
+    skin: what skin does with light.
     """
 
     laser_grey: float
@@ -29,6 +32,7 @@ class Lamps:
     focus_mm: float
     window_grey: float = 0.0
     window_way: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    skin: Skin = field(default_factory=Skin)
 
 
 def room_light(hits: Hits, lamps: Lamps) -> Floats:
@@ -46,10 +50,23 @@ def room_light(hits: Hits, lamps: Lamps) -> Floats:
     return np.asarray(light + np.float32(lamps.window_grey) * facing, np.float32)
 
 
+@dataclass(frozen=True, eq=False)
+class LaserLight:
+    """What each hit (N,) would get from a lit stripe.
+
+    weight: grey level of the light that it scatters.  s: where the projector's light is from, NaN where
+    none arrives.  gloss: grey level of what its skin mirrors; None where nothing is glossy.
+    """
+
+    weight: Floats
+    s: Floats
+    gloss: Floats | None
+
+
 def laser_light(
     scene: Scene, hits: Hits, projector: Projector, lamps: Lamps, *, seen: bool = True
-) -> tuple[Floats, Floats]:
-    """Grey level that each hit would get from a lit stripe (cosine, 1/r^2, shadow), and its s.
+) -> LaserLight:
+    """By cosine, 1/r^2 and shadow.
 
     seen: only where the light falls on the side that the camera sees.
     """
@@ -63,6 +80,20 @@ def laser_light(
     cosine = np.abs(height) / np.sqrt(square * dot(normals, normals))
     shadow = scene.is_shadowed(points, towards, hits.surface[chosen])
     bright = np.float32(lamps.laser_grey * lamps.reach_mm**2) * cosine / square
+    reaches = (front | (not seen)) & ~shadow
     weight = np.zeros(len(s), np.float32)
-    weight[chosen] = bright * ((front | (not seen)) & ~shadow) * hits.albedo[chosen]
-    return weight, s
+    weight[chosen] = bright * reaches * hits.albedo[chosen]
+
+    covered = np.flatnonzero(hits.skin[chosen] > 0.5)
+    gloss = None
+    if covered.size and lamps.skin.gloss > 0:
+        mirrored = highlight(points[covered], towards[covered], normals[covered], lamps.skin)
+        full = np.float32(lamps.laser_grey * lamps.reach_mm**2) / square[covered]
+        gloss = np.zeros(len(s), np.float32)
+        gloss[chosen[covered]] = full * mirrored * reaches[covered]
+    if covered.size and lamps.skin.oblique_mm > 0:
+        aside = lamps.skin.oblique_mm
+        entry = came_in_at(points[covered], towards[covered], normals[covered], aside)
+        s = s.copy()
+        s[chosen[covered]] = projector.stripe(entry)
+    return LaserLight(weight, s, gloss)

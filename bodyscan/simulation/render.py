@@ -22,6 +22,7 @@ from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene
 from bodyscan.simulation.sensor import add_speckle, blur, off_focus, shade
 from bodyscan.simulation.settings import InterReflection, Optics, Projection
+from bodyscan.simulation.skin import spread_light
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.stripe_code import StripeCode
 
@@ -115,6 +116,10 @@ def render_pair(
     if inter_reflection is not None and inter_reflection.facet_mm > 0:
         between = _Between.of(scene, source, lit, inter_reflection)
         between.add_to(seen.laser, scene, view)
+    for name in lit:
+        light = seen.laser[name]
+        light = spread_light(light, seen.skin, seen.depth, view.camera.alpha, lamps.skin)
+        seen.laser[name] = light + seen.gloss[name] if name in seen.gloss else light
     for name, now in (flicker or {}).items():
         if name in seen.laser:
             seen.laser[name] *= np.float32(now.laser)
@@ -145,13 +150,16 @@ class _Seen:
     """What a camera sees before its lens blurs it: grey levels (H, W).
 
     laser, ambient: by frame, of the projector's light and of the room's.  depth: (H, W) mm, the least
-    in each pixel.  near: (H, W) where something shows that moves.
+    in each pixel.  near: (H, W) where something shows that moves.  gloss: by frame, of the projector's
+    light what skin mirrors; none where nothing is glossy.  skin: (H, W) the share that is skin.
     """
 
     laser: dict[str, Floats]
     ambient: dict[str, Floats]
     depth: Floats
     near: Mask
+    gloss: dict[str, Floats]
+    skin: Floats
 
 
 def _see(
@@ -166,7 +174,9 @@ def _see(
     shape = (view.camera.height, view.camera.width)
     laser = {name: np.zeros(shape, np.float32) for name in (*lit, *unlit)}
     ambient, depth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    near = np.zeros(shape, bool)
+    near, skin = np.zeros(shape, bool), np.zeros(shape, np.float32)
+    glossy = lit if source.lamps.skin.gloss > 0 else {}
+    gloss = {name: np.zeros(shape, np.float32) for name in glossy}
     for rows, directions in view.bands:
         rays = _LitRays.of(scene, directions, source)
         for name, table in lit.items():
@@ -174,7 +184,10 @@ def _see(
         ambient[rows] = rays.ambient(source.lamps).reshape(-1, shape[1])
         depth[rows] = rays.nearest().reshape(-1, shape[1])
         near[rows] = rays.on_first(moving_surfaces).reshape(-1, shape[1])
-    return _Seen(laser, dict.fromkeys(laser, ambient), depth, near)
+        skin[rows] = rays.skin().reshape(-1, shape[1])
+        for name in gloss:
+            gloss[name][rows] = rays.mirrored(lit[name]).reshape(-1, shape[1])
+    return _Seen(laser, dict.fromkeys(laser, ambient), depth, near, gloss, skin)
 
 
 def _see_again(
@@ -189,31 +202,45 @@ def _see_again(
         seen.ambient[name][near] = rays.ambient(source.lamps)
         if name in lit:
             seen.laser[name][near] = rays.light(lit[name])
+        if name in seen.gloss:
+            seen.gloss[name][near] = rays.mirrored(lit[name])
 
 
 @dataclass(frozen=True, eq=False)
 class _LitRays:
     """Rays of some pixels, several each, with the projector's light where they end.
 
-    weight: (rays,) grey level under full light.  index: into a table of light.
+    weight, gloss: (rays,) grey level under full light, scattered and mirrored.  index: into a table
+    of light.
     """
 
     hits: Hits
     weight: Floats
+    gloss: Floats | None
     index: NDArray[np.int32]
     samples: int
 
     @staticmethod
     def of(scene: Scene, directions: Floats, source: _Source) -> _LitRays:
         hits = scene.cast(directions)
-        weight, s = laser_light(scene, hits, source.projector, source.lamps)
+        light = laser_light(scene, hits, source.projector, source.lamps)
         blurs = _blur_rows(hits, source.projection, source.lamps)
-        index = table_index(s, source.projector.stripes, blurs)
-        return _LitRays(hits, weight, index, source.samples)
+        index = table_index(light.s, source.projector.stripes, blurs)
+        return _LitRays(hits, light.weight, light.gloss, index, source.samples)
 
     def light(self, table: LightTable) -> Floats:
         """(pixels,) grey level of one frame."""
         return _pixels(self.weight, table.at(self.index), self.samples)
+
+    def mirrored(self, table: LightTable) -> Floats:
+        """(pixels,) the part of one frame that glossy skin mirrors."""
+        if self.gloss is None:
+            return np.zeros(len(self.index) // self.samples, np.float32)
+        return _pixels(self.gloss, table.at(self.index), self.samples)
+
+    def skin(self) -> Floats:
+        """(pixels,) the share that is skin."""
+        return _pixels(self.hits.skin, np.ones_like(self.hits.skin), self.samples)
 
     def ambient(self, lamps: Lamps) -> Floats:
         """(pixels,) grey level by the room's own light."""
@@ -282,7 +309,7 @@ def pixel_truth(scene: Scene, camera: TrueCamera, projector: Projector) -> Pixel
     directions = camera.directions(camera.grid()).reshape(-1, 3)
     hits = scene.cast(directions.astype(np.float32))
     depth = np.where(np.isfinite(hits.depth), hits.depth, np.nan).astype(float)
-    weight, _ = laser_light(scene, hits, projector, Lamps(1.0, 0.0, 1.0, 1.0))
+    weight = laser_light(scene, hits, projector, Lamps(1.0, 0.0, 1.0, 1.0)).weight
     s = projector.stripe(directions * depth[:, None])
     lit = (weight > 0) & (s >= 0) & (s <= projector.stripes)
     shape = (camera.height, camera.width)

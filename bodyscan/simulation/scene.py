@@ -38,6 +38,7 @@ class Surface:
     normals: (N, 3) unit, if the surface is to be shaded smoothly.
     open_to_light: nothing can stand between it and the projector, so no shadow is looked for.
     encloses: everything stands on one side of it, so it throws no shadow.
+    skin: (N,) how far each vertex is skin that lets light in, 0 to 1; None where nothing is.
     """
 
     vertices: Array
@@ -48,6 +49,7 @@ class Surface:
     normals: Array | None = None
     open_to_light: bool = False
     encloses: bool = False
+    skin: Array | None = None
 
     def moved(self, a_from_b: RigidTransform) -> Surface:
         """The surface carried by a rigid transform."""
@@ -62,6 +64,7 @@ class Hits:
     depth: (N,), infinite where nothing.  normals: (N, 3), of any length, to either side.
 
     surface: (N,) number of the surface, one past the last where nothing.
+    skin: (N,) as `Surface.skin`.
     """
 
     depth: Floats
@@ -69,6 +72,7 @@ class Hits:
     normals: Floats
     albedo: Floats
     surface: NDArray[np.uint32]
+    skin: Floats
 
 
 class Scene:
@@ -95,6 +99,7 @@ class Scene:
         depth, normals = found["t_hit"], found["primitive_normals"]
         surface = np.minimum(found["geometry_ids"], len(self.surfaces))
         albedo = np.array([finish.albedo for finish in self._finish] + [0.0], np.float32)[surface]
+        skin = np.zeros_like(depth)
         for number, finish in enumerate(self._finish):
             if finish.plain:
                 continue
@@ -103,8 +108,10 @@ class Scene:
             albedo[chosen] = finish.albedo_at(triangles, uv)
             if finish.normals is not None:
                 normals[chosen] = _spread(finish.normals, triangles, uv)
+            if finish.skin is not None:
+                skin[chosen] = _spread(finish.skin, triangles, uv)[:, 0]
         points = directions * np.where(np.isfinite(depth), depth, np.float32(0.0))[:, None]
-        return Hits(depth, points, normals, albedo, surface)
+        return Hits(depth, points, normals, albedo, surface, skin)
 
     def places(self, number: int, triangles: NDArray[np.integer], uv: Floats) -> Hits:
         """Places on one surface as if rays had met it there: its triangles (N,), and barycentric
@@ -123,6 +130,7 @@ class Scene:
             normals=normals.astype(np.float32),
             albedo=albedo.astype(np.float32),
             surface=np.full(len(points), number, np.uint32),
+            skin=np.zeros(len(points), np.float32),
         )
 
     def joined(self, starts: Floats, ends: Floats) -> Mask:
@@ -192,6 +200,7 @@ class _Finish:
     places: Floats | None
     printed: Print | None
     normals: Floats | None
+    skin: Floats | None
 
     @staticmethod
     def of(surface: Surface) -> _Finish:
@@ -208,12 +217,14 @@ class _Finish:
             corners(surface.places) if surface.printed is not None else None,
             surface.printed,
             corners(surface.normals),
+            corners(None if surface.skin is None else surface.skin[:, None]),
         )
 
     @property
     def plain(self) -> bool:
         """Whether nothing varies over the surface."""
-        return self.albedos is None and self.places is None and self.normals is None
+        varied = (self.albedos, self.places, self.normals, self.skin)
+        return all(values is None for values in varied)
 
     def albedo_at(self, triangles: NDArray[np.integer], uv: Floats) -> Floats | float:
         if self.printed is not None and self.places is not None:

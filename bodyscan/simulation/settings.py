@@ -177,6 +177,32 @@ class Person:
 
 
 @dataclass(frozen=True)
+class Skin:
+    """What covers the subject, besides its mean albedo (`Person.skin`).
+
+    spread_mm: light's mean free path under the skin; 0: none enters.  stays: share that does not
+    enter.  albedo: of the way inside.
+    oblique_mm: light comes out farther along, by this times the tangent of the refracted angle.
+    gloss: brightness of a highlight's middle, against white paper; gloss_power: how small it is.
+    mottling: standard deviation of the albedo over millimetres, relative.  moles: their number.
+    hair: albedo of the scalp's hair, and hair_mm how rough it is, standard deviation; 0: bald.
+    shorts: albedo of a pair of shorts; 0: none.
+    """
+
+    spread_mm: float = 0.0
+    stays: float = 0.07
+    albedo: float = 0.62
+    oblique_mm: float = 0.0
+    gloss: float = 0.0
+    gloss_power: float = 40.0
+    mottling: float = 0.0
+    moles: int = 0
+    hair: float = 0.0
+    hair_mm: float = 1.0
+    shorts: float = 0.0
+
+
+@dataclass(frozen=True)
 class Pace:
     """When frames of a person are taken. Each is as short as nothing moves in it.
 
@@ -221,6 +247,7 @@ class SimulationSettings:
     noise: Noise = field(default_factory=Noise)
     board: BoardMaking = field(default_factory=BoardMaking)
     person: Person = field(default_factory=Person)
+    skin: Skin = field(default_factory=Skin)
     pace: Pace = field(default_factory=Pace)
     room: Room = field(default_factory=Room)
     inter_reflection: InterReflection = field(default_factory=InterReflection)

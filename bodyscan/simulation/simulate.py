@@ -122,7 +122,7 @@ def _decide(
     plan = plan_boards(rig, pairs, shots or default_shots(len(pairs)), stream(_PLAN))
     if subject is None:
         return Truth(rig.name, seed, settings, pairs, boards, tuple(plan), None, None, {})
-    person = body.load_subject(subject, settings.person, stream(_SKIN))
+    person = body.load_subject(subject, settings.person, stream(_SKIN), settings.skin)
     height = float(person.vertices[:, 2].max())
     sways = body.draw_sways(settings.person, height, len(pairs), stream(_SWAY))
     by_pair = dict(zip(pairs, sways, strict=True))
@@ -264,6 +264,7 @@ def render_task(
         reach,
         light.window_grey,
         tuple(window.tolist()),
+        settings.skin,
     )
     code = rig.pair(pair.name).projector
     taken = settings.pace.order or rig.frames.of_sequence(code)

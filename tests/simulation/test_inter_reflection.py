@@ -38,7 +38,14 @@ def on_right_plate(x: np.ndarray, half_angle: float) -> Hits:
     points = (np.array([0.0, 0.0, CREASE_Z]) + x[:, None] * way).astype(np.float32)
     normal = np.array([[np.cos(half_angle), 0.0, np.sin(half_angle)]], np.float32)
     whole = np.ones(len(x), np.float32)
-    return Hits(points[:, 2], points, np.repeat(normal, len(x), 0), whole, whole.astype(np.uint32))
+    return Hits(
+        points[:, 2],
+        points,
+        np.repeat(normal, len(x), 0),
+        whole,
+        whole.astype(np.uint32),
+        0 * whole,
+    )
 
 
 @pytest.mark.parametrize("opening_deg", [60.0, 90.0])
