@@ -15,7 +15,7 @@ from bodyscan.arrays import Array, Bytes, Floats, Indices
 from bodyscan.boards import board_layout
 from bodyscan.boards.board_map import BoardMap, fit_board_map
 from bodyscan.boards.corners import SightedCorners, refine_corners
-from bodyscan.boards.regions import Region, board_regions
+from bodyscan.boards.regions import Region, board_regions, shows_lattice
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 
@@ -124,7 +124,8 @@ def _beyond(board: Board) -> Iterator[tuple[Indices, Indices]]:
 def _candidates(image: Bytes, board: Board) -> Iterator[Array]:
     """Corner sets (N, 2) px that the detectors offer, quickest and most often right first.
 
-    The plain threshold of the whole picture finds most boards in hundredths of a second; adaptive
+    The plain threshold of the whole picture finds most boards in hundredths of a second. Where it
+    finds none, and there is no lattice of saddles either, there is no board. Else: adaptive
     thresholds those in uneven light or before a busy background; crops, enlarged, fine and slanted
     boards; the sector-based detector, a fifth of a second for a megapixel, blurred and noisy ones
     (its CALIB_CB_NORMALIZE_IMAGE shifts corners by 0.25 px), and enlarged, in a second, fine ones.
@@ -132,6 +133,8 @@ def _candidates(image: Bytes, board: Board) -> Iterator[Array]:
     size = (board.columns - 1, board.rows - 1)
     whole = Region(0, 0, image.shape[1], image.shape[0])
     yield from _found(_classic, image, size, whole, 1.0)
+    if not shows_lattice(image, size):
+        return
     yield from _found(_adaptive, image, size, whole, 1.0)
     regions = board_regions(image, size[0] * size[1])
     small = [region for region in regions if 2 * region.area < image.size]

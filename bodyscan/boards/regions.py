@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from bodyscan.arrays import Bytes
+from bodyscan.arrays import Array, Bytes
 
 BLUR_PX = 1.5
 LIGHT_PX = 12.0
@@ -21,6 +22,12 @@ REGIONS_EACH = 2
 MIN_SHARE_OF_CORNERS = 0.7
 MARGIN_PX = 20
 MARGIN = 0.15
+SCALES = (1.0, 0.5, 0.25)  # fine boards, blurred ones, large ones out of focus
+NEIGHBOURS = 8
+ASTRAY = 0.25  # of a step: opposite neighbours of a slanted board at its worst, and noise
+LEAST_ANGLE = 0.3  # sine, between the two directions
+FEWEST_WITHIN = 4  # corners with neighbours all round; with fewer a lattice proves nothing
+LEAST_WITHIN = 0.3  # of these are found lattice-like on the poorest boards that a detector finds
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,7 @@ def board_regions(image: Bytes, corners: int) -> list[Region]:
 
     Clusters of saddles nearer to each other than one of `REACHES_PX`; the largest first.
     """
-    points = _strongest_saddles(image, 4 * corners + 100)
+    points, _ = _strongest_saddles(image, 4 * corners + 100)
     height, width = image.shape
     marks = np.zeros((height, width), np.uint8)
     marks[points[:, 1], points[:, 0]] = 1
@@ -70,9 +77,50 @@ def board_regions(image: Bytes, corners: int) -> list[Region]:
     return regions
 
 
-def _strongest_saddles(image: Bytes, count: int) -> NDArray[np.intp]:
+def shows_lattice(image: Bytes, size: tuple[int, int]) -> bool:
+    """Whether the image (H, W) may show size[0] x size[1] corners of a checkerboard, at one of
+    `SCALES`: a tenth of a second, where asking every detector takes seconds.
+
+    A corner of a board is a saddle whose neighbours lie opposite each other in two directions, and
+    fall where it rises. Skin, cloth, markers and noise have saddles enough, but few like that.
+    """
+    within = (size[0] - 2) * (size[1] - 2)
+    if within < FEWEST_WITHIN:
+        return True
+    for scale in SCALES:
+        reduced = image
+        if scale != 1.0:
+            reduced = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        saddles = _strongest_saddles(reduced, 4 * size[0] * size[1] + 100)
+        if _like_a_lattice(*saddles) >= LEAST_WITHIN * within:
+            return True
+    return False
+
+
+def _like_a_lattice(points: NDArray[np.intp], angles: Array) -> int:
+    """How many saddles have neighbours as a board's corner has; points (N, 2) px, angles (N,) rad of
+    the direction in which each rises."""
+    if len(points) <= NEIGHBOURS:
+        return 0
+    _, near = cKDTree(points).query(points, NEIGHBOURS + 1)
+    near = near[:, 1:]
+    step = (points[near] - points[:, None]).astype(float)
+    length = np.linalg.norm(step, axis=-1)
+    opposite = np.cos(2.0 * (angles[near] - angles[:, None])) < -0.7
+    apart = np.linalg.norm(step[:, :, None] + step[:, None], axis=-1)
+    pairs = apart < ASTRAY * np.minimum(length[:, :, None], length[:, None])
+    straight = (pairs & opposite[:, :, None] & opposite[:, None]).any(axis=2)
+    way = step / length[..., None]
+    across = np.abs(
+        way[:, :, None, 0] * way[:, None, :, 1] - way[:, :, None, 1] * way[:, None, :, 0]
+    )
+    both = straight[:, :, None] & straight[:, None] & (across > LEAST_ANGLE)
+    return int(both.any(axis=(1, 2)).sum())
+
+
+def _strongest_saddles(image: Bytes, count: int) -> tuple[NDArray[np.intp], Array]:
     """The (at most) `count` strongest saddles, (N, 2) px, by the Hessian's determinant measured
-    against the contrast around."""
+    against the contrast around, and the direction (N,) rad in which each rises most."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR_PX)
     xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0)
     yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2)
@@ -83,4 +131,6 @@ def _strongest_saddles(image: Bytes, count: int) -> NDArray[np.intp]:
     peaks = (saddle > 0) & (saddle == cv2.dilate(saddle, np.ones((5, 5), np.uint8)))
     row, column = np.nonzero(peaks)
     strongest = np.argsort(-saddle[row, column], kind="stable")[:count]
-    return np.stack([column[strongest], row[strongest]], axis=-1)
+    at = row[strongest], column[strongest]
+    angles = 0.5 * np.arctan2(2.0 * xy[at], xx[at] - yy[at]).astype(np.float64)
+    return np.stack(at[::-1], axis=-1), angles
