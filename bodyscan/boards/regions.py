@@ -102,8 +102,7 @@ def _like_a_lattice(points: NDArray[np.intp], angles: Array) -> int:
     the direction in which each rises."""
     if len(points) <= NEIGHBOURS:
         return 0
-    _, near = cKDTree(points).query(points, NEIGHBOURS + 1)
-    near = near[:, 1:]
+    near = np.asarray(cKDTree(points).query(points, NEIGHBOURS + 1)[1])[:, 1:]
     step = (points[near] - points[:, None]).astype(float)
     length = np.linalg.norm(step, axis=-1)
     opposite = np.cos(2.0 * (angles[near] - angles[:, None])) < -0.7
