@@ -202,8 +202,11 @@ def _judge(rig: str, subject: str, fault: Fault, sound: Sound) -> Found:
         scan = fuse(calibration, measured, SETTINGS)
     except BodyscanError as error:
         return Found(rig, subject, fault.name, "refused", None, True, str(error))
-    errors = girth_errors(scan.mesh, sound.vertices, sound.faces)
-    worst = errors.worst_mm if np.isfinite(errors.worst_mm) else None
+    try:
+        errors = girth_errors(scan.mesh, sound.vertices, sound.faces)
+        worst = errors.worst_mm if np.isfinite(errors.worst_mm) else None
+    except BodyscanError:  # of a body cut short no girth is given
+        worst = None
     said = " | ".join(scan.verdict.reasons)
     named = any(word in said for word in fault.named)
     return Found(rig, subject, fault.name, scan.verdict.grade, worst, named, said)

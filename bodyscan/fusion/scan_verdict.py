@@ -15,6 +15,7 @@ from bodyscan.fusion.seams import SeamReport, find_misfits
 from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.rings import rings
+from bodyscan.mesh.slices import loops_at
 from bodyscan.optional import optional
 from bodyscan.reconstruction.two_ways import Agreement
 from bodyscan.rig.rig import Volume
@@ -28,12 +29,22 @@ SOME_FILLED, MOST_FILLED = 0.12, 0.5
 SOME_DISAGREEMENT_MM, DISAGREEMENT_SIGMAS = 0.4, 2.0
 GIRTH_PER_MM = 2.0 * np.pi
 """mm that a girth is wrong by, where its surface stands 1 mm off all round"""
-SOME_CONTRADICTED, MOST_CONTRADICTED = 0.005, 0.05  # below 0.001 where all is well
+SOME_CONTRADICTED, MOST_CONTRADICTED = 0.005, 0.02  # below 0.001 where all is well
 SOME_MOTION_MM, MOST_MOTION_MM = 3.0, 6.0
 SOME_LEFT_MM, MOST_LEFT_MM = 0.6, 2.0  # standard deviations; 4 and 13 mm of a girth
 CELL_MM = 50.0
 SIDE_BY_SIDE = 0.4  # of the taller one's height
 SMALL_PIECE = 0.01
+LEVELS = np.arange(0.08, 0.95, 0.03)
+"""of the height: every 50 mm of an adult"""
+CROTCH = 0.5
+"""of the height: below it a person may stand on two legs"""
+BULKY = 0.35
+"""of the largest outline at a height: an arm is 0.2 of the trunk, a hand 0.1 of a thigh"""
+TRUNK_MM2 = 25_000.0
+"""An outline as large is no arm's: raised arms beside a neck are as large as it."""
+LIMB_MM2 = 1500.0
+"""A wrist; fingers are less."""
 OUTSIDE_MM = 15.0
 SOME_OUTSIDE, MOST_OUTSIDE = 0.01, 0.2
 RIM_MM, AT_RIM = 10.0, 3e-4
@@ -83,6 +94,7 @@ def grade_scan(
         "motion": lambda: _motion(alignment, person),
         "contradictions": lambda: _contradictions(contradicted),
         "pieces": lambda: _company(cloud),
+        "limbs": lambda: _limbs(mesh),
         "cuts": lambda: _cuts(cloud, volume),
         "omissions": lambda: _omissions(cloud, mesh),
         "contacts": lambda: _contacts(mesh),
@@ -213,6 +225,40 @@ def _company(cloud: BodyCloud) -> Iterator[Finding]:
                 f"a piece between {bottom:.0f} and {top:.0f} mm ({share[k]:.0%} of the points) is "
                 "not joined to the rest by anything measured",
             )
+
+
+def _limbs(mesh: BodyMesh) -> Iterator[Finding]:
+    """More trunks, legs or arms side by side than one person has, whatever touches."""
+    if mesh.filled.mean() > MOST_FILLED:
+        return
+    top = float(mesh.vertices[:, 2].max())
+    heights = mesh.vertices[mesh.faces, 2]
+    low, high = heights.min(axis=1), heights.max(axis=1)
+    doubled, many = [], []
+    for share in LEVELS:
+        level = share * top
+        faces = mesh.faces[(low < level) & (high >= level)]
+        areas = np.array([loop.area_mm2 for loop in loops_at(mesh.vertices, faces, level)])
+        if not areas.size:
+            continue
+        bulky = int(np.sum(areas > BULKY * areas.max()))
+        legs = share < CROTCH
+        if bulky > (2 if legs else 1) and (legs or areas.max() > TRUNK_MM2):
+            doubled.append(level)
+        elif np.sum(areas > LIMB_MM2) > (4 if legs else 3):
+            many.append(level)
+    if len(doubled) > 1:
+        yield (
+            "repeat",
+            f"more than one person: at heights from {min(doubled):.0f} to {max(doubled):.0f} mm there "
+            "are more trunks or legs than one has",
+        )
+    if len(many) > 1:
+        yield (
+            "usable",
+            f"more limbs than one person has at heights from {min(many):.0f} to {max(many):.0f} mm: is "
+            "somebody or something else in the volume, or a pair that does not belong?",
+        )
 
 
 def _cuts(cloud: BodyCloud, volume: Volume) -> Iterator[Finding]:

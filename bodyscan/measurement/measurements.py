@@ -12,8 +12,8 @@ from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
 from bodyscan.measurement.outline import Range, holds_middle, outline
-from bodyscan.measurement.slices import Loop, loops_at
 from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.slices import Loop, loops_at
 from bodyscan.mesh.topology import face_areas, signed_volume
 
 STEP_MM = 100.0

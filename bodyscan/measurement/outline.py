@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.measurement.slices import Loop, Run, joined, runs_of
+from bodyscan.mesh.slices import Loop, Run, joined, runs_of
 
 SHORTEST_GAP_MM = 15.0
 """A straight line across less, on a limb, is shorter than the limb's curve by less than 0.5 mm."""

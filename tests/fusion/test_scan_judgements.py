@@ -96,7 +96,7 @@ def test_pairs_that_nothing_ties_are_named(scan: MadeScan) -> None:
 
 
 @pytest.mark.parametrize(
-    ("share", "grade"), [(0.004, "good"), (0.006, "usable"), (0.049, "usable"), (0.051, "repeat")]
+    ("share", "grade"), [(0.004, "good"), (0.006, "usable"), (0.019, "usable"), (0.021, "repeat")]
 )
 def test_pairs_that_see_through_each_other(scan: MadeScan, share: float, grade: str) -> None:
     assert graded(scan, aligned(), contradicted=share).grade == grade

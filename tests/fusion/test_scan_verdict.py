@@ -114,6 +114,15 @@ def test_two_people(person: Truth) -> None:
     assert "two bodies" in said(scan)
 
 
+def test_two_people_hand_in_hand(person: Truth) -> None:
+    """In one piece: the scan volume's cells and the cloud's pieces do not tell them apart."""
+    apart = 0.5 * float(np.ptp(person.vertices[:, 1])) - 15.0
+    both = joined(moved(person, [0.0, -apart, 0.0]), moved(person, [0.0, apart, 0.0]))
+    scan = fused(photographed(both))
+    assert scan.verdict.grade == "repeat"
+    assert "more than one person" in said(scan)
+
+
 def test_what_always_stands_there_is_cut_away_by_an_empty_scan(person: Truth) -> None:
     """A post beside the person: part of the model, unless a scan of the empty rig shows it."""
     post = ball([-350.0, 350.0, 1000.0], 120.0)

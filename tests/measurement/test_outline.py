@@ -7,7 +7,7 @@ import pytest
 
 from bodyscan.arrays import Array, Mask
 from bodyscan.measurement.outline import Outline, outline
-from bodyscan.measurement.slices import Loop, loops_at
+from bodyscan.mesh.slices import Loop, loops_at
 
 TRUNK_MM, ARM_MM, ARM_AT_MM = 150.0, 45.0, 230.0
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from made_bodies import arrays, cylinder, ellipsoid, together
 from scipy.special import ellipe
 
-from bodyscan.measurement.slices import loops_at
+from bodyscan.mesh.slices import loops_at
 
 
 @pytest.mark.parametrize("height", [55.0, 100.0, 123.4])  # 100 lies on a ring of vertices
