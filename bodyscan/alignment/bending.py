@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bodyscan.alignment.body_cells import BodyCells, seen_from
 from bodyscan.alignment.following import Followed
-from bodyscan.arrays import Array, Floats, Mask
+from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import THREADS
@@ -55,21 +55,22 @@ def bend(
         return image
     pixel_mm = float(np.median(image.points[::8, ::8, 2][valid[::8, ::8]])) / image.camera.alpha
     size = max(1, round(BLOCK_MM / pixel_mm)) if np.isfinite(pixel_mm) else 1
-    rows, columns, block = _one_in_each_block(valid, size)
+    pixel = _one_in_each_block(image.sigma_mm, size)
+    block = pixel >= 0
+    rows, columns = np.divmod(pixel[block], valid.shape[1])
     chosen = image.points[rows, columns].astype(np.float64)
     normals = image.normals[rows, columns].astype(np.float64)
     ahead = -chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
     normals = np.where(np.isfinite(normals), normals, ahead)
-    found = cells.find(rig_from_camera.apply(chosen), rig_from_camera.rotate(normals))
     cell, depth = np.full(block.shape, -1, np.int32), np.zeros(block.shape, np.float32)
-    at = np.nonzero(block)
-    cell[at], depth[at] = found, chosen[:, 2]
+    cell[block] = cells.find(rig_from_camera.apply(chosen), rig_from_camera.rotate(normals))
+    depth[block] = chosen[:, 2]
     points, turned = image.points.copy(), image.normals.copy()
     camera_from_rig = rig_from_camera.inverse()
     _bend(
         points,
         turned,
-        valid,
+        image.sigma_mm,
         size,
         (cell, depth),
         (camera_from_rig.apply(cells.centres), seen_from(field, rig_from_camera)),
@@ -77,31 +78,36 @@ def bend(
     return replace(image, points=points, normals=turned, bent=True)
 
 
-def _one_in_each_block(valid: Mask, size: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Mask]:
-    """Rows and columns of the valid pixel nearest to the middle of each block, and which blocks
-    have one (h, w)."""
-    rows, columns = np.nonzero(valid)
-    wide = -(-valid.shape[1] // size)
-    high = -(-valid.shape[0] // size)
-    key = (rows // size) * wide + columns // size
-    off = np.hypot(rows % size - 0.5 * (size - 1), columns % size - 0.5 * (size - 1))
-    order = np.lexsort((off, key))
-    first = order[np.unique(key[order], return_index=True)[1]]
-    there = np.zeros(high * wide, bool)
-    there[key[first]] = True
-    return rows[first], columns[first], there.reshape(high, wide)
+@compiled
+def _one_in_each_block(sigma_mm: Floats, size: int) -> Numbers:
+    """(h, w) number of the measured pixel nearest to the middle of each block, -1 where none is."""
+    height, width = sigma_mm.shape
+    found = np.full((-(-height // size), -(-width // size)), np.int32(-1))
+    nearest = np.full(found.shape, np.inf)
+    middle = 0.5 * (size - 1)
+    for v in range(height):
+        row = v // size
+        for u in range(width):
+            if not np.isfinite(sigma_mm[v, u]):
+                continue
+            column = u // size
+            off = (v - row * size - middle) ** 2 + (u - column * size - middle) ** 2
+            if off < nearest[row, column]:
+                nearest[row, column] = off
+                found[row, column] = v * width + u
+    return found
 
 
 @compiled
 def _bend(
     points: Floats,
     normals: Floats,
-    valid: Mask,
+    sigma_mm: Floats,
     size: int,
     blocks: tuple[Numbers, Floats],
     motion: tuple[Array, Array],
 ) -> None:
-    """Displaces valid points (H, W, 3) and their normals.
+    """Displaces measured points (H, W, 3) and their normals.
 
     blocks: their cells (h, w), -1 for none, and depths.  motion: cells' centres (C, 3) and fields
     (C, 12), camera frame.  A pixel mixes those of the four blocks around it by how near they are.
@@ -110,17 +116,16 @@ def _bend(
     centres, fields = motion
     high, wide = cell.shape
     shift, slope = np.empty(3), np.empty((3, 3))
-    for v in range(valid.shape[0]):
+    kinds, weights = np.empty(4, np.int64), np.empty(4)
+    for v in range(sigma_mm.shape[0]):
         y = (v + 0.5) / size - 0.5
         top = int(np.floor(y))
-        for u in range(valid.shape[1]):
-            if not valid[v, u]:
+        for u in range(sigma_mm.shape[1]):
+            if not np.isfinite(sigma_mm[v, u]):
                 continue
             x = (u + 0.5) / size - 0.5
             left = int(np.floor(x))
-            total = 0.0
-            shift[:] = 0.0
-            slope[:, :] = 0.0
+            count, total = 0, 0.0
             for corner in range(4):
                 row, column = top + corner // 2, left + corner % 2
                 if row < 0 or column < 0 or row >= high or column >= wide:
@@ -132,16 +137,23 @@ def _bend(
                     continue
                 weight = (1.0 - abs(y - row)) * (1.0 - abs(x - column))
                 total += weight
+                if count and kinds[count - 1] == there:
+                    weights[count - 1] += weight
+                else:
+                    kinds[count], weights[count] = there, weight
+                    count += 1
+            shift[:] = 0.0
+            slope[:, :] = 0.0
+            for n in range(count):
+                there, share = kinds[n], weights[n] / total
                 for k in range(3):
-                    shift[k] += weight * fields[there, k]
+                    shift[k] += share * fields[there, k]
                     for axis in range(3):
-                        gradient = weight * fields[there, 3 + 3 * axis + k]
+                        gradient = share * fields[there, 3 + 3 * axis + k]
                         slope[axis, k] += gradient
                         shift[k] += gradient * (points[v, u, axis] - centres[there, axis])
-            if total == 0.0:
-                continue
             a, b, c = normals[v, u]
             for k in range(3):
-                points[v, u, k] += shift[k] / total
+                points[v, u, k] += shift[k]
                 # A surface's normal is carried by the inverse of its transpose, here to first order.
-                normals[v, u, k] -= (slope[k, 0] * a + slope[k, 1] * b + slope[k, 2] * c) / total
+                normals[v, u, k] -= slope[k, 0] * a + slope[k, 1] * b + slope[k, 2] * c

@@ -18,6 +18,7 @@ from scipy.linalg.lapack import dpotri
 
 from bodyscan.alignment.body_cells import BodyCells, modulated, normal_field, rigid_fields
 from bodyscan.alignment.cell_evidence import CellEvidence
+from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.moments import Courses, of_breath, of_stance
 from bodyscan.alignment.sway import BODY_CENTRE
 from bodyscan.arrays import Array, Indices
@@ -123,8 +124,13 @@ class BodyMotion:
                 total += kind.fields.reshape(len(total), -1) @ self.of(kind.name, course)
         return total.T.reshape(total.shape[1], -1, 12)
 
-    def solved(self, evidence: Mapping[tuple[int, int], CellEvidence]) -> BodyMotion:
-        """One step of all amplitudes; every round matches anew. evidence: by pairs (a, b)."""
+    def solved(
+        self,
+        evidence: Mapping[tuple[int, int], CellEvidence],
+        speeds: Mapping[int, CellSpeeds] | None = None,
+    ) -> BodyMotion:
+        """One step of all amplitudes; every round matches anew. evidence: by pairs (a, b).  speeds: by
+        pair, as its own stripes tell them."""
         names = [kind.name for kind in self.kinds]
         now = self.displacements(names)
         asked = [self._asked(e, now[a] - now[b]) for (a, b), e in evidence.items()]
@@ -143,7 +149,20 @@ class BodyMotion:
                     kind.count, other.count
                 )
             normal[rows, rows] += kind.prior
+        for pair, told in (speeds or {}).items():
+            rates = told.combined @ self.rates(pair, told.cells, told.normals)
+            normal += rates.T @ rates
+            right += rates.T @ told.speeds
         return self._settled(normal, right)
+
+    def rates(self, pair: int, cells: Indices, normals: Array) -> Array:
+        """(c, n): the speed along normals (c, 3) that each amplitude gives cells at a pair's moment."""
+        return np.hstack(
+            [
+                _along(kind, cells, normals, kind.courses.speeds[pair] * kind.moves)
+                for kind in self.kinds
+            ]
+        )
 
     def _asked(self, seen: CellEvidence, apart: Array) -> tuple[Array, Array]:
         """What an overlap asks of the fields, (M, M) and (M,); apart: (C, 12) of its two pairs now."""
@@ -180,11 +199,12 @@ def _products(block: Array, first: Array, second: Array) -> Array:
     return np.asarray((flat.T @ courses).reshape(shape).transpose(0, 2, 1, 3))
 
 
+def _along(kind: Kind, cells: Indices, normals: Array, course: Array) -> Array:
+    along = np.einsum("cim,ci->cm", kind.fields[cells, :3], normals)
+    return (along[:, :, None] * course).reshape(len(cells), -1)
+
+
 def observed(motion: BodyMotion, pair: int, cells: Indices, normals: Array) -> Array:
     """(c, n): how each amplitude displaces cells along their normals (c, 3) as a pair saw them,
     against the middle."""
-    rows = []
-    for kind in motion.kinds:
-        along = np.einsum("cim,ci->cm", kind.fields[cells, :3], normals)
-        rows.append((along[:, :, None] * kind.during(pair)).reshape(len(cells), -1))
-    return np.hstack(rows)
+    return np.hstack([_along(kind, cells, normals, kind.during(pair)) for kind in motion.kinds])

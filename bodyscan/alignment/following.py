@@ -19,6 +19,7 @@ import numpy as np
 from bodyscan.alignment.body_cells import BodyCells, displaced
 from bodyscan.alignment.body_motion import BodyMotion, observed
 from bodyscan.alignment.cell_evidence import CellEvidence
+from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.icp import COARSE, Alignment
 from bodyscan.alignment.matching import (
     SEAM_RIM_PX,
@@ -139,6 +140,11 @@ def follow(
         boards = SwayPrior(0.0, 0.0, 0.0, 0.0).covariance(names, prior)
         motion = BodyMotion.start(cells, seconds, boards, usual)
         asks = partial(CellEvidence.of, centres=cells.centres, correlated=settings.correlated)
+        speeds = {
+            k: CellSpeeds.of(image, place, cells, np.flatnonzero(there))
+            for k, (image, (place, _), there) in enumerate(zip(images, both, seen, strict=True))
+            if image.velocity is not None and image.time_ms is not None
+        }
         coarse, reach = [view.some(slice(None, None, COARSE)) for view in views], settings.reach_mm
         for left in range(ROUNDS, 0, -1):
             taken = coarse if left > 1 else views
@@ -147,7 +153,7 @@ def follow(
                 return aligned, None
             if left < ROUNDS:
                 motion = motion.resized()
-            motion = motion.solved(_both_ways(said))
+            motion = motion.solved(_both_ways(said), speeds)
             reach = max(reach / 2.0, settings.least_reach_mm)
             if left == ROUNDS - 1 and _stands_still(motion, seen, settings):
                 return aligned, None
