@@ -56,7 +56,8 @@ def test_a_pairs_own_velocity_is_the_rigid_motion_nearest_to_the_cells(
     normals = PLACE.inverse().rotate(cells.normals)
     levers = np.hstack([np.cross(centres, normals), normals])
     prior = np.diag([1e4] * 3 + [1e-2] * 3)
-    covariance = np.linalg.inv(levers.T @ levers / len(levers) / 0.1**2 + prior)
+    held = levers.T @ levers / len(levers) / 0.1**2 + prior
+    covariance = np.asarray(np.linalg.inv(held), np.float64)
     moving = replace(image, velocity=Velocity(twist, covariance), time_ms=0.0)
     told = CellSpeeds.of(moving, PLACE, cells, np.arange(len(cells.centres)))
     points = PLACE.inverse().apply(cells.centres[told.cells])
