@@ -18,11 +18,12 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.ray_depths import intersect_rays
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.geometry.velocity import SpeedField, Velocity
 from bodyscan.reconstruction.speed_field import CellSpeeds, FieldFit, Knots, fit_field, unexplained
 from bodyscan.reconstruction.surface_cells import Cells, fit_planes
-from bodyscan.stripes.comb import Comb
+from bodyscan.stripes.comb import TEETH, Comb
 from bodyscan.stripes.one_moment import StripeMotion
 
 CELLS_ACROSS, CELL_WINDOWS = 80, 1.2
@@ -37,6 +38,7 @@ BENT_MM = 600.0
 body that is round. Renderings with cells of 14 and 28 mm: off by 3 and 6 % of the speed."""
 SETTLED = 1e-3
 """Variances: a thirtieth of a sigma."""
+FEWEST_BANDS = 5
 TEETH_NOISE = Noise("teeth", cauchy=3.0)
 SIGMAS = 3.0
 """A chi-square counts where it exceeds what noise alone does by so many of its own deviations."""
@@ -46,11 +48,13 @@ SIGMAS = 3.0
 class _Teeth:
     """What windows (N,) tell: their cell, speed in depth (mm per unit of time), its sigma, and dz/ds.
 
-    by_twist: (cells, 6), how a twist about `middle` changes the depth.
+    band: number of the stripes that a window is made of.  by_twist: (cells, 6), how a twist about
+    `middle` changes the depth.
     common: standard deviation of speed that all windows share.
     """
 
     cell: Indices
+    band: Indices
     speed: Array
     sigma: Array
     per_stripe: Array
@@ -120,7 +124,8 @@ def _teeth(camera: Camera, sheets: LightSheets, comb: Comb, cells: Cells) -> _Te
     per_stripe = found.per_stripe[seen].mean(axis=1)
     speed, common = comb.speed[seen] * per_stripe, comb.common[seen] * np.abs(per_stripe)
     shared = float(np.median(common)) if len(common) else 0.0
-    return _Teeth(cell[seen], speed, sigma[seen], per_stripe, by_twist, middle, shared)
+    band = (comb.s[seen].mean(axis=1) / TEETH).astype(np.int64)
+    return _Teeth(cell[seen], band, speed, sigma[seen], per_stripe, by_twist, middle, shared)
 
 
 def _weights(teeth: _Teeth) -> Array:
@@ -136,7 +141,26 @@ def _weights(teeth: _Teeth) -> Array:
         )
 
     found = minimize(np.zeros(6), blocks, np.add, unknowns=6, settled=SETTLED)
-    return found.weights[0] / (teeth.sigma * found.spreads[0]) ** 2
+    weights = found.weights[0] / (teeth.sigma * found.spreads[0]) ** 2
+    return weights * _band_share(teeth.band, teeth.speed - by_twist @ found.state, weights)
+
+
+def _band_share(band: Indices, left: Array, weights: Array) -> Array:
+    """(N,) to what share of their weights windows count, because those of the same stripes err alike:
+    a projector that strays moves a boundary all along its stripe.
+
+    left: (N,) speeds that no rigid motion explains. From one band of stripes to the next a body's
+    speed hardly changes, so that what their means are apart beyond noise is the stripes' own.
+    """
+    count = int(band.max()) + 1
+    weight, mean = np.bincount(band, weights, count), _mean_by(band, left, weights, count)
+    both = (weight[1:] > 0.0) & (weight[:-1] > 0.0)
+    if np.count_nonzero(both) < FEWEST_BANDS:
+        return np.ones(len(band))
+    noise = (1.0 / weight[1:][both] + 1.0 / weight[:-1][both]) / 2.0
+    excess = np.diff(mean)[both] ** 2 / 2.0 - noise / SIGMAS_PER_MEDIAN**2
+    shared = max(float(np.median(excess)) * SIGMAS_PER_MEDIAN**2, 0.0)
+    return np.asarray(1.0 / (1.0 + shared * weight[band]), np.float64)
 
 
 def _by_cell(cells: Cells, teeth: _Teeth, weights: Array) -> CellSpeeds:

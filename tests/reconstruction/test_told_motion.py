@@ -104,6 +104,17 @@ def test_without_a_clock_the_order_is_enough() -> None:
     assert motion.velocity.at(CENTRE)[2] == pytest.approx(8.0 / 60.0, rel=0.1)
 
 
+def test_stripes_that_stray_by_themselves_are_not_taken_for_motion() -> None:
+    stray = 0.02 * np.random.default_rng(53).standard_normal(200)  # px, along the whole of a stripe
+    seen = seen_boundaries(STILL, TIMES)
+    seen = replace(seen, position=seen.position + stray[seen.index])
+    carried, motion, _ = carry(seen)
+    assert motion is not None
+    # Counted as if each column told them anew, these teeth are 9 sigmas.
+    assert not motion.is_significant
+    assert carried is seen
+
+
 def test_of_two_orders_the_one_that_explains_the_teeth_is_believed() -> None:
     places = np.array([5.0, 3.0, 1.0, 0.0, 2.0, 4.0, 6.0])  # no line of the bits' numbers
     seen = seen_boundaries(np.array([0.0, 0.0, 8.0]), (places - places[-1]) / 60.0)
@@ -115,13 +126,16 @@ def test_of_two_orders_the_one_that_explains_the_teeth_is_believed() -> None:
 
 
 def test_teeth_that_no_smooth_motion_explains_go_into_the_sigmas() -> None:
-    # Patches of 10 px that go to and fro: far finer than the field's knots.
-    rng = np.random.default_rng(0)
-    patches = np.kron(rng.choice([-30.0, 30.0], (12, 16)), np.ones((10, 10)))
-    patches = cv2.GaussianBlur(patches, (0, 0), 2.5)  # lines must not fold
+    # Patches of 24 px go to and fro on one side: as wide as cells, finer than the knots see.
+    patches = np.zeros((CAMERA.height, CAMERA.width))
+    patches[:, :48] = np.kron(
+        [[1, -1], [-1, 1], [1, -1], [-1, 1], [1, -1]], np.full((24, 24), 40.0)
+    )
+    patches = cv2.GaussianBlur(patches, (0, 0), 3.0)  # lines must not fold
     seen = seen_boundaries(np.array([0.0, 0.0, 8.0]), TIMES, beside=patches)
     carried, motion, _ = carry(seen)
     assert motion is not None
-    assert motion.doubt_mm > 5.0  # of 16 that are seen to move
-    late = bit_of(seen.index) < BITS - 2
+    grid = motion.doubt[:, : 48 // motion.cell_px], motion.doubt[:, 100 // motion.cell_px :]
+    assert np.median(grid[0]) > 5.0 * np.median(grid[1])
+    late = (bit_of(carried.index) < BITS - 2) & (carried.line < 40)
     assert np.median(carried.sigma_px[late] / seen.sigma_px[late]) > 1.5
