@@ -107,7 +107,7 @@ def describe(truth: Truth) -> dict[str, Any]:
 
 def _pair(pair: TruePair, sway: RigidTransform | None) -> dict[str, Any]:
     document: dict[str, Any] = {
-        "camera": _camera(pair.camera),
+        "camera": describe_camera(pair.camera),
         "rig_from_camera": pair.rig_from_camera.matrix,
         "projector": _projector(pair.projector),
     }
@@ -119,7 +119,7 @@ def _pair(pair: TruePair, sway: RigidTransform | None) -> dict[str, Any]:
     return document
 
 
-def _camera(camera: TrueCamera) -> dict[str, Any]:
+def describe_camera(camera: TrueCamera) -> dict[str, Any]:
     """As calibrations have it: the lens's kind is left out where it is the chapter's."""
     values, more = asdict(camera), ("p1", "p2", "k3")
     if any(values[name] for name in more):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 
 import numpy as np
 
@@ -13,8 +12,9 @@ from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.chapter import apparatus
+from bodyscan.simulation.truth import describe_camera
 
-LENS = from_fields(asdict(apparatus.CAMERA))
+LENS = from_fields(describe_camera(apparatus.CAMERA))
 MIRROR = apparatus.chapter_setup(apparatus.ideal_settings(1)).projector
 TRUE_PLANES = apparatus.true_planes(apparatus.chapter_setup(apparatus.ideal_settings(1)))
 STRIPES = apparatus.PROJECTOR.stripes

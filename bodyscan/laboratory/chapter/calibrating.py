@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from bodyscan.laboratory.rivals.approaches import (
     rivals,
 )
 from bodyscan.laboratory.rivals.targets import LocatedBoards, by_reference_plane, by_slide_stage
+from bodyscan.simulation.truth import describe_camera
 
 CORNER_NOISE_PX = 0.012
 """What corners found in the rendered images are off, each way."""
@@ -129,7 +130,7 @@ def sigma_trial(seeds: int, seed: int = 0) -> SigmaTrial:
     corners = corner_points(TARGET.board)
     places = apparatus.board_poses()
     seen = [apparatus.CAMERA.image(place.apply(corners)) for place in places]
-    true, errors = from_fields(asdict(apparatus.CAMERA)), []
+    true, errors = from_fields(describe_camera(apparatus.CAMERA)), []
     for number in range(seeds):
         rng = np.random.default_rng([seed, number])
         views = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.apparatus import ChapterSetup
 from bodyscan.laboratory.chapter.captures import ChapterCaptures
 from bodyscan.laboratory.rivals.approaches import Approach
+from bodyscan.simulation.truth import describe_camera
 
 Stripes = NDArray[np.floating[Any]]
 BEST_SHARE = 0.9
@@ -146,7 +147,9 @@ class TrueSheets:
 
 def true_approach(setup: ChapterSetup) -> Approach:
     """What no calibration can better: the simulator's own camera and light."""
-    return Approach("true calibration", from_fields(asdict(apparatus.CAMERA)), TrueSheets(setup))
+    return Approach(
+        "true calibration", from_fields(describe_camera(apparatus.CAMERA)), TrueSheets(setup)
+    )
 
 
 @dataclass(frozen=True)
