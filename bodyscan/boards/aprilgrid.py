@@ -16,7 +16,7 @@ import numpy as np
 from bodyscan.arrays import Array, Bytes, Mask
 from bodyscan.boards import board_layout
 from bodyscan.boards.board_map import BoardMap, fit_board_map
-from bodyscan.boards.charuco import Markers, detect_markers, fit_markers
+from bodyscan.boards.charuco import Markers, detect_markers, fit_markers, markers_concerned
 from bodyscan.boards.corners import WINDOW_SQUARES, SightedCorners, refine_corners
 from bodyscan.rig.board import Board
 
@@ -67,7 +67,8 @@ def _placings(
         if grown > 1:
             picture = cv2.dilate(picture, np.ones((grown, grown), np.uint8))
         for border_bits in BORDER_BITS:
-            tags = detect_markers(picture, board, border_bits=border_bits)
+            first = markers_concerned(board)
+            tags = detect_markers(picture, board, border_bits=border_bits, first=first)
             corners = (tags.corners + 0.5) / scale - 0.5
             placed = place_tags(board, Markers(tags.ids, corners), border_bits)
             if placed is not None:

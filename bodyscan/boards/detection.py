@@ -10,7 +10,7 @@ import numpy as np
 from bodyscan.arrays import Bytes
 from bodyscan.boards.appearance import AS_PRINTED, OTHERWISE, Appearance
 from bodyscan.boards.aprilgrid import find_aprilgrid
-from bodyscan.boards.charuco import Markers, detect_markers, locate_charuco
+from bodyscan.boards.charuco import Markers, detect_markers, locate_charuco, markers_concerned
 from bodyscan.boards.checkerboard import find_checkerboard
 from bodyscan.boards.corners import SightedCorners
 from bodyscan.boards.view import BoardView
@@ -31,9 +31,12 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
     """
     views = []
     seen: dict[tuple[str, Appearance], Markers] = {}
+    first: dict[str, int] = {}
+    for board in boards:
+        first[board.dictionary] = max(markers_concerned(board), first.get(board.dictionary, 0))
     for board in boards:
         if board.kind != "checkerboard":
-            found = _find_marked(image, board, seen)
+            found = _find_marked(image, board, seen, first)
         else:
             found = find_checkerboard(image, board)
         if found is not None and _determines_plane(found):
@@ -47,9 +50,13 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
 
 
 def _find_marked(
-    image: Bytes, board: Board, seen: dict[tuple[str, Appearance], Markers]
+    image: Bytes,
+    board: Board,
+    seen: dict[tuple[str, Appearance], Markers],
+    first: dict[str, int],
 ) -> SightedCorners | None:
-    """The board as printed, or else white on black, or mirrored: markers found once a dictionary."""
+    """The board as printed, or else white on black, or mirrored: markers found once a dictionary, of
+    which only the first so many are printed."""
     for appearance in (AS_PRINTED, *OTHERWISE):
         picture = appearance.as_printed(image)
         key = board.dictionary, appearance
@@ -57,7 +64,7 @@ def _find_marked(
             found = find_aprilgrid(picture, board, thorough=appearance == AS_PRINTED)
         else:
             if key not in seen:
-                seen[key] = detect_markers(picture, board)
+                seen[key] = detect_markers(picture, board, first=first[board.dictionary])
             found = locate_charuco(picture, board, seen[key])
         if found is not None and _determines_plane(found):
             pixels = appearance.in_image(found.pixels, image.shape[1])

@@ -10,6 +10,7 @@ from board_rendering import render, true_corners, view_of
 
 from bodyscan.arrays import Array, Bytes
 from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.charuco import detect_markers
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.unfound import describe_unfound
 from bodyscan.boards.view import BoardView
@@ -53,6 +54,29 @@ def test_a_marked_board_is_recognised_whichever_way_it_is_seen(
     assert (view.appearance.inverted, view.appearance.mirrored) == (inverted, mirrored)
     assert len(view.corner_ids) >= 50
     assert rms(view, true) < 0.012, "as well as one seen as printed"
+
+
+@pytest.mark.parametrize("dictionary", ["DICT_4X4_50", "DICT_4X4_1000", "DICT_6X6_250"])
+def test_looking_for_few_markers_finds_those_as_well(dictionary: str) -> None:
+    """The dictionary's others are not there; errors in bits are corrected as far, and not farther."""
+    board = MARKED.model_copy(update={"dictionary": dictionary})
+    image = render([(board, PLACE)], blur_px=1.6)
+    every = detect_markers(image, board)
+    some = detect_markers(image, board, first=20)
+    concerned = every.ids < 20
+    order = np.argsort(every.ids[concerned]), np.argsort(some.ids)
+    assert 10 < len(some.ids) < len(every.ids)
+    np.testing.assert_array_equal(every.ids[concerned][order[0]], some.ids[order[1]])
+    np.testing.assert_array_equal(every.corners[concerned][order[0]], some.corners[order[1]])
+
+
+def test_two_boards_of_one_dictionary_are_both_found() -> None:
+    """Markers are looked for once, as far as the board with the highest numbers needs them."""
+    second = MARKED.model_copy(update={"name": "second", "first_marker": 400})
+    for shown in (MARKED, second):
+        image = render([(shown, PLACE)], blur_px=0.8)
+        views = find_boards(image, [MARKED, second], pair="p", shot="s")
+        assert [view.board for view in views] == [shown.name]
 
 
 def test_either_of_the_two_historic_layouts_is_recognised(picture: Bytes) -> None:
