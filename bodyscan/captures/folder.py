@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
@@ -124,13 +124,6 @@ class Captures:
         when the first pair began to the middle of the exposure. None where nothing says so."""
         times = self.times.get((shot, pair))
         return None if times is None else dict(times)
-
-    def middle_ms(self, shot: str, pair: str, frames: Iterable[str]) -> float | None:
-        """The middle of the time in which the pair took these frames of that shot; None where nothing
-        says it."""
-        times = self.times.get((shot, pair), {})
-        taken = [times[name] for name in frames if name in times]
-        return (min(taken) + max(taken)) / 2.0 if taken else None
 
     def relative(self, text: str) -> str:
         """A message with its paths relative to `base`, as it may be kept."""

@@ -38,7 +38,6 @@ def firsts(captures: Captures) -> dict[str, float]:
 def test_without_timing_nothing_is_known(tmp_path: Path) -> None:
     captures = open_captures(load_rig(write_small_captures(tmp_path)), tmp_path / "rig.yaml")
     assert captures.frame_ms("b1", "p1") is None
-    assert captures.middle_ms("b1", "p1", CODE) is None
     assert captures.described_in == ()
 
 
@@ -48,8 +47,6 @@ def test_frames_follow_each_other_in_the_order_of_the_patterns(tmp_path: Path) -
     assert times is not None
     assert list(times) == DEFAULT
     assert list(times.values()) == [5.0 + 10.0 * place for place in range(len(FRAMES))]
-    # Those of the code are the third to the last.
-    assert captures.middle_ms("b1", "p1", CODE) == (25.0 + 95.0) / 2
     assert captures.frame_ms("b2", "p1") is None
 
 
