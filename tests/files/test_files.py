@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -14,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyscan.files.atomic import atomic_replacement, json_text, write_bytes, write_json, write_npz
+from bodyscan.files.hashing import file_hash
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
@@ -97,3 +99,13 @@ def test_npz_never_pickles(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="allow_pickle"):
         write_npz(tmp_path / "x.npz", things=np.array([{}], dtype=object))
     assert os.listdir(tmp_path) == []
+
+
+def test_every_byte_of_a_large_file_is_hashed(tmp_path: Path) -> None:
+    path, content = tmp_path / "large", bytearray(range(256)) * (3 << 12)
+    path.write_bytes(content)
+    whole = file_hash(path)
+    assert whole == hashlib.sha256(content).hexdigest()
+    content[-1] ^= 1
+    path.write_bytes(content)
+    assert file_hash(path) != whole

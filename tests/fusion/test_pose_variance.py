@@ -57,3 +57,18 @@ def test_draws_of_the_placing_spread_by_the_error_bar(cloud: BodyCloud) -> None:
     seen = sigma > 0
     assert seen.sum() > 20
     assert sigma[seen] == pytest.approx(along.std(axis=0)[seen], rel=0.06)
+
+
+def test_what_pairs_share_does_not_average_out(cloud: BodyCloud) -> None:
+    """Two pairs side by side, each known to 0.04 mm along x: together no better than either, and not
+    worse; one that looks at the back says nothing of the front."""
+    each = np.diag([0.0, 0.0, 0.0, 0.04**2, 0.0, 0.0])
+    rough = 100.0 * each
+    zero = np.zeros((6, 6))
+    covariance = np.block([[each, zero, zero], [zero, each, zero], [zero, zero, rough]])
+    prior = PoseCovariance(("p0", "p1", "p2"), covariance)
+    places = placed([1300, 100, 900], [1300, -100, 900], [-1300, 0, 900])
+    found = add_pose_variance(cloud, places, prior)
+    front, back = cloud.normals[:, 0] > 0.999, cloud.normals[:, 0] < -0.999
+    assert found.sigma_mm[front] == pytest.approx(0.05, rel=1e-3)
+    assert found.sigma_mm[back] == pytest.approx(np.hypot(0.03, 0.4), rel=1e-3)

@@ -1,0 +1,106 @@
+"""What a fused point's sigma is made of, on two flat walls that two cameras see."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_comparing import ASIDE, WALL_MM, wall
+
+from bodyscan.fusion.averaging import average, scatter
+from bodyscan.fusion.comparing import Evidence, compare
+from bodyscan.fusion.smoothing import SmoothSurface
+from bodyscan.fusion.thinning import Samples, take_samples
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyCloud
+
+GAIN = np.ones(2, np.float32)
+
+
+def known_to(surface: SmoothSurface, sigma_mm: float, rim: float = 1.0) -> SmoothSurface:
+    """The surface with the same sigma and weight everywhere."""
+    sigma = np.full(len(surface.points), sigma_mm, np.float32)
+    return replace(surface, sigma_mm=sigma, weight=np.float32(rim) / sigma**2)
+
+
+def fused(
+    further_mm: float, sigmas: tuple[float, float], rim: float = 1.0
+) -> tuple[BodyCloud, Samples, list[SmoothSurface], list[Evidence]]:
+    """Two walls, the second so much further and with a rim's weight, made one."""
+    surfaces = [
+        known_to(wall(WALL_MM, 100, RigidTransform.identity()), sigmas[0]),
+        known_to(wall(WALL_MM + further_mm, 120, ASIDE), sigmas[1], rim),
+    ]
+    samples = take_samples(surfaces, 10**6)
+    evidence = [compare(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)]
+    return average(samples, surfaces, evidence, GAIN, 1), samples, surfaces, evidence
+
+
+def test_two_that_agree_are_known_better_by_their_weights() -> None:
+    cloud, *_ = fused(0.0, (0.1, 0.2))
+    both = cloud.pairs_seen == 2
+    assert both.sum() > 1000
+    assert cloud.sigma_mm[both] == pytest.approx(1.0 / np.sqrt(1 / 0.1**2 + 1 / 0.2**2), rel=1e-3)
+    assert set(np.round(cloud.sigma_mm[~both], 4).tolist()) == {
+        np.float32(0.1).round(4).item(),
+        np.float32(0.2).round(4).item(),
+    }
+
+
+def test_at_a_rim_a_surface_counts_for_less_and_so_it_does_in_the_sigma() -> None:
+    cloud, *_ = fused(0.0, (0.1, 0.1), rim=0.25)
+    both = cloud.pairs_seen == 2
+    # Weights 1 and 1/4: sqrt(1 + 1/16) / (5/4) of one's own sigma.
+    assert cloud.sigma_mm[both] == pytest.approx(0.1 * np.sqrt(1 + 1 / 16) / 1.25, rel=1e-3)
+
+
+def test_the_mean_lies_where_the_weights_say() -> None:
+    cloud, *_ = fused(0.1, (0.1, 0.2))
+    both = cloud.pairs_seen == 2
+    # Of 0.1 mm between them a fifth, by weights 4 and 1.
+    assert cloud.points[both, 2] == pytest.approx(WALL_MM + 0.02, abs=2e-3)
+
+
+def test_pairs_that_disagree_everywhere_are_all_less_certain() -> None:
+    cloud, samples, surfaces, evidence = fused(0.5, (0.1, 0.1))
+    # 0.5 mm apart, with 0.14 expected: 3.5 times, over 0.6745 since a median is compared.
+    times = scatter(samples, surfaces, evidence)
+    assert times == pytest.approx(0.5 / np.hypot(0.1, 0.1) / 0.6745, rel=0.01)
+    both = cloud.pairs_seen == 2
+    assert cloud.sigma_mm[both] == pytest.approx(times * 0.1 / np.sqrt(2.0), rel=0.01)
+
+
+def test_a_place_where_pairs_disagree_by_more_than_elsewhere_is_less_certain() -> None:
+    surfaces = [
+        known_to(wall(WALL_MM, 100, RigidTransform.identity()), 0.1),
+        known_to(wall(WALL_MM, 120, ASIDE), 0.1),
+    ]
+    some = np.arange(len(surfaces[1].points)) % 20 == 0
+    moved = surfaces[1].points + np.where(some, 0.8, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
+    surfaces[1] = replace(surfaces[1], points=moved.astype(np.float32))
+    samples = take_samples(surfaces, 10**6)
+    evidence = [compare(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)]
+    assert scatter(samples, surfaces, evidence) == 1.0
+    cloud = average(samples, surfaces, evidence, GAIN, 1)
+    both = cloud.pairs_seen == 2
+    apart = np.isclose(np.abs(cloud.points[:, 2] - WALL_MM), 0.4, atol=0.01) & both
+    assert apart.sum() > 50
+    # Two 0.8 mm apart have chi-squared 0.8^2 / (2 * 0.1^2) = 32; beyond 9, three sigmas, it counts.
+    expected = 0.1 / np.sqrt(2.0) * np.sqrt(32.0 / 9.0)
+    assert cloud.sigma_mm[apart] == pytest.approx(expected, rel=0.02)
+    calm = np.isclose(cloud.points[:, 2], WALL_MM, atol=0.01) & both
+    assert cloud.sigma_mm[calm] == pytest.approx(0.1 / np.sqrt(2.0), rel=1e-3)
+
+
+def test_surfaces_that_look_other_ways_are_not_one() -> None:
+    """The two sides of a thin wall."""
+    surfaces = [
+        known_to(wall(WALL_MM, 100, RigidTransform.identity()), 0.1),
+        known_to(wall(WALL_MM, 120, ASIDE), 0.1),
+    ]
+    turned = replace(surfaces[1], normals=-surfaces[1].normals)
+    samples = take_samples([surfaces[0], turned], 10**6)
+    found = compare(replace(samples, starts=samples.starts), turned, 1, 1.5, 6.0)
+    own = found.index[found.index < samples.starts[1]]
+    assert not own.size

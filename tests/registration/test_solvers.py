@@ -1,0 +1,106 @@
+"""The two solvers of a rig's boards: COLMAP's cameras are ours; the full solve ends at a minimum."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ring import ring_of_cameras, ring_views
+
+from bodyscan.calibration.board_views import LocatedView, PlanarView
+from bodyscan.calibration.camera import locate_board
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.brown import Brown
+from bodyscan.geometry.lenses.lens import Lens
+from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.full_solve import solve_fully
+from bodyscan.registration.joint_solve import (
+    JointSolution,
+    _refined,
+    colmap_camera,
+    colmap_pixels,
+)
+from bodyscan.registration.normal_equations import normal_equations
+
+PLACINGS, CAMERAS = ring_of_cameras(poles=2, heights=(700, 1100))
+ROOT = "p1-1"
+
+
+@pytest.mark.parametrize("lens", [Radial(-0.2, 0.1), Brown(-0.2, 0.1, 1e-3, -2e-3, 0.0)])
+def test_colmap_sees_points_where_our_camera_does(lens: Lens) -> None:
+    camera = Camera(900.0, 920.0, -1.5, 310.0, 255.0, lens, 640, 480)
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.3, 0.3, (50, 2)), np.ones(50)])
+    model = colmap_camera(camera, 1)
+    seen = np.asarray(model.img_from_cam(points))
+    # Both are float64; half a pixel would be missed by 0.5.
+    assert np.allclose(seen, colmap_pixels(camera, camera.project(points)), atol=1e-6)
+    again = _refined(camera, model)
+    assert np.allclose(again.parameters, camera.parameters, rtol=1e-12)
+
+
+def in_frame_of_root(
+    placings: dict[str, RigidTransform], boards: dict[tuple[str, str], RigidTransform]
+) -> JointSolution:
+    to_root = placings[ROOT].inverse()
+    return JointSolution(
+        {name: to_root @ placing for name, placing in placings.items()},
+        {target: to_root @ board for target, board in boards.items()},
+        dict(CAMERAS),
+    )
+
+
+def test_the_full_solve_ends_at_the_minimum_from_afar() -> None:
+    """Corners without noise: everything is found again, from poses 2 degrees and 20 mm off."""
+    views, truth = ring_views(PLACINGS, CAMERAS, shots=12, noise_px=0.0)
+    true = in_frame_of_root(PLACINGS, {view.target: truth[view.target] for view in views})
+    rng = np.random.default_rng(1)
+
+    def astray(placing: RigidTransform) -> RigidTransform:
+        return placing @ RigidTransform.from_rotation_vector(
+            rng.normal(0.0, 0.02, 3), rng.normal(0.0, 10.0, 3)
+        )
+
+    start = JointSolution(
+        {n: p if n == ROOT else astray(p) for n, p in true.root_from_camera.items()},
+        {target: astray(placing) for target, placing in true.root_from_board.items()},
+        {n: c.moved(np.array([8.0, 8.0, 0.0, 3.0, 3.0, 0, 0])) for n, c in CAMERAS.items()},
+    )
+    found = solve_fully(views, start, root=ROOT, refine_cameras=True)
+    for name, placing in true.root_from_camera.items():
+        off = found.root_from_camera[name].translation - placing.translation
+        # One step of Gauss and Newton leaves some millimetres.
+        assert np.linalg.norm(off) < 1e-3, name
+        assert np.allclose(found.cameras[name].parameters, CAMERAS[name].parameters, atol=1e-3)
+
+
+def test_the_corners_variance_is_found_although_the_unknowns_take_some_up() -> None:
+    """Of 32 residuals the pose takes 6: without the degrees of freedom 19 % too small."""
+    camera = replace(CAMERAS[ROOT], gamma=0.0)
+    column, row = np.meshgrid(np.arange(4.0), np.arange(4.0))
+    corners = 100.0 * np.column_stack([column.ravel(), row.ravel(), np.zeros(16)])
+    true = RigidTransform.from_rotation_vector([0.4, 0.3, 0.0], [-150.0, -150.0, 1200.0])
+    sigma_px, found = 0.05, []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        pixels = camera.project(true.apply(corners)) + rng.normal(0.0, sigma_px, (16, 2))
+        pose, _ = locate_board(camera, PlanarView("s", corners, pixels))
+        view = LocatedView(ROOT, "s", "b", corners, pixels, pose)
+        found.append(_variance(view, camera, pose))
+    # 60 draws of 26 degrees of freedom: 3.6 %; weights of corners beyond 4 sigmas take 3 % away.
+    assert np.mean(found) == pytest.approx(sigma_px**2, rel=0.12)
+
+
+def _variance(view: LocatedView, camera: Camera, pose: RigidTransform) -> float:
+    identity = {ROOT: RigidTransform.identity()}
+    return normal_equations(
+        [view],
+        {ROOT: camera},
+        identity,
+        {view.target: pose},
+        fixed_pair=ROOT,
+        fixed_target=None,
+        cameras_free=False,
+    ).variance_px2
