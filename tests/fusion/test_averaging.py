@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_comparing import ASIDE, WALL_MM, wall
+from flat_walls import ASIDE, WALL_MM, wall
 
 from bodyscan.fusion.averaging import average, scatter
 from bodyscan.fusion.comparing import Evidence, compare
