@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -37,8 +37,8 @@ SIDE_BY_SIDE = 0.4  # of the taller one's height
 SMALL_PIECE = 0.01
 LEVELS = np.arange(0.08, 0.95, 0.03)
 """of the height: every 50 mm of an adult"""
-CROTCH = 0.5
-"""of the height: below it a person may stand on two legs"""
+LEGS = 0.62
+"""of the height: below it a person may stand on two legs, even one whose hair gave no data"""
 BULKY = 0.35
 """of the largest outline at a height: an arm is 0.2 of the trunk, a hand 0.1 of a thigh"""
 TRUNK_MM2 = 25_000.0
@@ -85,7 +85,9 @@ def grade_scan(
 
     A check that fails by itself leaves the scan usable at best, and says so.
     """
-    checks: dict[str, Callable[[], Iterator[Finding]]] = {
+    # What is filled touches anything, and has any shape.
+    unknown = (surface.filled_share if surface else mesh.filled_share) > MOST_FILLED
+    checks: dict[str, Callable[[], Iterable[Finding]]] = {
         "pairs": lambda: _pairs(failed, alignment),
         "calibration": lambda: _calibration(unjudged),
         "directions": lambda: _directions(agreements or {}),
@@ -94,12 +96,14 @@ def grade_scan(
         "motion": lambda: _motion(alignment, person),
         "contradictions": lambda: _contradictions(contradicted),
         "pieces": lambda: _company(cloud),
-        "limbs": lambda: _limbs(mesh),
+        "limbs": lambda: () if unknown else _limbs(mesh),
         "cuts": lambda: _cuts(cloud, volume),
         "omissions": lambda: _omissions(cloud, mesh),
-        "contacts": lambda: _contacts(mesh),
+        "contacts": lambda: () if unknown else _contacts(mesh),
         "yields": lambda: _yields(surface),
-        "gaps": lambda: _other_side(mesh) if _see_one_side(cloud, cameras) else _gaps(surface),
+        "gaps": lambda: (
+            _other_side(mesh) if _see_one_side(cloud, cameras) else _gaps(cloud, surface)
+        ),
     }
     findings: list[Finding] = []
     failures: list[str] = []
@@ -229,8 +233,6 @@ def _company(cloud: BodyCloud) -> Iterator[Finding]:
 
 def _limbs(mesh: BodyMesh) -> Iterator[Finding]:
     """More trunks, legs or arms side by side than one person has, whatever touches."""
-    if mesh.filled.mean() > MOST_FILLED:
-        return
     top = float(mesh.vertices[:, 2].max())
     heights = mesh.vertices[mesh.faces, 2]
     low, high = heights.min(axis=1), heights.max(axis=1)
@@ -242,7 +244,7 @@ def _limbs(mesh: BodyMesh) -> Iterator[Finding]:
         if not areas.size:
             continue
         bulky = int(np.sum(areas > BULKY * areas.max()))
-        legs = share < CROTCH
+        legs = share < LEGS
         if bulky > (2 if legs else 1) and (legs or areas.max() > TRUNK_MM2):
             doubled.append(level)
         elif np.sum(areas > LIMB_MM2) > (4 if legs else 3):
@@ -284,8 +286,6 @@ def _omissions(cloud: BodyCloud, mesh: BodyMesh) -> Iterator[Finding]:
 
 
 def _contacts(mesh: BodyMesh) -> Iterator[Finding]:
-    if mesh.filled.mean() > MOST_FILLED:
-        return  # what is filled touches anywhere
     middle = 0.5 * (mesh.vertices[:, 1].min() + mesh.vertices[:, 1].max())
     for ring in rings(mesh.vertices, mesh.faces):
         side = "left" if ring.y_mm > middle else "right"
@@ -335,7 +335,7 @@ def _yields(surface: SurfaceCheck | None) -> Iterator[Finding]:
             )
 
 
-def _gaps(surface: SurfaceCheck | None) -> Iterator[Finding]:
+def _gaps(cloud: BodyCloud, surface: SurfaceCheck | None) -> Iterator[Finding]:
     """The made-up share of all, and of each height."""
     if surface is None:
         return
@@ -347,7 +347,10 @@ def _gaps(surface: SurfaceCheck | None) -> Iterator[Finding]:
         )
     area = surface.areas_mm2
     band = np.maximum(surface.heights_mm / BAND_MM, 0.0).astype(np.int64)
-    share = np.bincount(band, area * surface.filled) / np.maximum(np.bincount(band, area), 1e-9)
+    own = np.bincount(band, area)
+    share = np.bincount(band, area * surface.filled) / np.maximum(own, 1e-9)
+    seen = np.bincount(np.maximum(cloud.points[:, 2] / BAND_MM, 0).astype(np.int64), None, len(own))
+    share[(own == 0.0) & (seen[: len(own)] == 0)] = 1.0  # the mesh begins above it
     unknown = (share > UNKNOWN_BAND) & (BAND_MM * np.arange(len(share)) >= SOLES_MM)
     starts = np.flatnonzero(unknown & ~np.roll(unknown, 1))
     ends = np.flatnonzero(unknown & ~np.roll(unknown, -1)) + 1
