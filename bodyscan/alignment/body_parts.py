@@ -85,6 +85,8 @@ def tell_breath(followed: Followed) -> float | None:
     """mm, between the fullest and the emptiest trunk that a pair saw, where it rose most; None if
     what bent most did not rise all over, or no more than is uncertain."""
     here = name_parts(followed.cells) == PARTS.index("trunk")
+    if not here.any():
+        return None
     outwards = np.einsum(
         "pci,ci->pc",
         np.array(list(followed.bends.values()))[:, here, :3],

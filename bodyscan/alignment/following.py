@@ -42,7 +42,7 @@ Result = TypeVar("Result")
 BENDING = ("parts", "bulge")
 MOVING = ("sway", *BENDING)
 BLEND_MM = 60.0
-ROUNDS = 4  # the last with all points
+ROUNDS = 3  # the last with all points
 STILL_MM = 0.1
 """RMS of what no rigid motion explains; less does no harm, and calibrations bend by half of it."""
 

@@ -135,6 +135,21 @@ def test_parts_are_named_whichever_way_a_person_faces(
         assert one.centres[head, 2].min() > one.centres[part == 0, 2].mean()
 
 
+def test_without_a_trunk_there_is_no_breath(
+    found: tuple[Alignment, Alignment, Followed | None],
+) -> None:
+    """Legs alone were seen: they are named, and that is all."""
+    _, _, followed = found
+    assert followed is not None
+    cells = followed.cells
+    high = cells.centres * [1.0, 1.0, 0.0] + [0.0, 0.0, 100.0]
+    high[0, 2] = 1000.0
+    person = PersonMotion.of(replace(followed, cells=replace(cells, centres=high)))
+    assert "trunk" not in {part.name for part in person.parts}
+    assert person.breathed_mm is None
+    assert "could not be told" in person.lines[-1]
+
+
 def test_without_times_every_pair_has_a_free_stance(standing: LivingScan) -> None:
     aligned, alignment, followed = together(standing, timed=False)
     assert followed is not None
