@@ -60,7 +60,8 @@ def _report(title: str, rig: str, subject: str) -> str:
     return f"""## {title}, full size (synthetic)
 
 `rigs/{rig}.yaml` with `{subject}` simulated at 1280 x 1024, 640 stripes, mirror projectors,
-default noise, then the commands a user would type. Seconds of wall clock and peak memory of each:
+the preset `workshop`, then the commands a user would type. Seconds of wall clock and peak
+memory of each:
 
 | command | s | GiB |
 |---|---|---|

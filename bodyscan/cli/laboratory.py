@@ -40,7 +40,7 @@ def simulate(
     preset: Annotated[
         Literal["ideal", "workshop"],
         typer.Option(help="Devices without faults, or as people build them."),
-    ] = "ideal",
+    ] = "workshop",
     subject_preset: Annotated[
         Literal["mannequin", "standing", "restless", "child"],
         typer.Option(help="How the subject moves while frames are taken."),

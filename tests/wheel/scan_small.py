@@ -35,7 +35,7 @@ def main() -> None:
     installed = Path(bodyscan.__file__).resolve()
     if not installed.is_relative_to(Path(sys.prefix).resolve()):
         sys.exit(f"this is no wheel: bodyscan comes from {installed}")
-    size = ("--scale", 0.25, "--board-shots", 6)
+    size = ("--scale", 0.25, "--board-shots", 6, "--preset", "ideal")
     run("simulate", small_rig(Path("rig.yaml")), "--out", "work", *size, "--subject", SUBJECT)
     run("calibrate-rig", "work/rig.yaml")
     scan = ("--calibration", "work/calibration", "--out", "work/scan", "--points", 20_000)

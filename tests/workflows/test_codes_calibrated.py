@@ -20,9 +20,9 @@ def workspace(folder: Path, **code: object) -> Path:
     rig = yaml.safe_load((PROJECT / "rigs" / "one-pair.yaml").read_text("utf-8"))
     rig["pairs"][0]["projector"] |= code
     (folder / "code.yaml").write_text(yaml.safe_dump(rig), "utf-8")
-    out = folder / "work"
+    out, size = folder / "work", ("--scale", 0.3, "--board-shots", 4, "--preset", "ideal")
     for command in (
-        ("simulate", folder / "code.yaml", "--out", out, "--scale", 0.3, "--board-shots", 4),
+        ("simulate", folder / "code.yaml", "--out", out, *size),
         ("check", out / "rig.yaml"),
         ("calibrate-rig", out / "rig.yaml"),
     ):

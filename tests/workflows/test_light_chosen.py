@@ -18,7 +18,7 @@ def test_held_out_boards_choose_a_lens_for_a_lens_and_planes_for_a_mirror(
     tmp_path: Path, projector: str, expected: set[str]
 ) -> None:
     rig, folder = PROJECT / "rigs" / "one-pair.yaml", tmp_path / "work"
-    size = ("--scale", 0.4, "--board-shots", 6)
+    size = ("--scale", 0.4, "--board-shots", 6, "--preset", "ideal")
     for command in (
         ("simulate", rig, "--out", folder, "--projector", projector, *size),
         ("calibrate-rig", folder / "rig.yaml"),
