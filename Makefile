@@ -51,6 +51,18 @@ check: setup
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
+# docs/reproduction.md and its figures: the chapter's experiments, ideal and with real light.
+.PHONY: reproduction
+REPRODUCED := build/reproduction
+reproduction: setup
+	$(BIN)/bodyscan reproduce --out $(REPRODUCED)
+	$(BIN)/bodyscan reproduce --out $(REPRODUCED) --real-light
+	cp $(REPRODUCED)/*.png docs/
+	{ echo '<!-- Made by `make reproduction`: do not edit, run it again. -->'; echo; \
+		cat $(REPRODUCED)/reproduction.md; echo; \
+		sed '1s/.*/# The same with real light/' $(REPRODUCED)/reproduction-real-light.md; } \
+		> docs/reproduction.md
+
 bench: setup
 	$(BIN)/python -m benchmarks
 
