@@ -39,15 +39,15 @@ class PartMotion:
 @dataclass(frozen=True)
 class PersonMotion:
     """How each part moved that was seen, from the trunk outwards; breathed_mm: see `tell_breath`.
-    timed: whether the pairs' moments were known; if so, all is as of the middle of the scan."""
+    moment_ms: since the scan began, as of which all is; None (the mean of all) without times."""
 
     parts: tuple[PartMotion, ...]
     breathed_mm: float | None
-    timed: bool
+    moment_ms: float | None
 
     @staticmethod
     def of(followed: Followed) -> PersonMotion:
-        return PersonMotion(tell_parts(followed), tell_breath(followed), followed.timed)
+        return PersonMotion(tell_parts(followed), tell_breath(followed), followed.moment_ms)
 
     @property
     def lines(self) -> tuple[str, ...]:

@@ -56,7 +56,7 @@ class Followed:
     person moved between its moment and the middle.
     seen: (P, C) which pairs saw which cells.  sigma_mm: (C,), of a cell's surface along its normal,
     from what is not known of the motion and of the pairs' poses.
-    timed: whether the pairs' moments were known; if not, the middle is the mean.
+    moment_ms: the middle of the scan; None (it is the mean of all) if no pair's moment is known.
     """
 
     cells: BodyCells
@@ -64,7 +64,7 @@ class Followed:
     moved: Array
     seen: Mask
     sigma_mm: Array
-    timed: bool
+    moment_ms: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,9 +164,15 @@ def follow(
         motion.displacements(MOVING, from_middle=True)[..., :3],
         seen,
         _cell_sigmas(motion, cells, seen),
-        all(second is not None for second in seconds),
+        _middle_ms(images),
     )
     return _placed(aligned, names, views, motion, gaps), followed
+
+
+def _middle_ms(images: Sequence[RangeImage]) -> float | None:
+    """As `Courses` has it."""
+    known = [image.time_ms for image in images if image.time_ms is not None]
+    return 0.5 * (min(known) + max(known)) if known else None
 
 
 def _rigid(motion: BodyMotion, pair: int, *, from_middle: bool = False) -> Array:

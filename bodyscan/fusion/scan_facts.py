@@ -58,7 +58,7 @@ class _PartMotion(_Part):
 class _Person(_Part):
     parts: list[_PartMotion]
     breathed_mm: float | None
-    timed: bool
+    moment_ms: float | None
 
 
 class _Hashes(BaseModel):

@@ -103,7 +103,7 @@ def test_the_operator_hears_what_each_part_did(
     assert followed is not None
     person = PersonMotion.of(followed)
     assert [part.name for part in person.parts] == list(PARTS)
-    assert person.timed
+    assert person.moment_ms == pytest.approx(1e3 * standing.middle_s)
     moved = {part.name: part.moved_mm for part in person.parts}
     truth, still = standing.body, standing.body.at(standing.middle_s).vertices
     most = np.max(
@@ -153,7 +153,7 @@ def test_without_a_trunk_there_is_no_breath(
 def test_without_times_every_pair_has_a_free_stance(standing: LivingScan) -> None:
     aligned, alignment, followed = together(standing, timed=False)
     assert followed is not None
-    assert not followed.timed
+    assert followed.moment_ms is None
     # Its moment is the mean of all, which nobody knows: how well overlaps agree is what there is.
     assert alignment.rms_after_mm < 0.6 * aligned.rms_after_mm
 
