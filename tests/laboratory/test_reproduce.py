@@ -185,10 +185,13 @@ def test_points_are_as_far_off_as_they_say(
     captures: ChapterCaptures, calibrated: Calibrations
 ) -> None:
     found = point_sigma(calibrated.ours, captures)
-    # 0.9 to 1.0 in docs/reproduction.md; so coarsely rendered, boards seem worse placed than they are.
-    assert 0.25 < found.spheres < 1.7
-    assert 0.25 < found.plate < 1.7
-    assert found.beyond_three < 0.02
+    # Nearly all of a sigma is common to all points: one calibration is one draw of a normal variable,
+    # of which nothing but "not beyond three" can be asked; many are drawn in test_refinement_choice.
+    assert found.spheres < 3.0
+    assert found.plate < 3.0
+    # Nor may it be had by sigmas that are too large: 0.076 mm in docs/reproduction.md, and corners of
+    # images so coarsely rendered err by 0.03 px instead of 0.014.
+    assert found.median_mm < 3.0 * 0.076
 
 
 def test_whole_stripes_are_middles() -> None:
