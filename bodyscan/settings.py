@@ -130,6 +130,7 @@ class ScanSettings(Model):
     fusion: FusionSettings = FusionSettings()
     mesh: MeshSettings = MeshSettings()
     use: UseLimits = UseLimits()
+    """mm of a girth: what the scan is for, by which its verdict judges."""
 
 
 class ExportSettings(Model):

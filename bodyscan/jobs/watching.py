@@ -54,7 +54,6 @@ class Watched:
     """What is watched and what becomes of it.
 
     quiet_s: a scan with images missing is taken as it is when nothing has come for so long.
-    threads: of the process that does the work.
     """
 
     inbox: Path
@@ -62,7 +61,6 @@ class Watched:
     calibration: Path
     pipeline: Pipeline
     quiet_s: float = 30.0
-    threads: int = 2
     command: Sequence[str] = COMMAND
 
 
@@ -113,7 +111,7 @@ class _Watching:
 
     def __post_init__(self) -> None:
         own = self.watched
-        self.process = _Resident(own.calibration, own.threads, own.command)
+        self.process = _Resident(own.calibration, own.pipeline.resources.threads, own.command)
 
     def folders(self) -> list[Path]:
         """Of scans that are not done: what an earlier watch or batch did stays done."""

@@ -43,7 +43,7 @@ def calibrated(ring: SeenBoards, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(calibrate_rig, "open_captures", lambda *_: ring.captures(ring.views))
     monkeypatch.setattr(calibrate_rig, "find_all_boards", lambda *_: ring.found(ring.views))
     for name in (
-        *("coverage_notes", "boards_not_found", "check_board_size"),
+        *("coverage_notes", "boards_not_found"),
         *("advise", "compare_halves", "stripe_board_notes"),
     ):
         monkeypatch.setattr(rig_remarks, name, broken_later)
@@ -58,7 +58,7 @@ def test_a_calibration_is_written_before_anything_is_said_of_it(
     assert sorted(found.pairs) == sorted(ring.placings)
     failures = [note.partition(":")[0] for note in found.notes if "KeyError" in note]
     assert failures == [
-        *("coverage of the pictures", "boards that were not found", "size of the boards"),
+        *("coverage of the pictures", "boards that were not found"),
         *("advice", "halves of the shots", "boards by the stripes"),
     ]
 
