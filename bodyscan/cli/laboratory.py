@@ -107,10 +107,12 @@ def evaluate(
     ],
 ) -> None:
     """Compare the calibration and scan of a simulated workspace with the truth beside it."""
+    from bodyscan.simulation.living import body_of
     from bodyscan.workflows.evaluate import evaluate_workspace
 
     with output.stages() as progress, step(progress, "comparing"):
-        text = evaluate_workspace(workspace)
+        body = body_of(workspace / "truth")
+        text = evaluate_workspace(workspace, None if body is None else body.vertices)
     output.say(*text.splitlines())
 
 

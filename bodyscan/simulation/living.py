@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -258,3 +259,13 @@ def load_body(motion: dict[str, Any], path: Path) -> LivingBody:
 
 def _wander(fields: dict[str, Any]) -> Wander:
     return Wander(*(np.array(fields[name], float) for name in ("hz", "sizes", "phases")))
+
+
+def body_of(truth: Path) -> LivingBody | None:
+    """That of a workspace's folder `truth`; None for a subject that did not move, or that cannot be
+    read."""
+    try:
+        motion = json.loads((truth / "truth.json").read_text("utf-8"))["motion"]
+        return load_body(motion, truth / "body.npz")
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

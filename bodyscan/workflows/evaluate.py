@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ from bodyscan.optional import optional
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
 from bodyscan.report.pictures import draw_deviation
+
+BodyAt = Callable[[float], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,11 +107,13 @@ def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
     return RigDeviation(names, np.array(centres), np.array(rotations), np.array(sigmas))
 
 
-def evaluate_workspace(workspace: Path) -> str:
+def evaluate_workspace(workspace: Path, body_at: BodyAt | None = None) -> str:
     """A text with every figure, and deviation pictures beside the scan.
 
-    Raises BadInput without truth, CalibrationFileError, ResultError; a figure that cannot be had is
-    a line that says so.
+    body_at: of a subject who moved, the vertices of the truth's surface at a moment, ms since the
+    scan began: a scan without some pairs shows another moment than the middle of all. Raises
+    BadInput without truth, CalibrationFileError, ResultError; a figure that cannot be had is a line
+    that says so.
     """
     truth = load_truth(workspace / "truth")
     calibration = load_calibration(workspace / "calibration")
@@ -121,7 +126,11 @@ def evaluate_workspace(workspace: Path) -> str:
     folder = workspace / "scan"
     if not (folder / "scan.json").exists() or truth.vertices is None or truth.faces is None:
         return "\n".join([*lines, "  no scan to compare yet"])
-    lines += _scan_lines(load_scan(folder), folder, calibration, truth)
+    stored = load_scan(folder)
+    moment_ms = (stored.facts.get("person") or {}).get("moment_ms")
+    if body_at is not None and moment_ms is not None:
+        truth = replace(truth, vertices=body_at(moment_ms))
+    lines += _scan_lines(stored, folder, calibration, truth)
     lines += [
         "results:",
         f"  calibration {workspace / 'calibration' / 'calibration.json'}",
@@ -142,7 +151,7 @@ def _scan_lines(
     surface, pairs = (truth.vertices, truth.faces), truth.facts["pairs"]
     place = sway_residual(_placings(stored, calibration), pairs, truth.vertices)
     still_from_rig = RigidTransform.identity()
-    if "motion" in truth.facts:  # laid onto the body as it was at mid-scan
+    if "motion" in truth.facts:  # laid onto the body as it was then
         still_from_rig = fit_to_surface(stored.cloud.points, *surface)
     elif truth.facts["settings"]["person"]["sway_mm"]:
         still_from_rig = place.rig_from_still.inverse()  # who sways stands nowhere in particular

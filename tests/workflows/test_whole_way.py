@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from bodyscan.mesh.ply import read_ply_mesh
 from bodyscan.mesh.topology import topology
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
-from bodyscan.workflows.evaluate import compare_rig, load_truth
+from bodyscan.workflows.evaluate import compare_rig, evaluate_workspace, load_truth
 
 
 @pytest.fixture(scope="module")
@@ -118,3 +119,27 @@ def test_every_command_says_where_its_results_are(workspace: Workspace) -> None:
     assert "scan.json" in workspace.outputs["scan"]
     assert "body.glb" in workspace.outputs["export"]
     assert "mesh.ply" in workspace.outputs["evaluate"]
+
+
+def test_a_person_who_moved_is_held_against_the_body_of_that_moment(
+    workspace: Workspace, tmp_path: Path
+) -> None:
+    folder = tmp_path / "moved"
+    for part in ("calibration", "truth", "scan"):
+        shutil.copytree(workspace.folder / part, folder / part)
+    facts = json.loads((folder / "scan" / "scan.json").read_text("utf-8"))
+    facts["person"] = {"moment_ms": 791.5, "breathed_mm": None, "parts": []}
+    (folder / "scan" / "scan.json").write_text(json.dumps(facts))
+    truth = load_truth(folder / "truth").vertices
+    assert truth is not None
+    asked = []
+
+    def body_at(ms: float) -> Array:
+        asked.append(ms)
+        return 1.01 * truth  # of 1.7 m: 2 mm all round
+
+    grown, as_it_was = evaluate_workspace(folder, body_at), evaluate_workspace(folder)
+    assert asked == [791.5]
+    clouds = [text.partition("cloud,")[2] for text in (grown, as_it_was)]
+    rms = [float(text.partition("RMS ")[2].split(",")[0]) for text in clouds]
+    assert rms[0] > rms[1] + 1.0
