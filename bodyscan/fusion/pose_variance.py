@@ -47,12 +47,15 @@ def add_pose_variance(
     return replace(cloud, sigma_mm=np.hypot(cloud.sigma_mm, placing_mm).astype(np.float32))
 
 
-def add_motion_variance(cloud: BodyCloud, followed: Followed) -> BodyCloud:
-    """The cloud with sigmas that allow for what is not known of the person's motion, and of the
-    pairs' poses, after both were found together."""
+def add_motion_variance(cloud: BodyCloud, placed: BodyCloud, followed: Followed) -> BodyCloud:
+    """The cloud with sigmas that allow for what is not known of the person's motion.
+
+    placed: the cloud with the pairs' poses, as the boards know them, in its sigmas.  Following
+    leaves out what moves the body as a whole, which they hold: the larger of both counts.
+    """
     cell = followed.cells.find_many(cloud.points, cloud.normals.astype(np.float64))
-    sigma_mm = np.hypot(cloud.sigma_mm, followed.sigma_mm[cell]).astype(np.float32)
-    return replace(cloud, sigma_mm=sigma_mm)
+    sigma_mm = np.hypot(cloud.sigma_mm, followed.sigma_mm[cell])
+    return replace(cloud, sigma_mm=np.maximum(sigma_mm, placed.sigma_mm).astype(np.float32))
 
 
 @compiled

@@ -84,11 +84,9 @@ def fuse(
     with step(progress, "merging"):
         fused = merge(seen, placing, settings.fusion)
         there = {image.pair: placing[image.pair] for image in seen}
-        cloud = (
-            add_motion_variance(fused.cloud, followed)
-            if followed
-            else add_pose_variance(fused.cloud, there, known)
-        )
+        cloud = add_pose_variance(fused.cloud, there, known)
+        if followed:
+            cloud = add_motion_variance(fused.cloud, cloud, followed)
     with step(progress, "meshing"):
         surface = mesh(cloud, settings.mesh, images, placing)
     with step(progress, "judging"):

@@ -1,9 +1,14 @@
 """Error bars hold how well the pairs are placed."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from bodyscan.fusion.pose_variance import add_pose_variance
+from bodyscan.arrays import Array, Indices
+from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
@@ -72,3 +77,17 @@ def test_what_pairs_share_does_not_average_out(cloud: BodyCloud) -> None:
     front, back = cloud.normals[:, 0] > 0.999, cloud.normals[:, 0] < -0.999
     assert found.sigma_mm[front] == pytest.approx(0.05, rel=1e-3)
     assert found.sigma_mm[back] == pytest.approx(np.hypot(0.03, 0.4), rel=1e-3)
+
+
+def test_what_moves_a_followed_body_as_a_whole_stays_in_its_sigmas(cloud: BodyCloud) -> None:
+    """Following tells shapes alone; the boards hold where the whole stands."""
+    by_boards = replace(cloud, sigma_mm=np.full_like(cloud.sigma_mm, 0.5))
+
+    class Cells:
+        def find_many(self, points: Array, normals: Array) -> Indices:
+            return np.zeros(len(points), np.int64)
+
+    for motion_mm, expected in ((0.1, 0.5), (2.0, np.hypot(0.03, 2.0))):
+        followed: Any = SimpleNamespace(cells=Cells(), sigma_mm=np.array([motion_mm]))
+        found = add_motion_variance(cloud, by_boards, followed)
+        assert found.sigma_mm == pytest.approx(expected, rel=1e-6)
