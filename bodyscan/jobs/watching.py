@@ -111,7 +111,7 @@ class _Watching:
 
     def __post_init__(self) -> None:
         own = self.watched
-        self.process = _Resident(own.calibration, own.pipeline.resources.threads, own.command)
+        self.process = ResidentProcess(own.calibration, own.pipeline.resources.threads, own.command)
 
     def folders(self) -> list[Path]:
         """Of scans that are not done: what an earlier watch or batch did stays done."""
@@ -165,7 +165,7 @@ class _Watching:
             60.0 * self.watched.pipeline.resources.limit_minutes,
         )
         if status is None and self.running and time.monotonic() - self.started_s > limit_s:
-            self.process.stop()
+            self.process.kill()
         elif status is not None:
             self._begin_again(status)
 
@@ -202,7 +202,6 @@ class _Watching:
         if not self.running:
             self.started_s = time.monotonic()
         self.running[path] = (job, attempt)
-        self.jobs[path] = job
         note_state(job.folder, {"state": "running", "attempts": attempt, "reason": ""})
         self.listen({"event": "job", "job": job.name, "state": "running", "attempt": attempt})
         self.process.ask(folder=str(job.folder))
@@ -250,7 +249,7 @@ class _Watching:
         return JobResult(**{**known, "stages": tuple(known.get("stages", ()))})
 
 
-class _Resident:
+class ResidentProcess:
     """The process that does the work, and what it says."""
 
     def __init__(self, calibration: Path, threads: int, command: Sequence[str]) -> None:
@@ -298,9 +297,14 @@ class _Resident:
             return None
         return self._process.poll()
 
-    def stop(self) -> None:
+    def kill(self) -> None:
+        """One that is stuck: `status` tells that it has ended."""
         if self._process is not None:
             self._process.kill()
+
+    def stop(self) -> None:
+        self.kill()
+        if self._process is not None:
             self._process.wait()
             self._process = None
 
