@@ -4,6 +4,7 @@
 # make coverage     all tests again, with the lines of the package that they run
 # make wheel        build the wheel, install it into an empty environment, scan something small there
 # make check        format, lint, types and the directions of imports
+# make lock         the versions that CI installs, data/constraints.txt, made anew from the newest that fit
 # make bench        speed and accuracy at full size, written to docs/results.md, old sections marked
 
 PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
@@ -71,6 +72,15 @@ bench: setup
 mutants: setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'cosmic-ray>=8.4'
 	$(BIN)/python -m benchmarks mutants
+
+# Users get the newest libraries that pyproject.toml allows; CI those of the day it was last looked at.
+.PHONY: lock
+lock:
+	rm -rf build/lock
+	"$(PYTHON)" -m venv build/lock
+	build/lock/bin/python -m pip install --quiet --disable-pip-version-check '.[dev,docs,cluster,e57]'
+	build/lock/bin/python -m pip freeze --exclude bodyscan > data/constraints.txt
+	rm -rf build/lock
 
 setup: $(VENV)/.ready
 
