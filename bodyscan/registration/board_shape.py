@@ -13,6 +13,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.held_out import CLEARLY, Compared, gain
 from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import rigid_fit
 from bodyscan.registration.full_solve import solve_fully
@@ -26,10 +27,9 @@ HASTE = 1.6
 SETTLED_MM = 1e-3
 PRIOR_MM = 1.0
 """How far a corner lies from where it should, before any picture says more."""
-SUSPECT = 4.0
-"""Offsets are looked into where they lower the squared residuals by so many variances each."""
-CLEARLY = 0.9
-"""They are used where others' views then fit so many times as closely, or closer."""
+SUSPECT = 1.25
+"""Offsets are looked into where they lower the squared residuals by so many variances each: noise
+alone lowers them by one; of 48 corners or more by 1.25 once in 700 times."""
 FEWEST_TARGETS = 6
 DIGITS = 6
 
@@ -89,11 +89,15 @@ def with_board_shapes(
     targets = sorted({view.target for view in views})
     if len(targets) < FEWEST_TARGETS or _gain_per_unknown(views, solution) < SUSPECT:
         return plain
-    before, after = _held_out(views, solution, root, refine_cameras)
+    held_out = _hold_out(views, solution, root, refine_cameras)
     shaped = _estimate(views, solution, root, refine_cameras)
     sizes = "; ".join(_said(name, shape) for name, shape in sorted(shaped.shapes.items()))
-    figures = f"boards held out fit to {after:.3f} px with it, {before:.3f} without"
-    if after > CLEARLY * before:
+    better_by = gain(held_out)
+    figures = (
+        f"boards held out fit to {_median(held_out.rich):.3f} px with it, "
+        f"{_median(held_out.simple):.3f} without, by {better_by:.0f} standard errors"
+    )
+    if better_by < CLEARLY:
         return replace(plain, notes=(f"{sizes}: not used, {figures}",))
     return replace(shaped, notes=(f"{sizes}: used, {figures}",))
 
@@ -225,28 +229,32 @@ def _corner_equations(
     return information, pull, variance
 
 
-def _held_out(
+def _hold_out(
     views: Sequence[LocatedView], solution: JointSolution, root: str, refine_cameras: bool
-) -> tuple[float, float]:
-    """RMS px of boards held out, posed by the rest's cameras: without shapes, with them."""
+) -> Compared:
+    """Boards held out, posed by the rest's cameras, flat and in the shape that the rest give them."""
     targets = sorted({view.target for view in views})
-    squares: list[tuple[float, float]] = []
-    for part in range(2):
-        held = set(targets[part::2])
+    flat_ones, bent_ones, part = [], [], []
+    for half in range(2):
+        held = set(targets[half::2])
         others = [view for view in views if view.target not in held]
         kept = {t: p for t, p in solution.root_from_board.items() if t not in held}
         start = replace(solution, root_from_board=kept)
         flat = solve_fully(others, start, root=root, refine_cameras=refine_cameras)
         bent = _estimate(others, flat, root, refine_cameras)
-        for target in held:
+        for target in sorted(held):
             own = [view for view in views if view.target == target]
             true = [in_shape(view, bent.shapes) for view in own]
             placing = solution.root_from_board[target]
-            before = fit_board(own, flat, placing).rms_px
-            after = fit_board(true, bent.solution, placing).rms_px
-            squares += list(zip(before**2, after**2, strict=True))
-    before_px, after_px = np.sqrt(np.median(np.array(squares), axis=0))
-    return float(before_px), float(after_px)
+            flat_ones.append(np.concatenate(fit_board(own, flat, placing).residuals))
+            bent_ones.append(np.concatenate(fit_board(true, bent.solution, placing).residuals))
+            part.append(np.full(len(flat_ones[-1]), targets.index(target)))
+    return Compared(np.concatenate(flat_ones), np.concatenate(bent_ones), np.concatenate(part))
+
+
+def _median(residuals: Array) -> float:
+    """px; the median, which a few wrong views do not change."""
+    return float(np.sqrt(np.median(np.sum(residuals**2, axis=1))))
 
 
 def _keys(points: Array) -> list[tuple[float, ...]]:

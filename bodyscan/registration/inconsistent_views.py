@@ -44,10 +44,16 @@ class InconsistentViews:
 
 @dataclass(frozen=True, eq=False)
 class BoardFit:
-    """One board pose for several views: RMS px of each view, and how large the board seems."""
+    """One board pose for several views: residuals (N, 2) px of each view, and how large the board
+    seems."""
 
-    rms_px: Array
+    residuals: tuple[Array, ...]
     size: float
+
+    @property
+    def rms_px(self) -> Array:
+        """(V,) of each view."""
+        return np.array([_rms(residuals) for residuals in self.residuals])
 
 
 def single_view_errors(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> Array:
@@ -185,8 +191,8 @@ def _descend(
         settled=SETTLED,
         damping=1e-9,
     )
-    rms = [_rms(block.residuals.reshape(-1, 2)) for block in fitted.blocks]
-    return BoardFit(np.array(rms), fitted.state[1])
+    residuals = tuple(block.residuals.reshape(-1, 2) for block in fitted.blocks)
+    return BoardFit(residuals, fitted.state[1])
 
 
 def _corners(
