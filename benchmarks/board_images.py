@@ -115,9 +115,8 @@ def _views_of(
     number: int,
 ) -> Iterator[BoardView]:
     samples = SETTINGS.optics.samples
-    rays = sample_directions(
-        pair.camera, samples, np.random.default_rng([seed, 6, number]), slice(None)
-    )
+    shift = np.random.default_rng([seed, 6, number]).random((*pair.camera.grid().shape[:2], 2))
+    rays = sample_directions(pair.camera, samples, shift, slice(None))
     planes = np.ascontiguousarray(
         rays[:, :2]
         .reshape(pair.camera.height, pair.camera.width, samples**2, 2)

@@ -19,11 +19,11 @@ from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation import files
 from bodyscan.simulation.layout import TruePair
 from bodyscan.simulation.presets import settings_of
-from bodyscan.simulation.render import View
 from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Surface, grid_surface
 from bodyscan.simulation.settings import SimulationSettings
 from bodyscan.simulation.simulate import Task, render_task, sensor_of, true_pairs
+from bodyscan.simulation.view import View
 
 ALBEDO = 0.7
 RINGS = 200

@@ -122,11 +122,9 @@ def sample_offsets(count: int) -> Array:
     return np.stack([(index + 0.5) / total, (index * step % total + 0.5) / total], axis=-1)
 
 
-def sample_directions(
-    camera: TrueCamera, count: int, rng: np.random.Generator, rows: slice
-) -> Floats:
-    """Rays of some rows, (rows * width * count^2, 3) float32; each pixel shifts its samples."""
-    shift = rng.random((*camera.grid(rows).shape[:2], 1, 2))
-    inside = np.mod(sample_offsets(count) + shift, 1.0) - 0.5
+def sample_directions(camera: TrueCamera, count: int, shift: Array, rows: slice) -> Floats:
+    """Rays of some rows, (rows * width * count^2, 3) float32; each pixel shifts its samples by
+    `shift` (rows, width, 2), in [0, 1)."""
+    inside = np.mod(sample_offsets(count) + shift[:, :, None], 1.0) - 0.5
     pixels = camera.grid(rows)[:, :, None, :] + inside
     return camera.directions(pixels.reshape(-1, 2)).astype(np.float32)

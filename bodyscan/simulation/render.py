@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -15,45 +15,20 @@ from bodyscan.rig.frame_names import FrameNames
 from bodyscan.simulation.flicker import Brightness
 from bodyscan.simulation.gray import LightTable, light_table, table_index
 from bodyscan.simulation.inter_reflection import LitFacets, light_facets
-from bodyscan.simulation.lamps import Lamps, laser_light, room_light
-from bodyscan.simulation.lens import TrueCamera, sample_directions
+from bodyscan.simulation.lamps import Lamps, laser_light
+from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.patterns import projected_patterns
 from bodyscan.simulation.projector import Projector
-from bodyscan.simulation.scene import Hits, Scene
+from bodyscan.simulation.ray_ends import RayEnds, ends_of_rays, mean_light
+from bodyscan.simulation.scene import Scene
 from bodyscan.simulation.sensor import add_speckle, blur, off_focus, shade
-from bodyscan.simulation.settings import InterReflection, Optics, Projection
+from bodyscan.simulation.settings import InterReflection, Projection
 from bodyscan.simulation.skin import spread_light
+from bodyscan.simulation.view import Band, View
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.stripe_code import StripeCode
 
-_BAND = 250_000
 _DEFOCUS_STEPS = 12
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A camera's rays, several a pixel, kept for all its shots.
-
-    bands: rows of the image, and their rays (rows * width * samples, 3).
-    """
-
-    camera: TrueCamera
-    optics: Optics
-    bands: tuple[tuple[slice, Floats], ...]
-
-    @staticmethod
-    def of(camera: TrueCamera, optics: Optics, rng: np.random.Generator) -> View:
-        """Rays through places inside each pixel that `rng` shifts."""
-        rows = max(1, _BAND // (camera.width * optics.samples**2))
-        cuts = [slice(r, min(r + rows, camera.height)) for r in range(0, camera.height, rows)]
-        bands = [(cut, sample_directions(camera, optics.samples, rng, cut)) for cut in cuts]
-        return View(camera, optics, tuple(bands))
-
-    def rays_of(self, chosen: Mask) -> Floats:
-        """Rays (pixels * samples, 3) of the pixels chosen (H, W)."""
-        samples = self.optics.samples**2
-        parts = [rays.reshape(-1, samples, 3)[chosen[rows].ravel()] for rows, rays in self.bands]
-        return np.concatenate(parts).reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,13 +84,13 @@ def render_pair(
     lit = _tables(code, projection, rng, frames, sequence)
     dark = frames.dark if code.uses_dark else None if code.is_projected else ""
     unlit = () if dark is None or not sequence else (dark,)
-    source = _Source(projector, lamps, projection, view.optics.samples**2)
+    source = _Source(projector, lamps, projection)
     seen = _see(scene, view, source, lit, unlit, moving.surfaces if moving else 0)
     if moving is not None:
         _see_again(seen, view, source, lit, moving)
     if inter_reflection is not None and inter_reflection.facet_mm > 0:
         between = _Between.of(scene, source, lit, inter_reflection)
-        between.add_to(seen.laser, scene, view)
+        between.add_to(seen, scene, view)
     for name in lit:
         light = seen.laser[name]
         light = spread_light(light, seen.skin, seen.depth, view.camera.alpha, lamps.skin)
@@ -137,12 +112,11 @@ def render_pair(
 
 @dataclass(frozen=True, eq=False)
 class _Source:
-    """What lights the ends of rays, of which each pixel has several."""
+    """What lights the ends of rays."""
 
     projector: Projector
     lamps: Lamps
     projection: Projection
-    samples: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +126,7 @@ class _Seen:
     laser, ambient: by frame, of the projector's light and of the room's.  depth: (H, W) mm, the least
     in each pixel.  near: (H, W) where something shows that moves.  gloss: by frame, of the projector's
     light what skin mirrors; none where nothing is glossy.  skin: (H, W) the share that is skin.
+    albedo: (H, W), the mean.
     """
 
     laser: dict[str, Floats]
@@ -160,6 +135,7 @@ class _Seen:
     near: Mask
     gloss: dict[str, Floats]
     skin: Floats
+    albedo: Floats
 
 
 def _see(
@@ -173,21 +149,21 @@ def _see(
     """Every frame of a scene in which nothing moves; its first surfaces will."""
     shape = (view.camera.height, view.camera.width)
     laser = {name: np.zeros(shape, np.float32) for name in (*lit, *unlit)}
-    ambient, depth = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    ambient, albedo, depth = (np.zeros(shape, np.float32) for _ in range(3))
     near, skin = np.zeros(shape, bool), np.zeros(shape, np.float32)
     glossy = lit if source.lamps.skin.gloss > 0 else {}
     gloss = {name: np.zeros(shape, np.float32) for name in glossy}
-    for rows, directions in view.bands:
-        rays = _LitRays.of(scene, directions, source)
+    for band in view.bands:
+        place, rays = band.place, _LitRays.of(scene, band, source)
         for name, table in lit.items():
-            laser[name][rows] = rays.light(table).reshape(-1, shape[1])
-        ambient[rows] = rays.ambient(source.lamps).reshape(-1, shape[1])
-        depth[rows] = rays.nearest().reshape(-1, shape[1])
-        near[rows] = rays.on_first(moving_surfaces).reshape(-1, shape[1])
-        skin[rows] = rays.skin().reshape(-1, shape[1])
+            laser[name][place] = rays.light(table)
+        ambient[place], albedo[place] = rays.ambient(), rays.ends.albedo.mean(axis=-1)
+        depth[place] = rays.ends.depth.min(axis=-1)
+        near[place] = (rays.ends.surface < moving_surfaces).any(axis=-1)
+        skin[place] = rays.ends.skin.mean(axis=-1)
         for name in gloss:
-            gloss[name][rows] = rays.mirrored(lit[name]).reshape(-1, shape[1])
-    return _Seen(laser, dict.fromkeys(laser, ambient), depth, near, gloss, skin)
+            gloss[name][place] = rays.mirrored(lit[name])
+    return _Seen(laser, dict.fromkeys(laser, ambient), depth, near, gloss, skin, albedo)
 
 
 def _see_again(
@@ -195,64 +171,50 @@ def _see_again(
 ) -> None:
     """What moves, and what it covers and uncovers, as it is when each frame is taken."""
     near = _reached(seen.near, seen.depth, moving.reach_mm, view.camera)
-    directions = view.rays_of(near)
+    bands = list(view.around(near))
     for name in seen.laser:
-        rays = _LitRays.of(moving.at(name), directions, source)
+        scene = moving.at(name)
         seen.ambient[name] = seen.ambient[name].copy()
-        seen.ambient[name][near] = rays.ambient(source.lamps)
-        if name in lit:
-            seen.laser[name][near] = rays.light(lit[name])
-        if name in seen.gloss:
-            seen.gloss[name][near] = rays.mirrored(lit[name])
+        for band in bands:
+            rays, chosen = _LitRays.of(scene, band, source), near[band.place]
+            np.copyto(seen.ambient[name][band.place], rays.ambient(), where=chosen)
+            if name in lit:
+                np.copyto(seen.laser[name][band.place], rays.light(lit[name]), where=chosen)
+            if name in seen.gloss:
+                np.copyto(seen.gloss[name][band.place], rays.mirrored(lit[name]), where=chosen)
 
 
 @dataclass(frozen=True, eq=False)
 class _LitRays:
-    """Rays of some pixels, several each, with the projector's light where they end.
+    """A band's rays, with the projector's light where they end.
 
-    weight, gloss: (rays,) grey level under full light, scattered and mirrored.  index: into a table
+    weight, gloss: (R, C, K) grey level under full light, scattered and mirrored.  index: into a table
     of light.
     """
 
-    hits: Hits
+    ends: RayEnds
     weight: Floats
-    gloss: Floats | None
+    gloss: Floats
     index: NDArray[np.int32]
-    samples: int
 
     @staticmethod
-    def of(scene: Scene, directions: Floats, source: _Source) -> _LitRays:
-        hits = scene.cast(directions)
-        light = laser_light(scene, hits, source.projector, source.lamps)
-        blurs = _blur_rows(hits, source.projection, source.lamps)
-        index = table_index(light.s, source.projector.stripes, blurs)
-        return _LitRays(hits, light.weight, light.gloss, index, source.samples)
+    def of(scene: Scene, band: Band, source: _Source) -> _LitRays:
+        ends = ends_of_rays(scene, band, source.projector, source.lamps)
+        blurs = _blur_rows(ends.depth, source.projection, source.lamps)
+        index = table_index(ends.s, source.projector.stripes, blurs)
+        return _LitRays(ends, ends.white * ends.albedo, ends.gloss, index)
 
     def light(self, table: LightTable) -> Floats:
-        """(pixels,) grey level of one frame."""
-        return _pixels(self.weight, table.at(self.index), self.samples)
+        """(R, C) grey level of one frame."""
+        return mean_light(self.weight, self.index, table.values.ravel())
 
     def mirrored(self, table: LightTable) -> Floats:
-        """(pixels,) the part of one frame that glossy skin mirrors."""
-        if self.gloss is None:
-            return np.zeros(len(self.index) // self.samples, np.float32)
-        return _pixels(self.gloss, table.at(self.index), self.samples)
+        """(R, C) the part of one frame that glossy skin mirrors."""
+        return mean_light(self.gloss, self.index, table.values.ravel())
 
-    def skin(self) -> Floats:
-        """(pixels,) the share that is skin."""
-        return _pixels(self.hits.skin, np.ones_like(self.hits.skin), self.samples)
-
-    def ambient(self, lamps: Lamps) -> Floats:
-        """(pixels,) grey level by the room's own light."""
-        return _pixels(self.hits.albedo, room_light(self.hits, lamps), self.samples)
-
-    def nearest(self) -> Floats:
-        """(pixels,) the least depth, mm."""
-        return self.hits.depth.reshape(-1, self.samples).min(axis=1)
-
-    def on_first(self, surfaces: int) -> Mask:
-        """(pixels,) whether any ray ends on one of the first surfaces."""
-        return np.asarray((self.hits.surface < surfaces).reshape(-1, self.samples).any(axis=1))
+    def ambient(self) -> Floats:
+        """(R, C) grey level by the room's own light."""
+        return np.asarray((self.ends.room * self.ends.albedo).mean(axis=-1), np.float32)
 
 
 def _reached(near: Mask, depth: Floats, reach_mm: float, camera: TrueCamera) -> Mask:
@@ -281,27 +243,19 @@ class _Between:
         chosen: InterReflection,
     ) -> _Between:
         facets = light_facets(scene, source.projector, source.lamps, chosen.facet_mm)
-        blur = _blur_rows(facets.samples, source.projection, source.lamps)
+        blur = _blur_rows(facets.samples.depth, source.projection, source.lamps)
         index = table_index(facets.s, source.projector.stripes, blur)
         light = np.stack([facets.radiosity(table.at(index)) for table in tables.values()])
         return _Between(tuple(tables), facets, light)
 
-    def add_to(self, laser: dict[str, Floats], scene: Scene, view: View) -> None:
-        """What pixels get of it, to every frame (H, W): it changes slowly, one sample of each tells."""
-        samples = view.optics.samples**2
-        for rows, directions in view.bands:
-            hits = scene.cast(directions)
-            middle = Hits(*(getattr(hits, f.name)[samples // 2 :: samples] for f in fields(Hits)))
-            albedo = _pixels(hits.albedo, np.ones_like(hits.albedo), samples)
-            found = self.facets.irradiance(middle, self.radiosity)
+    def add_to(self, seen: _Seen, scene: Scene, view: View) -> None:
+        """What pixels get of it, to every frame: it changes slowly, one sample of each tells."""
+        for band in view.bands:
+            hits = scene.cast(band.rays[:, :, band.rays.shape[2] // 2].reshape(-1, 3))
+            found = self.facets.irradiance(hits, self.radiosity)
             for name, light in zip(self.names, found, strict=True):
-                laser[name][rows] += (albedo * light).reshape(-1, view.camera.width)
-
-
-def _pixels(weight: Floats, light: Floats, samples: int) -> Floats:
-    """Mean over each pixel's samples of weight times light."""
-    total = np.einsum("ij,ij->i", weight.reshape(-1, samples), light.reshape(-1, samples))
-    return total * np.float32(1.0 / samples)
+                albedo = seen.albedo[band.place]
+                seen.laser[name][band.place] += albedo * light.reshape(albedo.shape)
 
 
 def pixel_truth(scene: Scene, camera: TrueCamera, projector: Projector) -> PixelTruth:
@@ -365,9 +319,9 @@ def _blurs(projection: Projection) -> Array:
     return np.hypot(projection.blur_stripes, steps)
 
 
-def _blur_rows(hits: Hits, projection: Projection, lamps: Lamps) -> NDArray[np.int32] | None:
-    """Which of `_blurs` holds at each hit; its distance to the projector is about its depth."""
+def _blur_rows(depth: Floats, projection: Projection, lamps: Lamps) -> NDArray[np.int32] | None:
+    """Which of `_blurs` holds at each depth: the distance to the projector is about that."""
     if projection.defocus_stripes <= 0:
         return None
-    off = off_focus(hits.depth, lamps.focus_mm)
+    off = off_focus(depth, lamps.focus_mm)
     return np.rint(off * (_DEFOCUS_STEPS - 1)).astype(np.int32)

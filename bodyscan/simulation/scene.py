@@ -65,6 +65,8 @@ class Hits:
 
     surface: (N,) number of the surface, one past the last where nothing.
     skin: (N,) as `Surface.skin`.
+    facets: (N, 3) normals of the triangles, of any length.
+    places: (N, 2) on the surface's print, if it has one.
     """
 
     depth: Floats
@@ -73,6 +75,8 @@ class Hits:
     albedo: Floats
     surface: NDArray[np.uint32]
     skin: Floats
+    facets: Floats
+    places: Floats
 
 
 class Scene:
@@ -96,7 +100,8 @@ class Scene:
         rays[:, 3:] = directions
         answer = self._rays.cast_rays(Tensor.from_numpy(rays), nthreads=_THREADS)
         found: dict[str, NDArray[Any]] = {key: value.numpy() for key, value in answer.items()}
-        depth, normals = found["t_hit"], found["primitive_normals"]
+        depth, facets = found["t_hit"], found["primitive_normals"]
+        normals, places = facets.copy(), np.zeros((len(depth), 2), np.float32)
         surface = np.minimum(found["geometry_ids"], len(self.surfaces))
         albedo = np.array([finish.albedo for finish in self._finish] + [0.0], np.float32)[surface]
         skin = np.zeros_like(depth)
@@ -110,8 +115,17 @@ class Scene:
                 normals[chosen] = _spread(finish.normals, triangles, uv)
             if finish.skin is not None:
                 skin[chosen] = _spread(finish.skin, triangles, uv)[:, 0]
+            if finish.places is not None:
+                places[chosen] = _spread(finish.places, triangles, uv)
         points = directions * np.where(np.isfinite(depth), depth, np.float32(0.0))[:, None]
-        return Hits(depth, points, normals, albedo, surface, skin)
+        return Hits(depth, points, normals, albedo, surface, skin, facets, places)
+
+    def print_on(self, surface: Floats, across: Floats, down: Floats, albedo: Floats) -> None:
+        """Write the prints' albedo where the number of the surface is that of a printed one."""
+        for number, finish in enumerate(self._finish):
+            if finish.printed is not None:
+                on = surface == number
+                albedo[on] = finish.printed.albedo(np.stack([across[on], down[on]], axis=1))
 
     def places(self, number: int, triangles: NDArray[np.integer], uv: Floats) -> Hits:
         """Places on one surface as if rays had met it there: its triangles (N,), and barycentric
@@ -120,7 +134,7 @@ class Scene:
         corners = surface.vertices[surface.triangles[triangles]]
         first, sides = corners[:, 0], corners[:, 1:] - corners[:, :1]
         points = first + np.einsum("nk,nkc->nc", uv, sides)
-        normals = np.cross(sides[:, 0], sides[:, 1])
+        normals = facets = np.cross(sides[:, 0], sides[:, 1])
         if finish.normals is not None:
             normals = _spread(finish.normals, triangles, uv)
         albedo = np.broadcast_to(finish.albedo_at(triangles, uv), len(points))
@@ -131,6 +145,8 @@ class Scene:
             albedo=albedo.astype(np.float32),
             surface=np.full(len(points), number, np.uint32),
             skin=np.zeros(len(points), np.float32),
+            facets=facets.astype(np.float32),
+            places=np.zeros((len(points), 2), np.float32),
         )
 
     def joined(self, starts: Floats, ends: Floats) -> Mask:

@@ -85,6 +85,8 @@ def blur(image: Floats, optics: Optics, out_of_focus: Floats | None) -> Floats:
     result = np.zeros_like(image)
     for step in range(_FOCUS_STEPS):
         share = np.maximum(1.0 - np.abs(place - step), 0.0).astype(np.float32)
+        if not share.any():
+            continue
         wide = np.hypot(optics.blur_px, optics.defocus_px * step / (_FOCUS_STEPS - 1))
         result += share * _gaussian(image, float(wide))
     return result

@@ -25,12 +25,13 @@ from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.living import LivingBody, bring_to_life, moves, save_body
 from bodyscan.simulation.patterns import refuse_unknown_code, refuse_unknown_frames
 from bodyscan.simulation.plan import default_shots, plan_boards
-from bodyscan.simulation.render import Moving, View, render_pair
+from bodyscan.simulation.render import Moving, render_pair
 from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Scene, Surface
 from bodyscan.simulation.sensor import FixedPattern, expose, exposure, fixed_pattern
 from bodyscan.simulation.settings import SimulationSettings
 from bodyscan.simulation.truth import Motion, Truth, describe
+from bodyscan.simulation.view import View
 
 CALIBRATION, PERSON = "captures/calibration", "captures/person"
 PERSON_SHOT = "s01"

@@ -45,6 +45,8 @@ def on_right_plate(x: np.ndarray, half_angle: float) -> Hits:
         whole,
         whole.astype(np.uint32),
         0 * whole,
+        np.repeat(normal, len(x), 0),
+        np.zeros((len(x), 2), np.float32),
     )
 
 

@@ -16,10 +16,11 @@ from bodyscan.simulation.gray import code_bits
 from bodyscan.simulation.layout import build_mirror, build_pinhole
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
-from bodyscan.simulation.render import View, pixel_truth, render_pair
+from bodyscan.simulation.render import pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.sensor import blur, expose
 from bodyscan.simulation.settings import Noise, Optics, Projection
+from bodyscan.simulation.view import View
 
 BITS = 5
 

@@ -64,7 +64,9 @@ def test_samples_share_no_row_and_no_column(count: int) -> None:
 
 def test_samples_stay_inside_their_pixel_and_average_to_its_middle() -> None:
     camera = TrueCamera(755.0, 755.0, 0.0, 31.5, 23.5, 0.0, 0.0, 64, 48)
-    rays = sample_directions(camera, 3, np.random.default_rng(0), slice(0, 48)).astype(float)
+    rays = sample_directions(
+        camera, 3, np.random.default_rng(0).random((48, 64, 2)), slice(0, 48)
+    ).astype(float)
     off = (camera.image(rays).reshape(48, 64, 9, 2) - camera.grid()[:, :, None]).reshape(-1, 2)
     assert np.abs(off).max() <= 0.5 + 1e-4  # float32 rays
     # uniform in a pixel: standard deviation 0.29 px, 27,648 of them, five standard errors

@@ -18,7 +18,6 @@ from bodyscan.simulation.board import MadeBoard, make_board
 from bodyscan.simulation.layout import build_mirror, seen_points
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector
-from bodyscan.simulation.render import View
 from bodyscan.simulation.settings import (
     BoardMaking,
     Noise,
@@ -26,6 +25,7 @@ from bodyscan.simulation.settings import (
     Projection,
     SimulationSettings,
 )
+from bodyscan.simulation.view import View
 from bodyscan.stripes.codes.gray import Gray
 
 CAMERA = TrueCamera(1061.71, 1064.09, -0.562002, 350.08, 286.547, -0.140279, -0.0916363, 640, 480)
