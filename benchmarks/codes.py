@@ -16,10 +16,11 @@ from bodyscan.simulation.files import scale_rig
 from bodyscan.simulation.instrument import instrument_images
 from bodyscan.simulation.lamps import Lamps
 from bodyscan.simulation.layout import TruePair, build_pairs
-from bodyscan.simulation.render import PixelTruth, View, pixel_truth, render_pair
+from bodyscan.simulation.render import PixelTruth, pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, grid_surface
 from bodyscan.simulation.sensor import expose, exposure
 from bodyscan.simulation.settings import InterReflection, SimulationSettings
+from bodyscan.simulation.view import View
 from bodyscan.stripes.codes import stripe_code
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_code import StripeCode
