@@ -10,6 +10,7 @@ from bodyscan.rig.board import Board, family
 from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.frame_names import FrameNames, ImageNames
 from bodyscan.rig.pair import Pair
+from bodyscan.rig.reference import Reference
 from bodyscan.rig.rig_frame import RigFrame
 from bodyscan.rig.templates import template_faults
 from bodyscan.stripes.codes import image_kinds
@@ -25,6 +26,7 @@ class RigParts:
     pair_names: tuple[str | None, ...]
     pairs: tuple[Pair | None, ...]
     folders: tuple[CaptureFolder | None, ...]
+    references: tuple[Reference | None, ...]
     files: str | None
     exposures: tuple[str, ...]
     frames: FrameNames | None
@@ -42,6 +44,7 @@ def rig_problems(parts: RigParts) -> Iterator[Problem]:
     yield from _wrong_frames(parts)
     yield from _template_problems(parts)
     yield from _unknown_references(parts)
+    yield from _wrong_references(parts)
 
 
 def _marker_overlaps(boards: Sequence[Board | None]) -> Iterator[Problem]:
@@ -148,3 +151,33 @@ def _unknown_references(parts: RigParts) -> Iterator[Problem]:
             yield ("rig_frame", key), f"names no {key} of this file{hint} (got {wanted!r})"
     if frame.shot is not None and frame.board is None and len(parts.boards) > 1:
         yield ("rig_frame", "board"), "is missing: say which of the boards fixes the rig frame"
+
+
+def _wrong_references(parts: RigParts) -> Iterator[Problem]:
+    names = tuple(reference.name if reference else None for reference in parts.references)
+    for index, name in duplicates(names):
+        yield ("references", index, "name"), f"is given to two references (got {name!r})"
+    boards = {board.name: board for board in parts.boards if board}
+    frame = parts.rig_frame
+    for index, reference in enumerate(parts.references):
+        if reference is None:
+            continue
+        where = ("references", index, "boards")
+        if len(set(reference.boards)) < len(reference.boards):
+            yield where, f"names a board twice (got {reference.boards[0]!r})"
+        for place, name in enumerate(reference.boards):
+            if name not in parts.board_names:
+                hint = did_you_mean(name, filter(None, parts.board_names))
+                yield (*where, place), f"names no board of this file{hint} (got {name!r})"
+            elif name in boards and boards[name].kind == "checkerboard":
+                yield (
+                    (*where, place),
+                    f"must have markers, which tell its corners apart from every side: board {name} "
+                    "is a plain checkerboard",
+                )
+            elif frame and name == frame.board and len(parts.boards) > len(reference.boards):
+                yield (
+                    (*where, place),
+                    f"must not fix the rig frame as well: board {name} of a reference takes no part "
+                    "in placing the rig",
+                )

@@ -13,6 +13,7 @@ from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.consistency import RigParts, rig_problems
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.pair import Pair
+from bodyscan.rig.reference import Reference
 from bodyscan.rig.rig_frame import RigFrame
 
 
@@ -38,7 +39,8 @@ class Rig(Model):
     """The whole rig file.
 
     exposures: what `{exposure}` becomes in file names, the shortest first; () where every image is
-    taken once.  follow_links: whether symbolic links may lead out of a capture folder.
+    taken once.  follow_links: whether symbolic links may lead out of a capture folder.  references:
+    certified lengths that fix the size.
     """
 
     version: Literal[1] = 1
@@ -46,6 +48,7 @@ class Rig(Model):
     boards: tuple[Board, ...] = ()
     pairs: tuple[Pair, ...] = Field(min_length=1)
     calibration: tuple[CaptureFolder, ...] = ()
+    references: tuple[Reference, ...] = ()
     files: str = "{shot}/{pair}/{frame}.png"
     exposures: tuple[ExposureName, ...] = ()
     follow_links: bool = False
@@ -94,6 +97,7 @@ class Rig(Model):
                 pair_names=tuple(pair.name for pair in self.pairs),
                 pairs=self.pairs,
                 folders=self.calibration,
+                references=self.references,
                 files=self.files,
                 exposures=self.exposures,
                 frames=self.frames,

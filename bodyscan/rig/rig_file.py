@@ -16,6 +16,7 @@ from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.consistency import RigParts, rig_problems
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.rig.pair import Pair
+from bodyscan.rig.reference import Reference
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import RigFrame
 
@@ -46,6 +47,7 @@ def _problems_of_parts(data: Any) -> Iterator[Problem]:
             pair_names=tuple(map(_name, pairs)),
             pairs=tuple(validate(Pair, item) for item in pairs),
             folders=tuple(validate(CaptureFolder, item) for item in folders),
+            references=tuple(validate(Reference, item) for item in _items(data, "references")),
             files=files if isinstance(files, str) else None,
             exposures=tuple(name for name in _items(data, "exposures") if isinstance(name, str)),
             frames=validate(FrameNames, data.get("frames", {})),

@@ -18,6 +18,7 @@ from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, step
 from bodyscan.registration.board_checks import check_board_size, describe_findings
+from bodyscan.registration.references import find_size, resized, solving_views
 from bodyscan.registration.rig_calibration import RigCalibration, seen_corners
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
@@ -101,10 +102,16 @@ def join_rig(
         remedy = "\n  ".join([*filter(None, [findings]), *list(seen.values())[:MOST_SEEN]])
         raise _nothing_calibrated(rig, cameras.failures, remedy)
     with step(progress, "joining the pairs"):
-        located = locate_views(rig, boards.value, cameras.value)
+        views = solving_views(rig, boards.value)
+        located = locate_views(rig, views, cameras.value)
         joined = _join_pairs(rig, located.value, cameras)
+        size = find_size(rig, joined.value, boards.value)
+        if size.value.factor != 1.0:
+            rig = resized(rig, size.value.factor)
+            located = locate_views(rig, views, cameras.value)
+            joined = _join_pairs(rig, located.value, cameras)
     placed = joined.value
-    sized = check_board_size(rig, placed.rig_from_camera)
+    sized = [*size.notes, *check_board_size(rig, placed.rig_from_camera)]
     decoded = decode_on_boards(rig, captures, _of_views(placed, boards.value), progress)
     lost = {**cameras.failures, **joined.failures, **decoded.failures}
     fitted = _fit_sheets(rig, placed, cameras.value, decoded, progress)

@@ -23,6 +23,7 @@ from bodyscan.stripes.codes import stripe_code
 from bodyscan.stripes.codes.gray import INVERSE, PATTERN, Gray
 
 RIGS = Path(__file__).parents[2] / "rigs"
+REFERENCE = "version: 1\nreferences: [{name: a"
 
 
 def refused(tmp_path: Path, text: str | bytes) -> list[str]:
@@ -124,6 +125,14 @@ def test_merge_keys_take_what_is_not_given(tmp_path: Path) -> None:
         ("version: 1", "version: 1\nrig_frame: {board: board}", "rig_frame.board: needs shot"),
         ("version: 1", "version: 1\nrig_frame: {shot: b, x_axis: [0, 0, 0]}", "not be zero"),
         ("version: 1", "version: 1\nrig_frame: {shot: b, x_axis: [1, 1, 0]}", "perpendicular"),
+        ("version: 1", f"{REFERENCE}, boards: [bord], length_mm: 1, sigma_mm: 1}}]",
+         "2:33: references[0].boards[0]: names no board of this file (did you mean 'board'?)"),
+        ("version: 1", f"{REFERENCE}, boards: [board], length_mm: 1, sigma_mm: 1}}]",
+         "must have markers, which tell its corners apart from every side: board board is a plain"),
+        ("version: 1", f"{REFERENCE}, boards: [], length_mm: 1, sigma_mm: 1}}]",
+         "references[0].boards: "),
+        ("version: 1", f"{REFERENCE}, boards: [x, x], length_mm: 1, sigma_mm: 0}}]",
+         "references[0].sigma_mm: must be"),
         ("version: 1", "version: 1\nvolume: {top_mm: 100, bottom_mm: 200}", "must lie below top"),
         ("version: 1", "version: 1\nframes: {pattern: bit}", "frames.pattern: needs {bit}, or"),
         ("version: 1", "version: 1\nframes: {pattern: '{bit.real}'}", "may only hold {bit}"),

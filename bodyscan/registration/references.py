@@ -1,0 +1,236 @@
+"""The size of a rig by references: certified lengths, measured by the cameras as boards place them.
+
+All lengths of a rig come from what `square_mm` says of prints, which paper and printers change by
+parts in a thousand. Boards of references take no part in the solve; their corners are
+triangulated, and what they come to against the certificate is how much all prints are off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.arrays import Array, Indices
+from bodyscan.boards.board_layout import corner_grid, corner_points
+from bodyscan.boards.view import BoardView
+from bodyscan.errors import FailedWork
+from bodyscan.geometry.transforms import rigid_fit
+from bodyscan.outcome import Outcome
+from bodyscan.registration.board_checks import OTHER_SIZE, REFUSED_SIZE
+from bodyscan.registration.rig_solve import RigSolution
+from bodyscan.rig.board import Board
+from bodyscan.rig.reference import Reference
+from bodyscan.rig.rig import Rig
+
+FEWEST = 6
+"""corners of a board that two cameras saw: fewer say little of its middle, and hide a wrong one."""
+DISAGREE_SIGMAS = 4.0
+"""References farther apart than that contradict each other: once in 10,000 by chance."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How many times as large all is as `square_mm` says; sigma: relative; 0 where nothing fixes it."""
+
+    factor: float = 1.0
+    sigma: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """A reference as it was measured in one shot, mm."""
+
+    length_mm: float
+    sigma_mm: float
+
+
+def solving_views(rig: Rig, views: Sequence[BoardView]) -> list[BoardView]:
+    """Those that place the rig: of boards that are no reference, if there are any."""
+    certified = {name for reference in rig.references for name in reference.boards}
+    if certified.issuperset(board.name for board in rig.boards):
+        return list(views)
+    return [view for view in views if view.board not in certified]
+
+
+def find_size(rig: Rig, placed: RigSolution, views: Sequence[BoardView]) -> Outcome[Size]:
+    """By all references together, with a line on each.
+
+    Raises FailedWork for a size that is no printer's error, or references that contradict each other.
+    """
+    found: dict[str, Size] = {}
+    notes: list[str] = []
+    for reference in rig.references:
+        own = list(_readings(rig, reference, placed, views))
+        if not own:
+            notes.append(
+                f"reference {reference.name} was measured in no shot, so that the size is what "
+                f"square_mm says: two cameras have to see {FEWEST} corners of its boards at once"
+            )
+            continue
+        length, sigma = _mean(own)
+        size = Size(
+            reference.length_mm / length,
+            float(np.hypot(sigma / length, reference.sigma_mm / reference.length_mm)),
+        )
+        found[reference.name] = size
+        notes.append(
+            f"reference {reference.name}: {length:.3f} mm by square_mm (sigma {sigma:.3f}, "
+            f"{len(own)} shots) for {reference.length_mm:g} mm: {_words(size)}"
+        )
+    if not found:
+        return Outcome(Size(), tuple(notes))
+    weights = np.array([1.0 / size.sigma**2 for size in found.values()])
+    factors = np.array([size.factor for size in found.values()])
+    size = Size(float(weights @ factors / weights.sum()), float(weights.sum() ** -0.5))
+    _refuse(rig, found, size)
+    if abs(size.factor - 1.0) > OTHER_SIZE:
+        notes.append(
+            f"by its references the rig is {size.factor:.3f} times as large as square_mm says, more "
+            "than prints are off: is square_mm right, and length_mm?"
+        )
+    notes.append(f"size by references: {_words(size)}; every length is as uncertain")
+    return Outcome(size, tuple(notes))
+
+
+def resized(rig: Rig, factor: float) -> Rig:
+    """The rig with the squares that its boards turned out to have."""
+    certified = {name for reference in rig.references for name in reference.boards}
+    alone = certified.issuperset(board.name for board in rig.boards)
+    return rig.model_copy(
+        update={
+            "boards": tuple(
+                board if board.name in certified and not alone else _times(board, factor)
+                for board in rig.boards
+            )
+        }
+    )
+
+
+def _times(board: Board, factor: float) -> Board:
+    marker = None if board.marker_mm is None else board.marker_mm * factor
+    return board.model_copy(update={"square_mm": board.square_mm * factor, "marker_mm": marker})
+
+
+def _words(size: Size) -> str:
+    return f"{100.0 * (size.factor - 1.0):+.3f} % (sigma {100.0 * size.sigma:.3f} %)"
+
+
+def _refuse(rig: Rig, found: dict[str, Size], size: Size) -> None:
+    if abs(size.factor - 1.0) > REFUSED_SIZE:
+        raise FailedWork(
+            f"by its references the rig is {size.factor:.3f} times as large as square_mm says",
+            where=f"rig {rig.name}",
+            remedy="correct square_mm of the boards, or length_mm of the references",
+        )
+    for name, one in found.items():
+        if abs(one.factor - size.factor) > DISAGREE_SIGMAS * one.sigma:
+            said = "; ".join(f"{other}: {_words(own)}" for other, own in found.items())
+            raise FailedWork(
+                f"the references contradict each other: {said}",
+                where=f"rig {rig.name}",
+                remedy=f"measure {name} anew, or leave out the one that is wrong",
+            )
+
+
+def _mean(readings: Sequence[_Reading]) -> tuple[float, float]:
+    """Of all shots, and its sigma, larger where shots scatter more than each promises."""
+    lengths = np.array([one.length_mm for one in readings])
+    weights = np.array([one.sigma_mm**-2 for one in readings])
+    mean = float(weights @ lengths / weights.sum())
+    scatter = float(weights @ (lengths - mean) ** 2) / max(len(readings) - 1, 1)
+    return mean, float(np.sqrt(max(scatter, 1.0) / weights.sum()))
+
+
+def _readings(
+    rig: Rig, reference: Reference, placed: RigSolution, views: Sequence[BoardView]
+) -> Iterator[_Reading]:
+    """One for each shot in which two cameras saw enough of all its boards."""
+    for shot in sorted({view.shot for view in views if view.board in reference.boards}):
+        seen = []
+        for name in reference.boards:
+            own = [view for view in views if (view.shot, view.board) == (shot, name)]
+            ids, points = triangulated(placed, own)
+            if len(ids) >= FEWEST:
+                seen.append((rig.board(name), ids, points))
+        if len(seen) < len(reference.boards):
+            continue
+        if len(seen) == 1:
+            yield _along(*seen[0], placed.excess)
+        else:
+            yield _between([_Middle.of(*one) for one in seen], placed.excess)
+
+
+def triangulated(placed: RigSolution, views: Sequence[BoardView]) -> tuple[Indices, Array]:
+    """Numbers (N,) of the corners of one board that several placed cameras saw, and where they are,
+    (N, 3) mm, rig frame: nearest to all rays."""
+    views = [view for view in views if view.pair in placed.rig_from_camera]
+    if len({view.pair for view in views}) < 2:
+        return np.zeros(0, np.int64), np.zeros((0, 3))
+    ids = np.concatenate([view.corner_ids for view in views])
+    across, centres = [], []
+    for view in views:
+        at = placed.rig_from_camera[view.pair]
+        rays = at.rotate(placed.cameras[view.pair].rays(view.pixels))
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        across.append(np.eye(3) - rays[:, :, None] * rays[:, None, :])
+        centres.append(np.broadcast_to(at.translation, rays.shape))
+    square, centre = np.concatenate(across), np.concatenate(centres)
+    known, number, count = np.unique(ids, return_inverse=True, return_counts=True)
+    normal, right = np.zeros((len(known), 3, 3)), np.zeros((len(known), 3))
+    np.add.at(normal, number, square)
+    np.add.at(right, number, np.einsum("nij,nj->ni", square, centre))
+    twice = count >= 2
+    found: Array = np.linalg.solve(normal[twice], right[twice][..., None])[..., 0]
+    return known[twice].astype(np.int64), found
+
+
+def _along(board: Board, ids: Indices, points: Array, excess: float) -> _Reading:
+    """Of one board: its size against its layout, as a similarity has it."""
+    layout = corner_points(board)
+    length = board_length(board)
+    own, found = layout[ids], rigid_fit(layout[ids], points).inverse().apply(points)
+    spread = own - own.mean(axis=0)
+    scale = float(np.sum(spread * found) / np.sum(spread**2))
+    left = found - found.mean(axis=0) - scale * spread
+    # As corners err along the board, which is less than towards the cameras.
+    sigma = np.sqrt(excess * np.sum(np.sum(spread * left, axis=1) ** 2)) / np.sum(spread**2)
+    return _Reading(scale * length, float(sigma) * length)
+
+
+def board_length(board: Board) -> float:
+    """mm between the first and the last corner of a row of corners."""
+    layout = corner_points(board)
+    return float(np.linalg.norm(layout[corner_grid(board)[0] - 1] - layout[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Middle:
+    """Where the middle of a board is, (3,) mm, rig frame; left: (N, 3) by how much its corners lie
+    elsewhere; lever: corners to one side leave the middle at the end of one, of their own spread."""
+
+    place: Array
+    left: Array
+    lever: float
+
+    @staticmethod
+    def of(board: Board, ids: Indices, points: Array) -> _Middle:
+        own = corner_points(board)[ids]
+        rig_from_board = rigid_fit(own, points)
+        width, height = board.columns * board.square_mm, board.rows * board.square_mm
+        middle, spread = np.array([0.5 * width, 0.5 * height, 0.0]), own - own.mean(axis=0)
+        lever = np.linalg.norm(middle - own.mean(axis=0)) / np.sqrt(np.mean(spread**2) * 3.0)
+        left = rig_from_board.apply(own) - points
+        return _Middle(rig_from_board.apply(middle), left, float(lever))
+
+
+def _between(middles: Sequence[_Middle], excess: float) -> _Reading:
+    one, other = middles
+    length = float(np.linalg.norm(one.place - other.place))
+    along = (one.place - other.place) / length
+    variance = sum(
+        np.mean((each.left @ along) ** 2) * (1.0 + each.lever**2) / len(each.left)
+        for each in middles
+    )
+    return _Reading(length, float(np.sqrt(excess * variance)))

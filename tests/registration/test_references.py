@@ -1,0 +1,154 @@
+"""A certified length fixes the size of a rig, with its sigma; what contradicts it is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
+
+from bodyscan.boards.board_layout import corner_points
+from bodyscan.boards.view import BoardView
+from bodyscan.errors import FailedWork
+from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.references import board_length, find_size, resized, solving_views
+from bodyscan.registration.rig_solve import RigSolution, solve_rig
+from bodyscan.rig.board import Board
+from bodyscan.rig.reference import Reference
+from bodyscan.rig.rig import Rig
+
+PLACINGS, CAMERAS = ring_of_cameras(poles=2, heights=(850, 1300))
+BAR_MM = 400.0
+SMALLER = 0.997
+"""A print three parts in a thousand larger than its file says makes a rig that much too small."""
+
+
+def plate(name: str, first: int) -> Board:
+    return Board(
+        name=name, kind="charuco", columns=5, rows=4, square_mm=30, marker_mm=22, first_marker=first
+    )
+
+
+LEFT, RIGHT = plate("left", 200), plate("right", 220)
+
+
+def small_rig(*references: Reference) -> Rig:
+    rig = ring_rig(PLACINGS)
+    return rig.model_copy(
+        update={"boards": (CHARUCO, LEFT, RIGHT), "references": tuple(references)}
+    )
+
+
+def bar(length_mm: float = BAR_MM, name: str = "bar") -> Reference:
+    return Reference(name=name, boards=("left", "right"), length_mm=length_mm, sigma_mm=0.01)
+
+
+def placed(scale: float) -> RigSolution:
+    """The cameras as boards would place them whose squares are taken to be `scale` of what they are."""
+    poses = {
+        name: RigidTransform(at.rotation, scale * at.translation) for name, at in PLACINGS.items()
+    }
+    unknown = PoseCovariance(tuple(poses), np.zeros((6 * len(poses),) * 2))
+    return RigSolution(poses, {}, CAMERAS, unknown, {}, (), {})
+
+
+def bar_views(rng: np.random.Generator, shots: int = 4, noise_px: float = 0.05) -> list[BoardView]:
+    """The bar in front of the first pole, both of whose cameras see all of it."""
+    views = []
+    towards = PLACINGS["p1-1"].translation * [1.0, 1.0, 0.0]
+    towards /= np.linalg.norm(towards)
+    along = np.cross([0.0, 0.0, 1.0], towards)
+    facing = np.column_stack([along, [0.0, 0.0, -1.0], -towards])
+    for shot in range(shots):
+        turn = RigidTransform.from_rotation_vector(rng.normal(0.0, 0.15, 3), np.zeros(3))
+        middle = np.array([0.0, 0.0, 1050.0]) + rng.normal(0.0, 30.0, 3)
+        for board, side in ((LEFT, -0.5), (RIGHT, 0.5)):
+            own = [0.5 * board.columns * board.square_mm, 0.5 * board.rows * board.square_mm, 0.0]
+            points = corner_points(board) - own + [side * BAR_MM, 0.0, 0.0]
+            there = points @ (turn.rotation @ facing).T + middle
+            for name in ("p1-1", "p1-2"):
+                pixels = CAMERAS[name].project(PLACINGS[name].inverse().apply(there))
+                pixels = pixels + rng.normal(0.0, noise_px, pixels.shape)
+                views.append(
+                    BoardView(name, f"r{shot}", board.name, np.arange(len(points)), pixels)
+                )
+    return views
+
+
+def test_a_bar_gives_the_size_within_its_sigma() -> None:
+    errors = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        certified = bar(BAR_MM + 0.01 * rng.standard_normal())
+        size = find_size(small_rig(certified), placed(SMALLER), bar_views(rng)).value
+        errors.append((size.factor - 1.0 / SMALLER) / size.sigma)
+        assert size.sigma < 2e-4  # 0.05 px at 1.3 m over 400 mm
+    # RMS of 20 standard normal numbers, four sigmas of it to either side; four shots each.
+    assert 0.4 < np.sqrt(np.mean(np.square(errors))) < 1.9
+
+
+def test_one_certified_board_does_as_well() -> None:
+    steel = Reference(name="steel", boards=("left",), length_mm=board_length(LEFT), sigma_mm=0.01)
+    assert board_length(LEFT) == pytest.approx(90.0)
+    views = bar_views(np.random.default_rng(0), noise_px=1e-6)
+    size = find_size(small_rig(steel), placed(SMALLER), views).value
+    assert size.factor == pytest.approx(1.0 / SMALLER, abs=1e-6)
+    assert size.sigma == pytest.approx(0.01 / 90.0, rel=0.01)  # the certificate's
+
+
+def test_references_that_contradict_each_other_are_refused() -> None:
+    steel = Reference(
+        name="steel", boards=("left",), length_mm=1.01 * board_length(LEFT), sigma_mm=0.01
+    )
+    with pytest.raises(FailedWork, match=r"contradict each other: bar: .*steel: "):
+        find_size(small_rig(bar(), steel), placed(1.0), bar_views(np.random.default_rng(0)))
+
+
+@pytest.mark.parametrize(("scale", "said"), [(0.95, "is square_mm right"), (0.9999, "size by ref")])
+def test_a_size_that_no_print_is_off_by_is_asked_about(scale: float, said: str) -> None:
+    found = find_size(small_rig(bar()), placed(scale), bar_views(np.random.default_rng(0)))
+    assert any(said in note for note in found.notes)
+    assert ("is square_mm right" in " ".join(found.notes)) == (scale < 0.97)
+
+
+def test_a_rig_in_centimetres_is_refused() -> None:
+    with pytest.raises(FailedWork, match=r"10\.0\d\d times as large as square_mm says"):
+        find_size(small_rig(bar()), placed(0.1), bar_views(np.random.default_rng(0)))
+
+
+def test_a_reference_that_nobody_saw_leaves_the_size_and_is_named() -> None:
+    found = find_size(small_rig(bar()), placed(1.0), [])
+    assert found.value.factor == 1.0
+    assert "reference bar was measured in no shot" in found.notes[0]
+
+
+def test_the_rig_has_its_size_after_a_second_solve() -> None:
+    """Boards of 70 mm that the rig file says are 69.79."""
+    views, _ = ring_views(PLACINGS, CAMERAS, shots=12)
+    rig = small_rig(bar())
+    small = [
+        replace(
+            view,
+            points=SMALLER * view.points,
+            camera_from_board=RigidTransform(
+                view.camera_from_board.rotation, SMALLER * view.camera_from_board.translation
+            ),
+        )
+        for view in views
+    ]
+    first = solve_rig(rig, small, CAMERAS).value
+    size = find_size(rig, first, bar_views(np.random.default_rng(0))).value
+    second = resized(rig, size.factor)
+    assert second.board("left").square_mm == 30.0  # the bar's own boards are what they are
+    ratio = second.board("board").square_mm / CHARUCO.square_mm
+    # Nominal places hold one camera; the other's distance is 0.4 m away.
+    assert ratio == pytest.approx(1.0 / SMALLER, abs=4 * size.sigma)
+
+
+def test_boards_of_references_do_not_place_the_rig() -> None:
+    views = bar_views(np.random.default_rng(0), shots=1)
+    assert solving_views(small_rig(bar()), views) == []
+    alone = small_rig(bar()).model_copy(update={"boards": (LEFT, RIGHT)})
+    assert solving_views(alone, views) == views
