@@ -80,6 +80,16 @@ def faults() -> Iterator[Fault]:
     yield Fault("a chair behind the legs", ("piece", "ring", "not in the mesh", "chair"), _chair)
 
 
+def faults_of_the_living() -> Iterator[Fault]:
+    """What may be taken for a person's own motion."""
+    for mm in (2.0, 5.0, 15.0, 25.0):
+        yield _moved("pole p2", f"aside {mm:g} mm", mm, 1, 0.0)
+    yield _moved("pole p1", "out 5 mm", 5.0, 0, 0.0)
+    yield _moved("pole p2", "turned 2 deg", 0.0, 1, 2.0)
+    yield Fault("pole p2: another person's", ("pole p2",), _another("p2"))
+    yield _moved("pair p1-2", "out 5 mm", 5.0, 0, 0.0)
+
+
 def _moved(what: str, how: str, mm: float, way: int, degrees: float) -> Fault:
     """way: 0 away from the axis, 1 sideways."""
     name = what.split()[1]

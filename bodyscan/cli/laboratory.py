@@ -62,7 +62,8 @@ def simulate(
         ),
     ] = None,
     board_shots: Annotated[
-        int | None, typer.Option(min=3, help="Number of board poses; 40 for twelve pairs.")
+        int | None,
+        typer.Option(min=0, help="Number of board poses; 40 for twelve pairs, 0 for none."),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:

@@ -78,7 +78,8 @@ def simulate(
 
     subject: a body mesh (see `body.load_subject`); without one only boards are captured.
     scale: of image size and number of stripes.  board_shots: besides the one that fixes the rig
-    frame; 40 for twelve pairs if not given.  workers: pairs at the same time.
+    frame; 40 for twelve pairs if not given; 0 for the subject alone, in front of a rig that was
+    calibrated before.  workers: pairs at the same time.
     The same arguments give the same bytes. Raises RigFileError, and BadInput for a rig without
     nominal poses, a stripe code that only its decoder knows, or a subject that cannot be read.
     """
@@ -91,8 +92,9 @@ def simulate(
     truth = _decide(rig, subject, settings, seed, board_shots)
     _render_all(rig, truth, Path(out), workers, progress)
     write_rig(out / "rig.yaml", rig)
-    listed = [(shot.name, shot.stripes, shot.lit) for shot in truth.plan]
-    files.write_captures(out / CALIBRATION, "calibration", listed)
+    if truth.plan:
+        listed = [(shot.name, shot.stripes, shot.lit) for shot in truth.plan]
+        files.write_captures(out / CALIBRATION, "calibration", listed)
     if truth.person is not None:
         striped = [name for name, pair in truth.pairs.items() if pair.has_stripes]
         alone = [name for name in truth.pairs if name not in striped]
@@ -120,7 +122,8 @@ def _decide(
         board.name: make_board(board, settings.board, stream(_BOARDS, number))
         for number, board in enumerate(rig.boards)
     }
-    plan = plan_boards(rig, pairs, shots or default_shots(len(pairs)), stream(_PLAN))
+    shots = default_shots(len(pairs)) if shots is None else shots
+    plan = plan_boards(rig, pairs, shots, stream(_PLAN)) if shots else []
     if subject is None:
         return Truth(rig.name, seed, settings, pairs, boards, tuple(plan), None, None, {})
     person = body.load_subject(subject, settings.person, stream(_SKIN), settings.skin)
