@@ -182,7 +182,7 @@ def triangulated(placed: RigSolution, views: Sequence[BoardView]) -> tuple[Indic
     np.add.at(normal, number, square)
     np.add.at(right, number, np.einsum("nij,nj->ni", square, centre))
     twice = count >= 2
-    found: Array = np.linalg.solve(normal[twice], right[twice][..., None])[..., 0]
+    found = np.asarray(np.linalg.solve(normal[twice], right[twice][..., None])[..., 0], np.float64)
     return known[twice].astype(np.int64), found
 
 
