@@ -1,4 +1,4 @@
-"""The form of a board as unknowns: how its sheet is bent, and where its corners were printed.
+"""The form of a board: of a face as found, and as unknowns (how its sheet is bent, where corners are).
 
 A sheet stands over its plane by a polynomial of second and third degree; its corners lie in it a
 little beside where they should.  Both are known beforehand to some extent, so what boards in few
@@ -16,9 +16,37 @@ from bodyscan.arrays import Array, Indices
 
 # Of x and y; `_powers` has them in this order.
 POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+THIRD_DEGREE = np.add.outer(np.arange(4), np.arange(4)) <= 3
 FALL = 0.3
 """A coefficient of third degree is expected to be so many times as large as one of second."""
 DIGITS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class BoardFace:
+    """The sheet on which the corners of one face lie: over the plane of z_mm a polynomial of third
+    degree in x and y, of which middle (2,) becomes 0 and half (2,) mm from it 1.  coefficients:
+    (4, 4)."""
+
+    z_mm: float
+    middle: Array
+    half: Array
+    coefficients: Array
+
+    @staticmethod
+    def through(points: Array) -> BoardFace:
+        """The one nearest to corners (N, 3) mm, board frame."""
+        low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+        middle, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, 1e-9)
+        z_mm, (x, y) = float(np.median(points[:, 2])), ((points[:, :2] - middle) / half).T
+        powers = np.polynomial.polynomial.polyvander2d(x, y, (3, 3)) * THIRD_DEGREE.ravel()
+        found = np.linalg.lstsq(powers, points[:, 2] - z_mm, rcond=1e-9)[0]
+        return BoardFace(z_mm, middle, half, found.reshape(4, 4))
+
+    def height(self, places: Array) -> Array:
+        """(...) mm over the plane at places (..., 2) mm of the board."""
+        x, y = np.moveaxis((places - self.middle) / self.half, -1, 0)
+        return np.asarray(np.polynomial.polynomial.polyval2d(x, y, self.coefficients))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -13,6 +13,12 @@ from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 
 BIN_PX = 16
+BENDS = 2
+"""Times that a ray's point is lifted to where the board is bent: the first is off by what the board
+rises over a few tenths of a millimetre."""
+
+Height = Callable[[Array], Array]
+"""Places (..., 2) mm of a board -> (...) mm that it stands over its plane there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,15 +37,33 @@ class BoundaryPoints:
     sigma_px: Array
 
 
-def points_on_board(camera: Camera, camera_from_board: RigidTransform, pixels: Array) -> Array:
-    """Eq. 18: pixels (N, 2) carried onto the board's plane z = 0, camera frame (N, 3) mm."""
-    return rays_on_board(camera.rays(pixels), camera_from_board)
+def points_on_board(
+    camera: Camera, camera_from_board: RigidTransform, pixels: Array, height: Height | None = None
+) -> Array:
+    """Eq. 18: pixels (N, 2) carried onto the board's plane z = 0, camera frame (N, 3) mm; onto the
+    board itself where its height is given."""
+    return rays_on_board(camera.rays(pixels), camera_from_board, height)
 
 
-def rays_on_board(rays: Array, camera_from_board: RigidTransform) -> Array:
-    """Where rays (..., 3) of the camera frame meet the board's plane z = 0, (..., 3) mm."""
+def rays_on_board(
+    rays: Array, camera_from_board: RigidTransform, height: Height | None = None
+) -> Array:
+    """Where rays (..., 3) of the camera frame meet the board's plane z = 0, (..., 3) mm; or the board,
+    which stands so high over it."""
     normal = camera_from_board.rotation[:, 2]
-    return rays * (normal @ camera_from_board.translation / (rays @ normal))[..., None]
+    flat = rays * (normal @ camera_from_board.translation / (rays @ normal))[..., None]
+    if height is None:
+        return flat
+    points, board_from_camera = flat, camera_from_board.inverse()
+    for _ in range(BENDS):
+        here = height(board_from_camera.apply(points)[..., :2])
+        points = flat + lifts(rays, camera_from_board, here)
+    return points
+
+
+def lifts(rays: Array, camera_from_board: RigidTransform, height: Array) -> Array:
+    """How far points on rays (..., 3) move along them where the board stands so high over its plane."""
+    return np.asarray(rays * (height / (rays @ camera_from_board.rotation[:, 2]))[..., None])
 
 
 def boundary_points(
@@ -51,17 +75,15 @@ def boundary_points(
     *,
     board: int,
     direction: Axis,
+    height: Height | None = None,
 ) -> BoundaryPoints:
-    """Carry boundary pixels (N, 2) of one shot onto its board."""
+    """Carry boundary pixels (N, 2) of one shot onto its board, flat unless its height is given."""
     across = np.array([0.0, 0.5]) if direction == "horizontal" else np.array([0.5, 0.0])
-    return BoundaryPoints(
-        index,
-        np.full(len(index), board),
-        points_on_board(camera, camera_from_board, pixels),
-        points_on_board(camera, camera_from_board, pixels + across)
-        - points_on_board(camera, camera_from_board, pixels - across),
-        sigma_px,
+    here, after, before = (
+        points_on_board(camera, camera_from_board, pixels + step, height)
+        for step in (0.0 * across, across, -across)
     )
+    return BoundaryPoints(index, np.full(len(index), board), here, after - before, sigma_px)
 
 
 def concatenate(parts: Sequence[BoundaryPoints]) -> BoundaryPoints:

@@ -17,7 +17,12 @@ import numpy as np
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_form import POWERS, BoardForm
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, rays_on_board
+from bodyscan.calibration.boundary_points import (
+    BoundaryPoints,
+    boundary_points,
+    lifts,
+    rays_on_board,
+)
 from bodyscan.calibration.camera import known_beforehand
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
@@ -34,9 +39,6 @@ SETTLED = 1e-2
 CORNERS = Noise("corners, px", group=2, cauchy=4.0, least=1e-3)
 STRIPES = Noise("stripes, in sigmas", cauchy=4.0, least=1e-2)
 FLOOR_PX = 0.02
-BENDS = 2
-"""Times that a ray's point is lifted to where the board is bent: the first is off by what the board
-rises over a few tenths of a millimetre."""
 LEAST_SHOWN = 1e-6
 """Share of what is best known of a print, below which nothing is."""
 SPREADS_MM = np.append(0.0, np.geomspace(1e-3, 1.0, 121))
@@ -339,22 +341,12 @@ def _over_sigma(
 def _on_board(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
     """(2, N, 3) mm: where rays meet the face on which the stripes were seen."""
     camera_from_face = state.poses[k] @ _face(board)
-    points, form = rays_on_board(rays, camera_from_face), state.forms[board.board]
-    if form.heights.any():
-        flat, board_from_camera = points, camera_from_face.inverse()
-        for _ in range(BENDS):
-            height = form.height(board_from_camera.apply(points)[..., :2])
-            points = flat + _lifts(rays, camera_from_face, height)
-    return points
+    form = state.forms[board.board]
+    return rays_on_board(rays, camera_from_face, form.height if form.heights.any() else None)
 
 
 def _face(board: StripedBoard) -> RigidTransform:
     return RigidTransform(np.eye(3), np.array([0.0, 0.0, board.view.points[0, 2]]))
-
-
-def _lifts(rays: Array, camera_from_face: RigidTransform, height: Array) -> Array:
-    """How far points on rays (..., 3) move along them where the board stands so high over its plane."""
-    return np.asarray(rays * (height / (rays @ camera_from_face.rotation[:, 2]))[..., None])
 
 
 def _sigma(board: StripedBoard, points: Array, across: Array, by_point: Array) -> Array:
@@ -395,7 +387,7 @@ def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: A
 
     def there(rays: Array, pose: RigidTransform) -> Array:
         place = pose @ face
-        found = rays_on_board(rays, place) + _lifts(rays, place, height)
+        found = rays_on_board(rays, place) + lifts(rays, place, height)
         return _over_sigma(state.sheets, at, board, found[0], found[1])
 
     def turned(column: int, step: float) -> Array:

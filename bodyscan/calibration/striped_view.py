@@ -1,4 +1,4 @@
-"""The stripes of one pair on its boards: what was decoded near each, carried onto its plane."""
+"""The stripes of one pair on its boards: what was decoded near each, carried onto it."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.boards.view import BoardView
+from bodyscan.calibration.board_form import BoardFace
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
+    Height,
     boundary_points,
     concatenate,
     select,
@@ -41,17 +43,21 @@ class BoardBoundaries:
 
 @dataclass(frozen=True, eq=False)
 class StripedView:
-    """A board that a pair saw, where it lies in the camera frame, and the stripes decoded on it."""
+    """A board that a pair saw, where it lies in the camera frame, and the stripes decoded on it.
+
+    face: of a board that is known not to be flat, the face that was seen.
+    """
 
     view: LocatedView
     board: Board
     boundaries: BoardBoundaries
+    face: BoardFace | None = None
 
     @property
     def camera_from_face(self) -> RigidTransform:
-        """Of the face that was seen: its corners lie at z = 0."""
-        height = np.array([0.0, 0.0, self.view.points[0, 2]])
-        return self.view.camera_from_board @ RigidTransform(np.eye(3), height)
+        """Of the face that was seen: its corners lie at z = 0, or about it where it is not flat."""
+        z_mm = self.face.z_mm if self.face else self.view.points[0, 2]
+        return self.view.camera_from_board @ RigidTransform(np.eye(3), np.array([0.0, 0.0, z_mm]))
 
 
 def boundaries_near(stripes: StripeMap, view: BoardView) -> BoardBoundaries:
@@ -76,7 +82,15 @@ def boundaries_on_boards(
     Raises PairFailed if fewer than two boards carry stripes.
     """
     parts = [
-        on_board(camera, projector, shot.board, shot.camera_from_face, shot.boundaries, number)
+        on_board(
+            camera,
+            projector,
+            shot.board,
+            shot.camera_from_face,
+            shot.boundaries,
+            number,
+            shot.face.height if shot.face else None,
+        )
         for number, shot in enumerate(shots)
     ]
     striped = sum(len(part.index) > 0 for part in parts)
@@ -96,6 +110,7 @@ def on_board(
     camera_from_face: RigidTransform,
     boundaries: BoardBoundaries,
     number: int,
+    height: Height | None = None,
 ) -> BoundaryPoints:
     """Only what lies on the board's checkered area: stripes fall on the wall and floor too."""
     carried = boundary_points(
@@ -106,6 +121,7 @@ def on_board(
         boundaries.sigma_px,
         board=number,
         direction=projector.direction,
+        height=height,
     )
     x, y, _ = camera_from_face.inverse().apply(carried.points).T
     rim = RIM_SQUARES * board.square_mm

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodyscan.arrays import Array
+from bodyscan.calibration.board_form import BoardFace
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain
 from bodyscan.geometry.scaled_systems import solve_scaled
@@ -63,6 +64,11 @@ class BoardShape:
         along = (np.polyfit(self.points[:, axis], self.offsets[:, axis], 1)[0] for axis in range(2))
         x, y = (float(value) for value in along)
         return x, y
+
+    def face(self, points: Array) -> BoardFace:
+        """The face of which a view saw corners (M, 3), through all that any view saw of it."""
+        away = np.abs(self.points[:, 2] - np.median(points[:, 2]))
+        return BoardFace.through((self.points + self.offsets)[away <= away.min() + 1e-3])
 
     def applied(self, points: Array) -> Array:
         """Nominal points (M, 3) of this board -> where they lie; unknown ones stay."""

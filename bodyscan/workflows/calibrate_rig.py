@@ -191,12 +191,13 @@ def _placed_pair(
     boundaries: Mapping[ViewKey, BoardBoundaries],
 ) -> PlacedPair:
     camera_from_rig = placed.rig_from_camera[name].inverse()
-    views = [view for view in placed.views if view.pair == name]
+    views, shapes = [view for view in placed.views if view.pair == name], placed.board_shapes
     shots = tuple(
         StripedView(
             replace(view, camera_from_board=camera_from_rig @ placed.rig_from_board[view.target]),
             rig.board(view.board),
             boundaries[name, view.shot, view.board],
+            shapes[view.board].face(view.points) if view.board in shapes else None,
         )
         for view in views
         if (name, view.shot, view.board) in boundaries

@@ -1,0 +1,81 @@
+"""Stripes lie where the board is, flat or bent, on the face that was seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lit_boards import CHAPTER_POSES, chapter_scene
+
+from bodyscan.arrays import Array
+from bodyscan.calibration.board_form import BoardFace
+from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, boundaries_on_boards
+from bodyscan.registration.board_shape import BoardShape
+from bodyscan.rig.board import Board
+from bodyscan.stripes.codes.gray import Gray
+
+SCENE = chapter_scene()
+BOARD = Board(name="board", columns=9, rows=7, square_mm=20.0, faces=2, thickness_mm=6.0)
+X, Y = np.meshgrid(20.0 * np.arange(1, 9), 20.0 * np.arange(1, 7))
+FRONT = np.column_stack([X.ravel(), Y.ravel(), np.zeros(X.size)])
+CORNERS = np.concatenate([FRONT, FRONT + [0.0, 0.0, 6.0]])
+
+
+def bow(places: Array) -> Array:
+    """mm: a bowl of 0.8 mm, steeper towards one side."""
+    x, y = places[..., 0] / 90.0 - 1.0, places[..., 1] / 70.0 - 1.0
+    return 0.8 * (1.0 - x**2) - 0.3 * y**2 + 0.1 * x**3
+
+
+def shape(noise_mm: float = 0.0) -> BoardShape:
+    rng = np.random.default_rng(0)
+    lifted = np.column_stack([np.zeros((len(CORNERS), 2)), bow(CORNERS[:, :2])])
+    return BoardShape(CORNERS, lifted + rng.normal(0.0, noise_mm, lifted.shape))
+
+
+def striped(face_mm: float) -> list[StripedView]:
+    """Boundaries at known places of bent boards, seen by a camera; their truth is `bow` alone."""
+    rng = np.random.default_rng(1)
+    found = []
+    for number, pose in enumerate(CHAPTER_POSES):
+        camera_from_board = SCENE.looking_at(*pose)
+        places = rng.uniform([15.0, 15.0], [165.0, 125.0], (200, 2))
+        points = np.column_stack([places, face_mm + bow(places)])
+        pixels = SCENE.camera.project(camera_from_board.apply(points))
+        corners = shape().applied(CORNERS[CORNERS[:, 2] == face_mm])
+        view = LocatedView("p1", f"b{number}", "board", corners, pixels, camera_from_board, ())
+        boundaries = BoardBoundaries(np.arange(200), pixels, np.full(200, 0.1))
+        found.append(StripedView(view, BOARD, boundaries, shape(0.01).face(corners)))
+    return found
+
+
+def off_mm(shots: list[StripedView], face_mm: float) -> Array:
+    """How far carried points lie over the true board, in its own frame."""
+    code = Gray(stripes=254, direction="vertical")
+    carried = boundaries_on_boards("p1", SCENE.camera, code, shots)
+    heights = []
+    for number, shot in enumerate(shots):
+        points = carried.points[carried.board == number]
+        x, y, z = shot.view.camera_from_board.inverse().apply(points).T
+        heights.append(z - face_mm - bow(np.column_stack([x, y])))
+    return np.concatenate(heights)
+
+
+@pytest.mark.parametrize("face_mm", [0.0, 6.0])
+def test_stripes_are_carried_onto_the_bent_face_that_was_seen(face_mm: float) -> None:
+    shots = striped(face_mm)
+    # 48 corners that are known to 0.01 mm each tell ten coefficients: 0.005 mm, twice that at a rim
+    # one square beyond them.
+    assert np.abs(off_mm(shots, face_mm)).max() < 0.03
+    flat = [replace(shot, face=None) for shot in shots]
+    assert np.abs(off_mm(flat, face_mm)).max() > 0.5
+
+
+def test_a_face_goes_through_its_corners_and_no_further_than_they_say() -> None:
+    face = BoardFace.through(FRONT + [0.0, 0.0, 2.0])
+    beyond = np.array([[0.0, 0.0], [180.0, 140.0]])
+    np.testing.assert_allclose(face.z_mm + face.height(beyond), 2.0, atol=1e-9)
+    few = BoardFace.through(FRONT[:6])  # one row, which says nothing of the other direction
+    np.testing.assert_allclose(few.height(beyond), 0.0, atol=1e-9)
