@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from bodyscan.alignment.body_cells import BodyCells
 from bodyscan.arrays import Array, Indices
@@ -62,6 +61,8 @@ def _beside_rigid(field: SpeedField | None, image: RangeImage, points: Array) ->
     """(n,) speeds in z beside the rigid ones at points (n, 3) of the camera's frame."""
     if field is None or min(field.speed.shape) < 2:
         return np.zeros(len(points))
+    from scipy.interpolate import RegularGridInterpolator  # 0.2 s, and few scans need it
+
     pixels = image.camera.project(points)[:, ::-1]
     places = field.rows, field.columns
     found = RegularGridInterpolator(places, field.speed, bounds_error=False)(pixels)

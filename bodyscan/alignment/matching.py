@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import open3d as o3d
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
@@ -220,9 +219,12 @@ def match_nearest(
     """
     points, normals = rig_from_source.apply(source.points), rig_from_source.rotate(source.normals)
     there, across = rig_from_target.apply(target.points), rig_from_target.rotate(target.normals)
-    found = o3d.pipelines.registration.evaluate_registration(
-        _cloud(points), _cloud(there), reach_mm
-    )
+    import open3d as o3d  # longer than any other way of aligning takes
+
+    def cloud(places: Array) -> o3d.geometry.PointCloud:
+        return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(places))
+
+    found = o3d.pipelines.registration.evaluate_registration(cloud(points), cloud(there), reach_mm)
     pairs = np.asarray(found.correspondence_set).reshape(-1, 2)
     pairs = pairs[np.argsort(pairs[:, 0])]  # Open3D's threads leave them in any order
     i, j = pairs[:, 0], pairs[:, 1]
@@ -233,9 +235,3 @@ def match_nearest(
     distance = np.sum((points[i] - there[j]) * mean, axis=1)
     sigma_mm = np.hypot(source.sigma_mm[i], target.sigma_mm[j])
     return Matches(points[i], mean, distance, sigma_mm, i.astype(np.int64))
-
-
-def _cloud(points: Array) -> o3d.geometry.PointCloud:
-    cloud = o3d.geometry.PointCloud()
-    cloud.points = o3d.utility.Vector3dVector(points)
-    return cloud

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import open3d as o3d
-from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.depth_buffer import nearest_faces
 from bodyscan.reconstruction.range_image import RangeImage
 
 RAY_SPACING_MM = 3.0  # on a subject in the middle of the rig
@@ -20,19 +19,18 @@ WIDEST_GAP_MM = 200.0
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """A closed surface that is partly filled: a ray-casting scene, and which faces are."""
+    """A closed surface that is partly filled.
 
-    scene: o3d.t.geometry.RaycastingScene
+    vertices: (V, 3) float32, rig frame.  faces: (F, 3).  filled: (F,).
+    """
+
+    vertices: Floats
+    faces: Indices
     filled: Mask
 
     @staticmethod
     def of(vertices: Array, faces: Indices, filled: Mask) -> Guess:
-        scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(
-            o3d.core.Tensor(vertices.astype(np.float32)),
-            o3d.core.Tensor(faces.astype(np.uint32)),
-        )
-        return Guess(scene, filled)
+        return Guess(vertices.astype(np.float32), faces, filled)
 
 
 def sees_through(
@@ -78,15 +76,15 @@ def gaps(
 ) -> Mask:
     """Blocks of stride x stride pixels, of those in a window, that look through a gap of the body.
 
-    There nothing was measured, the ray meets the guessed surface in made-up faces only, and there
+    There nothing was measured, their middle shows made-up faces of the guessed surface only, and there
     is measured surface to the left and to the right: between the legs, between arm and trunk.
-    A ray that enters or leaves through measured surface looks at a part in shadow instead; and a
+    What lies before or behind measured surface looks at a part in shadow instead; and a
     part of the outline that nobody measured (dark hair) has measured surface on one side at most.
     """
     rows, columns = (stride * np.arange(some.start, some.stop) + stride // 2 for some in blocks)
-    rays = _rays(image.camera, rig_from_camera, rows, columns)
-    first = guess.scene.cast_rays(o3d.core.Tensor(rays))["primitive_ids"].numpy()
-    hit = first != o3d.t.geometry.RaycastingScene.INVALID_ID
+    places = _in_blocks(guess.vertices, image, rig_from_camera, stride, blocks)
+    first = nearest_faces(places, guess.faces, len(rows), len(columns))
+    hit = first >= 0
     made_up = np.zeros(hit.shape, bool)
     made_up[hit] = guess.filled[first[hit]]
     body = hit & ~made_up
@@ -95,10 +93,8 @@ def gaps(
     reach = int(WIDEST_GAP_MM / RAY_SPACING_MM)
     open_ = made_up & (measured[np.ix_(rows + stride, columns + stride)] == 0)
     open_ &= _within(body, reach) & _within(body[:, ::-1], reach)[:, ::-1]
-    rows, columns = np.nonzero(open_)
-    if rows.size:
-        open_[rows, columns] = _only_made_up(guess, rays[rows, columns])
-    return open_
+    real = nearest_faces(places, guess.faces[~guess.filled], len(rows), len(columns))
+    return open_ & (real < 0)
 
 
 def _stride(camera: Camera, depth_mm: float) -> int:
@@ -106,18 +102,20 @@ def _stride(camera: Camera, depth_mm: float) -> int:
     return max(1, round(RAY_SPACING_MM * camera.alpha / depth_mm))
 
 
-def _rays(
-    camera: Camera,
+def _in_blocks(
+    vertices: Floats,
+    image: RangeImage,
     rig_from_camera: RigidTransform,
-    rows: NDArray[np.intp],
-    columns: NDArray[np.intp],
+    stride: int,
+    blocks: tuple[slice, slice],
 ) -> Floats:
-    """(h, w, 6) rays through pixels of h rows and w columns, rig frame."""
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).astype(float)
-    rays = np.empty((*pixels.shape[:2], 6), np.float32)
-    rays[..., :3] = rig_from_camera.translation
-    rays[..., 3:] = _rotate_directions(camera.rays(pixels).astype(np.float32), rig_from_camera)
-    return rays
+    """(V, 3) column and row of the block that shows each vertex in its middle, and depth; NaN for what
+    is not before the camera."""
+    seen = _transform_points(vertices, rig_from_camera.inverse())
+    seen[seen[:, 2] < 1.0] = np.nan
+    pixels = (image.camera.project(seen.astype(float)) - stride // 2) / stride
+    first = blocks[1].start, blocks[0].start
+    return np.concatenate([pixels - first, seen[:, 2:]], axis=1).astype(np.float32)
 
 
 def _within(mask: Mask, reach: int) -> Mask:
@@ -127,20 +125,7 @@ def _within(mask: Mask, reach: int) -> Mask:
     return columns - latest <= reach
 
 
-def _only_made_up(guess: Guess, rays: Floats) -> Mask:
-    """Whether rays (N, 6) meet no measured face on their whole way."""
-    crossings = guess.scene.list_intersections(o3d.core.Tensor(rays))
-    ray, face = crossings["ray_ids"].numpy(), crossings["primitive_ids"].numpy()
-    real = np.bincount(ray[~guess.filled[face]], minlength=len(rays))
-    return real == 0
-
-
 def _transform_points(points: Floats, a_from_b: RigidTransform) -> Floats:
     """Points (..., 3) float32 in b to a; several times quicker than numpy on triples."""
     matrix = np.column_stack([a_from_b.rotation, a_from_b.translation])
     return cv2.transform(points.reshape(1, -1, 3), matrix).reshape(points.shape)
-
-
-def _rotate_directions(directions: Floats, a_from_b: RigidTransform) -> Floats:
-    """Directions (..., 3) float32 in b to a."""
-    return cv2.transform(directions.reshape(1, -1, 3), a_from_b.rotation).reshape(directions.shape)

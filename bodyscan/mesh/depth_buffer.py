@@ -1,0 +1,63 @@
+"""What hides what in a picture: the nearest face, or the nearest point, at each pixel.
+
+Two short loops in place of casting a ray for each pixel, for which Open3D would have to be imported:
+longer than all pictures of a scan take.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.arrays import Floats, Indices
+from bodyscan.compiled import compiled
+
+Numbers = NDArray[np.int32]
+
+
+@compiled
+def nearest_faces(places: Floats, faces: Indices, height: int, width: int) -> Numbers:
+    """(height, width) number of the face that is nearest, -1 where there is none.
+
+    places: (V, 3) of vertices: column, row, depth; NaN for those that cannot be seen.  faces: (F, 3).
+    Faces are flat, and cover the pixels whose centres they hold.
+    """
+    number = np.full((height, width), -1, np.int32)
+    depth = np.full((height, width), np.inf, np.float32)
+    for f in range(len(faces)):
+        a, b, c = places[faces[f, 0]], places[faces[f, 1]], places[faces[f, 2]]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
+        if not abs(area) > 0.0:  # seen from its edge, or not at all
+            continue
+        for r in range(
+            max(0, int(np.ceil(min(a[1], b[1], c[1])))),
+            min(height, int(np.floor(max(a[1], b[1], c[1]))) + 1),
+        ):
+            for k in range(
+                max(0, int(np.ceil(min(a[0], b[0], c[0])))),
+                min(width, int(np.floor(max(a[0], b[0], c[0]))) + 1),
+            ):
+                of_b = ((k - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (r - a[1])) / area
+                of_c = ((b[0] - a[0]) * (r - a[1]) - (k - a[0]) * (b[1] - a[1])) / area
+                away = a[2] + of_b * (b[2] - a[2]) + of_c * (c[2] - a[2])
+                if of_b >= 0.0 and of_c >= 0.0 and of_b + of_c <= 1.0 and away < depth[r, k]:
+                    number[r, k], depth[r, k] = f, away
+    return number
+
+
+@compiled
+def nearest_points(places: Floats, size: int, height: int, width: int) -> Numbers:
+    """(height, width) number of the point that is nearest, -1 where there is none.
+
+    places: (N, 3) column, row, depth.  size: each covers so many pixels squared around its own.
+    """
+    number = np.full((height, width), -1, np.int32)
+    depth = np.full((height, width), np.inf, np.float32)
+    for n in range(len(places)):
+        left = int(np.floor(places[n, 0] + 0.5)) - size // 2
+        top = int(np.floor(places[n, 1] + 0.5)) - size // 2
+        for r in range(max(0, top), min(height, top + size)):
+            for k in range(max(0, left), min(width, left + size)):
+                if places[n, 2] < depth[r, k]:
+                    number[r, k], depth[r, k] = n, places[n, 2]
+    return number
