@@ -13,6 +13,8 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= demo
+# Containers forbid Python to keep what it compiled, and every process that tests start compiles again.
+export PYTHONDONTWRITEBYTECODE :=
 # A file's tests stay in one worker, which makes what they share once; the longest come first.
 PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
 

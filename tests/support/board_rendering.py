@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from bodyscan.arrays import Array, Bytes, Floats
+from bodyscan.arrays import Array, Floats, Indices
 from bodyscan.rig.board import Board
 
 SUPERSAMPLING = 8
@@ -95,9 +94,11 @@ def render(
     if light_falloff:
         ramp = np.linspace(1.0, 1.0 - light_falloff, fine.shape[1], dtype=np.float32)
         fine *= ramp
-    fine = cv2.GaussianBlur(fine, (0, 0), blur_px * n) if blur_px else fine
-    image = fine.reshape(view.height, n, view.width, n).mean(axis=(1, 3))
-    image += np.random.default_rng(seed).normal(0.0, noise, image.shape)
+    # Blurred at half of the fineness, which is fine enough for a blur: a quarter of the time.
+    half = cv2.resize(fine, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    half = cv2.GaussianBlur(half, (0, 0), blur_px * n / 2) if blur_px else half
+    image = cv2.resize(half, (view.width, view.height), interpolation=cv2.INTER_AREA)
+    image = image + np.random.default_rng(seed).normal(0.0, noise, image.shape)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
@@ -117,52 +118,48 @@ def _paint(fine: Floats, board: Board, view: View, white: float, black: float) -
     seen = view.project(rim)
     low = np.clip(np.floor(seen.min(axis=0)) - 2, 0, None).astype(int)
     high = np.minimum(np.ceil(seen.max(axis=0)) + 3, [view.width, view.height]).astype(int)
-    u = (np.arange(low[0] * n, high[0] * n, dtype=np.float32) + 0.5) / n - 0.5
-    v = (np.arange(low[1] * n, high[1] * n, dtype=np.float32) + 0.5) / n - 0.5
-    x = (u[None, :] - (view.width - 1) / 2) / view.focal_px + 0 * v[:, None]
-    y = (v[:, None] - (view.height - 1) / 2) / view.focal_px + 0 * u[None, :]
+    # Where a pixel's middle meets the board, and one pixel more all round; from these the samples by
+    # linear interpolation, which is off by less than 1e-4 px.
+    u, v = np.arange(low[0] - 1, high[0] + 1), np.arange(low[1] - 1, high[1] + 1)
+    x, y = _met(view, depth, *np.meshgrid(u, v))
+    if face:
+        x = size[0] - x
+    x, y = (
+        cv2.resize(part.astype(np.float32), None, fx=n, fy=n)[n:-n, n:-n]
+        / np.float32(board.square_mm)
+        for part in (x, y)
+    )
+    margin = board.margin_mm / board.square_mm
+    inside = (x >= -margin) & (x <= board.columns + margin)
+    inside &= (y >= -margin) & (y <= board.rows + margin)
+    print_, scale = _print(board, face, white, black)
+    colours = cv2.remap(
+        print_, x * scale - 0.5, y * scale - 0.5, cv2.INTER_NEAREST, borderValue=(white,)
+    )
+    np.copyto(fine[low[1] * n : high[1] * n, low[0] * n : high[0] * n], colours, where=inside)
+
+
+def _met(view: View, depth: float, u: Indices, v: Indices) -> tuple[Array, Array]:
+    """Where rays of pixels meet the board's face at `depth`, board frame, mm."""
+    x = (u - (view.width - 1) / 2) / view.focal_px
+    y = (v - (view.height - 1) / 2) / view.focal_px
     scale = np.ones_like(x)
     r2 = x * x + y * y
     for _ in range(6):
         scale = 1 / (1 + view.k1 * r2 * scale * scale)
-    x, y = x * scale, y * scale
+    rays = np.stack([x * scale, y * scale, np.ones_like(x)], axis=-1)
     normal = view.rotation[:, 2]
     origin = view.translation + depth * normal
-    distance = (normal @ origin) / (normal[0] * x + normal[1] * y + normal[2])
-    board_x = (
-        view.rotation[0, 0] * (x * distance - origin[0])
-        + view.rotation[1, 0] * (y * distance - origin[1])
-        + view.rotation[2, 0] * (distance - origin[2])
-    )
-    board_y = (
-        view.rotation[0, 1] * (x * distance - origin[0])
-        + view.rotation[1, 1] * (y * distance - origin[1])
-        + view.rotation[2, 1] * (distance - origin[2])
-    )
-    if face:
-        board_x = size[0] - board_x
-    colour = _colours(board, face, board_x / board.square_mm, board_y / board.square_mm)
-    values = np.array([black, white], np.float32)[colour]
-    margin = board.margin_mm / board.square_mm
-    inside = (board_x >= -margin * board.square_mm) & (board_x <= size[0] + board.margin_mm)
-    inside &= (board_y >= -board.margin_mm) & (board_y <= size[1] + board.margin_mm)
-    part = fine[low[1] * n : high[1] * n, low[0] * n : high[0] * n]
-    part[inside] = values[inside]
+    distance = (normal @ origin) / (rays @ normal)
+    across = (rays * distance[..., None] - origin) @ view.rotation[:, :2]
+    return across[..., 0], across[..., 1]
 
 
-def _colours(board: Board, face: int, x: Array, y: Array) -> NDArray[np.int32]:
-    """0 black, 1 white at print coordinates in squares; outside the squares white."""
-    column, row = np.floor(x).astype(np.int32), np.floor(y).astype(np.int32)
-    on_print = (column >= 0) & (column < board.columns) & (row >= 0) & (row < board.rows)
+def _print(board: Board, face: int, white: float, black: float) -> tuple[Floats, float]:
+    """What is printed on a face, without its margin, and its pixels a square."""
     if board.kind == "checkerboard":
-        return np.where(on_print, (column + row) % 2, 1)
-    texture, scale = _charuco_texture(board, face), 100
-    tx = np.clip((x * scale).astype(np.int32), 0, texture.shape[1] - 1)
-    ty = np.clip((y * scale).astype(np.int32), 0, texture.shape[0] - 1)
-    return np.where(on_print, texture[ty, tx] > 127, 1).astype(np.int32)
-
-
-def _charuco_texture(board: Board, face: int) -> Bytes:
+        row, column = np.indices((board.rows, board.columns))
+        return np.where((column + row) % 2, white, black).astype(np.float32), 1.0
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     count = board.columns * board.rows // 2
     ids = np.arange(count) + board.first_marker + face * count
@@ -170,4 +167,5 @@ def _charuco_texture(board: Board, face: int) -> Bytes:
         (board.columns, board.rows), board.square_mm, board.marker_mm, dictionary, ids
     )
     printed.setLegacyPattern(board.legacy_layout)
-    return printed.generateImage((board.columns * 100, board.rows * 100))
+    image = printed.generateImage((board.columns * 100, board.rows * 100))
+    return np.where(image > 127, white, black).astype(np.float32), 100.0

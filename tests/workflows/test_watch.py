@@ -16,6 +16,7 @@ from small_workspace import Workspace, run
 from bodyscan.files.hashing import file_hash, files_below
 
 SMALL = ("--set", "fusion.points=20000", "--set", "mesh.depth=6", "--set", "export.formats=glb")
+STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0" / "calibration"
 OWN = {"state.json", "log.txt", "lock", "batch.lock", "summary.csv"}
 """What tells of times and attempts."""
 
@@ -94,8 +95,8 @@ def _bytes(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): file_hash(path) for path in paths}
 
 
-def test_a_calibration_that_cannot_be_used_is_said_at_once(day: Path, tmp_path: Path) -> None:
-    shutil.copytree(day / "calibration", tmp_path / "calibration")
+def test_a_calibration_that_cannot_be_used_is_said_at_once(tmp_path: Path) -> None:
+    shutil.copytree(STORED, tmp_path / "calibration")
     (tmp_path / "calibration" / "calibration.npz").write_bytes(b"no arrays")
     (tmp_path / "inbox").mkdir()
     assert watch(tmp_path, "out").wait(timeout=120) == 2
