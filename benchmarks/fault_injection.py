@@ -105,7 +105,7 @@ def _moved(what: str, how: str, mm: float, way: int, degrees: float) -> Fault:
         placed |= {n: MIDDLE @ by @ MIDDLE.inverse() @ placed[n] for n in group}
         return replace(sound.calibration, rig_from_camera=placed), Outcome(sound.images)
 
-    return Fault(f"{what}: {how}", (what, "moved by"), inject)
+    return Fault(f"{what}: {how}", (what,), inject)
 
 
 def _another(pole: str) -> Callable[[Sound], Case]:

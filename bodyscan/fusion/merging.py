@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 from bodyscan.fusion.averaging import average
 from bodyscan.fusion.brightness import even_exposures
-from bodyscan.fusion.comparing import Evidence, compare
+from bodyscan.fusion.comparing import compare
+from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.smoothing import smooth
 from bodyscan.fusion.thinning import take_samples
 from bodyscan.geometry.transforms import RigidTransform
@@ -24,10 +25,10 @@ from bodyscan.settings import FusionSettings
 
 @dataclass(frozen=True, eq=False)
 class MergedCloud:
-    """A cloud, and of all that one pair said of another's points the share that spoke against them."""
+    """A cloud, and what the pairs said against each other's points."""
 
     cloud: BodyCloud
-    contradicted: float
+    contradictions: Contradictions
 
 
 def merge(
@@ -48,7 +49,12 @@ def merge(
             lambda image: smooth(image, rig_from_camera[image.pair], settings.window_mm),
             range_images,
         )
-        surfaces = [surface for surface in smoothed if surface is not None]
+        shown = {
+            image.pair: surface
+            for image, surface in zip(range_images, smoothed, strict=True)
+            if surface is not None
+        }
+        surfaces = list(shown.values())
         samples = take_samples(surfaces, settings.points)
         compared = pool.map(
             lambda number: compare(
@@ -59,9 +65,4 @@ def merge(
         evidence = list(compared)
     gain = even_exposures(samples, surfaces, evidence)
     cloud = average(samples, surfaces, evidence, gain, workers)
-    return MergedCloud(cloud, _share_against(evidence))
-
-
-def _share_against(evidence: Sequence[Evidence]) -> float:
-    against = sum(one.against_index.size for one in evidence)
-    return against / max(against + sum(one.index.size for one in evidence), 1)
+    return MergedCloud(cloud, Contradictions.of(list(shown), evidence, samples.starts))

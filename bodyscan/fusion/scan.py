@@ -106,7 +106,7 @@ def fuse(
         settings.use,
         seams,
         held,
-        fused.contradicted,
+        fused.contradictions,
         unjudged=[name for name, pair in calibration.pairs.items() if pair.quality.unjudged],
         cameras=np.array([at.translation for at in calibration.rig_from_camera.values()]),
         agreements={image.pair: image.agreement for image in images if image.agreement},

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.icp import Alignment
 from bodyscan.arrays import Array
+from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.seams import SeamReport, find_misfits
 from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -68,14 +69,14 @@ def grade_scan(
     use: UseLimits,
     seams: SeamReport | None = None,
     surface: SurfaceCheck | None = None,
-    contradicted: float = 0.0,
+    contradictions: Contradictions | None = None,
     unjudged: Sequence[str] = (),
     cameras: Array | None = None,
     agreements: Mapping[str, Agreement] | None = None,
     person: PersonMotion | None = None,
 ) -> Verdict:
     """The worst of all findings decides; the reasons come worst first. use: how wrong a girth may
-    be. seams: see `judge_seams`. surface: see `check_surface`. contradicted: see `merge`.
+    be. seams: see `judge_seams`. surface: see `check_surface`. contradictions: see `merge`.
 
     unjudged: pairs whose calibration was imported and says nothing of how exact it is.
     cameras: (N, 3) where those of the whole rig stand; None for all round.  What none of them could
@@ -94,7 +95,7 @@ def grade_scan(
         "seams": lambda: _seams(seams, use),
         "disagreement": lambda: _disagreement(alignment),
         "motion": lambda: _motion(alignment, person),
-        "contradictions": lambda: _contradictions(contradicted),
+        "contradictions": lambda: _contradictions(contradictions, seams),
         "pieces": lambda: _company(cloud),
         "limbs": lambda: () if unknown else _limbs(mesh),
         "cuts": lambda: _cuts(cloud, volume),
@@ -198,15 +199,22 @@ def _motion(alignment: Alignment | None, person: PersonMotion | None) -> Iterato
         )
 
 
-def _contradictions(share: float) -> Iterator[Finding]:
+def _contradictions(found: Contradictions | None, seams: SeamReport | None) -> Iterator[Finding]:
     """Pairs that see through each other's surfaces, which points near each other do not tell."""
-    if share > SOME_CONTRADICTED:
-        yield (
-            "repeat" if share > MOST_CONTRADICTED else "usable",
-            f"the pairs contradict each other: {share:.1%} of what they say of one "
-            "another's points is that there is no surface; is this the calibration of this rig, has "
-            "nothing moved since, were cables or folders exchanged?",
-        )
+    if found is None or found.share <= SOME_CONTRADICTED:
+        return
+    blamed = found.blamed(seams.groups) if seams else ""
+    yield (
+        "repeat" if found.share > MOST_CONTRADICTED else "usable",
+        f"{f'{blamed} and the others' if blamed else 'the pairs'} contradict each other: "
+        f"{found.share:.1%} of what pairs say of one another's points is that there is no surface; "
+        + (
+            f"was {blamed} moved since the calibration, is it from another scan?"
+            if blamed
+            else "is this the calibration of this rig, has nothing moved since, were cables or folders "
+            "exchanged?"
+        ),
+    )
 
 
 def _company(cloud: BodyCloud) -> Iterator[Finding]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from made_scan import MadeScan, make_scan
 
 from bodyscan.alignment.icp import Alignment, Overlap
+from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.seams import Seam, SeamReport
 from bodyscan.rig.rig import Volume
@@ -33,13 +36,13 @@ def graded(
     step_mm: float | None = None,
     untied: tuple[tuple[str, ...], ...] = (),
     use: UseLimits = UseLimits(),  # noqa: B008  (frozen)
-    contradicted: float = 0.0,
+    contradictions: Contradictions | None = None,
 ) -> Verdict:
     seams = (Seam(("p1", "p2"), np.full(9, step_mm), np.zeros(9)),) if step_mm else ()
     report = SeamReport(seams, GROUPS, untied)
     volume = Volume()
     return grade_scan(
-        scan.cloud, scan.mesh, alignment, {}, volume, use, report, contradicted=contradicted
+        scan.cloud, scan.mesh, alignment, {}, volume, use, report, contradictions=contradictions
     )
 
 
@@ -99,7 +102,44 @@ def test_pairs_that_nothing_ties_are_named(scan: MadeScan) -> None:
     ("share", "grade"), [(0.004, "good"), (0.006, "usable"), (0.019, "usable"), (0.021, "repeat")]
 )
 def test_pairs_that_see_through_each_other(scan: MadeScan, share: float, grade: str) -> None:
-    assert graded(scan, aligned(), contradicted=share).grade == grade
+    found = against({("a", "b"): share, ("b", "c"): share, ("a", "c"): share})
+    verdict = graded(scan, aligned(), contradictions=found)
+    assert verdict.grade == grade
+    assert ("the pairs contradict each other" in str(verdict)) == (grade != "good")
+
+
+def against(shares: dict[tuple[str, str], float]) -> Contradictions:
+    """Of 1000 words that every two pairs have for each other's points."""
+    names = sorted({name for both in shares for name in both})
+    asked, found = np.zeros((2, len(names), len(names)), np.int64)
+    for (one, other), share in shares.items():
+        i, j = names.index(one), names.index(other)
+        asked[i, j] = asked[j, i] = 1000
+        found[i, j] = found[j, i] = round(1000 * share)
+    return Contradictions(tuple(names), asked, found)
+
+
+POLES = {
+    **{f"pair {name}": frozenset([name]) for name in ("a1", "a2", "b1", "b2", "c1")},
+    **{f"pole {name}": frozenset([f"{name}1", f"{name}2"]) for name in "ab"},
+}
+
+
+def test_what_pairs_see_through_is_blamed_on_the_pole_that_all_of_it_is_with() -> None:
+    of_pole = {(one, other): 0.1 for one in ("a1", "a2") for other in ("b1", "b2", "c1")}
+    rest = {("b1", "b2"): 0.0, ("b1", "c1"): 0.002, ("b2", "c1"): 0.0, ("a1", "a2"): 0.0}
+    assert against(of_pole | rest).blamed(POLES) == "pole a"
+
+
+def test_one_pair_is_blamed_rather_than_its_pole() -> None:
+    of_pair = {("a1", other): 0.1 for other in ("a2", "b1", "b2", "c1")}
+    rest = {("a2", "b1"): 0.0, ("a2", "c1"): 0.0, ("b1", "b2"): 0.0, ("b2", "c1"): 0.001}
+    assert against(of_pair | rest).blamed(POLES) == "pair a1"
+
+
+def test_a_person_who_moved_all_the_time_is_blamed_on_nobody() -> None:
+    names = ["a1", "a2", "b1", "b2", "c1"]
+    assert against(dict.fromkeys(combinations(names, 2), 0.1)).blamed(POLES) == ""
 
 
 def test_a_pair_that_does_not_fit_is_to_be_repeated(scan: MadeScan) -> None:

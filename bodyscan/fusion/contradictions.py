@@ -1,0 +1,64 @@
+"""Who sees through whose surfaces: how much of what pairs say of each other's points, and of whom."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.fusion.comparing import Evidence, Numbers
+
+Counts = NDArray[np.int64]
+MOST_OF_IT = 0.5
+"""A group is blamed if less than so much of the share is left without it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contradictions:
+    """pairs: P of them.  asked: (P, P), how often the pair of the row said something of points of
+    the column's; against: how often it was that there is no surface."""
+
+    pairs: tuple[str, ...]
+    asked: Counts
+    against: Counts
+
+    @staticmethod
+    def of(
+        pairs: Sequence[str], evidence: Sequence[Evidence], starts: NDArray[np.intp]
+    ) -> Contradictions:
+        """evidence: of each pair about all samples; those of pair k begin at starts[k]."""
+
+        def counted(index: Numbers) -> Counts:
+            owner = np.searchsorted(starts, index, side="right") - 1
+            return np.bincount(owner, minlength=len(pairs))
+
+        against = np.array([counted(one.against_index) for one in evidence])
+        agreed = np.array([counted(one.index) for one in evidence])
+        return Contradictions(tuple(pairs), agreed + against, against)
+
+    @property
+    def share(self) -> float:
+        """Of all that one pair said of another's points, what spoke against them."""
+        return float(self.against.sum() / max(self.asked.sum(), 1))
+
+    def blamed(self, groups: Mapping[str, frozenset[str]]) -> str:
+        """The smallest of the groups without which the others agree best; "" if none makes a
+        difference that tells."""
+        left = {name: self._without(group).share for name, group in groups.items()}
+        fair = [
+            name
+            for name, group in groups.items()
+            if len(self.pairs) > len(group) + 1 and left[name] < MOST_OF_IT * self.share
+        ]
+        least = min((left[name] for name in fair), default=0.0)
+        # One of its pairs is as good as a pole where it alone is to blame.
+        near = [name for name in fair if left[name] <= least + 0.1 * (self.share - least)]
+        return min(near, key=lambda name: (len(groups[name]), left[name]), default="")
+
+    def _without(self, group: frozenset[str]) -> Contradictions:
+        kept = np.flatnonzero([name not in group for name in self.pairs])
+        some = np.ix_(kept, kept)
+        names = tuple(self.pairs[k] for k in kept)
+        return Contradictions(names, self.asked[some], self.against[some])
