@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from bodyscan.alignment.bending import at_once
 from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.following import follow
 from bodyscan.alignment.icp import Alignment, align
+from bodyscan.alignment.pole_steps import PoleStep, find_pole_step, motions_between
 from bodyscan.alignment.sway import SwayPrior
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.merging import merge
@@ -25,6 +26,7 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, step
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.rig.rig import Rig
 from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Verdict
 
@@ -72,10 +74,11 @@ def fuse(
         cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume, empty=empty)
         seen = require_subject(cleaned)
     placing = dict(calibration.rig_from_camera)
-    alignment, followed, known = None, None, calibration.covariance
+    alignment, followed, shifted, known = None, None, None, calibration.covariance
     if settings.alignment.matching != "none" and len(seen) > 1:
         with step(progress, "aligning"):
             found = align(seen, placing, known, settings.alignment)
+            shifted = _pole_step(seen, placing, found, calibration.rig)
             alignment, followed = follow(seen, placing, found, known, settings.alignment)
             placing |= alignment.rig_from_camera
             seen = at_once(seen, placing, followed)
@@ -111,5 +114,15 @@ def fuse(
         cameras=np.array([at.translation for at in calibration.rig_from_camera.values()]),
         agreements={image.pair: image.agreement for image in images if image.agreement},
         person=person,
+        shifted=shifted,
     )
     return Scan(cloud, surface, alignment, points, failed, verdict, tuple(seen), placing, person)
+
+
+def _pole_step(
+    seen: Sequence[RangeImage], placing: Mapping[str, RigidTransform], found: Alignment, rig: Rig
+) -> PoleStep | None:
+    """Of the pairs that overlaps tie."""
+    tied = {name: found.rig_from_camera[name] for name in found.motion_mm}
+    moments = {image.pair: image.time_ms for image in seen}
+    return find_pole_step(motions_between(placing, tied), moments, rig.poles)

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.icp import Alignment
+from bodyscan.alignment.pole_steps import PoleStep
 from bodyscan.arrays import Array
 from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.seams import SeamReport, find_misfits
@@ -74,6 +75,7 @@ def grade_scan(
     cameras: Array | None = None,
     agreements: Mapping[str, Agreement] | None = None,
     person: PersonMotion | None = None,
+    shifted: PoleStep | None = None,
 ) -> Verdict:
     """The worst of all findings decides; the reasons come worst first. use: how wrong a girth may
     be. seams: see `judge_seams`. surface: see `check_surface`. contradictions: see `merge`.
@@ -83,6 +85,7 @@ def grade_scan(
     see is no reason to repeat.
 
     agreements: of pairs that project stripes of two directions.  person: how a body that moved did.
+    shifted: a pole that moved since the calibration.
 
     A check that fails by itself leaves the scan usable at best, and says so.
     """
@@ -93,6 +96,7 @@ def grade_scan(
         "calibration": lambda: _calibration(unjudged),
         "directions": lambda: _directions(agreements or {}),
         "seams": lambda: _seams(seams, use),
+        "poles": lambda: _shifted(shifted),
         "disagreement": lambda: _disagreement(alignment),
         "motion": lambda: _motion(alignment, person),
         "contradictions": lambda: _contradictions(contradictions, seams),
@@ -163,6 +167,17 @@ def _seams(seams: SeamReport | None, use: UseLimits) -> Iterator[Finding]:
             "usable",
             f"nothing ties {', '.join(group)} to the others: they share no surface, so that a person "
             "who moved in between, or a pole that did, would not be seen",
+        )
+
+
+def _shifted(step: PoleStep | None) -> Iterator[Finding]:
+    """Alignment has taken it out; what that left is for the seams to say."""
+    if step is not None:
+        yield (
+            "usable",
+            f"pole {step.pole} stands {step.shift_mm:.1f} mm from where its calibration has it, turned "
+            f"by {step.turn_deg:.2f} degrees: all its pairs alike, as no person moves; they were "
+            "brought to the others, calibrate again",
         )
 
 

@@ -1,0 +1,102 @@
+"""A pole that was moved since the calibration, told from a person who moved while it was scanned.
+
+Both shift pairs against each other. But all pairs of a pole that was moved are off by the same, at
+once and whenever they fire, while a person moves smoothly: what pairs see within a moment of each
+other hardly differs. Which of the two explains the pairs' motions better is asked of both as
+Gaussian processes over time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.alignment.body_motion import ARM_MM
+from bodyscan.alignment.moments import of_stance
+from bodyscan.alignment.sway import centre_shifts
+from bodyscan.arrays import Array, Mask
+from bodyscan.geometry.transforms import RigidTransform
+
+STEP_MM = 1.0
+"""What it is said from. Less is what calibrations of poles disagree by, and alignment takes it out."""
+SURE = 5.0
+"""Logarithm of how many times as well a moved pole has to explain it: 150 times."""
+NOISE_MM = np.geomspace(0.05, 1.0, 5)
+SWAY_MM = np.geomspace(1.0, 20.0, 6)
+"""None stands stiller than that for sure: whether it is a mannequin, nobody says."""
+STEPS_MM = np.geomspace(0.5, 30.0, 8)
+NEARLY = 0.5
+"""Correlation of a stance with that of half a second later. A pole that fired when no other did, by
+that, saw a person who may have gone there meanwhile."""
+ANYWHERE_MM = 100.0
+"""Of all pairs together: how the whole stands is not asked."""
+
+
+@dataclass(frozen=True)
+class PoleStep:
+    """A pole that stands off by shift_mm at the body's centre, and turned, from where the others and
+    its calibration put it."""
+
+    pole: str
+    shift_mm: float
+    turn_deg: float
+
+
+def find_pole_step(
+    motions: Mapping[str, Array], moments_ms: Mapping[str, float | None], poles: Mapping[str, str]
+) -> PoleStep | None:
+    """The pole that moved by itself, if one did.
+
+    motions: (6,) of each pair by its name, as alignment moved it: a rotation vector about the rig's
+    origin, a translation.  moments_ms: when each saw the person; of pairs whose moment is not known
+    (None) nobody can tell.  poles: of the pairs that stand on one.
+    """
+    names = [name for name in motions if moments_ms[name] is not None]
+    if len(names) < 3:
+        return None
+    twists = np.array([motions[name] for name in names])
+    seen = np.hstack([centre_shifts(twists), ARM_MM * twists[:, :3]])
+    seconds = 1e-3 * np.array([moments_ms[name] for name in names], float)
+    sway = of_stance(seconds[:, None] - seconds)
+    still = _evidence(seen, sway, np.zeros((len(names),) * 2), np.zeros(1))
+    found: list[tuple[float, PoleStep]] = []
+    for pole in sorted({poles[name] for name in names if name in poles}):
+        own = np.array([poles.get(name) == pole for name in names])
+        if 2 <= own.sum() < len(names) and sway[np.ix_(own, ~own)].max() > NEARLY:
+            gain = _evidence(seen, sway, np.outer(own, own).astype(float), STEPS_MM) - still
+            found.append((gain, _step(pole, twists, own)))
+    gain, step = max(found, key=lambda one: one[0], default=(0.0, PoleStep("", 0.0, 0.0)))
+    lever = np.radians(step.turn_deg) * ARM_MM
+    return step if gain > SURE and np.hypot(step.shift_mm, lever) > STEP_MM else None
+
+
+def motions_between(
+    before: Mapping[str, RigidTransform], after: Mapping[str, RigidTransform]
+) -> dict[str, Array]:
+    """(6,) by which each pair was moved, rig frame."""
+    return {name: (after[name] @ before[name].inverse()).twist for name in after}
+
+
+def _step(pole: str, twists: Array, own: Mask) -> PoleStep:
+    """Against the mean of the others."""
+    off = twists[own].mean(axis=0) - twists[~own].mean(axis=0)
+    shift = float(np.linalg.norm(centre_shifts(off[None])[0]))
+    return PoleStep(pole, shift, float(np.degrees(np.linalg.norm(off[:3]))))
+
+
+def _evidence(seen: Array, sway: Array, step: Array, steps_mm: Array) -> float:
+    """Logarithm of the likelihood of motions (P, 6), at the sizes of sway, step and noise that
+    explain them best."""
+    size = len(sway)
+    noise2, sway2, step2 = np.meshgrid(NOISE_MM**2, SWAY_MM**2, steps_mm**2, indexing="ij")
+    covariance = (
+        noise2.ravel()[:, None, None] * np.eye(size)
+        + sway2.ravel()[:, None, None] * sway
+        + step2.ravel()[:, None, None] * step
+        + ANYWHERE_MM**2
+    )
+    pulls = np.linalg.solve(covariance, np.broadcast_to(seen, (len(covariance), *seen.shape)))
+    fit = np.einsum("pi,kpi->k", seen, pulls)
+    return float(np.max(-0.5 * fit - 0.5 * seen.shape[1] * np.linalg.slogdet(covariance)[1]))

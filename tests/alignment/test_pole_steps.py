@@ -1,0 +1,83 @@
+"""A pole that was moved is told from a person who moves: both as drawn from what is known of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.alignment.body_motion import ARM_MM
+from bodyscan.alignment.moments import of_stance
+from bodyscan.alignment.pole_steps import PoleStep, find_pole_step, motions_between
+from bodyscan.alignment.sway import BODY_CENTRE, centre_shifts
+from bodyscan.arrays import Array
+from bodyscan.geometry.transforms import RigidTransform
+
+NAMES = [f"p{pole}-{k}" for pole in (1, 2, 3) for k in (1, 2, 3, 4)]
+POLES = {name: name[:2] for name in NAMES}
+SEQUENCE_MS = 22 * 1000.0 / 120.0
+SEEDS = range(20)
+
+
+def found(seed: int, sway_mm: float, step: Array, every_ms: float = SEQUENCE_MS) -> PoleStep | None:
+    """Pairs one after another see a person who sways and turns, known to 0.1 mm; the second pole is
+    off by `step`: a shift, mm, and a turn, degrees."""
+    rng = np.random.default_rng(seed)
+    at_ms = every_ms * np.arange(len(NAMES))
+    alike = of_stance(1e-3 * (at_ms[:, None] - at_ms)) + 1e-9 * np.eye(len(NAMES))
+    moved = np.linalg.cholesky(alike) @ rng.standard_normal((len(NAMES), 6))
+    moved *= sway_mm * np.repeat([1.0, 0.3], 3)
+    moved += 0.1 * rng.standard_normal(moved.shape)
+    own = np.array([POLES[name] == "p2" for name in NAMES])
+    moved[own] += [*step[:3], *(ARM_MM * np.radians(step[3:]))]
+    turn = moved[:, 3:] / ARM_MM
+    twists = np.hstack([turn, moved[:, :3] - np.cross(turn, BODY_CENTRE)])
+    np.testing.assert_allclose(centre_shifts(twists), moved[:, :3])
+    moments: dict[str, float | None] = dict(zip(NAMES, at_ms.tolist(), strict=True))
+    return find_pole_step(dict(zip(NAMES, twists, strict=True)), moments, POLES)
+
+
+@pytest.mark.parametrize("sway_mm", [0.0, 1.0, 3.0, 6.0])
+def test_a_person_is_no_pole(sway_mm: float) -> None:
+    """SURE is 150 to 1, and what is drawn is what is believed: none of 20."""
+    assert not any(found(seed, sway_mm, np.zeros(6)) for seed in SEEDS)
+
+
+@pytest.mark.parametrize(
+    ("sway_mm", "step"),
+    [(0.0, [0, 2, 0, 0, 0, 0]), (3.0, [5, 0, 0, 0, 0, 0]), (3.0, [0, 0, 0, 0, 0, 2])],
+)
+def test_a_pole_that_moved_is_named_though_the_person_sways(
+    sway_mm: float, step: list[float]
+) -> None:
+    steps = [found(seed, sway_mm, np.array(step, float)) for seed in SEEDS]
+    assert all(one is not None and one.pole == "p2" for one in steps)
+    shifts = [one.shift_mm for one in steps if one]
+    # The others' mean sways too.
+    assert np.median(shifts) == pytest.approx(np.linalg.norm(step[:3]), abs=0.2 + sway_mm)
+
+
+def test_poles_that_fire_at_one_moment_each_cannot_be_told_from_a_person() -> None:
+    """All of a pole's pairs see one stance, and poles see one each."""
+    at: dict[str, float | None] = {name: 2000.0 * int(POLES[name][1]) for name in NAMES}
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        stances = {
+            pole: 5.0 * rng.standard_normal(6) * [0, 0, 0, 1, 1, 1] for pole in POLES.values()
+        }
+        twists = {
+            name: stances[POLES[name]] + 0.1 * rng.standard_normal(6) * [0, 0, 0, 1, 1, 1]
+            for name in NAMES
+        }
+        assert find_pole_step(twists, at, POLES) is None
+
+
+def test_without_moments_nobody_can_tell() -> None:
+    twists = {name: np.array([0, 0, 0, 5.0 * (POLES[name] == "p2"), 0, 0]) for name in NAMES}
+    assert find_pole_step(twists, dict.fromkeys(NAMES, None), POLES) is None
+
+
+def test_motions_are_those_of_alignment() -> None:
+    twist = np.array([0.01, 0.0, -0.02, 3.0, 4.0, 5.0])
+    before = {"a": RigidTransform.from_rotation_vector([0.1, 0.2, 0.3], [100.0, 200.0, 300.0])}
+    after = {"a": before["a"].moved(twist)}
+    np.testing.assert_allclose(motions_between(before, after)["a"], twist, atol=1e-12)
