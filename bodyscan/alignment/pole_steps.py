@@ -28,7 +28,7 @@ SWAY_MM = np.geomspace(1.0, 20.0, 6)
 """None stands stiller than that for sure: whether it is a mannequin, nobody says."""
 STEPS_MM = np.geomspace(0.5, 30.0, 8)
 NEARLY = 0.5
-"""Correlation of a stance with that of half a second later. A pole that fired when no other did, by
+"""Correlation of a stance with that of 0.8 s later. A pole that fired when no other did, by
 that, saw a person who may have gone there meanwhile."""
 ANYWHERE_MM = 100.0
 """Of all pairs together: how the whole stands is not asked."""
