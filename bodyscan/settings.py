@@ -31,9 +31,9 @@ a subject turns about it, so that a turn does not look like a shift."""
 class AlignmentSettings(Model):
     """How range images are brought together where they overlap (`alignment.icp`)."""
 
-    matching: Literal["projected", "nearest", "none"] = "projected"
-    """`projected`: into the other camera's pixels, which needs no search; `nearest`: in space, as
-    Open3D's ICP does; `none`: no alignment, each pair stays where the boards put it."""
+    matching: Literal["projected", "open3d", "none"] = "projected"
+    """`projected`: points into the other camera's pixels, all pairs in one solve; `open3d`: Open3D's
+    ICP of every two and its pose graph; `none`: each pair stays where the boards put it."""
 
     spacing_mm: Millimetres = 3.0
     """mm between the points that take part: some 10,000 a pair, more add time and no exactness."""

@@ -26,7 +26,6 @@ from bodyscan.alignment.matching import (
     AlignmentPoints,
     Matches,
     alignment_points,
-    match_nearest,
     match_projected,
 )
 from bodyscan.alignment.sway import BODY_CENTRE, SwayPrior, centre_shifts
@@ -196,7 +195,6 @@ def _each_overlap(
 ) -> dict[tuple[int, int], Result]:
     """What the matches of every two pairs, and their cells, say, the person as followed so far."""
     motion, cells = person
-    match = match_projected if settings.matching == "projected" else match_nearest
     placed = [view.start.moved(_rigid(motion, k)) for k, view in enumerate(views)]
     bends = motion.displacements(BENDING)
 
@@ -211,9 +209,9 @@ def _each_overlap(
         }
         here, there = RigidTransform.identity(), placed[j]
         inner, whole = replace(view.points, **carried), replace(view.whole, **carried)
-        found = match(inner, views[j].points, here, there, reach_mm)
+        found = match_projected(inner, views[j].points, here, there, reach_mm)
         if len(found.distances) < settings.fewest:
-            found = match(whole, views[j].whole, here, there, reach_mm).of_seam
+            found = match_projected(whole, views[j].whole, here, there, reach_mm).of_seam
         few = len(found.distances) < settings.fewest
         return None if few else measure(found, view.cell[found.source])
 

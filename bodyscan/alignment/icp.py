@@ -23,11 +23,11 @@ from bodyscan.alignment.matching import (
     AlignmentPoints,
     Matches,
     alignment_points,
-    match_nearest,
     match_projected,
 )
 from bodyscan.alignment.overlap_equations import OverlapEquations, solve_motions
 from bodyscan.alignment.sway import SwayPrior, bound_motions, centre_shifts
+from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import THREADS
@@ -113,19 +113,17 @@ def align(
     """
     names = [image.pair for image in images]
     start = [rig_from_camera[name] for name in names]
-    motion = np.zeros((len(names), 6))
-    reach, scale = settings.reach_mm, 1.0
     sway = SwayPrior.of(settings)
-    equations = partial(OverlapEquations.of, correlated=settings.correlated)
     with ThreadPoolExecutor(workers) as pool:
         clouds = list(pool.map(lambda image: _Seen.of(image, settings.spacing_mm), images))
         coarse = [seen.subsample(COARSE) for seen in clouds]
-        for left in range(settings.rounds, 0, -1):
-            moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
-            taken = clouds if left <= FINE_ROUNDS else coarse
-            overlaps = _each_overlap(equations, pool, taken, moved, reach, settings)
-            motion = solve_motions(overlaps, motion, sway.covariance(names, prior, scale))
-            reach, scale = max(reach / 2.0, settings.least_reach_mm), sway.scale(motion)
+        if settings.matching == "open3d":
+            from bodyscan.alignment.open3d_registration import register  # Open3D loads for a second
+
+            inner = [seen.inner for seen in clouds]
+            motion = register(inner, start, names, prior, settings)
+        else:
+            motion = _register(pool, clouds, start, names, prior, settings)
         widest = sway.covariance(names, prior, sway.most)
         motion, refused = bound_motions(names, motion, widest, settings.limit_sigmas)
         moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
@@ -147,6 +145,28 @@ def align(
     )
 
 
+def _register(
+    pool: ThreadPoolExecutor,
+    clouds: Sequence[_Seen],
+    start: Sequence[RigidTransform],
+    names: Sequence[str],
+    prior: PoseCovariance,
+    settings: AlignmentSettings,
+) -> Array:
+    """Motions (P, 6), rig frame: in each round matches anew, and one step of all pairs together."""
+    motion, sway = np.zeros((len(start), 6)), SwayPrior.of(settings)
+    reach, scale = settings.reach_mm, 1.0
+    equations = partial(OverlapEquations.of, correlated=settings.correlated)
+    coarse = [seen.subsample(COARSE) for seen in clouds]
+    for left in range(settings.rounds, 0, -1):
+        moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
+        taken = clouds if left <= FINE_ROUNDS else coarse
+        overlaps = _each_overlap(equations, pool, taken, moved, reach, settings)
+        motion = solve_motions(overlaps, motion, sway.covariance(names, prior, scale))
+        reach, scale = max(reach / 2.0, settings.least_reach_mm), sway.scale(motion)
+    return motion
+
+
 def _each_overlap(
     measure: Callable[[Matches], Result],
     pool: ThreadPoolExecutor,
@@ -157,14 +177,13 @@ def _each_overlap(
 ) -> dict[tuple[int, int], Result]:
     """What the matches of every two pairs say, if they are enough, of their rims where their inner
     parts are not; both ways, so that what one way gets wrong on curves cancels."""
-    match = match_projected if settings.matching == "projected" else match_nearest
 
     def of_two(both: tuple[int, int]) -> Result | None:
         one, other = clouds[both[0]], clouds[both[1]]
         here, there = placings[both[0]], placings[both[1]]
-        matches = match(one.inner, other.inner, here, there, reach_mm)
+        matches = match_projected(one.inner, other.inner, here, there, reach_mm)
         if len(matches.distances) < settings.fewest:
-            matches = match(one.whole, other.whole, here, there, reach_mm).of_seam
+            matches = match_projected(one.whole, other.whole, here, there, reach_mm).of_seam
         return measure(matches) if len(matches.distances) >= settings.fewest else None
 
     every_two = list(permutations(range(len(clouds)), 2))

@@ -1,7 +1,7 @@
 """Which points of two range images are the same spot of the subject.
 
-`match_nearest` asks Open3D for the nearest point in space; `match_projected` looks into the other
-camera's pixel grid, which needs no search and knows where that camera saw nothing.
+Each point is looked up in the other camera's pixel grid, which needs no search and knows where that
+camera saw nothing.
 """
 
 from __future__ import annotations
@@ -203,35 +203,3 @@ def _vector(row: Floats) -> Vector:
 @compiled
 def _dot(one: Vector, other: Vector) -> float:
     return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
-
-
-def match_nearest(
-    source: AlignmentPoints,
-    target: AlignmentPoints,
-    rig_from_source: RigidTransform,
-    rig_from_target: RigidTransform,
-    reach_mm: float,
-) -> Matches:
-    """Each source point against the nearest target point (Open3D), unless that lies at a rim.
-
-    Distances are taken along the mean of both normals, which on a curved surface is right to second
-    order where a single normal is not (Rusinkiewicz, A Symmetric Objective Function for ICP, 2019).
-    """
-    points, normals = rig_from_source.apply(source.points), rig_from_source.rotate(source.normals)
-    there, across = rig_from_target.apply(target.points), rig_from_target.rotate(target.normals)
-    import open3d as o3d  # longer than any other way of aligning takes
-
-    def cloud(places: Array) -> o3d.geometry.PointCloud:
-        return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(places))
-
-    found = o3d.pipelines.registration.evaluate_registration(cloud(points), cloud(there), reach_mm)
-    pairs = np.asarray(found.correspondence_set).reshape(-1, 2)
-    pairs = pairs[np.argsort(pairs[:, 0])]  # Open3D's threads leave them in any order
-    i, j = pairs[:, 0], pairs[:, 1]
-    same = ~source.rim[i] & ~target.rim[j] & (np.sum(normals[i] * across[j], axis=1) > FACING)
-    i, j = i[same], j[same]
-    mean = normals[i] + across[j]
-    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
-    distance = np.sum((points[i] - there[j]) * mean, axis=1)
-    sigma_mm = np.hypot(source.sigma_mm[i], target.sigma_mm[j])
-    return Matches(points[i], mean, distance, sigma_mm, i.astype(np.int64))

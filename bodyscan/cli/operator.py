@@ -51,9 +51,9 @@ def scan(
         int, typer.Option(min=1000, help="Number of points in the body cloud.")
     ] = FusionSettings().points,
     align: Annotated[
-        Literal["projected", "nearest", "none"],
+        Literal["projected", "open3d", "none"],
         typer.Option(
-            help="How to align range images: by projection, by Open3D's ICP, or not at all."
+            help="How to align range images: by projection, by Open3D (ICP, pose graph), or not at all."
         ),
     ] = AlignmentSettings().matching,
     empty: Annotated[

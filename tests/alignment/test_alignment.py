@@ -80,10 +80,10 @@ def disagreement_mm(placings: dict[str, RigidTransform], truth: dict[str, RigidT
     return float(np.sqrt(np.mean(np.sum((moved - np.mean(moved, axis=0)) ** 2, axis=1))))
 
 
-@pytest.mark.parametrize("matching", ["projected", "nearest"])
+@pytest.mark.parametrize("matching", ["projected", "open3d"])
 def test_pairs_come_together(
     scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
-    matching: Literal["projected", "nearest"],
+    matching: Literal["projected", "open3d"],
 ) -> None:
     images, truth = scanned
     start = pushed(truth, 1.5)
@@ -166,10 +166,10 @@ def test_a_rig_is_refined_on_a_still_object(
         refine_on_object([i for i in images if i.pair in ("p0", "p2")], start, prior)
 
 
-@pytest.mark.parametrize("matching", ["projected", "nearest"])
+@pytest.mark.parametrize("matching", ["projected", "open3d"])
 def test_threads_change_nothing(
     scanned: tuple[list[RangeImage], dict[str, RigidTransform]],
-    matching: Literal["projected", "nearest"],
+    matching: Literal["projected", "open3d"],
 ) -> None:
     images, truth = scanned
     start, prior = pushed(truth, 1.5), known_to(truth, 1.5, 0.02)
