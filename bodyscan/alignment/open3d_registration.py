@@ -20,13 +20,16 @@ from bodyscan.alignment.overlap_equations import OverlapEquations
 from bodyscan.alignment.sway import SwayPrior
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.settings import AlignmentSettings
 
 registration = o3d.pipelines.registration
 
+COARSE = 4
+"""One in so many points takes part but for the last reach."""
 STEPS = 15
-"""Times that ICP matches anew with one reach: at a quarter of it nothing moves any more."""
+"""Times that ICP matches anew with one reach, at most."""
 KERNEL = 0.15
 """Of the reach: distances beyond it count for less, 0.5 mm with the last one."""
 SWAYS = 3
@@ -45,14 +48,17 @@ def register(
     settings: AlignmentSettings,
 ) -> Array:
     """Motions (P, 6) of the pairs, rig frame, that bring their overlaps together."""
-    placed = [_Placed.of(seen, at) for seen, at in zip(clouds, rig_from_camera, strict=True)]
-    edges = {
-        (i, j): edge
-        for i, j in combinations(range(len(placed)), 2)
-        if (edge := _bring_together(placed[i], placed[j], settings)) is not None
-    }
+    both = list(zip(clouds, rig_from_camera, strict=True))
+    fine = [_Placed.of(seen, at) for seen, at in both]
+    coarse = [_Placed.of(seen.subsample(COARSE), at) for seen, at in both]
     sway, scale = SwayPrior.of(settings), 1.0
-    motions = np.zeros((len(placed), 6))
+    widest = PoseCovariance(tuple(names), sway.covariance(names, prior, sway.most))
+    edges: dict[tuple[int, int], _Edge] = {}
+    for i, j in combinations(range(len(both)), 2):
+        edge = _bring_together((coarse[i], coarse[j]), (fine[i], fine[j]), settings)
+        if edge and edge.sigmas(widest.between(names[j], names[i])) < settings.limit_sigmas:
+            edges[i, j] = edge
+    motions = np.zeros((len(both), 6))
     for _ in range(SWAYS):
         motions = _solve_graph(edges, sway.covariance(names, prior, scale))
         scale = sway.scale(motions)
@@ -83,18 +89,27 @@ class _Edge:
     motion: Array
     information: Array
 
+    def sigmas(self, covariance: Array) -> float:
+        """How far the source was moved, in standard deviations of such a covariance (6, 6): where
+        two share a rim only ICP slides along it."""
+        twist = RigidTransform.from_matrix(self.motion).twist
+        return float(np.sqrt(twist @ solve_scaled(covariance, twist) / 6.0))
 
-def _bring_together(source: _Placed, target: _Placed, settings: AlignmentSettings) -> _Edge | None:
-    """ICP with a reach that halves each time; None if they share too little."""
+
+def _bring_together(
+    coarse: tuple[_Placed, _Placed], fine: tuple[_Placed, _Placed], settings: AlignmentSettings
+) -> _Edge | None:
+    """ICP of source and target with a reach that halves each time; None if they share too little."""
     motion, reach = np.eye(4), settings.reach_mm
-    steps = registration.ICPConvergenceCriteria(0.0, 0.0, STEPS)
+    steps = registration.ICPConvergenceCriteria(max_iteration=STEPS)
     while True:
+        source, target = fine if reach <= settings.least_reach_mm else coarse
         kernel = registration.CauchyLoss(KERNEL * reach)
         estimation = registration.TransformationEstimationPointToPlane(kernel)
         found = registration.registration_icp(
             source.cloud, target.cloud, reach, motion, estimation, steps
         )
-        if len(found.correspondence_set) < settings.fewest:
+        if len(found.correspondence_set) < settings.fewest / COARSE:
             return None
         motion = found.transformation
         if reach <= settings.least_reach_mm:
