@@ -8,8 +8,9 @@ neighbours say.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bodyscan.arrays import Floats, Indices, Mask
+from bodyscan.arrays import Floats, Mask
 from bodyscan.compiled import compiled
 
 SWEEPS = 16
@@ -32,7 +33,8 @@ def fill_harmonically(values: Floats, fixed: Mask, least: Floats, sure: float) -
         found, sweeps = np.where(fixed, values, np.maximum(_doubled(coarse), least)), SWEEPS
         unsure = ~fixed & (np.abs(found) < sure)
     found = np.ascontiguousarray(found, np.float32)
-    _relax(found.ravel(), np.flatnonzero(unsure), found.shape[1:], least.ravel(), sweeps)
+    nodes = np.flatnonzero(unsure).astype(np.int32)
+    _relax(found.ravel(), nodes, found.shape[1:], least.ravel(), sweeps)
     return found
 
 
@@ -55,14 +57,16 @@ def _doubled(coarse: Floats) -> Floats:
 
 @compiled
 def _relax(
-    values: Floats, some: Indices, shape: tuple[int, ...], least: Floats, sweeps: int
+    values: Floats, some: NDArray[np.int32], shape: tuple[int, ...], least: Floats, sweeps: int
 ) -> None:
     """Gauss and Seidel's sweeps over some nodes, to and fro, with over-relaxation."""
     a, b = shape[0] * shape[1], shape[1]
+    keep, share = np.float32(1.0 - OVERSHOOT), np.float32(OVERSHOOT / 6.0)
     for sweep in range(sweeps):
+        way = 1 if sweep % 2 == 0 else -1
         for n in range(len(some)):
-            at = some[n] if sweep % 2 == 0 else some[len(some) - 1 - n]
-            total = values[at - a] + values[at + a] + values[at - b] + values[at + b]
-            total += values[at - 1] + values[at + 1]
-            new = values[at] + OVERSHOOT * (total / 6.0 - values[at])
+            at = some[n if way > 0 else len(some) - 1 - n]
+            others = values[at - a] + values[at + a] + values[at - b] + values[at + b]
+            new = keep * values[at] + share * (others + values[at + way])
+            new += share * values[at - way]  # last: it was computed just now, and is waited for
             values[at] = max(new, least[at])
