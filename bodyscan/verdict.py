@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 Grade = Literal["good", "accepted", "usable", "not judged", "repeat", "recalibrate", "not accepted"]
 Mark = Literal["good", "usable", "bad"]
@@ -33,3 +33,14 @@ class Verdict:
 
     def __str__(self) -> str:
         return "\n  ".join([f"verdict: {self.grade}", *self.reasons])
+
+
+class Announce(Protocol):
+    """Takes a scan's verdict as soon as it is known: as the points have it, before there is a mesh, and
+    the final one, which the mesh can only make worse."""
+
+    def __call__(self, verdict: Verdict, *, final: bool) -> None: ...
+
+
+def say_nothing(verdict: Verdict, *, final: bool) -> None:
+    """Where nobody waits for a verdict."""

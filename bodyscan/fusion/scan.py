@@ -19,7 +19,7 @@ from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
 from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.seams import judge_seams
-from bodyscan.fusion.surface_check import check_surface
+from bodyscan.fusion.surface_check import SurfaceCheck, check_surface
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.outcome import Outcome
@@ -28,7 +28,7 @@ from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Rig
 from bodyscan.settings import ScanSettings
-from bodyscan.verdict import Verdict
+from bodyscan.verdict import Announce, Verdict, say_nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +63,12 @@ def fuse(
     progress: Progress = silent,
     *,
     empty: Sequence[RangeImage] = (),
+    announce: Announce = say_nothing,
 ) -> Scan:
     """Range images of one person, background and all, to body model and mesh.
 
-    measured: with the pairs that gave none as failures. empty: as in `clean`. Raises ScanFailed if
-    they show no body.
+    measured: with the pairs that gave none as failures. empty: as in `clean`. announce: told what the
+    points alone say of the scan, before the mesh is made. Raises ScanFailed if they show no body.
     """
     images = measured.value
     with step(progress, "cleaning"):
@@ -90,32 +91,37 @@ def fuse(
         cloud = add_pose_variance(fused.cloud, there, known)
         if followed:
             cloud = add_motion_variance(fused.cloud, cloud, followed)
-    with step(progress, "meshing"):
-        surface = mesh(cloud, settings.mesh, images, placing)
-    with step(progress, "judging"):
-        seams = judge_seams(seen, there, calibration.rig.poles)
-        carried = {image.pair: image for image in seen}
-        at_once_or_empty = [carried.get(image.pair, image) for image in cleaned]
-        held = check_surface(surface, at_once_or_empty, placing)
     person = PersonMotion.of(followed) if followed else None
     points = {image.pair: int(image.valid.sum()) for image in cleaned}
     failed = dict(measured.failures)
-    verdict = grade_scan(
-        cloud,
-        surface,
-        alignment,
-        failed,
-        calibration.rig.volume,
-        settings.use,
-        seams,
-        held,
-        fused.contradictions,
-        unjudged=[name for name, pair in calibration.pairs.items() if pair.quality.unjudged],
-        cameras=np.array([at.translation for at in calibration.rig_from_camera.values()]),
-        agreements={image.pair: image.agreement for image in images if image.agreement},
-        person=person,
-        shifted=shifted,
-    )
+
+    def graded(surface: BodyMesh | None, held: SurfaceCheck | None) -> Verdict:
+        return grade_scan(
+            cloud,
+            surface,
+            alignment,
+            failed,
+            calibration.rig.volume,
+            settings.use,
+            seams,
+            held,
+            fused.contradictions,
+            unjudged=[name for name, pair in calibration.pairs.items() if pair.quality.unjudged],
+            cameras=np.array([at.translation for at in calibration.rig_from_camera.values()]),
+            agreements={image.pair: image.agreement for image in images if image.agreement},
+            person=person,
+            shifted=shifted,
+        )
+
+    with step(progress, "judging"):
+        seams = judge_seams(seen, there, calibration.rig.poles)
+        announce(graded(None, None), final=False)
+    with step(progress, "meshing"):
+        surface = mesh(cloud, settings.mesh, images, placing)
+        carried = {image.pair: image for image in seen}
+        at_once_or_empty = [carried.get(image.pair, image) for image in cleaned]
+        held = check_surface(surface, at_once_or_empty, placing)
+        verdict = graded(surface, held)
     return Scan(cloud, surface, alignment, points, failed, verdict, tuple(seen), placing, person)
 
 

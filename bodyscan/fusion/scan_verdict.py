@@ -63,7 +63,7 @@ LEAST_YIELD = 0.6
 
 def grade_scan(
     cloud: BodyCloud,
-    mesh: BodyMesh,
+    mesh: BodyMesh | None,
     alignment: Alignment | None,
     failed: Mapping[str, str],
     volume: Volume,
@@ -77,8 +77,9 @@ def grade_scan(
     person: PersonMotion | None = None,
     shifted: PoleStep | None = None,
 ) -> Verdict:
-    """The worst of all findings decides; the reasons come worst first. use: how wrong a girth may
-    be. seams: see `judge_seams`. surface: see `check_surface`. contradictions: see `merge`.
+    """The worst of all findings decides; the reasons come worst first. mesh: None while there is none
+    yet: what it alone would show is left out. use: how wrong a girth may be. seams: see
+    `judge_seams`. surface: see `check_surface`. contradictions: see `merge`.
 
     unjudged: pairs whose calibration was imported and says nothing of how exact it is.
     cameras: (N, 3) where those of the whole rig stand; None for all round.  What none of them could
@@ -90,7 +91,8 @@ def grade_scan(
     A check that fails by itself leaves the scan usable at best, and says so.
     """
     # What is filled touches anything, and has any shape.
-    unknown = (surface.filled_share if surface else mesh.filled_share) > MOST_FILLED
+    filled = surface.filled_share if surface else mesh.filled_share if mesh else 1.0
+    shape = mesh if filled <= MOST_FILLED else None
     checks: dict[str, Callable[[], Iterable[Finding]]] = {
         "pairs": lambda: _pairs(failed, alignment),
         "calibration": lambda: _calibration(unjudged),
@@ -101,13 +103,13 @@ def grade_scan(
         "motion": lambda: _motion(alignment, person),
         "contradictions": lambda: _contradictions(contradictions, seams),
         "pieces": lambda: _company(cloud),
-        "limbs": lambda: () if unknown else _limbs(mesh),
+        "limbs": lambda: _limbs(shape) if shape else (),
         "cuts": lambda: _cuts(cloud, volume),
-        "omissions": lambda: _omissions(cloud, mesh),
-        "contacts": lambda: () if unknown else _contacts(mesh),
+        "omissions": lambda: _omissions(cloud, mesh) if mesh else (),
+        "contacts": lambda: _contacts(shape) if shape else (),
         "yields": lambda: _yields(surface),
         "gaps": lambda: (
-            _other_side(mesh) if _see_one_side(cloud, cameras) else _gaps(cloud, surface)
+            _other_side(mesh) if mesh and _see_one_side(cloud, cameras) else _gaps(cloud, surface)
         ),
     }
     findings: list[Finding] = []

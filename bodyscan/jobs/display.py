@@ -55,7 +55,8 @@ def screen() -> Iterator[Listen]:
 
 @contextmanager
 def lines() -> Iterator[Listen]:
-    """One line a scan as soon as its verdict is known, one when its job has ended."""
+    """One line a scan as soon as its points tell how good it is, one for its verdict, one when its job
+    has ended."""
     console = Console()
 
     def listen(event: dict[str, Any]) -> None:
@@ -115,7 +116,8 @@ class _Screen:
         self._bars.console.print(Text(ending(event), style=style), soft_wrap=True)
 
     def _verdict(self, event: dict[str, Any]) -> None:
-        self._bars.console.print(_verdict_text(event), soft_wrap=True)
+        if event["final"]:
+            self._bars.console.print(_verdict_text(event), soft_wrap=True)
 
     def _stage(self, event: dict[str, Any]) -> None:
         if event["job"] in self._running:
@@ -129,7 +131,8 @@ class _Screen:
 
 def _verdict_text(event: dict[str, Any]) -> Text:
     """A scan's verdict with its worst reason."""
-    said = ": ".join([event["job"], event["grade"], *event["reasons"][:1]])
+    grade = event["grade"] if event["final"] else f"{event['grade']} so far"
+    said = ": ".join([event["job"], grade, *event["reasons"][:1]])
     return Text(said, style=_STYLES[MARKS.get(event["grade"], "bad")])
 
 

@@ -17,13 +17,10 @@ from bodyscan.jobs.job import STAGE, Job
 from bodyscan.progress import Progress, step
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
-from bodyscan.verdict import Verdict
+from bodyscan.verdict import Announce
 
 if TYPE_CHECKING:
     from bodyscan.workflows.resident import Resident
-
-Announce = Callable[[Verdict], None]
-"""Takes a scan's verdict as soon as it is known, before anything is drawn or handed on."""
 
 
 @dataclass(frozen=True)

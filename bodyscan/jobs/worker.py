@@ -107,8 +107,8 @@ def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
     def progress(part: str, done: int, total: int) -> None:
         tell(stage=stage.name, part=part, done=done, total=total)
 
-    def announce(verdict: Verdict) -> None:
-        tell(grade=verdict.grade, reasons=verdict.reasons)
+    def announce(verdict: Verdict, *, final: bool) -> None:
+        tell(grade=verdict.grade, reasons=verdict.reasons, final=final)
 
     try:
         stage.run(job, made, progress, announce)

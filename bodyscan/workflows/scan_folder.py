@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from bodyscan.captures.folder import open_scan
@@ -14,7 +13,7 @@ from bodyscan.progress import Progress, silent, step
 from bodyscan.registration.storage import calibration_id, load_calibration
 from bodyscan.report.pictures import draw_scan
 from bodyscan.settings import ScanSettings
-from bodyscan.verdict import Verdict
+from bodyscan.verdict import Announce, say_nothing
 from bodyscan.workflows.resident import Resident
 from bodyscan.workflows.scan_person import scan_person
 
@@ -29,14 +28,15 @@ def scan_folder(
     empty: Path | None = None,
     follow_links: bool = False,
     resident: Resident | None = None,
-    announce: Callable[[Verdict], None] = lambda verdict: None,
+    announce: Announce = say_nothing,
 ) -> tuple[Scan, Path, Outcome[list[Path]]]:
     """The scan, its scan.json in `out`, and the pictures beside it, drawn once the result is kept.
     A result that lay there goes.
 
     empty: captures of the rig with nobody in it. follow_links: though the calibration's rig file does
-    not say so. resident: what was loaded and decoded before. announce: told the verdict, once the
-    result is kept. Raises ScanFailed after saying so in scan.json.
+    not say so. resident: what was loaded and decoded before. announce: told the verdict as the points
+    alone have it, and once the result is kept the final one. Raises ScanFailed after saying so in
+    scan.json.
     """
     rig = resident.calibration if resident else load_calibration(calibration)
     described = rig.rig
@@ -48,7 +48,9 @@ def scan_folder(
     origin = calibration_id(calibration)
     subject, when, simulated = captures.subject, captures.when, captures.simulated
     try:
-        scan = scan_person(rig, captures, settings, progress, empty=nobody, made=made)
+        scan = scan_person(
+            rig, captures, settings, progress, empty=nobody, made=made, announce=announce
+        )
     except ScanFailed as error:
         clear(out)
         save_failure(
@@ -59,7 +61,7 @@ def scan_folder(
     saved = save_scan(
         scan, out, calibration_id=origin, subject=subject, when=when, simulated=simulated
     )
-    announce(scan.verdict)
+    announce(scan.verdict, final=True)
     with step(progress, "drawing"):
         pictures = draw_scan(scan.cloud, scan.mesh, out)
     return scan, saved, pictures

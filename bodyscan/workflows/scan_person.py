@@ -10,6 +10,7 @@ from bodyscan.fusion.scan import Scan, fuse
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
+from bodyscan.verdict import Announce, say_nothing
 from bodyscan.workflows.range_images import Reconstructed, reconstruct_range_images
 
 
@@ -21,13 +22,14 @@ def scan_person(
     *,
     empty: Captures | None = None,
     made: Mapping[ImageSequence, Reconstructed] = MappingProxyType({}),
+    announce: Announce = say_nothing,
 ) -> Scan:
     """Person images in, body model and mesh out.
 
     empty: captures of the rig without anybody in it, whose surfaces are no part of the subject.
-    made: see `reconstruct_range_images`.
+    made: see `reconstruct_range_images`.  announce: see `fuse`.
     Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left.
     """
     images = reconstruct_range_images(calibration, captures, progress, made=made)
     background = reconstruct_range_images(calibration, empty, progress).value if empty else ()
-    return fuse(calibration, images, settings, progress, empty=background)
+    return fuse(calibration, images, settings, progress, empty=background, announce=announce)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -11,14 +12,17 @@ import pytest
 from ray_cast_scan import Truth, cast_scan, load_body, load_rig, nominal_placings, without
 
 from bodyscan.errors import ScanFailed
+from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.scan import Scan, fuse
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyMesh
 from bodyscan.outcome import Outcome
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import AlignmentSettings, FusionSettings, MeshSettings, ScanSettings
+from bodyscan.verdict import Announce, Verdict, say_nothing
 
 RIG = load_rig()
 SETTINGS = ScanSettings(
@@ -82,6 +86,7 @@ def fused(
     volume: Volume = RIG.volume,
     empty: Sequence[RangeImage] = (),
     settings: ScanSettings = SETTINGS,
+    announce: Announce = say_nothing,
 ) -> Scan:
     """What `bodyscan scan` makes of range images, with a calibration good to 0.05 mm."""
     placed = placed or placings()
@@ -89,7 +94,8 @@ def fused(
     covariance = PoseCovariance(tuple(placed), np.diag(sigmas**2))
     rig = RIG.model_copy(update={"volume": volume})
     calibration = RigCalibration(rig, {}, placed, covariance, {}, {}, ())
-    return fuse(calibration, Outcome(images, failures=failed or {}), settings, empty=empty)
+    measured = Outcome(images, failures=failed or {})
+    return fuse(calibration, measured, settings, empty=empty, announce=announce)
 
 
 def said(scan: Scan) -> str:
@@ -107,11 +113,26 @@ def test_nobody_in_the_volume(person: Truth) -> None:
         fused(empty)
 
 
-def test_two_people(person: Truth) -> None:
+def test_two_people_are_told_before_there_is_a_mesh(
+    person: Truth, monkeypatch: pytest.MonkeyPatch
+) -> None:
     both = joined(moved(person, [-230.0, 0.0, 0.0]), moved(person, [230.0, 0.0, 0.0]))
-    scan = fused(photographed(both))
+    told: list[Verdict] = []
+
+    def listen(verdict: Verdict, *, final: bool) -> None:
+        assert not final
+        told.append(verdict)
+
+    def meshed(*about: Any) -> BodyMesh:
+        assert [verdict.grade for verdict in told] == ["repeat"]
+        return mesh(*about)
+
+    monkeypatch.setattr("bodyscan.fusion.scan.mesh", meshed)
+    scan = fused(photographed(both), announce=listen)
     assert scan.verdict.grade == "repeat"
     assert "two bodies" in said(scan)
+    assert "two bodies" in told[0].reasons[0]
+    assert set(told[0].reasons) <= set(scan.verdict.reasons)  # a mesh takes nothing back
 
 
 def test_two_people_hand_in_hand(person: Truth) -> None:

@@ -20,10 +20,10 @@ from bodyscan.jobs.discovery import find_jobs
 from bodyscan.jobs.display import json_lines
 from bodyscan.jobs.job import Job
 from bodyscan.jobs.pipeline import load_pipeline
-from bodyscan.jobs.stages import Announce, Stage, results_of
+from bodyscan.jobs.stages import Stage, results_of
 from bodyscan.jobs.worker import main
 from bodyscan.progress import Progress
-from bodyscan.verdict import Verdict
+from bodyscan.verdict import Announce, Verdict
 
 COMMAND = (__file__,)
 PIPELINE = Path(__file__).parents[2] / "pipelines" / "fuse.yaml"
@@ -42,7 +42,7 @@ def scan(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
         (out / f"{number}.bin").write_bytes(hashlib.sha256(seed).digest() * 2000)
         seed += b"."
         _do(job)
-    announce(Verdict("good"))
+    announce(Verdict("good"), final=True)
     print("made a scan", flush=True)
 
 

@@ -70,9 +70,12 @@ def test_what_arrives_is_fused_as_a_batch_would_and_never_twice(
     process = watch(day, "out", "--once")
     told = events(process, "summary")
     code = process.wait()
-    grades = [e["grade"] for e in told if e["event"] == "verdict"]
-    assert len(grades) == 1
-    assert code == (1 if grades[0] == "repeat" else 0)
+    verdicts = [e for e in told if e["event"] == "verdict"]
+    assert [e["final"] for e in verdicts] == [False, True]
+    assert code == (1 if verdicts[1]["grade"] == "repeat" else 0)
+    assert set(verdicts[0]["reasons"]) <= set(verdicts[1]["reasons"])
+    meshed = [e.get("part") for e in told].index("meshing")
+    assert told.index(verdicts[0]) < meshed < told.index(verdicts[1])
     names = [e["event"] for e in told]
     assert names.index("verdict") < names.index("summary")
     assert (told[-1]["done"], told[-1]["set_aside"]) == (1, [])
