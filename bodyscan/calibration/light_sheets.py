@@ -30,6 +30,10 @@ START_BINS, START_STEPS, FOLD_STEPS = 1000, 15, 8
 AXIS_STARTS = (-0.5, 0.0, 0.5, 1.0, 1.5)
 """Where a projector's axis may be, in heights of its image."""
 FEWEST_BOARDS, FEWEST_POINTS = 2, 500
+PARTS = ("pinhole", "lens k1", "smooth planes")
+"""Models with a term left out that devices have: never chosen. Whether a term can be done without
+three or four boards hardly tell, and to leave it out by mistake costs several times what it costs to
+know it beforehand within what such devices have (the models' priors) and no better."""
 BINS_A_BOARD = 2
 """So many bins of a boundary make a board count for a free plane."""
 
@@ -145,7 +149,7 @@ def _smooth_candidate(name: str, start: SmoothSheets) -> Candidate:
     def fit(data: BoundaryPoints) -> LightSheets:
         return fit_sheets(start, data, board_error_mm=1.0, most_steps=FOLD_STEPS).sheets
 
-    return Candidate(name, fit)
+    return Candidate(name, fit, whole=name not in PARTS)
 
 
 def _planes_candidate(stripes: int, direction: Axis) -> Candidate:

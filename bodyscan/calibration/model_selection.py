@@ -31,11 +31,13 @@ class Candidate:
 
     fit: sheets from points, with the covariance of boards 1 mm out of place.
     everywhere: gives sheets for every s, so that a ray it cannot measure counts against it.
+    whole: has all terms that such devices have, so that it may be chosen; others are tried to be told.
     """
 
     name: str
     fit: Callable[[BoundaryPoints], LightSheets]
     everywhere: bool = True
+    whole: bool = True
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,8 @@ class HeldOutModel:
     mean_mm: of the absolute distances, outliers capped, board by board.  median_mm: of all absolute
     distances.  rms_mm: without outliers.  measured: share of the points that got a depth.  chosen:
     whether this model is used.  gain: by how many standard errors it beat the model chosen among those
-    before it, which it had to by three; None for the first.
+    before it, which it had to by three; None for the first of those that may be chosen, and for what is
+    but a part of another.
     """
 
     model: str
@@ -132,11 +135,11 @@ def select_model(
         np.isfinite(errors.distances) | candidate.everywhere
         for candidate, errors in zip(candidates, tried, strict=True)
     ]
-    chosen = 0
+    chosen = next(i for i, candidate in enumerate(candidates) if candidate.whole)
     gains: list[float | None] = [None] * len(candidates)
-    for i in range(1, len(candidates)):
+    for i in range(chosen + 1, len(candidates)):
         known = seen[i]
-        if not np.isfinite(medians[i]):
+        if not (candidates[i].whole and np.isfinite(medians[i])):
             continue
         rich, simple = (
             without_motion(_capped(tried[k].distances[known], cap), effects[known], board[known])

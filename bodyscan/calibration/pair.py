@@ -187,22 +187,25 @@ def _with_crossing(
 def drop_disagreeing(
     name: str, shots: Sequence[StripedView], found: ProjectorMotion
 ) -> Outcome[tuple[StripedView, ...]]:
-    """The shots less the one that fits no other. Raises PairFailed if it is more than one."""
+    """The shots less those that do not fit. Raises PairFailed if the projector moved."""
     names = [shot.view.shot for shot in shots]
     misfit = f"{found.together_px:.1f} px off together, {found.apart_px:.1f} px apart"
-    if not found.one_board:
+    if found.moved:
         before, after = names[found.kept[-1]], names[found.others[0]]
         raise PairFailed(
-            f"the projector moved between shots {before} and {after} (stripes are {misfit})",
+            f"the projector moved between shots {before} and {after} (stripes are {misfit}), or the "
+            f"images of {', '.join(names[k] for k in found.others)} are mixed up",
             where=f"pair {name}",
             remedy="fasten it and capture the boards again, or delete the shots before it moved",
         )
-    odd = int(found.others[0])
+    odd = ", ".join(names[k] for k in found.others)
+    said = f"the stripes of shot{'s' if len(found.others) > 1 else ''} {odd} do not fit the others'"
     note = (
-        f"{name}: the stripes of shot {names[odd]} do not fit the other shots' ({misfit}): the "
-        "board or the projector moved during it; its stripes are not used"
+        f"{name}: {said} ({misfit}): the board or the projector moved meanwhile, or images of several "
+        "shots are mixed up; these stripes are not used"
     )
-    return Outcome(tuple(shot for k, shot in enumerate(shots) if k != odd), (note,))
+    kept = tuple(shot for k, shot in enumerate(shots) if k not in found.others)
+    return Outcome(kept, (note,))
 
 
 def _refined(

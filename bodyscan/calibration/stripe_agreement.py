@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from bodyscan.calibration.boundary_points import (
 )
 from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.sheet_fit import fit_sheets
+from bodyscan.errors import PairFailed
 from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import Axis, LightSheets
@@ -26,6 +27,8 @@ FEW_POINTS = 1200
 STEPS = 12
 SUSPECT_PX = 0.4
 """Boards that agree this well are not looked at any further."""
+FEWEST_AGREEING = 3
+"""Two boards agree on nearly any light."""
 CLEARLY = 3.0
 """Boards are told apart if that makes them agree so many times better."""
 
@@ -34,26 +37,26 @@ CLEARLY = 3.0
 class ProjectorMotion:
     """Boards, told apart so that each group agrees on the light.
 
-    kept, others: numbers of the boards in two groups, in the order of the shots; `others` is one
-    board that fits none, or all that were taken after the projector moved.  together_px, apart_px:
-    how well the stripes of all boards fit one light, and those of each group theirs.
+    kept, others: numbers of the boards in two groups, in the order of the shots; `others` are a few
+    that do not fit, or, where the projector `moved`, all that were taken afterwards.  together_px,
+    apart_px: how well the stripes of all boards fit one light, and those of each group theirs.
     """
 
     kept: Indices
     others: Indices
     together_px: float
     apart_px: float
-
-    @property
-    def one_board(self) -> bool:
-        """A single shot fails to fit, so that the rest can be used."""
-        return len(self.others) == 1
+    moved: bool = False
 
 
 def find_projector_motion(
     data: BoundaryPoints, camera: Camera, stripes: int, direction: Axis
 ) -> ProjectorMotion | None:
-    """None if all boards agree, or are fewer than three. `data.board` counts in the order of shots."""
+    """None if all boards agree, or are fewer than three. `data.board` counts in the order of shots.
+
+    Raises PairFailed where stripes lie farther off than they are wide and most boards agree on no
+    light: images of several shots are mixed up, or the stripes are not those described.
+    """
     few = subsample(bin_points(data, camera, direction), FEW_POINTS)
     boards = np.unique(few.board)
     if len(boards) < 3:
@@ -61,14 +64,25 @@ def find_projector_motion(
     together = _misfit(few, [boards], stripes, direction)
     if together < SUSPECT_PX:
         return None
-    best = min(
-        (
-            ProjectorMotion(kept, others, together, _misfit(few, groups, stripes, direction))
-            for kept, others, groups in _partitions(boards)
-        ),
-        key=lambda tried: tried.apart_px,
-    )
-    return best if CLEARLY * best.apart_px < together else None
+    best, apart = None, together
+    for kept, others, misfit, moved in _told_apart(
+        boards, lambda groups: _misfit(few, groups, stripes, direction)
+    ):
+        if CLEARLY * misfit < apart:
+            best, apart = ProjectorMotion(kept, others, together, misfit, moved), misfit
+        if apart < SUSPECT_PX:
+            break
+    if best is not None:
+        return best
+    width = _stripe_width(few)
+    if together > width:
+        raise PairFailed(
+            f"the stripes of {len(boards)} boards fit no light together, nor do those of most of "
+            f"them: they are {together:.1f} px off, a stripe is {width:.1f} px wide",
+            remedy="see whether the images of these shots are mixed up (the lit image of one, the "
+            "patterns of another), and whether `stripes` and `direction` are right",
+        )
+    return None
 
 
 def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
@@ -82,16 +96,58 @@ def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
     return np.array([np.median(off[board == k]) for k in np.unique(board)], np.float64)
 
 
-def _partitions(boards: Indices) -> Iterator[tuple[Indices, Indices, list[Indices]]]:
-    """Each board against the rest, then all before against all after; the groups to fit."""
-    for board in boards:
-        kept = boards[boards != board]
-        yield kept, boards[boards == board], [kept]
-    for first in range(2, len(boards) - 1):
-        yield boards[:first], boards[first:], [boards[:first], boards[first:]]
+Misfit = Callable[[Sequence[Indices]], float]
 
 
-def _misfit(data: BoundaryPoints, groups: list[Indices], stripes: int, direction: Axis) -> float:
+def _told_apart(boards: Indices, misfit: Misfit) -> Iterator[tuple[Indices, Indices, float, bool]]:
+    """Ways to tell boards apart, the simplest first: kept, others, how well the groups agree, and
+    whether the projector moved between them."""
+    left_out = _left_out(boards, misfit)
+    yield next(left_out)
+    yield from _before_and_after(boards, misfit)
+    yield from left_out
+
+
+def _left_out(boards: Indices, misfit: Misfit) -> Iterator[tuple[Indices, Indices, float, bool]]:
+    """One board less, then more, each time the one without which the others agree best, while most
+    are left and they say something."""
+    kept, fewest = boards, max(FEWEST_AGREEING, len(boards) // 2 + 1)
+    while len(kept) > fewest or kept is boards:
+        apart, out = min((misfit([kept[kept != board]]), board) for board in kept)
+        kept = kept[kept != out]
+        yield kept, np.setdiff1d(boards, kept), apart, False
+
+
+def _before_and_after(
+    boards: Indices, misfit: Misfit
+) -> Iterator[tuple[Indices, Indices, float, bool]]:
+    """All before against all after, where they agree best. That the first two agree says nothing,
+    and the projector stands where the others saw it: they are left out."""
+    cuts = range(2, len(boards) - 1)
+    if cuts:
+        apart, first = min((misfit([boards[:cut], boards[cut:]]), cut) for cut in cuts)
+        before, after = boards[:first], boards[first:]
+        if first < FEWEST_AGREEING <= len(after):
+            yield after, before, apart, False
+        else:
+            yield before, after, apart, True
+
+
+def _stripe_width(data: BoundaryPoints) -> float:
+    """px, the median over the boards' points: by how neighbouring boundaries of a board lie apart."""
+    widths = []
+    for board in np.unique(data.board):
+        own = data.board == board
+        across = np.sum(data.points[own] * data.per_pixel[own], axis=1)
+        across /= np.sum(data.per_pixel[own] ** 2, axis=1)
+        slope = np.polyfit(data.index[own].astype(float), across, 1)[0]
+        widths.append(abs(float(slope)))
+    return float(np.median(widths))
+
+
+def _misfit(
+    data: BoundaryPoints, groups: Sequence[Indices], stripes: int, direction: Axis
+) -> float:
     """Root mean square over boards of the median distance (px) of its stripes from its group's
     sheets. Sheets that may bow, so that no kind of projector is taken for one that moved."""
     medians = []

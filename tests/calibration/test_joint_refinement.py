@@ -19,7 +19,7 @@ from bodyscan.calibration.joint_refinement import (
     refine_jointly,
     striped_board,
 )
-from bodyscan.calibration.light_sheets import fit_light_sheets
+from bodyscan.calibration.light_sheets import smooth_models
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightSheets
@@ -67,8 +67,7 @@ def calibrated(seed: int) -> tuple[CameraCalibration, SmoothSheets, list[Striped
             )
         )
     bins = bin_points(concatenate(parts), camera.camera, "vertical")
-    sheets = fit_light_sheets(bins, 254, "vertical", camera.camera).sheets
-    assert isinstance(sheets, SmoothSheets)
+    sheets = dict(smooth_models(bins, 254, "vertical"))["smooth planes"]
     return (
         camera,
         sheets,

@@ -62,7 +62,9 @@ def mirror() -> tuple[Scene, SheetsFit]:
 
 def test_planes_win_for_a_rotating_mirror() -> None:
     scene, fit = mirror()
-    assert fit.sheets.kind in ("planes", "smooth-planes")
+    # Sheets that may bow, and have no more of a bow than noise makes of it.
+    assert fit.model.startswith("bowed sheets")
+    assert figure(fit, fit.model) < 1.2 * figure(fit, "smooth planes")
     planes = min(figure(fit, "smooth planes"), figure(fit, "free planes"))
     # The mirror's planes share no line: no centre, with whatever lens, comes near.
     assert figure(fit, "pinhole") > 5.0 * planes

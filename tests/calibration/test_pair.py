@@ -29,12 +29,12 @@ def test_one_shot_that_fits_no_other_is_left_out_and_named() -> None:
     kept = drop_disagreeing("p1-1", SHOTS, found)
     assert [shot.view.shot for shot in kept.value] == ["a", "b", "d", "e"]
     (note,) = kept.notes
-    assert note.startswith("p1-1: the stripes of shot c ")
+    assert note.startswith("p1-1: the stripes of shot c do not fit the others'")
     assert "2.5 px" in note
 
 
 def test_a_projector_that_moved_costs_the_pair_and_the_shots_are_named() -> None:
-    found = ProjectorMotion(np.array([0, 1, 2]), np.array([3, 4]), 2.5, 0.1)
+    found = ProjectorMotion(np.array([0, 1, 2]), np.array([3, 4]), 2.5, 0.1, moved=True)
     with pytest.raises(PairFailed, match="moved between shots c and d") as error:
         drop_disagreeing("p1-1", SHOTS, found)
     assert error.value.where == "pair p1-1"

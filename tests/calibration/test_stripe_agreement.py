@@ -17,13 +17,14 @@ from lit_boards import (
     chapter_scene,
 )
 
-from bodyscan.calibration.boundary_points import concatenate
+from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.stripe_agreement import (
     ProjectorMotion,
     board_offsets,
     find_projector_motion,
 )
+from bodyscan.errors import PairFailed
 
 MORE_POSES = (
     *BODY_POSES,
@@ -80,7 +81,7 @@ def test_a_move_between_shots_tells_those_before_from_those_after() -> None:
     scene = body_scene(-0.05)
     found = disagreement(scene, MORE_POSES, turned(scene, 0.1), shots=(3, 4, 5, 6))
     assert found is not None
-    assert not found.one_board
+    assert found.moved
     np.testing.assert_array_equal(found.kept, [0, 1, 2])
     np.testing.assert_array_equal(found.others, [3, 4, 5, 6])
     assert found.together_px > 3.0 * found.apart_px
@@ -91,8 +92,40 @@ def test_a_shot_of_its_own_is_named(shot: int) -> None:
     scene = body_scene(-0.05)
     found = disagreement(scene, MORE_POSES, turned(scene, -0.1), shots=(shot,))
     assert found is not None
-    assert found.one_board
+    assert not found.moved
     assert found.others == [shot]
+
+
+def mixed_up(scene: Scene, poses: Sequence[Pose], *exchanged: tuple[int, int]) -> BoundaryPoints:
+    """Boards of which some carry each other's stripes: their images were exchanged."""
+    boards = [scene.looking_at(*pose) for pose in poses]
+    of = list(range(len(boards)))
+    for one, other in exchanged:
+        of[one], of[other] = other, one
+    parts = []
+    for number, board in enumerate(boards):
+        index, pixels = scene.crossings(boards[of[number]], 24)
+        sigma = np.full(len(index), 0.05)
+        placed = (scene.camera, board, index, pixels, sigma)
+        parts.append(boundary_points(*placed, board=number, direction=scene.direction))
+    return concatenate(parts)
+
+
+@pytest.mark.parametrize("exchanged", [(0, 1), (2, 5)])
+def test_two_shots_whose_images_were_exchanged_are_left_out(exchanged: tuple[int, int]) -> None:
+    scene = body_scene(-0.05)
+    data = mixed_up(scene, MORE_POSES, exchanged)
+    found = find_projector_motion(data, scene.camera, scene.projector.stripes, scene.direction)
+    assert found is not None
+    assert not found.moved
+    np.testing.assert_array_equal(found.others, exchanged)
+
+
+def test_stripes_of_which_most_are_mixed_up_are_refused() -> None:
+    scene = body_scene(-0.05)
+    data = mixed_up(scene, MORE_POSES, (0, 2), (1, 4), (3, 6))
+    with pytest.raises(PairFailed, match="fit no light together"):
+        find_projector_motion(data, scene.camera, scene.projector.stripes, scene.direction)
 
 
 def test_of_three_poses_something_is_noticed() -> None:
