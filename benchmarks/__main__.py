@@ -37,7 +37,7 @@ RESULTS = PROJECT / "docs" / "results.md"
 BENCHMARKS: dict[str, Callable[[], str]] = {
     "three-pole": full_size.three_pole,
     "four-pole": full_size.four_pole,
-    "sway": full_size.sway,
+    "living": full_size.living,
     "fusion": fusion.report,
     "faults": faults.report,
     "seconds": seconds.report,

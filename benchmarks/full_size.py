@@ -13,8 +13,7 @@ from pathlib import Path
 
 PROJECT = Path(__file__).parents[1]
 WORKSPACE = PROJECT / "bench" / "three-pole-12"
-SWAY_MM = 5
-FEWEST_SHOTS = 3
+PRESETS = ("standing", "restless")
 
 
 def three_pole() -> str:
@@ -27,20 +26,29 @@ def four_pole() -> str:
     return _report("Four poles, sixteen pairs", "four-pole-16", "man_average")
 
 
-def sway() -> str:
-    """The section of docs/results.md of the woman swaying, on the calibration of `three_pole`."""
-    workspace = PROJECT / "bench" / "sway"
+def living() -> str:
+    """The section of docs/results.md of the woman as people stand, calibrated by `three_pole`."""
+    parts = "\n".join(_living(preset) for preset in PRESETS)
+    return f"""## A person who sways, breathes and moves her arms, full size (synthetic)
+
+The woman in the rig of `three-pole-12`, calibrated there, twelve pairs one after the other
+(`bodyscan simulate --subject-preset`). Distances are to the body at the moment that the scan stands
+for.
+
+{parts}
+"""
+
+
+def _living(preset: str) -> str:
+    workspace = PROJECT / "bench" / preset
     rig, subject = PROJECT / "rigs" / "three-pole-12.yaml", _subject("woman_average")
     commands = _commands(rig, workspace, subject)
-    commands["simulate"] += ["--sway-mm", SWAY_MM, "--board-shots", FEWEST_SHOTS]
+    commands["simulate"] += ["--subject-preset", preset, "--board-shots", 0]
     del commands["calibrate-rig"], commands["export"]
     shutil.rmtree(workspace / "calibration", ignore_errors=True)
     shutil.copytree(WORKSPACE / "calibration", workspace / "calibration")
     outputs, _, _ = run_commands(commands, workspace)
-    return f"""## A subject that sways, full size (synthetic)
-
-The woman and the rig of `three-pole-12`, calibrated there, who now moves by up to {SWAY_MM} mm
-between the pairs (`bodyscan simulate --sway-mm {SWAY_MM}`).
+    return f"""`{preset}`:
 
 ```
 {_against_truth(outputs)}
