@@ -8,24 +8,26 @@ Gaussian processes over time.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from bodyscan.alignment.body_motion import ARM_MM
 from bodyscan.alignment.moments import of_stance
-from bodyscan.alignment.sway import centre_shifts
-from bodyscan.arrays import Array, Mask
+from bodyscan.alignment.sway import SwayPrior, centre_shifts
+from bodyscan.arrays import Array
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 
+FEWEST = 4
+"""pairs: of two or three, any may have been the one that moved."""
 STEP_MM = 1.0
 """What it is said from. Less is what calibrations of poles disagree by, and alignment takes it out."""
 SURE = 5.0
 """Logarithm of how many times as well a moved pole has to explain it: 150 times."""
 NOISE_MM = np.geomspace(0.05, 1.0, 5)
-SWAY_MM = np.geomspace(1.0, 20.0, 6)
-"""None stands stiller than that for sure: whether it is a mannequin, nobody says."""
+SWAY_MM = np.geomspace(0.05, 20.0, 10)
 STEPS_MM = np.geomspace(0.5, 30.0, 8)
 NEARLY = 0.5
 """Correlation of a stance with that of 0.8 s later. A pole that fired when no other did, by
@@ -34,27 +36,52 @@ ANYWHERE_MM = 100.0
 """Of all pairs together: how the whole stands is not asked."""
 
 
+FREE = SwayPrior(30.0, 5.0, 1.0, 1.0)
+"""How far a pole that moved may have: farther off it shares no surface with the others."""
+
+
 @dataclass(frozen=True)
 class PoleStep:
-    """A pole that stands off by shift_mm at the body's centre, and turned, from where the others and
-    its calibration put it."""
+    """A pole, or a pair by itself, that stands off by shift_mm at the body's centre, and turned, from
+    where the others and its calibration put it.  name: `pole p1`."""
 
-    pole: str
+    name: str
+    pairs: frozenset[str]
     shift_mm: float
     turn_deg: float
+
+    @staticmethod
+    def of(name: str, pairs: frozenset[str], motions: Mapping[str, Array]) -> PoleStep:
+        """Against the mean of the others."""
+        own, others = (
+            np.mean([twist for n, twist in motions.items() if (n in pairs) == its], axis=0)
+            for its in (True, False)
+        )
+        shift = float(np.linalg.norm(centre_shifts((own - others)[None])[0]))
+        return PoleStep(name, pairs, shift, float(np.degrees(np.linalg.norm((own - others)[:3]))))
+
+
+def moving_alone(names: Sequence[str], poles: Mapping[str, str]) -> dict[str, frozenset[str]]:
+    """What may have moved by itself, by what it is called: `pole p1`, `pair p1-2`.
+
+    poles: of the pairs that stand on one."""
+    groups = {f"pair {name}": frozenset([name]) for name in names}
+    for pole in sorted({poles[name] for name in names if name in poles}):
+        groups[f"pole {pole}"] = frozenset(name for name in names if poles.get(name) == pole)
+    return groups
 
 
 def find_pole_step(
     motions: Mapping[str, Array], moments_ms: Mapping[str, float | None], poles: Mapping[str, str]
 ) -> PoleStep | None:
-    """The pole that moved by itself, if one did.
+    """The pole that moved by itself, or the pair, if one did.
 
     motions: (6,) of each pair by its name, as alignment moved it: a rotation vector about the rig's
     origin, a translation.  moments_ms: when each saw the person; of pairs whose moment is not known
-    (None) nobody can tell.  poles: of the pairs that stand on one.
+    (None) nobody can tell.  poles: as in `moving_alone`.
     """
     names = [name for name in motions if moments_ms[name] is not None]
-    if len(names) < 3:
+    if len(names) < FEWEST:
         return None
     twists = np.array([motions[name] for name in names])
     seen = np.hstack([centre_shifts(twists), ARM_MM * twists[:, :3]])
@@ -62,14 +89,26 @@ def find_pole_step(
     sway = of_stance(seconds[:, None] - seconds)
     still = _evidence(seen, sway, np.zeros((len(names),) * 2), np.zeros(1))
     found: list[tuple[float, PoleStep]] = []
-    for pole in sorted({poles[name] for name in names if name in poles}):
-        own = np.array([poles.get(name) == pole for name in names])
-        if 2 <= own.sum() < len(names) and sway[np.ix_(own, ~own)].max() > NEARLY:
+    for name, pairs in moving_alone(names, poles).items():
+        own = np.array([pair in pairs for pair in names])
+        if not own.all() and sway[np.ix_(own, ~own)].max() > NEARLY:
             gain = _evidence(seen, sway, np.outer(own, own).astype(float), STEPS_MM) - still
-            found.append((gain, _step(pole, twists, own)))
-    gain, step = max(found, key=lambda one: one[0], default=(0.0, PoleStep("", 0.0, 0.0)))
+            found.append((gain, PoleStep.of(name, pairs, {n: motions[n] for n in names})))
+    if not found:
+        return None
+    gain, step = max(found, key=lambda one: one[0])
     lever = np.radians(step.turn_deg) * ARM_MM
     return step if gain > SURE and np.hypot(step.shift_mm, lever) > STEP_MM else None
+
+
+def loosened(boards: PoseCovariance, pairs: Collection[str]) -> PoseCovariance:
+    """The calibration's covariance with a pole's pairs free to move, all alike."""
+    matrix, own = boards.matrix.copy(), FREE.of_one()
+    places = [6 * boards.names.index(name) for name in pairs]
+    for i in places:
+        for j in places:
+            matrix[i : i + 6, j : j + 6] += own
+    return PoseCovariance(boards.names, matrix)
 
 
 def motions_between(
@@ -77,13 +116,6 @@ def motions_between(
 ) -> dict[str, Array]:
     """(6,) by which each pair was moved, rig frame."""
     return {name: (after[name] @ before[name].inverse()).twist for name in after}
-
-
-def _step(pole: str, twists: Array, own: Mask) -> PoleStep:
-    """Against the mean of the others."""
-    off = twists[own].mean(axis=0) - twists[~own].mean(axis=0)
-    shift = float(np.linalg.norm(centre_shifts(off[None])[0]))
-    return PoleStep(pole, shift, float(np.degrees(np.linalg.norm(off[:3]))))
 
 
 def _evidence(seen: Array, sway: Array, step: Array, steps_mm: Array) -> float:

@@ -11,8 +11,9 @@ from bodyscan.alignment.bending import at_once
 from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.following import follow
 from bodyscan.alignment.icp import Alignment, align
-from bodyscan.alignment.pole_steps import PoleStep, find_pole_step, motions_between
+from bodyscan.alignment.pole_steps import PoleStep, find_pole_step, loosened, motions_between
 from bodyscan.alignment.sway import SwayPrior
+from bodyscan.arrays import Array
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import mesh
@@ -26,7 +27,6 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, step
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.rig.rig import Rig
 from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Announce, Verdict, say_nothing
 
@@ -79,8 +79,14 @@ def fuse(
     if settings.alignment.matching != "none" and len(seen) > 1:
         with step(progress, "aligning"):
             found = align(seen, placing, known, settings.alignment)
-            shifted = _pole_step(seen, placing, found, calibration.rig)
-            alignment, followed = follow(seen, placing, found, known, settings.alignment)
+            shifted, believed = _pole_step(seen, placing, found, calibration), known
+            if shifted:
+                believed = loosened(known, shifted.pairs)
+                found = align(seen, placing, believed, settings.alignment)
+            alignment, followed = follow(seen, placing, found, believed, settings.alignment)
+            if shifted:
+                moved = _tied_motions(placing, alignment)
+                shifted = PoleStep.of(shifted.name, shifted.pairs, moved)
             placing |= alignment.rig_from_camera
             seen = at_once(seen, placing, followed)
             untied = {image.pair for image in seen} - alignment.motion_mm.keys()
@@ -126,9 +132,15 @@ def fuse(
 
 
 def _pole_step(
-    seen: Sequence[RangeImage], placing: Mapping[str, RigidTransform], found: Alignment, rig: Rig
+    seen: Sequence[RangeImage],
+    placing: Mapping[str, RigidTransform],
+    found: Alignment,
+    calibration: RigCalibration,
 ) -> PoleStep | None:
-    """Of the pairs that overlaps tie."""
-    tied = {name: found.rig_from_camera[name] for name in found.motion_mm}
     moments = {image.pair: image.time_ms for image in seen}
-    return find_pole_step(motions_between(placing, tied), moments, rig.poles)
+    return find_pole_step(_tied_motions(placing, found), moments, calibration.rig.poles)
+
+
+def _tied_motions(placing: Mapping[str, RigidTransform], found: Alignment) -> dict[str, Array]:
+    """Of the pairs that overlaps tie."""
+    return motions_between(placing, {name: found.rig_from_camera[name] for name in found.motion_mm})

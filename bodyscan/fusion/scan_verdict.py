@@ -100,7 +100,7 @@ def grade_scan(
         "seams": lambda: _seams(seams, use),
         "poles": lambda: _shifted(shifted),
         "disagreement": lambda: _disagreement(alignment),
-        "motion": lambda: _motion(alignment, person),
+        "motion": lambda: _motion(None if shifted else alignment, person),
         "contradictions": lambda: _contradictions(contradictions, seams),
         "pieces": lambda: _company(cloud),
         "limbs": lambda: _limbs(shape) if shape else (),
@@ -177,9 +177,9 @@ def _shifted(step: PoleStep | None) -> Iterator[Finding]:
     if step is not None:
         yield (
             "usable",
-            f"pole {step.pole} stands {step.shift_mm:.1f} mm from where its calibration has it, turned "
-            f"by {step.turn_deg:.2f} degrees: all its pairs alike, as no person moves; they were "
-            "brought to the others, calibrate again",
+            f"{step.name} stands {step.shift_mm:.1f} mm from where the calibration has it, turned by "
+            f"{step.turn_deg:.2f} degrees, by itself and at once, as no person moves: it was moved "
+            "since, and brought to the others here; calibrate again",
         )
 
 

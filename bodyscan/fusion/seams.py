@@ -23,6 +23,7 @@ from bodyscan.alignment.matching import (
     alignment_points,
     match_projected,
 )
+from bodyscan.alignment.pole_steps import moving_alone
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
@@ -97,9 +98,7 @@ def judge_seams(
     """images: cleaned.  poles: of each pair that stands on one."""
     seams = find_seams(images, rig_from_camera, workers=workers)
     names = [image.pair for image in images]
-    groups = {f"pair {name}": frozenset([name]) for name in names}
-    for pole in sorted({poles[name] for name in names if name in poles}):
-        groups[f"pole {pole}"] = frozenset(name for name in names if poles.get(name) == pole)
+    groups = moving_alone(names, poles)
     seen = {image.pair: np.count_nonzero(image.valid) for image in images}
     enough = [name for name in names if seen[name] > LEAST_SHARE * sum(seen.values())]
     return SeamReport(seams, groups, _untied(enough, seams))

@@ -50,7 +50,7 @@ def test_a_pole_that_moved_is_named_though_the_person_sways(
     sway_mm: float, step: list[float]
 ) -> None:
     steps = [found(seed, sway_mm, np.array(step, float)) for seed in SEEDS]
-    assert all(one is not None and one.pole == "p2" for one in steps)
+    assert all(one is not None and one.name == "pole p2" for one in steps)
     shifts = [one.shift_mm for one in steps if one]
     # The others' mean sways too.
     assert np.median(shifts) == pytest.approx(np.linalg.norm(step[:3]), abs=0.2 + sway_mm)
@@ -69,6 +69,17 @@ def test_poles_that_fire_at_one_moment_each_cannot_be_told_from_a_person() -> No
             for name in NAMES
         }
         assert find_pole_step(twists, at, POLES) is None
+
+
+def test_a_pair_that_moved_by_itself_is_named() -> None:
+    rng = np.random.default_rng(0)
+    twists = {name: 0.1 * rng.standard_normal(6) * [0, 0, 0, 1, 1, 1] for name in NAMES}
+    twists["p1-2"] += [0, 0, 0, 3.0, 0, 0]
+    at = dict(zip(NAMES, (SEQUENCE_MS * np.arange(12)).tolist(), strict=True))
+    step = find_pole_step(twists, at, POLES)
+    assert step is not None
+    assert step.name == "pair p1-2"
+    assert step.shift_mm == pytest.approx(3.0, abs=0.3)  # three sigmas of its own place
 
 
 def test_without_moments_nobody_can_tell() -> None:
