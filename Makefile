@@ -35,7 +35,7 @@ test: setup
 	$(BIN)/python -m pytest $(PARALLEL)
 
 test-quick: setup
-	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
+	$(BIN)/python -m pytest $(PARALLEL) -m "not slow" --hypothesis-profile=quick
 
 coverage: setup
 	$(BIN)/python -m pytest $(PARALLEL) --cov --cov-report=term:skip-covered

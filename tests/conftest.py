@@ -26,6 +26,7 @@ from bodyscan.settings import FusionSettings, MeshSettings
 # What is compiled is compiled at its first call, and machines may be loaded. In CI the same examples
 # are tried every time, so that a change is judged by itself; elsewhere new ones are looked for.
 settings.register_profile("bodyscan", deadline=None, derandomize=IN_CI)
+settings.register_profile("quick", settings.get_profile("bodyscan"), max_examples=20)
 settings.load_profile("bodyscan")
 
 PROJECT = Path(__file__).parents[1]

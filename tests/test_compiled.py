@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from bodyscan.compiled import compiled
 
@@ -59,6 +60,7 @@ print(twice())
 """
 
 
+@pytest.mark.slow
 def test_a_change_of_a_called_function_in_another_file_is_noticed(tmp_path: Path) -> None:
     def says(step: int) -> int:
         (tmp_path / "called.py").write_text(CALLED.format(step=step))

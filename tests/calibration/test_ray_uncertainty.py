@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from picture_boards import HEIGHT, MIDDLE, NOISE_PX, POINTS, WIDTH
 
 from bodyscan.calibration.board_views import PlanarView
@@ -48,6 +49,7 @@ def errors_px(true: Camera, found: Camera, covered: float) -> np.ndarray:
     return np.sqrt(np.mean(left**2, axis=1)).reshape(pixels.shape[:2])
 
 
+@pytest.mark.slow
 def test_a_camera_seen_by_boards_in_its_middle_says_how_little_it_knows_of_its_rim() -> None:
     """A quarter of the picture is covered. Errors over their sigmas at the rim."""
     ratios = []

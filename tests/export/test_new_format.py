@@ -76,6 +76,7 @@ def test_names_are_known_without_importing_what_writes_them() -> None:
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_its_file_in_the_folder_is_all_it_needs(tmp_path: Path) -> None:
     make_scan(tmp_path / "scan")
     call = ("export", "scan", "--format", "xyz")

@@ -40,6 +40,7 @@ def day(made: Path, tmp_path: Path) -> Path:
     return shutil.copytree(made, tmp_path, dirs_exist_ok=True)
 
 
+@pytest.mark.slow
 def test_any_byte_that_changed_is_found(day: Path) -> None:
     kinds = cheap_job.kinds()
     clean = verify(day / "out", kinds)

@@ -65,6 +65,7 @@ def some_s(seed: int, rising: bool) -> Floats:
     return (s if rising else STRIPES - s).clip(0.0, STRIPES).astype(np.float32)
 
 
+@pytest.mark.slow
 @given(
     st.floats(400.0, 800.0),
     st.floats(-3.0, 3.0),

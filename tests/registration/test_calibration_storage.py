@@ -190,6 +190,7 @@ def stored_now(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @given(st.data())
 def test_no_value_is_changed_unseen(stored_now: Path, data: st.DataObject) -> None:
     content = read(stored_now)

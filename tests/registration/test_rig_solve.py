@@ -36,6 +36,7 @@ def test_twelve_cameras_are_placed() -> None:
     assert not outcome.notes
 
 
+@pytest.mark.slow
 def test_sigmas_of_positions_are_honest() -> None:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     normalized = []
@@ -50,6 +51,7 @@ def test_sigmas_of_positions_are_honest() -> None:
     assert 0.75 < np.sqrt(np.mean(np.square(normalized))) < 1.3
 
 
+@pytest.mark.slow
 def test_wrong_views_are_found_and_named() -> None:
     placings, cameras = ring_of_cameras()
     views, _ = ring_views(placings, cameras)
@@ -80,6 +82,7 @@ def test_two_groups_without_a_shared_view_are_named() -> None:
     assert "capture shots in which" in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("columns", "faces"), [(9, 1), (9, 2), (10, 2)])
 def test_plain_boards_numbered_from_either_end_are_resolved(
     columns: int, faces: Literal[1, 2]
@@ -203,6 +206,7 @@ def near(placing: RigidTransform) -> NominalPose:
     )
 
 
+@pytest.mark.slow
 def test_skew_and_aspect_that_were_not_known_neither_harm_nor_stay_unsaid() -> None:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     rng = np.random.default_rng(11)

@@ -121,6 +121,7 @@ def test_ellipsoids_are_as_large_as_the_covariance_says(calibration: RigCalibrat
         assert middle == pytest.approx(placing.translation, abs=1.0)
 
 
+@pytest.mark.slow
 def test_everything_is_said_and_read_back_from_disk(
     calibration: RigCalibration, tmp_path: Path
 ) -> None:

@@ -163,6 +163,7 @@ def test_every_number_can_be_changed() -> None:
     assert settings.projection.kind == "pinhole"
 
 
+@pytest.mark.slow
 def test_what_moves_is_seen_where_it_is_when_each_frame_is_taken() -> None:
     """A white square before a dark wall: frame by frame its image is that of a still one there."""
     square = wall(900.0, 300.0, albedo=0.8)
@@ -187,6 +188,7 @@ def test_what_moves_is_seen_where_it_is_when_each_frame_is_taken() -> None:
         assert np.count_nonzero((images["dark"] > 5.0) != there) > 0 or frame == "dark"
 
 
+@pytest.mark.slow
 def test_a_scan_of_a_living_person_with_its_truth(tmp_path: Path) -> None:
     rig = PROJECT / "rigs" / "three-pole-12.yaml"
     settings = replace(SimulationSettings(), person=STANDING)

@@ -175,6 +175,7 @@ def test_black_and_white_squares_are_crossed() -> None:
     assert np.abs(off).max() < 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keys", [HIERARCHICAL, HETERODYNE], ids=str)
 def test_parts_of_grey_levels_are_used(keys: dict[str, Any]) -> None:
     """In dim light, of which a camera of 12 bits sees more than one of 8."""

@@ -127,6 +127,11 @@ class Scene:
         rays = self.camera.rays(pixels)
         return rays * (normal @ camera_from_board.translation / (rays @ normal))[:, None]
 
+    def on_board(self, pixels: Array, camera_from_board: RigidTransform) -> Array:
+        """Where pixels' rays meet the board, (N, 2) mm, board frame."""
+        met = camera_from_board.inverse().apply(self.on_plane(pixels, camera_from_board))
+        return met[:, :2]
+
     def crossings(
         self, camera_from_board: RigidTransform, every_px: int = 8
     ) -> tuple[Indices, Array]:
@@ -136,27 +141,34 @@ class Scene:
         lines = np.arange(0.0, width if tall else height, every_px)
         wanted = np.arange(1.0, self.projector.stripes)
 
-        def stripe(line: Array, place: Array) -> tuple[Array, Array]:
-            pixels = np.column_stack([line, place] if tall else [place, line])
-            return self.projector.stripe(self.on_plane(pixels, camera_from_board)), pixels
+        def pixels_at(line: Array, place: Array) -> Array:
+            return np.column_stack([line, place] if tall else [place, line])
+
+        def stripe(line: Array, place: Array) -> Array:
+            met = self.on_plane(pixels_at(line, place), camera_from_board)
+            return self.projector.stripe(met)
 
         coarse = np.linspace(0.0, height if tall else width, 40)
-        first = stripe(np.repeat(lines, 40), np.tile(coarse, len(lines)))[0].reshape(-1, 40)
+        first = stripe(np.repeat(lines, 40), np.tile(coarse, len(lines))).reshape(-1, 40)
         rises = 1 if first[0, -1] > first[0, 0] else -1
         place = np.stack(
             [np.interp(wanted, row[::rises], coarse[::rises]) for row in first]
         ).ravel()
         line, wanted = np.repeat(lines, len(wanted)), np.tile(wanted, len(lines))
         with np.errstate(all="ignore"):
+            # Most of the picture is beside the board: no need to look there any closer.
+            on_board = self.on_board(pixels_at(line, place), camera_from_board)
+            near = np.all((on_board > -self.square) & (on_board < self.size + self.square), axis=1)
+            line, wanted, place = line[near], wanted[near], place[near]
             for _ in range(3):
-                s = stripe(line, place)[0]
-                slope = (stripe(line, place + 0.5)[0] - s) / 0.5
+                s = stripe(line, place)
+                slope = (stripe(line, place + 0.5) - s) / 0.5
                 place = place - (s - wanted) / slope
-            s, pixels = stripe(line, place)
-            on_board = camera_from_board.inverse().apply(self.on_plane(pixels, camera_from_board))
+            s, pixels = stripe(line, place), pixels_at(line, place)
+            on_board = self.on_board(pixels, camera_from_board)
         seen = (np.abs(s - wanted) < 1e-6) & np.all(pixels > 0, axis=1)
         seen &= np.all(pixels < [width - 1, height - 1], axis=1)
-        seen &= np.all((on_board[:, :2] > 0) & (on_board[:, :2] < self.size), axis=1)
+        seen &= np.all((on_board > 0) & (on_board < self.size), axis=1)
         return wanted[seen].astype(np.int64), pixels[seen]
 
     def boundaries(

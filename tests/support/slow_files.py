@@ -1,4 +1,4 @@
-"""Files whose tests take seconds each, the longest first: `make test-quick` leaves them out.
+"""Files whose tests take a second or more each, the longest first: `make test-quick` leaves them out.
 
 Whole runs begin with them, and those that need the simulated workspace stand next to those that do
 not, so that no worker makes another wait: neither for the workspace nor at the end.
@@ -15,7 +15,6 @@ SLOW = (
     "workflows/test_check_calibration.py",
     "workflows/test_example_scan.py",
     "workflows/test_whole_way.py",
-    "workflows/test_import_rig.py",
     "workflows/test_any_subset.py",
     "examples/test_examples.py",
     "jobs/test_resuming.py",
@@ -29,6 +28,26 @@ SLOW = (
     "fusion/test_smoothing.py",
     "fusion/test_support.py",
     "mesh/test_versions.py",
+    "fusion/test_seams.py",
+    "fusion/test_cleaning.py",
+    "alignment/test_following.py",
+    "calibration/test_refinement_choice.py",
+    "calibration/test_stripe_agreement.py",
+    "calibration/test_crossing_stripes.py",
+    "calibration/test_lens_choice.py",
+    "laboratory/test_rival_projectors.py",
+    "simulation/test_board_plan.py",
+    "registration/test_drift.py",
+    "registration/test_known_cameras.py",
+    "registration/test_board_shape.py",
+    "registration/test_rig_lenses.py",
+    "stripes/test_two_frequency.py",
+    "stripes/test_gray_jpeg.py",
+    "reconstruction/test_told_motion.py",
+    "jobs/test_object_storage.py",
+    "jobs/test_planning.py",
+    "report/test_report.py",
+    "workflows/test_nothing_is_lost.py",
     "boards/test_detection.py",
     "calibration/test_joint_refinement.py",
     "calibration/test_light_sheets_fitted.py",

@@ -137,14 +137,15 @@ def render(
     s, brightness = s_at(u, v), albedo(u, v)
     on = np.isfinite(s) & (s >= 0) & (s < stripes)
     rng = np.random.default_rng(seed)
-    background = np.where(np.isfinite(s), ambient, 0.0)
+    background = (np.where(np.isfinite(s), ambient, 0.0) * brightness).astype(np.float32)
+    lit_share = np.where(on, light * brightness, 0.0).astype(np.float32)
+    place = places_in_table(np.where(on, s, 0.0), stripes)
 
     def frame(values: np.ndarray) -> np.ndarray:
         table = smeared(values.astype(float), light_blur_stripes, len(values) // stripes)
-        share = np.where(on, table(np.where(on, s, 0.0)), 0.0)
-        fine = (background + light * share) * brightness
-        image = cv2.GaussianBlur(fine, (0, 0), lens_blur_px * n)
-        image = image.reshape(height, n, width, n).mean(axis=(1, 3))
+        fine = background + lit_share * table.astype(np.float32)[place]
+        blurred = cv2.GaussianBlur(fine, (0, 0), lens_blur_px * n)
+        image = cv2.resize(blurred, (width, height), interpolation=cv2.INTER_AREA)
         image = image + rng.normal(0.0, noise, image.shape)
         return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
@@ -158,19 +159,25 @@ def render(
     )
 
 
-def smeared(values: np.ndarray, blur: float, parts: int = 1) -> Callable[[np.ndarray], np.ndarray]:
-    """Light against s, smeared by a Gaussian of `blur` stripes; beyond the ends as there.
+TABLE_PER_STRIPE, TABLE_AHEAD = 64, 4
+
+
+def smeared(values: np.ndarray, blur: float, parts: int = 1) -> np.ndarray:
+    """Table of the light against s, smeared by a Gaussian of `blur` stripes; beyond the ends as there.
 
     values: of each stripe, or of each of its `parts`.
     """
-    fine = 64
-    padded = np.pad(values, 4 * parts, mode="edge").repeat(fine // parts)
+    fine = TABLE_PER_STRIPE
+    table = np.pad(values, TABLE_AHEAD * parts, mode="edge").repeat(fine // parts)
     if blur > 0:
         reach = int(4 * blur * fine) + 1
         kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / fine / blur) ** 2)
-        padded = np.convolve(padded, kernel / kernel.sum(), mode="same")
+        table = np.convolve(table, kernel / kernel.sum(), mode="same")
+    return table
 
-    def light(s: np.ndarray) -> np.ndarray:
-        return padded[np.clip(((s + 4) * fine).astype(int), 0, len(padded) - 1)]
 
-    return light
+def places_in_table(s: np.ndarray, stripes: int) -> np.ndarray:
+    """Where values of s stand in the table that `smeared` makes of so many stripes."""
+    last = (stripes + 2 * TABLE_AHEAD) * TABLE_PER_STRIPE - 1
+    place = ((s + TABLE_AHEAD) * TABLE_PER_STRIPE).astype(np.int32)
+    return np.asarray(np.clip(place, 0, last))
