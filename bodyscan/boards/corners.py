@@ -13,6 +13,7 @@ board are fitted at once.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ from scipy.special import erf
 
 from bodyscan.arrays import Array, Bytes, Indices, Mask
 from bodyscan.boards.appearance import AS_PRINTED, Appearance
+from bodyscan.compiled import compiled
 from bodyscan.geometry.least_squares import StackedEquations, minimize_each
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.scaled_systems import solve_scaled
@@ -199,7 +201,7 @@ def _fit(patches: _Patches, start: Array, along: Array, light: _Light | None = N
     state[:, 5:] = _linear(patches, state)
 
     def equations(state: Array) -> StackedEquations:
-        own = StackedEquations.of(*_linearized(patches, state), patches.weight)
+        own = _equations(patches, state)
         return light.added(own, state) if light else own
 
     def within(state: Array) -> Array:
@@ -220,8 +222,10 @@ def _fit(patches: _Patches, start: Array, along: Array, light: _Light | None = N
 
 def _linear(patches: _Patches, state: Array) -> Array:
     """b, a and g (N, 4) by least squares for given edges."""
-    edges, *_ = _edges(patches, state)
     relative = patches.place - state[:, None, :2]
+    cos, sin = np.cos(state[:, None, 2:4]), np.sin(state[:, None, 2:4])
+    across = relative[..., :1] * cos + relative[..., 1:] * sin
+    edges = erf(across / (np.sqrt(2.0) * state[:, None, 4:5]))
     design = np.concatenate(
         [edges.prod(axis=-1)[..., None], np.ones_like(relative[..., :1]), relative], axis=-1
     )
@@ -230,36 +234,56 @@ def _linear(patches: _Patches, state: Array) -> Array:
     return solve_scaled(normal, np.einsum("npi,np->ni", weighted, patches.grey))
 
 
-def _edges(patches: _Patches, state: Array) -> tuple[Array, Array, Array, Array]:
-    """E (N, P, 2) of both edges, its slope, distances to the edges, and distances along them."""
-    relative = patches.place - state[:, None, :2]
-    cos, sin = np.cos(state[:, None, 2:4]), np.sin(state[:, None, 2:4])
-    across = relative[..., :1] * cos + relative[..., 1:] * sin
-    lengthwise = relative[..., 1:] * cos - relative[..., :1] * sin
-    blur = state[:, None, 4:5]
-    slope = np.sqrt(2.0 / np.pi) / blur * np.exp(-0.5 * (across / blur) ** 2)
-    return erf(across / (np.sqrt(2.0) * blur)), slope, across, lengthwise
+def _equations(patches: _Patches, state: Array) -> StackedEquations:
+    """Normal equations of every corner's fit at a state (N, 9)."""
+    return StackedEquations(*sum_equations(patches.place, patches.grey, patches.weight, state))
 
 
-def _linearized(patches: _Patches, state: Array) -> tuple[Array, Array]:
-    """Residuals (N, P), grey levels, and their derivatives (N, P, 9)."""
-    edges, slope, across, lengthwise = _edges(patches, state)
-    relative = patches.place - state[:, None, :2]
-    b, a, g = state[:, 5, None], np.maximum(state[:, 6, None], MIN_CONTRAST), state[:, 7:]
-    product = edges.prod(axis=-1)
-    squares, light = a + b * product, 1.0 + np.einsum("npi,ni->np", relative, g) / a
-    residual = squares * light - patches.grey
-    # b times the other edge's value: what a change of one edge's value is worth.
-    worth = (b * light)[..., None] * edges[..., ::-1] * slope
-    cos, sin = np.cos(state[:, None, 2:4]), np.sin(state[:, None, 2:4])
-    jacobian = np.empty((*product.shape, 9))
-    along_light = (squares / a)[..., None]
-    jacobian[..., :2] = -along_light * g[:, None]
-    jacobian[..., 0] -= (worth * cos).sum(axis=-1)
-    jacobian[..., 1] -= (worth * sin).sum(axis=-1)
-    jacobian[..., 2:4] = worth * lengthwise
-    jacobian[..., 4] = -(worth * across).sum(axis=-1) / state[:, 4, None]
-    jacobian[..., 5] = product * light
-    jacobian[..., 6] = light - squares * (light - 1.0) / a
-    jacobian[..., 7:] = along_light * relative
-    return residual, jacobian
+@compiled
+def sum_equations(
+    place: Array, grey: Array, weight: Array, state: Array
+) -> tuple[Array, Array, Array, Array]:
+    """What `StackedEquations` holds, of pixels and weights as in `_Patches` at states (N, 9).
+
+    Compiled, for it is most of the time in which boards are found: pixels without weight cost
+    nothing, and no derivative is stored.
+    """
+    count, pixels = grey.shape
+    normal, gradient = np.zeros((count, 9, 9)), np.zeros((count, 9))
+    cost, freedoms = np.zeros(count), np.zeros(count)
+    by = np.empty(9)
+    for n in range(count):
+        blur, b, a = state[n, 4], state[n, 5], max(state[n, 6], MIN_CONTRAST)
+        steep = math.sqrt(2.0 / math.pi) / blur
+        cos1, sin1 = math.cos(state[n, 2]), math.sin(state[n, 2])
+        cos2, sin2 = math.cos(state[n, 3]), math.sin(state[n, 3])
+        for p in range(pixels):
+            if weight[n, p] == 0.0:
+                continue
+            x, y = place[n, p, 0] - state[n, 0], place[n, p, 1] - state[n, 1]
+            across1, across2 = x * cos1 + y * sin1, x * cos2 + y * sin2
+            edge1 = math.erf(across1 / (math.sqrt(2.0) * blur))
+            edge2 = math.erf(across2 / (math.sqrt(2.0) * blur))
+            squares = a + b * edge1 * edge2
+            light = 1.0 + (x * state[n, 7] + y * state[n, 8]) / a
+            residual = squares * light - grey[n, p]
+            # b times the other edge's value: what a change of one edge's value is worth.
+            worth1 = b * light * edge2 * steep * math.exp(-0.5 * (across1 / blur) ** 2)
+            worth2 = b * light * edge1 * steep * math.exp(-0.5 * (across2 / blur) ** 2)
+            by[0] = -squares / a * state[n, 7] - worth1 * cos1 - worth2 * cos2
+            by[1] = -squares / a * state[n, 8] - worth1 * sin1 - worth2 * sin2
+            by[2], by[3] = worth1 * (y * cos1 - x * sin1), worth2 * (y * cos2 - x * sin2)
+            by[4] = -(worth1 * across1 + worth2 * across2) / blur
+            by[5], by[6] = edge1 * edge2 * light, light - squares * (light - 1.0) / a
+            by[7], by[8] = squares / a * x, squares / a * y
+            for i in range(9):
+                weighted = weight[n, p] * by[i]
+                gradient[n, i] += weighted * residual
+                for j in range(i + 1):
+                    normal[n, i, j] += weighted * by[j]
+            cost[n] += weight[n, p] * residual**2
+            freedoms[n] += weight[n, p]
+        for i in range(9):
+            for j in range(i):
+                normal[n, j, i] = normal[n, i, j]
+    return normal, gradient, cost, np.maximum(freedoms - 9.0, 1.0)

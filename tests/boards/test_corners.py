@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from board_rendering import render, true_corners, view_of
 from edge_lines import refine_by_lines
+from scipy.special import erf
 
 from bodyscan.arrays import Array, Bytes
 from bodyscan.boards.board_map import fit_board_map
-from bodyscan.boards.corners import refine_corners
+from bodyscan.boards.corners import refine_corners, sum_equations
+from bodyscan.geometry.least_squares import StackedEquations
 from bodyscan.rig.board import Board
 
 BOARD = Board(name="plain", columns=9, rows=6, square_mm=50, margin_mm=25)
@@ -91,3 +93,34 @@ def test_light_that_falls_off_over_a_tilted_board_moves_no_corner() -> None:
     # All corners of a view moved alike is what a rig suffers from most: it goes into the board's
     # place. 0.0024 px here; with the light taken for a slope added to the squares 0.018.
     assert np.all(np.abs(np.mean(shifts, axis=0)) < 0.004)
+
+
+def test_compiled_equations_are_those_of_the_corner_s_image() -> None:
+    rng = np.random.default_rng(4)
+    place = rng.uniform(-6.0, 6.0, (5, 40, 2)) + 100.0
+    grey, weight = rng.uniform(20.0, 220.0, (5, 40)), (rng.random((5, 40)) < 0.7).astype(float)
+    state = np.tile([100.0, 100.0, 0.3, 1.7, 0.9, 60.0, 110.0, 0.5, -0.3], (5, 1))
+    state += 0.1 * rng.standard_normal(state.shape)
+
+    def residuals(state: Array) -> Array:
+        """The formula at the head of `corners`, less what is seen."""
+        off = place - state[:, None, :2]
+        one, two = (
+            erf((off @ np.stack([np.cos(angle), np.sin(angle)], -1)[..., None])[..., 0] / blur)
+            for angle in (state[:, 2], state[:, 3])
+            for blur in [np.sqrt(2.0) * state[:, 4:5]]
+        )
+        a, b = state[:, 6:7], state[:, 5:6]
+        light = 1.0 + np.einsum("npi,ni->np", off, state[:, 7:]) / a
+        return np.asarray((a + b * one * two) * light - grey)
+
+    step = 1e-5
+    ways = step * np.eye(9)
+    slopes = [(residuals(state + way) - residuals(state - way)) / (2 * step) for way in ways]
+    plain = StackedEquations.of(residuals(state), np.stack(slopes, axis=-1), weight)
+    found = StackedEquations(*sum_equations(place, grey, weight, state))
+    for name in ("normal", "gradient", "cost", "freedoms"):
+        expected = getattr(plain, name)
+        # central differences of 1e-5 px are good to 1e-9 of the greatest entry
+        scale = np.abs(expected).max()
+        assert getattr(found, name) == pytest.approx(expected, abs=1e-7 * scale), name
