@@ -20,6 +20,7 @@ from pathlib import Path
 from benchmarks import (
     charuco_ring,
     codes,
+    costs,
     faults,
     full_size,
     fusion,
@@ -41,6 +42,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "fusion": fusion.report,
     "faults": faults.report,
     "seconds": seconds.report,
+    "costs": costs.report,
     "png": png.report,
     "rig": rig.report,
     "procam": procam.report,
