@@ -63,6 +63,7 @@ def _living(preset: str) -> str:
 def _report(title: str, rig: str, subject: str) -> str:
     workspace = PROJECT / "bench" / rig
     commands = _commands(PROJECT / "rigs" / f"{rig}.yaml", workspace, _subject(subject))
+    commands["simulate"] += ["--subject-preset", "mannequin"]  # people are `living`
     outputs, seconds, memory = run_commands(commands, workspace)
     rows = "\n".join(f"| `{name}` | {seconds[name]:.1f} | {memory[name]:.1f} |" for name in outputs)
     return f"""## {title}, full size (synthetic)

@@ -1,7 +1,7 @@
 """How a person's surface moved between the pairs' moments, from all overlaps together.
 
 Three kinds of motion share what the overlaps ask for: the whole body sways, parts of it shift and
-turn, its surface bulges with breath. Each is a Gaussian process over surface and time, as large as
+turn, the trunk breathes. Each is a Gaussian process over surface and time, as large as
 the evidence says; beside them stands what the boards left open of the pairs' poses.
 """
 
@@ -16,7 +16,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 
-from bodyscan.alignment.body_cells import BodyCells, modulated, normal_field, rigid_fields
+from bodyscan.alignment.body_cells import BodyCells, modulated, rigid_fields
+from bodyscan.alignment.breath import breath_fields
 from bodyscan.alignment.cell_evidence import CellEvidence
 from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.moments import Courses, of_breath, of_stance
@@ -25,11 +26,15 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.scaled_systems import invert_scaled
 
 PART_MM = 350.0  # how far what moves as one reaches: an arm, a thigh, a shoulder girdle
-BULGE_MM = 130.0  # a chest that rises, a belly
-LEAST_PART, LEAST_BULGE = 0.02, 0.01
+LEAST_PART = 0.02
 ARM_MM = 400.0  # at which a part's turn displaces as much as its shift
 FIRST_MM = 1.0
 SMALLEST_MM = 1e-3
+BREATH_MM = 1.5
+"""A chest or belly rises by 2 to 8 mm at rest; 4 are 1.4 of standard deviation. Limbs' motion would
+explain most of a breath too, so that evidence alone makes it too small: there is this or none."""
+ANY = 0.1
+"""Of what is usual; a statue that sways shows a thirtieth, calibrations bend by less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +42,7 @@ class Kind:
     """One kind of motion: displacement fields (C, 12, M), mm, each along J courses.
 
     size: standard deviation of their amplitudes before anything was seen; precision: (M J, M J), in
-    its place, where it is known.
+    its place, where it is known.  usual: of size at least, where the evidence asks for any.
     """
 
     name: str
@@ -45,6 +50,7 @@ class Kind:
     courses: Courses
     size: float = FIRST_MM
     precision: Array | None = None
+    usual: float = SMALLEST_MM
 
     @property
     def count(self) -> int:
@@ -58,6 +64,11 @@ class Kind:
     @property
     def prior(self) -> Array:
         return np.eye(self.count) / self.size**2 if self.precision is None else self.precision
+
+    def resized(self, size: float) -> Kind:
+        """As large as the evidence says."""
+        least = self.usual if size > ANY * self.usual else SMALLEST_MM
+        return replace(self, size=max(size, least))
 
     def during(self, pair: int) -> Array:
         """(J,) courses from the middle to a pair's moment; of the pairs' own errors at that moment."""
@@ -85,12 +96,12 @@ class BodyMotion:
         known = invert_scaled(boards)[np.ix_(by_freedom, by_freedom)]
         part = rigid_fields(cells, cells.centres.mean(axis=0), ARM_MM)
         limbs = modulated(part, cells, cells.alike(PART_MM, LEAST_PART))
-        bulge = modulated(normal_field(cells), cells, cells.alike(BULGE_MM, LEAST_BULGE))
+        breath = breath_fields(cells)
         kinds = (
             Kind("pose", rigid_fields(cells, np.zeros(3), 1.0), Courses.steady(pairs), 1.0, known),
             Kind("sway", rigid_fields(cells, BODY_CENTRE, 1.0) * sway, stance, 2.0),
             Kind("parts", limbs, stance),
-            Kind("bulge", bulge, Courses.of(of_breath, seconds)),
+            Kind("breath", breath, Courses.of(of_breath, seconds), BREATH_MM, usual=BREATH_MM),
         )
         count = sum(kind.count for kind in kinds)
         return BodyMotion(kinds, sway, np.zeros(count), np.zeros((count, count)))
@@ -131,14 +142,21 @@ class BodyMotion:
     ) -> BodyMotion:
         """One step of all amplitudes; every round matches anew. evidence: by pairs (a, b).  speeds: by
         pair, as its own stripes tell them."""
-        names = [kind.name for kind in self.kinds]
+        names, speeds = [kind.name for kind in self.kinds], speeds or {}
         now = self.displacements(names)
         asked = [self._asked(e, now[a] - now[b]) for (a, b), e in evidence.items()]
+        asked += [told.asked(self.fields) for told in speeds.values()]
         squares, pulls = zip(*asked, strict=True)
         square, pull = np.array(squares), np.array(pulls)
         first, second = np.array(list(evidence)).T
+        alone = np.array(list(speeds), np.int64)
         ends = np.cumsum([0, *(kind.fields.shape[2] for kind in self.kinds)])
-        apart = [k.courses.values[first] - k.courses.values[second] for k in self.kinds]
+        apart = [
+            np.concatenate(
+                [k.courses.values[first] - k.courses.values[second], k.courses.speeds[alone]]
+            )
+            for k in self.kinds
+        ]
         normal, right = np.zeros((len(self.amplitudes),) * 2), np.zeros(len(self.amplitudes))
         for g, kind in enumerate(self.kinds):
             own, rows = slice(ends[g], ends[g + 1]), self.slices[g]
@@ -149,20 +167,7 @@ class BodyMotion:
                     kind.count, other.count
                 )
             normal[rows, rows] += kind.prior
-        for pair, told in (speeds or {}).items():
-            rates = told.combined @ self.rates(pair, told.cells, told.normals)
-            normal += rates.T @ rates
-            right += rates.T @ told.speeds
         return self._settled(normal, right)
-
-    def rates(self, pair: int, cells: Indices, normals: Array) -> Array:
-        """(c, n): the speed along normals (c, 3) that each amplitude gives cells at a pair's moment."""
-        return np.hstack(
-            [
-                _along(kind, cells, normals, kind.courses.speeds[pair] * kind.moves)
-                for kind in self.kinds
-            ]
-        )
 
     def _asked(self, seen: CellEvidence, apart: Array) -> tuple[Array, Array]:
         """What an overlap asks of the fields, (M, M) and (M,); apart: (C, 12) of its two pairs now."""
@@ -187,7 +192,7 @@ class BodyMotion:
         for kind, some in zip(self.kinds, self.slices, strict=True):
             told = kind.count - np.trace(self.covariance[some, some]) / kind.size**2
             size = np.sqrt(np.sum(self.amplitudes[some] ** 2) / max(told, 1e-6))
-            kinds.append(replace(kind, size=max(float(size), SMALLEST_MM)) if kind.moves else kind)
+            kinds.append(kind.resized(float(size)) if kind.moves else kind)
         return replace(self, kinds=tuple(kinds))
 
 
@@ -202,6 +207,14 @@ def _products(block: Array, first: Array, second: Array) -> Array:
 def _along(kind: Kind, cells: Indices, normals: Array, course: Array) -> Array:
     along = np.einsum("cim,ci->cm", kind.fields[cells, :3], normals)
     return (along[:, :, None] * course).reshape(len(cells), -1)
+
+
+def field_sigmas(motion: BodyMotion, name: str, course: Array, normals: Array) -> Array:
+    """(C,) standard deviations along normals (C, 3) of what one kind comes to with courses (J,)."""
+    kind = motion.kind(name)
+    own = motion.slices[motion.kinds.index(kind)]
+    rows = _along(kind, np.arange(len(normals)), normals, course)
+    return np.sqrt(np.sum((rows @ motion.covariance[own, own]) * rows, axis=1))
 
 
 def observed(motion: BodyMotion, pair: int, cells: Indices, normals: Array) -> Array:

@@ -6,18 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.alignment.body_cells import BodyCells
+from bodyscan.alignment.breath import breathing
 from bodyscan.alignment.following import Followed
-from bodyscan.arrays import Array, Indices
+from bodyscan.alignment.part_names import PARTS, name_parts
 
-PARTS = ("trunk", "head", "left arm", "right arm", "left leg", "right leg")
-# Shares of the stature (Drillis and Contini 1966, rounded): where head and legs begin, how far it is
-# through the body from the navel to a fingertip at least, and from there to the shoulder.
-NECK, NAVEL, CROTCH, KNEE, TO_FINGERTIP, ARM = 0.86, 0.6, 0.47, 0.29, 0.35, 0.38
-FOOT, ANKLE, SHIN = 0.03, 0.05, 0.15
 MOST = 95.0
 ONE_WAY = 0.6  # of a breath's displacements goes outwards together
 SURE_SIGMAS = 4.0
+SHOWS = 0.5  # of a breath
 
 
 @dataclass(frozen=True)
@@ -39,15 +35,23 @@ class PartMotion:
 @dataclass(frozen=True)
 class PersonMotion:
     """How each part moved that was seen, from the trunk outwards; breathed_mm: see `tell_breath`.
-    moment_ms: since the scan began, as of which all is; None (the mean of all) without times."""
+    moment_ms: since the scan began, as of which all is; None (the mean of all) without times.
+    fuller_mm, fuller_sigma_mm: see `tell_fullness`."""
 
     parts: tuple[PartMotion, ...]
     breathed_mm: float | None
     moment_ms: float | None
+    fuller_mm: float | None = None
+    fuller_sigma_mm: float | None = None
 
     @staticmethod
     def of(followed: Followed) -> PersonMotion:
-        return PersonMotion(tell_parts(followed), tell_breath(followed), followed.moment_ms)
+        return PersonMotion(
+            tell_parts(followed),
+            tell_breath(followed),
+            followed.moment_ms,
+            *(tell_fullness(followed) or (None, None)),
+        )
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -57,7 +61,17 @@ class PersonMotion:
             if self.breathed_mm is None
             else f"breathed by {self.breathed_mm:.1f} mm, carried to one moment"
         )
-        return (*(part.words for part in self.parts), breath)
+        return (*(part.words for part in self.parts), breath, *self._fullness)
+
+    @property
+    def _fullness(self) -> tuple[str, ...]:
+        if self.fuller_mm is None or self.fuller_sigma_mm is None:
+            return ()
+        side = "before" if self.fuller_mm > 0 else "behind"
+        return (
+            f"chest and belly stood {abs(self.fuller_mm):.1f} mm {side} their place at mean breath, "
+            f"known to {self.fuller_sigma_mm:.1f}: girths are given at mean breath",
+        )
 
 
 def tell_parts(followed: Followed) -> tuple[PartMotion, ...]:
@@ -99,32 +113,13 @@ def tell_breath(followed: Followed) -> float | None:
     return rise if one_way and sure else None
 
 
-def name_parts(cells: BodyCells) -> Indices:
-    """(C,) number in PARTS of the part that each cell belongs to, whichever way the person faces."""
-    stature = float(cells.centres[:, 2].max())
-    height = cells.centres[:, 2] / stature
-    off = cells.centres[:, :2] - np.median(cells.centres[:, :2], axis=0)
-    sideways = off @ _leftward(cells, height) / stature
-    part = np.where(height > NECK, PARTS.index("head"), PARTS.index("trunk"))
-    part[height < CROTCH] = PARTS.index("right leg")
-    part[(height < CROTCH) & (sideways > 0.0)] = PARTS.index("left leg")
-    navel = int(np.argmin(np.abs(height - NAVEL) + np.abs(sideways)))
-    from_navel = cells.distances(np.array([navel]))[0] / stature
-    hands = (height > KNEE) & (height < NECK)
-    for name, way in (("left arm", sideways), ("right arm", -sideways)):
-        tip = int(np.argmax(np.where(hands, way, -np.inf)))
-        if from_navel[tip] > TO_FINGERTIP:
-            from_tip = cells.distances(np.array([tip]))[0] / stature
-            part[from_tip < ARM] = PARTS.index(name)
-    return part
-
-
-def _leftward(cells: BodyCells, height: Array) -> Array:
-    """(2,) to the subject's left: toes point forward, and who stands on none faces the rig's x."""
-    feet, shins = height < FOOT, (height > ANKLE) & (height < SHIN)
-    forward = np.array([1.0, 0.0])
-    if feet.any() and shins.any():
-        toes = cells.centres[feet, :2].mean(axis=0) - cells.centres[shins, :2].mean(axis=0)
-        if np.linalg.norm(toes) > 0.01 * cells.centres[:, 2].max():
-            forward = toes / np.linalg.norm(toes)
-    return np.array([-forward[1], forward[0]])
+def tell_fullness(followed: Followed) -> tuple[float, float] | None:
+    """How far the front of the trunk stood before its place at mean breath, mm, in the mean, and the
+    standard deviation of that; None without moments or without a trunk."""
+    breathes = breathing(followed.cells) > SHOWS
+    if followed.breath is None or not breathes.any():
+        return None
+    normals = followed.cells.normals[breathes]
+    way = np.sum(followed.breath.field[breathes, :3] * normals, axis=1)
+    # What is not known is the course of the breath, which all of it has in common.
+    return -float(np.mean(way)), float(np.sqrt(np.mean(followed.breath.sigma_mm[breathes] ** 2)))

@@ -6,64 +6,61 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.alignment.body_cells import BodyCells
+from bodyscan.alignment.body_cells import CELL_MM, BodyCells
 from bodyscan.arrays import Array, Indices
-from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
-from bodyscan.geometry.velocity import SpeedField
-from bodyscan.reconstruction.range_image import RangeImage
-
-SLACK = np.array([1e-3, 1e-3, 1e-3, 0.5, 0.5, 0.5])
-"""rad/s and mm/s: how far the rigid part of what is not rigid depends on what was looked at."""
-LEAST_FACING = 0.3
-ARM_MM = 300.0  # at which a turn of what one pair saw counts as much as its shift
-LEAST_SHOWN = 1e-3
-"""of what the cells show of a freedom on average; how a ball turns nobody sees"""
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.velocity import SurfaceSpeeds
 
 
 @dataclass(frozen=True, eq=False)
 class CellSpeeds:
-    """Of speeds along their normals (c, 3) of cells (c,), against the body's own, as they carry it
-    back: `combined` (r, c) of them are `speeds` (r,), each with a standard deviation of 1."""
+    """Normal equations of the speeds (mm/s, rig frame) with which cells are carried back: against
+    the body's own.
+
+    cells: (c,).  information (c, 3, 3), gradient (c, 3).  shared: (K, c, 3), information that errors
+    which all cells share, of standard deviation 1, have in common with them; beside: (K, K) and (K,)
+    that and what was seen of these errors.
+    """
 
     cells: Indices
-    normals: Array
-    combined: Array
-    speeds: Array
+    information: Array
+    gradient: Array
+    shared: Array
+    beside: tuple[Array, Array]
 
     @staticmethod
-    def of(
-        image: RangeImage, rig_from_camera: RigidTransform, cells: BodyCells, seen: Indices
-    ) -> CellSpeeds:
-        """What a pair's velocity, which is that of a rigid body, says of the cells seen (c,): the
-        rigid motion that comes nearest to theirs is the one it tells."""
-        velocity = image.velocity
-        assert velocity is not None
-        camera_from_rig = rig_from_camera.inverse()
-        points = camera_from_rig.apply(cells.centres[seen])
-        normals = camera_from_rig.rotate(cells.normals[seen])
-        facing = -np.sum(normals * points, axis=1) > LEAST_FACING * np.linalg.norm(points, axis=1)
-        seen, points, normals = seen[facing], points[facing], normals[facing]
-        # About the cells' middle turns and shifts are told apart.
-        about = adjoint(RigidTransform(np.eye(3), points.mean(axis=0)))
-        levers = np.einsum("nc,nck->nk", normals, twist_jacobian(points - points.mean(axis=0)))
-        levers[:, :3] /= ARM_MM
-        square = levers.T @ levers
-        held = square + LEAST_SHOWN * np.trace(square) / 6.0 * np.eye(6)
-        nearest = about @ (np.linalg.solve(held, levers.T) / np.repeat([ARM_MM, 1.0], 3)[:, None])
-        across = np.sum(normals * points, axis=1) / points[:, 2]
-        twist = velocity.twist + nearest @ (_beside_rigid(velocity.field, image, points) * across)
-        slack = about @ np.diag(SLACK**2) @ about.T
-        whiten = np.linalg.inv(np.linalg.cholesky(velocity.covariance + slack))
-        return CellSpeeds(seen, cells.normals[seen], whiten @ nearest, -(whiten @ twist))
+    def of(told: SurfaceSpeeds, rig_from_camera: RigidTransform, cells: BodyCells) -> CellSpeeds:
+        """What a pair tells, each place in the cell that it lies in."""
+        points, facing = rig_from_camera.apply(told.points), rig_from_camera.rotate(told.facing)
+        normals = -facing / np.linalg.norm(facing, axis=1, keepdims=True)
+        cell = cells.find(points, normals)
+        near = np.linalg.norm(points - cells.centres[cell], axis=1) < CELL_MM
+        own, number = np.unique(cell[near], return_inverse=True)
+        weight, facing, speed = told.sigma[near] ** -2.0, facing[near], -told.speed[near]
 
+        def total(values: Array) -> Array:
+            """(c, ...) of values (n, ...)."""
+            flat = values.reshape(len(values), -1).T
+            sums = [np.bincount(number, column, len(own)).astype(float) for column in flat]
+            return np.asarray(np.stack(sums, axis=-1).reshape(len(own), *values.shape[1:]))
 
-def _beside_rigid(field: SpeedField | None, image: RangeImage, points: Array) -> Array:
-    """(n,) speeds in z beside the rigid ones at points (n, 3) of the camera's frame."""
-    if field is None or min(field.speed.shape) < 2:
-        return np.zeros(len(points))
-    from scipy.interpolate import RegularGridInterpolator  # 0.2 s, and few scans need it
+        weighted, errors = weight[:, None] * facing, told.shared[near]
+        return CellSpeeds(
+            own,
+            total(weighted[:, :, None] * facing[:, None, :]),
+            total(weighted * speed[:, None]),
+            np.moveaxis(total(errors[:, :, None] * weighted[:, None, :]), 1, 0),
+            (np.eye(errors.shape[1]) + (errors.T * weight) @ errors, errors.T @ (weight * speed)),
+        )
 
-    pixels = image.camera.project(points)[:, ::-1]
-    places = field.rows, field.columns
-    found = RegularGridInterpolator(places, field.speed, bounds_error=False)(pixels)
-    return np.nan_to_num(found)
+    def asked(self, fields: Array) -> tuple[Array, Array]:
+        """(M, M) and (M,): normal equations of the rates at which fields (C, 12, M) grow."""
+        own = fields[self.cells, :3]
+        basis = own.reshape(-1, own.shape[2])
+        shared = self.shared.reshape(len(self.shared), basis.shape[0]) @ basis
+        square, pull = self.beside
+        share = np.linalg.solve(square, shared)
+        return (
+            basis.T @ (self.information @ own).reshape(basis.shape) - shared.T @ share,
+            basis.T @ self.gradient.ravel() - share.T @ pull,
+        )

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from bodyscan.alignment.body_cells import BodyCells, displaced
-from bodyscan.alignment.body_motion import BodyMotion, observed
+from bodyscan.alignment.body_motion import BodyMotion, field_sigmas, observed
 from bodyscan.alignment.cell_evidence import CellEvidence
 from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.icp import COARSE, Alignment
@@ -38,12 +38,34 @@ from bodyscan.settings import AlignmentSettings
 
 Result = TypeVar("Result")
 
-BENDING = ("parts", "bulge")
+BENDING = ("parts", "breath")
 MOVING = ("sway", *BENDING)
 BLEND_MM = 60.0
 ROUNDS = 3  # the last with all points
+BREATH_DOUBT = 1.6
+"""Eight people cast from two simulators: the breath that was left erred by 1.65 of its sigmas, since
+nobody breathes as a sum of cosines does."""
 STILL_MM = 0.1
 """RMS of what no rigid motion explains; less does no harm, and calibrations bend by half of it."""
+
+NEARER = 0.95
+"""Overlaps that bending brings no nearer than this are apart by the pairs' own calibrations, which bend
+with the place and not with time."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeanBreath:
+    """From the middle of the scan to mean breath: displacements (C, 12) as in `Followed.bends`, and the
+    standard deviation (C,) mm along the normals of what is not known of them."""
+
+    field: Array
+    sigma_mm: Array
+
+    def along(self, cells: BodyCells, points: Array, normals: Array) -> tuple[Array, Array]:
+        """(N,) mm each, outwards, of points (N, 3) with normals (N, 3): way and sigma."""
+        cell = cells.find_many(points, normals)
+        way = displaced(self.field[cell], points - cells.centres[cell])
+        return np.sum(way * normals, axis=1), self.sigma_mm[cell]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +78,7 @@ class Followed:
     seen: (P, C) which pairs saw which cells.  sigma_mm: (C,), of a cell's surface along its normal,
     from what is not known of the motion and of the pairs' poses.
     moment_ms: the middle of the scan; None (it is the mean of all) if no pair's moment is known.
+    breath: None without moments.
     """
 
     cells: BodyCells
@@ -64,6 +87,7 @@ class Followed:
     seen: Mask
     sigma_mm: Array
     moment_ms: float | None
+    breath: MeanBreath | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,8 +164,8 @@ def follow(
         motion = BodyMotion.start(cells, seconds, boards, usual)
         asks = partial(CellEvidence.of, centres=cells.centres, correlated=settings.correlated)
         speeds = {
-            k: CellSpeeds.of(image, place, cells, np.flatnonzero(there))
-            for k, (image, (place, _), there) in enumerate(zip(images, both, seen, strict=True))
+            k: CellSpeeds.of(image.velocity.seen, place, cells)
+            for k, (image, (place, _)) in enumerate(zip(images, both, strict=True))
             if image.velocity is not None and image.time_ms is not None
         }
         coarse, reach = [view.some(slice(None, None, COARSE)) for view in views], settings.reach_mm
@@ -154,9 +178,16 @@ def follow(
                 motion = motion.resized()
             motion = motion.solved(_both_ways(said), speeds)
             reach = max(reach / 2.0, settings.least_reach_mm)
-            if left == ROUNDS - 1 and _stands_still(motion, seen, settings):
+            if (
+                left == ROUNDS - 1
+                and _is_unbent(motion, seen)
+                and _is_unswayed(motion, seen, settings)
+            ):
                 return aligned, None
         gaps = _each_overlap(_gap, pool, coarse, (motion, cells), reach, settings)
+    placed = _placed(aligned, names, views, motion, gaps)
+    if placed.rms_after_mm > NEARER * aligned.rms_after_mm and _is_unswayed(motion, seen, settings):
+        return aligned, None
     followed = Followed(
         cells,
         dict(zip(names, motion.displacements(BENDING, from_middle=True), strict=True)),
@@ -164,14 +195,23 @@ def follow(
         seen,
         _cell_sigmas(motion, cells, seen),
         _middle_ms(images),
+        _mean_breath(motion, cells) if _middle_ms(images) is not None else None,
     )
-    return _placed(aligned, names, views, motion, gaps), followed
+    return placed, followed
 
 
 def _middle_ms(images: Sequence[RangeImage]) -> float | None:
     """As `Courses` has it."""
     known = [image.time_ms for image in images if image.time_ms is not None]
     return 0.5 * (min(known) + max(known)) if known else None
+
+
+def _mean_breath(motion: BodyMotion, cells: BodyCells) -> MeanBreath:
+    """A motion's courses are about their mean: there a breath is half way."""
+    middle = motion.kind("breath").courses.middle
+    field = motion.kind("breath").fields @ motion.of("breath", middle)
+    sigma = field_sigmas(motion, "breath", middle, cells.normals)
+    return MeanBreath(field, BREATH_DOUBT * sigma)
 
 
 def _rigid(motion: BodyMotion, pair: int, *, from_middle: bool = False) -> Array:
@@ -229,12 +269,19 @@ def _both_ways(said: Mapping[tuple[int, int], CellEvidence]) -> dict[tuple[int, 
     return {both: CellEvidence.total(parts) for both, parts in gathered.items()}
 
 
-def _stands_still(motion: BodyMotion, seen: Mask, settings: AlignmentSettings) -> bool:
+def _is_unbent(motion: BodyMotion, seen: Mask) -> bool:
     """Whether nothing moved that a rigid placing of each pair does not see to as well."""
-    bends = motion.displacements(BENDING, from_middle=True)[seen][:, :3]
-    sway = motion.displacements(("sway",), from_middle=True)[seen][:, :3]
-    bent, swayed = (np.sqrt(np.mean(np.sum(moved**2, axis=1))) for moved in (bends, sway))
-    return bool(bent < STILL_MM and swayed < settings.least_sway * settings.sway_mm)
+    return _far(motion, BENDING, seen) < STILL_MM
+
+
+def _is_unswayed(motion: BodyMotion, seen: Mask, settings: AlignmentSettings) -> bool:
+    return _far(motion, ("sway",), seen) < settings.least_sway * settings.sway_mm
+
+
+def _far(motion: BodyMotion, names: Sequence[str], seen: Mask) -> float:
+    """mm RMS."""
+    moved = motion.displacements(names, from_middle=True)[seen][:, :3]
+    return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
 
 
 def _gap(matches: Matches, cell: Indices) -> float:

@@ -44,14 +44,16 @@ def simulate(
     subject_preset: Annotated[
         Literal["mannequin", "standing", "restless", "child"],
         typer.Option(help="How the subject moves while frames are taken."),
-    ] = "mannequin",
+    ] = "standing",
     look: Annotated[
         Literal["matt", "skin", "dressed"],
         typer.Option(help="Matt all over, like skin, or with dark hair and shorts too."),
     ] = "matt",
     sway_mm: Annotated[
         float,
-        typer.Option(min=0.0, help="How far the person moves, rigid, between the pairs' captures."),
+        typer.Option(
+            min=0.0, help="How far a mannequin moves, rigid, between the pairs' captures."
+        ),
     ] = 0.0,
     changes: Annotated[
         list[str] | None,

@@ -63,12 +63,14 @@ class GirthErrors:
     stature_mm: float
 
 
-def girth_errors(mesh: BodyMesh, vertices: Array, faces: Indices) -> GirthErrors:
-    """mesh in the truth's frame; vertices, faces: the truth."""
+def girth_errors(
+    mesh: BodyMesh, vertices: Array, faces: Indices, *, mean_breath: bool = False
+) -> GirthErrors:
+    """mesh in the truth's frame; vertices, faces: the truth, at mean breath or at the mesh's moment."""
     truth = _as_measured(vertices, faces)
     stature = float(vertices[:, 2].max())
     levels = np.arange(TORSO[0] * stature, TORSO[1] * stature, STEP_MM).tolist()
-    ours, true = measure(mesh, levels), measure(truth, levels)
+    ours, true = measure(mesh, levels, mean_breath=mean_breath), measure(truth, levels)
     errors = {
         one.height_mm: error
         for one, other in zip(ours.slices, true.slices, strict=True)

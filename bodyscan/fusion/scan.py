@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bodyscan.alignment.bending import at_once
 from bodyscan.alignment.body_parts import PersonMotion
-from bodyscan.alignment.following import follow
+from bodyscan.alignment.following import Followed, follow
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.pole_steps import PoleStep, find_pole_step, loosened, motions_between
 from bodyscan.alignment.sway import SwayPrior
@@ -22,7 +22,7 @@ from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.seams import judge_seams
 from bodyscan.fusion.surface_check import SurfaceCheck, check_surface
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.body import BodyCloud, BodyMesh, BreathAt
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, step
 from bodyscan.reconstruction.range_image import RangeImage
@@ -123,7 +123,7 @@ def fuse(
         seams = judge_seams(seen, there, calibration.rig.poles)
         announce(graded(None, None), final=False)
     with step(progress, "meshing"):
-        surface = mesh(cloud, settings.mesh, images, placing)
+        surface = _breathing(mesh(cloud, settings.mesh, images, placing), followed)
         carried = {image.pair: image for image in seen}
         at_once_or_empty = [carried.get(image.pair, image) for image in cleaned]
         held = check_surface(surface, at_once_or_empty, placing)
@@ -144,3 +144,13 @@ def _pole_step(
 def _tied_motions(placing: Mapping[str, RigidTransform], found: Alignment) -> dict[str, Array]:
     """Of the pairs that overlaps tie."""
     return motions_between(placing, {name: found.rig_from_camera[name] for name in found.motion_mm})
+
+
+def _breathing(surface: BodyMesh, followed: Followed | None) -> BodyMesh:
+    """With the way to mean breath, where it is known."""
+    if followed is None or followed.breath is None:
+        return surface
+    way, sigma = followed.breath.along(
+        followed.cells, surface.vertices, surface.normals.astype(np.float64)
+    )
+    return replace(surface, breath=BreathAt(way.astype(np.float32), sigma.astype(np.float32)))

@@ -10,32 +10,34 @@ from bodyscan.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
-class SpeedField:
-    """Speed along the viewing rays, in z, that no rigid motion explains, mm/s.
+class SurfaceSpeeds:
+    """How fast places of a surface changed their depth, camera frame.
 
-    columns (C,), rows (R,): px, places of the knots in the camera's image; linear between.
-    speed, sigma: (R, C), of dz/dt at a fixed pixel; NaN where nothing was seen nearby.
+    points: (N, 3) mm.  facing: (N, 3): a place that moves by V changes its depth at a fixed pixel by
+    facing . V.  speed, sigma: (N,) of that depth, mm/s.  shared: (N, K) mm/s, standard deviations of
+    what all of them are off by together, K such errors.
     """
 
-    columns: Array
-    rows: Array
+    points: Array
+    facing: Array
     speed: Array
     sigma: Array
+    shared: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Velocity:
-    """A rigid velocity in the camera's frame, about its centre, and what is not rigid of it.
+    """A rigid velocity in the camera's frame, about its centre, and what was seen of it.
 
     twist: (6,) rotation w, rad/s, and translation v, mm/s: a point p moves by w x p + v.
     covariance: (6, 6) of it. Surfaces do not show what moves them within themselves; such
     directions keep the width of the prior, that of people who stand.
-    field: on top of the twist, where the evidence asks for it.
+    seen: the speeds behind it, of what does not move as one too.
     """
 
     twist: Array
     covariance: Array
-    field: SpeedField | None = None
+    seen: SurfaceSpeeds
 
     def at(self, points: Array) -> Array:
         """Of the rigid motion (..., 3), mm/s, at points (..., 3)."""

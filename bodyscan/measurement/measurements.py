@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,8 @@ class Girth:
     girth_range_mm, tape_range_mm: what they may be, given what was not: see `Outline`.
 
     A trunk that filled surface joins to arms is cut there, and closed straight.
+    breath_sigma_mm: standard deviation of girth_mm and tape_mm by what is not known of the breath; None
+    where nothing is.
     """
 
     part: str
@@ -43,6 +45,7 @@ class Girth:
     measured: float
     girth_range_mm: Range
     tape_range_mm: Range
+    breath_sigma_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,7 @@ class Slice:
 class Measurements:
     """stature_mm: highest point over the floor, in pose.  stature_measured: share of the crown's
     surface (its top 20 mm) that was measured.  measured: share of the whole surface.
+    at_mean_breath: whether the breath of the scan's own moment was taken out.
     """
 
     stature_mm: float
@@ -71,13 +75,19 @@ class Measurements:
     measured: float
     slices: tuple[Slice, ...]
     rig_from_body: RigidTransform
+    at_mean_breath: bool = False
 
 
-def measure(mesh: BodyMesh, heights_mm: Sequence[float] | None = None) -> Measurements:
+def measure(
+    mesh: BodyMesh, heights_mm: Sequence[float] | None = None, *, mean_breath: bool = True
+) -> Measurements:
     """Stature, volume, area, and the slices at heights (every 100 mm of the body if none are given).
 
-    Raises BadInput for a height at which there is no body.
+    mean_breath: of a person who breathed, as at mean breath; or else as of the scan's moment. Raises
+    BadInput for a height at which there is no body.
     """
+    breathes = mean_breath and mesh.breath is not None
+    mesh, fuller = (mesh.at_mean_breath(), mesh.at_mean_breath(1.0)) if breathes else (mesh, None)
     stature = float(mesh.vertices[:, 2].max())
     frame = rig_from_body(mesh.vertices)
     vertices = frame.inverse().apply(mesh.vertices)
@@ -86,7 +96,8 @@ def measure(mesh: BodyMesh, heights_mm: Sequence[float] | None = None) -> Measur
         every = np.arange(STEP_MM, stature, STEP_MM).tolist()
         slices = [_slice(vertices, mesh, height) for height in every]
     else:
-        slices = [_slice(vertices, mesh, float(height)) for height in heights_mm]
+        every = [float(height) for height in heights_mm]
+        slices = [_slice(vertices, mesh, height) for height in every]
         for height, found in zip(heights_mm, slices, strict=True):
             if found is None:
                 low, high = vertices[:, 2].min(), vertices[:, 2].max()
@@ -94,6 +105,12 @@ def measure(mesh: BodyMesh, heights_mm: Sequence[float] | None = None) -> Measur
                     f"there is no body at a height of {height:g} mm",
                     remedy=f"Give heights between {low:.0f} and {high:.0f} mm.",
                 )
+    if fuller is not None:
+        more = frame.inverse().apply(fuller.vertices)
+        slices = [
+            found and _doubted(found, _slice(more, mesh, height))
+            for found, height in zip(slices, every, strict=True)
+        ]
     areas = face_areas(mesh.vertices, mesh.faces)
     crown = mesh.vertices[mesh.faces, 2].max(axis=1) > stature - CROWN_MM
     return Measurements(
@@ -104,7 +121,18 @@ def measure(mesh: BodyMesh, heights_mm: Sequence[float] | None = None) -> Measur
         _share(areas, ~mesh.filled, np.ones_like(crown)),
         tuple(found for found in slices if found is not None),
         frame,
+        breathes,
     )
+
+
+def _doubted(level: Slice, fuller: Slice | None) -> Slice:
+    """With what girths are longer on a body that is a standard deviation of its breath fuller."""
+    girths = []
+    for girth in level.girths:
+        other = fuller.of(girth.part) if fuller and girth is level.of(girth.part) else None
+        sigma = None if other is None else abs(other.tape_mm - girth.tape_mm)
+        girths.append(replace(girth, breath_sigma_mm=sigma))
+    return replace(level, girths=tuple(girths))
 
 
 def heights_from(text: str) -> list[float]:

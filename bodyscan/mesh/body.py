@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,12 +27,22 @@ class BodyCloud:
 
 
 @dataclass(frozen=True, eq=False)
+class BreathAt:
+    """mm: (V,) float32, how far each vertex stands inside of its place at mean breath, along its
+    normal.  sigma_mm: (V,) float32, of that."""
+
+    mm: Floats
+    sigma_mm: Floats
+
+
+@dataclass(frozen=True, eq=False)
 class BodyMesh:
     """A closed triangle mesh with outward faces.
 
     vertices: (V, 3) float64, mm.  faces: (F, 3) int64.  normals: (V, 3) float32, unit, outward.
     colours: (V, 3) uint8.  sigma_mm: (V,) float32, NaN on filled vertices.
     filled: (F,) bool, faces that no pair measured and that were filled to close the mesh.
+    breath: of a person who was followed, how to come to mean breath.
     """
 
     vertices: Array
@@ -41,12 +51,20 @@ class BodyMesh:
     colours: Bytes
     sigma_mm: Floats
     filled: Mask
+    breath: BreathAt | None = None
 
     @property
     def filled_share(self) -> float:
         """Share of the surface's area that was filled."""
         area = face_areas(self.vertices, self.faces)
         return float(area[self.filled].sum() / area.sum()) if area.any() else 0.0
+
+    def at_mean_breath(self, sigmas: float = 0.0) -> BodyMesh:
+        """As the body is at mean breath; sigmas: everywhere so many standard deviations fuller."""
+        if self.breath is None:
+            return self
+        way = (self.breath.mm + sigmas * self.breath.sigma_mm).astype(np.float64)
+        return replace(self, vertices=self.vertices + way[:, None] * self.normals, breath=None)
 
     def measured_part(self) -> BodyMesh:
         """The open surface that is left without the filled faces."""

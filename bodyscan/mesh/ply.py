@@ -15,7 +15,7 @@ from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.errors import ResultError
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.files.regular import read_regular
-from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.body import BodyCloud, BodyMesh, BreathAt
 
 Records = NDArray[np.void]
 
@@ -50,14 +50,15 @@ def _vertex(*extra: tuple[str, str, str]) -> Element:
 
 
 CLOUD: tuple[Element, ...] = (_vertex(("pairs_seen", "u1", "uchar")),)
-MESH: tuple[Element, ...] = (
-    _vertex(),
-    Element(
-        "face",
-        np.dtype([("count", "u1"), ("corners", "<i4", 3), ("filled", "u1")]),
-        ("list uchar int vertex_indices", "uchar filled"),
-    ),
+_FACE = Element(
+    "face",
+    np.dtype([("count", "u1"), ("corners", "<i4", 3), ("filled", "u1")]),
+    ("list uchar int vertex_indices", "uchar filled"),
 )
+MESH: tuple[Element, ...] = (_vertex(), _FACE)
+_BREATH = ("breath_mm", "<f4", "float"), ("breath_sigma_mm", "<f4", "float")
+BREATHING: tuple[Element, ...] = (_vertex(*_BREATH), _FACE)
+"""A mesh that knows the way to mean breath."""
 
 
 def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
@@ -66,10 +67,13 @@ def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
         elements, records = CLOUD, [_vertex_records(CLOUD[0], body, body.points)]
         records[0]["pairs_seen"] = body.pairs_seen
     else:
-        elements = MESH
+        elements = MESH if body.breath is None else BREATHING
         faces = np.empty(len(body.faces), MESH[1].fields)
         faces["count"], faces["corners"], faces["filled"] = 3, body.faces, body.filled
-        records = [_vertex_records(MESH[0], body, body.vertices), faces]
+        records = [_vertex_records(elements[0], body, body.vertices), faces]
+        if body.breath is not None:
+            records[0]["breath_mm"] = body.breath.mm
+            records[0]["breath_sigma_mm"] = body.breath.sigma_mm
     with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
         stream.write(_header(elements, [len(some) for some in records]))
         for some in records:
@@ -78,18 +82,21 @@ def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
 
 def read_ply_cloud(path: Path) -> BodyCloud:
     """A cloud that `write_ply` wrote. Raises ResultError if the file is not one."""
-    (vertices,) = _read(Path(path), CLOUD, "cloud")
+    (vertices,) = _read(Path(path), (CLOUD,), "cloud")
     return BodyCloud(*_vertex_arrays(vertices), vertices["pairs_seen"].copy())
 
 
 def read_ply_mesh(path: Path) -> BodyMesh:
     """A mesh that `write_ply` wrote. Raises ResultError if the file is not one."""
-    vertices, faces = _read(Path(path), MESH, "mesh")
+    vertices, faces = _read(Path(path), (MESH, BREATHING), "mesh")
     points, normals, sigma_mm, colours = _vertex_arrays(vertices)
     corners = faces["corners"].astype(np.int64)
     if corners.size and (corners.min() < 0 or corners.max() >= len(points)):
         raise ResultError("a face names a vertex that is not there", where=str(path))
-    return BodyMesh(points, corners, normals, colours, sigma_mm, faces["filled"] != 0)
+    breath = None
+    if "breath_mm" in (vertices.dtype.names or ()):
+        breath = BreathAt(vertices["breath_mm"].copy(), vertices["breath_sigma_mm"].copy())
+    return BodyMesh(points, corners, normals, colours, sigma_mm, faces["filled"] != 0, breath)
 
 
 def _vertex_records(element: Element, body: BodyCloud | BodyMesh, positions: Array) -> Records:
@@ -117,13 +124,13 @@ def _vertex_arrays(
 def _header(elements: Sequence[Element], counts: Sequence[int]) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += ["comment bodyscan: mm, x the way the subject faces, z up, floor at z = 0"]
-    for element, count in zip(elements, counts, strict=True):
+    for element, count in zip(elements, counts, strict=False):
         lines += element.header(count)
     return "\n".join([*lines, ""]).encode("ascii") + END
 
 
-def _read(path: Path, elements: Sequence[Element], what: str) -> list[Records]:
-    """The records of a file that `write_ply` wrote with these elements."""
+def _read(path: Path, known: Sequence[Sequence[Element]], what: str) -> list[Records]:
+    """The records of a file that `write_ply` wrote with some of these elements."""
     try:
         data = read_regular(path)
     except OSError as error:
@@ -131,9 +138,9 @@ def _read(path: Path, elements: Sequence[Element], what: str) -> list[Records]:
     end = data[:HEADER_LIMIT].find(END) + len(END)
     lines = _meaning(data[:end])
     counts = [int(line.split()[-1]) for line in lines if re.fullmatch(rb"element \w+ \d+", line)]
+    elements = next((some for some in known if lines == _meaning(_header(some, counts))), ())
     sizes = [n * element.fields.itemsize for n, element in zip(counts, elements, strict=False)]
-    ours = len(counts) == len(elements) and lines == _meaning(_header(elements, counts))
-    if not ours or len(data) != end + sum(sizes):
+    if not elements or len(data) != end + sum(sizes):
         raise ResultError(
             f"is not a {what} that bodyscan wrote, or is cut short",
             where=str(path),

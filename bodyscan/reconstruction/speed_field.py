@@ -31,19 +31,15 @@ class CellSpeeds:
 
 @dataclass(frozen=True, eq=False)
 class Knots:
-    """columns (C,), rows (R,): px, places of the knots.  share: (cells, knots in use) of each in the
-    cells' middles, linear between.  used: flat numbers of those with evidence (of R * C).
-    akin: (used, used), correlation of their speeds before anything is seen."""
+    """share: (cells, knots) of each knot in the cells' middles, linear between.  akin: (knots, knots),
+    correlation of their speeds before anything is seen."""
 
-    columns: Array
-    rows: Array
     share: Array
-    used: Indices
     akin: Array
 
     @staticmethod
     def over(cells: Cells, known: Mask, mm_per_px: float) -> Knots:
-        """For an image whose pixels are as wide on the surface.  known: (cells,) where speeds are."""
+        """Those with evidence.  known: (cells,) where speeds are.  mm_per_px: on the surface."""
         step = KNOT_MM / mm_per_px
         columns, rows = (
             np.arange(np.ceil(size / step) + 1.0) * step for size in (cells.width, cells.height)
@@ -56,13 +52,7 @@ class Knots:
         used: Indices = np.flatnonzero(share[known].sum(axis=0) > 0.0)
         place = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)[used] * mm_per_px
         apart = np.linalg.norm(place[:, None] - place, axis=-1)
-        return Knots(columns, rows, share[:, used], used, np.exp(-apart / REACH_MM))
-
-    def spread(self, values: Array) -> Array:
-        """(R, C) of values (used,); NaN at other knots."""
-        grid = np.full(len(self.rows) * len(self.columns), np.nan)
-        grid[self.used] = values
-        return grid.reshape(len(self.rows), len(self.columns))
+        return Knots(share[:, used], np.exp(-apart / REACH_MM))
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.ray_depths import intersect_rays
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform, adjoint
-from bodyscan.geometry.velocity import SpeedField, Velocity
+from bodyscan.geometry.velocity import SurfaceSpeeds, Velocity
 from bodyscan.reconstruction.speed_field import CellSpeeds, FieldFit, Knots, fit_field, unexplained
 from bodyscan.reconstruction.surface_cells import Cells, fit_planes
 from bodyscan.stripes.comb import TEETH, Comb
@@ -49,7 +49,7 @@ class _Teeth:
     """What windows (N,) tell: their cell, speed in depth (mm per unit of time), its sigma, and dz/ds.
 
     band: number of the stripes that a window is made of.  by_twist: (cells, 6), how a twist about
-    `middle` changes the depth.
+    `middle` changes the depth.  points: (cells, 3) in their middles.
     common: standard deviation of speed that all windows share.
     """
 
@@ -59,6 +59,7 @@ class _Teeth:
     sigma: Array
     per_stripe: Array
     by_twist: Array
+    points: Array
     middle: Array
     common: float
 
@@ -82,12 +83,13 @@ def tell_motion(camera: Camera, sheets: LightSheets, comb: Comb) -> StripeMotion
     per_stripe = _mean_by(teeth.cell, teeth.per_stripe, np.ones(len(teeth.cell)), cells.count)
     per_stripe[~known] = np.nan
     grid = np.stack([speed, doubt]) / per_stripe
+    share = cells.px * mm_per_px / BENT_MM
     filled = _filled(grid.reshape(2, *cells.shape))
     return StripeMotion(
         speed=filled[0],
         doubt=np.abs(filled[1]),
         cell_px=cells.px,
-        velocity=_velocity(fit, knots, teeth, cells.px * mm_per_px / BENT_MM),
+        velocity=_velocity(fit, teeth, _seen(speeds, teeth, lost, share), share),
         speed_mm=_rms(speed[known]),
         doubt_mm=_rms(np.sqrt(lost[known])),
         explained=fit.explained,
@@ -125,7 +127,9 @@ def _teeth(camera: Camera, sheets: LightSheets, comb: Comb, cells: Cells) -> _Te
     speed, common = comb.speed[seen] * per_stripe, comb.common[seen] * np.abs(per_stripe)
     shared = float(np.median(common)) if len(common) else 0.0
     band = (comb.s[seen].mean(axis=1) / TEETH).astype(np.int64)
-    return _Teeth(cell[seen], band, speed, sigma[seen], per_stripe, by_twist, middle, shared)
+    return _Teeth(
+        cell[seen], band, speed, sigma[seen], per_stripe, by_twist, points, middle, shared
+    )
 
 
 def _weights(teeth: _Teeth) -> Array:
@@ -182,7 +186,20 @@ def _filled(grid: Array) -> Array:
     return np.asarray(grid[:, row, column], np.float64)
 
 
-def _velocity(fit: FieldFit, knots: Knots, teeth: _Teeth, share: float) -> Velocity:
+def _seen(speeds: CellSpeeds, teeth: _Teeth, lost: Array, share: float) -> SurfaceSpeeds:
+    """lost: (cells,) variance of what is no smooth motion.  share: as of `_velocity`."""
+    known = speeds.weight > 0.0
+    speed = speeds.speed[known]
+    return SurfaceSpeeds(
+        teeth.points[known],
+        teeth.by_twist[known, 3:],
+        speed,
+        np.sqrt(1.0 / speeds.weight[known] + lost[known]),
+        np.stack([np.full(len(speed), teeth.common), share * speed], axis=1),
+    )
+
+
+def _velocity(fit: FieldFit, teeth: _Teeth, seen: SurfaceSpeeds, share: float) -> Velocity:
     """About the camera's centre; what all windows share is a motion along the middle's ray.  share: of
     the speed, by which it may be off."""
     about_camera = adjoint(RigidTransform(np.eye(3), teeth.middle))
@@ -190,12 +207,7 @@ def _velocity(fit: FieldFit, knots: Knots, teeth: _Teeth, share: float) -> Veloc
     twist = about_camera @ fit.twist
     off = share * np.repeat([np.linalg.norm(part) for part in np.split(fit.twist, 2)], 3)
     covariance = fit.covariance[:6, :6] + np.outer(shared, shared) + np.diag(off**2)
-    covariance = about_camera @ covariance @ about_camera.T
-    if not fit.is_bent:
-        return Velocity(twist, covariance)
-    sigma = np.sqrt(np.diagonal(fit.covariance)[6:])
-    field = SpeedField(knots.columns, knots.rows, knots.spread(fit.field), knots.spread(sigma))
-    return Velocity(twist, covariance, field)
+    return Velocity(twist, about_camera @ covariance @ about_camera.T, seen)
 
 
 def _rms(values: Array) -> float:

@@ -28,7 +28,8 @@ def tables(measured: Measurements) -> Iterator[Table]:
     body.add_row("area", f"{measured.area_m2:.3f} m2")
     body.add_row("of it measured", f"{100.0 * measured.measured:.1f} %")
     yield body
-    slices = Table(title="horizontal slices, mm")
+    breath = ", at mean breath" if measured.at_mean_breath else ""
+    slices = Table(title=f"horizontal slices{breath}, mm")
     headings = ("height", "part", "tape (hull)", "along surface", "width", "depth", "measured")
     for heading in headings:
         slices.add_column(heading, justify="left" if heading == "part" else "right")
@@ -69,6 +70,7 @@ def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> d
         "volume_l": measured.volume_l,
         "area_m2": measured.area_m2,
         "measured": measured.measured,
+        "at_mean_breath": measured.at_mean_breath,
         "rig_from_body": measured.rig_from_body.matrix,
         "slices": [asdict(level) for level in measured.slices],
     }

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.evaluation.comparison import Comparison, compare_surfaces
 from bodyscan.fusion import scan_verdict as limits
 from bodyscan.fusion.scan_facts import read_facts, told_verdict
@@ -77,6 +78,8 @@ def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:
         "The body": lambda: Section("The body", [_viewer(scan, shown, limit)]),
         "Figures": lambda: Section("Figures", [_numbers(scan)]),
     }
+    if scan.facts.get("person"):
+        parts["The person"] = lambda: _person(scan.facts["person"])
     if shown:
         parts["Comparison"] = lambda: comparison_section(scan.mesh, found, shown, limit)
     return sections_of(
@@ -175,6 +178,40 @@ def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
             for farthest, motion in motions[:1]
         ),
     ]
+
+
+def _person(person: Mapping[str, Any]) -> Section:
+    """Of one who moved while being scanned: what, how far, and how well that is known."""
+    columns = (
+        Column("part"),
+        Column("moved", "mm", "most of it at most, against where it was in the middle.", digits=1),
+        Column(
+            "known to",
+            "mm",
+            "standard deviation of what is left of that, along the surface's normals.",
+            limits.SOME_LEFT_MM,
+            digits=2,
+        ),
+        Column(
+            "seen once", "%", "by a single pair: no other could tell how it had moved.", digits=0
+        ),
+    )
+    rows = tuple(
+        (part["name"], part["moved_mm"], part["left_mm"], 100.0 * part["seen_once"])
+        for part in person["parts"]
+    )
+    told = PersonMotion(
+        (),
+        person["breathed_mm"],
+        person.get("moment_ms"),
+        person.get("fuller_mm"),
+        person.get("fuller_sigma_mm"),
+    )
+    when = "the mean of all pairs"
+    if told.moment_ms is not None:
+        when = f"{told.moment_ms / 1000.0:.2f} s after the scan began"
+    intro = f"The person moved while being scanned. Cloud and mesh show the body as of {when}."
+    return Section("The person", [Table(columns, rows), Lines(told.lines)], intro)
 
 
 def _pictures(scan: StoredScan) -> Section:

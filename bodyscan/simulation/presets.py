@@ -113,7 +113,7 @@ def settings_for(
     """Settings with one kind of projector, `mirror` or `pinhole`, the devices of a preset (`ideal` or
     `workshop`), a person of `SUBJECTS` and of `LOOKS`, and `changes` such as `person.breath_mm=5`.
 
-    Raises BadInput for names and values that there are not.
+    sway_mm: of a mannequin. Raises BadInput for names and values that there are not.
     """
     for what, name, known in (
         ("projector of kind", projector, _WORKSHOP_LIGHT),
@@ -125,6 +125,11 @@ def settings_for(
             raise BadInput(
                 f"there is no {what} {name!r} to simulate", remedy=f"Choose {alternatives(known)}."
             )
+    if sway_mm and SUBJECTS[subject]:
+        raise BadInput(
+            f"a subject that is {subject} sways by itself",
+            remedy="Leave --sway-mm out, or say --subject-preset mannequin.",
+        )
     values = asdict(SimulationSettings())
     values["projection"]["kind"] = projector
     values["person"] |= {"sway_mm": sway_mm, **SUBJECTS[subject]}

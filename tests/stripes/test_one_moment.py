@@ -9,7 +9,7 @@ import pytest
 from stripe_rendering import gray_bits, render
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.geometry.velocity import Velocity
+from bodyscan.geometry.velocity import SurfaceSpeeds, Velocity
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.comb import Comb
 from bodyscan.stripes.decoding import decode_stripes
@@ -32,7 +32,9 @@ def told(comb: Comb) -> StripeMotion:
     weight = comb.sigma**-2.0
     speed = float(np.sum(weight * comb.speed) / np.sum(weight))
     grid = np.full((1, 1), speed)
-    still = Velocity(np.zeros(6), np.eye(6))
+    none = np.empty((0, 3))
+    unseen = SurfaceSpeeds(none, none, none[:, 0], none[:, 0], none[:, :1])
+    still = Velocity(np.zeros(6), np.eye(6), unseen)
     return StripeMotion(grid, 0.0 * grid, 200, still, abs(speed), 0.0, 100.0, True)
 
 

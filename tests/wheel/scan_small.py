@@ -36,7 +36,8 @@ def main() -> None:
     if not installed.is_relative_to(Path(sys.prefix).resolve()):
         sys.exit(f"this is no wheel: bodyscan comes from {installed}")
     size = ("--scale", 0.25, "--board-shots", 6, "--preset", "ideal")
-    run("simulate", small_rig(Path("rig.yaml")), "--out", "work", *size, "--subject", SUBJECT)
+    subject = ("--subject", SUBJECT, "--subject-preset", "mannequin")
+    run("simulate", small_rig(Path("rig.yaml")), "--out", "work", *size, *subject)
     run("calibrate-rig", "work/rig.yaml")
     scan = ("--calibration", "work/calibration", "--out", "work/scan", "--points", 20_000)
     # So few pixels on two poles are half a body, which the verdict may find too little: code 1.
