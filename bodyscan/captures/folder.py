@@ -36,7 +36,7 @@ class ImageSequence:
     lit image, or that of the board, was taken. lit, dark, board: None where there is no such image.
     missing: those of the paths that are not there.  inverses: those of `coded`.
     exposure: its name, where the rig file names several; longer: the same images of the
-    longer ones, in their order.
+    longer ones, in their order.  crossing: those of `coded` that show the stripes which cross.
     """
 
     pair: str
@@ -49,6 +49,30 @@ class ImageSequence:
     exposure: str = ""
     longer: tuple[ImageSequence, ...] = ()
     inverses: tuple[Path, ...] = ()
+    crossing: tuple[Path, ...] = ()
+
+    @property
+    def lacks_crossing(self) -> bool:
+        """Whether images of the stripes that cross are missing, and no others: it can do without."""
+        crossing = {path for one in (self, *self.longer) for path in one.crossing}
+        return bool(self.missing) and crossing.issuperset(self.missing)
+
+    @property
+    def without_crossing(self) -> ImageSequence:
+        """The same with the stripes of the first direction alone."""
+        own = {path for one in (self, *self.longer) for path in one.crossing}
+
+        def rest(paths: tuple[Path, ...]) -> tuple[Path, ...]:
+            return tuple(path for path in paths if path not in own)
+
+        return replace(
+            self,
+            coded=rest(self.coded),
+            inverses=rest(self.inverses),
+            missing=rest(self.missing),
+            longer=tuple(longer.without_crossing for longer in self.longer),
+            crossing=(),
+        )
 
     @property
     def has_stripes(self) -> bool:
@@ -434,8 +458,18 @@ def _sequence(rig: Rig, listing: Listing, template: str, shot: str, pair: Pair) 
     counts = [each for way in code.directions for each in way.image_counts.items()]
     kinds = [kind.name for kind, count in counts for _ in range(count)]
     inverses = tuple(p for p, kind in zip(coded, kinds, strict=True) if kind == "inverse")
-    missing = tuple(files.missing)
-    return ImageSequence(pair.name, shot, lit, dark, coded, missing, board, inverses=inverses)
+    crossing = coded[sum(code.image_counts.values()) :]
+    return ImageSequence(
+        pair.name,
+        shot,
+        lit,
+        dark,
+        coded,
+        tuple(files.missing),
+        board,
+        inverses=inverses,
+        crossing=crossing,
+    )
 
 
 def _exposed(

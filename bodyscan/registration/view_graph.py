@@ -18,6 +18,7 @@ from bodyscan.geometry.transforms import RigidTransform
 
 AGREEMENT = 0.04
 """Poses that differ by this share of the boards' usual distance agree: graphs place pairs roughly."""
+FEWEST_VOTES = 3
 BOARD_REACH = 0.3
 MOST_CANDIDATES = 12
 
@@ -47,8 +48,11 @@ class RelativePose:
 
     @property
     def decided(self) -> bool:
-        """Most boards agree on one pose, more than on any other."""
-        return self.votes > self.rivals and 2 * self.votes > len(self.targets)
+        """Most boards agree on one pose, more than on any other; or three that no two contradict by
+        agreeing on another: placed so, the others fit more closely than graphs can tell, or are
+        found to be wrong."""
+        most = self.votes > self.rivals and 2 * self.votes > len(self.targets)
+        return most or (self.votes >= FEWEST_VOTES and self.rivals <= 1)
 
     @property
     def strength(self) -> tuple[bool, int, int]:

@@ -49,6 +49,9 @@ MOST_APART = 0.06
 LINES_TRIED = 40
 AS_GOOD = 1.3
 MOST_CAUSES = 2
+WHOLE = 1e-6
+NEAREST_TRIED, SHARE_TRIED = 4, 0.1
+"""Periods are tried that differ from one given by so much, or by this share of it."""
 STARTS = range(30, 360, 30)
 """Degrees, of waves that are written as sines, or begin at a step's middle."""
 
@@ -167,7 +170,7 @@ def _disorder(
     some = lines[:, rows[:: max(1, len(rows) // LINES_TRIED)]]
     tried = (
         (cause, _Reading.of(some[order], changed, stripes).order)
-        for cause, order, changed in _mistakes(waves)
+        for cause, order, changed in _mistakes(waves, stripes)
     )
     fitting = [(order.misfit, cause) for cause, order in tried if _in_order(order)]
     best = min((misfit for misfit, _ in fitting), default=0.0)
@@ -185,7 +188,9 @@ def _disorder(
     )
 
 
-def _mistakes(waves: tuple[Wave, ...]) -> Iterator[tuple[str, list[int], tuple[Wave, ...]]]:
+def _mistakes(
+    waves: tuple[Wave, ...], stripes: int
+) -> Iterator[tuple[str, list[int], tuple[Wave, ...]]]:
     """Common mistakes with images and keys: what, and the order and the waves that undo it."""
     ends = np.cumsum([0, *(wave.steps for wave in waves)])
     everything = list(range(int(ends[-1])))
@@ -209,6 +214,23 @@ def _mistakes(waves: tuple[Wave, ...]) -> Iterator[tuple[str, list[int], tuple[W
             order[here], order[there] = everything[there], everything[here]
             names = f"{waves[one].period:g} and {waves[two].period:g} stripes"
             yield f"the images of the waves of {names} were exchanged", order, waves
+    for place, wave in enumerate(waves):
+        for what, period in _other_periods(wave.period, stripes):
+            other_wave = replace(wave, period=period)
+            yield what, everything, (*waves[:place], other_wave, *waves[place + 1 :])
+
+
+def _other_periods(period: float, stripes: int) -> Iterator[tuple[str, float]]:
+    """Periods near one, as people give them: whole numbers over all stripes, or of stripes in one."""
+    for key, given in (("periods", stripes / period), ("period", period)):
+        whole = round(given)
+        if whole < 2 or abs(given - whole) > WHOLE * given:
+            continue
+        reach = max(NEAREST_TRIED, round(SHARE_TRIED * whole))
+        for other in range(max(2, whole - reach), min(whole + reach, stripes // 2) + 1):
+            if other != whole:
+                length = stripes / other if key == "periods" else float(other)
+                yield f"`{key}` had {other} in place of {whole}", length
 
 
 def _orders(steps: int) -> Iterator[tuple[str, list[int]]]:

@@ -8,12 +8,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_near
 from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.captures.images import read_sequence
+from bodyscan.captures.images import read_sequence, readable
 from bodyscan.errors import BodyscanError, DecodingFailed, plainly
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
+from bodyscan.rig.templates import fill
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.one_moment import Moments
 from bodyscan.stripes.stripe_limits import StripeLimits
@@ -44,9 +45,10 @@ def decode_sequence(
     where = f"pair {sequence.pair}, shot {sequence.shot}"
     if pair.projector is None:
         raise DecodingFailed("this pair has no projector", where=where)
+    sequence, projector = readable(sequence, pair.projector)
     images = read_sequence(sequence, pair.camera, workers=workers)
     frames = (images.lit, images.dark, images.coded)
-    return decode_stripes(pair.projector, *frames, limits=limits, moments=moments, where=where)
+    return decode_stripes(projector, *frames, limits=limits, moments=moments, where=where)
 
 
 def decode_on_boards(
@@ -77,8 +79,38 @@ def decode_on_boards(
     boundaries = {key: near for found in decoded.values() for key, near in found.items()}
     failures = list(errors.items())
     failed = failed_pairs(failures, {pair for pair, _, _ in boundaries})
+    failed |= _without_stripes(rig, wanted, {sequence.pair for sequence in sequences})
     kept = [failure for failure in failures if failure[0].pair not in failed]
-    return Outcome(boundaries, (*failure_notes(kept), *response_notes(responses)), failed)
+    notes = (*failure_notes(kept), *one_way_notes(decoded), *response_notes(responses))
+    return Outcome(boundaries, notes, failed)
+
+
+def _without_stripes(
+    rig: Rig, wanted: Iterable[tuple[str, str]], striped: set[str]
+) -> dict[str, str]:
+    """Pairs with a projector that saw the board, but of which no sequence is there, with the reason."""
+    shots = dict(wanted)
+    return {
+        pair.name: "no stripe sequence was found in any shot of the board: there is no image such as "
+        + fill(rig.files, shot=shots[pair.name], pair=pair.name, frame=rig.frames.of_code(code)[0])
+        for pair in rig.pairs
+        for code in [pair.projector]
+        if code is not None and pair.name in shots and pair.name not in striped
+    }
+
+
+def one_way_notes(sequences: Iterable[ImageSequence]) -> Iterator[str]:
+    """A line for each pair of which images of the stripes that cross are missing."""
+    shots: dict[str, list[ImageSequence]] = defaultdict(list)
+    for sequence in sequences:
+        if sequence.lacks_crossing:
+            shots[sequence.pair].append(sequence)
+    for pair, own in sorted(shots.items()):
+        named = ", ".join(sequence.shot for sequence in own)
+        yield (
+            f"{pair}: images of `crossing` are missing, such as {own[0].missing[0]}: stripes of the "
+            f"first direction alone are used in shot{'s' if len(own) > 1 else ''} {named}"
+        )
 
 
 def responses_in(stripes: StripeMap) -> list[ResponseShare]:

@@ -18,7 +18,7 @@ from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.stripes.one_moment import Moments, StripeMotion
 from bodyscan.stripes.stripe_map import ResponseShare
-from bodyscan.workflows.decode import decode_sequence, response_notes, responses_in
+from bodyscan.workflows.decode import decode_sequence, one_way_notes, response_notes, responses_in
 
 Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...], StripeMotion | None]
 """A range image, and what was found on the way: the projector's response, and what moved."""
@@ -89,6 +89,7 @@ def reconstruct_range_images(
         if motion is not None:
             motions[image.pair] = motion
     notes = [f"{image.pair}: {image.agreement}" for image in images if image.agreement is not None]
+    notes += map(captures.relative, one_way_notes(found))
     notes += motion_notes(motions, timed=bool(captures.times))
     return Outcome(images, (*notes, *response_notes(responses)), failed)
 

@@ -321,3 +321,20 @@ def test_waves_that_do_not_tell_all_stripes_apart_are_refused(keys: Keys, said: 
 
 def test_periods_may_be_counted() -> None:
     assert described({"periods": (12, 1)}).waves == described({"period": (20, 240)}).waves
+
+
+@pytest.mark.parametrize(
+    ("taken", "given", "named"),
+    [
+        ({"period": (15, 240)}, {"periods": (15, 1)}, "`periods` had 16 in place of 15"),
+        ({"period": (18, 20, 23)}, {"period": (18, 21, 23)}, "`period` had 20 in place of 21"),
+    ],
+)
+def test_a_period_that_is_wrong_is_told_with_the_one_that_fits(
+    taken: Keys, given: Keys, named: str
+) -> None:
+    lit, coded, _ = captured({"steps": 4, **taken})
+    with pytest.raises(DecodingFailed) as error:
+        read({"steps": 4, **given}, lit, coded)
+    assert error.value.remedy is not None
+    assert named in error.value.remedy

@@ -2,9 +2,32 @@
 
 from pathlib import Path
 
-from bodyscan.captures.folder import ImageSequence
-from bodyscan.errors import DecodingFailed
-from bodyscan.workflows.decode import failed_pairs, failure_notes
+import cv2
+import numpy as np
+import pytest
+from stripe_rendering import code_light, render
+
+from bodyscan.captures.folder import ImageSequence, open_scan
+from bodyscan.errors import DecodingFailed, ImageError
+from bodyscan.rig.rig_file import load_rig
+from bodyscan.workflows.decode import (
+    decode_sequence,
+    failed_pairs,
+    failure_notes,
+    one_way_notes,
+)
+
+TWO_WAYS = """
+version: 1
+name: two-ways
+pairs:
+  - name: p1
+    camera: {width: 200, height: 160}
+    projector: {code: gray, stripes: 64, direction: vertical, crossing: {stripes: 32}}
+rig_frame: {pair: p1}
+files: "{frame}.png"
+frames: {crossing: {pattern: "row{bit}", inverse: "row{bit}-inverse"}}
+"""
 
 
 def failures(pair: str, what: str, *shots: str) -> list[tuple[ImageSequence, DecodingFailed]]:
@@ -31,3 +54,31 @@ def test_many_shots_with_one_fault_share_a_note() -> None:
     assert note.count("too dark") == 1
     assert "in 4 shots: a, b, c, d" in note
     assert len(list(failure_notes(failures("p1", "too dark", "a", "b")))) == 2
+
+
+def test_a_shot_without_its_crossing_images_keeps_the_others(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text(TWO_WAYS, "utf-8")
+    rig, scan = load_rig(tmp_path / "rig.yaml"), tmp_path / "scan"
+    scan.mkdir()
+
+    def s_at(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return 2.0 + 0.3 * u
+
+    lit, dark, coded, s = render(s_at, code_light("gray", 64), stripes=64, shape=(160, 200))
+    projector = rig.pairs[0].projector
+    assert projector is not None
+    names = ["lit", "dark", *rig.frames.of_code(projector)]  # those of rows follow
+    for name, image in zip(names, [lit, dark, *coded], strict=False):
+        cv2.imwrite(str(scan / f"{name}.png"), image)
+    (sequence,) = open_scan(rig, scan).sequences
+    found = decode_sequence(sequence, rig.pairs[0])
+    assert found.crossing is None
+    known = np.isfinite(found.s)
+    assert known.mean() > 0.9
+    assert np.median(np.abs(found.s - s)[known]) < 0.1  # stripes; they are 3 pixels wide
+    (note,) = one_way_notes([sequence])
+    assert "row0.png" in note
+    (scan / f"{names[2]}.png").unlink()
+    (sequence,) = open_scan(rig, scan).sequences
+    with pytest.raises(ImageError):
+        decode_sequence(sequence, rig.pairs[0])

@@ -9,7 +9,12 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.lenses.lens import Lens
-from bodyscan.geometry.lenses.polynomials import decentring, decentring_by_point, scaled_by_point
+from bodyscan.geometry.lenses.polynomials import (
+    DECENTRED,
+    decentring,
+    decentring_by_point,
+    scaled_by_point,
+)
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,7 @@ class Brown(Lens):
 
     @property
     def prior_sigmas(self) -> Array:
-        return np.array([0.5, 0.5, 0.005, 0.005, 0.2])
+        return np.array([0.5, 0.5, DECENTRED, DECENTRED, 0.2])
 
     @property
     def difference_steps(self) -> Array:
