@@ -155,19 +155,18 @@ def test_a_subject_is_forgotten(day: Path, night: tuple[Result, Result], tmp_pat
     assert Path("/etc/passwd").exists()  # a link to it lay there
 
 
-def test_rigs_are_calibrated_in_batches(workspace: Workspace, tmp_path: Path) -> None:
-    """The same bytes as the command's, and no more work the second time."""
+def test_rigs_are_calibrated_in_batches(example: Path, tmp_path: Path) -> None:
+    """The same bytes as the Python function's, and no more work the second time."""
     rig = tmp_path / "scans" / "small"
     rig.mkdir(parents=True)
-    shutil.copy(workspace.folder / "rig.yaml", rig)
-    (rig / "captures").mkdir()
-    shutil.copytree(workspace.folder / "captures" / "calibration", rig / "captures" / "calibration")
+    shutil.copy(example / "pole" / "rig.yaml", rig)
+    shutil.copytree(example / "pole" / "captures" / "calibration", rig / "captures" / "calibration")
     done = batch(tmp_path, "--json", pipeline="calibrate")
     assert done.exit_code == 0, done.output
     made = tmp_path / "out" / "small" / "calibration"
     assert (made / "calibration.json").exists()  # its notes name images by path, so it differs
     name = "calibration.npz"
-    assert file_hash(made / name) == file_hash(workspace.folder / "calibration" / name)
+    assert file_hash(made / name) == file_hash(example / "made" / "calibration" / name)
     assert list((tmp_path / "out" / "small" / "rig").iterdir())
     assert events(batch(tmp_path, "--json", pipeline="calibrate"))[-1]["ran"] == 0
 

@@ -379,6 +379,7 @@ def gray_code(folder: Path, axis: str, bits: int) -> tuple[Array, Mask]:
     return number, told
 
 
+@pytest.mark.slow
 def test_a_real_scan_lies_on_the_cloud_that_came_with_it(captures: Path, tmp_path: Path) -> None:
     """By the imported calibration alone: decoded plainly, a pixel of the projector is told to half
     of itself at best, which is 0.1 mm there."""
@@ -403,6 +404,7 @@ def test_a_real_scan_lies_on_the_cloud_that_came_with_it(captures: Path, tmp_pat
     assert (pair.crossing.direction, pair.crossing.stripes) == ("horizontal", 800)
 
 
+@pytest.mark.slow
 def test_the_other_real_calibration_is_read_and_held_against_a_board(
     captures: Path, tmp_path: Path
 ) -> None:

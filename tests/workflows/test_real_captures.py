@@ -81,7 +81,8 @@ def test_two_cameras_before_a_board_that_looks_the_same_turned(
 
 
 # The board stood still in the first nine shots; in 12 to 16 it lies near the edges of some pictures.
-PLACES = ([f"{shot:02}" for shot in range(9)], *([f"{shot:02}"] for shot in range(9, 17)))
+# Left out together: those, and of the others two at a time, so that five solves do for all.
+PLACES = ([f"{shot:02}" for shot in range(9)], *([f"{k:02}", f"{k + 4:02}"] for k in range(9, 13)))
 GOOD_LENSES = {"back": {"brown", "rational"}, "mid": {"brown", "rational"},
                "side": {"brown", "rational"}, "top": {"radial"}}  # fmt: skip
 """top's picture has no boards near its edges."""
