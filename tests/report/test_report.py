@@ -48,6 +48,14 @@ def test_the_verdict_comes_first_with_its_reason_as_text(html: str) -> None:
     assert "no light" in body
 
 
+def test_what_the_person_did_is_said_part_by_part(html: str) -> None:
+    body = html[html.index("<h2") :]
+    assert "as of 1.04 s after the scan began" in body
+    assert "left arm" in body
+    assert "breathed by 2.2 mm, carried to one moment" in body
+    assert "stood 1.3 mm behind their place at mean breath, known to 0.4" in body
+
+
 def test_a_report_elsewhere_is_found_when_its_subject_is_forgotten(
     scan: MadeScan, tmp_path: Path
 ) -> None:

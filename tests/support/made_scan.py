@@ -70,6 +70,15 @@ def make_scan(folder: Path, subject: str = "s-17", grown_mm: float = 0.0) -> Mad
             name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names
         },
         "counts": {},
+        "person": {
+            "parts": [
+                {"name": "left arm", "moved_mm": 4.61, "left_mm": 0.17, "seen_once": 0.25},
+            ],
+            "breathed_mm": 2.2,
+            "moment_ms": 1041.7,
+            "fuller_mm": -1.26,
+            "fuller_sigma_mm": 0.42,
+        },
         "verdict": {"grade": "usable", "reasons": ["the person moved by 3.4 mm </script><b>"]},
         "measured": {"p1-1": 1000, "p1-2": 1200, "p2-1": 0},
         "failed": {"p2-1": "no light"},
