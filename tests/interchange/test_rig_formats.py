@@ -490,3 +490,13 @@ def test_whatever_nodes_hold_is_read_or_refused(kind: str, at: int, cut: int, ju
         path.write_text(text[:at] + junk + text[at + cut :])
         with suppress(CalibrationFileError):
             read_nodes(path, NODES)
+
+
+def test_a_colmap_model_whose_names_are_no_text_is_refused(tmp_path: Path) -> None:
+    """Found by `python -m benchmarks.fuzz`: a model read well, and then its names did not."""
+    form = RIG_FORMATS.find("colmap")
+    folder = form.write(ring(), tmp_path / form.path)
+    named = next(path for path in sorted(folder.glob("images.*")))
+    named.write_bytes(named.read_bytes().replace(b"p1-1", b"\x85\xff-1"))
+    with pytest.raises(CalibrationFileError, match="is not a COLMAP model"):
+        form.read(folder)

@@ -72,6 +72,9 @@ def read_colmap(folder: Path) -> dict[str, FoundCamera]:
     folder, model = Path(folder), pycolmap.Reconstruction()
     try:
         model.read(folder)
+        images = sorted(model.images.values(), key=lambda image: image.image_id)
+        # Names are decoded when they are asked for.
+        names_of = {image.image_id: image.name for image in images}
     except (OSError, ValueError, RuntimeError, IndexError, MemoryError) as error:
         said = str(error).strip().splitlines() or [type(error).__name__]
         raise CalibrationFileError(
@@ -81,10 +84,9 @@ def read_colmap(folder: Path) -> dict[str, FoundCamera]:
         ) from error
     gammas = _gammas(folder)
     found: dict[str, FoundCamera] = {}
-    images = sorted(model.images.values(), key=lambda image: image.image_id)
     for number, camera in sorted(model.cameras.items()):
         own = [image for image in images if image.camera_id == number]
-        names = {str(number), *_common_folder([image.name for image in own])}
+        names = {str(number), *_common_folder([names_of[image.image_id] for image in own])}
         rig_pose = _place_in_rig(model, number)
         for name in names - {image.name for image in own}:
             found[name] = _found(folder, camera, 0.0, rig_pose)
