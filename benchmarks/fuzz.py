@@ -1,7 +1,6 @@
 """Damaged files of every kind that is read: nothing but the program's own errors may come out.
 
-python -m benchmarks.fuzz [COUNT] [SEED] damages so many, each kind in turn; every other error is printed
-once.
+python -m benchmarks.fuzz [COUNT] [SEED]: so many, each kind in turn; any other error is printed once.
 """
 
 from __future__ import annotations
