@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_near
@@ -20,6 +22,8 @@ from bodyscan.stripes.one_moment import Moments
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import ResponseShare, StripeMap
 
+NUMBER = re.compile(r"\d[\d.]*%?(, \d[\d.]*%?)*")
+MOST_REASONS = 3
 FEW = 2
 """So many shots are told one by one, more with the same fault together."""
 
@@ -56,7 +60,7 @@ def decode_on_boards(
 ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
     """Stripe boundaries near each of these views; sequences that are bad are noted.
 
-    A pair of which none can be decoded, all for the same reason, is a failure.
+    A pair of which none can be decoded is a failure.
     """
     wanted: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
     for view in views:
@@ -127,14 +131,19 @@ def response_notes(responses: Mapping[str, Sequence[ResponseShare]]) -> Iterator
 
 
 def failed_pairs(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:
-    """Pairs that failed in every shot and in the same way, with the reason."""
-    reasons: dict[str, set[str]] = defaultdict(set)
+    """Pairs that failed in every shot, with the reason; of several reasons the first few."""
+    reasons: dict[str, dict[str, str]] = defaultdict(dict)
     for sequence, error in failures:
-        reasons[sequence.pair].add(plainly(error))
+        said = plainly(error)
+        # Shares of pixels differ from shot to shot where the fault is one.
+        reasons[sequence.pair].setdefault(NUMBER.sub("", said), said)
     return {
-        pair: next(iter(said))
+        pair: next(iter(said.values()))
+        if len(said) == 1
+        else "no stripe sequence can be decoded: "
+        + "\n  or: ".join(islice(said.values(), MOST_REASONS))
         for pair, said in reasons.items()
-        if pair not in good and len(said) == 1
+        if pair not in good
     }
 
 

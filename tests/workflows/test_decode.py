@@ -43,10 +43,18 @@ def failures(pair: str, what: str, *shots: str) -> list[tuple[ImageSequence, Dec
 def test_a_pair_whose_stripes_all_run_the_other_way_fails_for_that_reason() -> None:
     same = failures("p1", "the stripes run vertically", "a", "b", "c")
     mixed = [*failures("p2", "one", "a"), *failures("p2", "other", "b")]
-    assert failed_pairs([*same, *mixed], good={"p3"}) == {
-        "p1": "the stripes run vertically\n  do something"
-    }
+    found = failed_pairs([*same, *mixed], good={"p3"})
+    assert found["p1"] == "the stripes run vertically\n  do something"
+    assert found["p2"].startswith("no stripe sequence can be decoded: one\n")
+    assert "or: other" in found["p2"]
     assert failed_pairs(same, good={"p1"}) == {}
+
+
+def test_a_fault_is_one_whatever_its_share_of_the_pixels() -> None:
+    shares = [failures("p1", f"{share}% of the codes lie beyond", "a") for share in (27, 31)]
+    assert failed_pairs([one for own in shares for one in own], set()) == {
+        "p1": "27% of the codes lie beyond\n  do something"
+    }
 
 
 def test_many_shots_with_one_fault_share_a_note() -> None:
