@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +17,9 @@ MOST_OF_A_BIT = 2000
 ENOUGH = 600_000
 """Of the pixels lines are taken until there are so many."""
 BESIDE_PX = 4
+RIM = 2.0
+"""Times that one side of a change is as bright as the other: a rim, behind which another surface shows
+any stripe, or the edge of a print; changes there tell nothing of the order of frames."""
 EVERY = 61
 """Lines are taken so far apart, then those beside them, so that few tell of the whole picture."""
 
@@ -34,9 +38,9 @@ def clear_changes(
     found = np.empty((bits * MOST_OF_A_BIT, 3), np.uint16)
     lines = np.concatenate([np.arange(first, len(words), EVERY) for first in range(EVERY)])
     lines = lines[: 1 + ENOUGH // words.shape[1]]
-    count = _collect(
-        words, good, lines, images.patterns, images.inverses, CLEAR**2 * variance, found
-    )
+    bright = cv2.subtract(images.lit, images.dark)
+    frames = images.patterns, images.inverses
+    count = _collect(words, good, bright, lines, *frames, CLEAR**2 * variance, found)
     one, other, doubt = np.ascontiguousarray(found[:count].T)
     return one, other, doubt
 
@@ -45,6 +49,7 @@ def clear_changes(
 def _collect(
     words: Words,
     good: Mask,
+    bright: Greys,
     lines: Indices,
     patterns: Greys,
     inverses: Greys,
@@ -73,7 +78,7 @@ def _collect(
                     step = np.float32(seen) - np.float32(other)
                     if step * step < least2[np.int64(seen)] + least2[np.int64(other)]:
                         end = max(end, height + 1)
-            if end >= at:
+            if end >= at or _is_rim(bright[line], place):
                 continue
             if at >= FINE_BITS and not _lasts(
                 words, patterns[bits - 1 - at], inverses[bits - 1 - at], least2, line, place, flip
@@ -84,6 +89,14 @@ def _collect(
             found[count, 2] = (1 << end) - 1
             count += 1
     return count
+
+
+@compiled
+def _is_rim(bright: Greys, place: int) -> bool:
+    """Whether the change from `place` to the next along a line (P,) is where brightness changes too."""
+    before = np.float32(bright[max(place - BESIDE_PX, 0)])
+    after = np.float32(bright[min(place + 1 + BESIDE_PX, len(bright) - 1)])
+    return max(before, after) > RIM * min(before, after)
 
 
 @compiled

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from stripe_rendering import Sequence, decode_gray, render_sequence
 
-from bodyscan.arrays import Bytes
+from bodyscan.arrays import Bytes, Floats
 from bodyscan.errors import DecodingFailed
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes import stripe_code
@@ -87,6 +87,22 @@ def test_a_bit_in_place_of_another_is_noticed(good: Sequence) -> None:
     order = [0, 1, 2, 4, 4, 5, 6]
     with pytest.raises(DecodingFailed, match="do not make a stripe code"):
         read(reordered(good, order))
+
+
+def test_a_rim_where_one_bit_alone_flips_is_no_wrong_order() -> None:
+    """A board before a dark wall: stripe 14 of the wall meets stripe 49 of the board, whose words
+    differ in bit 1, which flips nowhere else in the picture."""
+
+    def at(u: Floats, v: Floats) -> Floats:
+        return np.where(v < 120, 14.3 + (v - 120) / 12, 49.4 + (v - 120) / 3)
+
+    def albedo(u: Floats, v: Floats) -> Floats:
+        return np.where(v < 120, 0.25, 1.0)
+
+    scene = render_sequence(at, stripes=STRIPES, albedo=albedo)
+    assert np.isfinite(read(scene).s).mean() > 0.5
+    with pytest.raises(DecodingFailed, match="bits 3 and 4 were exchanged"):
+        read(reordered(scene, [0, 1, 2, 4, 3, 5, 6]))
 
 
 def test_a_sequence_of_the_wrong_length_or_size_is_refused(good: Sequence) -> None:
