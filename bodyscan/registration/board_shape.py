@@ -255,7 +255,18 @@ def _hold_out(
             flat_ones.append(np.concatenate(fit_board(own, flat, placing).residuals))
             bent_ones.append(np.concatenate(fit_board(true, bent.solution, placing).residuals))
             part.append(np.full(len(flat_ones[-1]), targets.index(target)))
-    return Compared(np.concatenate(flat_ones), np.concatenate(bent_ones), np.concatenate(part))
+    every = Compared(np.concatenate(flat_ones), np.concatenate(bent_ones), np.concatenate(part))
+    return _without_extremes(every)
+
+
+def _without_extremes(compared: Compared) -> Compared:
+    """Less the board that speaks most for the shape and the one that speaks most against it: where
+    half the views leave a lens open beyond their boards, one board there would decide alone."""
+    better = np.sum(compared.simple**2 - compared.rich**2, axis=1)
+    boards = np.unique(compared.part)
+    order = boards[np.argsort([better[compared.part == board].mean() for board in boards])]
+    kept = np.isin(compared.part, order[1:-1])
+    return Compared(compared.simple[kept], compared.rich[kept], compared.part[kept])
 
 
 def _median(residuals: Array) -> float:
