@@ -96,7 +96,7 @@ def _is_rim(bright: Greys, place: int) -> bool:
     """Whether the change from `place` to the next along a line (P,) is where brightness changes too."""
     before = np.float32(bright[max(place - BESIDE_PX, 0)])
     after = np.float32(bright[min(place + 1 + BESIDE_PX, len(bright) - 1)])
-    return max(before, after) > RIM * min(before, after)
+    return bool(max(before, after) > RIM * min(before, after))
 
 
 @compiled
