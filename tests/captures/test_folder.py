@@ -6,6 +6,7 @@ from datetime import datetime
 from pathlib import Path
 
 import pytest
+import yaml
 from small_captures import FRAMES, RIG, picture, write, write_small_captures
 
 from bodyscan.captures.captures_file import (
@@ -332,11 +333,19 @@ def test_the_examples_of_the_documentation_are_right(tmp_path: Path) -> None:
     root = Path(__file__).parents[2]
     text = (root / "docs" / "formats.md").read_text(encoding="utf-8")
     blocks = [part.split("```")[0] for part in text.split("```yaml\n")[1:]]
-    (whole,) = (block for block in blocks if "boards:" in block)
+    (whole,) = (block for block in blocks if "\nboards:" in block)
+    (references,) = (block for block in blocks if block.startswith("references:"))
     (frames,) = (block for block in blocks if block.startswith("frames:"))
     (captures,) = (block for block in blocks if "kind: calibration" in block)
     rig = load_rig(write(tmp_path / "rig.yaml", whole + frames))
     assert rig.frames.lit == "40"
+    described = yaml.safe_load(whole + frames + references)
+    described["boards"] += [
+        {**described["boards"][0], "name": name, "kind": "charuco"}
+        for name in ("left", "right", "plate")
+    ]
+    certified = load_rig(write(tmp_path / "rig.yaml", yaml.safe_dump(described)))
+    assert [reference.name for reference in certified.references] == ["bar", "steel"]
     write(tmp_path / "captures.yaml", captures)
     file = load_captures_file(tmp_path, load_rig(root / "rigs" / "three-pole-12.yaml"))
     assert file.shots is not None
