@@ -340,9 +340,10 @@ def test_the_examples_of_the_documentation_are_right(tmp_path: Path) -> None:
     rig = load_rig(write(tmp_path / "rig.yaml", whole + frames))
     assert rig.frames.lit == "40"
     described = yaml.safe_load(whole + frames + references)
+    marked = {**described["boards"][0], "kind": "charuco", "marker_mm": 50}
     described["boards"] += [
-        {**described["boards"][0], "name": name, "kind": "charuco"}
-        for name in ("left", "right", "plate")
+        {**marked, "name": name, "first_marker": 100 * k}
+        for k, name in enumerate(("left", "right", "plate"))
     ]
     certified = load_rig(write(tmp_path / "rig.yaml", yaml.safe_dump(described)))
     assert [reference.name for reference in certified.references] == ["bar", "steel"]
