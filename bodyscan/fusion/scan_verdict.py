@@ -223,8 +223,8 @@ def _contradictions(found: Contradictions | None, seams: SeamReport | None) -> I
     blamed = found.blamed(seams.groups) if seams else ""
     yield (
         "repeat" if found.share > MOST_CONTRADICTED else "usable",
-        f"the pairs contradict each other{f', {blamed} and the others' if blamed else ''}: "
-        f"{found.share:.1%} of what they say of one another's points is that there is no surface; "
+        f"{f'{blamed} and the others' if blamed else 'the pairs'} contradict each other: "
+        f"{found.share:.1%} of what pairs say of one another's points is that there is no surface; "
         + (
             f"was {blamed} moved since the calibration, is it from another scan, "
             if blamed
