@@ -173,10 +173,12 @@ def _seams(seams: SeamReport | None, use: UseLimits) -> Iterator[Finding]:
 
 
 def _shifted(step: PoleStep | None) -> Iterator[Finding]:
-    """Alignment has taken it out; what that left is for the seams to say."""
+    """Alignment has taken it out; what that left is for the seams to say. But whether a single pair
+    stands elsewhere or measures wrongly (another lens, rows lost), which no placing mends, nobody can
+    tell."""
     if step is not None:
         yield (
-            "usable",
+            "repeat" if len(step.pairs) == 1 else "usable",
             f"{step.name} stands {step.shift_mm:.1f} mm from where the calibration has it, turned by "
             f"{step.turn_deg:.2f} degrees, by itself and at once, as no person moves: it was moved "
             "since, and brought to the others here; calibrate again",

@@ -44,7 +44,7 @@ def test_a_person_is_no_pole(sway_mm: float) -> None:
 
 @pytest.mark.parametrize(
     ("sway_mm", "step"),
-    [(0.0, [0, 2, 0, 0, 0, 0]), (3.0, [5, 0, 0, 0, 0, 0]), (3.0, [0, 0, 0, 0, 0, 2])],
+    [(0.0, [0, 3, 0, 0, 0, 0]), (3.0, [5, 0, 0, 0, 0, 0]), (3.0, [0, 0, 0, 0, 0, 2])],
 )
 def test_a_pole_that_moved_is_named_though_the_person_sways(
     sway_mm: float, step: list[float]

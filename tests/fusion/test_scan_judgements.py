@@ -9,6 +9,7 @@ import pytest
 from made_scan import MadeScan, make_scan
 
 from bodyscan.alignment.icp import Alignment, Overlap
+from bodyscan.alignment.pole_steps import PoleStep
 from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.seams import Seam, SeamReport
@@ -140,6 +141,16 @@ def test_one_pair_is_blamed_rather_than_its_pole() -> None:
 def test_a_person_who_moved_all_the_time_is_blamed_on_nobody() -> None:
     names = ["a1", "a2", "b1", "b2", "c1"]
     assert against(dict.fromkeys(combinations(names, 2), 0.1)).blamed(POLES) == ""
+
+
+@pytest.mark.parametrize(("pairs", "grade"), [({"p1", "p2"}, "usable"), ({"p1"}, "repeat")])
+def test_a_pole_that_moved_is_mended_and_a_pair_may_measure_wrongly(
+    scan: MadeScan, pairs: set[str], grade: str
+) -> None:
+    step = PoleStep("pole p", frozenset(pairs), 5.0, 0.1)
+    verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=step)
+    assert verdict.grade == grade
+    assert "pole p stands 5.0 mm from where the calibration has it" in str(verdict)
 
 
 def test_a_pair_that_does_not_fit_is_to_be_repeated(scan: MadeScan) -> None:
