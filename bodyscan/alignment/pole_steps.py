@@ -24,14 +24,14 @@ FEWEST = 4
 """pairs: of two or three, any may have been the one that moved."""
 STEP_MM = 1.0
 """What it is said from. Less is what calibrations of poles disagree by, and alignment takes it out."""
-SURE = 5.0
-"""Logarithm of how many times as well a moved pole has to explain it: 150 times."""
+SURE = 6.0
+"""Logarithm of how many times as well a moved pole has to explain it: 400 times."""
 NOISE_MM = np.geomspace(0.05, 1.0, 5)
 SWAY_MM = np.geomspace(0.05, 20.0, 10)
 STILL_MM = 0.4
 """What a mannequin seems to sway by, as calibrations disagree; a person who stands, by 1 to 5."""
-SHARED_MM = 0.5
-"""What alignment gets wrong of all pairs of a pole together: they see the same side of the body."""
+SHARED = 0.3
+"""Of a sway: what its rigid motion leaves, alike for the pairs of a pole, which see the same side."""
 STEPS_MM = np.geomspace(0.5, 30.0, 8)
 NEARLY = 0.5
 """Correlation of a stance with that of 0.8 s later. A pole that fired when no other did, by
@@ -90,20 +90,17 @@ def find_pole_step(
     twists = np.array([motions[name] for name in names])
     seen = np.hstack([centre_shifts(twists), ARM_MM * twists[:, :3]])
     seconds = 1e-3 * np.array([moments_ms[name] for name in names], float)
-    sway = of_stance(seconds[:, None] - seconds)
+    stance = of_stance(seconds[:, None] - seconds)
     side = [poles.get(name, name) for name in names]
-    shared = SHARED_MM**2 * np.equal.outer(side, side)
-    still = _evidence(seen, shared, SWAY_MM, sway, np.zeros((len(names),) * 2), np.zeros(1))
+    sway = stance + SHARED**2 * np.equal.outer(side, side)
+    still = _evidence(seen, SWAY_MM, sway, np.zeros((len(names),) * 2), np.zeros(1))
     found: list[tuple[float, PoleStep]] = []
     for name, pairs in moving_alone(names, poles).items():
         own = np.array([pair in pairs for pair in names])
-        if not own.all() and sway[np.ix_(own, ~own)].max() > NEARLY:
+        if not own.all() and stance[np.ix_(own, ~own)].max() > NEARLY:
             # A head or an arm that moved looks like the one pair that saw it: of those who stand.
             swayed = SWAY_MM if len(pairs) > 1 else SWAY_MM[SWAY_MM < STILL_MM]
-            gain = (
-                _evidence(seen, shared, swayed, sway, np.outer(own, own).astype(float), STEPS_MM)
-                - still
-            )
+            gain = _evidence(seen, swayed, sway, np.outer(own, own).astype(float), STEPS_MM) - still
             found.append((gain, PoleStep.of(name, pairs, {n: motions[n] for n in names})))
     if not found:
         return None
@@ -129,9 +126,7 @@ def motions_between(
     return {name: (after[name] @ before[name].inverse()).twist for name in after}
 
 
-def _evidence(
-    seen: Array, shared: Array, sways_mm: Array, sway: Array, step: Array, steps_mm: Array
-) -> float:
+def _evidence(seen: Array, sways_mm: Array, sway: Array, step: Array, steps_mm: Array) -> float:
     """Logarithm of the likelihood of motions (P, 6), at the sizes of sway, step and noise that
     explain them best."""
     size = len(sway)
@@ -140,7 +135,6 @@ def _evidence(
         noise2.ravel()[:, None, None] * np.eye(size)
         + sway2.ravel()[:, None, None] * sway
         + step2.ravel()[:, None, None] * step
-        + shared
         + ANYWHERE_MM**2
     )
     pulls = np.linalg.solve(covariance, np.broadcast_to(seen, (len(covariance), *seen.shape)))
