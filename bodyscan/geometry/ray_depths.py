@@ -16,12 +16,16 @@ from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.pixel_rays import rays_through
 from bodyscan.geometry.plane_table import PlaneTable
+from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 Way = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 MOST_SIGMA = 1e-3
 """A sheet that leaves a depth uncertain by more than this share of it is as good as none: so far
 from all boards a smooth model only guesses."""
+GUESSED = 3.0
+"""Times as uncertain as amid the boards: what a few boards leave open of all depths alike is in their
+sigma, and no guess."""
 SAMPLES = 400
 BAND = 16  # rows at a time: what fits into a processor's cache
 
@@ -98,10 +102,20 @@ def triangulate_image(
 
 
 def _most_sigma(sheets: LightSheets) -> float:
-    """MOST_SIGMA where sheets were fitted to boards; a projector that was calibrated elsewhere is
-    nowhere a guess, however roughly it may be known."""
-    alike = isinstance(sheets, LensSheets) and sheets.uncertain_alike
-    return np.inf if alike else MOST_SIGMA
+    """MOST_SIGMA, or GUESSED times what boards leave open where they were; a projector that was
+    calibrated elsewhere is nowhere a guess, however roughly it may be known."""
+    if isinstance(sheets, LensSheets) and sheets.uncertain_alike:
+        return np.inf
+    if not isinstance(sheets, SmoothSheets):
+        return MOST_SIGMA
+    stripes = np.arange(sheets.stripes + 1.0)
+    rays = np.tile(sheets.middle / sheets.middle[2], (len(stripes), 1))
+    away = np.abs(sheets.depth(rays, stripes) - sheets.middle[2])
+    if not np.isfinite(away).any():
+        return MOST_SIGMA
+    nearest = slice(int(np.nanargmin(away)), None)
+    variance = sheets.variance_mm2(rays[nearest][:1], stripes[nearest][:1])
+    return float(max(MOST_SIGMA, GUESSED * np.sqrt(variance[0]) / sheets.middle[2]))
 
 
 def _way_to_measure(sheets: LightSheets) -> Way:

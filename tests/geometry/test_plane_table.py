@@ -93,3 +93,21 @@ def test_an_image_is_measured_as_its_rays_are(planes: SmoothSheets) -> None:
     # Rays are tabulated to 1e-4 px, or twice that between nodes: 1.2e-3 mm at 3 m and 500 px.
     np.testing.assert_allclose(points[near], z * rays[near], rtol=1e-6, atol=1.2e-3)
     np.testing.assert_allclose(sigma_mm[near], along[near], rtol=2e-3)
+
+
+def test_what_boards_leave_open_everywhere_is_no_guess(planes: SmoothSheets) -> None:
+    """A focal length from four boards at 4 m leaves all depths open by half a per cent alike."""
+    rays = CAMERA.pixel_rays()
+    column = int(np.argmin(np.linalg.norm(rays - MIDDLE / MIDDLE[2], axis=-1)) % CAMERA.width)
+    row = int(np.argmin(np.linalg.norm(rays - MIDDLE / MIDDLE[2], axis=-1)) // CAMERA.width)
+    ray, every = rays[row, column][None], np.linspace(1.0, STRIPES - 1.0, 500)
+    depth = planes.depth(np.repeat(ray, 500, axis=0), every)
+    stripe = every[np.nanargmin(np.abs(depth - MIDDLE[2]))]
+    share = np.sqrt(planes.variance_mm2(ray, np.array([stripe]))[0]) / MIDDLE[2]
+    s = np.full((CAMERA.height, CAMERA.width), np.nan, np.float32)
+    s[row, column] = stripe
+    sigma = np.full(s.shape, 0.02, np.float32)
+    vague = planes.with_covariance(planes.covariance * (5e-3 / share) ** 2)
+    known = np.isfinite(triangulate_image(vague, CAMERA, s, sigma)[1])
+    assert known[row, column]
+    assert known.sum() == 1
