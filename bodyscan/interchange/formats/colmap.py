@@ -129,7 +129,8 @@ def _place_in_rig(model: Any, number: int) -> RigidTransform | None:
         if rig.num_sensors() > 1 and rig.has_sensor(sensor):
             if rig.is_ref_sensor(sensor):
                 return RigidTransform.identity()
-            return _transform(rig.sensor_from_rig(sensor))
+            pose = rig.sensor_from_rig(sensor)
+            return None if pose is None else _transform(pose)
     return None
 
 
