@@ -76,6 +76,7 @@ mutants: setup
 	$(BIN)/python -m benchmarks mutants
 
 # Users get the newest libraries that pyproject.toml allows; CI those of the day it was last looked at.
+# To be made with the oldest Python there is: what it can have, all can.
 .PHONY: lock
 lock:
 	rm -rf build/lock
