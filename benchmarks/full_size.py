@@ -13,7 +13,6 @@ from pathlib import Path
 
 PROJECT = Path(__file__).parents[1]
 WORKSPACE = PROJECT / "bench" / "three-pole-12"
-PRESETS = ("standing", "restless")
 
 
 def three_pole() -> str:
@@ -28,27 +27,19 @@ def four_pole() -> str:
 
 def living() -> str:
     """The section of docs/results.md of the woman as people stand, calibrated by `three_pole`."""
-    parts = "\n".join(_living(preset) for preset in PRESETS)
-    return f"""## A person who sways, breathes and moves her arms, full size (synthetic)
-
-The woman in the rig of `three-pole-12`, calibrated there, twelve pairs one after the other
-(`bodyscan simulate --subject-preset`). Distances are to the body at the moment that the scan stands
-for.
-
-{parts}
-"""
-
-
-def _living(preset: str) -> str:
-    workspace = PROJECT / "bench" / preset
+    workspace = PROJECT / "bench" / "standing"
     rig, subject = PROJECT / "rigs" / "three-pole-12.yaml", _subject("woman_average")
     commands = _commands(rig, workspace, subject)
-    commands["simulate"] += ["--subject-preset", preset, "--board-shots", 0]
+    commands["simulate"] += ["--subject-preset", "standing", "--board-shots", 0]
     del commands["calibrate-rig"], commands["export"]
     shutil.rmtree(workspace / "calibration", ignore_errors=True)
     shutil.copytree(WORKSPACE / "calibration", workspace / "calibration")
     outputs, _, _ = run_commands(commands, workspace)
-    return f"""`{preset}`:
+    return f"""## A person who sways, breathes and moves her arms, full size (synthetic)
+
+The woman in the rig of `three-pole-12`, calibrated there, twelve pairs one after the other
+(`bodyscan simulate --subject-preset standing`). Distances are to the body at the moment that the
+scan stands for.
 
 ```
 {_against_truth(outputs)}
