@@ -191,19 +191,27 @@ def test_planes_have_slope_and_variance_between_two_and_at_the_last() -> None:
 
 
 def test_what_is_too_uncertain_is_not_measured() -> None:
+    """More uncertain than a thousandth of the distance, and than thrice what is amid the boards."""
     model = models(2)[0]
     assert isinstance(model, LensSheets)
-    points, _ = some_points(np.random.default_rng(6))
+    rng = np.random.default_rng(6)
+    points = MIDDLE + rng.uniform(-400.0, 400.0, (3000, 3))
+    points *= rng.uniform(0.5, 8.0, (3000, 1))  # far beyond the boards too
     rays = points / points[:, 2:]
     s = model.stripe(points)
     inside = (s > 0) & (s < STRIPES)
-    good = intersect_rays(model, rays, s)
-    assert np.array_equal(np.isfinite(good.depth), inside)
-    sigma = float(np.sqrt(np.nanmedian(good.variance_mm2)))
-    worse = model.with_covariance(model.covariance * (1e-3 * 1300.0 / sigma) ** 2)
-    kept = np.isfinite(intersect_rays(worse, rays, s).depth)
-    # Sigma is now about one thousandth of the distance: some are below, some above.
-    assert 0 < kept.sum() < inside.sum()
+    depth = model.depth(rays[inside], s[inside])
+    share = np.sqrt(model.variance_mm2(rays[inside], s[inside], depth)) / depth
+    amid_boards = model.stripe(MIDDLE[None])
+    amid = float(np.sqrt(model.variance_mm2(MIDDLE[None] / MIDDLE[2], amid_boards)[0])) / MIDDLE[2]
+    for at_the_boards, most in ((1e-4, 1e-3), (1e-3, 3e-3), (1e-2, 3e-2)):
+        scaled = share * at_the_boards / amid
+        worse = model.with_covariance(model.covariance * (at_the_boards / amid) ** 2)
+        kept = np.isfinite(intersect_rays(worse, rays[inside], s[inside]).depth)
+        clear = np.abs(scaled / most - 1.0) > 0.02  # the stripe amid the boards is a whole one
+        np.testing.assert_array_equal(kept[clear], scaled[clear] < most)
+        assert kept.sum() > 0
+    assert kept.sum() < inside.sum()
 
 
 @pytest.mark.parametrize("terms", [0, 1, 4, 5, 8])
