@@ -123,7 +123,7 @@ def align(
             inner = [seen.inner for seen in clouds]
             motion = register(inner, start, names, prior, settings)
         else:
-            motion = _register(pool, clouds, start, names, prior, settings)
+            motion = _register(pool, (coarse, clouds), start, names, prior, settings)
         widest = sway.covariance(names, prior, sway.most)
         motion, refused = bound_motions(names, motion, widest, settings.limit_sigmas)
         moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
@@ -147,20 +147,22 @@ def align(
 
 def _register(
     pool: ThreadPoolExecutor,
-    clouds: Sequence[_Seen],
+    clouds: tuple[Sequence[_Seen], Sequence[_Seen]],
     start: Sequence[RigidTransform],
     names: Sequence[str],
     prior: PoseCovariance,
     settings: AlignmentSettings,
 ) -> Array:
-    """Motions (P, 6), rig frame: in each round matches anew, and one step of all pairs together."""
+    """Motions (P, 6), rig frame: in each round matches anew, and one step of all pairs together.
+
+    clouds: coarse, and for the last rounds fine."""
     motion, sway = np.zeros((len(start), 6)), SwayPrior.of(settings)
     reach, scale = settings.reach_mm, 1.0
     equations = partial(OverlapEquations.of, correlated=settings.correlated)
-    coarse = [seen.subsample(COARSE) for seen in clouds]
+    coarse, fine = clouds
     for left in range(settings.rounds, 0, -1):
         moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
-        taken = clouds if left <= FINE_ROUNDS else coarse
+        taken = fine if left <= FINE_ROUNDS else coarse
         overlaps = _each_overlap(equations, pool, taken, moved, reach, settings)
         motion = solve_motions(overlaps, motion, sway.covariance(names, prior, scale))
         reach, scale = max(reach / 2.0, settings.least_reach_mm), sway.scale(motion)
