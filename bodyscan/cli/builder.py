@@ -234,10 +234,15 @@ def export_rig(
         RigExportSettings().formats
     ),
 ) -> None:
-    """Write a calibrated rig as colmap, opencv, kalibr, mrcal, caliscope or aniposelib read it."""
+    """Write a calibrated rig as colmap, opencv, kalibr, mrcal, caliscope or aniposelib read it.
+
+    Projectors that have a centre and a lens are written as further cameras.
+    """
     from bodyscan.export.rig import export_rig as write
     from bodyscan.registration.storage import load_calibration
 
     require_writable(out)
-    for path in write(load_calibration(calibration), out, formats.split(",")):
+    written = write(load_calibration(calibration), out, formats.split(","))
+    for path in written.value:
         output.made("rig", path)
+    output.told(written)

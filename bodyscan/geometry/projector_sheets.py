@@ -11,6 +11,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lens_sheets import CENTRE, FRAME, SCALE, LensSheets
+from bodyscan.geometry.lenses import lens_from_opencv
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 
@@ -54,6 +55,28 @@ def sheets_of_projector(
     covariance[CENTRE, CENTRE] = (sigma_px / width) ** 2
     frame = RigidTransform(turn, np.zeros(3)) @ projector_from_camera
     return LensSheets(frame, middle, stripes, direction, parameters, covariance)
+
+
+def projector_of_sheets(sheets: LensSheets) -> tuple[Camera, RigidTransform]:
+    """The way back: the projector as a camera with a pixel a stripe, and `projector_from_camera`.
+
+    Across the stripes it is exact. Along them its picture is square, of square pixels, its axis in
+    the middle: one direction of stripes says nothing of that.
+    """
+    focal, centre = sheets.parameters[:SCALE].tolist()
+    terms = sheets.parameters[SCALE:]
+    coefficients = np.zeros(max(len(terms), 5))
+    coefficients[: len(terms)] = terms
+    frame, size = sheets.projector_from_camera, sheets.stripes
+    u0 = v0 = 0.5 * (size - 1.0)
+    if sheets.direction == "vertical":
+        turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        frame = RigidTransform(turn, np.zeros(3)) @ frame
+        coefficients[[2, 3]] = -coefficients[3], coefficients[2]
+        u0 = centre - 0.5
+    else:
+        v0 = centre - 0.5
+    return Camera(focal, focal, 0.0, u0, v0, lens_from_opencv(coefficients), size, size), frame
 
 
 def looked_at(camera: Camera, projector: Camera, projector_from_camera: RigidTransform) -> Array:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from bodyscan.interchange.found_camera import FoundCamera
 
 RigCameras: TypeAlias = "Mapping[str, tuple[Camera, RigidTransform]]"
-"""Camera and `rig_from_camera` by the pair's name."""
+"""Camera and `rig_from_camera` by the pair's name; projectors, as cameras, by `projector_name`."""
 Unit = Literal["mm", "cm", "m"]
 MILLIMETRES: dict[Unit, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 """In one of a unit."""
@@ -42,6 +42,11 @@ class RigFormat:
     write: Callable[[RigCameras, Path], Path]
     read: Callable[[Path], dict[str, FoundCamera]]
     read_nodes: Callable[[Path, Nodes], FoundCamera] | None = None
+
+
+def projector_name(pair: str) -> str:
+    """How a pair's projector is called among the cameras."""
+    return f"{pair}-projector"
 
 
 def opencv_lens(name: str, camera: Camera) -> Array:

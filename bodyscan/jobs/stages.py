@@ -156,7 +156,7 @@ KINDS: Kinds = {
     ),
     "calibrate": (
         Stage("calibration", 3, (), rig_inputs, run_calibrate),
-        Stage("rig", 1, ("rig_export",), results_of("calibration"), run_rig_export),
+        Stage("rig", 2, ("rig_export",), results_of("calibration"), run_rig_export),
         Stage("report", 1, (), results_of("calibration"), run_report),
     ),
 }

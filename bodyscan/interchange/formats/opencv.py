@@ -8,6 +8,7 @@ OpenCV's camera functions know no skew, so the file says what to do about it.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,23 @@ import cv2
 from bodyscan.errors import CalibrationFileError
 from bodyscan.files.atomic import write_text
 from bodyscan.files.model import did_you_mean
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.foreign_file import ForeignFile
 from bodyscan.interchange.found_camera import FoundCamera
-from bodyscan.interchange.rig_format import Nodes, RigCameras, RigFormat, opencv_lens
+from bodyscan.interchange.rig_format import (
+    Nodes,
+    RigCameras,
+    RigFormat,
+    opencv_lens,
+    projector_name,
+)
 
 NOTE = (
     "Lengths in mm. x_camera = R x_rig + T. Pixel centres at whole numbers. camera_matrix holds the "
     "skew, but OpenCV's functions ignore it: use it with pixels sheared to "
-    "u - skew / fy * (v - cy), v, which a camera without skew would have seen."
+    "u - skew / fy * (v - cy), v, which a camera without skew would have seen. Of a projector, "
+    "x_projector = R x_camera + T, as stereoCalibrate has it; the middle of its first column is 0."
 )
 HEADER = "%YAML:1.0\n---\n"
 """OpenCV reads no YAML without it, such as ROS writes."""
@@ -31,7 +41,8 @@ HEADER = "%YAML:1.0\n---\n"
 
 def write_opencv(cameras: RigCameras, path: Path) -> Path:
     """A sequence `pairs` as cv2.FileStorage reads it: name, image size, camera_matrix (with its
-    skew), distortion_coefficients (OpenCV's, in its order), R and T of `camera_from_rig`.
+    skew), distortion_coefficients (OpenCV's, in its order), R and T of `camera_from_rig`; and of a
+    pair whose projector is known `projector`, with R and T of `projector_from_camera`.
 
     Returns `path`.  Raises BadInput for a lens that OpenCV does not have.
     """
@@ -39,25 +50,38 @@ def write_opencv(cameras: RigCameras, path: Path) -> Path:
     store = cv2.FileStorage("rig.yaml", memory)
     store.writeComment(NOTE, False)
     store.startWriteStruct("pairs", cv2.FILE_NODE_SEQ)
+    inner = {projector_name(name) for name in cameras}
     for name, (camera, rig_from_camera) in cameras.items():
-        camera_from_rig = rig_from_camera.inverse()
+        if name in inner:
+            continue
         store.startWriteStruct("", cv2.FILE_NODE_MAP)
         store.write("name", name)
-        store.write("image_width", camera.width)
-        store.write("image_height", camera.height)
-        store.write("camera_matrix", camera.matrix)
-        store.write("skew", camera.gamma)
-        store.write("distortion_coefficients", opencv_lens(name, camera)[None])
-        store.write("R", camera_from_rig.rotation)
-        store.write("T", camera_from_rig.translation.reshape(3, 1))
+        _write_camera(store, name, camera, rig_from_camera.inverse())
+        light = projector_name(name)
+        if light in cameras:
+            projector, rig_from_projector = cameras[light]
+            store.startWriteStruct("projector", cv2.FILE_NODE_MAP)
+            from_camera = rig_from_projector.inverse() @ rig_from_camera
+            _write_camera(store, light, projector, from_camera)
+            store.endWriteStruct()
         store.endWriteStruct()
     store.endWriteStruct()
     write_text(Path(path), store.releaseAndGetString())
     return Path(path)
 
 
+def _write_camera(store: Any, name: str, camera: Camera, pose: RigidTransform) -> None:
+    store.write("image_width", camera.width)
+    store.write("image_height", camera.height)
+    store.write("camera_matrix", camera.matrix)
+    store.write("skew", camera.gamma)
+    store.write("distortion_coefficients", opencv_lens(name, camera)[None])
+    store.write("R", pose.rotation)
+    store.write("T", pose.translation.reshape(3, 1))
+
+
 def read_opencv(path: Path) -> dict[str, FoundCamera]:
-    """The cameras of a file that `write_opencv` wrote."""
+    """The cameras of a file that `write_opencv` wrote, and their projectors by `projector_name`."""
     file = ForeignFile.read(path)
     store = _opened(file)
     pairs = store.getNode("pairs")
@@ -70,20 +94,30 @@ def read_opencv(path: Path) -> dict[str, FoundCamera]:
     found = {}
     for k in range(int(pairs.size())):
         entry, name = pairs.at(k), f"pairs/{k}"
-
-        def numbers(key: str, entry: Any = entry, name: str = name) -> Any:
-            return _values(file, _below(file, entry, key, name), f"{name}/{key}")
-
         label = _below(file, entry, "name", name).string()
-        size = [numbers("image_width"), numbers("image_height")]
-        found[label] = FoundCamera(
-            file.matrix(numbers("camera_matrix"), "camera_matrix", after=label),
-            file.lens(numbers("distortion_coefficients"), "distortion_coefficients", after=label),
-            file.size(size, "image_width", after=label),
-            file.pose(numbers("R"), numbers("T"), ("R", "T"), after=label),
-            file.where("camera_matrix", label),
-        )
+        own = found[label] = _read_camera(file, entry, name, label)
+        if "projector" in entry.keys():  # noqa: SIM118 (it is no dict)
+            light = _below(file, entry, "projector", name)
+            inner = _read_camera(file, light, f"{name}/projector", label)
+            assert inner.camera_from_world is not None
+            assert own.camera_from_world is not None
+            from_rig = inner.camera_from_world @ own.camera_from_world
+            found[projector_name(label)] = replace(inner, camera_from_world=from_rig)
     return found
+
+
+def _read_camera(file: ForeignFile, entry: Any, name: str, label: str) -> FoundCamera:
+    def numbers(key: str) -> Any:
+        return _values(file, _below(file, entry, key, name), f"{name}/{key}")
+
+    size = [numbers("image_width"), numbers("image_height")]
+    return FoundCamera(
+        file.matrix(numbers("camera_matrix"), "camera_matrix", after=label),
+        file.lens(numbers("distortion_coefficients"), "distortion_coefficients", after=label),
+        file.size(size, "image_width", after=label),
+        file.pose(numbers("R"), numbers("T"), ("R", "T"), after=label),
+        file.where("camera_matrix", label),
+    )
 
 
 def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:

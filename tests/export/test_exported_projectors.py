@@ -1,0 +1,164 @@
+"""A pair written for another program and imported again from there: the same rays, the same sheets."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from real_captures import real_rig_file
+
+from bodyscan.arrays import Array
+from bodyscan.calibration.pair import PairCalibration, PairQuality
+from bodyscan.export.rig import export_rig, projectors_of
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lens_sheets import LensSheets
+from bodyscan.geometry.lenses import lens_from_opencv
+from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.projector_sheets import sheets_of_projector
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.interchange.rig_format import RIG_FORMATS
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.rig.rig import Rig
+from bodyscan.rig.rig_file import load_rig
+from bodyscan.workflows.import_rig import import_rig
+
+SEEN = RigidTransform.from_rotation_vector([0.02, 0.2, 0.01], [-210.0, 5.0, -20.0])
+RADIAL, LONG = np.array([-0.05, 0.3, 1e-3, -2e-3, 0.0]), np.array([-0.05, 1.4, -7e-3, -2e-3, -7.3])
+STORED_MM, STORED_STRIPES = 1e-7, 1e-6
+"""What is left of a fit that is exact, in one of the scanner's 1000 mm and stripes."""
+
+
+def described(form: str | None) -> Rig:
+    """Two pairs; with a format they are known from what was written in it."""
+    projector = {"code": "gray", "stripes": 1280, "direction": "vertical"}
+    pair: dict[str, Any] = {
+        "camera": {"width": 1280, "height": 1024},
+        "projector": {**projector, "crossing": {"stripes": 800}},
+    }
+    pairs = []
+    for name in ("a", "b"):
+        own = {"name": name, **pair}
+        if form is not None:
+            known = {"file": RIG_FORMATS.find(form).path, "format": form}
+            names = {"camera": {"name": name}, "projector": {"name": f"{name}-projector"}}
+            unit = {} if RIG_FORMATS.find(form).unit else {"units": "mm"}
+            own["known"] = {**known, **names, **unit}
+        pairs.append(own)
+    return Rig.model_validate({"name": "two", "pairs": pairs})
+
+
+def calibrated(lens: Array) -> RigCalibration:
+    camera = Camera(1400.0, 1410.0, 0.0, 640.0, 500.0, Radial(-0.1, 0.05), 1280, 1024)
+    light = Camera(1650.0, 1720.0, 0.0, 622.0, 763.0, lens_from_opencv(lens), 1280, 800)
+    middle = np.array([0.0, 0.0, 1000.0])
+    columns = sheets_of_projector(light, SEEN, middle, 1280, "vertical")
+    rows = sheets_of_projector(light, SEEN, middle, 800, "horizontal")
+    quality = PairQuality(0.1, 9)
+    pairs = {
+        name: PairCalibration(name, camera, np.eye(7), columns, quality, rows)
+        for name in ("a", "b")
+    }
+    places = {
+        "a": RigidTransform.identity(),
+        "b": RigidTransform.from_rotation_vector([0.0, 1.2, 0.1], [-900.0, 20.0, 500.0]),
+    }
+    covariance = PoseCovariance(("a", "b"), np.eye(12))
+    return RigCalibration(described(None), pairs, places, covariance, {}, {}, ())
+
+
+def stripes_of(sheets: LightSheets | None, points: Array) -> Array:
+    assert isinstance(sheets, LensSheets)
+    return sheets.stripe(points)
+
+
+def assert_same(found: RigCalibration, wanted: RigCalibration) -> None:
+    points = np.random.default_rng(5).uniform([-200, -150, 800], [200, 150, 1200], (200, 3))
+    for name, pair in wanted.pairs.items():
+        own = found.pairs[name]
+        pixels = pair.camera.project(points)
+        np.testing.assert_allclose(own.camera.rays(pixels), pair.camera.rays(pixels), atol=1e-9)
+        for now, before in ((own.sheets, pair.sheets), (own.crossing, pair.crossing)):
+            s = stripes_of(now, points)
+            np.testing.assert_allclose(s, stripes_of(before, points), rtol=0, atol=STORED_STRIPES)
+
+
+@pytest.mark.parametrize("form", RIG_FORMATS.names())
+def test_what_was_exported_is_imported_as_it_was(tmp_path: Path, form: str) -> None:
+    wanted = calibrated(RADIAL)
+    exported = export_rig(wanted, tmp_path, [form])
+    assert [note.split(",")[0] for note in exported.notes] == [
+        f"{name}: its projector is written as a camera" for name in ("a", "b")
+    ]
+    found = import_rig(described(form), tmp_path)
+    assert not found.failed
+    assert_same(found, wanted)
+    apart = [c.rig_from_camera["a"].inverse() @ c.rig_from_camera["b"] for c in (found, wanted)]
+    np.testing.assert_allclose(apart[0].matrix, apart[1].matrix, rtol=0, atol=STORED_MM)
+
+
+def test_a_lens_that_kalibr_cannot_express_costs_that_projector_there(tmp_path: Path) -> None:
+    wanted = calibrated(LONG)
+    exported = export_rig(wanted, tmp_path, ["kalibr", "opencv"])
+    refused = [note for note in exported.notes if "camchain.yaml" in note]
+    assert refused == [
+        f"{name}-projector is not in camchain.yaml: Kalibr has no lens like 'brown': its radtan ends "
+        "with k1, k2, p1, p2"
+        for name in ("a", "b")
+    ]
+    assert sorted(RIG_FORMATS.find("kalibr").read(exported.value[0])) == ["a", "b", "cam0", "cam1"]
+    assert_same(import_rig(described("opencv"), tmp_path), wanted)
+
+
+def test_opencvs_whole_pair_is_stereo_calibrates(tmp_path: Path) -> None:
+    """R and T below `projector` take the camera's coordinates to the projector's."""
+    (path,) = export_rig(calibrated(RADIAL), tmp_path, ["opencv"]).value
+    store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    node = store.getNode("pairs").at(1).getNode("projector")
+    np.testing.assert_allclose(node.getNode("R").mat(), SEEN.rotation, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(node.getNode("T").mat()[:, 0], SEEN.translation, rtol=0, atol=1e-6)
+    lens = node.getNode("distortion_coefficients").mat().ravel()
+    np.testing.assert_allclose(lens, RADIAL, rtol=0, atol=1e-8)
+
+
+def test_a_camera_alone_and_a_name_that_is_taken(tmp_path: Path) -> None:
+    wanted = calibrated(RADIAL)
+    pairs = {
+        "a": wanted.pairs["a"],
+        "a-projector": replace(wanted.pairs["b"], sheets=None, crossing=None),
+    }
+    places = {"a": wanted.rig_from_camera["a"], "a-projector": wanted.rig_from_camera["b"]}
+    found = projectors_of(replace(wanted, pairs=pairs, rig_from_camera=places))
+    assert not found.value
+    assert found.notes == (
+        "a: its projector is left out: a pair is called a-projector, as it would be\n"
+        "  rename that pair",
+    )
+
+
+def test_a_real_pair_comes_back(captures: Path, tmp_path: Path) -> None:
+    """gray-jpeg's own calibration, through OpenCV's file: what its pixels and stripes say stays."""
+    rig_file = real_rig_file("gray-jpeg", captures, tmp_path)
+    rig = load_rig(rig_file)
+    wanted = import_rig(rig, rig_file.parent)
+    export_rig(wanted, tmp_path / "out", ["opencv"])
+    content = json.loads(rig.model_dump_json(exclude_none=True))
+    content["pairs"][0]["known"] = {
+        "file": "rig-opencv.yaml",
+        "format": "opencv",
+        "projector": {"name": "sltk-projector"},
+    }
+    found = import_rig(Rig.model_validate(content), tmp_path / "out")
+    points = np.random.default_rng(5).uniform([-100, -100, 450], [100, 100, 700], (200, 3))
+    own, before = found.pairs["sltk"], wanted.pairs["sltk"]
+    pixels = before.camera.project(points)
+    np.testing.assert_allclose(own.camera.rays(pixels), before.camera.rays(pixels), atol=1e-9)
+    for now, then in ((own.sheets, before.sheets), (own.crossing, before.crossing)):
+        s = stripes_of(now, points)
+        np.testing.assert_allclose(s, stripes_of(then, points), rtol=0, atol=STORED_STRIPES)
