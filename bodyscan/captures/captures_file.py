@@ -10,7 +10,7 @@ from typing import Literal
 from bodyscan.captures.timing import Timing, timing_problems
 from bodyscan.errors import CaptureError
 from bodyscan.files.atomic import write_text
-from bodyscan.files.model import Model, Name, Problem, did_you_mean, duplicates
+from bodyscan.files.model import Model, Name, Problem, ShotName, did_you_mean, duplicates
 from bodyscan.files.model_file import load_model
 from bodyscan.files.yaml_file import dump_yaml
 from bodyscan.rig.rig import Rig
@@ -25,7 +25,7 @@ class ShotEntry(Model):
     With neither, the files that are there tell.
     """
 
-    name: Name
+    name: ShotName
     stripes: tuple[Name, ...] | None = None
     lit: tuple[Name, ...] | None = None
 

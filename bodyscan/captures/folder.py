@@ -16,11 +16,12 @@ from bodyscan.captures.listing import Listing
 from bodyscan.captures.timing import FrameTimes, Timing, times_of_frames
 from bodyscan.errors import CaptureError
 from bodyscan.files.corners_vnl import Corners, read_corners
+from bodyscan.files.model import LONGEST_SHOT, SHOT
 from bodyscan.files.relative_text import relative_text
 from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
-from bodyscan.rig.templates import SHOT, fill, has_field, shot_pattern, with_exposure
+from bodyscan.rig.templates import fill, has_field, shot_pattern, with_exposure
 
 SUFFIXES = {".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
 """Of images, whatever takes them."""
@@ -367,12 +368,12 @@ def _discover(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
     """Shots told from the names of the files: those with a lit image or the first of a code."""
     if not has_field(template, "shot"):
         name = listing.root.resolve().name
-        if re.fullmatch(SHOT, name) and len(name) <= 64:
+        if re.fullmatch(SHOT, name) and len(name) <= LONGEST_SHOT:
             return (name,)
         raise CaptureError(
             "cannot give its shot its own name, which is no valid name of a shot",
             where=str(listing.root),
-            remedy="Rename the folder (letters, digits, '_', '-', '.'), or list its shot.",
+            remedy="Rename the folder (a letter, a digit or '_' first), or list its shot.",
         )
     found: set[str] = set()
     for pair in rig.pairs:
@@ -381,7 +382,7 @@ def _discover(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
             frames |= set(rig.frames.of_code(pair.projector)[:1])
         for frame in filter(None, frames):
             found |= _shots_matching(listing, shot_pattern(template, pair.name, frame), "", None)
-    return tuple(sorted((name for name in found if len(name) <= 64), key=_natural))
+    return tuple(sorted((name for name in found if len(name) <= LONGEST_SHOT), key=_natural))
 
 
 def _shots_matching(

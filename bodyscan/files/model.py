@@ -3,13 +3,37 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator
 from typing import Annotated, Self, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 Name = Annotated[str, Field(pattern=r"^[\w][\w.-]*$", max_length=64)]
+
+SHOT = r"\w(?:[^/\\*\x00-\x1f\x7f]*[^/\\*\x00-\x1f\x7f\s])?"
+"""What a shot may be called, as a regular expression: it is a part of other people's file names."""
+LONGEST_SHOT = 255
+"""Of a file's name on most disks."""
+
+
+def _as_shot(name: str) -> str:
+    if len(name) <= LONGEST_SHOT and re.fullmatch(SHOT, name):
+        return name
+    at_fault = [letter for letter in name if letter in "/\\*" or not letter.isprintable()]
+    met = f", not {', '.join(map(repr, dict.fromkeys(at_fault)))}" if at_fault else ""
+    raise PydanticCustomError(
+        "problem",
+        "{text}",
+        {
+            "text": "must be a name of a shot: a letter, a digit or '_' first, then anything but '/', "
+            f"'\\' and '*', no space last, {LONGEST_SHOT} characters at most{met} (got {name!r})"
+        },
+    )
+
+
+ShotName = Annotated[str, AfterValidator(_as_shot)]
 
 Problem: TypeAlias = tuple[tuple[str | int, ...], str]
 """Where in the model (keys and indices from its root) and what, in words that follow the path."""

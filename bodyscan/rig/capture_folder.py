@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from bodyscan.files.model import Model, Name, Problem, duplicates
+from bodyscan.files.model import Model, Problem, ShotName, duplicates
 
 
 class CaptureFolder(Model):
@@ -19,7 +19,7 @@ class CaptureFolder(Model):
 
     folder: Annotated[str, Field(min_length=1)]
     files: str | None = None
-    shots: tuple[Name, ...] | None = None
+    shots: tuple[ShotName, ...] | None = None
     corners: Annotated[str, Field(min_length=1)] | None = None
 
     def problems(self) -> Iterator[Problem]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from bodyscan.files.model import Model, Name, Problem
+from bodyscan.files.model import Model, Name, Problem, ShotName
 
 Vector = tuple[float, float, float]
 
@@ -22,7 +22,7 @@ class RigFrame(Model):
     printed side up, columns running the way the subject faces.
     """
 
-    shot: Name | None = None
+    shot: ShotName | None = None
     board: Name | None = None
     origin_mm: Vector = (0.0, 0.0, 0.0)
     x_axis: Vector = (1.0, 0.0, 0.0)

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from functools import lru_cache
 from string import Formatter
 
-SHOT = r"\w[\w.-]*"
+from bodyscan.files.model import SHOT
+
 _FIELDS = ("shot", "pair", "frame", "exposure")
 _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 _VIDEOS = (".mp4", ".m4v", ".avi", ".mov", ".mkv", ".webm", ".wmv", ".mpg", ".mpeg")
