@@ -13,10 +13,9 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.calibration.boundary_points import BoundaryPoints, bin_points, concatenate
+from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
 from bodyscan.calibration.camera import CameraCalibration
-from bodyscan.calibration.light_planes import fit_light_planes
-from bodyscan.calibration.light_sheets import fit_light_sheets, smooth_models
+from bodyscan.calibration.light_sheets import fit_light_sheets, fit_planes, smooth_models
 from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
@@ -81,13 +80,11 @@ def _models(
         [c[2] for c in corners],
         pinhole,
     )
-    smooth = dict(smooth_models(bin_points(points, camera.camera, direction), stripes, direction))
+    smooth = dict(smooth_models(points, stripes, direction))
     return {
         "smooth planes": smooth["smooth planes"],
-        "free planes": fit_light_planes(points, stripes, direction).planes,
-        "chosen by held-out boards": fit_light_sheets(
-            points, stripes, direction, camera.camera
-        ).sheets,
+        "free planes": fit_planes(points, stripes, direction, 0.0).planes,
+        "chosen by held-out boards": fit_light_sheets(points, stripes, direction).sheets,
         "pinhole (2 x 4, stripes)": pinhole.planes(stripes, direction),
         "pinhole (OpenCV, corners)": opencv.planes(stripes, direction),
     }

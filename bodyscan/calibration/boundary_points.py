@@ -12,7 +12,6 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 
-BIN_PX = 16
 BENDS = 2
 """Times that a ray's point is lifted to where the board is bent: the first is off by what the board
 rises over a few tenths of a millimetre."""
@@ -99,44 +98,6 @@ def concatenate(parts: Sequence[BoundaryPoints]) -> BoundaryPoints:
 def select(data: BoundaryPoints, kept: Mask) -> BoundaryPoints:
     """The points where `kept` (N,) is true."""
     return BoundaryPoints(*(getattr(data, field.name)[kept] for field in fields(data)))
-
-
-def bin_points(data: BoundaryPoints, camera: Camera, direction: Axis) -> BoundaryPoints:
-    """Weighted means over BIN_PX pixels along each boundary: ten times fewer points.
-
-    Over so short a piece a boundary is straight: its sagitta is below a thousandth of a pixel.
-    """
-    if not len(data.index):
-        return data
-    x, y, z = data.points.T
-    pixel = camera.alpha * x / z if direction == "horizontal" else camera.beta * y / z
-    place = np.floor(pixel / BIN_PX).astype(np.int64)
-    place -= place.min()
-    cell = np.ravel_multi_index(
-        (data.board, data.index, place),
-        tuple(int(v.max()) + 1 for v in (data.board, data.index, place)),
-    )
-    occupied = np.bincount(cell)
-    filled = np.flatnonzero(occupied)
-    number = np.zeros(len(occupied), np.int64)
-    number[filled] = np.arange(len(filled))
-    group = number[cell]
-    weight = 1.0 / data.sigma_px**2
-    total = np.bincount(group, weight)
-
-    def mean(values: Array) -> Array:
-        columns = [np.bincount(group, weight * column) / total for column in values.T]
-        return np.stack(columns, axis=1)
-
-    first = np.empty(len(filled), np.int64)
-    first[group] = np.arange(len(group))
-    return BoundaryPoints(
-        data.index[first],
-        data.board[first],
-        mean(data.points),
-        mean(data.per_pixel),
-        1.0 / np.sqrt(total),
-    )
 
 
 def subsample(data: BoundaryPoints, most: int) -> BoundaryPoints:

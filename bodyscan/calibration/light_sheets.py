@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Indices
-from bodyscan.calibration.boundary_points import BoundaryPoints, bin_points, subsample
+from bodyscan.calibration.boundary_points import BoundaryPoints, subsample
 from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
 from bodyscan.calibration.model_selection import (
     Candidate,
@@ -20,7 +20,6 @@ from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.sheet_fit import SheetFit, fit_sheets
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.bowed_sheets import BowedSheets
-from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
 from bodyscan.geometry.smooth_sheets import SmoothSheets
@@ -29,7 +28,7 @@ CHOICE_BINS, FIT_BINS = 4000, 25000
 START_BINS, START_STEPS, FOLD_STEPS = 1000, 15, 8
 AXIS_STARTS = (-0.5, 0.0, 0.5, 1.0, 1.5)
 """Where a projector's axis may be, in heights of its image."""
-FEWEST_BOARDS, FEWEST_POINTS = 2, 500
+FEWEST_BOARDS, FEWEST_POINTS = 2, 50
 PARTS = ("pinhole", "lens k1", "smooth planes")
 """Models with a term left out that devices have: never chosen. Whether a term can be done without
 three or four boards hardly tell, and to leave it out by mistake costs several times what it costs to
@@ -63,22 +62,19 @@ class SheetsFit:
         return int(np.count_nonzero(self.boards_seen[1:-1]))
 
 
-def fit_light_sheets(
-    data: BoundaryPoints, stripes: int, direction: Axis, camera: Camera
-) -> SheetsFit:
-    """Sheets of light from boundaries on two or more boards, camera frame.
+def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> SheetsFit:
+    """Sheets of light from boundaries on two or more boards, means over pieces of them, camera frame.
 
     With two boards halves of them are held out, with three or more whole boards.  Raises
     PairFailed with fewer than two boards, or hardly any boundaries on them.
     """
-    boards = len(np.unique(data.board))
-    if boards < FEWEST_BOARDS or len(data.index) < FEWEST_POINTS:
+    boards = len(np.unique(bins.board))
+    if boards < FEWEST_BOARDS or len(bins.index) < FEWEST_POINTS:
         raise PairFailed(
-            f"{len(data.index)} points of stripe boundaries on {boards} boards are too few for "
+            f"{len(bins.index)} points of stripe boundaries on {boards} boards are too few for "
             "sheets of light",
             remedy="capture the stripe sequence on the board in three or more poses",
         )
-    bins = bin_points(data, camera, direction)
     few = subsample(bins, CHOICE_BINS)
     starts = smooth_models(few, stripes, direction)
     candidates = [_smooth_candidate(name, start) for name, start in starts]

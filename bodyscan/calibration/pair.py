@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import BoundaryPoints, bin_points, subsample
+from bodyscan.calibration.boundary_points import BoundaryPoints, subsample
 from bodyscan.calibration.camera import CameraCalibration, LensTrial
 from bodyscan.calibration.joint_refinement import striped_board
 from bodyscan.calibration.light_sheets import fit_light_sheets
@@ -136,12 +136,12 @@ def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
     notes: tuple[str, ...] = ()
     shots = pair.shots
     points = boundaries_on_boards(pair.name, camera, projector, shots)
-    disagreement = find_projector_motion(points, camera, projector.stripes, projector.direction)
+    disagreement = find_projector_motion(points, projector.stripes, projector.direction)
     if disagreement is not None:
         agreed = drop_disagreeing(pair.name, shots, disagreement)
         shots, notes = agreed.value, agreed.notes
         points = boundaries_on_boards(pair.name, camera, projector, shots)
-    fit = fit_light_sheets(points, projector.stripes, projector.direction, camera)
+    fit = fit_light_sheets(points, projector.stripes, projector.direction)
     quality = replace(
         quality,
         planes_rms_mm=fit.rms_mm,
@@ -177,7 +177,7 @@ def _with_crossing(
     ]
     try:
         points = boundaries_on_boards(pair.name, pair.camera, across, crossed)
-        fit = fit_light_sheets(points, across.stripes, across.direction, pair.camera)
+        fit = fit_light_sheets(points, across.stripes, across.direction)
     except PairFailed as error:
         return Outcome(pair, (f"{pair.name}: crossing stripes are not used: {error.what}",))
     said = f"{pair.name}: crossing stripes: {fit.model}, {fit.rms_mm:.3f} mm from their sheets"
@@ -217,7 +217,7 @@ def _refined(
     """Camera, boards and light of a pair by itself in one solve, where held-out boards gain; and its
     shots with the boards where that puts them."""
     assert pair.sheets is not None
-    data = subsample(bin_points(points, pair.camera, pair.sheets.direction), REFINED_BINS)
+    data = subsample(points, REFINED_BINS)
     boards = [
         striped_board(
             PlanarView(shot.view.shot, shot.view.points, shot.view.pixels),

@@ -10,7 +10,6 @@ import numpy as np
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
-    bin_points,
     board_errors,
     select,
     subsample,
@@ -19,7 +18,6 @@ from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.sheet_fit import fit_sheets
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.bowed_sheets import BowedSheets
-from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.light_planes import Axis, LightSheets
 from bodyscan.geometry.ray_depths import intersect_rays
 
@@ -50,14 +48,14 @@ class ProjectorMotion:
 
 
 def find_projector_motion(
-    data: BoundaryPoints, camera: Camera, stripes: int, direction: Axis
+    data: BoundaryPoints, stripes: int, direction: Axis
 ) -> ProjectorMotion | None:
     """None if all boards agree, or are fewer than three. `data.board` counts in the order of shots.
 
     Raises PairFailed where stripes lie farther off than they are wide and most boards agree on no
     light: images of several shots are mixed up, or the stripes are not those described.
     """
-    few = subsample(bin_points(data, camera, direction), FEW_POINTS)
+    few = subsample(data, FEW_POINTS)
     boards = np.unique(few.board)
     if len(boards) < 3:
         return None

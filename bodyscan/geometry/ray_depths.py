@@ -15,7 +15,7 @@ from bodyscan.geometry.camera_tables import ray_table
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.pixel_rays import rays_through
-from bodyscan.geometry.plane_table import PlaneTable
+from bodyscan.geometry.sheet_table import SheetTable
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 Way = Callable[[Array, Array], tuple[Array, Array, Array]]
@@ -120,8 +120,8 @@ def _most_sigma(sheets: LightSheets) -> float:
 
 def _way_to_measure(sheets: LightSheets) -> Way:
     """Of rays (N, 3) at s (N,): depth, its change with s and its variance, each (N,)."""
-    if isinstance(sheets, BowedSheets) and sheets.kind == "smooth-planes":
-        return PlaneTable.of(sheets).measure
+    if isinstance(sheets, BowedSheets):
+        return SheetTable.of(sheets).measure
     if isinstance(sheets, LensSheets):
         return sheets.measure
 

@@ -4,11 +4,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from lit_boards import Mirror, Scene
+from lit_boards import Mirror, Scene, binned
 
 from bodyscan.calibration.board_form import BoardForm
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import bin_points, boundary_points, concatenate
+from bodyscan.calibration.boundary_points import boundary_points, concatenate
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
 from bodyscan.calibration.joint_refinement import (
     StripedBoard,
@@ -60,13 +60,9 @@ def calibrated(seed: int) -> tuple[CameraCalibration, SmoothSheets, list[Striped
         index, pixels = SCENE.crossings(pose, 2)
         pixels[:, 0] += rng.normal(0.0, 0.06, len(pixels))
         placed = camera.camera_from_board[f"s{k}"]
-        sigma = np.full(len(index), 0.06)
-        parts.append(
-            boundary_points(
-                camera.camera, placed, index, pixels, sigma, board=k, direction="vertical"
-            )
-        )
-    bins = bin_points(concatenate(parts), camera.camera, "vertical")
+        means = binned(index, pixels, 0.06, "vertical")
+        parts.append(boundary_points(camera.camera, placed, *means, board=k, direction="vertical"))
+    bins = concatenate(parts)
     sheets = dict(smooth_models(bins, 254, "vertical"))["smooth planes"]
     return (
         camera,

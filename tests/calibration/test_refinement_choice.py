@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from lit_boards import chapter_scene
+from lit_boards import binned, chapter_scene
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_form import BoardForm
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.boundary_points import bin_points, boundary_points, concatenate, subsample
+from bodyscan.calibration.boundary_points import boundary_points, concatenate, subsample
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
 from bodyscan.calibration.joint_refinement import StripedBoard, known_apart, striped_board
 from bodyscan.calibration.light_sheets import fit_light_sheets
@@ -89,13 +89,11 @@ def solved(bow_mm: float, boards: int, seed: int = 0) -> Solved:
     for k, pose in enumerate(poses):
         index, pixels = seen_on_bent_board(pose, bow_mm)
         pixels[:, 0] += rng.normal(0.0, STRIPE_PX, len(pixels))
-        sigma = np.full(len(index), STRIPE_PX)
+        means = binned(index, pixels, STRIPE_PX, "vertical")
         placed = own.camera_from_board[f"s{k}"]
-        parts.append(
-            boundary_points(own.camera, placed, index, pixels, sigma, board=k, direction="vertical")
-        )
-    data = subsample(bin_points(concatenate(parts), own.camera, "vertical"), 1500)
-    sheets = fit_light_sheets(data, 254, "vertical", own.camera).sheets
+        parts.append(boundary_points(own.camera, placed, *means, board=k, direction="vertical"))
+    data = subsample(concatenate(parts), 1500)
+    sheets = fit_light_sheets(data, 254, "vertical").sheets
     striped = [striped_board(v, own.camera, data, k, "b") for k, v in enumerate(views)]
     assert isinstance(sheets, SmoothSheets)
     found = refine_where_better(own, sheets, striped, data, {"b": FLATNESS_MM})

@@ -43,9 +43,7 @@ def disagreement(
         of = moved if moved is not None and number in shots else scene
         data = of.boundaries([of.looking_at(*pose)], seed=number)
         parts.append(replace(data, board=np.full_like(data.board, number)))
-    return find_projector_motion(
-        concatenate(parts), scene.camera, scene.projector.stripes, scene.direction
-    )
+    return find_projector_motion(concatenate(parts), scene.projector.stripes, scene.direction)
 
 
 def pushed(scene: Scene, push: tuple[float, float, float]) -> Scene:
@@ -115,7 +113,7 @@ def mixed_up(scene: Scene, poses: Sequence[Pose], *exchanged: tuple[int, int]) -
 def test_two_shots_whose_images_were_exchanged_are_left_out(exchanged: tuple[int, int]) -> None:
     scene = body_scene(-0.05)
     data = mixed_up(scene, MORE_POSES, exchanged)
-    found = find_projector_motion(data, scene.camera, scene.projector.stripes, scene.direction)
+    found = find_projector_motion(data, scene.projector.stripes, scene.direction)
     assert found is not None
     assert not found.moved
     np.testing.assert_array_equal(found.others, exchanged)
@@ -125,7 +123,7 @@ def test_stripes_of_which_most_are_mixed_up_are_refused() -> None:
     scene = body_scene(-0.05)
     data = mixed_up(scene, MORE_POSES, (0, 2), (1, 4), (3, 6))
     with pytest.raises(PairFailed, match="fit no light together"):
-        find_projector_motion(data, scene.camera, scene.projector.stripes, scene.direction)
+        find_projector_motion(data, scene.projector.stripes, scene.direction)
 
 
 def test_of_three_poses_something_is_noticed() -> None:
@@ -143,7 +141,7 @@ def test_a_board_that_stands_elsewhere_is_measured_there() -> None:
     scene = body_scene(0.0)
     poses = [scene.looking_at(*pose) for pose in MORE_POSES]
     data = scene.boundaries(poses, corner_px=0.0)
-    fit = fit_light_sheets(data, scene.projector.stripes, scene.direction, scene.camera)
+    fit = fit_light_sheets(data, scene.projector.stripes, scene.direction)
     # By its corners, board 2 lies 0.5 mm nearer than it does.
     nearer = np.where(data.board[:, None] == 2, data.points * (1.0 - 0.5 / 1400.0), data.points)
     off = board_offsets(replace(data, points=nearer), fit.sheets)

@@ -11,7 +11,14 @@ from lit_boards import CHAPTER_POSES, chapter_scene
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_form import BoardFace
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, boundaries_on_boards
+from bodyscan.calibration.striped_view import (
+    BIN_PX,
+    RIM_SQUARES,
+    BoardBoundaries,
+    StripedView,
+    boundaries_on_boards,
+    on_board,
+)
 from bodyscan.registration.board_shape import BoardShape
 from bodyscan.rig.board import Board
 from bodyscan.stripes.codes.gray import Gray
@@ -79,3 +86,20 @@ def test_a_face_goes_through_its_corners_and_no_further_than_they_say() -> None:
     np.testing.assert_allclose(face.z_mm + face.height(beyond), 2.0, atol=1e-9)
     few = BoardFace.through(FRONT[:6])  # one row, which says nothing of the other direction
     np.testing.assert_allclose(few.height(beyond), 0.0, atol=1e-9)
+
+
+def test_boundaries_are_averaged_in_pieces_on_the_print_alone() -> None:
+    code, place = Gray(stripes=254, direction="vertical"), SCENE.looking_at(*CHAPTER_POSES[0])
+    index, pixels = SCENE.crossings(place, 1)
+    rim = RIM_SQUARES * BOARD.square_mm
+    area = np.array([BOARD.columns, BOARD.rows]) * BOARD.square_mm
+    met = SCENE.on_board(pixels, place)
+    inside = np.all((met > rim) & (met < area - rim), axis=1)
+    assert np.sum(~inside) > 50
+    seen = BoardBoundaries(index, pixels, np.full(len(index), 0.2))
+    found = on_board(SCENE.camera, code, BOARD, place, seen, 0)
+    assert 0.8 * BIN_PX < inside.sum() / len(found.index) < BIN_PX
+    # A mean of n of them is known 1 / sqrt(n) as well.
+    np.testing.assert_allclose(np.sum(1.0 / found.sigma_px**2), inside.sum() / 0.2**2)
+    # Over 16 px a boundary bends by less than a hundredth of a stripe.
+    assert np.abs(SCENE.projector.stripe(found.points) - found.index).max() < 0.01

@@ -12,6 +12,7 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
 from bodyscan.calibration.camera import locate_board
+from bodyscan.calibration.striped_view import BoardBoundaries, bin_boundaries
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import Axis
@@ -186,14 +187,12 @@ class Scene:
             index, pixels = self.crossings(pose)
             pixels[:, across] += rng.normal(0.0, noise_px, len(pixels))
             placed = self.placed(pose, corner_px, rng) if corner_px else pose
-            sigma = np.full(len(index), max(noise_px, 0.01))
+            means = binned(index, pixels, max(noise_px, 0.01), self.direction)
             parts.append(
                 boundary_points(
                     self.camera,
                     placed,
-                    index,
-                    pixels,
-                    sigma,
+                    *means,
                     board=number,
                     direction=self.direction,
                 )
@@ -262,3 +261,12 @@ BODY_POSES: tuple[Pose, ...] = (
     ([-30.0, 0.0, 1400.0], [0.1, -0.4, 1.6]),
     ([40.0, -190.0, 1420.0], [-0.2, -0.3, 0.0]),
 )
+
+
+def binned(
+    index: Indices, pixels: Array, sigma_px: float, direction: Axis
+) -> tuple[Indices, Array, Array]:
+    """Boundaries (N,) at pixels (N, 2) as calibrations take them: means over pieces, their sigmas."""
+    seen = BoardBoundaries(index, pixels, np.full(len(index), sigma_px))
+    means = bin_boundaries(seen, np.ones(len(index), np.bool_), direction)
+    return means.index, means.pixels, means.sigma_px

@@ -9,7 +9,7 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.calibration.board_views import PlanarView, planar_view
-from bodyscan.calibration.boundary_points import bin_points, subsample
+from bodyscan.calibration.boundary_points import subsample
 from bodyscan.calibration.camera import (
     CameraCalibration,
     calibrate_camera,
@@ -18,6 +18,7 @@ from bodyscan.calibration.joint_refinement import striped_board
 from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.refinement_choice import REFINED_BINS, refine_where_better
+from bodyscan.calibration.striped_view import BIN_PX
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.captures import TARGET, ChapterCaptures
@@ -28,7 +29,12 @@ from bodyscan.laboratory.rivals.approaches import (
     planes_by_stage_camera,
     rivals,
 )
-from bodyscan.laboratory.rivals.targets import LocatedBoards, by_reference_plane, by_slide_stage
+from bodyscan.laboratory.rivals.targets import (
+    LocatedBoards,
+    by_reference_plane,
+    by_slide_stage,
+    locate,
+)
 from bodyscan.simulation.truth import describe_camera
 
 CORNER_NOISE_PX = 0.012
@@ -91,9 +97,11 @@ def _ours(
     """As `bodyscan calibrate-rig` does a pair by itself: the model of the light that held-out boards
     choose, and one solve for all where they gain by it."""
     projector, board = TARGET.projector, TARGET.board
-    bins = bin_points(boards.points, boards.camera, projector.direction)
+    bins = locate(
+        TARGET, captures.boards, boards.camera, boards.camera_from_board, bin_px=BIN_PX
+    ).points
     data = subsample(bins, REFINED_BINS)
-    fit = fit_light_sheets(boards.points, projector.stripes, projector.direction, boards.camera)
+    fit = fit_light_sheets(bins, projector.stripes, projector.direction)
     striped = [
         striped_board(planar_view(shot.view, board), boards.camera, data, number, board.name)
         for number, shot in enumerate(captures.boards)

@@ -112,8 +112,10 @@ def locate(
     shots: Sequence[StripedShot],
     camera: Camera,
     camera_from_board: dict[str, RigidTransform],
+    *,
+    bin_px: int = 1,
 ) -> LocatedBoards:
-    """Carry the boundaries onto boards of known place (Eq. 18)."""
+    """Carry the boundaries onto boards of known place (Eq. 18), one by one or means of pieces."""
     parts = [
         on_board(
             camera,
@@ -122,6 +124,7 @@ def locate(
             camera_from_board[shot.view.shot],
             boundaries_near(shot.stripes, shot.view),
             number,
+            bin_px=bin_px,
         )
         for number, shot in enumerate(shots)
     ]
@@ -161,7 +164,9 @@ def _by_homography(
         return camera_from_board.apply(flat)
 
     # What lies on the checkered area is judged as for every other model.
-    everything = on_board(camera, target.projector, target.board, camera_from_board, near, number)
+    everything = on_board(
+        camera, target.projector, target.board, camera_from_board, near, number, bin_px=1
+    )
     pixels = camera.project(everything.points)
     horizontal = target.projector.direction == "horizontal"
     across = np.array([0.0, 0.5]) if horizontal else np.array([0.5, 0.0])

@@ -1,4 +1,4 @@
-"""The table of smooth planes against Newton's method on the same sheets."""
+"""The table of bowed sheets and smooth planes against Newton's method on the same sheets."""
 
 from __future__ import annotations
 
@@ -7,16 +7,22 @@ import pytest
 from sheet_models import MIDDLE, STRIPES, models
 
 from bodyscan.arrays import Array
+from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.plane_table import PlaneTable
 from bodyscan.geometry.ray_depths import MOST_SIGMA, intersect_rays, triangulate_image
-from bodyscan.geometry.smooth_sheets import SmoothSheets
+from bodyscan.geometry.sheet_table import SheetTable
 
 
-@pytest.fixture(params=[3, 4, 5])
-def planes(request: pytest.FixtureRequest) -> SmoothSheets:
-    return next(model for model in models(request.param) if model.kind == "smooth-planes")
+@pytest.fixture(params=[(3, 0), (4, 0), (5, 0), (3, 1), (4, 3)], ids=str)
+def sheets(request: pytest.FixtureRequest) -> BowedSheets:
+    """A draw of the models' parameters, and how many terms the bow has."""
+    draw, bow_terms = request.param
+    return next(
+        model
+        for model in models(draw)
+        if isinstance(model, BowedSheets) and model.bow_terms == bow_terms
+    )
 
 
 CAMERA = Camera(500.0, 502.0, -0.5, 100.0, 75.0, Radial(-0.15, 0.03), 200, 150)
@@ -28,43 +34,43 @@ def some_rays(count: int) -> tuple[Array, Array]:
     return points / points[:, 2:], rng.uniform(0.0, STRIPES, count)
 
 
-def test_it_agrees_with_the_sheets(planes: SmoothSheets) -> None:
+def test_it_agrees_with_the_sheets(sheets: BowedSheets) -> None:
     rays, s = some_rays(40_000)  # more than a chunk
-    depth = planes.depth(rays, s)
-    found, per_stripe, variance = PlaneTable.of(planes).measure(rays, s)
+    depth = sheets.depth(rays, s)
+    found, per_stripe, variance = SheetTable.of(sheets).measure(rays, s)
     near = depth < 3000.0  # where bodies are; far planes are nearly along the ray
     assert near.sum() > 5000
     # Linear between nodes: m'' / 8 / 64 of a plane that turns by a radian over 200 stripes, 3e-9 in
     # 1/z, which is 5 um at 1.3 m; a tenth of it with the 640 stripes of a real rig.
     np.testing.assert_allclose(1.0 / found[near], 1.0 / depth[near], rtol=0.0, atol=3e-9)
     np.testing.assert_allclose(
-        per_stripe[near], planes.depth_per_stripe(rays, s, depth)[near], rtol=1e-4, atol=1e-4
+        per_stripe[near], sheets.depth_per_stripe(rays, s, depth)[near], rtol=1e-4, atol=1e-4
     )
-    np.testing.assert_allclose(variance[near], planes.variance_mm2(rays, s, depth)[near], rtol=2e-3)
+    np.testing.assert_allclose(variance[near], sheets.variance_mm2(rays, s, depth)[near], rtol=2e-3)
 
 
-def test_nothing_outside_the_stripes_or_behind(planes: SmoothSheets) -> None:
+def test_nothing_outside_the_stripes_or_behind(sheets: BowedSheets) -> None:
     rays, _ = some_rays(300)
-    table = PlaneTable.of(planes)
+    table = SheetTable.of(sheets)
     for nowhere in (-0.1, STRIPES + 0.1, np.nan):
         assert np.isnan(table.measure(rays, np.full(len(rays), nowhere))).all()
     s = np.linspace(0.0, STRIPES, 300)
     upward = np.tile([0.0, -2.0, 1.0], (300, 1))
     np.testing.assert_array_equal(
-        np.isnan(table.measure(upward, s)[0]), np.isnan(planes.depth(upward, s))
+        np.isnan(table.measure(upward, s)[0]), np.isnan(sheets.depth(upward, s))
     )
 
 
-def test_measuring_takes_the_table(planes: SmoothSheets) -> None:
+def test_measuring_takes_the_table(sheets: BowedSheets) -> None:
     rays, s = some_rays(500)
-    found = intersect_rays(planes, rays.reshape(20, 25, 3), s.reshape(20, 25))
+    found = intersect_rays(sheets, rays.reshape(20, 25, 3), s.reshape(20, 25))
     assert found.depth.shape == (20, 25)
-    expected = PlaneTable.of(planes).measure(rays, s)[0]
+    expected = SheetTable.of(sheets).measure(rays, s)[0]
     known = np.isfinite(found.depth.ravel())
     np.testing.assert_array_equal(found.depth.ravel()[known], expected[known])
 
 
-def test_an_image_is_measured_as_its_rays_are(planes: SmoothSheets) -> None:
+def test_an_image_is_measured_as_its_rays_are(sheets: BowedSheets) -> None:
     """The same points and sigmas as the sheets' own depth, slope and variance give, pixel by pixel."""
     rng = np.random.default_rng(4)
     shape = (CAMERA.height, CAMERA.width)
@@ -72,13 +78,13 @@ def test_an_image_is_measured_as_its_rays_are(planes: SmoothSheets) -> None:
     s[rng.random(shape) < 0.1] = np.nan
     sigma = rng.uniform(0.01, 0.03, shape).astype(np.float32)
     sigma[rng.random(shape) < 0.05] = np.nan
-    points, sigma_mm, _ = triangulate_image(planes, CAMERA, s, sigma)
+    points, sigma_mm, _ = triangulate_image(sheets, CAMERA, s, sigma)
     assert points.dtype == sigma_mm.dtype == np.float32
 
     rays, wide = CAMERA.pixel_rays(), s.astype(float)
-    depth = planes.depth(rays, wide)
-    variance = planes.variance_mm2(rays, wide, depth)
-    slope = planes.depth_per_stripe(rays, wide, depth)
+    depth = sheets.depth(rays, wide)
+    variance = sheets.variance_mm2(rays, wide, depth)
+    slope = sheets.depth_per_stripe(rays, wide, depth)
     along = np.sqrt((slope * sigma) ** 2 + variance) * np.linalg.norm(rays, axis=-1)
     sure = variance <= (MOST_SIGMA * depth) ** 2
     expected, known = sure & np.isfinite(along), np.isfinite(sigma_mm)
@@ -95,19 +101,19 @@ def test_an_image_is_measured_as_its_rays_are(planes: SmoothSheets) -> None:
     np.testing.assert_allclose(sigma_mm[near], along[near], rtol=2e-3)
 
 
-def test_what_boards_leave_open_everywhere_is_no_guess(planes: SmoothSheets) -> None:
+def test_what_boards_leave_open_everywhere_is_no_guess(sheets: BowedSheets) -> None:
     """A focal length from four boards at 4 m leaves all depths open by half a per cent alike."""
     rays = CAMERA.pixel_rays()
     column = int(np.argmin(np.linalg.norm(rays - MIDDLE / MIDDLE[2], axis=-1)) % CAMERA.width)
     row = int(np.argmin(np.linalg.norm(rays - MIDDLE / MIDDLE[2], axis=-1)) // CAMERA.width)
     ray, every = rays[row, column][None], np.linspace(1.0, STRIPES - 1.0, 500)
-    depth = planes.depth(np.repeat(ray, 500, axis=0), every)
+    depth = sheets.depth(np.repeat(ray, 500, axis=0), every)
     stripe = every[np.nanargmin(np.abs(depth - MIDDLE[2]))]
-    share = np.sqrt(planes.variance_mm2(ray, np.array([stripe]))[0]) / MIDDLE[2]
+    share = np.sqrt(sheets.variance_mm2(ray, np.array([stripe]))[0]) / MIDDLE[2]
     s = np.full((CAMERA.height, CAMERA.width), np.nan, np.float32)
     s[row, column] = stripe
     sigma = np.full(s.shape, 0.02, np.float32)
-    vague = planes.with_covariance(planes.covariance * (5e-3 / share) ** 2)
+    vague = sheets.with_covariance(sheets.covariance * (5e-3 / share) ** 2)
     known = np.isfinite(triangulate_image(vague, CAMERA, s, sigma)[1])
     assert known[row, column]
     assert known.sum() == 1
