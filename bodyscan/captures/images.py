@@ -22,7 +22,6 @@ from bodyscan.files.regular import read_regular
 from bodyscan.progress import THREADS
 from bodyscan.rig.pair import CameraSpec, Pair
 from bodyscan.stripes.decoding import images_by_kind
-from bodyscan.stripes.stripe_code import StripeCode
 
 SHOWS_NOTHING_BELOW = 8
 """Grey levels (sensor offset and noise): a lit image without a brighter pixel is black."""
@@ -68,18 +67,11 @@ def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
     if path is not None or pair.projector is None:
         names = {"pair": sequence.pair, "shot": sequence.shot}
         return read_image(sequence.seen_in, pair.camera, lit=True, **names)
-    sequence, code = readable(sequence, pair.projector)
-    images = read_sequence(sequence, pair.camera)
+    code = pair.projector.model_copy(update={"crossing": None})
+    images = read_sequence(sequence.without_crossing, pair.camera)
     made = whole_grey(code.lit_from(images_by_kind(code, images.coded)[0]))
     _refuse_black(made, sequence.seen_in, sequence.pair, sequence.shot)
     return made
-
-
-def readable(sequence: ImageSequence, code: StripeCode) -> tuple[ImageSequence, StripeCode]:
-    """What can be read of a sequence: without images of the stripes that cross, the others."""
-    if not sequence.lacks_crossing:
-        return sequence, code
-    return sequence.without_crossing, code.model_copy(update={"crossing": None})
 
 
 def read_sequence(

@@ -34,7 +34,8 @@ def decode_stripes(
     moments: of the code's images, then of those of the stripes that cross, if what moved meanwhile
     is to be told and taken out.
 
-    Raises DecodingFailed, naming the image where it can be told, if they do not add up.
+    Raises DecodingFailed, naming the image where it can be told, if they do not add up. Where only
+    those of the stripes that cross do not, the map is that of the others and says why.
     """
     try:
         own, *others = images_by_kind(code, coded)
@@ -42,27 +43,16 @@ def decode_stripes(
         found = _decode(code, lit, dark, own, limits, seen)
         if code.crossing is None:
             return found
-        crossing = _decode_crossing(code.crossing, lit, dark, others[0], across)
-        return replace(found, crossing=crossing)
     except DecodingFailed as error:
         raise DecodingFailed(error.what, where=where, remedy=error.remedy) from error
-
-
-def _decode_crossing(
-    way: StripeCode,
-    lit: Greys | None,
-    dark: Greys | None,
-    coded: Mapping[ImageKind, Greys],
-    moments: Moments | None,
-) -> StripeMap:
-    """The map of the stripes that cross. What is wrong with them is said to be wrong with these."""
     try:
-        return _decode(way, lit, dark, coded, None, moments)
+        crossing = _decode(code.crossing, lit, dark, others[0], None, across)
+        return replace(found, crossing=crossing)
     except DecodingFailed as error:
         remedy = error.remedy
         if isinstance(error, WrongDirection):
             remedy = "exchange the lists of frames and of `crossing`, or correct `direction`"
-        raise DecodingFailed(f"stripes of `crossing`: {error.what}", remedy=remedy) from error
+        return replace(found, crossing_fault=f"{error.what}\n  {remedy}" if remedy else error.what)
 
 
 def _decode(

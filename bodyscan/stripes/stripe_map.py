@@ -45,7 +45,8 @@ class StripeMap:
     stripes: S, the number of stripes projected.
     beyond: (height, width) bool, lit by a stripe that lies deeper than wanted; None where all stripes
     were wanted. s is NaN there (see `StripeLimits`).
-    crossing: the map of the stripes that run the other way, where such were projected.
+    crossing: the map of the stripes that run the other way, where such were projected; crossing_fault:
+    why there is none although they were, "" otherwise.
     response: what the projector's response did, of codes that tell it; None where noise explains all.
     motion: what moved while the images were taken, of codes that tell it where their moments are given.
     """
@@ -61,6 +62,7 @@ class StripeMap:
     crossing: StripeMap | None = None
     response: ResponseShare | None = None
     motion: StripeMotion | None = None
+    crossing_fault: str = ""
 
 
 def stripe_map(

@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
 
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_near
 from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.captures.images import read_sequence, readable
-from bodyscan.errors import BodyscanError, DecodingFailed, plainly
+from bodyscan.captures.images import read_sequence
+from bodyscan.errors import BodyscanError, DecodingFailed, ImageError, plainly
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.rig.pair import Pair
@@ -19,6 +20,7 @@ from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import fill
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.one_moment import Moments
+from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import ResponseShare, StripeMap
 
@@ -44,15 +46,28 @@ def decode_sequence(
     """Read and decode what `pair` took in one shot; limits, moments: see `decode_stripes`.
 
     Raises ImageError for bad files, DecodingFailed (naming pair and shot) for frames that do not
-    add up or a pair without projector.
+    add up or a pair without projector. Where only images of the stripes that cross are missing, bad
+    or in disorder, the map is that of the others and says why.
     """
     where = f"pair {sequence.pair}, shot {sequence.shot}"
     if pair.projector is None:
         raise DecodingFailed("this pair has no projector", where=where)
-    sequence, projector = readable(sequence, pair.projector)
-    images = read_sequence(sequence, pair.camera, workers=workers)
-    frames = (images.lit, images.dark, images.coded)
-    return decode_stripes(projector, *frames, limits=limits, moments=moments, where=where)
+
+    def decode(sequence: ImageSequence, projector: StripeCode) -> StripeMap:
+        images = read_sequence(sequence, pair.camera, workers=workers)
+        frames = (images.lit, images.dark, images.coded)
+        return decode_stripes(projector, *frames, limits=limits, moments=moments, where=where)
+
+    one_way = sequence.without_crossing, pair.projector.model_copy(update={"crossing": None})
+    if sequence.lacks_crossing:
+        fault = f"images are missing, such as {sequence.missing[0]}"
+        return replace(decode(*one_way), crossing_fault=fault)
+    try:
+        return decode(sequence, pair.projector)
+    except ImageError as error:
+        if pair.projector.crossing is None or sequence.missing:
+            raise
+        return replace(decode(*one_way), crossing_fault=str(error))
 
 
 def decode_on_boards(
@@ -68,10 +83,12 @@ def decode_on_boards(
     sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
 
     responses: dict[str, list[ResponseShare]] = defaultdict(list)
+    one_way: dict[ImageSequence, str] = {}
 
     def decode(sequence: ImageSequence) -> dict[ViewKey, BoardBoundaries]:
         stripes = decode_sequence(sequence, rig.pair(sequence.pair))
         responses[sequence.pair] += responses_in(stripes)
+        one_way[sequence] = stripes.crossing_fault
         return {
             (view.pair, view.shot, view.board): boundaries_near(stripes, view)
             for view in wanted[sequence.pair, sequence.shot]
@@ -85,7 +102,7 @@ def decode_on_boards(
     failed = failed_pairs(failures, {pair for pair, _, _ in boundaries})
     failed |= _without_stripes(rig, wanted, {sequence.pair for sequence in sequences})
     kept = [failure for failure in failures if failure[0].pair not in failed]
-    notes = (*failure_notes(kept), *one_way_notes(decoded), *response_notes(responses))
+    notes = (*failure_notes(kept), *one_way_notes(one_way), *response_notes(responses))
     return Outcome(boundaries, notes, failed)
 
 
@@ -103,17 +120,19 @@ def _without_stripes(
     }
 
 
-def one_way_notes(sequences: Iterable[ImageSequence]) -> Iterator[str]:
-    """A line for each pair of which images of the stripes that cross are missing."""
-    shots: dict[str, list[ImageSequence]] = defaultdict(list)
-    for sequence in sequences:
-        if sequence.lacks_crossing:
-            shots[sequence.pair].append(sequence)
-    for pair, own in sorted(shots.items()):
-        named = ", ".join(sequence.shot for sequence in own)
+def one_way_notes(faults: Mapping[ImageSequence, str]) -> Iterator[str]:
+    """A line for each pair and reason for which stripes that cross are not used."""
+    shots: dict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)
+    for sequence, fault in faults.items():
+        if fault:
+            # What differs from shot to shot, shares and names of files, is that of the first.
+            alike = NUMBER.sub("", fault.partition("such as")[0])
+            shots[sequence.pair, alike].append((sequence.shot, fault))
+    for (pair, _), own in sorted(shots.items()):
+        named, fault = ", ".join(shot for shot, _ in own), own[0][1]
         yield (
-            f"{pair}: images of `crossing` are missing, such as {own[0].missing[0]}: stripes of the "
-            f"first direction alone are used in shot{'s' if len(own) > 1 else ''} {named}"
+            f"{pair}: stripes of the first direction alone are used in "
+            f"shot{'s' if len(own) > 1 else ''} {named}, not those of `crossing`: {fault}"
         )
 
 

@@ -20,8 +20,9 @@ from bodyscan.stripes.one_moment import Moments, StripeMotion
 from bodyscan.stripes.stripe_map import ResponseShare
 from bodyscan.workflows.decode import decode_sequence, one_way_notes, response_notes, responses_in
 
-Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...], StripeMotion | None]
-"""A range image, and what was found on the way: the projector's response, and what moved."""
+Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...], StripeMotion | None, str]
+"""A range image, and what was found on the way: the projector's response, what moved, and why the
+stripes that cross were not used."""
 
 
 def reconstruct_sequence(
@@ -43,7 +44,7 @@ def reconstruct_sequence(
     if frame_ms is not None and moments:
         velocity = None if motion is None else motion.velocity
         image = replace(image, time_ms=MS * moments[0].moment, velocity=velocity)
-    return image, tuple(responses_in(stripes)), motion
+    return image, tuple(responses_in(stripes)), motion, stripes.crossing_fault
 
 
 def reconstruct_range_images(
@@ -84,12 +85,12 @@ def reconstruct_range_images(
     images = [image for image, *_ in found.values()]
     responses: dict[str, list[ResponseShare]] = defaultdict(list)
     motions: dict[str, StripeMotion] = {}
-    for image, shares, motion in found.values():
+    for image, shares, motion, _ in found.values():
         responses[image.pair] += shares
         if motion is not None:
             motions[image.pair] = motion
     notes = [f"{image.pair}: {image.agreement}" for image in images if image.agreement is not None]
-    notes += map(captures.relative, one_way_notes(found))
+    notes += map(captures.relative, one_way_notes({one: own[-1] for one, own in found.items()}))
     notes += motion_notes(motions, timed=bool(captures.times))
     return Outcome(images, (*notes, *response_notes(responses)), failed)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from bodyscan.geometry.light_planes import Axis
 from bodyscan.stripes.codes import stripe_code
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
 
 STRIPES = 100
@@ -226,12 +228,16 @@ def test_a_finest_bit_that_no_lens_shows_costs_pixels_not_the_capture(good: Sequ
 def test_what_is_wrong_with_crossing_stripes_is_said_of_them(good: Sequence) -> None:
     """Rows twice: the second time as if they were columns; and the other way about."""
     coded = np.concatenate([good.patterns, good.inverses])
-    for direction, said in (("horizontal", "stripes of `crossing`: the"), ("vertical", "^the")):
-        code = stripe_code(
-            {"code": "gray", "stripes": STRIPES, "direction": direction}
-            | {"crossing": {"stripes": STRIPES}}
-        )
-        with pytest.raises(DecodingFailed, match=f"{said} stripes run horizontally") as caught:
-            decode_stripes(code, good.lit, good.dark, np.concatenate([coded, coded]))
-        assert "exchange" in caught.value.remedy
-        assert ("direction: horizontal" in caught.value.remedy) == (direction == "vertical")
+    twice = np.concatenate([coded, coded])
+
+    def code(direction: str) -> StripeCode:
+        both = {"code": "gray", "stripes": STRIPES, "crossing": {"stripes": STRIPES}}
+        return stripe_code({**both, "direction": direction})
+
+    found = decode_stripes(code("horizontal"), good.lit, good.dark, twice)
+    assert found.crossing is None
+    assert re.match(r"the stripes run horizontally.*\n  exchange", found.crossing_fault)
+    np.testing.assert_array_equal(found.s, read(good).s)
+    with pytest.raises(DecodingFailed, match=r"^the stripes run horizontally") as caught:
+        decode_stripes(code("vertical"), good.lit, good.dark, twice)
+    assert "direction: horizontal" in caught.value.remedy

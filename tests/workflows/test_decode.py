@@ -84,8 +84,14 @@ def test_a_shot_without_its_crossing_images_keeps_the_others(tmp_path: Path) -> 
     known = np.isfinite(found.s)
     assert known.mean() > 0.9
     assert np.median(np.abs(found.s - s)[known]) < 0.1  # stripes; they are 3 pixels wide
-    (note,) = one_way_notes([sequence])
+    (note,) = one_way_notes({sequence: found.crossing_fault})
     assert "row0.png" in note
+    for name in names[2 + len(coded) :]:
+        (scan / f"{name}.png").write_bytes(b"not an image")
+    (sequence,) = open_scan(rig, scan).sequences
+    damaged = decode_sequence(sequence, rig.pairs[0])
+    np.testing.assert_array_equal(damaged.s, found.s)
+    assert "row0.png" in damaged.crossing_fault
     (scan / f"{names[2]}.png").unlink()
     (sequence,) = open_scan(rig, scan).sequences
     with pytest.raises(ImageError):
