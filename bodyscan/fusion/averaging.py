@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.compiled import compiled
+from bodyscan.fusion.brightness import EvenGrey
 from bodyscan.fusion.comparing import Evidence
 from bodyscan.fusion.quadratics import NORMAL_MEDIAN
 from bodyscan.fusion.smoothing import SmoothSurface
@@ -29,26 +30,21 @@ def average(
     samples: Samples,
     surfaces: Sequence[SmoothSurface],
     evidence: Sequence[Evidence],
-    gain: Floats,
+    grey: EvenGrey,
     workers: int = THREADS,
 ) -> BodyCloud:
-    """Weighted means of each sample and what agrees with it; the outvoted are dropped.
-
-    gain: (surfaces,) factors for their grey levels.
-    """
-    own_gain = np.repeat(gain, np.diff(samples.starts))
+    """Weighted means of each sample and what agrees with it; the outvoted are dropped."""
     general = scatter(samples, surfaces, evidence) ** 2
 
     def part(start: int) -> tuple[NDArray[Any], ...]:
         some = slice(start, start + AT_A_TIME)
         normals, sigma_mm = samples.normals[some], samples.sigma_mm[some]
-        own = normals, sigma_mm, samples.weight[some], samples.colours[some], own_gain[some]
-        sums, seen = _own_sums(*own)
-        for surface, one, factor in zip(surfaces, evidence, gain, strict=True):
-            facts = (surface.normals, surface.sigma_mm, surface.weight, surface.colours)
+        sums, seen = _own_sums(normals, sigma_mm, samples.weight[some], grey.samples[some])
+        for surface, one, levels in zip(surfaces, evidence, grey.surfaces, strict=True):
+            facts = (surface.normals, surface.sigma_mm, surface.weight, levels)
             here = slice(*np.searchsorted(one.index, (some.start, some.stop)))
             agreed = one.index[here] - start, one.at[here], one.shift_mm[here]
-            _add(facts, factor, *agreed, sums, seen)
+            _add(facts, *agreed, sums, seen)
             here = slice(*np.searchsorted(one.against_index, (some.start, some.stop)))
             weights = surface.weight[one.against_at[here]]
             sums[one.against_index[here] - start, AGAINST] += weights
@@ -73,13 +69,13 @@ def scatter(
 
 @compiled
 def _own_sums(
-    normals: Floats, sigma_mm: Floats, weights: Floats, colours: Bytes, gain: Floats
+    normals: Floats, sigma_mm: Floats, weights: Floats, levels: Floats
 ) -> tuple[Array, Bytes]:
     """Sums (N, 9) over the samples' own surfaces alone, and by how many each was seen."""
     sums = np.zeros((len(weights), SUMS))
     for n in range(len(weights)):
         weight = float(weights[n])
-        sums[n, WEIGHT], sums[n, GREY] = weight, weight * colours[n] * gain[n]
+        sums[n, WEIGHT], sums[n, GREY] = weight, weight * levels[n]
         sums[n, SPREAD] = (weight * sigma_mm[n]) ** 2
         for k in range(3):
             sums[n, NORMAL + k] = weight * normals[n, k]
@@ -88,8 +84,7 @@ def _own_sums(
 
 @compiled
 def _add(
-    surface: tuple[Floats, Floats, Floats, Bytes],
-    gain: float,
+    surface: tuple[Floats, Floats, Floats, Floats],
     index: NDArray[np.int32],
     at: NDArray[np.int32],
     shifts: Floats,
@@ -97,14 +92,14 @@ def _add(
     seen: Bytes,
 ) -> None:
     """Points `at` of a surface (normals, sigma, weight, grey levels) to the sums at `index`."""
-    normals, sigma_mm, weights, colours = surface
+    normals, sigma_mm, weights, levels = surface
     for n in range(len(index)):
         here, there = index[n], at[n]
         weight, shift = float(weights[there]), shifts[n]
         sums[here, WEIGHT] += weight
         sums[here, SHIFT] += weight * shift
         sums[here, SHIFT2] += weight * shift * shift
-        sums[here, GREY] += weight * colours[there] * gain
+        sums[here, GREY] += weight * levels[there]
         sums[here, SPREAD] += (weight * sigma_mm[there]) ** 2
         for k in range(3):
             sums[here, NORMAL + k] += weight * normals[there, k]

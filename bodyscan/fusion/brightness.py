@@ -1,37 +1,137 @@
-"""Exposures of the pairs evened out, so that a body's colour shows no seam from pair to pair."""
+"""Grey levels of the pairs evened out, so that a body's colour shows no seam from pair to pair.
+
+Two things differ between cameras that see the same spot: their exposures, and how squarely each
+one's projector, which stands beside it, lights the spot. A matt surface is as bright as the cosine of
+the light's incidence, over the squared distance; what light the room adds makes that less, by a
+power from 0 to 1. The overlaps tell that power and the exposures.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from bodyscan.arrays import Bytes, Floats
+from bodyscan.arrays import Array, Bytes, Floats
+from bodyscan.compiled import compiled
 from bodyscan.fusion.comparing import Evidence
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples
 
-DARKEST = 8.0  # grey levels that say nothing of the exposure
+DARKEST, BRIGHTEST = 8, 250
+"""Grey levels beyond which nothing is said of the light"""
 FEWEST = 200
 SPOTS = 5000  # of an overlap are enough to compare exposures
 HOLD = 1e-3  # of an overlap's weight: pairs without overlap keep their own brightness
+FLATTEST = 0.1  # cosine: what is lit flatter than this is mostly lit by the room
 
 
-def even_exposures(
+@dataclass(frozen=True, eq=False)
+class EvenGrey:
+    """Evened grey levels, float32: of the samples (N,), and of each surface's points."""
+
+    samples: Floats
+    surfaces: list[Floats]
+
+
+def even_brightness(
     samples: Samples, surfaces: Sequence[SmoothSurface], evidence: Sequence[Evidence]
-) -> Floats:
-    """(P,) factors for the surfaces' grey levels, from where two of them show one spot."""
-    ratios = []
+) -> EvenGrey:
+    """As if all pairs were exposed alike and lit the body evenly."""
+    centres = [surface.rig_from_camera.translation for surface in surfaces]
+    of_surfaces = [
+        _shades(surface.points, surface.normals, centre)
+        for surface, centre in zip(surfaces, centres, strict=True)
+    ]
+    own = [slice(start, end) for start, end in pairwise(samples.starts)]
+    of_samples = np.concatenate(
+        [
+            _shades(samples.points[part], samples.normals[part], centre)
+            for part, centre in zip(own, centres, strict=True)
+        ]
+    )
+    overlaps = _overlaps(samples, surfaces, evidence, of_samples, of_surfaces)
+    power = light_power([(overlap.ratio, overlap.shade) for overlap in overlaps])
+    ratios = [(o.a, o.b, float(np.median(o.ratio - power * o.shade)), o.spots) for o in overlaps]
+    gain = gains(ratios, len(surfaces))
+    typical = float(np.mean(of_samples)) if len(of_samples) else 0.0
+
+    def evened(colours: Bytes, shades: Floats, factor: float) -> Floats:
+        return colours * (factor * np.exp(np.float32(-power) * (shades - np.float32(typical))))
+
+    return EvenGrey(
+        np.concatenate(
+            [
+                evened(samples.colours[part], of_samples[part], factor)
+                for part, factor in zip(own, gain, strict=True)
+            ]
+        ),
+        [
+            evened(surface.colours, shades, factor)
+            for surface, shades, factor in zip(surfaces, of_surfaces, gain, strict=True)
+        ],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Overlap:
+    """Where surfaces a and b show the same spots: logarithms (N,) of b's grey levels over a's, and of
+    the light that falls there. spots: how many these stand for."""
+
+    a: int
+    b: int
+    ratio: Floats
+    shade: Floats
+    spots: int
+
+
+def _overlaps(
+    samples: Samples,
+    surfaces: Sequence[SmoothSurface],
+    evidence: Sequence[Evidence],
+    of_samples: Floats,
+    of_surfaces: Sequence[Floats],
+) -> list[_Overlap]:
+    found = []
     for b, (surface, one) in enumerate(zip(surfaces, evidence, strict=True)):
         starts = np.searchsorted(one.index, samples.starts)
         for a, (start, end) in enumerate(pairwise(starts)):
             step = 1 + (end - start) // SPOTS
-            some = slice(start, end, step)
-            ours, theirs = samples.colours[one.index[some]], surface.colours[one.at[some]]
-            ratio, spots = log_ratio(ours, theirs.astype(np.float32))
-            ratios.append((a, b, ratio, spots * step))
-    return gains([ratio for ratio in ratios if ratio[-1]], len(evidence))
+            here, there = one.index[start:end:step], one.at[start:end:step]
+            ours, theirs = samples.colours[here], surface.colours[there]
+            clear = (np.minimum(ours, theirs) > DARKEST) & (np.maximum(ours, theirs) < BRIGHTEST)
+            if np.count_nonzero(clear) < FEWEST:
+                continue
+            here, there = here[clear], there[clear]
+            ratio = np.log(surface.colours[there] / samples.colours[here].astype(np.float32))
+            shade = of_surfaces[b][there] - of_samples[here]
+            found.append(_Overlap(a, b, ratio, shade, step * len(here)))
+    return found
+
+
+def light_power(overlaps: Sequence[tuple[Floats, Floats]]) -> float:
+    """From 0 to 1: with which power of the light that falls on a spot its grey level rises.
+
+    overlaps: logarithms (N,) of one camera's grey levels over another's, and of the light's. Within
+    each overlap, so that exposures do not matter; the least sum of absolute errors.
+    """
+    if not overlaps:
+        return 0.0
+    ratio, shade = (
+        np.concatenate([own[k] - np.median(own[k]) for own in overlaps]).astype(np.float64)
+        for k in range(2)
+    )
+    some = np.abs(shade) > 1e-6
+    slopes, weights = ratio[some] / shade[some], np.abs(shade[some])
+    return float(np.clip(_weighted_median(slopes, weights), 0.0, 1.0)) if some.any() else 0.0
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = np.argsort(values, kind="stable")
+    below = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
 
 
 def gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Floats:
@@ -51,10 +151,17 @@ def gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Floats:
     return np.exp(logarithms - logarithms.mean()).astype(np.float32)
 
 
-def log_ratio(ours: Bytes | Floats, theirs: Bytes | Floats) -> tuple[float, int]:
-    """Median log of `theirs` over `ours` (N,) grey levels, and of how many; 0 of too few."""
-    bright = (ours > DARKEST) & (theirs > DARKEST)
-    spots = int(np.count_nonzero(bright))
-    if spots < FEWEST:
-        return 0.0, 0
-    return float(np.median(np.log(theirs[bright] / ours[bright].astype(np.float32)))), spots
+@compiled
+def _shades(points: Floats, normals: Floats, centre: Array) -> Floats:
+    """(N,) logarithms of the light that points of a surface get from one beside a camera's centre, but
+    for a constant: cosine of its incidence over the squared distance."""
+    shades = np.empty(len(points), np.float32)
+    for n in range(len(points)):
+        towards = distance2 = 0.0
+        for k in range(3):
+            away = centre[k] - points[n, k]
+            towards += normals[n, k] * away
+            distance2 += away * away
+        cosine = max(towards / np.sqrt(distance2), FLATTEST)
+        shades[n] = np.log(cosine / distance2)
+    return shades

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from bodyscan.fusion.averaging import average
-from bodyscan.fusion.brightness import even_exposures
+from bodyscan.fusion.brightness import even_brightness
 from bodyscan.fusion.comparing import compare
 from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.smoothing import smooth
@@ -63,6 +63,6 @@ def merge(
             range(len(surfaces)),
         )
         evidence = list(compared)
-    gain = even_exposures(samples, surfaces, evidence)
-    cloud = average(samples, surfaces, evidence, gain, workers)
+    grey = even_brightness(samples, surfaces, evidence)
+    cloud = average(samples, surfaces, evidence, grey, workers)
     return MergedCloud(cloud, Contradictions.of(list(shown), evidence, samples.starts))

@@ -9,13 +9,18 @@ import pytest
 from flat_walls import ASIDE, WALL_MM, wall
 
 from bodyscan.fusion.averaging import average, scatter
+from bodyscan.fusion.brightness import EvenGrey
 from bodyscan.fusion.comparing import Evidence, compare
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples, take_samples
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 
-GAIN = np.ones(2, np.float32)
+
+def as_seen(samples: Samples, surfaces: list[SmoothSurface]) -> EvenGrey:
+    """Grey levels as the cameras gave them."""
+    own = [surface.colours.astype(np.float32) for surface in surfaces]
+    return EvenGrey(samples.colours.astype(np.float32), own)
 
 
 def known_to(surface: SmoothSurface, sigma_mm: float, rim: float = 1.0) -> SmoothSurface:
@@ -34,7 +39,12 @@ def fused(
     ]
     samples = take_samples(surfaces, 10**6)
     evidence = [compare(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)]
-    return average(samples, surfaces, evidence, GAIN, 1), samples, surfaces, evidence
+    return (
+        average(samples, surfaces, evidence, as_seen(samples, surfaces), 1),
+        samples,
+        surfaces,
+        evidence,
+    )
 
 
 def test_two_that_agree_are_known_better_by_their_weights() -> None:
@@ -82,7 +92,7 @@ def test_a_place_where_pairs_disagree_by_more_than_elsewhere_is_less_certain() -
     samples = take_samples(surfaces, 10**6)
     evidence = [compare(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)]
     assert scatter(samples, surfaces, evidence) == 1.0
-    cloud = average(samples, surfaces, evidence, GAIN, 1)
+    cloud = average(samples, surfaces, evidence, as_seen(samples, surfaces), 1)
     both = cloud.pairs_seen == 2
     apart = np.isclose(np.abs(cloud.points[:, 2] - WALL_MM), 0.4, atol=0.01) & both
     assert apart.sum() > 50

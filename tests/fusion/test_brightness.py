@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ray_cast_scan import Scan
 
-from bodyscan.fusion.brightness import gains, log_ratio
+from bodyscan.fusion.brightness import gains, light_power
 from bodyscan.fusion.merging import merge
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import FusionSettings
@@ -27,11 +27,23 @@ def test_a_pair_without_overlap_keeps_its_brightness() -> None:
     assert gains([], 3) == pytest.approx(np.ones(3))
 
 
-def test_a_ratio_of_too_few_spots_counts_for_nothing() -> None:
-    assert log_ratio(np.full(50, 100, np.uint8), np.full(50, 50.0, np.float32)) == (0.0, 0)
-    ratio, spots = log_ratio(np.full(500, 100, np.uint8), np.full(500, 50.0, np.float32))
-    assert ratio == pytest.approx(np.log(0.5))
-    assert spots == 500
+def test_the_power_of_light_is_told_whatever_the_exposures_and_some_stains() -> None:
+    rng = np.random.default_rng(0)
+    overlaps = []
+    for exposure in (0.3, -0.2):
+        shade = rng.normal(0.1, 0.4, 800).astype(np.float32)
+        ratio = exposure + 0.8 * shade + rng.normal(0.0, 0.02, 800)
+        ratio[::10] += 1.0  # highlights
+        overlaps.append((ratio.astype(np.float32), shade))
+    # Where light falls off to a third, 0.05 of the power is 5 % of grey, which nobody sees.
+    assert light_power(overlaps) == pytest.approx(0.8, abs=0.05)
+    assert light_power([]) == 0.0
+
+
+def test_light_that_the_room_gives_is_not_taken_for_more_than_matt() -> None:
+    shade = np.linspace(-1.0, 1.0, 500).astype(np.float32)
+    assert light_power([(-0.5 * shade, shade)]) == 0.0
+    assert light_power([(3.0 * shade, shade)]) == 1.0
 
 
 def test_no_seams_between_exposures(scan: Scan, cleaned: list[RangeImage]) -> None:
@@ -45,3 +57,20 @@ def test_no_seams_between_exposures(scan: Scan, cleaned: list[RangeImage]) -> No
     grey = cloud.colours[:, 0].astype(float)
     # Without gains the scatter is that of the factors, 0.25.
     assert grey.std() / grey.mean() < 0.02
+
+
+def test_no_seams_where_one_pair_looks_squarely_and_another_along(
+    scan: Scan, cleaned: list[RangeImage]
+) -> None:
+    """A matt body, each pair's light beside its camera: one grey all over."""
+    images = []
+    for image in cleaned:
+        distance = np.linalg.norm(image.points, axis=-1)
+        facing = -np.sum(image.points * image.normals, axis=-1) / distance
+        lit = np.nan_to_num(120.0 * facing * (1300.0 / distance) ** 2)
+        images.append(replace(image, colours=np.clip(np.rint(lit), 0, 255).astype(np.uint8)))
+    cloud = merge(images, scan.rig_from_camera, FusionSettings(points=100_000)).cloud
+    grey = cloud.colours[:, 0].astype(float)
+    low, high = np.percentile(grey, [5, 95])
+    # As the cameras give it, the brightest is 2.5 times the darkest.
+    assert high / low < 1.1

@@ -7,6 +7,7 @@ import pytest
 from flat_walls import ASIDE, WALL_MM, wall
 
 from bodyscan.fusion.averaging import average
+from bodyscan.fusion.brightness import EvenGrey
 from bodyscan.fusion.comparing import Evidence, compare
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples, take_samples
@@ -55,7 +56,9 @@ def test_a_wall_in_front_says_nothing() -> None:
 def test_means_by_weight() -> None:
     samples, surfaces, evidence = seen_beside(0.8)
     nothing = compare(samples, surfaces[0], 0, 0.0, 0.0)
-    cloud = average(samples, surfaces, [nothing, evidence], np.ones(2, np.float32))
+    own = [surface.colours.astype(np.float32) for surface in surfaces]
+    grey = EvenGrey(samples.colours.astype(np.float32), own)
+    cloud = average(samples, surfaces, [nothing, evidence], grey)
     assert len(cloud.points) == len(samples.points)
     inner = np.zeros(len(cloud.points), bool)
     inner[evidence.index] = True
