@@ -10,8 +10,9 @@ from pathlib import Path
 
 from bodyscan.captures.folder import Captures, ImageSequence, join_captures, open_folder, open_scan
 from bodyscan.captures.image_faults import NO_INVERSES, absence, header_fault
+from bodyscan.captures.image_header import NoImage, read_header
 from bodyscan.captures.unlisted_images import find_unlisted_images
-from bodyscan.errors import CaptureError
+from bodyscan.errors import BadInput, CaptureError
 from bodyscan.files.model import did_you_mean
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import Pair
@@ -23,6 +24,9 @@ FEWEST_SHOTS = 3
 ENOUGH_SHOTS = 6
 MANY_SHOTS = 3
 """Where more shots than this have the same fault, they share a line."""
+COARSE = 4.0
+"""Grey levels: boundaries and corners rise by some 40 a pixel, so that they are off by 0.1 px, several
+times what a camera's own noise makes of them."""
 _READERS = 8  # waiting for a disk or a server, not computing
 
 
@@ -105,8 +109,10 @@ def check(
     warnings = [] if silent else [f"{rig_path}: names no calibration captures"]
     warnings += odd_sizes(rig)
     warnings += [NO_INVERSES] if any(map(_lacks_inverses, sequences)) else []
+    warnings += _coarse_images(sequences)
     warnings += filter(None, map(_unlisted_images, captures))
-    warnings += map(_turned, filter(lambda board: board.looks_same_turned, rig.boards))
+    if len(rig.pairs) > 1:  # one camera alone agrees with itself
+        warnings += [_turned(board) for board in rig.boards if board.looks_same_turned]
     warnings += filter(None, map(_few, rig.pairs, counts)) if calibration else ()
     return CheckReport(
         rig_path=Path(rig_path),
@@ -217,6 +223,29 @@ def _unlisted_images(captures: Captures) -> str | None:
         f"{_several(len(found), 'image')} {belong} to no pair and frame of the rig file, such as "
         f"{found[0]}; is a name spelt differently?"
     )
+
+
+def _coarse_images(sequences: list[ImageSequence]) -> list[str]:
+    """JPEG of low quality, by the first image of each pair."""
+    firsts = {s.pair: path for s in reversed(sequences) for path in s.paths[:1]}
+    with ThreadPoolExecutor(_READERS) as pool:
+        rounded = dict(zip(firsts, pool.map(_rounding, firsts.values()), strict=True))
+    coarse = [pair for pair, grey in rounded.items() if grey > COARSE]
+    if not coarse:
+        return []
+    return [
+        f"images of {', '.join(sorted(coarse))} are JPEG of low quality: they err by up to "
+        f"{max(rounded.values()):.0f} grey levels, and stripes' boundaries with them; save PNG, or "
+        "JPEG of a quality of 95 or more"
+    ]
+
+
+def _rounding(path: Path) -> float:
+    """Grey levels; 0 of what cannot be read, which is told elsewhere."""
+    try:
+        return read_header(path).rounded
+    except (NoImage, BadInput, OSError):
+        return 0.0
 
 
 def _turned(board: Board) -> str:

@@ -29,12 +29,16 @@ _TAIL = 65536  # some writers add a few bytes behind the end
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Width and height in pixels, bits a sample, and whether the end of the image is there."""
+    """Width and height in pixels, bits a sample, and whether the end of the image is there.
+
+    rounded: grey levels, RMS, by which JPEG's rounding may be off, where an image has sharp edges
+    everywhere, as stripes are."""
 
     width: int
     height: int
     bits: int
     complete: bool
+    rounded: float = 0.0
 
 
 class NoImage(Exception):
@@ -52,8 +56,8 @@ def read_header(path: Path) -> ImageHeader:
             width, height, bits = _png_header(start)
             return ImageHeader(width, height, bits, _ends_with(stream, 33, _PNG_END))
         if start.startswith(_JPEG):
-            width, height, bits, end = _jpeg_header(stream)
-            return ImageHeader(width, height, bits, _ends_with(stream, end, _JPEG_END))
+            width, height, bits, rounded, end = _jpeg_header(stream)
+            return ImageHeader(width, height, bits, _ends_with(stream, end, _JPEG_END), rounded)
         if start.startswith(_BMP):
             return _bmp_header(start, stream.seek(0, 2))
         if start.startswith(_TIFF):
@@ -102,8 +106,10 @@ def _png_header(start: bytes) -> tuple[int, int, int]:
     return width, height, bits
 
 
-def _jpeg_header(stream: BinaryIO) -> tuple[int, int, int, int]:
-    """Width, height, bits, and where the frame header ends. Source: ITU-T T.81, Annex B."""
+def _jpeg_header(stream: BinaryIO) -> tuple[int, int, int, float, int]:
+    """Width, height, bits, what rounding leaves, and where the frame header ends. Source: ITU-T T.81,
+    Annex B."""
+    rounded = 0.0
     stream.seek(2)
     while True:
         marker = stream.read(2)
@@ -126,8 +132,26 @@ def _jpeg_header(stream: BinaryIO) -> tuple[int, int, int, int]:
             if len(frame) < 5:
                 raise NoImage("is cut short")
             bits, height, width = struct.unpack(">BHH", frame)
-            return width, height, bits, stream.tell()
-        stream.seek(length - 2, 1)
+            return width, height, bits, rounded, stream.tell()
+        if marker[1] == 0xDB:
+            rounded = max(rounded, _rounding(stream.read(length - 2)))
+        else:
+            stream.seek(length - 2, 1)
+
+
+def _rounding(tables: bytes) -> float:
+    """Of the first table, that of brightness; 0.0 if it is not among these.
+
+    A coefficient rounded to multiples of q errs by q / sqrt(12); the transform keeps squares.
+    """
+    while len(tables) > 64:
+        wide, which = divmod(tables[0], 16)
+        steps = tables[1 : 65 + 64 * bool(wide)]
+        if which == 0 and len(steps) == 64 * (1 + bool(wide)):
+            squares = [step**2 for step in struct.unpack(">64H" if wide else ">64B", steps)]
+            return float((sum(squares) / 64 / 12) ** 0.5)
+        tables = tables[1 + len(steps) :]
+    return 0.0
 
 
 def _bmp_header(start: bytes, size: int) -> ImageHeader:

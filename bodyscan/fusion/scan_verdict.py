@@ -124,8 +124,11 @@ def grade_scan(
 
 
 def _pairs(failed: Mapping[str, str], alignment: Alignment | None) -> Iterator[Finding]:
+    alike: dict[str, list[str]] = {}
     for name, reason in failed.items():
-        yield "usable", f"left out: {name}: {reason}"
+        alike.setdefault(reason.replace(name, "*"), []).append(name)
+    for names in alike.values():
+        yield "usable", f"left out: {', '.join(names)}: {failed[names[0]]}"
     for name in alignment.refused if alignment else ():
         yield (
             "repeat",

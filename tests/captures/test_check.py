@@ -7,11 +7,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from real_captures import real_rig_file
 from small_captures import FRAMES, RIG, encoded, picture, write, write_small_captures
 
 from bodyscan.captures.check import check, report_lines
+from bodyscan.captures.image_header import read_header
 from bodyscan.errors import RigFileError
 
 
@@ -233,6 +236,29 @@ def test_a_board_that_looks_the_same_turned_round_is_named(
 ) -> None:
     write(rig_path, RIG.replace("columns: 5, rows: 4", board))
     assert len(lines_with(rig_path, "board board looks the same turned round")) == turned
+
+
+@pytest.mark.parametrize(("quality", "told"), [(40, True), (96, False)])
+def test_jpeg_of_low_quality_is_named_with_its_pair(
+    rig_path: Path, quality: int, told: bool
+) -> None:
+    for path in sorted(rig_path.parent.rglob("p2/*.png")):
+        content = cv2.imencode(".jpg", picture("lit"), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        write(path, content.tobytes())
+    found = lines_with(rig_path, "JPEG of low quality")
+    assert len(found) == told
+    assert not told or "images of p2 are" in found[0]
+
+
+def test_what_jpeg_leaves_is_as_its_tables_say(tmp_path: Path) -> None:
+    """Of noise, which has everything in it that rounding can take."""
+    noise = np.random.default_rng(0).integers(0, 256, (256, 256)).astype(np.uint8)
+    path = tmp_path / "noise.jpg"
+    for quality in (50, 80, 95):
+        cv2.imwrite(str(path), noise, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        off = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(float) - noise
+        # Grey levels beyond 0 and 255 are cut, which takes some of the error.
+        assert read_header(path).rounded == pytest.approx(off.std(), rel=0.15)
 
 
 def test_pairs_that_no_shot_ties_together_are_named(rig_path: Path) -> None:

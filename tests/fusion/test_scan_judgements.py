@@ -158,3 +158,13 @@ def test_a_pair_that_does_not_fit_is_to_be_repeated(scan: MadeScan) -> None:
     verdict = graded(scan, found)
     assert verdict.grade == "repeat"
     assert "pair p2 does not fit the others" in str(verdict)
+
+
+def test_pairs_that_failed_alike_share_a_line_and_its_remedy(scan: MadeScan) -> None:
+    missing = "s01/{}/lit.png: is missing\n  Copy it here."
+    failed = {name: missing.format(name) for name in ("p1-1", "p1-2")} | {"p2-1": "too dark"}
+    verdict = grade_scan(scan.cloud, scan.mesh, None, failed, Volume(), NO_LIMITS)
+    assert verdict.reasons == (
+        "left out: p1-1, p1-2: s01/p1-1/lit.png: is missing\n  Copy it here.",
+        "left out: p2-1: too dark",
+    )
