@@ -94,7 +94,7 @@ def scan(
         output.show(tables.scan_table(found))
         output.figures(**tables.scan_figures(found))
     output.made("result", saved)
-    output.notes(found.agreements)
+    output.notes(found.notes)
     output.notes(pictures.notes)
     output.made("pictures", *pictures.value)
     output.verdict(found.verdict)

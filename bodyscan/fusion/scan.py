@@ -36,7 +36,8 @@ class Scan:
     """A body model, how it came about and whether it is good.  measured: points of each pair's
     cleaned range image.  failed: pairs that gave none, with the reason.  range_images: cleaned, of
     the pairs that saw the subject, carried to one moment; rig_from_camera: where each stood to it,
-    after alignment.  person: how a body that moved did, part by part.
+    after alignment.  person: how a body that moved did, part by part.  notes: what was said of the
+    range images, such as what of their stripes was not used.
     """
 
     cloud: BodyCloud
@@ -48,12 +49,7 @@ class Scan:
     range_images: tuple[RangeImage, ...]
     rig_from_camera: dict[str, RigidTransform]
     person: PersonMotion | None = None
-
-    @property
-    def agreements(self) -> tuple[str, ...]:
-        """Of pairs that project stripes of two directions, how well these agree."""
-        own = ((image.pair, image.agreement) for image in self.range_images)
-        return tuple(f"{pair}: {agreement}" for pair, agreement in own if agreement)
+    notes: tuple[str, ...] = ()
 
 
 def fuse(
@@ -128,7 +124,8 @@ def fuse(
         at_once_or_empty = [carried.get(image.pair, image) for image in cleaned]
         held = check_surface(surface, at_once_or_empty, placing)
         verdict = graded(surface, held)
-    return Scan(cloud, surface, alignment, points, failed, verdict, tuple(seen), placing, person)
+    images, notes = tuple(seen), measured.notes
+    return Scan(cloud, surface, alignment, points, failed, verdict, images, placing, person, notes)
 
 
 def _pole_step(

@@ -252,7 +252,8 @@ def test_alignment_takes_no_part_if_not_wanted(images: list[RangeImage]) -> None
     known = PoseCovariance(tuple(placed), np.zeros((6 * len(placed), 6 * len(placed))))
     calibration = RigCalibration(RIG, {}, placed, known, {}, {}, ())
     boards_alone = SETTINGS.model_copy(update={"alignment": AlignmentSettings(matching="none")})
-    scan = fuse(calibration, Outcome(images), boards_alone)
+    scan = fuse(calibration, Outcome(images, ("as it was said",)), boards_alone)
+    assert scan.notes == ("as it was said",)
     assert scan.alignment is None
     assert scan.verdict.grade == "good"
 
