@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,9 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
+
+Crop = tuple[slice, slice]
+WHOLE: Crop = (slice(None), slice(None))
 
 FEWEST_STRIPE_SHOTS = 2
 RIM_SQUARES = 0.1
@@ -66,18 +69,34 @@ class StripedView:
         return self.view.camera_from_board @ RigidTransform(np.eye(3), np.array([0.0, 0.0, z_mm]))
 
 
-def boundaries_near(stripes: StripeMap, view: BoardView) -> BoardBoundaries:
-    """The boundaries within the box around the view's corners: all that its board can hold."""
-    low, high = view.pixels.min(axis=0), view.pixels.max(axis=0)
-    reach = 0.5 * (high - low)
-    pixels = stripes.boundary_pixels
-    near = np.all((pixels >= low - reach) & (pixels <= high + reach), axis=1)
+def boundaries_near(stripes: StripeMap, view: BoardView, crop: Crop = WHOLE) -> BoardBoundaries:
+    """The boundaries within the box around the view: all that its board can hold.
+
+    crop: rows and columns of the image that the stripe map is of."""
+    low, high = _box(view)
+    pixels = stripes.boundary_pixels + [crop[1].start or 0, crop[0].start or 0]
+    near = np.all((pixels >= low) & (pixels <= high), axis=1)
     return BoardBoundaries(
         stripes.boundary_index[near],
         pixels[near],
         stripes.boundary_sigma_px[near].astype(np.float64),
-        boundaries_near(stripes.crossing, view) if stripes.crossing is not None else None,
+        boundaries_near(stripes.crossing, view, crop) if stripes.crossing is not None else None,
     )
+
+
+def crop_around(views: Iterable[BoardView]) -> Crop:
+    """Rows and columns that hold the boxes around all views of an image."""
+    boxes = np.array([_box(view) for view in views])
+    left, top = np.floor(np.maximum(boxes[:, 0].min(axis=0), 0.0)).astype(int)
+    right, bottom = np.ceil(boxes[:, 1].max(axis=0)).astype(int) + 1
+    return slice(int(top), int(bottom)), slice(int(left), int(right))
+
+
+def _box(view: BoardView) -> tuple[Array, Array]:
+    """Least and greatest (u, v) between which its board lies, of which not all corners may be seen."""
+    low, high = view.pixels.min(axis=0), view.pixels.max(axis=0)
+    reach = 0.5 * (high - low)
+    return low - reach, high + reach
 
 
 def boundaries_on_boards(

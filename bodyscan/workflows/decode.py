@@ -7,9 +7,19 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
+from typing import cast
 
+import numpy as np
+
+from bodyscan.arrays import Greys
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_near
+from bodyscan.calibration.striped_view import (
+    WHOLE,
+    BoardBoundaries,
+    Crop,
+    boundaries_near,
+    crop_around,
+)
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import BodyscanError, DecodingFailed, ImageError, plainly
@@ -41,9 +51,12 @@ def decode_sequence(
     *,
     limits: StripeLimits | None = None,
     moments: Sequence[Moments] = (),
+    crop: Crop = WHOLE,
     workers: int = 1,
 ) -> StripeMap:
     """Read and decode what `pair` took in one shot; limits, moments: see `decode_stripes`.
+
+    crop: rows and columns of the images to decode; the map is of these alone.
 
     Raises ImageError for bad files, DecodingFailed (naming pair and shot) for frames that do not
     add up or a pair without projector. Where only images of the stripes that cross are missing, bad
@@ -55,8 +68,13 @@ def decode_sequence(
 
     def decode(sequence: ImageSequence, projector: StripeCode) -> StripeMap:
         images = read_sequence(sequence, pair.camera, workers=workers)
-        frames = (images.lit, images.dark, images.coded)
-        return decode_stripes(projector, *frames, limits=limits, moments=moments, where=where)
+        lit, dark = (
+            None if image is None else _cut(image, crop) for image in (images.lit, images.dark)
+        )
+        coded = _cut(images.coded, crop)
+        return decode_stripes(
+            projector, lit, dark, coded, limits=limits, moments=moments, where=where
+        )
 
     one_way = sequence.without_crossing, pair.projector.model_copy(update={"crossing": None})
     if sequence.lacks_crossing:
@@ -68,6 +86,11 @@ def decode_sequence(
         if pair.projector.crossing is None or sequence.missing:
             raise
         return replace(decode(*one_way), crossing_fault=str(error))
+
+
+def _cut(images: Greys, crop: Crop) -> Greys:
+    rows, columns = crop
+    return cast(Greys, np.ascontiguousarray(images[..., rows, columns]))
 
 
 def decode_on_boards(
@@ -86,12 +109,13 @@ def decode_on_boards(
     one_way: dict[ImageSequence, str] = {}
 
     def decode(sequence: ImageSequence) -> dict[ViewKey, BoardBoundaries]:
-        stripes = decode_sequence(sequence, rig.pair(sequence.pair))
+        own = wanted[sequence.pair, sequence.shot]
+        crop = crop_around(own)
+        stripes = decode_sequence(sequence, rig.pair(sequence.pair), crop=crop)
         responses[sequence.pair] += responses_in(stripes)
         one_way[sequence] = stripes.crossing_fault
         return {
-            (view.pair, view.shot, view.board): boundaries_near(stripes, view)
-            for view in wanted[sequence.pair, sequence.shot]
+            (view.pair, view.shot, view.board): boundaries_near(stripes, view, crop) for view in own
         }
 
     decoded, errors = attempt_each(

@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 from stripe_rendering import code_light, render
 
+from bodyscan.arrays import Array
+from bodyscan.boards.view import BoardView
+from bodyscan.calibration.striped_view import boundaries_near, crop_around
 from bodyscan.captures.folder import ImageSequence, open_scan
 from bodyscan.errors import DecodingFailed, ImageError
+from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.workflows.decode import (
     decode_sequence,
@@ -64,7 +68,27 @@ def test_many_shots_with_one_fault_share_a_note() -> None:
     assert len(list(failure_notes(failures("p1", "too dark", "a", "b")))) == 2
 
 
-def test_a_shot_without_its_crossing_images_keeps_the_others(tmp_path: Path) -> None:
+def test_a_crop_shows_the_same_boundaries_as_the_whole(tmp_path: Path) -> None:
+    rig, sequence, _ = a_scan_one_way(tmp_path)
+    corners = np.array([[60.0, 40.0], [140.0, 40.0], [60.0, 90.0], [140.0, 90.0]])
+    view = BoardView("p1", "s1", "board", np.arange(4), corners)
+    crop = crop_around([view])
+    assert crop == (slice(15, 116), slice(20, 181))  # half a corner box more on each side
+    whole = boundaries_near(decode_sequence(sequence, rig.pairs[0]), view)
+    cut = boundaries_near(decode_sequence(sequence, rig.pairs[0], crop=crop), view, crop)
+    inside = np.all((whole.pixels > [22, 17]) & (whole.pixels < [178, 113]), axis=1)
+    assert inside.sum() > 1500
+    found = {(i, round(v)): u for i, (u, v) in zip(cut.index, cut.pixels, strict=True)}
+    off = [
+        found[i, round(v)] - u
+        for i, (u, v) in zip(whole.index[inside], whole.pixels[inside], strict=True)
+    ]
+    # The blur, of which edges of brightness are freed, is measured on other pixels.
+    assert np.abs(off).max() < 0.01
+
+
+def a_scan_one_way(tmp_path: Path) -> tuple[Rig, ImageSequence, Array]:
+    """A rig whose code counts both ways, a scan with the images of one, and its true s."""
     (tmp_path / "rig.yaml").write_text(TWO_WAYS, "utf-8")
     rig, scan = load_rig(tmp_path / "rig.yaml"), tmp_path / "scan"
     scan.mkdir()
@@ -79,6 +103,11 @@ def test_a_shot_without_its_crossing_images_keeps_the_others(tmp_path: Path) -> 
     for name, image in zip(names, [lit, dark, *coded], strict=False):
         cv2.imwrite(str(scan / f"{name}.png"), image)
     (sequence,) = open_scan(rig, scan).sequences
+    return rig, sequence, s
+
+
+def test_a_shot_without_its_crossing_images_keeps_the_others(tmp_path: Path) -> None:
+    rig, sequence, s = a_scan_one_way(tmp_path)
     found = decode_sequence(sequence, rig.pairs[0])
     assert found.crossing is None
     known = np.isfinite(found.s)
@@ -86,13 +115,17 @@ def test_a_shot_without_its_crossing_images_keeps_the_others(tmp_path: Path) -> 
     assert np.median(np.abs(found.s - s)[known]) < 0.1  # stripes; they are 3 pixels wide
     (note,) = one_way_notes({sequence: found.crossing_fault})
     assert "row0.png" in note
-    for name in names[2 + len(coded) :]:
-        (scan / f"{name}.png").write_bytes(b"not an image")
+    scan, projector = tmp_path / "scan", rig.pairs[0].projector
+    assert projector is not None
+    files = [scan / f"{name}.png" for name in rig.frames.of_code(projector)]
+    for file in files:
+        if not file.exists():
+            file.write_bytes(b"not an image")
     (sequence,) = open_scan(rig, scan).sequences
     damaged = decode_sequence(sequence, rig.pairs[0])
     np.testing.assert_array_equal(damaged.s, found.s)
     assert "row0.png" in damaged.crossing_fault
-    (scan / f"{names[2]}.png").unlink()
+    files[0].unlink()
     (sequence,) = open_scan(rig, scan).sequences
     with pytest.raises(ImageError):
         decode_sequence(sequence, rig.pairs[0])
