@@ -22,6 +22,8 @@ from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import MeshSettings
 
 FEWEST_POINTS = 1000
+TELLING = 20_000
+"""Points, about, that say which piece of a surface is the subject."""
 GUESS_WEIGHT = np.float32(0.1)  # against the points': a seam's width, where these become few
 
 
@@ -50,7 +52,8 @@ def mesh(
     vertices, faces = surface_nets(bricks, distances)
     if not len(faces):
         raise ScanFailed("no surface came out of the cloud: its points contradict each other")
-    vertices, faces = largest_piece(vertices, faces)
+    some = cloud.points[:: -(-len(cloud.points) // TELLING)]
+    vertices, faces = largest_piece(vertices, faces, some)
     found = topology(vertices, faces)
     if not found.manifold:
         raise ScanFailed(f"no closed surface came out of the cloud ({found})")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.mesh.half_edges import RIM, UNSOUND, corner_fans, twins
@@ -49,11 +50,23 @@ def _fill_holes(vertices: Array, faces: Indices, rim: Indices) -> tuple[Array, I
     return np.concatenate([vertices, middles]), np.concatenate([faces, fans])
 
 
-def largest_piece(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
-    """The connected piece with the most faces, closed and turned to look outwards."""
+def largest_piece(
+    vertices: Array, faces: Indices, points: Array | None = None
+) -> tuple[Array, Indices]:
+    """The connected piece with the most faces, closed and turned to look outwards.
+
+    points: (N, 3), the piece that lies next to most of these instead: what closes the surface behind a
+    wall may have more faces than what was scanned before it.
+    """
     vertices, faces = close_mesh(vertices, faces)
-    labels = face_components(faces, len(vertices))
+    labels = counted = face_components(faces, len(vertices))
+    if points is not None and labels.any():
+        of_vertex = np.empty(len(vertices), labels.dtype)
+        of_vertex[faces] = labels[:, None]
+        used = np.unique(faces)
+        nearest = cKDTree(vertices[used]).query(points)[1]
+        counted = of_vertex[used[nearest]]
     vertices, faces, _ = drop_unused_vertices(
-        vertices, faces[labels == np.argmax(np.bincount(labels))]
+        vertices, faces[labels == np.argmax(np.bincount(counted))]
     )
     return vertices, faces if signed_volume(vertices, faces) > 0 else faces[:, ::-1].copy()

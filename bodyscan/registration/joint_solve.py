@@ -55,6 +55,8 @@ def solve_jointly(
         model.add_camera(colmap_camera(cameras[name], ids[name]))
     model.add_rig(_colmap_rig(names, start.root_from_camera))
     points = _add_points(model, views)
+    if not points:  # a single view of a camera that is known; `full_solve` needs no start
+        return start
     for number, target in enumerate(targets, start=1):
         group = [view for view in views if view.target == target]
         _add_frame(model, number, group, ids, cameras, points, start.root_from_board[target])

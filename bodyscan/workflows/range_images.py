@@ -41,6 +41,12 @@ def reconstruct_sequence(
         moments = sequence_moments(pair, spec.projector, calibration.rig.frames, frame_ms)
     stripes = decode_sequence(sequence, spec, limits=limits, moments=moments)
     image, motion = reconstruct_range_image(pair, stripes), stripes.motion
+    if motion is not None and motion.is_significant and image.agreement is not None:
+        # What stands still, and is seen with faults that look like motion, agrees better as it is.
+        still = decode_sequence(sequence, spec, limits=limits)
+        standing = reconstruct_range_image(pair, still)
+        if standing.agreement and standing.agreement.apart_mm < image.agreement.apart_mm:
+            stripes, image, motion = still, standing, None
     if frame_ms is not None and moments:
         velocity = None if motion is None else motion.velocity
         image = replace(image, time_ms=MS * moments[0].moment, velocity=velocity)

@@ -7,8 +7,9 @@ import open3d as o3d
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_bodies import arrays, together
 
-from bodyscan.mesh.repair import close_mesh
+from bodyscan.mesh.repair import close_mesh, largest_piece
 from bodyscan.mesh.topology import topology
 
 SPHERE = o3d.geometry.TriangleMesh.create_sphere(100.0, 12)
@@ -76,3 +77,14 @@ def test_surfaces_that_touch_in_a_vertex_are_parted() -> None:
 def test_a_face_with_a_repeated_corner_goes() -> None:
     found = topology(*close_mesh(VERTICES, np.concatenate([FACES, [[5, 5, 6]]])))
     assert found.manifold
+
+
+def test_of_several_pieces_the_one_that_was_measured_most_is_kept() -> None:
+    """A wall's back, filled, may have more faces than what stands before it."""
+    make = o3d.geometry.TriangleMesh.create_sphere
+    small, large = arrays(make(40.0, 8)), arrays(make(100.0, 24).translate([500.0, 0.0, 0.0]))
+    vertices, faces = together(small, large)
+    assert len(largest_piece(vertices, faces)[1]) == len(large[1])
+    points = np.concatenate([np.repeat(1.01 * small[0], 50, axis=0), large[0]])
+    kept, _ = largest_piece(vertices, faces, points)
+    np.testing.assert_allclose(np.linalg.norm(kept, axis=1).max(), 40.0)

@@ -72,6 +72,18 @@ def test_a_camera_that_is_held_stays_to_the_last_digit(
     assert sigma["held"] < sigma["free"]
 
 
+def test_one_view_places_the_board_before_a_known_camera(
+    views: list[BoardView], tmp_path: Path
+) -> None:
+    """No other view shares its corners, which is what COLMAP asks for."""
+    rig = rig_with(tmp_path, off_px=0.0, sigma_px=None)
+    rig = rig.model_copy(update={"pairs": tuple(p for p in rig.pairs if p.name == KNOWN)})
+    own = next(view for view in views if view.pair == KNOWN)
+    found = solved(rig, [own], tmp_path)
+    assert found.value.rms_px[KNOWN] < 0.3  # corners have 0.1 px
+    assert len(found.value.rig_from_board) == 1
+
+
 def test_a_camera_that_is_held_wrong_pulls_the_rig_along(
     views: list[BoardView], tmp_path: Path
 ) -> None:
