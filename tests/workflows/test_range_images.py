@@ -33,7 +33,7 @@ def agreement(apart_mm: float) -> Agreement:
 def test_motion_that_makes_both_directions_disagree_is_none(
     monkeypatch: pytest.MonkeyPatch, moved_mm: float, believed: bool
 ) -> None:
-    """0.9 mm as it is. `gray-jpeg` is of a statue, but what is wrong with its patterns looks like motion."""
+    """0.9 mm as it is. In `gray-jpeg` a statue stands; faults of its patterns look like motion."""
     motion: Any = SimpleNamespace(is_significant=True, velocity=None)
 
     def decode(*_: Any, moments: tuple[Moments, ...] = (), **__: Any) -> Seen:
