@@ -12,6 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from bodyscan.alignment.body_motion import ARM_MM
 from bodyscan.alignment.moments import of_stance
@@ -36,6 +37,11 @@ STEPS_MM = np.geomspace(0.5, 30.0, 8)
 NEARLY = 0.5
 """Correlation of a stance with that of 0.8 s later. A pole that fired when no other did, by
 that, saw a person who may have gone there meanwhile."""
+TOLD_SIGMAS = 8.0
+"""A shift of x sigmas one way has a logarithm of x^2 / 2 - 3 log(1 + x^2) for it: SURE at 5.8, and two
+more lest chance hides it."""
+SEVERAL = 3
+"""scans: from so many on what is alike in all is no sway, whenever pairs fire."""
 ANYWHERE_MM = 100.0
 """Of all pairs together: how the whole stands is not asked."""
 
@@ -75,38 +81,69 @@ def moving_alone(names: Sequence[str], poles: Mapping[str, str]) -> dict[str, fr
     return groups
 
 
+Scan = tuple[Mapping[str, Array], Mapping[str, float | None]]
+"""motions: (6,) of each pair by its name, as alignment moved it: a rotation vector about the rig's
+origin, a translation.  moments_ms: when each saw the person; None where that is not known."""
+
+
 def find_pole_step(
     motions: Mapping[str, Array], moments_ms: Mapping[str, float | None], poles: Mapping[str, str]
 ) -> PoleStep | None:
-    """The pole that moved by itself, or the pair, if one did.
-
-    motions: (6,) of each pair by its name, as alignment moved it: a rotation vector about the rig's
-    origin, a translation.  moments_ms: when each saw the person; of pairs whose moment is not known
-    (None) nobody can tell.  poles: as in `moving_alone`.
+    """The pole that moved by itself, or the pair, if one did: see `Scan`.  Of pairs whose moment is not
+    known nobody can tell in one scan.  poles: as in `moving_alone`.
     """
-    names = [name for name in motions if moments_ms[name] is not None]
-    if len(names) < FEWEST:
-        return None
-    twists = np.array([motions[name] for name in names])
-    seen = np.hstack([centre_shifts(twists), ARM_MM * twists[:, :3]])
-    seconds = 1e-3 * np.array([moments_ms[name] for name in names], float)
-    stance = of_stance(seconds[:, None] - seconds)
-    side = [poles.get(name, name) for name in names]
-    sway = stance + SHARED**2 * np.equal.outer(side, side)
-    still = _evidence(seen, SWAY_MM, sway, np.zeros((len(names),) * 2), np.zeros(1))
+    return find_steps([(motions, moments_ms)], poles).step
+
+
+@dataclass(frozen=True)
+class StepSearch:
+    """step: the pole or pair that stands off in all scans, if one does.  least_mm: from which on it
+    would have been seen of any pole or pair; infinite if of some it cannot be told at all."""
+
+    step: PoleStep | None
+    least_mm: float
+
+
+def find_steps(scans: Sequence[Scan], poles: Mapping[str, str]) -> StepSearch:
+    """From one scan, or several since the calibration: a person sways otherwise in each, while what was
+    moved stands off by the same in all.  poles: as in `moving_alone`."""
+    several = len(scans) >= SEVERAL
+    seen = _Seen.of(scans, poles, timed=not several)
+    if len(set(seen.names)) < FEWEST:
+        return StepSearch(None, np.inf)
+    nothing = np.zeros(len(seen.names))
+    still, believed, sway_mm = _evidence(seen, SWAY_MM, nothing, np.zeros(1))
     found: list[tuple[float, PoleStep]] = []
-    for name, pairs in moving_alone(names, poles).items():
-        own = np.array([pair in pairs for pair in names])
-        if not own.all() and stance[np.ix_(own, ~own)].max() > NEARLY:
-            # A head or an arm that moved looks like the one pair that saw it: of those who stand.
-            swayed = SWAY_MM if len(pairs) > 1 else SWAY_MM[SWAY_MM < STILL_MM]
-            gain = _evidence(seen, swayed, sway, np.outer(own, own).astype(float), STEPS_MM) - still
-            found.append((gain, PoleStep.of(name, pairs, {n: motions[n] for n in names})))
+    least = STEP_MM
+    for name, pairs in moving_alone(sorted(set(seen.names)), poles).items():
+        own = np.array([pair in pairs for pair in seen.names])
+        if own.all():
+            continue
+        if not several and seen.sway[np.ix_(own, ~own)].max() <= NEARLY:
+            least = np.inf
+            continue
+        spread = 1.0 / np.sqrt(own @ np.linalg.solve(believed, own.astype(float)))
+        least = max(least, TOLD_SIGMAS * float(spread))
+        # A head or an arm that moved looks like the one pair that saw it: of those who stand.
+        free = len(pairs) > 1 or several
+        if not free and sway_mm > STILL_MM:
+            least = np.inf
+        swayed = SWAY_MM if free else SWAY_MM[SWAY_MM < STILL_MM]
+        gain = _evidence(seen, swayed, own.astype(float), STEPS_MM)[0] - still
+        motions = [{n: m[n] for n in m if n in seen.names} for m, _ in scans]
+        found.append((gain, PoleStep.of(name, pairs, _mean(motions))))
     if not found:
-        return None
+        return StepSearch(None, np.inf)
     gain, step = max(found, key=lambda one: one[0])
     lever = np.radians(step.turn_deg) * ARM_MM
-    return step if gain > SURE and np.hypot(step.shift_mm, lever) > STEP_MM else None
+    moved = gain > SURE and np.hypot(step.shift_mm, lever) > STEP_MM
+    return StepSearch(step if moved else None, least)
+
+
+def _mean(motions: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+    """Of each pair over the scans that have it."""
+    names = dict.fromkeys(name for own in motions for name in own)
+    return {name: np.mean([own[name] for own in motions if name in own], axis=0) for name in names}
 
 
 def loosened(boards: PoseCovariance, pairs: Collection[str]) -> PoseCovariance:
@@ -126,17 +163,60 @@ def motions_between(
     return {name: (after[name] @ before[name].inverse()).twist for name in after}
 
 
-def _evidence(seen: Array, sways_mm: Array, sway: Array, step: Array, steps_mm: Array) -> float:
-    """Logarithm of the likelihood of motions (P, 6), at the sizes of sway, step and noise that
-    explain them best."""
-    size = len(sway)
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What N pairs, those of each scan after those of another, saw.  motions: (N, 6) mm, of the body's
+    centre and of what is an arm's length from it.  sway: (N, N) correlations of a person's.  together:
+    (N, N), 1 for those of one scan, whose place as a whole is not asked."""
+
+    names: tuple[str, ...]
+    motions: Array
+    sway: Array
+    together: Array
+
+    @staticmethod
+    def of(scans: Sequence[Scan], poles: Mapping[str, str], *, timed: bool) -> _Seen:
+        """timed: of pairs whose moment is known alone."""
+        names: list[str] = []
+        motions, sways, sizes = [np.empty((0, 6))], [], []
+        for moved, moments_ms in scans:
+            own = [name for name in moved if not timed or moments_ms[name] is not None]
+            twists = np.array([moved[name] for name in own]).reshape(-1, 6)
+            motions.append(np.hstack([centre_shifts(twists), ARM_MM * twists[:, :3]]))
+            side = [poles.get(name, name) for name in own]
+            alike = _stances([moments_ms[name] for name in own])
+            sways.append(alike + SHARED**2 * np.equal.outer(side, side))
+            sizes.append(len(own))
+            names += own
+        together = block_diag(*(np.ones((size, size)) for size in sizes))
+        return _Seen(tuple(names), np.concatenate(motions), block_diag(*sways), together)
+
+
+def _stances(moments_ms: Sequence[float | None]) -> Array:
+    """Correlations; a moment that is not known is like no other."""
+    seconds = np.array([np.nan if at is None else 1e-3 * at for at in moments_ms], float)
+    apart = seconds[:, None] - seconds
+    return np.where(np.isnan(apart), np.eye(len(seconds)), of_stance(np.nan_to_num(apart)))
+
+
+def _evidence(
+    seen: _Seen, sways_mm: Array, own: Array, steps_mm: Array
+) -> tuple[float, Array, float]:
+    """Logarithm of the likelihood of the motions, at the sizes of sway, step and noise that explain
+    them best, the covariance (N, N) that these make, and the sway.  own: (N,) 1 for what has the
+    step."""
+    size = len(seen.names)
     noise2, sway2, step2 = np.meshgrid(NOISE_MM**2, sways_mm**2, steps_mm**2, indexing="ij")
     covariance = (
         noise2.ravel()[:, None, None] * np.eye(size)
-        + sway2.ravel()[:, None, None] * sway
-        + step2.ravel()[:, None, None] * step
-        + ANYWHERE_MM**2
+        + sway2.ravel()[:, None, None] * seen.sway
+        + step2.ravel()[:, None, None] * np.outer(own, own)
+        + ANYWHERE_MM**2 * seen.together
     )
-    pulls = np.linalg.solve(covariance, np.broadcast_to(seen, (len(covariance), *seen.shape)))
-    fit = np.einsum("pi,kpi->k", seen, pulls)
-    return float(np.max(-0.5 * fit - 0.5 * seen.shape[1] * np.linalg.slogdet(covariance)[1]))
+    motions = np.broadcast_to(seen.motions, (len(covariance), *seen.motions.shape))
+    pulls = np.linalg.solve(covariance, motions)
+    fit = np.einsum("pi,kpi->k", seen.motions, pulls)
+    volume = seen.motions.shape[1] * np.linalg.slogdet(covariance)[1]
+    likelihood = -0.5 * fit - 0.5 * volume
+    best = int(np.argmax(likelihood))
+    return float(likelihood[best]), covariance[best], float(np.sqrt(sway2.ravel()[best]))

@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from bodyscan.captures.folder import Captures, join_captures, open_check
 from bodyscan.errors import BadInput, FailedWork
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.workflows.check_boards import BoardCheck, check_boards, move_line, repaired
-from bodyscan.workflows.check_scans import ScanCheck, check_scans
+from bodyscan.workflows.check_scans import FEWEST_SCANS, ScanCheck, check_scans
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +131,10 @@ def _of_boards(calibration: RigCalibration, check: BoardCheck) -> Findings:
 
 
 def _of_scans(check: ScanCheck) -> Findings:
+    step = check.search.step
     moved = [drift for drift in (*check.poles, *check.pairs) if drift.moved]
-    if moved:
-        said = ["NOT valid: the same motion in every scan, which no sway explains"]
+    if not check.valid:
+        said = ["NOT valid: what no person's motion explains"]
     elif check.apart:
         groups = "; ".join(", ".join(group) for group in check.apart)
         said = [
@@ -139,16 +142,24 @@ def _of_scans(check: ScanCheck) -> Findings:
             "they stand to each other a scan does not tell; give shots of the board that they share"
         ]
     elif check.decided:
-        said = ["valid: no pair moves the same way in all scans"]
+        said = [f"valid: a pole or pair that had moved by {check.unseen_mm:.1f} mm would be seen"]
+    elif check.quiet:
+        said = ["valid: all pairs see the same surface, and alignment moves none of them"]
     else:
+        less = f" by less than {check.unseen_mm:.1f} mm" if check.unseen_mm < np.inf else ""
+        count = len(check.before_mm)
+        more = f"{FEWEST_SCANS} scans or more" if count < FEWEST_SCANS else "more scans"
         said = [
-            f"undecided: from {_scans(check)} a moved pair cannot be told from a person's sway; give "
-            "three scans or more, or a shot of the board"
+            f"undecided: from {_scans(check)} a pair that moved{less} cannot be told from a person's "
+            f"sway; give {more}, or a shot of the board"
         ]
-        if check.quiet:
-            said = ["valid: all pairs see the same surface, and alignment moves none of them"]
+    if step is not None:
+        said.append(
+            f"{step.name} stands {step.shift_mm:.1f} mm off, turned by {step.turn_deg:.2f} degrees"
+        )
     for drift in moved:
-        said.append(f"{drift.pair}: {drift.shift_mm:.2f} mm (sigma {drift.sigma_mm:.2f})")
+        if step is None or drift.pair not in step.name:
+            said.append(f"{drift.pair}: {drift.shift_mm:.2f} mm (sigma {drift.sigma_mm:.2f})")
     before, after = max(check.before_mm), max(check.after_mm)
     said.append(f"overlaps in {_scans(check)}: {before:.2f} mm RMS at most, {after:.2f} aligned")
     farthest = max(check.pairs, key=lambda drift: drift.shift_mm)

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import networkx as nx
 import numpy as np
+from scipy.special import fdtri
 
 from bodyscan.alignment.icp import Alignment, align
+from bodyscan.alignment.pole_steps import StepSearch, find_steps, motions_between
 from bodyscan.alignment.sway import BODY_CENTRE
 from bodyscan.arrays import Array
 from bodyscan.captures.folder import Captures
@@ -21,19 +23,24 @@ from bodyscan.workflows.range_images import reconstruct_range_images
 
 FEWEST_SCANS = 3
 """A person sways by as much as a pair may have moved: from so many scans on the two are told apart."""
-SIGMAS, LEAST_MM = 4.0, 0.3
+BY_CHANCE, LEAST_MM = 1e-4, 0.3
 LEAST_SIGMA_MM = 0.05
 OVERLAP_MM = 0.5
+MOST_UNSEEN_MM = 5.0
+"""A pole that moved by less alignment takes out of a scan: girths are still good to 2 mm
+(docs/results.md, faults)."""
 
 
 @dataclass(frozen=True)
 class PairDrift:
     """shift: mean motion (3,) mm at the body's centre that its overlaps asked for, rig axes; sigma_mm
-    of it, from how much it varies from scan to scan; None with fewer than three scans."""
+    of it, from how much it varies from scan to scan; None with fewer than three scans.  limit_mm:
+    beyond it chance is out of the question."""
 
     pair: str
     shift: tuple[float, float, float]
     sigma_mm: float | None
+    limit_mm: float
 
     @property
     def shift_mm(self) -> float:
@@ -42,7 +49,7 @@ class PairDrift:
     @property
     def moved(self) -> bool:
         """The same motion in every scan, which no sway explains."""
-        return self.sigma_mm is not None and self.shift_mm > max(SIGMAS * self.sigma_mm, LEAST_MM)
+        return self.shift_mm > self.limit_mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +57,7 @@ class ScanCheck:
     """before_mm, after_mm: of each scan, RMS of its overlaps, before and after the pairs were moved.
 
     pairs: what the overlaps asked of each.  poles: likewise, of poles whose pairs moved alike.
+    search: for what moved by itself, by when each pair saw the person.
     apart: groups of pairs between which no scan has an overlap, the largest first; empty if there is
     one group. How groups stand to each other is not seen: moved far enough, they share nothing.
     """
@@ -58,12 +66,19 @@ class ScanCheck:
     after_mm: tuple[float, ...]
     pairs: tuple[PairDrift, ...]
     poles: tuple[PairDrift, ...]
+    search: StepSearch
     apart: tuple[tuple[str, ...], ...] = ()
 
     @property
+    def unseen_mm(self) -> float:
+        """What moved by less, a pair or a pole, would not be told from a person's motion."""
+        by_mean = max(drift.limit_mm for drift in (*self.pairs, *self.poles))
+        return min(by_mean, self.search.least_mm)
+
+    @property
     def decided(self) -> bool:
-        """Whether there are scans enough to tell a move from sway, and all pairs are joined."""
-        return len(self.before_mm) >= FEWEST_SCANS and not self.apart
+        """Whether a move is told from sway before it does harm, and all pairs are joined."""
+        return self.unseen_mm <= MOST_UNSEEN_MM and not self.apart
 
     @property
     def quiet(self) -> bool:
@@ -73,14 +88,15 @@ class ScanCheck:
 
     @property
     def valid(self) -> bool:
-        return not any(drift.moved for drift in (*self.pairs, *self.poles))
+        alike = any(drift.moved for drift in (*self.pairs, *self.poles))
+        return not alike and self.search.step is None
 
 
 def check_scans(
     calibration: RigCalibration, scans: Sequence[Captures], progress: Progress = silent
 ) -> ScanCheck:
     """Raises ScanFailed if a scan shows nobody."""
-    alignments = []
+    alignments, moments = [], []
     for captures in scans:
         images = reconstruct_range_images(calibration, captures, progress).value
         cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)
@@ -88,15 +104,17 @@ def check_scans(
         alignments.append(
             align(seen, calibration.rig_from_camera, calibration.covariance, AlignmentSettings())
         )
-    return judge_scans(alignments, calibration.rig_from_camera, calibration.rig.poles)
+        moments.append({image.pair: image.time_ms for image in seen})
+    return judge_scans(alignments, calibration.rig_from_camera, calibration.rig.poles, moments)
 
 
 def judge_scans(
     alignments: Sequence[Alignment],
     rig_from_camera: Mapping[str, RigidTransform],
     poles: Mapping[str, str],
+    moments_ms: Sequence[Mapping[str, float | None]] | None = None,
 ) -> ScanCheck:
-    """poles: of each pair that stands on one."""
+    """poles: of each pair that stands on one.  moments_ms: of each scan, when pairs saw the person."""
     shifts = {
         name: np.array(
             [
@@ -113,11 +131,18 @@ def judge_scans(
         own = [shifts[n] for n in sorted(shifts) if poles.get(n) == pole and len(shifts[n])]
         if len(own) > 1 and len({len(one) for one in own}) == 1:
             together.append(_drift(f"pole {pole}", np.mean(own, axis=0)))
+    if moments_ms is None:
+        moments_ms = [dict.fromkeys(found.rig_from_camera) for found in alignments]
+    motions = [
+        motions_between(rig_from_camera, {n: found.rig_from_camera[n] for n in found.motion_mm})
+        for found in alignments
+    ]
     return ScanCheck(
         tuple(found.rms_before_mm for found in alignments),
         tuple(found.rms_after_mm for found in alignments),
         tuple(pairs),
         tuple(together),
+        find_steps(list(zip(motions, moments_ms, strict=True)), poles),
         _apart(alignments),
     )
 
@@ -133,8 +158,12 @@ def _apart(alignments: Sequence[Alignment]) -> tuple[tuple[str, ...], ...]:
 
 def _drift(name: str, shifts: Array) -> PairDrift:
     """shifts: (scans, 3) mm."""
+    scans = len(shifts)
     x, y, z = (float(value) for value in shifts.mean(axis=0))
-    if len(shifts) < FEWEST_SCANS:
-        return PairDrift(name, (x, y, z), None)
-    varies = float(np.sqrt(shifts.var(axis=0, ddof=1).sum() / len(shifts)))
-    return PairDrift(name, (x, y, z), max(varies, LEAST_SIGMA_MM))
+    if scans < FEWEST_SCANS:
+        return PairDrift(name, (x, y, z), None, np.inf)
+    varies = float(np.sqrt(shifts.var(axis=0, ddof=1).sum() / scans))
+    sigma = max(varies, LEAST_SIGMA_MM)
+    # Hotelling's test with one variance for all axes: the ratio of squares has an F distribution.
+    times = float(np.sqrt(fdtri(3, 3 * (scans - 1), 1.0 - BY_CHANCE)))
+    return PairDrift(name, (x, y, z), sigma, max(times * sigma, LEAST_MM))

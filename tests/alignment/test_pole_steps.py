@@ -7,7 +7,7 @@ import pytest
 
 from bodyscan.alignment.body_motion import ARM_MM
 from bodyscan.alignment.moments import of_stance
-from bodyscan.alignment.pole_steps import PoleStep, find_pole_step, motions_between
+from bodyscan.alignment.pole_steps import PoleStep, find_pole_step, find_steps, motions_between
 from bodyscan.alignment.sway import BODY_CENTRE, centre_shifts
 from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
@@ -19,9 +19,15 @@ SEEDS = range(20)
 
 
 def found(seed: int, sway_mm: float, step: Array, every_ms: float = SEQUENCE_MS) -> PoleStep | None:
+    rng = np.random.default_rng(seed)
+    return find_pole_step(*scanned(rng, sway_mm, step, every_ms), POLES)
+
+
+def scanned(
+    rng: np.random.Generator, sway_mm: float, step: Array, every_ms: float = SEQUENCE_MS
+) -> tuple[dict[str, Array], dict[str, float | None]]:
     """Pairs one after another see a person who sways and turns, known to 0.1 mm; the second pole is
     off by `step`: a shift, mm, and a turn, degrees."""
-    rng = np.random.default_rng(seed)
     at_ms = every_ms * np.arange(len(NAMES))
     alike = of_stance(1e-3 * (at_ms[:, None] - at_ms)) + 1e-9 * np.eye(len(NAMES))
     moved = np.linalg.cholesky(alike) @ rng.standard_normal((len(NAMES), 6))
@@ -33,7 +39,7 @@ def found(seed: int, sway_mm: float, step: Array, every_ms: float = SEQUENCE_MS)
     twists = np.hstack([turn, moved[:, :3] - np.cross(turn, BODY_CENTRE)])
     np.testing.assert_allclose(centre_shifts(twists), moved[:, :3])
     moments: dict[str, float | None] = dict(zip(NAMES, at_ms.tolist(), strict=True))
-    return find_pole_step(dict(zip(NAMES, twists, strict=True)), moments, POLES)
+    return dict(zip(NAMES, twists, strict=True)), moments
 
 
 @pytest.mark.parametrize("sway_mm", [0.0, 1.0, 3.0, 6.0])
@@ -92,3 +98,26 @@ def test_motions_are_those_of_alignment() -> None:
     before = {"a": RigidTransform.from_rotation_vector([0.1, 0.2, 0.3], [100.0, 200.0, 300.0])}
     after = {"a": before["a"].moved(twist)}
     np.testing.assert_allclose(motions_between(before, after)["a"], twist, atol=1e-12)
+
+
+def test_what_several_scans_would_have_seen_they_do_see() -> None:
+    """Three people who sway by 3 mm: nothing is told of a rig that holds, a step of the size that would
+    be seen is, and pairs and poles alike can be told."""
+    for seed in range(5):
+        still, moved = (
+            find_steps([scanned(rng, 3.0, np.array(step)) for _ in range(3)], POLES)
+            for rng, step in (
+                (np.random.default_rng(seed), [0.0] * 6),
+                (np.random.default_rng(seed), [0.0, 6.0, 0.0, 0.0, 0.0, 0.0]),
+            )
+        )
+        assert still.step is None
+        assert 2.0 < still.least_mm < 6.0
+        assert moved.step is not None
+        assert moved.step.name == "pole p2"
+
+
+def test_one_scan_of_a_person_says_nothing_of_single_pairs_and_one_of_a_mannequin_does() -> None:
+    rng = np.random.default_rng(0)
+    assert find_steps([scanned(rng, 3.0, np.zeros(6))], POLES).least_mm == np.inf
+    assert find_steps([scanned(rng, 0.0, np.zeros(6))], POLES).least_mm < 2.0
