@@ -25,9 +25,10 @@ from bodyscan.registration.normal_equations import CORNERS
 ROUNDS = 15
 HASTE = 1.6
 """Corners go so many times as far as they would by themselves: cameras and poses follow them."""
-SETTLED_MM = 1e-3
-PRIOR_MM = 1.0
-"""How far a corner lies from where it should, before any picture says more."""
+SETTLED = 4e-6
+PRIOR = 4e-3
+"""How far a corner lies from where it should, before any picture says more: as shares of the board's
+diagonal (a millimetre in 250), for it may be given in any unit."""
 SUSPECT = 1.25
 """Offsets are looked into where they lower the squared residuals by so many variances each: noise
 alone lowers them by one; of 48 corners or more by 1.25 once in 700 times."""
@@ -45,6 +46,11 @@ class BoardShape:
 
     points: Array
     offsets: Array
+
+    @property
+    def diagonal(self) -> float:
+        """From the first corner to the last, mm."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
     @property
     def rms_mm(self) -> float:
@@ -154,7 +160,8 @@ def _estimate(
         }
         shaped = [replace(v, points=shapes[v.board].applied(v.points)) for v in views]
         solution = solve_fully(shaped, solution, root=root, refine_cameras=refine_cameras)
-        if max(float(np.sqrt(np.mean(step**2))) for step in steps.values()) < SETTLED_MM:
+        moved = (np.sqrt(np.mean(steps[name] ** 2)) / s.diagonal for name, s in shapes.items())
+        if max(moved) < SETTLED:
             break
     return ShapedSolution(solution, shaped, shapes, ())
 
@@ -177,9 +184,9 @@ def _corner_steps(
 ) -> dict[str, Array]:
     """A Gauss-Newton step (N, 3) mm of every corner by itself, held near the nominal board."""
     information, pull, variance = _corner_equations(views, shaped, shapes, solution)
-    held = variance / PRIOR_MM**2
     steps = {}
     for name, shape in shapes.items():
+        held = variance / (PRIOR * shape.diagonal) ** 2
         matrix = information[name] + held * np.eye(3)
         right = pull[name] + held * shape.offsets
         steps[name] = -solve_scaled(matrix, right)

@@ -59,7 +59,7 @@ def test_held_out_boards_are_measured_best_by_the_chosen_model(
     assert mean["free planes"] < 3.5
 
 
-@pytest.mark.parametrize("square_mm", [25.0, 1000.0])
+@pytest.mark.parametrize("square_mm", [1.0, 1000.0])
 def test_two_cameras_before_a_board_that_looks_the_same_turned(
     captures: Path, tmp_path: Path, square_mm: float
 ) -> None:
@@ -73,8 +73,8 @@ def test_two_cameras_before_a_board_that_looks_the_same_turned(
         pair = calibration.pairs[name]
         assert pair.quality.poses == 6, "a flipped board fits nowhere, and its view is taken out"
         assert pair.quality.corners_rms_px is not None
-        # 0.27 and 0.32 px with k1 and k2, where OpenCV's stereo solve has 0.37 with its own corners.
-        assert pair.quality.corners_rms_px < 0.35
+        # 0.13 and 0.15 px: the print is 1 % wider than high. OpenCV's stereo solve has 0.37.
+        assert pair.quality.corners_rms_px < 0.20
     # Any unit does for the squares: nothing that is decided depends on it.
     baseline = np.linalg.norm(calibration.rig_from_camera["R"].translation)
     assert baseline / square_mm == pytest.approx(4.48, rel=0.02)
