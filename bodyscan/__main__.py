@@ -1,3 +1,21 @@
-from bodyscan.cli.main import main
+"""Where the command line begins: Ctrl-C is heard while modules are still being imported."""
 
-main()
+from __future__ import annotations
+
+import os
+import sys
+
+
+def start() -> None:
+    """Run the command; see `bodyscan.cli.main`."""
+    try:
+        from bodyscan.cli.main import main
+
+        main()
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr, flush=True)
+        os._exit(130)  # as shells have it: 128 + SIGINT
+
+
+if __name__ == "__main__":
+    start()

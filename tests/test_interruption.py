@@ -16,6 +16,10 @@ BUSY = {
     "waiting": "import time; time.sleep(30)",
     # As a library does that meshes for half a minute: no Python runs meanwhile, in no thread.
     "in a library": "import ctypes; ctypes.PyDLL(None).sleep(30)",
+    # As COLMAP does, which answers it with a stack trace.
+    "with a library that hears signals": (
+        "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_DFL); time.sleep(30)"
+    ),
     "in threads": (
         "import ctypes; from concurrent.futures import ThreadPoolExecutor\n"
         "    with ThreadPoolExecutor(2) as pool: list(pool.map(ctypes.CDLL(None).sleep, [30, 30]))"
@@ -90,3 +94,17 @@ def test_work_that_the_system_kills_is_told() -> None:
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 137
     assert errors == "error: the work was ended by SIGKILL (out of memory?)\n"
+
+
+def test_ctrl_c_is_heard_while_modules_are_imported() -> None:
+    program = (
+        "import sys\n"
+        "class Slow:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'bodyscan.cli.main': raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Slow())\n"
+        "from bodyscan.__main__ import start\n"
+        "start()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "stopped\n")

@@ -19,6 +19,8 @@ GRACE_S = 1.0  # for taking away what is half written
 LOOK_S = 0.02
 
 
+ASKED = signal.SIGUSR1
+"""By which the child is asked: COLMAP, where it is imported, answers a SIGTERM with a stack trace."""
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SHOW_CURSOR = "\x1b[?25h"
 
@@ -56,7 +58,8 @@ def _work(work: Callable[[], int], parent: int) -> int:
     """In the child: a Ctrl-C of the terminal reaches both, so only the parent's word counts."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _interrupt)
+    for number in (ASKED, signal.SIGTERM):
+        signal.signal(number, _interrupt)
     _end_with(parent)
     try:
         code = work()
@@ -79,7 +82,7 @@ def _code(status: int) -> int:
 
 def _stop(child: int) -> None:
     """Asks the child to end, and ends it if it does not."""
-    os.kill(child, signal.SIGTERM)
+    os.kill(child, ASKED)
     until = time.monotonic() + GRACE_S
     while os.waitpid(child, os.WNOHANG)[0] == 0:
         if time.monotonic() > until:
