@@ -87,12 +87,16 @@ origin, a translation.  moments_ms: when each saw the person; None where that is
 
 
 def find_pole_step(
-    motions: Mapping[str, Array], moments_ms: Mapping[str, float | None], poles: Mapping[str, str]
+    motions: Mapping[str, Array],
+    moments_ms: Mapping[str, float | None],
+    poles: Mapping[str, str],
+    freed: Collection[str] = (),
 ) -> PoleStep | None:
     """The pole that moved by itself, or the pair, if one did: see `Scan`.  Of pairs whose moment is not
-    known nobody can tell in one scan.  poles: as in `moving_alone`.
+    known nobody can tell in one scan.  poles: as in `moving_alone`.  freed: pairs of poles that are
+    known to have moved: is there another?
     """
-    return find_steps([(motions, moments_ms)], poles).step
+    return find_steps([(motions, moments_ms)], poles, freed).step
 
 
 @dataclass(frozen=True)
@@ -104,11 +108,13 @@ class StepSearch:
     least_mm: float
 
 
-def find_steps(scans: Sequence[Scan], poles: Mapping[str, str]) -> StepSearch:
+def find_steps(
+    scans: Sequence[Scan], poles: Mapping[str, str], freed: Collection[str] = ()
+) -> StepSearch:
     """From one scan, or several since the calibration: a person sways otherwise in each, while what was
     moved stands off by the same in all.  poles: as in `moving_alone`."""
     several = len(scans) >= SEVERAL
-    seen = _Seen.of(scans, poles, timed=not several)
+    seen = _Seen.of(scans, poles, freed, timed=not several)
     if len(set(seen.names)) < FEWEST:
         return StepSearch(None, np.inf)
     nothing = np.zeros(len(seen.names))
@@ -117,7 +123,7 @@ def find_steps(scans: Sequence[Scan], poles: Mapping[str, str]) -> StepSearch:
     least = STEP_MM
     for name, pairs in moving_alone(sorted(set(seen.names)), poles).items():
         own = np.array([pair in pairs for pair in seen.names])
-        if own.all():
+        if not pairs.isdisjoint(freed) or not set(seen.names) - pairs - set(freed):
             continue
         if not several and seen.sway[np.ix_(own, ~own)].max() <= NEARLY:
             least = np.inf
@@ -130,7 +136,7 @@ def find_steps(scans: Sequence[Scan], poles: Mapping[str, str]) -> StepSearch:
             least = np.inf
         swayed = SWAY_MM if free else SWAY_MM[SWAY_MM < STILL_MM]
         gain = _evidence(seen, swayed, own.astype(float), STEPS_MM)[0] - still
-        motions = [{n: m[n] for n in m if n in seen.names} for m, _ in scans]
+        motions = [{n: m[n] for n in m if n in seen.names and n not in freed} for m, _ in scans]
         found.append((gain, PoleStep.of(name, pairs, _mean(motions))))
     if not found:
         return StepSearch(None, np.inf)
@@ -166,16 +172,18 @@ def motions_between(
 @dataclass(frozen=True, eq=False)
 class _Seen:
     """What N pairs, those of each scan after those of another, saw.  motions: (N, 6) mm, of the body's
-    centre and of what is an arm's length from it.  sway: (N, N) correlations of a person's.  together:
-    (N, N), 1 for those of one scan, whose place as a whole is not asked."""
+    centre and of what is an arm's length from it.  sway: (N, N) correlations of a person's.  free:
+    (N, N) mm2, of what is not asked: how a scan stands as a whole, and poles known to have moved."""
 
     names: tuple[str, ...]
     motions: Array
     sway: Array
-    together: Array
+    free: Array
 
     @staticmethod
-    def of(scans: Sequence[Scan], poles: Mapping[str, str], *, timed: bool) -> _Seen:
+    def of(
+        scans: Sequence[Scan], poles: Mapping[str, str], freed: Collection[str], *, timed: bool
+    ) -> _Seen:
         """timed: of pairs whose moment is known alone."""
         names: list[str] = []
         motions, sways, sizes = [np.empty((0, 6))], [], []
@@ -188,8 +196,11 @@ class _Seen:
             sways.append(alike + SHARED**2 * np.equal.outer(side, side))
             sizes.append(len(own))
             names += own
-        together = block_diag(*(np.ones((size, size)) for size in sizes))
-        return _Seen(tuple(names), np.concatenate(motions), block_diag(*sways), together)
+        off = np.array([name in freed for name in names], float)
+        free = block_diag(*(np.ones((size, size)) for size in sizes)) + np.outer(off, off)
+        return _Seen(
+            tuple(names), np.concatenate(motions), block_diag(*sways), ANYWHERE_MM**2 * free
+        )
 
 
 def _stances(moments_ms: Sequence[float | None]) -> Array:
@@ -211,7 +222,7 @@ def _evidence(
         noise2.ravel()[:, None, None] * np.eye(size)
         + sway2.ravel()[:, None, None] * seen.sway
         + step2.ravel()[:, None, None] * np.outer(own, own)
-        + ANYWHERE_MM**2 * seen.together
+        + seen.free
     )
     motions = np.broadcast_to(seen.motions, (len(covariance), *seen.motions.shape))
     pulls = np.linalg.solve(covariance, motions)

@@ -71,18 +71,18 @@ def fuse(
         cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume, empty=empty)
         seen = require_subject(cleaned)
     placing = dict(calibration.rig_from_camera)
-    alignment, followed, shifted, known = None, None, None, calibration.covariance
+    alignment, followed, known = None, None, calibration.covariance
+    shifted: list[PoleStep] = []
     if settings.alignment.matching != "none" and len(seen) > 1:
         with step(progress, "aligning"):
             found = align(seen, placing, known, settings.alignment)
-            shifted, believed = _pole_step(seen, placing, found, calibration), known
-            if shifted:
-                believed = loosened(known, shifted.pairs)
+            believed = known
+            while moved := _pole_step(seen, placing, found, calibration, shifted):
+                shifted.append(moved)
+                believed = loosened(believed, moved.pairs)
                 found = align(seen, placing, believed, settings.alignment)
             alignment, followed = follow(seen, placing, found, believed, settings.alignment)
-            if shifted:
-                moved = _tied_motions(placing, alignment)
-                shifted = PoleStep.of(shifted.name, shifted.pairs, moved)
+            shifted = _measured_again(shifted, _tied_motions(placing, alignment))
             placing |= alignment.rig_from_camera
             seen = at_once(seen, placing, followed)
             untied = {image.pair for image in seen} - alignment.motion_mm.keys()
@@ -133,9 +133,28 @@ def _pole_step(
     placing: Mapping[str, RigidTransform],
     found: Alignment,
     calibration: RigCalibration,
+    known: Sequence[PoleStep],
 ) -> PoleStep | None:
+    """What moved by itself besides what is known to; one pole stays, or all would have moved."""
+    freed = frozenset[str]().union(*(step.pairs for step in known))
+    poles = calibration.rig.poles
+    if len({poles.get(image.pair, image.pair) for image in seen if image.pair not in freed}) < 2:
+        return None
     moments = {image.pair: image.time_ms for image in seen}
-    return find_pole_step(_tied_motions(placing, found), moments, calibration.rig.poles)
+    return find_pole_step(_tied_motions(placing, found), moments, poles, freed)
+
+
+def _measured_again(steps: Sequence[PoleStep], motions: Mapping[str, Array]) -> list[PoleStep]:
+    """How far each stands off from those that did not move, now that all were free to."""
+    off = frozenset[str]().union(*(step.pairs for step in steps))
+    return [
+        PoleStep.of(
+            step.name,
+            step.pairs,
+            {name: at for name, at in motions.items() if name not in off - step.pairs},
+        )
+        for step in steps
+    ]
 
 
 def _tied_motions(placing: Mapping[str, RigidTransform], found: Alignment) -> dict[str, Array]:

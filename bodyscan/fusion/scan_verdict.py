@@ -75,7 +75,7 @@ def grade_scan(
     cameras: Array | None = None,
     agreements: Mapping[str, Agreement] | None = None,
     person: PersonMotion | None = None,
-    shifted: PoleStep | None = None,
+    shifted: Sequence[PoleStep] = (),
 ) -> Verdict:
     """The worst of all findings decides; the reasons come worst first. mesh: None while there is none
     yet: what it alone would show is left out. use: how wrong a girth may be. seams: see
@@ -86,7 +86,7 @@ def grade_scan(
     see is no reason to repeat.
 
     agreements: of pairs that project stripes of two directions.  person: how a body that moved did.
-    shifted: a pole that moved since the calibration.
+    shifted: poles that moved since the calibration.
 
     A check that fails by itself leaves the scan usable at best, and says so.
     """
@@ -175,13 +175,13 @@ def _seams(seams: SeamReport | None, use: UseLimits) -> Iterator[Finding]:
         )
 
 
-def _shifted(step: PoleStep | None) -> Iterator[Finding]:
+def _shifted(steps: Sequence[PoleStep]) -> Iterator[Finding]:
     """Alignment has taken it out; what that left is for the seams to say. But whether a single pair
     stands elsewhere or measures wrongly (another lens, rows lost), which no placing mends, nobody can
-    tell."""
-    if step is not None:
+    tell. And where several moved, nothing but what the overlaps tie holds the body's size."""
+    for step in steps:
         yield (
-            "repeat" if len(step.pairs) == 1 else "usable",
+            "repeat" if len(step.pairs) == 1 or len(steps) > 1 else "usable",
             f"{step.name} stands {step.shift_mm:.1f} mm from where the calibration has it, turned by "
             f"{step.turn_deg:.2f} degrees, by itself and at once, as no person moves: it was moved "
             "since, and brought to the others here; calibrate again",

@@ -121,3 +121,25 @@ def test_one_scan_of_a_person_says_nothing_of_single_pairs_and_one_of_a_mannequi
     rng = np.random.default_rng(0)
     assert find_steps([scanned(rng, 3.0, np.zeros(6))], POLES).least_mm == np.inf
     assert find_steps([scanned(rng, 0.0, np.zeros(6))], POLES).least_mm < 2.0
+
+
+def test_a_second_pole_that_moved_is_found_once_the_first_is_free() -> None:
+    rng = np.random.default_rng(0)
+    motions, moments = scanned(rng, 0.2, np.array([0.0, 4.0, 0.0, 0.0, 0.0, 0.0]))
+    for name in NAMES[:4]:
+        motions[name] = motions[name] + [0, 0, 0, 3.0, 0, 0]
+    first = find_pole_step(motions, moments, POLES)
+    assert first is not None
+    second = find_pole_step(motions, moments, POLES, first.pairs)
+    assert second is not None
+    # Of three poles, which two of them moved is the same to whoever sees them alone.
+    assert {first.name, second.name} < {"pole p1", "pole p2", "pole p3"}
+    assert find_pole_step(motions, moments, POLES, first.pairs | second.pairs) is None
+
+
+def test_where_one_pole_moved_there_is_no_second() -> None:
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        motions, moments = scanned(rng, 2.0, np.array([0.0, 12.0, 0.0, 0.0, 0.0, 0.0]))
+        own = [name for name in NAMES if POLES[name] == "p2"]
+        assert find_pole_step(motions, moments, POLES, own) is None

@@ -148,9 +148,18 @@ def test_a_pole_that_moved_is_mended_and_a_pair_may_measure_wrongly(
     scan: MadeScan, pairs: set[str], grade: str
 ) -> None:
     step = PoleStep("pole p", frozenset(pairs), 5.0, 0.1)
-    verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=step)
+    verdict = grade_scan(
+        scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=[step]
+    )
     assert verdict.grade == grade
     assert "pole p stands 5.0 mm from where the calibration has it" in str(verdict)
+
+
+def test_two_poles_that_moved_leave_nothing_to_hold_the_size(scan: MadeScan) -> None:
+    steps = [PoleStep(f"pole p{k}", frozenset({f"p{k}-1", f"p{k}-2"}), 3.0, 0.1) for k in (1, 2)]
+    verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=steps)
+    assert verdict.grade == "repeat"
+    assert all(f"{step.name} stands 3.0 mm" in str(verdict) for step in steps)
 
 
 def test_a_pair_that_does_not_fit_is_to_be_repeated(scan: MadeScan) -> None:
