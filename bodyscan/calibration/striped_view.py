@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -139,17 +139,8 @@ def on_board(
     *,
     bin_px: int = BIN_PX,
 ) -> BoundaryPoints:
-    """Means over bin_px pixels along each boundary, of what lies on the board's checkered area: stripes
-    fall on the wall and floor too."""
-    place = camera_from_face
-    # A ray and where it meets the board's plane are images of each other: x ~ [r1 r2 t] (X, Y, 1).
-    plane = np.column_stack([place.rotation[:, :2], place.translation])
-    rim = RIM_SQUARES * board.square_mm
-    area = np.array([board.columns * board.square_mm, board.rows * board.square_mm]) - rim
-    inside = np.zeros(len(boundaries.index), np.bool_)
-    pixels = np.ascontiguousarray(boundaries.pixels)
-    _look_inside(ray_table(camera), np.linalg.inv(plane), np.append(area, rim), pixels, inside)
-    means = bin_boundaries(boundaries, inside, projector.direction, bin_px)
+    """What lies `on_print`, carried there."""
+    means = on_print(camera, projector, board, camera_from_face, boundaries, bin_px)
     return boundary_points(
         camera,
         camera_from_face,
@@ -160,6 +151,31 @@ def on_board(
         direction=projector.direction,
         height=height,
     )
+
+
+def on_print(
+    camera: Camera,
+    code: StripeCode,
+    board: Board,
+    camera_from_face: RigidTransform,
+    boundaries: BoardBoundaries,
+    bin_px: int = BIN_PX,
+) -> BoardBoundaries:
+    """Means over bin_px pixels along each boundary, of what lies on the board's checkered area: stripes
+    fall on the wall and floor too. Means of such means are as they were."""
+    place = camera_from_face
+    # A ray and where it meets the board's plane are images of each other: x ~ [r1 r2 t] (X, Y, 1).
+    plane = np.column_stack([place.rotation[:, :2], place.translation])
+    rim = RIM_SQUARES * board.square_mm
+    area = np.array([board.columns * board.square_mm, board.rows * board.square_mm]) - rim
+    inside = np.zeros(len(boundaries.index), np.bool_)
+    pixels = np.ascontiguousarray(boundaries.pixels)
+    _look_inside(ray_table(camera), np.linalg.inv(plane), np.append(area, rim), pixels, inside)
+    means = bin_boundaries(boundaries, inside, code.direction, bin_px)
+    if boundaries.crossing is None or code.crossing is None:
+        return means
+    across = code.crossing, board, camera_from_face, boundaries.crossing, bin_px
+    return replace(means, crossing=on_print(camera, *across))
 
 
 def bin_boundaries(

@@ -11,7 +11,7 @@ from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import CameraCalibration, locate_board
 from bodyscan.calibration.pair import PairCalibration, PlacedPair, calibrate_pair
-from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
+from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_print
 from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.errors import BadInput, BodyscanError, FailedWork, listed, plainly
 from bodyscan.optional import optional
@@ -112,7 +112,7 @@ def join_rig(
             joined = _join_pairs(rig, located.value, cameras)
     placed = joined.value
     sized = [*size.notes, *check_board_size(rig, placed.rig_from_camera)]
-    decoded = decode_on_boards(rig, captures, _of_views(placed, boards.value), progress)
+    decoded = _decode(rig, captures, placed, boards.value, progress)
     lost = {**cameras.failures, **joined.failures, **decoded.failures}
     fitted = _fit_sheets(rig, placed, cameras.value, decoded, progress)
     failed = lost | dict(fitted.failures)
@@ -154,10 +154,26 @@ def _join_pairs(
         raise BadInput(error.what, where=error.where, remedy=remedy) from error
 
 
-def _of_views(placed: RigSolution, views: list[BoardView]) -> list[BoardView]:
-    """The views that took part in placing the rig."""
-    kept = {(view.pair, view.shot, view.board) for view in placed.views}
-    return [view for view in views if (view.pair, view.shot, view.board) in kept]
+def _decode(
+    rig: Rig,
+    captures: Captures,
+    placed: RigSolution,
+    views: list[BoardView],
+    progress: Progress,
+) -> Outcome[dict[ViewKey, BoardBoundaries]]:
+    """Stripes on the boards that took part in placing the rig: of tens of millions of boundaries means
+    on the print alone."""
+    used = {(view.pair, view.shot, view.board): view for view in placed.views}
+
+    def printed(view: BoardView, seen: BoardBoundaries) -> BoardBoundaries:
+        shot = _striped(rig, placed, used[view.pair, view.shot, view.board], seen)
+        code = rig.pair(view.pair).projector
+        assert code is not None
+        camera = placed.cameras[view.pair]
+        return on_print(camera, code, shot.board, shot.camera_from_face, seen)
+
+    wanted = [view for view in views if (view.pair, view.shot, view.board) in used]
+    return decode_on_boards(rig, captures, wanted, progress, keep=printed)
 
 
 def _fit_sheets(
@@ -183,6 +199,20 @@ def _fit_sheets(
     )
 
 
+def _striped(
+    rig: Rig, placed: RigSolution, view: LocatedView, seen: BoardBoundaries
+) -> StripedView:
+    """A view with its stripes, its board where the joint solve has it."""
+    shape = placed.board_shapes.get(view.board)
+    camera_from_rig = placed.rig_from_camera[view.pair].inverse()
+    return StripedView(
+        replace(view, camera_from_board=camera_from_rig @ placed.rig_from_board[view.target]),
+        rig.board(view.board),
+        seen,
+        shape.face(view.points) if shape else None,
+    )
+
+
 def _placed_pair(
     rig: Rig,
     placed: RigSolution,
@@ -190,15 +220,9 @@ def _placed_pair(
     own: CameraCalibration,
     boundaries: Mapping[ViewKey, BoardBoundaries],
 ) -> PlacedPair:
-    camera_from_rig = placed.rig_from_camera[name].inverse()
-    views, shapes = [view for view in placed.views if view.pair == name], placed.board_shapes
+    views = [view for view in placed.views if view.pair == name]
     shots = tuple(
-        StripedView(
-            replace(view, camera_from_board=camera_from_rig @ placed.rig_from_board[view.target]),
-            rig.board(view.board),
-            boundaries[name, view.shot, view.board],
-            shapes[view.board].face(view.points) if view.board in shapes else None,
-        )
+        _striped(rig, placed, view, boundaries[name, view.shot, view.board])
         for view in views
         if (name, view.shot, view.board) in boundaries
     )

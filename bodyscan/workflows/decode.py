@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from typing import cast
@@ -43,6 +43,7 @@ ViewKey = tuple[str, str, str]
 """Pair, shot and board: which view."""
 
 Failure = tuple[ImageSequence, BodyscanError]
+Keep = Callable[[BoardView, BoardBoundaries], BoardBoundaries]
 
 
 def decode_sequence(
@@ -93,12 +94,22 @@ def _cut(images: Greys, crop: Crop) -> Greys:
     return cast(Greys, np.ascontiguousarray(images[..., rows, columns]))
 
 
+def _all(view: BoardView, boundaries: BoardBoundaries) -> BoardBoundaries:
+    return boundaries
+
+
 def decode_on_boards(
-    rig: Rig, captures: Captures, views: Iterable[BoardView], progress: Progress = silent
+    rig: Rig,
+    captures: Captures,
+    views: Iterable[BoardView],
+    progress: Progress = silent,
+    *,
+    keep: Keep = _all,
 ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
     """Stripe boundaries near each of these views; sequences that are bad are noted.
 
-    A pair of which none can be decoded is a failure.
+    keep: what is kept of a view's, of which a rig has tens of millions.  A pair of which none can be
+    decoded is a failure.
     """
     wanted: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
     for view in views:
@@ -115,7 +126,8 @@ def decode_on_boards(
         responses[sequence.pair] += responses_in(stripes)
         one_way[sequence] = stripes.crossing_fault
         return {
-            (view.pair, view.shot, view.board): boundaries_near(stripes, view, crop) for view in own
+            (view.pair, view.shot, view.board): keep(view, boundaries_near(stripes, view, crop))
+            for view in own
         }
 
     decoded, errors = attempt_each(
