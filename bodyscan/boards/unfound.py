@@ -14,12 +14,16 @@ import numpy as np
 from bodyscan.arrays import Bytes
 from bodyscan.boards.appearance import AS_PRINTED, OTHERWISE, Appearance
 from bodyscan.boards.aprilgrid import BORDER_BITS, place_tags
+from bodyscan.boards.board_layout import marker_corners
 from bodyscan.boards.charuco import Markers, detect_markers, place_markers
 from bodyscan.boards.checkerboard import find_quickly
 from bodyscan.rig.board import LARGEST_DICTIONARIES, MARKERS_IN, Board
 
 FEW_MARKERS = 4
 """Fewer may be chance: quadrilaterals whose insides happen to read as a marker."""
+ENOUGH_MARKERS, ENOUGH_SHARE = 8, 0.8
+OTHER_SIDE = 0.2
+"""Of a marker's side; unrefined outlines lie up to a tenth within it."""
 OTHER_SIZES = (-2, -1, 1, 2)
 
 
@@ -42,6 +46,12 @@ def _describe_markers(image: Bytes, board: Board) -> str:
         said += ", white on black"
     if appearance.mirrored:
         said += ", mirrored"
+    side = _marker_side(board, most)
+    if side is not None and abs(side / (board.marker_mm or 1.0) - 1.0) > OTHER_SIDE:
+        return (
+            f"{said}, whose sides are about {side / board.square_mm:.2f} of a square's: `marker_mm` is "
+            f"about {side:.2g} if `square_mm` is {board.square_mm:g}, not {board.marker_mm:g}"
+        )
     if _agreeing(board, most):
         return f"{said}, with too few corners beside them that can be seen sharply"
     better = max(_resized(board, most), default=None)
@@ -77,6 +87,26 @@ def _agreeing(board: Board, markers: Markers) -> int:
         return 0
     placed = place_markers(board, markers)
     return placed.agreeing if placed and placed.believed else 0
+
+
+def _marker_side(board: Board, markers: Markers) -> float | None:
+    """mm, by where the markers' middles lie, whatever `marker_mm` says; None where they do not tell."""
+    layouts = (board, board.model_copy(update={"legacy_layout": not board.legacy_layout}))
+    for described in layouts if board.kind == "charuco" else (board,):
+        ids, printed = marker_corners(described)
+        _, seen, of_board = np.intersect1d(markers.ids, ids, return_indices=True)
+        if len(seen) < ENOUGH_MARKERS:
+            continue
+        corners = markers.corners[seen]
+        middles = printed[of_board].mean(axis=1)[:, :2]
+        near = 0.2 * board.square_mm
+        homography, inliers = cv2.findHomography(corners.mean(axis=1), middles, cv2.RANSAC, near)
+        if homography is None or inliers.mean() < ENOUGH_SHARE:
+            continue
+        flat = cv2.perspectiveTransform(corners.reshape(-1, 1, 2), homography).reshape(-1, 4, 2)
+        sides = np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=-1)
+        return float(np.median(sides[inliers.ravel() > 0]))
+    return None
 
 
 def _other_dictionaries(image: Bytes, board: Board) -> str:

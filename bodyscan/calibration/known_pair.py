@@ -21,6 +21,8 @@ from bodyscan.stripes.stripe_code import StripeCode
 
 HELD_PX = 1e-6
 """What a camera that is held may be moved by."""
+NEAREST_MM, FARTHEST_MM = 5.0, 2e4
+"""Between a projector and its camera: lenses are wider than the one, rooms no wider than the other."""
 GRID = 9
 """Places of a picture, each way, at which a parameter's effect on its pixels is looked at."""
 
@@ -89,10 +91,22 @@ def read_known_pair(pair: Pair, folder: Path) -> KnownPair:
             )
         world_from_camera = (camera_from_world or RigidTransform.identity()).inverse()
         projector_from_camera = from_world @ world_from_camera
+        _require_baseline(projector_from_camera, light.where, known)
     source = f"{known.file} ({known.format})"
     return KnownPair(
         camera, camera_from_world, projector, projector_from_camera, known.sigma_px, source
     )
+
+
+def _require_baseline(projector_from_camera: RigidTransform, where: str, known: Known) -> None:
+    baseline = float(np.linalg.norm(projector_from_camera.translation))
+    if not NEAREST_MM < baseline < FARTHEST_MM:
+        raise CalibrationFileError(
+            f"puts the projector {baseline:.3g} mm from its camera, which no scanner is like",
+            where=where,
+            remedy=f"see whether its lengths are in {known.units or 'the unit of its format'}, "
+            "as `units` below `known` in the rig file says",
+        )
 
 
 def parameter_sigmas(camera: Camera, sigma_px: float) -> Array:

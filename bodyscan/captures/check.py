@@ -11,7 +11,7 @@ from pathlib import Path
 from bodyscan.captures.folder import Captures, ImageSequence, join_captures, open_folder, open_scan
 from bodyscan.captures.image_faults import NO_INVERSES, absence, header_fault
 from bodyscan.captures.image_header import NoImage, read_header
-from bodyscan.captures.unlisted_images import find_unlisted_images
+from bodyscan.captures.unlisted_images import describe_unlisted_images
 from bodyscan.errors import BadInput, CaptureError
 from bodyscan.files.model import did_you_mean
 from bodyscan.rig.board import Board
@@ -110,7 +110,7 @@ def check(
     warnings += odd_sizes(rig)
     warnings += [NO_INVERSES] if any(map(_lacks_inverses, sequences)) else []
     warnings += _coarse_images(sequences)
-    warnings += filter(None, map(_unlisted_images, captures))
+    warnings += filter(None, map(describe_unlisted_images, captures))
     if len(rig.pairs) > 1:  # one camera alone agrees with itself
         warnings += [_turned(board) for board in rig.boards if board.looks_same_turned]
     warnings += filter(None, map(_few, rig.pairs, counts)) if calibration else ()
@@ -212,17 +212,6 @@ def _lacks_inverses(sequence: ImageSequence) -> bool:
 def _empty_shots(captures: Captures) -> list[str]:
     taken = {sequence.shot for sequence in captures.sequences}
     return [shot for shot in captures.shots if shot not in taken]
-
-
-def _unlisted_images(captures: Captures) -> str | None:
-    found = find_unlisted_images(captures)
-    if not found:
-        return None
-    belong = "belongs" if len(found) == 1 else "belong"
-    return (
-        f"{_several(len(found), 'image')} {belong} to no pair and frame of the rig file, such as "
-        f"{found[0]}; is a name spelt differently?"
-    )
 
 
 def _coarse_images(sequences: list[ImageSequence]) -> list[str]:

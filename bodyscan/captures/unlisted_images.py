@@ -9,6 +9,18 @@ from pathlib import Path
 from bodyscan.captures.folder import SUFFIXES, Captures
 
 
+def describe_unlisted_images(captures: Captures) -> str | None:
+    """How many there are, and one of them; None if there are none."""
+    found = find_unlisted_images(captures)
+    if not found:
+        return None
+    number = "1 image belongs" if len(found) == 1 else f"{len(found)} images belong"
+    return (
+        f"{number} to no pair and frame of the rig file, such as {found[0]}; is a name spelt "
+        "differently?"
+    )
+
+
 def find_unlisted_images(captures: Captures) -> list[Path]:
     """Images beside those of the captures' shots that belong to no pair and frame of the rig file.
 
@@ -16,12 +28,18 @@ def find_unlisted_images(captures: Captures) -> list[Path]:
     """
     wanted = {path for sequence in captures.sequences for path in sequence.paths}
     beside = {path.parent.parent for path in wanted} | {path.parent for path in wanted}
+    named = {(len(path.parts), path.stem) for path in wanted}
+    suffixes = {path.suffix for path in wanted}
     return sorted(
         path
         for folder in captures.folders
         for path in _images(folder)
         if path not in wanted
-        and _belongs(path.relative_to(folder), captures, path.parent in beside)
+        and (
+            _belongs(path.relative_to(folder), captures, path.parent in beside)
+            # of another shot, named alike but for the suffix
+            or (path.suffix not in suffixes and (len(path.parts), path.stem) in named)
+        )
     )
 
 

@@ -13,6 +13,7 @@ from bodyscan.calibration.camera import CameraCalibration, locate_board
 from bodyscan.calibration.pair import PairCalibration, PlacedPair, calibrate_pair
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_print
 from bodyscan.captures.folder import Captures, open_captures
+from bodyscan.captures.unlisted_images import describe_unlisted_images
 from bodyscan.errors import BadInput, BodyscanError, FailedWork, listed, plainly
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
@@ -71,6 +72,8 @@ def calibrate_folder(
     unsaid: list[str] = []
     with optional("corners.vnl", unsaid.append):
         write_found_corners(folder / "corners.vnl", rig, captures, boards.value)
+    with optional("images that are not used", unsaid.append):
+        unsaid += filter(None, [describe_unlisted_images(captures)])
     calibration = remarked(found, progress)
     calibration = replace(calibration, notes=(*calibration.notes, *unsaid))
     return calibration, save_calibration(calibration, folder)

@@ -3,6 +3,8 @@ none is found."""
 
 from __future__ import annotations
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -108,6 +110,16 @@ def test_rows_that_are_not_there_or_not_described_are_named(picture: Bytes) -> N
         views = found(picture, described) * 3
         rig = Rig(name="r", boards=(described,), pairs=(CAMERA,))
         assert any(said in note for note in appearance_notes(rig, views)), said
+
+
+def test_markers_of_another_size_are_named(picture: Bytes) -> None:
+    assert MARKED.marker_mm is not None
+    described = MARKED.model_copy(update={"marker_mm": 0.6 * MARKED.marker_mm})
+    said = describe_unfound(picture, described)
+    share = MARKED.marker_mm / MARKED.square_mm
+    told = re.search(r"sides are about (0\.\d+) of a square's", said)
+    assert told, said
+    assert float(told[1]) == pytest.approx(share, rel=0.1)
 
 
 def test_another_dictionary_is_named(picture: Bytes) -> None:

@@ -297,3 +297,13 @@ def test_captures_that_are_named_otherwise_are_shown(rig_path: Path) -> None:
     assert "should be named such as" in line
     assert "but one is named b" in line
     assert ".PNG" in line
+
+
+def test_a_shot_with_another_suffix_is_not_passed_over_in_silence(tmp_path: Path) -> None:
+    rig_path = write_small_captures(tmp_path)
+    images = sorted((tmp_path / "captures" / "b2").rglob("*.png"))
+    for path in images:
+        path.rename(path.with_suffix(".PNG"))
+    (warning,) = [w for w in check(rig_path).warnings if "such as" in w]
+    assert f"{len(images)} images belong to no pair" in warning
+    assert ".PNG" in warning

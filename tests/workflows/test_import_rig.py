@@ -243,6 +243,20 @@ def test_what_is_wrong_is_named(
         import_rig(rig, folder)
 
 
+@pytest.mark.parametrize(("millimetres", "units"), [(1.0, "m"), (1000.0, "mm")])
+def test_another_unit_is_asked_about(tmp_path: Path, millimetres: float, units: str) -> None:
+    """211 mm for metres and the other way round."""
+    write_storage(tmp_path / "foreign.yaml", millimetres=millimetres)
+    content = described("a")
+    content["pairs"][0]["known"]["units"] = units
+    rig_file = write_rig_file(tmp_path, content)
+    with pytest.raises(
+        CalibrationFileError, match=r"puts the projector (2.11e\+05|0.211) mm"
+    ) as found:
+        import_rig(load_rig(rig_file), tmp_path)
+    assert f"lengths are in {units}" in found.value.remedy
+
+
 def test_a_mirrored_or_endless_pose_is_named(folder: Path) -> None:
     text = (folder / "foreign.yaml").read_text()
     mirrored = np.diag([1.0, -1.0, 1.0]) @ rotations_and_shifts("a")["light"].rotation
