@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import calendar
 from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +62,7 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
         told_verdict(facts) or Verdict("usable", (NO_VERDICT,)),
         is_synthetic(folder) or facts.get("simulated", False),
         (
-            ("taken", str(facts.get("when") or "not known")),
+            ("taken", _in_words(facts.get("when"))),
             ("calibration", str(facts["calibration_id"])[:12]),
             ("made by", str(facts["software"])),
             ("folder", folder.resolve().name),
@@ -68,6 +70,17 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
         sections,
         subject,
     )
+
+
+def _in_words(when: str | None) -> str:
+    """A date as people write it; what is no date as it stands."""
+    if not when:
+        return "not known"
+    try:
+        moment = datetime.fromisoformat(when)
+    except ValueError:
+        return when
+    return f"{moment.day} {calendar.month_name[moment.month]} {moment.year}, {moment:%H:%M}"
 
 
 def _sections(scan: StoredScan, found: list[Comparison]) -> list[Section]:

@@ -74,6 +74,11 @@ def test_nothing_lies_outside_of_the_file(html: str) -> None:
     assert "compliant" not in html.lower()
 
 
+def test_when_it_was_taken_is_said_as_people_say_it(html: str) -> None:
+    assert "21 November 2026, 10:00" in html
+    assert "2026-11-21T10:00" not in html[html.index("<body>") :]
+
+
 def test_the_same_result_gives_the_same_bytes(scan: MadeScan, html: str) -> None:
     assert render(build_page(scan.folder)) == html
 
