@@ -322,7 +322,7 @@ def _contacts(mesh: BodyMesh) -> Iterator[Finding]:
         yield (
             "usable",
             f"parts of the body touch: a closed ring on the {side} from {ring.low_mm:.0f} to "
-            f"{ring.high_mm:.0f} mm (a hand on the hip?); girths there hold both parts",
+            f"{ring.high_mm:.0f} mm (a hand on the hip?); where they do, girths hold both parts",
         )
 
 

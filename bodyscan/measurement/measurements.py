@@ -13,21 +13,25 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
 from bodyscan.measurement.outline import Range, holds_middle, outline
 from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.rings import LAYER_MM, rings
 from bodyscan.mesh.slices import Loop, loops_at
 from bodyscan.mesh.topology import face_areas, signed_volume
 
 STEP_MM = 100.0
 SPECK_MM2 = 50.0  # less than a fingertip
 CROWN_MM = 20.0
+HAND_MM = 200.0
+"""Below where a hand begins to touch the body it may go on to touch."""
 
 
 @dataclass(frozen=True)
 class Girth:
     """One part of the body in a horizontal slice.
 
-    part: trunk (neck and head too), left leg, right leg, left arm, right arm.  girth_mm: along the
-    surface.  tape_mm: as a tape runs (convex hull).  width_mm, depth_mm: extent to the side and
-    forward.  centre_mm: (x, y), body frame.  measured: share of girth_mm that was measured, not filled.
+    part: trunk (neck and head too), left leg, right leg, left arm, right arm; "trunk and left arm"
+    where a hand touches the trunk and the outline goes round both.  girth_mm: along the surface.  tape_mm: as
+    a tape runs (convex hull).  width_mm, depth_mm: extent to the side and forward.  centre_mm: (x, y),
+    body frame.  measured: share of girth_mm that was measured, not filled.
     girth_range_mm, tape_range_mm: what they may be, given what was not: see `Outline`.
 
     A trunk that filled surface joins to arms is cut there, and closed straight.
@@ -91,13 +95,14 @@ def measure(
     stature = float(mesh.vertices[:, 2].max())
     frame = rig_from_body(mesh.vertices)
     vertices = frame.inverse().apply(mesh.vertices)
+    contacts = _contacts(vertices, mesh)
     if heights_mm is None:
         # Of a body seen in part, what there is of it.
         every = np.arange(STEP_MM, stature, STEP_MM).tolist()
-        slices = [_slice(vertices, mesh, height) for height in every]
+        slices = [_slice(vertices, mesh, height, contacts) for height in every]
     else:
         every = [float(height) for height in heights_mm]
-        slices = [_slice(vertices, mesh, height) for height in every]
+        slices = [_slice(vertices, mesh, height, contacts) for height in every]
         for height, found in zip(heights_mm, slices, strict=True):
             if found is None:
                 low, high = vertices[:, 2].min(), vertices[:, 2].max()
@@ -108,7 +113,7 @@ def measure(
     if fuller is not None:
         more = frame.inverse().apply(fuller.vertices)
         slices = [
-            found and _doubted(found, _slice(more, mesh, height))
+            found and _doubted(found, _slice(more, mesh, height, contacts))
             for found, height in zip(slices, every, strict=True)
         ]
     areas = face_areas(mesh.vertices, mesh.faces)
@@ -149,13 +154,54 @@ def _share(areas: Array, which: Mask, among: Mask) -> float:
     return float(areas[which & among].sum() / max(areas[among].sum(), 1e-12))
 
 
-def _slice(vertices: Array, mesh: BodyMesh, height_mm: float) -> Slice | None:
-    """None where there is no body."""
+@dataclass(frozen=True)
+class _Contact:
+    """An arm whose hand touches the trunk, at heights from low_mm to high_mm; y_mm: of its middle just
+    above, body frame."""
+
+    side: str
+    low_mm: float
+    high_mm: float
+    y_mm: float
+
+    def joins(self, loop: Loop, height_mm: float) -> bool:
+        """Whether a trunk's outline goes round the arm as well."""
+        reach = loop.segments[..., 1]
+        beyond = reach.max() > self.y_mm if self.y_mm > 0 else reach.min() < self.y_mm
+        return self.low_mm <= height_mm <= self.high_mm and bool(beyond)
+
+
+def _contacts(vertices: Array, mesh: BodyMesh) -> list[_Contact]:
+    found = []
+    for ring in rings(vertices, mesh.faces):
+        above = ring.low_mm + 1.5 * LAYER_MM
+        loops = _loops(vertices, mesh, above)
+        side = "left" if ring.y_mm > 0 else "right"
+        for part, loop in zip(name_parts(loops), loops, strict=True):
+            if part == f"{side} arm":
+                y = float(loop.centre[1])
+                found.append(_Contact(side, ring.low_mm - HAND_MM, above, y))
+                break
+    return found
+
+
+def _loops(vertices: Array, mesh: BodyMesh, height_mm: float) -> tuple[Loop, ...]:
     loops = loops_at(vertices, mesh.faces, height_mm, mesh.filled)
-    loops = tuple(loop for loop in loops if loop.area_mm2 > SPECK_MM2)
+    return tuple(loop for loop in loops if loop.area_mm2 > SPECK_MM2)
+
+
+def _slice(
+    vertices: Array, mesh: BodyMesh, height_mm: float, contacts: Sequence[_Contact]
+) -> Slice | None:
+    """None where there is no body."""
+    loops = _loops(vertices, mesh, height_mm)
     if not loops:
         return None
-    girths = [_girth(part, loop) for part, loop in zip(name_parts(loops), loops, strict=True)]
+    girths = []
+    for part, loop in zip(name_parts(loops), loops, strict=True):
+        arms = [one.side for one in contacts if part == "trunk" and one.joins(loop, height_mm)]
+        joined = "".join(f" and {side} arm" for side in dict.fromkeys(arms))
+        girths.append(_girth(part + joined, loop))
     return Slice(height_mm, tuple(sorted(girths, key=lambda girth: (girth.part, -girth.area_mm2))))
 
 

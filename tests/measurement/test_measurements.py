@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
-from made_bodies import cylinder, ellipsoid, mesh_of, together
+from made_bodies import boxes, cylinder, ellipsoid, mesh_of, together
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
@@ -144,3 +144,24 @@ def test_of_a_body_seen_from_the_knees_up_the_slices_there_are_are_given(subject
     assert heights[-1] == 1600.0
     with pytest.raises(BadInput, match="no body at a height of 100 mm"):
         measure(upper, [100.0])
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_girth_that_goes_round_a_hand_on_the_hip_is_not_the_trunks(side: int) -> None:
+    """A trunk on a foot, an arm 100 mm beside it from the shoulder down to a hand that touches."""
+    trunk = ((-10, -15, 0), (10, 15, 150))
+    arm, shoulder = ((-4, 25, 80), (4, 33, 140)), ((-4, 15, 130), (4, 33, 140))
+    hand = ((-4, 15, 80), (4, 33, 88))
+    parts = [
+        ((x, min(side * y, side * far), z), (other, max(side * y, side * far), top))
+        for (x, y, z), (other, far, top) in (trunk, arm, shoulder, hand)
+    ]
+    measured = measure(mesh_of(*boxes(*parts)), [705.0, 845.0, 1005.0])
+    below, touched, beside = measured.slices
+    arm_of = f"{'left' if side > 0 else 'right'} arm"
+    assert [girth.part for girth in touched.girths] == [f"trunk and {arm_of}"]
+    assert touched.of("trunk") is None
+    # 300 by 200 mm, where nothing touches.
+    assert tape_mm(below, "trunk") == pytest.approx(1000.0)
+    assert tape_mm(beside, "trunk") == pytest.approx(1000.0)
+    assert tape_mm(beside, arm_of) == pytest.approx(320.0)

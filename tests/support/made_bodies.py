@@ -51,3 +51,23 @@ def together(*bodies: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.nda
         np.concatenate([vertices for vertices, _ in bodies]),
         np.concatenate([faces + start for (_, faces), start in zip(bodies, starts, strict=False)]),
     )
+
+
+def boxes(*ends: tuple[tuple[int, int, int], tuple[int, int, int]]) -> tuple[Array, Indices]:
+    """The closed surface of boxes made one; two corners of each in multiples of 10 mm."""
+    corners = 10 * np.array(ends)
+    low = corners.min(axis=(0, 1)) - 10
+    full = np.zeros((corners.max(axis=(0, 1)) + 10 - low) // 10, bool)
+    for first, last in (corners - low) // 10:
+        full[first[0] : last[0], first[1] : last[1], first[2] : last[2]] = True
+    quads = []
+    for axis in range(3):
+        one, other = np.eye(3, dtype=int)[(axis + 1) % 3], np.eye(3, dtype=int)[(axis + 2) % 3]
+        for step in (-1, 1):
+            open_ = full & ~np.roll(full, -step, axis)
+            start = np.argwhere(open_) + (step > 0) * np.eye(3, dtype=int)[axis]
+            ring = [start, start + one, start + one + other, start + other]
+            quads.append(np.stack(ring[:: 1 if step > 0 else -1], axis=1))
+    places, number = np.unique(np.concatenate(quads).reshape(-1, 3), axis=0, return_inverse=True)
+    around = number.reshape(-1, 4)
+    return 10.0 * places + low, np.concatenate([around[:, [0, 1, 2]], around[:, [0, 2, 3]]])
