@@ -29,9 +29,9 @@ class Girth:
     """One part of the body in a horizontal slice.
 
     part: trunk (neck and head too), left leg, right leg, left arm, right arm; "trunk and left arm"
-    where a hand touches the trunk and the outline goes round both.  girth_mm: along the surface.  tape_mm: as
-    a tape runs (convex hull).  width_mm, depth_mm: extent to the side and forward.  centre_mm: (x, y),
-    body frame.  measured: share of girth_mm that was measured, not filled.
+    where a hand touches the trunk and the outline goes round both.  girth_mm: along the surface.
+    tape_mm: as a tape runs (convex hull).  width_mm, depth_mm: extent to the side and forward.
+    centre_mm: (x, y), body frame.  measured: share of girth_mm that was measured, not filled.
     girth_range_mm, tape_range_mm: what they may be, given what was not: see `Outline`.
 
     A trunk that filled surface joins to arms is cut there, and closed straight.
