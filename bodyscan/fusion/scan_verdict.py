@@ -55,6 +55,9 @@ SOLES_MM = 50.0
 ONE_SIDE = 0.7
 """Cosine to the cameras' mean direction: within 45 degrees of it all of them see the same half."""
 UNKNOWN_BAND = 0.5
+CROWN_MM = 5.0
+"""A dome's top 5 mm are 40 mm across; of a head that ends where its hair begins they are what closes
+it."""
 SOME_SATURATED = 0.05
 """of the skin: highlights on nose and forehead are less"""
 LEAST_YIELD = 0.6
@@ -385,9 +388,15 @@ def _gaps(cloud: BodyCloud, surface: SurfaceCheck | None) -> Iterator[Finding]:
     starts = np.flatnonzero(unknown & ~np.roll(unknown, 1))
     ends = np.flatnonzero(unknown & ~np.roll(unknown, -1)) + 1
     for low, high in zip(starts, ends, strict=True):
-        crown = high == len(share)
         yield (
             "usable",
             f"next to nothing was measured from {BAND_MM * low:.0f} to {BAND_MM * high:.0f} mm "
-            f"(hair, black cloth, or out of view){': the stature is a guess' if crown else ''}",
+            "(hair, black cloth, or out of view)",
+        )
+    crown = surface.heights_mm > surface.heights_mm.max() - CROWN_MM
+    if (area * surface.filled)[crown].sum() > UNKNOWN_BAND * area[crown].sum():
+        yield (
+            "usable",
+            f"nothing was measured of the crown, and perhaps of all above "
+            f"{surface.heights_mm.max():.0f} mm (hair, a cap, or out of view): the stature is a guess",
         )

@@ -13,6 +13,7 @@ from bodyscan.alignment.pole_steps import PoleStep
 from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.seams import Seam, SeamReport
+from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
 from bodyscan.verdict import Verdict
@@ -177,3 +178,14 @@ def test_pairs_that_failed_alike_share_a_line_and_its_remedy(scan: MadeScan) -> 
         "left out: p1-1, p1-2: s01/p1-1/lit.png: is missing\n  Copy it here.",
         "left out: p2-1: too dark",
     )
+
+
+@pytest.mark.parametrize("filled", [True, False])
+def test_a_head_that_ends_in_a_cut_has_no_stature(scan: MadeScan, filled: bool) -> None:
+    """Nothing of its hair was measured: the mesh is closed flat where the forehead ends."""
+    heights = np.append(np.linspace(0.0, 1500.0, 1000), np.full(20, 1503.0))
+    areas = np.full(len(heights), 1600.0)
+    check = SurfaceCheck(heights, areas, (heights > 1500.0) & filled, {}, {})
+    verdict = grade_scan(scan.cloud, scan.mesh, None, {}, Volume(), NO_LIMITS, surface=check)
+    assert verdict.grade == ("usable" if filled else "good")
+    assert ("above 1503 mm" in str(verdict)) == filled
