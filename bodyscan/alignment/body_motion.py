@@ -1,8 +1,8 @@
 """How a person's surface moved between the pairs' moments, from all overlaps together.
 
-Three kinds of motion share what the overlaps ask for: the whole body sways, parts of it shift and
-turn, the trunk breathes. Each is a Gaussian process over surface and time, as large as
-the evidence says; beside them stands what the boards left open of the pairs' poses.
+Kinds of motion share what the overlaps ask for: the whole body sways, head and arms turn each as a
+whole, any part shifts and turns, the trunk breathes. Each is a Gaussian process over surface and
+time, as large as the evidence says; beside them stands what the boards left open of the pairs' poses.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from bodyscan.alignment.body_cells import BodyCells, modulated, rigid_fields
 from bodyscan.alignment.breath import breath_fields
 from bodyscan.alignment.cell_evidence import CellEvidence
 from bodyscan.alignment.cell_speeds import CellSpeeds
+from bodyscan.alignment.limbs import limb_fields
 from bodyscan.alignment.moments import Courses, of_breath, of_stance
 from bodyscan.alignment.sway import BODY_CENTRE
 from bodyscan.arrays import Array, Indices
@@ -29,6 +30,8 @@ PART_MM = 350.0  # how far what moves as one reaches: an arm, a thigh, a shoulde
 LEAST_PART = 0.02
 ARM_MM = 400.0  # at which a part's turn displaces as much as its shift
 FIRST_MM = 1.0
+SIZINGS = 3
+"""Of each round: what the evidence does not ask for shrinks by steps."""
 SMALLEST_MM = 1e-3
 BREATH_MM = 1.5
 """A chest or belly rises by 2 to 8 mm at rest; 4 are 1.4 of standard deviation. Limbs' motion would
@@ -95,12 +98,13 @@ class BodyMotion:
         by_freedom = np.arange(6 * pairs).reshape(pairs, 6).T.ravel()
         known = invert_scaled(boards)[np.ix_(by_freedom, by_freedom)]
         part = rigid_fields(cells, cells.centres.mean(axis=0), ARM_MM)
-        limbs = modulated(part, cells, cells.alike(PART_MM, LEAST_PART))
+        any_part = modulated(part, cells, cells.alike(PART_MM, LEAST_PART))
         breath = breath_fields(cells)
         kinds = (
             Kind("pose", rigid_fields(cells, np.zeros(3), 1.0), Courses.steady(pairs), 1.0, known),
             Kind("sway", rigid_fields(cells, BODY_CENTRE, 1.0) * sway, stance, 2.0),
-            Kind("parts", limbs, stance),
+            *(Kind(name, field, stance) for name, field in limb_fields(cells, ARM_MM).items()),
+            Kind("parts", any_part, stance),
             Kind("breath", breath, Courses.of(of_breath, seconds), BREATH_MM, usual=BREATH_MM),
         )
         count = sum(kind.count for kind in kinds)
@@ -140,8 +144,8 @@ class BodyMotion:
         evidence: Mapping[tuple[int, int], CellEvidence],
         speeds: Mapping[int, CellSpeeds] | None = None,
     ) -> BodyMotion:
-        """One step of all amplitudes; every round matches anew. evidence: by pairs (a, b).  speeds: by
-        pair, as its own stripes tell them."""
+        """One step of all amplitudes, each kind as large as the evidence says; every round matches
+        anew. evidence: by pairs (a, b).  speeds: by pair, as its own stripes tell them."""
         names, speeds = [kind.name for kind in self.kinds], speeds or {}
         now = self.displacements(names)
         asked = [self._asked(e, now[a] - now[b]) for (a, b), e in evidence.items()]
@@ -166,8 +170,10 @@ class BodyMotion:
                 normal[rows, self.slices[h]] = _products(block, apart[g], apart[h]).reshape(
                     kind.count, other.count
                 )
-            normal[rows, rows] += kind.prior
-        return self._settled(normal, right)
+        motion = self._settled(normal, right)
+        for _ in range(SIZINGS):
+            motion = motion._resized()._settled(normal, right)
+        return motion
 
     def _asked(self, seen: CellEvidence, apart: Array) -> tuple[Array, Array]:
         """What an overlap asks of the fields, (M, M) and (M,); apart: (C, 12) of its two pairs now."""
@@ -177,7 +183,10 @@ class BodyMotion:
         return basis.T @ (seen.information @ fields).reshape(basis.shape), basis.T @ wanted.ravel()
 
     def _settled(self, normal: Array, right: Array) -> BodyMotion:
-        """With the solution of normal equations of which the lower triangle counts."""
+        """With the solution of normal equations of which the lower triangle counts, and the prior."""
+        normal = normal.copy()
+        for kind, own in zip(self.kinds, self.slices, strict=True):
+            normal[own, own] += kind.prior
         size = 1.0 / np.sqrt(np.diag(normal))
         factor = cho_factor(normal * size[:, None] * size, lower=True, check_finite=False)
         lower = np.tril(dpotri(factor[0], lower=True)[0])
@@ -186,7 +195,7 @@ class BodyMotion:
             self, amplitudes=size * cho_solve(factor, size * right), covariance=covariance
         )
 
-    def resized(self) -> BodyMotion:
+    def _resized(self) -> BodyMotion:
         """Each kind as large as the evidence says (MacKay 1992): what it does not ask for shrinks."""
         kinds = []
         for kind, some in zip(self.kinds, self.slices, strict=True):
@@ -209,12 +218,14 @@ def _along(kind: Kind, cells: Indices, normals: Array, course: Array) -> Array:
     return (along[:, :, None] * course).reshape(len(cells), -1)
 
 
-def field_sigmas(motion: BodyMotion, name: str, course: Array, normals: Array) -> Array:
-    """(C,) standard deviations along normals (C, 3) of what one kind comes to with courses (J,)."""
+def outward_errors(motion: BodyMotion, name: str, course: Array, normals: Array) -> Array:
+    """(C, n): how much of what one kind comes to along normals (C, 3), with courses (J,), is not known,
+    as n independent errors of standard deviation 1."""
     kind = motion.kind(name)
     own = motion.slices[motion.kinds.index(kind)]
     rows = _along(kind, np.arange(len(normals)), normals, course)
-    return np.sqrt(np.sum((rows @ motion.covariance[own, own]) * rows, axis=1))
+    sizes, ways = np.linalg.eigh(motion.covariance[own, own])
+    return np.asarray(rows @ (ways * np.sqrt(np.maximum(sizes, 0.0))))
 
 
 def observed(motion: BodyMotion, pair: int, cells: Indices, normals: Array) -> Array:

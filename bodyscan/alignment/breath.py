@@ -8,12 +8,12 @@ from bodyscan.alignment.body_cells import BodyCells, modulated, normal_field
 from bodyscan.alignment.part_names import PARTS, leftward, name_parts
 from bodyscan.arrays import Array
 
-LENGTH_MM = 150.0  # over which a trunk rises alike: a chest, a belly
-LEAST = 0.01
+LENGTH_MM = 110.0  # over which a trunk rises alike: a chest, a belly, a side
+LEAST = 0.04
 # Shares of the stature: breath begins to show above the hips, and no more above the collarbones.
 HIPS, WAIST, COLLAR, NECK = 0.47, 0.54, 0.79, 0.86
 BEHIND = 0.25
-"""Of the front: ribs rise to the sides too, and a back leans on nothing."""
+"""Of the front: ribs rise to the sides too, less than half as far, and a back leans on nothing."""
 
 
 def breath_fields(cells: BodyCells) -> Array:
@@ -28,7 +28,7 @@ def breathing(cells: BodyCells) -> Array:
     height = cells.centres[:, 2] / cells.centres[:, 2].max()
     left = leftward(cells)
     forward = cells.normals[:, :2] @ np.array([left[1], -left[0]])
-    front = BEHIND + (1.0 - BEHIND) * _rising(forward, -0.5, 0.5)
+    front = BEHIND + (1.0 - BEHIND) * _rising(forward, -0.5, 1.0)
     at_height = _rising(height, HIPS, WAIST) * (1.0 - _rising(height, COLLAR, NECK))
     return np.asarray((name_parts(cells) == PARTS.index("trunk")) * at_height * front)
 

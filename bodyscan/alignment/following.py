@@ -17,10 +17,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from bodyscan.alignment.body_cells import BodyCells, displaced
-from bodyscan.alignment.body_motion import BodyMotion, field_sigmas, observed
+from bodyscan.alignment.body_motion import BodyMotion, observed, outward_errors
 from bodyscan.alignment.cell_evidence import CellEvidence
 from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.icp import COARSE, Alignment
+from bodyscan.alignment.limbs import LIMBS
 from bodyscan.alignment.matching import (
     SEAM_RIM_PX,
     AlignmentPoints,
@@ -38,13 +39,11 @@ from bodyscan.settings import AlignmentSettings
 
 Result = TypeVar("Result")
 
-BENDING = ("parts", "breath")
+BENDING = (*LIMBS, "parts", "breath")
 MOVING = ("sway", *BENDING)
 BLEND_MM = 60.0
 ROUNDS = 3  # the last with all points
-BREATH_DOUBT = 1.6
-"""Eight people cast from two simulators: the breath that was left erred by 1.65 of its sigmas, since
-nobody breathes as a sum of cosines does."""
+RING_MM = 20.0  # heights of one girth: less than a cell's
 STILL_MM = 0.1
 """RMS of what no rigid motion explains; less does no harm, and calibrations bend by half of it."""
 
@@ -56,7 +55,7 @@ with the place and not with time."""
 @dataclass(frozen=True, eq=False)
 class MeanBreath:
     """From the middle of the scan to mean breath: displacements (C, 12) as in `Followed.bends`, and the
-    standard deviation (C,) mm along the normals of what is not known of them."""
+    standard deviation (C,) mm along the normals of what a girth there is not known by."""
 
     field: Array
     sigma_mm: Array
@@ -174,8 +173,6 @@ def follow(
             said = _each_overlap(asks, pool, taken, (motion, cells), reach, settings)
             if not said:
                 return aligned, None
-            if left < ROUNDS:
-                motion = motion.resized()
             motion = motion.solved(_both_ways(said), speeds)
             reach = max(reach / 2.0, settings.least_reach_mm)
             if (
@@ -210,8 +207,16 @@ def _mean_breath(motion: BodyMotion, cells: BodyCells) -> MeanBreath:
     """A motion's courses are about their mean: there a breath is half way."""
     middle = motion.kind("breath").courses.middle
     field = motion.kind("breath").fields @ motion.of("breath", middle)
-    sigma = field_sigmas(motion, "breath", middle, cells.normals)
-    return MeanBreath(field, BREATH_DOUBT * sigma)
+    errors = outward_errors(motion, "breath", middle, cells.normals)
+    return MeanBreath(field, sigmas_around(errors, cells.centres[:, 2]))
+
+
+def sigmas_around(errors: Array, height: Array) -> Array:
+    """(C,) mm, standard deviations of errors (C, n), no more of each than what cells at the same height
+    (C,) have in common: the rest does not change a girth."""
+    near = np.exp(-0.5 * ((height[:, None] - height) / RING_MM) ** 2)
+    own = np.linalg.norm(errors, axis=1)
+    return own * np.linalg.norm(near @ errors, axis=1) / np.maximum(near @ own, 1e-12)
 
 
 def _rigid(motion: BodyMotion, pair: int, *, from_middle: bool = False) -> Array:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from bodyscan.alignment.bending import at_once
 from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.breath import breathing
-from bodyscan.alignment.following import Followed, follow
+from bodyscan.alignment.following import Followed, follow, sigmas_around
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.part_names import PARTS, name_parts
 from bodyscan.arrays import Array
@@ -82,10 +82,10 @@ def test_one_body_comes_of_many_moments(
     truth = standing.body.at(standing.middle_s)
     rigid = errors_mm(truth, surface(standing, aligned, None))
     carried = errors_mm(truth, surface(standing, alignment, followed))
-    # 0.14 mm with pixels of 2 mm; with these of 4, fingers are a few pixels wide.
-    assert rms(carried) < 0.45
-    assert rms(carried) < 0.4 * rms(rigid)
-    assert np.median(np.abs(carried)) < 0.2
+    # 0.19 mm of 1.23; with pixels of 4 mm, fingers are a few pixels wide.
+    assert rms(carried) < 0.3
+    assert rms(carried) < 0.25 * rms(rigid)
+    assert np.median(np.abs(carried)) < 0.1
     assert alignment.rms_after_mm < 0.6 * aligned.rms_after_mm
 
 
@@ -95,9 +95,9 @@ def test_sigmas_say_what_is_left(
     _, alignment, followed = found
     assert followed is not None
     errors = errors_mm(standing.body.at(standing.middle_s), surface(standing, alignment, followed))
-    # As much as they err, within a factor that a single person's motion may be off by; fingers, a few
-    # pixels wide here, apart.
-    assert 0.5 < 1.4826 * np.median(np.abs(errors)) / rms(followed.sigma_mm) < 2.0
+    # As much as they err, within a factor that a single person's motion may be off by. Of both the
+    # squares' mean: arms err, and are known, several times worse than legs.
+    assert 0.5 < rms(errors) / rms(followed.sigma_mm) < 2.0
 
 
 def test_the_operator_hears_what_each_part_did(
@@ -173,11 +173,20 @@ def test_the_way_to_mean_breath_is_told(
     assert person.fuller_sigma_mm is not None
     assert abs(true) > 0.3  # or the seed says nothing
     assert abs(person.fuller_mm - true) < 0.7 * abs(true)
-    assert abs(person.fuller_mm - true) < 2.5 * person.fuller_sigma_mm
+    # Of fourteen people this one is the farthest off; all are by 1.16 of it, RMS.
+    assert abs(person.fuller_mm - true) < 3.5 * person.fuller_sigma_mm
     assert "mean breath" in person.lines[-1]
     along, sigma = followed.breath.along(cells, cells.centres, cells.normals)
     np.testing.assert_allclose(along[front].mean(), -person.fuller_mm, rtol=0.02)
     assert sigma[front].mean() < 1.5
+
+
+def test_a_girth_is_uncertain_by_what_all_around_it_shares() -> None:
+    """Errors of many cells, each by itself, cancel around a girth; one of them all does not."""
+    height = np.repeat([1000.0, 1200.0], 50)
+    alone, together = np.eye(100), np.ones((100, 1))
+    np.testing.assert_allclose(sigmas_around(together, height), 1.0)
+    np.testing.assert_allclose(sigmas_around(alone, height), 50.0**-0.5)
 
 
 def test_without_times_every_pair_has_a_free_stance(standing: LivingScan) -> None:
