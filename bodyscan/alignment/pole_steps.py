@@ -27,7 +27,7 @@ STEP_MM = 1.0
 """What it is said from. Less is what calibrations of poles disagree by, and alignment takes it out."""
 SURE = 6.0
 """Logarithm of how many times as well a moved pole has to explain it: 400 times."""
-NOISE_MM = np.geomspace(0.05, 1.0, 5)
+NOISE_MM = np.geomspace(0.05, 5.0, 9)
 SWAY_MM = np.geomspace(0.05, 20.0, 10)
 STILL_MM = 0.4
 """What a mannequin seems to sway by, as calibrations disagree; a person who stands, by 1 to 5."""
@@ -102,10 +102,14 @@ def find_pole_step(
 @dataclass(frozen=True)
 class StepSearch:
     """step: the pole or pair that stands off in all scans, if one does.  least_mm: from which on it
-    would have been seen of any pole or pair; infinite if of some it cannot be told at all."""
+    would have been seen of any pole or pair; infinite if of some it cannot be told at all.  sway_mm:
+    a person's, for each axis, and own_mm: what pairs stand off besides, each by itself: standard
+    deviations."""
 
     step: PoleStep | None
     least_mm: float
+    sway_mm: float = 0.0
+    own_mm: float = 0.0
 
 
 def find_steps(
@@ -118,7 +122,7 @@ def find_steps(
     if len(set(seen.names)) < FEWEST:
         return StepSearch(None, np.inf)
     nothing = np.zeros(len(seen.names))
-    still, believed, sway_mm = _evidence(seen, SWAY_MM, nothing, np.zeros(1))
+    still, believed, sway_mm, own_mm = _evidence(seen, SWAY_MM, nothing, np.zeros(1))
     found: list[tuple[float, PoleStep]] = []
     least = STEP_MM
     for name, pairs in moving_alone(sorted(set(seen.names)), poles).items():
@@ -143,7 +147,7 @@ def find_steps(
     gain, step = max(found, key=lambda one: one[0])
     lever = np.radians(step.turn_deg) * ARM_MM
     moved = gain > SURE and np.hypot(step.shift_mm, lever) > STEP_MM
-    return StepSearch(step if moved else None, least)
+    return StepSearch(step if moved else None, least, sway_mm, own_mm)
 
 
 def _mean(motions: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
@@ -212,9 +216,9 @@ def _stances(moments_ms: Sequence[float | None]) -> Array:
 
 def _evidence(
     seen: _Seen, sways_mm: Array, own: Array, steps_mm: Array
-) -> tuple[float, Array, float]:
+) -> tuple[float, Array, float, float]:
     """Logarithm of the likelihood of the motions, at the sizes of sway, step and noise that explain
-    them best, the covariance (N, N) that these make, and the sway.  own: (N,) 1 for what has the
+    them best, the covariance (N, N) that these make, sway and noise.  own: (N,) 1 for what has the
     step."""
     size = len(seen.names)
     noise2, sway2, step2 = np.meshgrid(NOISE_MM**2, sways_mm**2, steps_mm**2, indexing="ij")
@@ -230,4 +234,5 @@ def _evidence(
     volume = seen.motions.shape[1] * np.linalg.slogdet(covariance)[1]
     likelihood = -0.5 * fit - 0.5 * volume
     best = int(np.argmax(likelihood))
-    return float(likelihood[best]), covariance[best], float(np.sqrt(sway2.ravel()[best]))
+    sway, noise = (float(np.sqrt(sizes.ravel()[best])) for sizes in (sway2, noise2))
+    return float(likelihood[best]), covariance[best], sway, noise

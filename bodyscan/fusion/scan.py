@@ -11,7 +11,13 @@ from bodyscan.alignment.bending import at_once
 from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.following import Followed, follow
 from bodyscan.alignment.icp import Alignment, align
-from bodyscan.alignment.pole_steps import PoleStep, find_pole_step, loosened, motions_between
+from bodyscan.alignment.pole_steps import (
+    PoleStep,
+    StepSearch,
+    find_steps,
+    loosened,
+    motions_between,
+)
 from bodyscan.alignment.sway import SwayPrior
 from bodyscan.arrays import Array
 from bodyscan.fusion.cleaning import clean, require_subject
@@ -73,11 +79,12 @@ def fuse(
     placing = dict(calibration.rig_from_camera)
     alignment, followed, known = None, None, calibration.covariance
     shifted: list[PoleStep] = []
+    search: StepSearch | None = None
     if settings.alignment.matching != "none" and len(seen) > 1:
         with step(progress, "aligning"):
             found = align(seen, placing, known, settings.alignment)
             believed = known
-            while moved := _pole_step(seen, placing, found, calibration, shifted):
+            while moved := (search := _moved(seen, placing, found, calibration, shifted)).step:
                 shifted.append(moved)
                 believed = loosened(believed, moved.pairs)
                 found = align(seen, placing, believed, settings.alignment)
@@ -113,6 +120,7 @@ def fuse(
             agreements={image.pair: image.agreement for image in images if image.agreement},
             person=person,
             shifted=shifted,
+            search=search,
         )
 
     with step(progress, "judging"):
@@ -128,20 +136,20 @@ def fuse(
     return Scan(cloud, surface, alignment, points, failed, verdict, images, placing, person, notes)
 
 
-def _pole_step(
+def _moved(
     seen: Sequence[RangeImage],
     placing: Mapping[str, RigidTransform],
     found: Alignment,
     calibration: RigCalibration,
     known: Sequence[PoleStep],
-) -> PoleStep | None:
+) -> StepSearch:
     """What moved by itself besides what is known to; one pole stays, or all would have moved."""
     freed = frozenset[str]().union(*(step.pairs for step in known))
     poles = calibration.rig.poles
     if len({poles.get(image.pair, image.pair) for image in seen if image.pair not in freed}) < 2:
-        return None
+        return StepSearch(None, np.inf)
     moments = {image.pair: image.time_ms for image in seen}
-    return find_pole_step(_tied_motions(placing, found), moments, poles, freed)
+    return find_steps([(_tied_motions(placing, found), moments)], poles, freed)
 
 
 def _measured_again(steps: Sequence[PoleStep], motions: Mapping[str, Array]) -> list[PoleStep]:

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.icp import Alignment
-from bodyscan.alignment.pole_steps import PoleStep
+from bodyscan.alignment.pole_steps import STILL_MM, PoleStep, StepSearch
 from bodyscan.arrays import Array
 from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.seams import SeamReport, find_misfits
@@ -79,6 +79,7 @@ def grade_scan(
     agreements: Mapping[str, Agreement] | None = None,
     person: PersonMotion | None = None,
     shifted: Sequence[PoleStep] = (),
+    search: StepSearch | None = None,
 ) -> Verdict:
     """The worst of all findings decides; the reasons come worst first. mesh: None while there is none
     yet: what it alone would show is left out. use: how wrong a girth may be. seams: see
@@ -89,7 +90,7 @@ def grade_scan(
     see is no reason to repeat.
 
     agreements: of pairs that project stripes of two directions.  person: how a body that moved did.
-    shifted: poles that moved since the calibration.
+    shifted: poles that moved since the calibration.  search: what the pairs' motions are besides.
 
     A check that fails by itself leaves the scan usable at best, and says so.
     """
@@ -102,6 +103,7 @@ def grade_scan(
         "directions": lambda: _directions(agreements or {}),
         "seams": lambda: _seams(seams, use),
         "poles": lambda: _shifted(shifted),
+        "places": lambda: _own_places(search, use),
         "disagreement": lambda: _disagreement(alignment),
         "motion": lambda: _motion(None if shifted else alignment, person),
         "contradictions": lambda: _contradictions(contradictions, seams),
@@ -189,6 +191,19 @@ def _shifted(steps: Sequence[PoleStep]) -> Iterator[Finding]:
             f"{step.turn_deg:.2f} degrees, by itself and at once, as no person moves: it was moved "
             "since, and brought to the others here; calibrate again",
         )
+
+
+def _own_places(search: StepSearch | None, use: UseLimits) -> Iterator[Finding]:
+    """Pairs that stand off where no sway takes them; head and arms of people may, by themselves."""
+    off = search.own_mm * GIRTH_PER_MM if search else 0.0
+    if search is None or off <= use.good_girth_mm:
+        return
+    sways = search.sway_mm > STILL_MM
+    yield (
+        "repeat" if off > use.usable_girth_mm and not sways else "usable",
+        f"pairs stand {search.own_mm:.1f} mm off the places that the calibration has, otherwise than a "
+        f"person sways{': did head or arms move' if sways else ''}, was the rig moved since?",
+    )
 
 
 def _disagreement(alignment: Alignment | None) -> Iterator[Finding]:

@@ -143,3 +143,18 @@ def test_where_one_pole_moved_there_is_no_second() -> None:
         motions, moments = scanned(rng, 2.0, np.array([0.0, 12.0, 0.0, 0.0, 0.0, 0.0]))
         own = [name for name in NAMES if POLES[name] == "p2"]
         assert find_pole_step(motions, moments, POLES, own) is None
+
+
+def test_what_pairs_stand_off_each_by_itself_is_told_from_sway() -> None:
+    rng = np.random.default_rng(0)
+    swayed = scanned(rng, 3.0, np.zeros(6))
+    found = find_steps([swayed], POLES)
+    assert found.sway_mm > 1.0
+    assert found.own_mm < 0.3  # 0.1 was put in
+    still, moments = scanned(rng, 0.0, np.zeros(6))
+    lifted = {n: m + [0, 0, 0, 0, 0, 4.0 * n.endswith("3")] for n, m in still.items()}
+    found = find_steps([(lifted, moments)], POLES)
+    # Of 12 pairs three by 4 mm, of one axis of six.
+    assert found.step is None
+    assert found.own_mm == pytest.approx(4.0 * np.sqrt(3 / 12 * 9 / 12 / 6), rel=0.5)
+    assert found.sway_mm < 0.4

@@ -9,7 +9,7 @@ import pytest
 from made_scan import MadeScan, make_scan
 
 from bodyscan.alignment.icp import Alignment, Overlap
-from bodyscan.alignment.pole_steps import PoleStep
+from bodyscan.alignment.pole_steps import PoleStep, StepSearch
 from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.seams import Seam, SeamReport
@@ -189,3 +189,18 @@ def test_a_head_that_ends_in_a_cut_has_no_stature(scan: MadeScan, filled: bool) 
     verdict = grade_scan(scan.cloud, scan.mesh, None, {}, Volume(), NO_LIMITS, surface=check)
     assert verdict.grade == ("usable" if filled else "good")
     assert ("above 1503 mm" in str(verdict)) == filled
+
+
+@pytest.mark.parametrize(
+    ("own_mm", "sway_mm", "grade"),
+    [(0.28, 0.1, "good"), (0.5, 0.1, "usable"), (0.9, 0.1, "repeat"), (0.9, 2.0, "usable")],
+)
+def test_pairs_that_stand_off_each_by_itself(
+    scan: MadeScan, own_mm: float, sway_mm: float, grade: str
+) -> None:
+    """2 mm of a girth are 0.32 of a radius, 4 are 0.64."""
+    search = StepSearch(None, 1.0, sway_mm, own_mm)
+    limits = UseLimits(good_girth_mm=2.0, usable_girth_mm=4.0)
+    verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), limits, search=search)
+    assert verdict.grade == grade
+    assert ("did head or arms move" in str(verdict)) == (sway_mm > 1.0)
