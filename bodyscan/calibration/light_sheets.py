@@ -88,6 +88,11 @@ def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> She
     if chosen < len(starts):
         fit = fit_sheets(starts[chosen][1], subsample(bins, FIT_BINS), board_error_mm=error)
         sheets = fit.sheets
+        if not np.isfinite(sheets.covariance).all():
+            raise PairFailed(
+                f"the stripes on {boards} boards fit no sheets of light",
+                remedy="capture the stripe sequence on the board in more poses, nearer and farther",
+            )
     else:
         fit = fit_planes(bins, stripes, direction, error)
         sheets = fit.planes
@@ -122,7 +127,7 @@ def _lens_start(plain: LensSheets, data: BoundaryPoints) -> LensSheets:
     centres = [plain.parameters[1], *(share * plain.stripes for share in AXIS_STARTS)]
     starts = [plain.turned(float(centre)).with_lens(2) for centre in centres]
     fits = [fit_sheets(start, data, most_steps=START_STEPS) for start in starts]
-    return min(fits, key=lambda fit: fit.noise).sheets
+    return min(fits, key=lambda fit: np.nan_to_num(fit.noise, nan=np.inf)).sheets
 
 
 def count_boards(data: BoundaryPoints, stripes: int) -> Indices:

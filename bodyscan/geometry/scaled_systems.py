@@ -29,12 +29,12 @@ def solve_scaled(matrix: Array, right: Array, damping: Array | float = 0.0) -> A
     try:
         solved = np.linalg.solve(scaled, columns)
     except np.linalg.LinAlgError:
-        solved = np.linalg.pinv(scaled, rcond=RANK, hermitian=True) @ columns
+        solved = _pseudo_inverse(scaled) @ columns
     return np.asarray(solved[..., 0] / size, np.float64)
 
 
 def invert_scaled(matrix: Array) -> Array:
-    """Pseudo-inverse (..., P, P) of symmetric matrices (..., P, P)."""
+    """Pseudo-inverse (..., P, P) of symmetric matrices (..., P, P); NaN of those not finite."""
     size = _size(matrix)
     outer = size[..., :, None] * size[..., None, :]
     scaled = matrix / outer
@@ -44,8 +44,15 @@ def invert_scaled(matrix: Array) -> Array:
     except np.linalg.LinAlgError:
         regular = False
     # Eigenvalues take ten times as long, and are asked only where the rank is in doubt.
-    inverse = np.linalg.inv(scaled) if regular else np.linalg.pinv(scaled, RANK, hermitian=True)
+    inverse = np.linalg.inv(scaled) if regular else _pseudo_inverse(scaled)
     return np.asarray(0.5 * (inverse + np.swapaxes(inverse, -1, -2)) / outer, np.float64)
+
+
+def _pseudo_inverse(scaled: Array) -> Array:
+    finite = np.isfinite(scaled).all(axis=(-2, -1))
+    inverse = np.full(scaled.shape, np.nan)
+    inverse[finite] = np.linalg.pinv(scaled[finite], RANK, hermitian=True)
+    return inverse
 
 
 def gram(left: Array, right: Array) -> Array:
