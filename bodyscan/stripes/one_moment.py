@@ -9,9 +9,18 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.compiled import compiled
+from bodyscan.errors import DecodingFailed
 from bodyscan.geometry.velocity import Velocity
 from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.comb import Comb, find_comb
+
+SEEN_MM = 0.25  # of motion while the patterns were taken: with less none can have leapt
+TORN_MM = 2.0
+"""At 120 images a second four times what people move in depth meanwhile; wherever a body leaps by
+so much, fine stripes are taken for their neighbours."""
+TORN = 4.0
+"""Times what steady motion explains. Of eight pairs with images of another moment among theirs a leap
+explained 4.9 times as much at least; of those left whole no leap went beyond `TORN_MM`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +77,7 @@ def carry_to_moment(
     that s had to be carried, stripes.  bit: (N,) in whose images each boundary was seen.
 
     What noise explains leaves them untouched. Of two orders the one that explains more is believed.
+    Raises DecodingFailed for a sequence whose images show the body in two places.
     """
 
     def told(seen: Moments) -> StripeMotion | None:
@@ -80,6 +90,7 @@ def carry_to_moment(
         other = told(moments.instead)
         if other is not None and other.explained > motion.explained:
             moments, motion = moments.instead, other
+    _check_whole(boundaries, bit, (moments, motion), turned=turned)
     late = moments.of_bits[bit] - moments.moment
     place = [boundaries.line_position, boundaries.position]
     column, row = place if turned else place[::-1]
@@ -98,6 +109,32 @@ def carry_to_moment(
         sigma_px=np.hypot(boundaries.sigma_px, doubt_px),
     )
     return carried, motion, float(np.abs(speed * late).max(initial=0.0))
+
+
+def _check_whole(
+    boundaries: Boundaries, bit: Indices, moved: tuple[Moments, StripeMotion], *, turned: bool
+) -> None:
+    """Raises DecodingFailed where one leap explains the teeth far better than the steady motion that
+    was told."""
+    moments, motion = moved
+    times = moments.of_bits
+    lasted, order = float(np.ptp(times)), np.argsort(times, kind="stable")
+    if np.hypot(motion.speed_mm, motion.doubt_mm) * lasted < SEEN_MM:
+        return
+    leaps: list[tuple[float, float, int]] = []
+    for first in range(1, len(order)):
+        after = np.zeros(len(times))
+        after[order[first:]] = lasted
+        leap = moments.told(find_comb(boundaries, after[bit], turned=turned))
+        if leap is not None:
+            leaps.append((leap.explained, leap.speed_mm * lasted, first))
+    explained, apart_mm, first = max(leaps, default=(0.0, 0.0, 0))
+    if explained > TORN * motion.explained and apart_mm > TORN_MM:
+        raise DecodingFailed(
+            f"from about bit {order[first]} on, patterns show the subject some {apart_mm:.1f} mm"
+            " in depth from where those before show it",
+            remedy="see whether images of another moment or subject stand among them; scan again",
+        )
 
 
 @compiled

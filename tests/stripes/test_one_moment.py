@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from stripe_rendering import gray_bits, render
 
 from bodyscan.arrays import Array, Indices
+from bodyscan.errors import DecodingFailed
 from bodyscan.geometry.velocity import SurfaceSpeeds, Velocity
 from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.comb import Comb
@@ -75,3 +77,38 @@ def test_what_moved_meanwhile_is_taken_out_of_s(seen: tuple[bool, list[np.ndarra
     assert np.sqrt(np.mean(before**2)) > 0.03
     assert np.sqrt(np.mean(after**2)) < (0.0033 if inverses else 0.005)
     assert len(after) > 0.995 * len(before)
+
+
+MM_PER_STRIPE = 8.0
+
+
+def told_in_mm(comb: Comb) -> StripeMotion | None:
+    if not len(comb.speed):
+        return None
+    speed = float(told(comb).speed[0, 0])
+    left = np.median(np.abs(comb.speed - speed)) / 0.6745
+    explained = len(comb.speed) * float(speed / left) ** 2
+    return replace(told(comb), speed_mm=MM_PER_STRIPE * abs(speed), explained=explained)
+
+
+@pytest.mark.parametrize("leap", [0.4, 0.0])
+def test_a_sequence_of_two_moments_is_named(leap: float) -> None:
+    """The images of bits 3 to 5, in which the body stands 3.2 mm elsewhere; or in which it moves on."""
+    bits, images = gray_bits(np.arange(STRIPES)), []
+    for place, light in enumerate(np.stack([bits, 1 - bits], axis=1).reshape(2 * BITS, STRIPES)):
+        time = float(place) if not leap else leap / SPEED * (place >= 6)
+        s = partial(s_at, time)
+        images.append(render(s, light[None], stripes=STRIPES, shape=SHAPE, seed=place))
+    patterns = [image[2] for image in images]
+    code = Gray(stripes=STRIPES, direction="horizontal", inverses=True)
+    beside = np.arange(0.0, 2.0 * BITS, 2.0, dtype=np.float64)
+    times: dict[str, Array] = {"pattern": beside, "inverse": np.asarray(beside + 1.0, np.float64)}
+    moments = Moments(times, code.moment(times), told_in_mm)
+    given = *images[0][:2], np.concatenate([*patterns[::2], *patterns[1::2]])
+    if not leap:
+        assert decode_stripes(code, *given, moments=(moments,)).motion is not None
+        return
+    with pytest.raises(
+        DecodingFailed, match=r"from about bit 3 on, patterns show the subject some 3\.2 mm"
+    ):
+        decode_stripes(code, *given, moments=(moments,))
