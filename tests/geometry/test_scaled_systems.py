@@ -9,8 +9,7 @@ from bodyscan.geometry.scaled_systems import invert_scaled, solve_scaled
 
 def test_one_matrix_that_is_not_finite_spoils_no_other() -> None:
     good = np.diag([1e-12, 1.0, 1e12])
-    bad = good.copy()
-    bad[0, 1] = bad[1, 0] = np.nan
+    bad = np.full((3, 3), np.nan)
     singular = np.diag([4.0, 0.0, 2.0])
     found = invert_scaled(np.stack([good, bad, singular]))
     np.testing.assert_allclose(found[0], np.diag([1e12, 1.0, 1e-12]))
@@ -19,8 +18,7 @@ def test_one_matrix_that_is_not_finite_spoils_no_other() -> None:
 
 
 def test_a_singular_system_beside_one_that_is_not_finite_is_solved() -> None:
-    singular = np.array([[1.0, 1.0], [1.0, 1.0]])
-    matrices = np.stack([singular, np.full((2, 2), np.nan)])
-    found = solve_scaled(matrices, np.array([[2.0, 2.0], [1.0, 1.0]]))
-    np.testing.assert_allclose(found[0], [1.0, 1.0])
+    matrices = np.stack([np.ones((3, 3)), np.full((3, 3), np.nan)])
+    found = solve_scaled(matrices, np.array([[3.0, 3.0, 3.0], [1.0, 1.0, 1.0]]))
+    np.testing.assert_allclose(found[0], [1.0, 1.0, 1.0])
     assert np.isnan(found[1]).all()
