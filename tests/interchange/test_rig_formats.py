@@ -460,6 +460,24 @@ def test_a_colmap_model_of_others(tmp_path: Path) -> None:
         RIG_FORMATS.find("colmap").read(tmp_path / "fisheye")
 
 
+def test_a_colmap_sensor_without_a_place_in_its_rig_has_none(tmp_path: Path) -> None:
+    names = list(ring())
+    folder = RIG_FORMATS.find("colmap").write(ring(), tmp_path / "model")
+    model = pycolmap.Reconstruction(folder)
+    for file in folder.glob("*.bin"):
+        file.unlink()
+    model.write_text(folder)
+    rigs = (folder / "rigs.txt").read_text("utf-8").rstrip("\n").split("\n")
+    fields = rigs[-1].split()
+    # rig, sensors, CAMERA 1, then of each: CAMERA, its number, whether it has a pose, the pose.
+    assert fields[4:7] == ["CAMERA", "2", "1"]
+    rigs[-1] = " ".join([*fields[:6], "0", *fields[14:]])
+    (folder / "rigs.txt").write_text("\n".join(rigs) + "\n", "utf-8")
+    found = RIG_FORMATS.find("colmap").read(folder)
+    assert found[names[1]].camera_from_world is None
+    assert found[names[2]].camera_from_world is not None
+
+
 JUNK = st.sampled_from(
     ["", "[", "]", "{", "}", "nan", "1e999", "-1", '"', "x", "\n", "\t", ":", "null", "[[1, 2], 3]",
      "\x00", "- ", 'b"x"', "</a>", "!!opencv-matrix", "9" * 30]

@@ -91,8 +91,8 @@ def read_colmap(folder: Path) -> dict[str, FoundCamera]:
         for name in names - {image.name for image in own}:
             found[name] = _found(folder, camera, 0.0, rig_pose)
         for image in own:
-            pose = _transform(image.cam_from_world()) if image.has_pose else None
-            found[image.name] = _found(folder, camera, gammas.get(image.name, 0.0), pose)
+            gamma = gammas.get(image.name, 0.0)
+            found[image.name] = _found(folder, camera, gamma, _place_of(image))
     for name in gammas:
         if name not in found:
             raise CalibrationFileError(
@@ -121,6 +121,14 @@ def _gammas(folder: Path) -> dict[str, float]:
 def _common_folder(names: list[str]) -> set[str]:
     folders = Counter(name.rpartition("/")[0] for name in names)
     return set(folders) - {""} if len(folders) == 1 else set()
+
+
+def _place_of(image: Any) -> RigidTransform | None:
+    """None where it has none, or its rig is placed and its camera has no place in that."""
+    try:
+        return _transform(image.cam_from_world()) if image.has_pose else None
+    except RuntimeError:
+        return None
 
 
 def _place_in_rig(model: Any, number: int) -> RigidTransform | None:
