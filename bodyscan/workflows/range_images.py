@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
+import numpy as np
+
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.errors import BodyscanError, ScanFailed, listed
 from bodyscan.outcome import Outcome
@@ -23,6 +25,9 @@ from bodyscan.workflows.decode import decode_sequence, one_way_notes, response_n
 Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...], StripeMotion | None, str]
 """A range image, and what was found on the way: the projector's response, what moved, and why the
 stripes that cross were not used."""
+
+FASTEST_MM_S = 40.0
+"""In depth, RMS over what a pair sees, half of the pairs: more than twice what the restless do."""
 
 
 def reconstruct_sequence(
@@ -113,6 +118,13 @@ def motion_notes(motions: Mapping[str, StripeMotion], *, timed: bool) -> Iterato
         f"moved by up to {moved[most].speed_mm:.2g} {unit} in depth while a pair saw it ({most});"
         f" what {len(moved)} of {len(motions)} pairs saw was carried to one moment each"
     )
+    usual = float(np.median([motion.speed_mm for motion in moved.values()]))
+    if timed and usual > FASTEST_MM_S:
+        yield (
+            f"nobody who stands moves at {usual:.0f} mm/s, as these {len(moved)} pairs have it:"
+            " see whether `timing` of captures.yaml has the frames' true times; if it has,"
+            " repeat the scan"
+        )
     unclear = max(moved, key=lambda pair: moved[pair].doubt_mm)
     if moved[unclear].doubt_mm > 0.0:
         yield (
