@@ -104,10 +104,13 @@ def check(
     if calibration:
         errors += _frame_errors(calibration, good)
         errors += _untied(rig, good)
-        errors += filter(None, map(_too_few, rig.pairs, counts))
+        too_few = [*filter(None, map(_too_few, rig.pairs, counts))]
+        errors += () if rig.is_known else too_few
     silent = rig.calibration or rig.is_known
     warnings = [] if silent else [f"{rig_path}: names no calibration captures"]
     warnings += odd_sizes(rig)
+    if calibration and rig.is_known:
+        warnings += [f"{fault}; all its pairs are `known`: `bodyscan import`" for fault in too_few]
     warnings += [NO_INVERSES] if any(map(_lacks_inverses, sequences)) else []
     warnings += _coarse_images(sequences)
     warnings += filter(None, map(describe_unlisted_images, captures))
