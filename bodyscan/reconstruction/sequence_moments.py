@@ -20,6 +20,10 @@ from bodyscan.stripes.one_moment import Moments, StripeMotion
 from bodyscan.stripes.stripe_code import StripeCode
 
 MS = 1000.0
+FASTEST_MM_S = 40.0
+"""In depth, RMS over what a pair sees: more than twice what the restless do."""
+LEAP_MM = 2.0
+"""Nor is a leap of less than this named: from there on fine stripes are taken for their neighbours."""
 
 
 def sequence_moments(
@@ -36,7 +40,9 @@ def sequence_moments(
     is not known.
     """
     if frame_ms is not None:
-        return _moments(pair, code, frames, frame_ms)
+        lasted = float(np.ptp(list(frame_ms.values()))) / MS
+        most = max(LEAP_MM, FASTEST_MM_S * lasted)
+        return tuple(replace(one, most_mm=most) for one in _moments(pair, code, frames, frame_ms))
     orders = frames.of_code(code), frames.as_shown(code)
     counted = [{name: MS * place for place, name in enumerate(names)} for names in orders]
     usual, shown = (_moments(pair, code, frames, each) for each in counted)

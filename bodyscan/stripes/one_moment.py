@@ -15,12 +15,8 @@ from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.comb import Comb, find_comb
 
 SEEN_MM = 0.25  # of motion while the patterns were taken: with less none can have leapt
-TORN_MM = 2.0
-"""At 120 images a second four times what people move in depth meanwhile; wherever a body leaps by
-so much, fine stripes are taken for their neighbours."""
 TORN = 4.0
-"""Times what steady motion explains. Of eight pairs with images of another moment among theirs a leap
-explained 4.9 times as much at least; of those left whole no leap went beyond `TORN_MM`."""
+"""Times what steady motion explains: motion back and forth is not steady either, and shorter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +47,15 @@ class Moments:
     its motion from the comb.
 
     times: of each image (n,) by the name of its kind, any unit.  told: None where the comb tells
-    nothing.  instead: another order in which they may have come, where nobody says.
+    nothing.  instead: another order in which they may have come, where nobody says.  most_mm: no
+    subject moves farther in depth meanwhile; infinite where nobody says how long it took.
     """
 
     times: Mapping[str, Array]
     moment: float
     told: Callable[[Comb], StripeMotion | None]
     instead: Moments | None = None
+    most_mm: float = np.inf
 
     @property
     def of_bits(self) -> Array:
@@ -119,7 +117,8 @@ def _check_whole(
     moments, motion = moved
     times = moments.of_bits
     lasted, order = float(np.ptp(times)), np.argsort(times, kind="stable")
-    if np.hypot(motion.speed_mm, motion.doubt_mm) * lasted < SEEN_MM:
+    moved_mm = np.hypot(motion.speed_mm, motion.doubt_mm) * lasted
+    if not np.isfinite(moments.most_mm) or moved_mm < SEEN_MM:
         return
     leaps: list[tuple[float, float, int]] = []
     for first in range(1, len(order)):
@@ -129,7 +128,7 @@ def _check_whole(
         if leap is not None:
             leaps.append((leap.explained, leap.speed_mm * lasted, first))
     explained, apart_mm, first = max(leaps, default=(0.0, 0.0, 0))
-    if explained > TORN * motion.explained and apart_mm > TORN_MM:
+    if explained > TORN * motion.explained and apart_mm > moments.most_mm:
         raise DecodingFailed(
             f"from about bit {order[first]} on, patterns show the subject some {apart_mm:.1f} mm"
             " in depth from where those before show it",

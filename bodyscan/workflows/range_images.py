@@ -15,7 +15,7 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.scan_volume import stripes_in_volume
-from bodyscan.reconstruction.sequence_moments import MS, sequence_moments
+from bodyscan.reconstruction.sequence_moments import FASTEST_MM_S, MS, sequence_moments
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.stripes.one_moment import Moments, StripeMotion
@@ -25,9 +25,6 @@ from bodyscan.workflows.decode import decode_sequence, one_way_notes, response_n
 Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...], StripeMotion | None, str]
 """A range image, and what was found on the way: the projector's response, what moved, and why the
 stripes that cross were not used."""
-
-FASTEST_MM_S = 40.0
-"""In depth, RMS over what a pair sees, half of the pairs: more than twice what the restless do."""
 
 
 def reconstruct_sequence(

@@ -103,7 +103,7 @@ def test_a_sequence_of_two_moments_is_named(leap: float) -> None:
     code = Gray(stripes=STRIPES, direction="horizontal", inverses=True)
     beside = np.arange(0.0, 2.0 * BITS, 2.0, dtype=np.float64)
     times: dict[str, Array] = {"pattern": beside, "inverse": np.asarray(beside + 1.0, np.float64)}
-    moments = Moments(times, code.moment(times), told_in_mm)
+    moments = Moments(times, code.moment(times), told_in_mm, most_mm=2.0)
     given = *images[0][:2], np.concatenate([*patterns[::2], *patterns[1::2]])
     if not leap:
         assert decode_stripes(code, *given, moments=(moments,)).motion is not None
