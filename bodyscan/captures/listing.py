@@ -97,5 +97,6 @@ class Listing:
                 f"is a symbolic link that leads out of the capture folder, to {real}",
                 where=str(path),
                 remedy="If it is meant, write `follow_links: true` in the rig file, or say "
-                "--follow-links to `scan`; else copy what it points to here, or name that folder.",
+                "--follow-links to `scan` or `check-calibration`; else copy what it points to here, "
+                "or name that folder.",
             )

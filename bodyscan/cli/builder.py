@@ -149,6 +149,10 @@ def check_calibration(
         Path | None,
         typer.Option(help="Write a calibration with the moves corrected into this folder."),
     ] = None,
+    follow_links: Annotated[
+        bool,
+        typer.Option("--follow-links", help="Images may be links that lead out of FOLDER."),
+    ] = False,
     overwrite: OverwriteCalibration = False,
 ) -> None:
     """Say whether anything in the rig has moved, and if so which pair or pole, and how far."""
@@ -165,7 +169,7 @@ def check_calibration(
         refuse_existing(repair, overwrite)
     rig = load_calibration(calibration)
     with output.stages() as progress:
-        found = check_rig(rig, folders, progress)
+        found = check_rig(rig, folders, progress, follow_links=follow_links)
     output.say(*found.lines, wrong=not found.valid)
     output.figures(valid=found.valid)
     if repair is not None:

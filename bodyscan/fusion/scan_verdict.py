@@ -329,7 +329,8 @@ def _omissions(cloud: BodyCloud, mesh: BodyMesh) -> Iterator[Finding]:
         low, high = np.percentile(some[outside, 2], [1, 99])
         yield (
             "repeat" if share > MOST_OUTSIDE else "usable",
-            f"{share:.0%} of the points, between {low:.0f} and {high:.0f} mm, are not in the mesh",
+            f"{share:.0%} of the points, between {low:.0f} and {high:.0f} mm (z), are not in the mesh,"
+            " which is one piece: see whether `volume` holds anything else",
         )
 
 

@@ -90,17 +90,32 @@ def check_boards(
     )
     # Which end of a plain board is which does not matter to its surface.
     stripes = _stripe_offsets(calibration, captures, views.value, seen_by.value, progress)
+    notes = (*views.notes, *seen_by.notes, *stripes.notes)
     if not drift.rig_from_board and not stripes.value:
-        raise BoardNotFound(
-            "no board is seen by two calibrated pairs at once, and no stripes on one were decoded",
-            where=", ".join(str(folder) for folder in captures.folders),
-            remedy="show a board whose corners are numbered (ChArUco) to as many cameras as can see "
-            "it together, or take the stripe sequence on a board",
-        )
+        raise _nothing_seen(captures, seen_by.value, notes)
     seen = tuple(sorted({view.pair for view in (located or seen_by.value)}))
     unseen = tuple(sorted(set(calibration.pairs) - set(seen)))
-    notes = (*views.notes, *seen_by.notes, *stripes.notes)
     return BoardCheck(drift, stripes.value, seen, unseen, notes)
+
+
+def _nothing_seen(
+    captures: Captures, seen: Sequence[LocatedView], notes: Sequence[str]
+) -> BoardNotFound:
+    """Why there is nothing to hold the rig against, with all that was said on the way."""
+    turned = sorted({view.board for view in seen if view.ambiguous})
+    what = (
+        f"board {', '.join(turned)} looks the same turned round, so that cameras cannot be held "
+        "against each other by it"
+        if turned
+        else "no board is seen by two calibrated pairs at once"
+    )
+    why = "".join(f"\n  {note}" for note in dict.fromkeys(notes))
+    return BoardNotFound(
+        f"{what}, and no stripes on one were decoded{why}",
+        where=", ".join(str(folder) for folder in captures.folders),
+        remedy="show a board whose corners are numbered (ChArUco) to as many cameras as can see "
+        "it together, or take the stripe sequence on a board",
+    )
 
 
 def repaired(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibration:

@@ -50,13 +50,22 @@ class Findings:
 
 
 def check_rig(
-    calibration: RigCalibration, folders: Sequence[Path], progress: Progress = silent
+    calibration: RigCalibration,
+    folders: Sequence[Path],
+    progress: Progress = silent,
+    *,
+    follow_links: bool = False,
 ) -> Findings:
     """Folders of one kind: shots of the board, or scans of people.
+
+    follow_links: though the calibration's rig file does not say so.
 
     Raises CaptureError for folders without captures, BadInput for a mixture, BoardNotFound,
     ScanFailed if there is nobody in a scan.
     """
+    if follow_links:
+        described = calibration.rig.model_copy(update={"follow_links": True})
+        calibration = replace(calibration, rig=described)
     captures = [open_check(calibration.rig, folder) for folder in folders]
     kinds = {kind for kind, _ in captures}
     if len(kinds) > 1:
@@ -151,7 +160,7 @@ def _of_scans(check: ScanCheck) -> Findings:
         more = f"{FEWEST_SCANS} scans or more" if count < FEWEST_SCANS else "more scans"
         said = [
             f"undecided: from {_scans(check)} a pair that moved{less} cannot be told from a person's "
-            f"sway; give {more}, or a shot of the board"
+            f"sway; give {more}, or a shot of the board (with `kind: calibration` in its captures.yaml)"
         ]
     if step is not None:
         said.append(
@@ -161,7 +170,9 @@ def _of_scans(check: ScanCheck) -> Findings:
         if step is None or drift.pair not in step.name:
             said.append(f"{drift.pair}: {drift.shift_mm:.2f} mm (sigma {drift.sigma_mm:.2f})")
     before, after = max(check.before_mm), max(check.after_mm)
-    said.append(f"overlaps in {_scans(check)}: {before:.2f} mm RMS at most, {after:.2f} aligned")
+    if np.isfinite(before):
+        overlaps = f"overlaps in {_scans(check)}: {before:.2f} mm RMS at most, {after:.2f} aligned"
+        said.append(overlaps)
     farthest = max(check.pairs, key=lambda drift: drift.shift_mm)
     said.append(f"most moved on average: {farthest.pair}, {farthest.shift_mm:.2f} mm")
     return Findings(check, tuple(said))

@@ -65,6 +65,28 @@ def test_a_touched_pair_is_named_and_put_right(
     assert again.exit_code == 0, again.output
 
 
+def test_where_nothing_can_be_told_the_causes_are(workspace: Workspace, board_shots: Path) -> None:
+    """One pair's images alone, two of them exchanged."""
+    (shot,) = [s for s in board_shots.iterdir() if len(list(s.glob("*/bit00.png"))) > 0][:1]
+    pair = next(iter(shot.glob("*/bit00.png"))).parent
+    for other in board_shots.iterdir():
+        if other != shot:
+            shutil.rmtree(other)
+    for other in shot.iterdir():
+        if other != pair:
+            shutil.rmtree(other)
+    (pair / "bit02.png").rename(pair / "kept.png")
+    (pair / "bit03.png").rename(pair / "bit02.png")
+    (pair / "kept.png").rename(pair / "bit03.png")
+    (board_shots / "captures.yaml").write_text("kind: calibration\n", "utf-8")
+    result = run(
+        "check-calibration", board_shots, "--calibration", workspace.folder / "calibration"
+    )
+    assert result.exit_code == 1
+    assert "no board is seen by two calibrated pairs" in result.output
+    assert "bit02" in result.output or "bit 2" in result.output
+
+
 def test_a_scan_of_a_person_is_checked_too(workspace: Workspace) -> None:
     person = workspace.folder / "captures" / "person"
     result = run("check-calibration", person, "--calibration", workspace.folder / "calibration")
