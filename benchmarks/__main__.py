@@ -47,6 +47,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "fuzz": fuzz.report,
     "seconds": seconds.report,
     "costs": costs.report,
+    "day": costs.day,
     "png": png.report,
     "rig": rig.report,
     "procam": procam.report,
@@ -55,7 +56,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "lens": lens.report,
     "mutants": mutants.report,
 }
-SLOW = ("mutants",)
+SLOW = ("mutants", "day")
 """Run when named, not with all."""
 
 

@@ -34,10 +34,6 @@ def report(pairs: tuple[int, ...] = PAIRS, megapixels: tuple[float, ...] = MEGAP
             for count in pairs:
                 rig = around(one, count, Path(folder) / f"{size:g}-{count}")
                 rows.append(f"| {count} | {size:g} | {_scanned(rig)} |")
-        day = around(
-            make_pair(Path(folder) / "day", DAY_MEGAPIXELS), DAY_PAIRS, Path(folder) / "scan"
-        )
-        first, last, start_mib, end_mib = _day(day)
     table = "\n".join(rows)
     return f"""## Costs
 
@@ -47,6 +43,15 @@ clock, processor time and the most memory that it held, once each.
 | pairs | megapixels | s | s of processor | MiB |
 |---|---|---|---|---|
 {table}
+"""
+
+
+def day() -> str:
+    """The section of docs/results.md on a day in one process."""
+    with tempfile.TemporaryDirectory() as folder:
+        one = make_pair(Path(folder) / "one", DAY_MEGAPIXELS)
+        first, last, start_mib, end_mib = _day(around(one, DAY_PAIRS, Path(folder) / "scan"))
+    return f"""## A day in one process
 
 A day of {DAY} scans ({DAY_PAIRS} pairs of {DAY_MEGAPIXELS:g} megapixels) in one resident process: the
 first {SAMPLED} after the very first took {first:.2f} s each, the last {SAMPLED} {last:.2f} s; it held
