@@ -104,10 +104,9 @@ def _overlaps(
             clear = (np.minimum(ours, theirs) > DARKEST) & (np.maximum(ours, theirs) < BRIGHTEST)
             if np.count_nonzero(clear) < FEWEST:
                 continue
-            here, there = here[clear], there[clear]
-            ratio = np.log(surface.colours[there] / samples.colours[here].astype(np.float32))
-            shade = of_surfaces[b][there] - of_samples[here]
-            found.append(_Overlap(a, b, ratio, shade, step * len(here)))
+            ratio = np.log(theirs[clear] / ours[clear].astype(np.float32))
+            shade = of_surfaces[b][there[clear]] - of_samples[here[clear]]
+            found.append(_Overlap(a, b, ratio, shade, step * len(ratio)))
     return found
 
 
