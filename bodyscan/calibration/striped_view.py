@@ -21,15 +21,13 @@ from bodyscan.compiled import compiled
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import ray_table
+from bodyscan.geometry.crop import WHOLE, Crop
 from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.quadratic_table import Table, look_up
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
-
-Crop = tuple[slice, slice]
-WHOLE: Crop = (slice(None), slice(None))
 
 FEWEST_STRIPE_SHOTS = 2
 RIM_SQUARES = 0.1

@@ -13,16 +13,11 @@ import numpy as np
 
 from bodyscan.arrays import Greys
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.striped_view import (
-    WHOLE,
-    BoardBoundaries,
-    Crop,
-    boundaries_near,
-    crop_around,
-)
+from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_near, crop_around
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import BodyscanError, DecodingFailed, ImageError, plainly
+from bodyscan.geometry.crop import WHOLE, Crop
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.rig.pair import Pair
