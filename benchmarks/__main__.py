@@ -32,6 +32,7 @@ from benchmarks import (
     procam,
     rig,
     seconds,
+    sigmas,
 )
 from bodyscan.files.atomic import write_text
 
@@ -41,6 +42,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "three-pole": full_size.three_pole,
     "four-pole": full_size.four_pole,
     "living": full_size.living,
+    "sigmas": sigmas.report,
     "one-solve": one_solve.report,
     "fusion": fusion.report,
     "faults": faults.report,

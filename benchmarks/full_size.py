@@ -132,8 +132,9 @@ def _run(arguments: list[str]) -> tuple[str, float]:
     """What a bodyscan command printed, and the peak memory (GiB) of its own process."""
     with tempfile.TemporaryFile("w+") as printed:
         line = [sys.executable, "-m", "bodyscan", *arguments]
+        wide = {**os.environ, "COLUMNS": "150"}  # a row a pair
         process = subprocess.Popen(
-            line, stdout=printed, stderr=subprocess.PIPE, text=True, cwd=PROJECT
+            line, stdout=printed, stderr=subprocess.PIPE, text=True, cwd=PROJECT, env=wide
         )
         assert process.stderr is not None
         complaints = process.stderr.read()

@@ -69,7 +69,7 @@ def calibrate_all(captures: ChapterCaptures) -> Calibrations:
     _, skewed = by_slide_stage(TARGET, captures.stage, captures.readings, skewed=True)
     projector = TARGET.projector
     planes = fit_light_planes(reference_boards.points, projector.stripes, projector.direction)
-    ours, covariance, model, refinement = _ours(captures, reference, reference_boards)
+    ours, covariance, model, refinement = calibrate_ours(captures, reference, reference_boards)
     approaches = (
         pinhole_by_stage(TARGET, captures.stage, captures.readings),
         mended_pinhole_by_stage(TARGET, stage),
@@ -91,7 +91,7 @@ def calibrate_all(captures: ChapterCaptures) -> Calibrations:
     )
 
 
-def _ours(
+def calibrate_ours(
     captures: ChapterCaptures, reference: CameraCalibration, boards: LocatedBoards
 ) -> tuple[Approach, Array, str, str]:
     """As `bodyscan calibrate-rig` does a pair by itself: the model of the light that held-out boards

@@ -1,0 +1,120 @@
+"""Errors over their sigmas, over seeds and presets: of the chapter's unit, and of a rig with a body."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.full_size import run_commands
+from bodyscan.arrays import Array
+from bodyscan.evaluation.surface import signed_distances
+from bodyscan.fusion.storage import load_scan
+from bodyscan.laboratory.chapter import apparatus
+from bodyscan.laboratory.chapter.calibrating import calibrate_ours
+from bodyscan.laboratory.chapter.captures import TARGET, take_captures
+from bodyscan.laboratory.chapter.point_sigma import PointSigma, point_sigma
+from bodyscan.laboratory.rivals.targets import by_reference_plane
+from bodyscan.registration.storage import load_calibration
+from bodyscan.workflows.evaluate import compare_rig, load_truth
+
+PROJECT = Path(__file__).parents[1]
+SEEDS = range(5)
+PRESETS = ("ideal", "workshop")
+BOARDS = (3, 10)
+SCALE, SHOTS = 0.4, 24
+"""Of the rig: a calibration and a scan at full size take minutes to render, each."""
+
+
+def report() -> str:
+    """The section of docs/results.md."""
+    units = [
+        (boards, light, [_unit(boards, light == "real light", seed) for seed in SEEDS])
+        for boards in BOARDS
+        for light in ("ideal", "real light")
+    ]
+    rigs = [(preset, [_rig(preset, seed) for seed in SEEDS]) for preset in PRESETS]
+    return f"""## Errors over their sigmas, over {len(SEEDS)} seeds (synthetic)
+
+Root mean square over all seeds of error over sigma, 1 if sigmas are honest; in brackets that of each
+seed, since what is open of one calibration is common to all its points and a seed is one draw of it.
+The chapter's unit (`bodyscan reproduce`; depth on spheres and plate):
+
+| boards | light | spheres | plate | beyond three |
+|---|---|---|---|---|
+{chr(10).join(_unit_row(*unit) for unit in units)}
+
+`rigs/three-pole-12.yaml` with the woman as a mannequin, `--scale {SCALE:g}`, {SHOTS} shots of the
+board, each seed with devices and a board of its own, calibrated and scanned by the commands:
+
+| preset | camera centres | beyond three | cloud | beyond three | cloud RMS mm |
+|---|---|---|---|---|---|
+{chr(10).join(_rig_row(*one) for one in rigs)}
+"""
+
+
+def _unit(boards: int, real_light: bool, seed: int) -> PointSigma:
+    settings = apparatus.real_settings() if real_light else apparatus.ideal_settings()
+    captures = take_captures(apparatus.chapter_setup(settings, seed), boards=boards, stage_stops=0)
+    ours, *_ = calibrate_ours(captures, *by_reference_plane(TARGET, captures.boards))
+    return point_sigma(ours, captures)
+
+
+@dataclass(frozen=True, eq=False)
+class RigErrors:
+    """centres: (P, 3) errors over sigmas.  cloud: (N,) likewise.  cloud_mm: (N,)."""
+
+    centres: Array
+    cloud: Array
+    cloud_mm: Array
+
+
+def _rig(preset: str, seed: int) -> RigErrors:
+    workspace = PROJECT / "bench" / "sigmas" / f"{preset}-{seed}"
+    rig, subject = PROJECT / "rigs" / "three-pole-12.yaml", "data/subjects/woman_average.ply"
+    calibration = workspace / "calibration"
+    commands: dict[str, list[object]] = {
+        "simulate": [rig, "--out", workspace, "--subject", PROJECT / subject, "--scale", SCALE]
+        + ["--board-shots", SHOTS, "--preset", preset, "--subject-preset", "mannequin"]
+        + ["--seed", seed],
+        "calibrate-rig": [workspace / "rig.yaml", "--overwrite"],
+        "scan": [workspace / "captures" / "person", "--calibration", calibration]
+        + ["--out", workspace / "scan", "--overwrite"],
+    }
+    run_commands(commands, workspace)
+    truth = load_truth(workspace / "truth")
+    placed = compare_rig(load_calibration(calibration), truth)
+    assert truth.vertices is not None
+    assert truth.faces is not None
+    cloud = load_scan(workspace / "scan").cloud
+    distances = signed_distances(cloud.points, truth.vertices, truth.faces)
+    shutil.rmtree(workspace / "scan")
+    return RigErrors(placed.centres_mm / placed.sigmas_mm, distances / cloud.sigma_mm, distances)
+
+
+def _unit_row(boards: int, light: str, seeds: Sequence[PointSigma]) -> str:
+    beyond = 100.0 * np.mean([one.beyond_three for one in seeds])
+    spheres, plate = [s.spheres for s in seeds], [s.plate for s in seeds]
+    return f"| {boards} | {light} | {_each(spheres)} | {_each(plate)} | {beyond:.2f} % |"
+
+
+def _rig_row(preset: str, seeds: Sequence[RigErrors]) -> str:
+    centres, cloud = [_rms(s.centres) for s in seeds], [_rms(s.cloud) for s in seeds]
+    apart = np.mean(np.abs(np.concatenate([s.centres for s in seeds])) > 3.0)
+    beyond = np.mean(np.abs(np.concatenate([s.cloud for s in seeds])) > 3.0)
+    size = _rms(np.concatenate([s.cloud_mm for s in seeds]))
+    return (
+        f"| {preset} | {_each(centres)} | {100 * apart:.1f} % | {_each(cloud)} | "
+        f"{100 * beyond:.2f} % | {size:.3f} |"
+    )
+
+
+def _each(spreads: Sequence[float]) -> str:
+    return f"{_rms(np.array(spreads)):.2f} ({', '.join(f'{one:.2f}' for one in spreads)})"
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
