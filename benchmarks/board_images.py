@@ -81,7 +81,7 @@ def save_views(views: Sequence[BoardView], path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(
         path,
-        which=np.array([(view.pair, view.shot, view.board) for view in views]),
+        which=np.array([view.key for view in views]),
         turnable=np.array([view.turnable for view in views]),
         counts=np.array([len(view.pixels) for view in views]),
         ids=np.concatenate([view.corner_ids for view in views]),

@@ -6,20 +6,20 @@ Needs the workspace that `three-pole` simulates (benchmarks/full_size.py).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array
+from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.stripe_agreement import board_offsets
-from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, boundaries_on_boards
+from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_on_boards
 from bodyscan.captures.folder import open_captures
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig_file import load_rig
-from bodyscan.workflows.calibrate_rig import join_rig
-from bodyscan.workflows.decode import ViewKey, decode_on_boards
+from bodyscan.workflows.calibrate_rig import join_rig, striped
+from bodyscan.workflows.decode import decode_on_boards
 from bodyscan.workflows.evaluate import Truth, load_truth
 from bodyscan.workflows.find_boards import find_all_boards
 from bodyscan.workflows.rig_remarks import JoinedRig
@@ -60,22 +60,19 @@ def _errors(
     """(2, B) mm of each pair, less their means: boards off the truth, and as the stripes have it."""
     placed, rig, facts = joined.placed, joined.calibration.rig, truth.facts
     for name, pair in joined.calibration.pairs.items():
-        camera_from_rig = placed.rig_from_camera[name].inverse()
         true = RigidTransform.from_matrix(facts["pairs"][name]["rig_from_camera"]).inverse()
         shots, off = [], []
         for view in placed.views:
-            key = view.pair, view.shot, view.board
-            if view.pair != name or key not in decoded:
+            if view.pair != name or view.key not in decoded:
                 continue
-            pose = camera_from_rig @ placed.rig_from_board[view.target]
+            shot = striped(rig, placed, view, decoded[view.key])
+            pose = shot.view.camera_from_board
             corners = np.array(facts["boards"][view.board]["corners_mm"]).reshape(-1, 3)
             own = corners[cKDTree(corners).query(view.points)[1]]
             there = true @ RigidTransform.from_matrix(facts["shots"][view.shot]["rig_from_board"])
             away = pose.rotation[:, 2] * np.sign(pose.rotation[2, 2])
             off.append(float(((pose.apply(view.points) - there.apply(own)) @ away).mean()))
-            face = placed.board_shapes[view.board].face(view.points)
-            seen = replace(view, camera_from_board=pose)
-            shots.append(StripedView(seen, rig.board(view.board), decoded[key], face))
+            shots.append(shot)
         projector = rig.pair(name).projector
         assert projector is not None
         assert pair.sheets is not None

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from bodyscan.arrays import Array, Indices
 from bodyscan.boards.appearance import AS_PRINTED, Appearance
 
+ViewKey = tuple[str, str, str]
+"""Pair, shot and board: which view."""
+
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
@@ -25,3 +28,7 @@ class BoardView:
     pixels: Array
     turnable: bool = False
     appearance: Appearance = AS_PRINTED
+
+    @property
+    def key(self) -> ViewKey:
+        return self.pair, self.shot, self.board

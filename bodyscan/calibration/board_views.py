@@ -8,7 +8,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_grid, corner_points, corners_per_face
-from bodyscan.boards.view import BoardView
+from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 
@@ -52,6 +52,10 @@ class LocatedView:
     pixels: Array
     camera_from_board: RigidTransform
     alternatives: tuple[RigidTransform, ...] = (RigidTransform.identity(),)
+
+    @property
+    def key(self) -> ViewKey:
+        return self.pair, self.shot, self.board
 
     @property
     def target(self) -> tuple[str, str]:

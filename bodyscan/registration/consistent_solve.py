@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
+from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.registration.full_solve import solve_fully
 from bodyscan.registration.inconsistent_views import find_inconsistent_views
 from bodyscan.registration.joint_solve import JointSolution
 
 ROUNDS = 4
-
-ViewKey = tuple[str, str, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +28,7 @@ class ConsistentSolve:
 
     def kept(self, views: Sequence[LocatedView]) -> list[LocatedView]:
         """Those of the views that took part."""
-        return [view for view in views if view_key(view) not in self.wrong]
-
-
-def view_key(view: LocatedView) -> ViewKey:
-    """(pair, shot, board)."""
-    return view.pair, view.shot, view.board
+        return [view for view in views if view.key not in self.wrong]
 
 
 def solve_consistently(
@@ -54,7 +48,7 @@ def solve_consistently(
             kept, _boards_of(kept, at.solution), root=root, refine_cameras=refine_cameras
         )
         found = find_inconsistent_views(views, solved, limit_px)
-        now = frozenset(view_key(view) for view in found.wrong)
+        now = frozenset(view.key for view in found.wrong)
         if now == at.wrong:
             return ConsistentSolve(solved, now, found.notes)
         whole_cameras = 2 * len(now) > len(views)  # see `rig_solve`

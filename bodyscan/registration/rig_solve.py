@@ -30,11 +30,7 @@ from bodyscan.registration.board_shape import (
     with_board_shapes,
     with_same_shapes,
 )
-from bodyscan.registration.consistent_solve import (
-    ConsistentSolve,
-    solve_consistently,
-    view_key,
-)
+from bodyscan.registration.consistent_solve import ConsistentSolve, solve_consistently
 from bodyscan.registration.honest_covariance import board_places, honest_covariance
 from bodyscan.registration.inconsistent_views import (
     error_limit,
@@ -165,7 +161,7 @@ def _solve(
         refine_cameras=several,
         limit_px=error_limit(single_view_errors(kept, cameras)),
     )
-    judged = solve(resolved, solution, wrong=[view_key(view) for view in gross])
+    judged = solve(resolved, solution, wrong=[view.key for view in gross])
     shaped = ShapedSolution(judged.solution, judged.kept(resolved), {}, ())
     lenses: ChosenLenses | None = None
     # With strangers among them all are solved again.
@@ -183,7 +179,7 @@ def _solve(
 
 
 def _dropped(views: Sequence[LocatedView], judged: ConsistentSolve) -> list[LocatedView]:
-    return [view for view in views if view_key(view) in judged.wrong]
+    return [view for view in views if view.key in judged.wrong]
 
 
 def _strangers(kept: Sequence[LocatedView], dropped: Sequence[LocatedView]) -> list[str]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from bodyscan.boards.view import BoardView
+from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import CameraCalibration, locate_board
 from bodyscan.calibration.pair import PairCalibration, PlacedPair, calibrate_pair
@@ -26,7 +26,7 @@ from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.registration.storage import keep_former, save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
-from bodyscan.workflows.decode import ViewKey, decode_on_boards
+from bodyscan.workflows.decode import decode_on_boards
 from bodyscan.workflows.find_boards import (
     HERE,
     FoundBoards,
@@ -166,16 +166,16 @@ def _decode(
 ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
     """Stripes on the boards that took part in placing the rig: of tens of millions of boundaries means
     on the print alone."""
-    used = {(view.pair, view.shot, view.board): view for view in placed.views}
+    used = {view.key: view for view in placed.views}
 
     def printed(view: BoardView, seen: BoardBoundaries) -> BoardBoundaries:
-        shot = _striped(rig, placed, used[view.pair, view.shot, view.board], seen)
+        shot = striped(rig, placed, used[view.key], seen)
         code = rig.pair(view.pair).projector
         assert code is not None
         camera = placed.cameras[view.pair]
         return on_print(camera, code, shot.board, shot.camera_from_face, seen)
 
-    wanted = [view for view in views if (view.pair, view.shot, view.board) in used]
+    wanted = [view for view in views if view.key in used]
     return decode_on_boards(rig, captures, wanted, progress, keep=printed)
 
 
@@ -202,9 +202,7 @@ def _fit_sheets(
     )
 
 
-def _striped(
-    rig: Rig, placed: RigSolution, view: LocatedView, seen: BoardBoundaries
-) -> StripedView:
+def striped(rig: Rig, placed: RigSolution, view: LocatedView, seen: BoardBoundaries) -> StripedView:
     """A view with its stripes, its board where the joint solve has it."""
     shape = placed.board_shapes.get(view.board)
     camera_from_rig = placed.rig_from_camera[view.pair].inverse()
@@ -225,9 +223,7 @@ def _placed_pair(
 ) -> PlacedPair:
     views = [view for view in placed.views if view.pair == name]
     shots = tuple(
-        _striped(rig, placed, view, boundaries[name, view.shot, view.board])
-        for view in views
-        if (name, view.shot, view.board) in boundaries
+        striped(rig, placed, view, boundaries[view.key]) for view in views if view.key in boundaries
     )
     return PlacedPair(
         name,

@@ -173,12 +173,8 @@ def _stripe_offsets(
     progress: Progress,
 ) -> Outcome[tuple[StripeOffset, ...]]:
     """Of every pair that took stripes on a board it saw."""
-    known = {
-        (view.pair, view.shot, view.board): view
-        for view in located
-        if calibration.pairs[view.pair].sheets is not None
-    }
-    wanted = [view for view in views if (view.pair, view.shot, view.board) in known]
+    known = {view.key: view for view in located if calibration.pairs[view.pair].sheets is not None}
+    wanted = [view for view in views if view.key in known]
     decoded = decode_on_boards(calibration.rig, captures, wanted, progress)
     parts: dict[str, list[Array]] = defaultdict(list)
     for key, boundaries in decoded.value.items():

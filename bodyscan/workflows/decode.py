@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 
 from bodyscan.arrays import Greys
-from bodyscan.boards.view import BoardView
+from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_near, crop_around
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_sequence
@@ -33,9 +33,6 @@ NUMBER = re.compile(r"\d[\d.]*%?(, \d[\d.]*%?)*")
 MOST_REASONS = 3
 FEW = 2
 """So many shots are told one by one, more with the same fault together."""
-
-ViewKey = tuple[str, str, str]
-"""Pair, shot and board: which view."""
 
 Failure = tuple[ImageSequence, BodyscanError]
 Keep = Callable[[BoardView, BoardBoundaries], BoardBoundaries]
@@ -120,10 +117,7 @@ def decode_on_boards(
         stripes = decode_sequence(sequence, rig.pair(sequence.pair), crop=crop)
         responses[sequence.pair] += responses_in(stripes)
         one_way[sequence] = stripes.crossing_fault
-        return {
-            (view.pair, view.shot, view.board): keep(view, boundaries_near(stripes, view, crop))
-            for view in own
-        }
+        return {view.key: keep(view, boundaries_near(stripes, view, crop)) for view in own}
 
     decoded, errors = attempt_each(
         decode, sequences, BodyscanError, stage="decoding stripes", progress=progress

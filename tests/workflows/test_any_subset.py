@@ -14,7 +14,7 @@ from seen_boards import SeenBoards, seen_boards
 from small_workspace import Detected
 
 from bodyscan.arrays import Array
-from bodyscan.boards.view import BoardView
+from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.calibration.striped_view import BoardBoundaries
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BodyscanError, FailedWork, RigDisconnected
@@ -26,7 +26,7 @@ from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import RigFrame
 from bodyscan.workflows import calibrate_rig
 from bodyscan.workflows.calibrate_rig import join_rig
-from bodyscan.workflows.decode import Keep, ViewKey
+from bodyscan.workflows.decode import Keep
 from bodyscan.workflows.find_boards import FoundBoards
 from bodyscan.workflows.rig_remarks import remarked
 
@@ -144,7 +144,7 @@ def test_any_subset_of_images_with_stripes_does_too(
     def decoded(
         _rig: Rig, _captures: Captures, wanted: Views, _progress: Progress, *, keep: Keep
     ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
-        keys = {(view.pair, view.shot, view.board): view for view in wanted}
+        keys = {view.key: view for view in wanted}
         return Outcome({key: keep(keys[key], striped[key]) for key in keys if key in striped})
 
     with pytest.MonkeyPatch.context() as patched:
