@@ -91,6 +91,7 @@ def tell_motion(camera: Camera, sheets: LightSheets, comb: Comb) -> StripeMotion
         cell_px=cells.px,
         velocity=_velocity(fit, teeth, _seen(speeds, teeth, lost, share), share),
         speed_mm=_rms(speed[known]),
+        mm_per_stripe=float(np.median(np.abs(teeth.per_stripe))),
         doubt_mm=_rms(np.sqrt(lost[known])),
         explained=fit.explained,
         is_significant=_rms(speed[known]) > SIGMAS * teeth.common

@@ -15,6 +15,9 @@ from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.comb import Comb, find_comb
 
 SEEN_MM = 0.25  # of motion while the patterns were taken: with less none can have leapt
+LEAPT = 0.25
+"""Of the least leap that is named, on the average of windows: with less it is not looked for. A part of
+the body that leapt alone leaves as much."""
 TORN = 4.0
 """Times what steady motion explains: motion back and forth is not steady either, and shorter."""
 
@@ -26,6 +29,7 @@ class StripeMotion:
     speed, doubt: (rows, columns) at the middles of cells of `cell_px` x `cell_px` camera pixels, linear
     between: stripes per unit of time, and the standard deviation of what is not known of it.
     velocity: of the body, per the same unit of time.  speed_mm: how fast it moved in depth, RMS.
+    mm_per_stripe: of depth, at a pixel that stays where it is, in the median.
     doubt_mm: of that, what neither a rigid motion nor the field explains, RMS over the cells.
     explained: by how much the rigid motion lowers chi-square.
     is_significant: whether noise does not explain it.
@@ -36,6 +40,7 @@ class StripeMotion:
     cell_px: int
     velocity: Velocity
     speed_mm: float
+    mm_per_stripe: float
     doubt_mm: float
     explained: float
     is_significant: bool
@@ -124,7 +129,9 @@ def _check_whole(
     for first in range(1, len(order)):
         after = np.zeros(len(times))
         after[order[first:]] = lasted
-        leap = moments.told(find_comb(boundaries, after[bit], turned=turned))
+        comb = find_comb(boundaries, after[bit], turned=turned)
+        usual_mm = _mean_size(comb.speed) * lasted * motion.mm_per_stripe
+        leap = moments.told(comb) if usual_mm > LEAPT * moments.most_mm else None
         if leap is not None:
             leaps.append((leap.explained, leap.speed_mm * lasted, first))
     explained, apart_mm, first = max(leaps, default=(0.0, 0.0, 0))
@@ -134,6 +141,10 @@ def _check_whole(
             " in depth from where those before show it",
             remedy="see whether images of another moment or subject stand among them; scan again",
         )
+
+
+def _mean_size(values: Array) -> float:
+    return float(np.mean(np.abs(values))) if len(values) else 0.0
 
 
 @compiled

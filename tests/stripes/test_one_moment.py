@@ -21,6 +21,7 @@ from bodyscan.stripes.stripe_map import StripeMap
 STRIPES, BITS, SHAPE = 64, 6, (110, 90)
 SPEED = -0.03
 """Stripes an image: a body at 8 mm/s in depth, 120 images a second."""
+MM_PER_STRIPE = 8.0
 FINEST = {True: (5.0 + 11.0) / 2, False: 5.0}
 """Where the patterns come first and then their inverses, or no inverses at all."""
 
@@ -37,7 +38,7 @@ def told(comb: Comb) -> StripeMotion:
     none = np.empty((0, 3))
     unseen = SurfaceSpeeds(none, none, none[:, 0], none[:, 0], none[:, :1])
     still = Velocity(np.zeros(6), np.eye(6), unseen)
-    return StripeMotion(grid, 0.0 * grid, 200, still, abs(speed), 0.0, 100.0, True)
+    return StripeMotion(grid, 0.0 * grid, 200, still, abs(speed), MM_PER_STRIPE, 0.0, 100.0, True)
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["with inverses", "without"])
@@ -79,9 +80,6 @@ def test_what_moved_meanwhile_is_taken_out_of_s(seen: tuple[bool, list[np.ndarra
     assert len(after) > 0.995 * len(before)
 
 
-MM_PER_STRIPE = 8.0
-
-
 def told_in_mm(comb: Comb) -> StripeMotion | None:
     if not len(comb.speed):
         return None
@@ -112,3 +110,25 @@ def test_a_sequence_of_two_moments_is_named(leap: float) -> None:
         DecodingFailed, match=r"from about bit 3 on, patterns show the subject some 3\.2 mm"
     ):
         decode_stripes(code, *given, moments=(moments,))
+
+
+def test_leaps_too_small_to_be_named_are_not_looked_for() -> None:
+    asked: list[Comb] = []
+
+    def counted(comb: Comb) -> StripeMotion | None:
+        asked.append(comb)
+        return told_in_mm(comb)
+
+    code = Gray(stripes=STRIPES, direction="horizontal", inverses=False)
+    bits = gray_bits(np.arange(STRIPES))
+    seen = [
+        render(partial(s_at, float(t)), b[None], stripes=STRIPES, shape=SHAPE, seed=t)
+        for t, b in enumerate(bits)
+    ]
+    given = *seen[0][:2], np.concatenate([image[2] for image in seen])
+    times: dict[str, Array] = {"pattern": np.arange(float(BITS))}
+    for most_mm, expected in ((1000.0, 1), (0.5, BITS)):
+        asked.clear()
+        moments = Moments(times, code.moment(times), counted, most_mm=most_mm)
+        decode_stripes(code, *given, moments=(moments,))
+        assert len(asked) == expected

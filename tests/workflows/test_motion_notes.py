@@ -15,7 +15,7 @@ def motion(speed_mm: float) -> StripeMotion:
     unseen = SurfaceSpeeds(none, none, none[:, 0], none[:, 0], none[:, :1])
     velocity = Velocity(np.zeros(6), np.eye(6), unseen)
     grid = np.zeros((1, 1))
-    return StripeMotion(grid, grid, 100, velocity, speed_mm, 0.0, 100.0, True)
+    return StripeMotion(grid, grid, 100, velocity, speed_mm, 5.0, 0.0, 100.0, True)
 
 
 @pytest.mark.parametrize(
