@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cached_property
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from bodyscan.calibration.zhang import (
 )
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import MATRIX, Camera
-from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
+from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.ray_uncertainty import RayUncertainty
@@ -25,6 +25,7 @@ from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 FEWEST_POSES = 3
 SETTLED = 1e-6
+DAMPING = 1e-3
 CHAPTERS_LENS = Radial()
 CORNERS = Noise("corners", group=2, cauchy=4.0)
 
@@ -63,16 +64,34 @@ class CameraCalibration:
 
 @dataclass(frozen=True, eq=False)
 class CameraFit:
-    """A camera and `camera_from_board` of each of its views, with what that leaves over.
+    """A camera and `camera_from_board` of each of its views, with what that leaves over."""
 
-    residuals: (N, 2) px of each view.  weights: (N,) of each, robust.  covariance: (P, P).
-    """
+    solution: Solution[_State]
 
-    camera: Camera
-    poses: tuple[RigidTransform, ...]
-    residuals: tuple[Array, ...]
-    weights: tuple[Array, ...]
-    covariance: Array
+    @property
+    def camera(self) -> Camera:
+        return self.solution.state.camera
+
+    @property
+    def poses(self) -> tuple[RigidTransform, ...]:
+        return self.solution.state.poses
+
+    @property
+    def residuals(self) -> tuple[Array, ...]:
+        """(N, 2) px of each view."""
+        corners = self.solution.blocks[0]
+        return _by_view(corners.residuals.reshape(-1, 2), corners)
+
+    @property
+    def weights(self) -> tuple[Array, ...]:
+        """(N,) of each view's corners, robust."""
+        return _by_view(self.solution.weights[0][::2], self.solution.blocks[0])
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(P, P) of the camera's parameters."""
+        size = len(self.camera.parameters)
+        return self.solution.variance * self.solution.covariance[:size, :size]
 
     @property
     def rms_px(self) -> float:
@@ -98,9 +117,11 @@ class _State:
 
     def moved(self, step: Array) -> _State:
         size = len(self.camera.parameters)
-        twists = step[size:].reshape(-1, 6)
-        poses = tuple(pose.moved(twist) for pose, twist in zip(self.poses, twists, strict=True))
-        return _State(self.camera.moved(step[:size]), poses)
+        return _State(self.camera.moved(step[:size]), self.boards_moved(step[size:]).poses)
+
+    def boards_moved(self, step: Array) -> _State:
+        twists = zip(self.poses, step.reshape(-1, 6), strict=True)
+        return _State(self.camera, tuple(pose.moved(twist) for pose, twist in twists))
 
 
 def calibrate_camera(
@@ -153,26 +174,23 @@ def fit_camera(
     views: Sequence[PlanarView],
     *,
     settled: float = SETTLED,
+    damping: float = DAMPING,
 ) -> CameraFit:
-    """Least squares over camera and boards from where they are, `camera_from_board` of each view."""
+    """Least squares over camera and boards from where they are, `camera_from_board` of each view;
+    damping: see `minimize`."""
     size = len(camera.parameters)
     solution = minimize(
         _State(camera, tuple(poses)),
         lambda state: [
-            *_corners_of_all(state, views),
+            _corners_of_all(state, views),
             known_beforehand(state.camera, np.arange(size)),
         ],
         _State.moved,
         unknowns=size + 6 * len(views),
         settled=settled,
+        damping=damping,
     )
-    return CameraFit(
-        solution.state.camera,
-        solution.state.poses,
-        tuple(block.residuals.reshape(-1, 2) for block in solution.blocks[:-1]),
-        tuple(weights[::2] for weights in solution.weights[:-1]),
-        solution.variance * solution.covariance[:size, :size],
-    )
+    return CameraFit(solution)
 
 
 def weighted_rms(residuals: Sequence[Array], weights: Sequence[Array]) -> float:
@@ -210,14 +228,29 @@ def locate_board(
         start = camera_from_plane(
             homography(view.points[:, :2], normalized), float(view.points[0, 2])
         )
+    (pose,), (residuals,) = locate_boards(camera, [view], [start])
+    return pose, residuals
+
+
+def locate_boards(
+    camera: Camera,
+    views: Sequence[PlanarView],
+    starts: Sequence[RigidTransform],
+    *,
+    settled: float = SETTLED,
+) -> tuple[tuple[RigidTransform, ...], tuple[Array, ...]]:
+    """`camera_from_board` of views whose corners err alike, for a known camera, and the residuals
+    (N, 2) px of each."""
     solution = minimize(
-        start,
-        lambda pose: [_corners(camera, pose, view)],
-        RigidTransform.moved,
-        unknowns=6,
+        _State(camera, tuple(starts)),
+        lambda state: [_corners_of_all(state, views, camera_free=False)],
+        _State.boards_moved,
+        unknowns=6 * len(views),
         steps=30,
+        settled=settled,
     )
-    return solution.state, solution.blocks[0].residuals.reshape(-1, 2)
+    corners = solution.blocks[0]
+    return solution.state.poses, _by_view(corners.residuals.reshape(-1, 2), corners)
 
 
 def _camera(matrix: Array, lens: Lens, width: int, height: int) -> Camera:
@@ -233,43 +266,33 @@ def _camera(matrix: Array, lens: Lens, width: int, height: int) -> Camera:
     )
 
 
-def _corners_of_all(state: _State, views: Sequence[PlanarView]) -> list[Block]:
-    """Reprojection errors, px, of each view; by the camera's parameters, which come first, and by its
-    board's pose."""
+def _corners_of_all(
+    state: _State, views: Sequence[PlanarView], *, camera_free: bool = True
+) -> Block:
+    """Reprojection errors, px, a run for each view; by the camera's parameters, which come first if
+    free, and by its board's pose."""
     placed = zip(state.poses, views, strict=True)
     points = np.concatenate([pose.apply(view.points) for pose, view in placed])
-    cuts = np.cumsum([len(view.points) for view in views])[:-1]
-    seen = np.split(state.camera.project(points), cuts)
-
-    @cache
-    def linearize() -> list[Array]:
-        by_parameter, by_point = state.camera.jacobians(points)
-        jacobian = np.concatenate([by_parameter, by_point @ twist_jacobian(points)], axis=2)
-        return np.split(jacobian, cuts)
-
-    def of_view(k: int) -> Callable[[], Array]:
-        return lambda: linearize()[k].reshape(-1, size + 6)
-
-    size = len(state.camera.parameters)
-    own = np.arange(size)
-    return [
-        Block(
-            (seen[k] - view.pixels).ravel(),
-            of_view(k),
-            np.append(own, size + 6 * k + np.arange(6)),
-            CORNERS,
-        )
-        for k, view in enumerate(views)
-    ]
-
-
-def _corners(camera: Camera, pose: RigidTransform, view: PlanarView) -> Block:
-    """One view's reprojection errors, px, by its board's pose."""
-    points = pose.apply(view.points)
+    pixels = np.concatenate([view.pixels for view in views])
+    camera = state.camera
+    size = len(camera.parameters) if camera_free else 0
+    boards = size + np.arange(6 * len(views)).reshape(-1, 6)
 
     def linearize() -> Array:
-        by_pose = camera.jacobians(points)[1] @ twist_jacobian(points)
-        return by_pose.reshape(-1, 6)
+        by_parameter, by_point = camera.jacobians(points)
+        by_pose = by_point @ twist_jacobian(points)
+        return np.concatenate([by_parameter[..., :size], by_pose], axis=2).reshape(-1, size + 6)
 
-    residuals = (camera.project(points) - view.pixels).ravel()
-    return Block(residuals, linearize, slice(0, 6), CORNERS)
+    return Block(
+        (camera.project(points) - pixels).ravel(),
+        linearize,
+        np.column_stack([np.tile(np.arange(size), (len(views), 1)), boards]),
+        CORNERS,
+        runs=np.array([2 * len(view.points) for view in views]),
+    )
+
+
+def _by_view(values: Array, corners: Block) -> tuple[Array, ...]:
+    """What each corner of a block has, view by view."""
+    assert corners.runs is not None
+    return tuple(np.split(values, np.cumsum(corners.runs)[:-1] // 2))

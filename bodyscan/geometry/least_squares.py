@@ -79,6 +79,8 @@ EXACT = Noise("in standard deviations", known=1.0)
 class Block:
     """Residuals (N,) that depend on the unknowns `columns` (C,) alone.
 
+    runs: (G,) where residuals come in runs of so many, each with `columns` of its own, a row of (G, C).
+    As boards of one camera, each with its pose: with a block for each, calls take longer than sums.
     linearize: gives the Jacobian (N, C); asked once, and never at a step that is tried and refused.
     sigma: of each residual (N,), or of all; held while steps from here are tried.
     A prior is a block too: of what is known, in standard deviations (`EXACT`).
@@ -89,6 +91,7 @@ class Block:
     columns: Columns
     noise: Noise
     sigma: Array | float = 1.0
+    runs: Indices | None = None
 
     @cached_property
     def jacobian(self) -> Array:
@@ -328,10 +331,34 @@ def _equations(
         if not len(block.residuals):
             continue
         weighted = block.jacobian * (weight / (block.sigma * size) ** 2)[:, None]
+        if block.runs is not None:
+            _add_runs(block, weighted, normal, gradient)
+            continue
         square = _square(block.columns)
         normal[square] += gram(weighted, block.jacobian)
         gradient[block.columns] += weighted.T @ block.residuals
     return normal, gradient
+
+
+def _add_runs(block: Block, weighted: Array, normal: Array, gradient: Array) -> None:
+    """To the equations, what a block of several runs gives; weighted: (N, C) its weighted Jacobian."""
+    assert block.runs is not None
+    assert not isinstance(block.columns, slice)
+    turned = _stacked(weighted, block.runs).transpose(0, 2, 1)
+    parts = turned @ _stacked(block.jacobian, block.runs)
+    pulls = turned @ _stacked(block.residuals[:, None], block.runs)
+    unknowns, columns = len(gradient), block.columns
+    place = columns[:, :, None] * unknowns + columns[:, None, :]
+    normal += np.bincount(place.ravel(), parts.ravel(), normal.size).reshape(normal.shape)
+    gradient += np.bincount(columns.ravel(), pulls.ravel(), unknowns)
+
+
+def _stacked(rows: Array, runs: Indices) -> Array:
+    """Runs of rows (N, C), one after another -> (G, M, C), short ones filled up with zeros."""
+    longest = int(runs.max())
+    stacked = np.zeros((len(runs), longest, rows.shape[1]))
+    stacked[np.arange(longest) < runs[:, None]] = rows
+    return stacked
 
 
 def _square(columns: Columns) -> tuple[Columns, Columns] | tuple[Indices, ...]:

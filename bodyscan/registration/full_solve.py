@@ -32,9 +32,12 @@ def solve_fully(
 ) -> JointSolution:
     """Least squares from a solution of `solve_jointly`, in the root camera's frame."""
     unknowns = _Unknowns(solution, root, refine_cameras)
+    of_pair = [
+        [view for view in views if view.pair == name] for name in sorted({v.pair for v in views})
+    ]
     return minimize(
         solution,
-        lambda state: _blocks(views, state, unknowns),
+        lambda state: _blocks(of_pair, state, unknowns),
         unknowns.moved,
         unknowns=unknowns.count,
         steps=MOST_STEPS,
@@ -78,17 +81,21 @@ class _Unknowns:
 
 
 def _blocks(
-    views: Sequence[LocatedView], solution: JointSolution, unknowns: _Unknowns
+    of_pair: Sequence[Sequence[LocatedView]], solution: JointSolution, unknowns: _Unknowns
 ) -> Iterator[Block]:
-    """Of each view its corners, then what is known of each camera."""
+    """Of each pair the corners of its views, then what is known of each camera."""
     placings = solution.cameras, solution.root_from_camera, solution.root_from_board
-    for view in views:
-        residuals, linearize = corners_seen(view, *placings, cameras_free=unknowns.refine_cameras)
-        of_pair, of_board = unknowns.of_pair[view.pair], unknowns.of_board[view.target]
-        columns = np.concatenate([of_pair, of_board, unknowns.of_camera[view.pair]])
-        if not len(of_pair):
+    for views in of_pair:
+        pair = views[0].pair
+        residuals, linearize = corners_seen(views, *placings, cameras_free=unknowns.refine_cameras)
+        of_motion, of_camera = unknowns.of_pair[pair], unknowns.of_camera[pair]
+        columns = [
+            np.concatenate([of_motion, unknowns.of_board[view.target], of_camera]) for view in views
+        ]
+        if not len(of_motion):
             linearize = _without_motion(linearize)
-        yield Block(residuals, linearize, columns, CORNERS)
+        runs = np.array([2 * len(view.points) for view in views])
+        yield Block(residuals, linearize, np.array(columns), CORNERS, runs=runs)
     if unknowns.refine_cameras:
         for name, own in unknowns.of_camera.items():
             yield from camera_priors(solution.cameras[name], own)

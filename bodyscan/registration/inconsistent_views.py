@@ -111,7 +111,7 @@ def _examine_board(
     """Which of one board's views at one moment are wrong, since not all of them can be true."""
     shot, board = group[0].target
     start = _placing(group, solution)
-    own = [fit_board([view], solution, start).rms_px[0] for view in group]
+    own = [_fit_from_both([view], solution, start).rms_px[0] for view in group]
     bad = [view for view, error in zip(group, own, strict=True) if error > limit_px]
     notes = [
         f"{view.pair}: board {board} in shot {shot} fits no pose "
@@ -120,10 +120,10 @@ def _examine_board(
         if error > limit_px
     ]
     kept = [view for view in group if view not in bad]
-    together = fit_board(kept, solution, start) if kept else None
+    together = _fit_from_both(kept, solution, start) if kept else None
     if together is None or together.rms_px.max() <= limit_px:
         return InconsistentViews(tuple(bad), tuple(notes))
-    resized = fit_board(kept, solution, start, free_size=True)
+    resized = _fit_from_both(kept, solution, start, free_size=True)
     if resized.rms_px.max() <= limit_px and abs(resized.size - 1.0) > OTHER_SIZE:
         said = (
             f"shot {shot}: what {_names(kept)} took for board {board} has squares {resized.size:.3f} "
@@ -151,7 +151,7 @@ def _largest_agreement(
     kept = list(views)
     while len(kept) > 2:
         rests = [[view for view in kept if view is not out] for out in kept]
-        fits = [fit_board(rest, solution, start).rms_px for rest in rests]
+        fits = [_fit_from_both(rest, solution, start).rms_px for rest in rests]
         best = int(np.argmin([np.sum(rms**2) for rms in fits]))
         kept = rests[best]
         if fits[best].max() <= limit_px:
@@ -159,7 +159,7 @@ def _largest_agreement(
     return []
 
 
-def fit_board(
+def _fit_from_both(
     views: Sequence[LocatedView],
     solution: JointSolution,
     start: RigidTransform,
@@ -168,19 +168,21 @@ def fit_board(
 ) -> BoardFit:
     """The board pose (and size) that fits all views, from the first view's own pose or `start`."""
     own = solution.root_from_camera[views[0].pair] @ views[0].camera_from_board
-    first = _descend(views, solution, own, free_size)
+    first = fit_board(views, solution, own, free_size=free_size)
     if len(views) == 1:
         return first
-    second = _descend(views, solution, start, free_size)
+    second = fit_board(views, solution, start, free_size=free_size)
     return min(first, second, key=lambda fit: float(np.sum(fit.rms_px**2)))
 
 
-def _descend(
+def fit_board(
     views: Sequence[LocatedView],
     solution: JointSolution,
     placing: RigidTransform,
-    free_size: bool,
+    *,
+    free_size: bool = False,
 ) -> BoardFit:
+    """The board pose (and size) that fits all views, from `placing` on."""
     unknowns = 7 if free_size else 6
     fitted = minimize(
         (placing, 1.0),

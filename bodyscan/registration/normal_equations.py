@@ -113,7 +113,9 @@ def normal_equations(
     size = first_camera + sum(parameters)
     residuals, linearized = zip(
         *(
-            corners_seen(view, cameras, rig_from_camera, rig_from_board, cameras_free=cameras_free)
+            corners_seen(
+                [view], cameras, rig_from_camera, rig_from_board, cameras_free=cameras_free
+            )
             for view in views
         ),
         strict=True,
@@ -193,18 +195,20 @@ def _held(
 
 
 def corners_seen(
-    view: LocatedView,
+    views: Sequence[LocatedView],
     cameras: Mapping[str, Camera],
     rig_from_camera: Mapping[str, RigidTransform],
     rig_from_board: Mapping[Target, RigidTransform],
     *,
     cameras_free: bool,
 ) -> tuple[Array, Callable[[], Array]]:
-    """Reprojection errors (2N,) px, and what gives their Jacobian (2N, 12 + P): by the camera's
-    motion, the board's motion, and the camera's parameters if free."""
-    camera = cameras[view.pair]
-    in_rig = rig_from_board[view.target].apply(view.points)
-    camera_from_rig = rig_from_camera[view.pair].inverse()
+    """Reprojection errors (2N,) px of one pair's views, and what gives their Jacobian (2N, 12 + P): by
+    the camera's motion, each board's motion, and the camera's parameters if free."""
+    pair = views[0].pair
+    camera = cameras[pair]
+    in_rig = np.concatenate([rig_from_board[view.target].apply(view.points) for view in views])
+    pixels = np.concatenate([view.pixels for view in views])
+    camera_from_rig = rig_from_camera[pair].inverse()
     points = camera_from_rig.apply(in_rig)
 
     def linearize() -> Array:
@@ -214,4 +218,4 @@ def corners_seen(
         jacobian = np.concatenate(parts, axis=2)
         return jacobian.reshape(-1, jacobian.shape[2])
 
-    return (camera.project(points) - view.pixels).ravel(), linearize
+    return (camera.project(points) - pixels).ravel(), linearize

@@ -190,6 +190,29 @@ def test_blocks_that_touch_few_columns_give_what_one_dense_block_gives() -> None
     assert np.allclose(by_blocks.covariance, at_once.covariance, atol=1e-12)
 
 
+def test_one_block_of_runs_gives_what_a_block_for_each_run_gives() -> None:
+    rng = np.random.default_rng(1)
+    lengths = np.array([20, 8, 14])
+    columns = np.array([[0, 1, 2 + 3 * k, 3 + 3 * k, 4 + 3 * k] for k in range(3)])
+    jacobian, measured = rng.normal(size=(42, 5)), rng.normal(size=42)
+    runs = np.split(np.arange(42), np.cumsum(lengths)[:-1])
+
+    def residuals(state: Array) -> list[Array]:
+        return [jacobian[r] @ state[c] - measured[r] for r, c in zip(runs, columns, strict=True)]
+
+    def apart(state: Array) -> Iterator[Block]:
+        for left, own, rows in zip(residuals(state), columns, runs, strict=True):
+            yield Block(left, partial(np.asarray, jacobian[rows]), own, ROBUST)
+
+    def together(state: Array) -> list[Block]:
+        left = np.concatenate(residuals(state))
+        return [Block(left, lambda: jacobian, columns, ROBUST, runs=lengths)]
+
+    many, one = (minimize(np.zeros(11), f, add, unknowns=11) for f in (apart, together))
+    assert np.allclose(many.state, one.state, atol=1e-12)
+    assert np.allclose(many.covariance, one.covariance, atol=1e-12)
+
+
 def test_a_fit_cut_short_says_so() -> None:
     report = fit(noisy(2), [0.5, 3.0, 1.0], steps=2).report
     assert (report.ending, report.steps, report.converged) == ("out of steps", 2, False)

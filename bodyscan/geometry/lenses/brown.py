@@ -14,6 +14,7 @@ from bodyscan.geometry.lenses.polynomials import (
     decentring,
     decentring_by_point,
     scaled_by_point,
+    squared_radius,
 )
 
 
@@ -42,18 +43,18 @@ class Brown(Lens):
         return np.array([*[1e-5] * 4, 1e-4])
 
     def distort(self, ideal: Array) -> Array:
-        r2 = np.sum(ideal**2, axis=-1, keepdims=True)
+        r2 = squared_radius(ideal)[..., None]
         factor = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         return ideal * factor + decentring(ideal) @ np.array([self.p1, self.p2])
 
     def by_coefficients(self, ideal: Array) -> Array:
-        r2 = np.sum(ideal**2, axis=-1)[..., None, None]
+        r2 = squared_radius(ideal)[..., None, None]
         point = ideal[..., None]
         parts = [point * r2, point * r2**2, decentring(ideal), point * r2**3]
         return np.concatenate(parts, axis=-1)
 
     def by_point(self, ideal: Array) -> Array:
-        r2 = np.sum(ideal**2, axis=-1)
+        r2 = squared_radius(ideal)
         factor = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         slope = self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3)
         return scaled_by_point(ideal, factor, slope) + decentring_by_point(ideal, self.p1, self.p2)

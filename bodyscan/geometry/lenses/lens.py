@@ -15,6 +15,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
+from bodyscan.geometry.lenses.polynomials import squared_radius
 
 NEWTON_STEPS = 20
 """Five or six reach rounding; it takes more close to where a lens folds."""
@@ -106,7 +107,7 @@ class Lens(ABC):
                 x, y = np.moveaxis(self.distort(ideal) - real, -1, 0)
                 step = np.stack([d * x - b * y, a * y - c * x], -1) / (a * d - b * c)[..., None]
                 ideal = _at_most(
-                    ideal - step, 0.5 * (self.fold_radius + np.linalg.norm(ideal, axis=-1))
+                    ideal - step, 0.5 * (self.fold_radius + np.sqrt(squared_radius(ideal)))
                 )
                 if settled(step):
                     break
@@ -114,8 +115,8 @@ class Lens(ABC):
 
     def before_fold(self, ideal: Array, real: Array) -> Array:
         """Ideal points (..., 2), NaN where they are beyond `fold_radius` or not those of `real`."""
-        seen = np.linalg.norm(self.distort(ideal) - real, axis=-1) < NOT_FOUND
-        seen &= np.linalg.norm(ideal, axis=-1) < self.fold_radius
+        seen = squared_radius(self.distort(ideal) - real) < NOT_FOUND**2
+        seen &= np.sqrt(squared_radius(ideal)) < self.fold_radius
         return np.where(seen[..., None], ideal, np.nan)
 
     def opencv(self) -> Array:
@@ -136,7 +137,7 @@ class Lens(ABC):
 
 def _at_most(points: Array, radius: Array | float) -> Array:
     """Points (..., 2), those farther than `radius` (...) from the axis brought there."""
-    own = np.linalg.norm(points, axis=-1)
+    own = np.sqrt(squared_radius(points))
     return points * np.where(own > radius, radius / own, 1.0)[..., None]
 
 

@@ -12,6 +12,12 @@ p1 and p2 from the principal point; a prior ten times as wide made Brown's lens 
 alone for boards left out."""
 
 
+def squared_radius(ideal: Array) -> Array:
+    """(...) of points (..., 2); numpy's sum over so short an axis takes ten times as long."""
+    x, y = ideal[..., 0], ideal[..., 1]
+    return np.asarray(x * x + y * y, np.float64)
+
+
 def scaled_by_point(ideal: Array, factor: Array, slope: Array) -> Array:
     """Derivatives (..., 2, 2) of `ideal` times a factor of r^2, by the ideal points (..., 2).
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.lenses.lens import NEWTON_STEPS, Lens, settled
-from bodyscan.geometry.lenses.polynomials import scaled_by_point
+from bodyscan.geometry.lenses.polynomials import scaled_by_point, squared_radius
 
 
 @dataclass(frozen=True)
@@ -34,15 +34,15 @@ class Radial(Lens):
         return np.array([1e-5, 1e-5])
 
     def distort(self, ideal: Array) -> Array:
-        r2 = np.sum(ideal**2, axis=-1, keepdims=True)
+        r2 = squared_radius(ideal)[..., None]
         return ideal * (1.0 + r2 * (self.k1 + r2 * self.k2))
 
     def by_coefficients(self, ideal: Array) -> Array:
-        r2 = np.sum(ideal**2, axis=-1, keepdims=True)
+        r2 = squared_radius(ideal)[..., None]
         return np.stack([ideal * r2, ideal * r2**2], axis=-1)
 
     def by_point(self, ideal: Array) -> Array:
-        r2 = np.sum(ideal**2, axis=-1)
+        r2 = squared_radius(ideal)
         factor = 1.0 + r2 * (self.k1 + r2 * self.k2)
         return scaled_by_point(ideal, factor, self.k1 + 2.0 * r2 * self.k2)
 

@@ -14,6 +14,7 @@ from bodyscan.geometry.lenses.polynomials import (
     decentring,
     decentring_by_point,
     scaled_by_point,
+    squared_radius,
 )
 
 
@@ -47,11 +48,11 @@ class Rational(Lens):
         return np.array([*[1e-5] * 4, 1e-4, 1e-5, 1e-5, 1e-4])
 
     def distort(self, ideal: Array) -> Array:
-        above, below = self._parts(np.sum(ideal**2, axis=-1, keepdims=True))
+        above, below = self._parts(squared_radius(ideal)[..., None])
         return ideal * above / below + decentring(ideal) @ np.array([self.p1, self.p2])
 
     def by_coefficients(self, ideal: Array) -> Array:
-        r2 = np.sum(ideal**2, axis=-1)[..., None, None]
+        r2 = squared_radius(ideal)[..., None, None]
         above, below = self._parts(r2)
         point = ideal[..., None] / below
         turned = -point * above / below
@@ -60,7 +61,7 @@ class Rational(Lens):
         return np.concatenate([*parts, turned * powers], axis=-1)
 
     def by_point(self, ideal: Array) -> Array:
-        r2 = np.sum(ideal**2, axis=-1)
+        r2 = squared_radius(ideal)
         above, below = self._parts(r2)
         above_slope = self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3)
         below_slope = self.k4 + r2 * (2.0 * self.k5 + r2 * 3.0 * self.k6)
