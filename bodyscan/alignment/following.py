@@ -11,8 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import permutations
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,15 +19,10 @@ from bodyscan.alignment.body_cells import BodyCells, displaced
 from bodyscan.alignment.body_motion import BodyMotion, observed, outward_errors
 from bodyscan.alignment.cell_evidence import CellEvidence
 from bodyscan.alignment.cell_speeds import CellSpeeds
-from bodyscan.alignment.icp import COARSE, Alignment
+from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.limbs import LIMBS
-from bodyscan.alignment.matching import (
-    SEAM_RIM_PX,
-    AlignmentPoints,
-    Matches,
-    alignment_points,
-    match_projected,
-)
+from bodyscan.alignment.matching import AlignmentPoints, Matches
+from bodyscan.alignment.overlaps import COARSE, OverlapPoints, each_overlap, match_overlap
 from bodyscan.alignment.sway import BODY_CENTRE, SwayPrior, centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.pose_covariance import PoseCovariance
@@ -91,36 +85,27 @@ class Followed:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """What one pair adds: points that take part, and each one's cell; whole: the same points nearly
-    up to the rims, for pairs with which it shares no more."""
+    """What one pair adds: points that take part, and each one's cell."""
 
     start: RigidTransform
-    points: AlignmentPoints
-    whole: AlignmentPoints
+    seen: OverlapPoints
     cell: Indices
 
     @staticmethod
     def of(start: RigidTransform, image: RangeImage, spacing_mm: float) -> _View:
-        points = alignment_points(image, spacing_mm)
-        whole = alignment_points(image, spacing_mm, SEAM_RIM_PX)
-        return _View(start, points, whole, np.zeros(len(points.points), np.int64))
+        seen = OverlapPoints.of(image, spacing_mm)
+        return _View(start, seen, np.zeros(len(seen.inner.points), np.int64))
+
+    @property
+    def points(self) -> AlignmentPoints:
+        return self.seen.inner
 
     def among(self, cell: Indices) -> _View:
         """With the cell of each point; without the points that lie in none."""
         return replace(self, cell=cell).some(cell >= 0)
 
     def some(self, chosen: Mask | slice) -> _View:
-        points, whole = (
-            replace(
-                part,
-                points=part.points[chosen].copy(),
-                normals=part.normals[chosen].copy(),
-                sigma_mm=part.sigma_mm[chosen].copy(),
-                rim=part.rim[chosen].copy(),
-            )
-            for part in (self.points, self.whole)
-        )
-        return _View(self.start, points, whole, self.cell[chosen].copy())
+        return _View(self.start, self.seen.some(chosen), self.cell[chosen].copy())
 
 
 def follow(
@@ -167,7 +152,7 @@ def follow(
             for k, (image, (place, _)) in enumerate(zip(images, both, strict=True))
             if image.velocity is not None and image.time_ms is not None
         }
-        coarse, reach = [view.some(slice(None, None, COARSE)) for view in views], settings.reach_mm
+        coarse, reach = [view.some(COARSE) for view in views], settings.reach_mm
         for left in range(ROUNDS, 0, -1):
             taken = coarse if left > 1 else views
             said = _each_overlap(asks, pool, taken, (motion, cells), reach, settings)
@@ -243,26 +228,17 @@ def _each_overlap(
     placed = [view.start.moved(_rigid(motion, k)) for k, view in enumerate(views)]
     bends = motion.displacements(BENDING)
 
-    def of_two(both: tuple[int, int]) -> Result | None:
+    def of_two(i: int, j: int) -> Result | None:
         """The source carried to where it was when the target was seen."""
-        (i, j), view = both, views[both[0]]
+        view = views[i]
         points, away = placed[i].apply(view.points.points), bends[i] - bends[j]
         points += displaced(away[view.cell], points - cells.centres[view.cell])
-        carried: dict[str, Any] = {
-            "points": points,
-            "normals": placed[i].rotate(view.points.normals),
-        }
+        source = view.seen.carried(points, placed[i].rotate(view.points.normals))
         here, there = RigidTransform.identity(), placed[j]
-        inner, whole = replace(view.points, **carried), replace(view.whole, **carried)
-        found = match_projected(inner, views[j].points, here, there, reach_mm)
-        if len(found.distances) < settings.fewest:
-            found = match_projected(whole, views[j].whole, here, there, reach_mm).of_seam
-        few = len(found.distances) < settings.fewest
-        return None if few else measure(found, view.cell[found.source])
+        found = match_overlap(source, views[j].seen, here, there, reach_mm, settings.fewest)
+        return None if found is None else measure(found, view.cell[found.source])
 
-    every_two = list(permutations(range(len(views)), 2))
-    said = zip(every_two, pool.map(of_two, every_two), strict=True)
-    return {both: result for both, result in said if result is not None}
+    return each_overlap(pool, len(views), of_two)
 
 
 def _both_ways(said: Mapping[tuple[int, int], CellEvidence]) -> dict[tuple[int, int], CellEvidence]:

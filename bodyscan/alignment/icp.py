@@ -12,20 +12,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from itertools import permutations
 from typing import TypeVar
 
 import networkx as nx
 import numpy as np
 
-from bodyscan.alignment.matching import (
-    SEAM_RIM_PX,
-    AlignmentPoints,
-    Matches,
-    alignment_points,
-    match_projected,
-)
+from bodyscan.alignment.matching import Matches
 from bodyscan.alignment.overlap_equations import OverlapEquations, solve_motions
+from bodyscan.alignment.overlaps import COARSE, OverlapPoints, each_overlap, match_overlap
 from bodyscan.alignment.sway import SwayPrior, bound_motions, centre_shifts
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
@@ -36,27 +30,8 @@ from bodyscan.settings import AlignmentSettings
 
 Result = TypeVar("Result")
 
-COARSE = 4  # only one in so many points takes part
 FINE_ROUNDS = 2  # at the end, with all of them
 UNKNOWN = 0, float("nan"), float("nan")
-
-
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """What takes part of one range image: its inner part, and nearly up to its rims, for those with
-    which it shares no more."""
-
-    inner: AlignmentPoints
-    whole: AlignmentPoints
-
-    @staticmethod
-    def of(image: RangeImage, spacing_mm: float) -> _Seen:
-        return _Seen(
-            alignment_points(image, spacing_mm), alignment_points(image, spacing_mm, SEAM_RIM_PX)
-        )
-
-    def subsample(self, step: int) -> _Seen:
-        return _Seen(self.inner.subsample(step), self.whole.subsample(step))
 
 
 @dataclass(frozen=True)
@@ -115,8 +90,8 @@ def align(
     start = [rig_from_camera[name] for name in names]
     sway = SwayPrior.of(settings)
     with ThreadPoolExecutor(workers) as pool:
-        clouds = list(pool.map(lambda image: _Seen.of(image, settings.spacing_mm), images))
-        coarse = [seen.subsample(COARSE) for seen in clouds]
+        clouds = list(pool.map(lambda image: OverlapPoints.of(image, settings.spacing_mm), images))
+        coarse = [seen.some(COARSE) for seen in clouds]
         if settings.matching == "open3d":
             from bodyscan.alignment.open3d_registration import register  # Open3D loads for a second
 
@@ -139,7 +114,7 @@ def align(
         {name: shift[k] for k, name in enumerate(names) if k in tied},
         refused,
         tuple(
-            Overlap(names[i], names[j], COARSE * count, was.get((i, j), UNKNOWN)[1], *apart)
+            Overlap(names[i], names[j], COARSE.step * count, was.get((i, j), UNKNOWN)[1], *apart)
             for (i, j), (count, *apart) in now.items()
         ),
     )
@@ -147,7 +122,7 @@ def align(
 
 def _register(
     pool: ThreadPoolExecutor,
-    clouds: tuple[Sequence[_Seen], Sequence[_Seen]],
+    clouds: tuple[Sequence[OverlapPoints], Sequence[OverlapPoints]],
     start: Sequence[RigidTransform],
     names: Sequence[str],
     prior: PoseCovariance,
@@ -172,25 +147,20 @@ def _register(
 def _each_overlap(
     measure: Callable[[Matches], Result],
     pool: ThreadPoolExecutor,
-    clouds: Sequence[_Seen],
+    clouds: Sequence[OverlapPoints],
     placings: Sequence[RigidTransform],
     reach_mm: float,
     settings: AlignmentSettings,
 ) -> dict[tuple[int, int], Result]:
-    """What the matches of every two pairs say, if they are enough, of their rims where their inner
-    parts are not; both ways, so that what one way gets wrong on curves cancels."""
+    """What the matches of every two pairs say, if they are enough."""
 
-    def of_two(both: tuple[int, int]) -> Result | None:
-        one, other = clouds[both[0]], clouds[both[1]]
-        here, there = placings[both[0]], placings[both[1]]
-        matches = match_projected(one.inner, other.inner, here, there, reach_mm)
-        if len(matches.distances) < settings.fewest:
-            matches = match_projected(one.whole, other.whole, here, there, reach_mm).of_seam
-        return measure(matches) if len(matches.distances) >= settings.fewest else None
+    def of_two(i: int, j: int) -> Result | None:
+        matches = match_overlap(
+            clouds[i], clouds[j], placings[i], placings[j], reach_mm, settings.fewest
+        )
+        return None if matches is None else measure(matches)
 
-    every_two = list(permutations(range(len(clouds)), 2))
-    found = zip(every_two, pool.map(of_two, every_two), strict=True)
-    return {both: said for both, said in found if said is not None}
+    return each_overlap(pool, len(clouds), of_two)
 
 
 def _largest_group(overlaps: Iterable[tuple[int, int]]) -> set[int]:

@@ -44,15 +44,13 @@ class AlignmentPoints:
     sigma_mm: Array
     rim: Mask
 
-    def subsample(self, step: int) -> AlignmentPoints:
-        """Every `step`th point."""
-        some = slice(None, None, step)
+    def some(self, chosen: Mask | slice) -> AlignmentPoints:
         return replace(
             self,
-            points=self.points[some].copy(),
-            normals=self.normals[some].copy(),
-            sigma_mm=self.sigma_mm[some].copy(),
-            rim=self.rim[some].copy(),
+            points=self.points[chosen].copy(),
+            normals=self.normals[chosen].copy(),
+            sigma_mm=self.sigma_mm[chosen].copy(),
+            rim=self.rim[chosen].copy(),
         )
 
 

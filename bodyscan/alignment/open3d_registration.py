@@ -17,6 +17,7 @@ import open3d as o3d
 
 from bodyscan.alignment.matching import FACING, AlignmentPoints, Matches
 from bodyscan.alignment.overlap_equations import OverlapEquations
+from bodyscan.alignment.overlaps import COARSE
 from bodyscan.alignment.sway import SwayPrior
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
@@ -26,8 +27,6 @@ from bodyscan.settings import AlignmentSettings
 
 registration = o3d.pipelines.registration
 
-COARSE = 4
-"""One in so many points takes part but for the last reach."""
 STEPS = 15
 """Times that ICP matches anew with one reach, at most."""
 KERNEL = 0.15
@@ -50,7 +49,7 @@ def register(
     """Motions (P, 6) of the pairs, rig frame, that bring their overlaps together."""
     both = list(zip(clouds, rig_from_camera, strict=True))
     fine = [_Placed.of(seen, at) for seen, at in both]
-    coarse = [_Placed.of(seen.subsample(COARSE), at) for seen, at in both]
+    coarse = [_Placed.of(seen.some(COARSE), at) for seen, at in both]
     sway, scale = SwayPrior.of(settings), 1.0
     widest = PoseCovariance(tuple(names), sway.covariance(names, prior, sway.most))
     edges: dict[tuple[int, int], _Edge] = {}
@@ -109,7 +108,7 @@ def _bring_together(
         found = registration.registration_icp(
             source.cloud, target.cloud, reach, motion, estimation, steps
         )
-        if len(found.correspondence_set) < settings.fewest / COARSE:
+        if len(found.correspondence_set) < settings.fewest / COARSE.step:
             return None
         motion = found.transformation
         if reach <= settings.least_reach_mm:

@@ -1,0 +1,77 @@
+"""What the overlaps of every two range images say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import permutations
+from typing import TypeVar
+
+from bodyscan.alignment.matching import (
+    SEAM_RIM_PX,
+    AlignmentPoints,
+    Matches,
+    alignment_points,
+    match_projected,
+)
+from bodyscan.arrays import Array, Mask
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.reconstruction.range_image import RangeImage
+
+Result = TypeVar("Result")
+
+COARSE = slice(None, None, 4)
+"""Of the points; all take part but at the end."""
+
+
+@dataclass(frozen=True, eq=False)
+class OverlapPoints:
+    """What takes part of one range image: its inner part; and the same points nearly up to its rims,
+    for those with which it shares no more."""
+
+    inner: AlignmentPoints
+    whole: AlignmentPoints
+
+    @staticmethod
+    def of(image: RangeImage, spacing_mm: float) -> OverlapPoints:
+        return OverlapPoints(
+            alignment_points(image, spacing_mm), alignment_points(image, spacing_mm, SEAM_RIM_PX)
+        )
+
+    def some(self, chosen: Mask | slice) -> OverlapPoints:
+        return OverlapPoints(self.inner.some(chosen), self.whole.some(chosen))
+
+    def carried(self, points: Array, normals: Array) -> OverlapPoints:
+        """The same points elsewhere: (N, 3) each."""
+        inner, whole = (
+            replace(part, points=points, normals=normals) for part in (self.inner, self.whole)
+        )
+        return OverlapPoints(inner, whole)
+
+
+def match_overlap(
+    source: OverlapPoints,
+    target: OverlapPoints,
+    rig_from_source: RigidTransform,
+    rig_from_target: RigidTransform,
+    reach_mm: float,
+    fewest: int,
+) -> Matches | None:
+    """As `match_projected`: of the inner parts, or if these share less than `fewest` spots, of all up
+    to the rims, believed less; None if that is too little too."""
+    there = rig_from_source, rig_from_target, reach_mm
+    matches = match_projected(source.inner, target.inner, *there)
+    if len(matches.distances) < fewest:
+        matches = match_projected(source.whole, target.whole, *there).of_seam
+    return matches if len(matches.distances) >= fewest else None
+
+
+def each_overlap(
+    pool: ThreadPoolExecutor, count: int, of_two: Callable[[int, int], Result | None]
+) -> dict[tuple[int, int], Result]:
+    """What is said of each of `count` images as source and each other as target, where anything is:
+    both ways, so that what one way gets wrong on curves cancels."""
+    every_two = list(permutations(range(count), 2))
+    found = zip(every_two, pool.map(lambda both: of_two(*both), every_two), strict=True)
+    return {both: said for both, said in found if said is not None}
