@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +36,13 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Announce, Verdict, say_nothing
 
+Merged = Callable[[BodyCloud], None]
+"""Takes a scan's cloud as soon as it is there, before it is meshed."""
+
+
+def no_use(cloud: BodyCloud) -> None:
+    """Where nobody waits for the cloud."""
+
 
 @dataclass(frozen=True, eq=False)
 class Scan:
@@ -66,11 +73,14 @@ def fuse(
     *,
     empty: Sequence[RangeImage] = (),
     announce: Announce = say_nothing,
+    merged: Merged = no_use,
 ) -> Scan:
     """Range images of one person, background and all, to body model and mesh.
 
     measured: with the pairs that gave none as failures. empty: as in `clean`. announce: told what the
-    points alone say of the scan, before the mesh is made. Raises ScanFailed if they show no body.
+    points alone say of the scan, before the mesh is made. merged: given the cloud then.
+
+    Raises ScanFailed if they show no body.
     """
     images = measured.value
     with step(progress, "cleaning"):
@@ -126,6 +136,7 @@ def fuse(
     with step(progress, "judging"):
         seams = judge_seams(seen, there, calibration.rig.poles)
         announce(graded(None, None), final=False)
+    merged(cloud)
     with step(progress, "meshing"):
         surface = _breathing(mesh(cloud, settings.mesh, images, placing), followed)
         carried = {image.pair: image for image in seen}

@@ -26,6 +26,7 @@ from bodyscan.fusion.scan_facts import (
 )
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
+from bodyscan.progress import threaded
 from bodyscan.verdict import Verdict
 from bodyscan.version import __version__
 
@@ -80,13 +81,18 @@ def save_scan(
 ) -> Path:
     """Write the body model and what it is into `folder`; returns the path of scan.json."""
     (folder / FILE_NAME).unlink(missing_ok=True)
-    write_ply(folder / CLOUD_NAME, scan.cloud)
-    write_ply(folder / MESH_NAME, scan.mesh)
+
+    def write(name: str) -> str:
+        write_ply(folder / name, scan.cloud if name == CLOUD_NAME else scan.mesh)
+        return file_hash(folder / name)
+
+    names = (CLOUD_NAME, MESH_NAME)
+    digests = threaded(write, names, stage="writing")
     write_json(
         folder / FILE_NAME,
         _origin(calibration_id, subject, when, simulated)
         | {
-            "sha256": {name: file_hash(folder / name) for name in (CLOUD_NAME, MESH_NAME)},
+            "sha256": dict(zip(names, digests, strict=True)),
             "counts": {
                 "points": len(scan.cloud.points),
                 "vertices": len(scan.mesh.vertices),

@@ -5,7 +5,7 @@ Orthographic views side by side in one PNG.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,25 +33,47 @@ from bodyscan.report.canvas import (
 FILLED_TINT = (60, 160, 255)  # blue, green, red: orange
 WRONG_SIDE = (200, 40, 200)
 SLICE_POINTS = 20_000  # of a body's cloud, 40 mm of the trunk: far thicker than a gap
+Pictures = Outcome[dict[str, bytes]]
+"""PNG files by their names; those that could not be drawn are noted."""
 AZIMUTHS_DEG = {"front": 0.0, "side": 90.0, "back": 180.0}
 """Where the viewer of each view stands, from the subject's front towards its left."""
 
 
-def draw_scan(cloud: BodyCloud, mesh: BodyMesh, folder: Path) -> Outcome[list[Path]]:
-    """The pictures that a scan leaves beside its result: the cloud by photo, sigma and number of
-    pairs, and the mesh with its filled faces marked. One that cannot be drawn is noted."""
-    pictures = {
-        "cloud.png": partial(draw_cloud, cloud, colour="photo"),
-        "sigma.png": partial(draw_cloud, cloud, colour="sigma"),
-        "pairs.png": partial(draw_cloud, cloud, colour="pairs_seen"),
-        "mesh.png": partial(draw_mesh, mesh),
-    }
-    drawn: list[Path] = []
+def cloud_pictures(cloud: BodyCloud) -> Pictures:
+    """The cloud by photo, sigma and number of pairs."""
+    return _drawn(
+        {
+            "cloud.png": partial(draw_cloud, cloud, colour="photo"),
+            "sigma.png": partial(draw_cloud, cloud, colour="sigma"),
+            "pairs.png": partial(draw_cloud, cloud, colour="pairs_seen"),
+        }
+    )
+
+
+def mesh_pictures(mesh: BodyMesh) -> Pictures:
+    """The mesh with its filled faces marked."""
+    return _drawn({"mesh.png": partial(draw_mesh, mesh)})
+
+
+def write_pictures(pictures: Iterable[Pictures], folder: Path) -> Outcome[list[Path]]:
+    """What a scan leaves beside its result. A picture that cannot be drawn or written is noted."""
+    written: list[Path] = []
+    notes: list[str] = []
+    for some in pictures:
+        notes += some.notes
+        for name, content in some.value.items():
+            with optional(name, notes.append):
+                write_bytes(folder / name, content)
+                written.append(folder / name)
+    return Outcome(written, tuple(notes))
+
+
+def _drawn(pictures: Mapping[str, Callable[[], bytes]]) -> Pictures:
+    drawn: dict[str, bytes] = {}
     notes: list[str] = []
     for name, draw in pictures.items():
         with optional(name, notes.append):
-            write_bytes(folder / name, draw())
-            drawn.append(folder / name)
+            drawn[name] = draw()
     return Outcome(drawn, tuple(notes))
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from bodyscan.captures.folder import open_scan
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.scan import Scan
 from bodyscan.fusion.storage import clear, save_failure, save_scan
+from bodyscan.mesh.body import BodyCloud
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, step
 from bodyscan.registration.storage import calibration_id, load_calibration
-from bodyscan.report.pictures import draw_scan
+from bodyscan.report.pictures import Pictures, cloud_pictures, mesh_pictures, write_pictures
 from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Announce, say_nothing
 from bodyscan.workflows.resident import Resident
@@ -30,8 +32,8 @@ def scan_folder(
     resident: Resident | None = None,
     announce: Announce = say_nothing,
 ) -> tuple[Scan, Path, Outcome[list[Path]]]:
-    """The scan, its scan.json in `out`, and the pictures beside it, drawn once the result is kept.
-    A result that lay there goes.
+    """The scan, its scan.json in `out`, and the pictures beside it, written once the result is kept.
+    A result that lay there goes. The cloud is drawn while it is meshed, where a core is free.
 
     empty: captures of the rig with nobody in it. follow_links: though the calibration's rig file does
     not say so. resident: what was loaded and decoded before. announce: told the verdict as the points
@@ -47,21 +49,35 @@ def scan_folder(
     made = resident.made_of(captures) if resident else {}
     origin = calibration_id(calibration)
     subject, when, simulated = captures.subject, captures.when, captures.simulated
-    try:
-        scan = scan_person(
-            rig, captures, settings, progress, empty=nobody, made=made, announce=announce
-        )
-    except ScanFailed as error:
-        clear(out)
-        save_failure(
-            error, out, calibration_id=origin, subject=subject, when=when, simulated=simulated
-        )
-        raise
-    clear(out)
-    saved = save_scan(
-        scan, out, calibration_id=origin, subject=subject, when=when, simulated=simulated
-    )
-    announce(scan.verdict, final=True)
-    with step(progress, "drawing"):
-        pictures = draw_scan(scan.cloud, scan.mesh, out)
+    drawn: list[Future[Pictures]] = []
+    with ThreadPoolExecutor(1) as beside:
+
+        def draw(cloud: BodyCloud) -> None:
+            drawn.append(beside.submit(cloud_pictures, cloud))
+
+        try:
+            scan = scan_person(
+                rig,
+                captures,
+                settings,
+                progress,
+                empty=nobody,
+                made=made,
+                announce=announce,
+                merged=draw,
+            )
+        except ScanFailed as error:
+            clear(out)
+            save_failure(
+                error, out, calibration_id=origin, subject=subject, when=when, simulated=simulated
+            )
+            raise
+        with step(progress, "writing"):
+            drawn.append(beside.submit(mesh_pictures, scan.mesh))
+            clear(out)
+            saved = save_scan(
+                scan, out, calibration_id=origin, subject=subject, when=when, simulated=simulated
+            )
+            announce(scan.verdict, final=True)
+            pictures = write_pictures((each.result() for each in drawn), out)
     return scan, saved, pictures

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.fusion.scan import Scan, fuse
+from bodyscan.fusion.scan import Merged, Scan, fuse, no_use
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
@@ -23,13 +23,22 @@ def scan_person(
     empty: Captures | None = None,
     made: Mapping[ImageSequence, Reconstructed] = MappingProxyType({}),
     announce: Announce = say_nothing,
+    merged: Merged = no_use,
 ) -> Scan:
     """Person images in, body model and mesh out.
 
     empty: captures of the rig without anybody in it, whose surfaces are no part of the subject.
-    made: see `reconstruct_range_images`.  announce: see `fuse`.
+    made: see `reconstruct_range_images`.  announce, merged: see `fuse`.
     Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left.
     """
     images = reconstruct_range_images(calibration, captures, progress, made=made)
     background = reconstruct_range_images(calibration, empty, progress).value if empty else ()
-    return fuse(calibration, images, settings, progress, empty=background, announce=announce)
+    return fuse(
+        calibration,
+        images,
+        settings,
+        progress,
+        empty=background,
+        announce=announce,
+        merged=merged,
+    )

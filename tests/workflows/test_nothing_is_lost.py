@@ -90,7 +90,8 @@ def test_a_picture_that_cannot_be_drawn_costs_itself_alone(
     scan = make_scan(tmp_path / "scan")
     before = {name: file_hash(scan.folder / name) for name in ("cloud.ply", "mesh.ply")}
     monkeypatch.setattr(pictures, "draw_mesh", broken)
-    drawn = pictures.draw_scan(scan.cloud, scan.mesh, scan.folder)
+    every = pictures.cloud_pictures(scan.cloud), pictures.mesh_pictures(scan.mesh)
+    drawn = pictures.write_pictures(every, scan.folder)
     assert [path.name for path in drawn.value] == ["cloud.png", "sigma.png", "pairs.png"]
     assert all(path.exists() for path in drawn.value)
     (note,) = drawn.notes
