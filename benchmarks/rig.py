@@ -88,7 +88,7 @@ Others on the same corners of the first seed, each camera calibrated by itself b
 of a plain board is which is told to them. Here all are carried by one motion onto the true camera
 centres, since they know no rig frame. Ratios to ours in brackets. By default aniposelib refines the
 lenses too, with one focal length a camera, which these cameras do not have; "lenses kept": it does not.
-caliscope is not run: rig_rivals.py hands it boards with one face only.
+OpenCV and caliscope get each face of a board as a flat board of its own.
 
 | rig, board | | centres RMS mm | rotations RMS degrees | s wall | s CPU |
 |---|---|---|---|---|---|
@@ -218,8 +218,6 @@ def _rival_rows(
         f"{ours.seconds:.1f} | {ours.cpu:.1f} |"
     ]
     for method, label in RIVALS.items():
-        if method == "caliscope" and seen.rig.boards[0].faces > 1:
-            continue  # rig_rivals.py hands it boards with one face only
         found = run_rival(method, seen.rig.boards[0], placed.views, cameras)
         if isinstance(found, str):
             rows.append(f"| | {label} | {found} | | | |")

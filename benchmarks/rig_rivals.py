@@ -31,27 +31,21 @@ FEWEST = 8
 KEEP = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
 
 
-def opencv_multiview(corners: Corners) -> Found:
-    """OpenCV 5's calibrateMultiview, corners not seen marked as its manual says.
+def opencv_multiview(corners: Corners, *, partly: bool = False) -> Found:
+    """OpenCV 5's calibrateMultiview, on boards seen whole.
 
-    It takes flat patterns only: each face of a two-faced board is a frame of its own.  Metres: it
-    takes points in millimetres for collinear.
+    partly: boards seen in part too, their other corners marked as its manual says.  Metres: it takes
+    points in millimetres for collinear.
     """
-    pixels, seen = _seen(corners)
-    faces = 1 + int(np.ptp(corners["points"][:, 2]) > 0)
-    front = len(corners["points"]) // faces
-    pixels = np.concatenate(np.split(pixels, faces, axis=2), axis=1)
-    seen = np.concatenate(np.split(seen, faces, axis=2), axis=1)
-    used = (seen.sum(axis=2) >= FEWEST).any(axis=0)
-    pixels, seen = pixels[:, used], seen[:, used]
-    face = np.repeat(np.arange(faces), len(used) // faces)[used]
-    mask = seen.sum(axis=2) >= FEWEST
+    pixels, points = _faces_apart(corners)
+    seen = np.isfinite(pixels[..., 0])
+    mask = seen.sum(axis=2) >= (FEWEST if partly else seen.shape[2])
+    used = mask.any(axis=0)
+    pixels, seen, mask, points = pixels[:, used], seen[:, used], mask[:, used], points[used]
     count = len(mask)
     marked = np.where(seen[..., None], pixels, -1.0).astype(np.float32)
-    printed = corners["points"].reshape(faces, front, 3).astype(np.float32) / 1000.0
-    printed[..., 2] = 0.0
     _, matrices, lenses, rotations, shifts = cv2.calibrateMultiview(
-        [printed[f] for f in face],
+        list((points / 1000.0).astype(np.float32)),
         [list(marked[k]) for k in range(count)],
         [tuple(int(v) for v in corners["size"])] * count,
         mask.astype(np.uint8),
@@ -162,7 +156,7 @@ def aniposelib(corners: Corners, *, lenses_kept: bool = False) -> Found:
 
 def caliscope(corners: Corners) -> Found:
     """caliscope's whole pipeline: pairwise poses, bundle adjustment with the board's distances as
-    constraints, outliers out, once more.  Metres; boards with one face only."""
+    constraints, outliers out, once more.  Metres; each face of a board is a frame of its own."""
     from caliscope.api import (  # type: ignore[import-not-found]
         CameraArray,
         CameraData,
@@ -173,23 +167,24 @@ def caliscope(corners: Corners) -> Found:
     )
     from pandas import DataFrame  # type: ignore[import-untyped]
 
-    pixels, seen = _seen(corners)
+    pixels, points = _faces_apart(corners)
+    seen = np.isfinite(pixels[..., 0])
     columns, rows, square = corners["grid"]
     board = Charuco.from_squares(
         columns=int(columns), rows=int(rows), square_size_cm=float(square) / 10.0
     )
     # Its constraints name corners as OpenCV's board does: row by row.
-    across, down = (np.round(corners["points"][:, k] / square).astype(int) - 1 for k in (0, 1))
-    names = down * (int(columns) - 1) + across
+    across, down = (np.round((p - p.min()) / square).astype(int) for p in points.T[:2])
+    names = (down * (int(columns) - 1) + across).T
     camera, frame, corner = np.nonzero(seen)
     table = DataFrame(
         {
             "sync_index": frame,
             "cam_id": camera,
             "object_id": 0,
-            "keypoint_id": names[corner],
+            "keypoint_id": names[frame, corner],
             **{f"img_loc_{axis}": pixels[seen][:, k] for k, axis in enumerate("xy")},
-            **{f"obj_loc_{a}": corners["points"][corner, k] / 1e3 for k, a in enumerate("xyz")},
+            **{f"obj_loc_{a}": points[frame, corner, k] / 1e3 for k, a in enumerate("xyz")},
         }
     )
     cameras = {
@@ -217,11 +212,21 @@ def caliscope(corners: Corners) -> Found:
 
 METHODS: dict[str, Callable[[Corners], Found]] = {
     "opencv-multiview": opencv_multiview,
+    "opencv-multiview-partly": partial(opencv_multiview, partly=True),
     "stereo-chain": stereo_chain,
     "aniposelib": aniposelib,
     "aniposelib-lenses-kept": partial(aniposelib, lenses_kept=True),
     "caliscope": caliscope,
 }
+
+
+def _faces_apart(corners: Corners) -> tuple[Array, Array]:
+    """Pixels (C, G, M, 2) and points (G, M, 3), z = 0, mm: each face of each frame as a flat board."""
+    pixels, points = np.asarray(corners["pixels"], float), np.asarray(corners["points"], float)
+    faces = 1 + int(np.ptp(points[:, 2]) > 0)
+    frames = pixels.shape[1]
+    flat = points.reshape(faces, -1, 3) * [1.0, 1.0, 0.0]
+    return np.concatenate(np.split(pixels, faces, axis=2), axis=1), np.repeat(flat, frames, axis=0)
 
 
 def _seen(corners: Corners) -> tuple[Array, Mask]:

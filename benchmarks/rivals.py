@@ -22,7 +22,8 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 
 RIVALS = {
-    "opencv-multiview": "OpenCV 5 `calibrateMultiview`",
+    "opencv-multiview": "OpenCV 5 `calibrateMultiview`, boards seen whole",
+    "opencv-multiview-partly": "OpenCV 5 `calibrateMultiview`, in part too",
     "aniposelib": "aniposelib",
     "aniposelib-lenses-kept": "aniposelib, lenses kept",
     "caliscope": "caliscope",
