@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +36,13 @@ BIN_PX = 16
 """Along a boundary, which is straight over so short a piece: its sagitta is below a thousandth of a
 pixel. Ten times fewer points are left."""
 
+AROUND_PX = 16.0
+"""Decoding a boundary looks at pixels up to 7 px beside it (`indirect_light`, `albedo_edges`), and at
+boundaries of its run up to 6 px away, which look so far in turn."""
+
+Box = tuple[Array, Array]
+"""Least and greatest (u, v), px."""
+
 
 @dataclass(frozen=True, eq=False)
 class BoardBoundaries:
@@ -67,34 +74,50 @@ class StripedView:
         return self.view.camera_from_board @ RigidTransform(np.eye(3), np.array([0.0, 0.0, z_mm]))
 
 
-def boundaries_near(stripes: StripeMap, view: BoardView, crop: Crop = WHOLE) -> BoardBoundaries:
-    """The boundaries within the box around the view: all that its board can hold.
+def boundaries_near(stripes: StripeMap, box: Box, crop: Crop = WHOLE) -> BoardBoundaries:
+    """The boundaries within a box around a view.
 
     crop: rows and columns of the image that the stripe map is of."""
-    low, high = _box(view)
+    low, high = box
     pixels = stripes.boundary_pixels + [crop[1].start or 0, crop[0].start or 0]
     near = np.all((pixels >= low) & (pixels <= high), axis=1)
     return BoardBoundaries(
         stripes.boundary_index[near],
         pixels[near],
         stripes.boundary_sigma_px[near].astype(np.float64),
-        boundaries_near(stripes.crossing, view, crop) if stripes.crossing is not None else None,
+        boundaries_near(stripes.crossing, box, crop) if stripes.crossing is not None else None,
     )
 
 
-def crop_around(views: Iterable[BoardView]) -> Crop:
-    """Rows and columns that hold the boxes around all views of an image."""
-    boxes = np.array([_box(view) for view in views])
-    left, top = np.floor(np.maximum(boxes[:, 0].min(axis=0), 0.0)).astype(int)
-    right, bottom = np.ceil(boxes[:, 1].max(axis=0)).astype(int) + 1
+def crop_around(boxes: Sequence[Box]) -> Crop:
+    """Rows and columns that hold all boxes of an image."""
+    lows, highs = zip(*boxes, strict=True)
+    left, top = np.floor(np.maximum(np.min(lows, axis=0), 0.0)).astype(int)
+    right, bottom = np.ceil(np.max(highs, axis=0)).astype(int) + 1
     return slice(int(top), int(bottom)), slice(int(left), int(right))
 
 
-def _box(view: BoardView) -> tuple[Array, Array]:
-    """Least and greatest (u, v) between which its board lies, of which not all corners may be seen."""
+def box_around(view: BoardView | LocatedView) -> Box:
+    """Where its board lies, of which not all corners may be seen."""
     low, high = view.pixels.min(axis=0), view.pixels.max(axis=0)
     reach = 0.5 * (high - low)
     return low - reach, high + reach
+
+
+def box_of_print(camera: Camera, board: Board, view: LocatedView) -> Box:
+    """Where a board of known pose shows its print: a part of the box around its view."""
+    low, high = box_around(view)
+    grid = np.indices((board.columns + 1, board.rows + 1)).reshape(2, -1).T * board.square_mm
+    on_face = np.column_stack([grid, np.full(len(grid), view.points[0, 2])])
+    points = view.camera_from_board.apply(on_face)
+    ideal = points[:, :2] / points[:, 2:]
+    if np.any(points[:, 2] <= 0.0) or np.hypot(*ideal.T).max() >= camera.lens.fold_radius:
+        return low, high
+    shown = camera.project(points)
+    return (
+        np.maximum(low, shown.min(axis=0) - AROUND_PX),
+        np.minimum(high, shown.max(axis=0) + AROUND_PX),
+    )
 
 
 def boundaries_on_boards(

@@ -20,21 +20,22 @@ BAD_STREAM = cast("type[Exception]", isal_zlib.error)
 SUB, UP, AVERAGE, PAETH = 1, 2, 3, 4
 
 
-def decode_grey_png(data: bytes, width: int, height: int) -> Bytes | None:
-    """(height, width) uint8; None if the file, whose chunks are sound, shows something else than a
-    grey image of that size, or nothing."""
+def decode_grey_png(data: bytes, width: int, height: int, rows: int | None = None) -> Bytes | None:
+    """(height, width) uint8, or its first rows; None if the file, whose chunks are sound, shows
+    something else than a grey image of that size, or nothing."""
     if data[16:29] != struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0):
         return None
     packed = b"".join(content for kind, content, _ in png_chunks(data) if kind == b"IDAT")
-    # No more is inflated than belongs to the image, whatever the file holds.
+    # No more is inflated than is wanted, whatever the file holds.
+    wanted = height if rows is None else min(rows, height)
     try:
-        rows = isal_zlib.decompressobj().decompress(packed, height * (width + 1))
+        filtered = isal_zlib.decompressobj().decompress(packed, wanted * (width + 1))
     except BAD_STREAM:
         return None
-    if len(rows) < height * (width + 1):
+    if len(filtered) < wanted * (width + 1):
         return None
-    image = np.empty((height, width), np.uint8)
-    known = _unfilter(np.frombuffer(rows, np.uint8).reshape(height, width + 1), image)
+    image = np.empty((wanted, width), np.uint8)
+    known = _unfilter(np.frombuffer(filtered, np.uint8).reshape(wanted, width + 1), image)
     return image if known else None
 
 

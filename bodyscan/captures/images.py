@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -19,6 +20,7 @@ from bodyscan.captures.image_faults import header_fault, image_error, missing_er
 from bodyscan.captures.image_header import png_damage
 from bodyscan.errors import ImageError
 from bodyscan.files.regular import read_regular
+from bodyscan.geometry.crop import WHOLE, Crop
 from bodyscan.progress import THREADS
 from bodyscan.rig.pair import CameraSpec, Pair
 from bodyscan.stripes.decoding import images_by_kind
@@ -75,9 +77,10 @@ def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
 
 
 def read_sequence(
-    sequence: ImageSequence, camera: CameraSpec, *, workers: int = THREADS
+    sequence: ImageSequence, camera: CameraSpec, *, crop: Crop = WHOLE, workers: int = THREADS
 ) -> StripeImages:
-    """All images of a stripe sequence; of several exposures, the best of each pixel.
+    """All images of a stripe sequence, of these rows and columns; of several exposures, the best of
+    each pixel.
 
     Raises ImageError as `read_image`, where exposures are not in their order, and where the sequence
     is an image of the board alone.
@@ -88,7 +91,9 @@ def read_sequence(
             where=f"{sequence.lit} (pair {sequence.pair}, shot {sequence.shot})",
             remedy="Take the stripes as well, or leave this pair out of this shot.",
         )
-    stacks = [_read_stack(exposure, camera, workers) for exposure in (sequence, *sequence.longer)]
+    stacks = [
+        _read_stack(exposure, camera, crop, workers) for exposure in (sequence, *sequence.longer)
+    ]
     names = [exposure.exposure for exposure in (sequence, *sequence.longer)]
     where = f"pair {sequence.pair}, shot {sequence.shot}"
     whole = stacks[0] if len(stacks) == 1 else merge_exposures(stacks, names, where)
@@ -100,30 +105,35 @@ def read_sequence(
     return StripeImages(sequence.pair, sequence.shot, lit, dark, coded)
 
 
-def _read_stack(sequence: ImageSequence, camera: CameraSpec, workers: int) -> Greys:
+def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers: int) -> Greys:
     """(F, H, W) grey levels of one exposure: lit and dark, if there are such, and those of the code."""
     taken = [path for path in (sequence.lit, sequence.dark) if path is not None]
     paths = (*taken, *sequence.coded)
     missing = [path for path in paths if path in sequence.missing]
     if missing:
         raise missing_error(missing, sequence.inverses, sequence.pair, sequence.shot)
-    first = _read_raw(paths[0], camera, sequence.pair, sequence.shot)
-    stack = np.empty((len(paths), *first.shape), first.dtype)
-    stack[0] = first
+    read = partial(
+        _read_raw, camera=camera, pair=sequence.pair, shot=sequence.shot, rows=crop[0].stop
+    )
+    first = read(paths[0])
+    # What white is in files of 16 bits, all of their numbers tell.
+    early, late = (crop, WHOLE) if first.dtype == np.uint8 else (WHOLE, crop)
+    stack = np.empty((len(paths), *first[early].shape), first.dtype)
+    stack[0] = first[early]
 
     def read_into(place: int) -> None:
-        image = _read_raw(paths[place], camera, sequence.pair, sequence.shot)
+        image = read(paths[place])
         if image.dtype != first.dtype:
             bits = (
                 f"{8 * image.itemsize} bits a sample, but {paths[0].name} has {8 * first.itemsize}"
             )
             raise image_error(f"has {bits}", paths[place], sequence.pair, sequence.shot)
-        stack[place] = image
+        stack[place] = image[early]
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(read_into, range(1, len(paths))))
     scale = _scale(list(stack), camera, paths[0], sequence.pair, sequence.shot)
-    return as_greys(stack, scale)
+    return as_greys(np.ascontiguousarray(stack[(slice(None), *late)]), scale)
 
 
 def _scale(images: list[Raw], camera: CameraSpec, path: Path, pair: str, shot: str) -> float:
@@ -134,9 +144,9 @@ def _scale(images: list[Raw], camera: CameraSpec, path: Path, pair: str, shot: s
         raise image_error(error.what, path, pair, shot, remedy=error.remedy or "") from None
 
 
-def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str) -> Raw:
+def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str, rows: int | None = None) -> Raw:
     """The numbers of an image file, (height, width) uint8 or uint16; of a colour image those of the
-    camera's channel, grey being luma.
+    camera's channel, grey being luma.  rows: no more than the first need be read.
 
     The size is compared with the header before anything is decoded. A turn noted in EXIF is not
     applied, since it would swap the camera's axes. Raises ImageError: missing, no image, of the wrong
@@ -151,7 +161,7 @@ def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str) -> Raw:
     damage = png_damage(data) if is_png else None
     if damage:
         raise image_error(damage, path, pair, shot)
-    image = decode_grey_png(data, width, height) if is_png else None
+    image = decode_grey_png(data, width, height, rows) if is_png else None
     if image is not None and camera.channel == "grey":
         return image
     found = _decoded(data, camera.channel)

@@ -11,7 +11,13 @@ from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import CameraCalibration, locate_board
 from bodyscan.calibration.pair import PairCalibration, PlacedPair, calibrate_pair
-from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_print
+from bodyscan.calibration.striped_view import (
+    BoardBoundaries,
+    Box,
+    StripedView,
+    box_of_print,
+    on_print,
+)
 from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.captures.unlisted_images import describe_unlisted_images
 from bodyscan.errors import BadInput, BodyscanError, FailedWork, listed, plainly
@@ -168,6 +174,10 @@ def _decode(
     on the print alone."""
     used = {view.key: view for view in placed.views}
 
+    def box(view: BoardView) -> Box:
+        located = _as_solved(placed, used[view.key])
+        return box_of_print(placed.cameras[view.pair], rig.board(view.board), located)
+
     def printed(view: BoardView, seen: BoardBoundaries) -> BoardBoundaries:
         shot = striped(rig, placed, used[view.key], seen)
         code = rig.pair(view.pair).projector
@@ -176,7 +186,7 @@ def _decode(
         return on_print(camera, code, shot.board, shot.camera_from_face, seen)
 
     wanted = [view for view in views if view.key in used]
-    return decode_on_boards(rig, captures, wanted, progress, keep=printed)
+    return decode_on_boards(rig, captures, wanted, progress, box=box, keep=printed)
 
 
 def _fit_sheets(
@@ -205,13 +215,18 @@ def _fit_sheets(
 def striped(rig: Rig, placed: RigSolution, view: LocatedView, seen: BoardBoundaries) -> StripedView:
     """A view with its stripes, its board where the joint solve has it."""
     shape = placed.board_shapes.get(view.board)
-    camera_from_rig = placed.rig_from_camera[view.pair].inverse()
     return StripedView(
-        replace(view, camera_from_board=camera_from_rig @ placed.rig_from_board[view.target]),
+        _as_solved(placed, view),
         rig.board(view.board),
         seen,
         shape.face(view.points) if shape else None,
     )
+
+
+def _as_solved(placed: RigSolution, view: LocatedView) -> LocatedView:
+    """A view with its board where the joint solve has it."""
+    camera_from_rig = placed.rig_from_camera[view.pair].inverse()
+    return replace(view, camera_from_board=camera_from_rig @ placed.rig_from_board[view.target])
 
 
 def _placed_pair(

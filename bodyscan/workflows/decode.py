@@ -7,13 +7,15 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
-from typing import cast
 
-import numpy as np
-
-from bodyscan.arrays import Greys
 from bodyscan.boards.view import BoardView, ViewKey
-from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_near, crop_around
+from bodyscan.calibration.striped_view import (
+    BoardBoundaries,
+    Box,
+    boundaries_near,
+    box_around,
+    crop_around,
+)
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import BodyscanError, DecodingFailed, ImageError, plainly
@@ -60,13 +62,15 @@ def decode_sequence(
         raise DecodingFailed("this pair has no projector", where=where)
 
     def decode(sequence: ImageSequence, projector: StripeCode) -> StripeMap:
-        images = read_sequence(sequence, pair.camera, workers=workers)
-        lit, dark = (
-            None if image is None else _cut(image, crop) for image in (images.lit, images.dark)
-        )
-        coded = _cut(images.coded, crop)
+        images = read_sequence(sequence, pair.camera, crop=crop, workers=workers)
         return decode_stripes(
-            projector, lit, dark, coded, limits=limits, moments=moments, where=where
+            projector,
+            images.lit,
+            images.dark,
+            images.coded,
+            limits=limits,
+            moments=moments,
+            where=where,
         )
 
     one_way = sequence.without_crossing, pair.projector.model_copy(update={"crossing": None})
@@ -81,11 +85,6 @@ def decode_sequence(
         return replace(decode(*one_way), crossing_fault=str(error))
 
 
-def _cut(images: Greys, crop: Crop) -> Greys:
-    rows, columns = crop
-    return cast(Greys, np.ascontiguousarray(images[..., rows, columns]))
-
-
 def _all(view: BoardView, boundaries: BoardBoundaries) -> BoardBoundaries:
     return boundaries
 
@@ -96,12 +95,13 @@ def decode_on_boards(
     views: Iterable[BoardView],
     progress: Progress = silent,
     *,
+    box: Callable[[BoardView], Box] = box_around,
     keep: Keep = _all,
 ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
     """Stripe boundaries near each of these views; sequences that are bad are noted.
 
-    keep: what is kept of a view's, of which a rig has tens of millions.  A pair of which none can be
-    decoded is a failure.
+    box: where the board of a view shows stripes that are wanted.  keep: what is kept of a view's, of
+    which a rig has tens of millions.  A pair of which none can be decoded is a failure.
     """
     wanted: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
     for view in views:
@@ -113,11 +113,15 @@ def decode_on_boards(
 
     def decode(sequence: ImageSequence) -> dict[ViewKey, BoardBoundaries]:
         own = wanted[sequence.pair, sequence.shot]
-        crop = crop_around(own)
+        boxes = [box(view) for view in own]
+        crop = crop_around(boxes)
         stripes = decode_sequence(sequence, rig.pair(sequence.pair), crop=crop)
         responses[sequence.pair] += responses_in(stripes)
         one_way[sequence] = stripes.crossing_fault
-        return {view.key: keep(view, boundaries_near(stripes, view, crop)) for view in own}
+        return {
+            view.key: keep(view, boundaries_near(stripes, near, crop))
+            for view, near in zip(own, boxes, strict=True)
+        }
 
     decoded, errors = attempt_each(
         decode, sequences, BodyscanError, stage="decoding stripes", progress=progress

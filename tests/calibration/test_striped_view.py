@@ -12,13 +12,17 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.board_form import BoardFace
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.striped_view import (
+    AROUND_PX,
     BIN_PX,
     RIM_SQUARES,
     BoardBoundaries,
     StripedView,
     boundaries_on_boards,
+    box_around,
+    box_of_print,
     on_board,
 )
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.registration.board_shape import BoardShape
 from bodyscan.rig.board import Board
 from bodyscan.stripes.codes.gray import Gray
@@ -86,6 +90,26 @@ def test_a_face_goes_through_its_corners_and_no_further_than_they_say() -> None:
     np.testing.assert_allclose(face.z_mm + face.height(beyond), 2.0, atol=1e-9)
     few = BoardFace.through(FRONT[:6])  # one row, which says nothing of the other direction
     np.testing.assert_allclose(few.height(beyond), 0.0, atol=1e-9)
+
+
+def test_the_box_of_a_print_holds_it_all_and_little_else() -> None:
+    place = SCENE.looking_at(*CHAPTER_POSES[0])
+    rim = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    area = np.array([BOARD.columns, BOARD.rows]) * BOARD.square_mm
+    print_px = SCENE.camera.project(
+        place.apply(
+            np.column_stack([rim * area, np.zeros(4)])
+        )  # straight edges: corners are extreme
+    )
+    corners = SCENE.camera.project(place.apply(FRONT))
+    view = LocatedView("p1", "b1", "board", FRONT, corners, place, ())
+    low, high = box_of_print(SCENE.camera, BOARD, view)
+    np.testing.assert_allclose(
+        low, print_px.min(axis=0) - AROUND_PX, atol=1.0
+    )  # the lens bends them
+    np.testing.assert_allclose(high, print_px.max(axis=0) + AROUND_PX, atol=1.0)
+    folded = replace(SCENE.camera, lens=Radial(k1=-1.0 / 3.0 / 0.01))  # one to one up to 0.1 alone
+    assert np.array_equal(box_of_print(folded, BOARD, view), box_around(view))
 
 
 def test_boundaries_are_averaged_in_pieces_on_the_print_alone() -> None:

@@ -59,6 +59,8 @@ def test_any_grey_image_in_any_filters_is_read(
     file = png((width, height), zlib.compress(filtered(image, kinds)), parts=parts)
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(file, np.uint8), 0), image)
     np.testing.assert_array_equal(decode_grey_png(file, width, height), image)
+    for rows in (1, height, height + 1):
+        np.testing.assert_array_equal(decode_grey_png(file, width, height, rows), image[:rows])
 
 
 @pytest.mark.parametrize("level", range(10))

@@ -193,6 +193,22 @@ def test_a_sequence_comes_in_order(tmp_path: Path) -> None:
     np.testing.assert_array_equal(gray, np.repeat((stripe ^ stripe >> 1)[:, None], WIDTH, axis=1))
 
 
+@pytest.mark.parametrize("scale", [1, 5])
+def test_of_a_sequence_a_part_can_be_read(tmp_path: Path, scale: int) -> None:
+    """Of 16 bits too, whose white the rest of the images may tell: the crop has too few for 12."""
+    sequence = first_sequence(tmp_path)
+    for path in (sequence.lit, sequence.dark, *sequence.coded):
+        assert path is not None
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image[-1, -1] = 255
+        write(path, image * np.uint16(scale) + np.uint16(1) if scale > 1 else image)
+    whole = read_sequence(sequence, CAMERA)
+    part = read_sequence(sequence, CAMERA, crop=(slice(2, HEIGHT - 3), slice(5, WIDTH - 1)))
+    assert whole.lit is not None
+    np.testing.assert_array_equal(part.lit, whole.lit[2:-3, 5:-1])
+    np.testing.assert_array_equal(part.coded, whole.coded[:, 2:-3, 5:-1])
+
+
 def test_a_dark_image_need_not_be_taken(tmp_path: Path) -> None:
     rig_path = small(tmp_path, shots=1)
     rig_path.write_text(rig_path.read_text() + "frames: {dark: null}\n")

@@ -9,7 +9,7 @@ from stripe_rendering import code_light, render
 
 from bodyscan.arrays import Array
 from bodyscan.boards.view import BoardView
-from bodyscan.calibration.striped_view import boundaries_near, crop_around
+from bodyscan.calibration.striped_view import boundaries_near, box_around, crop_around
 from bodyscan.captures.folder import ImageSequence, open_scan
 from bodyscan.errors import DecodingFailed, ImageError
 from bodyscan.rig.rig import Rig
@@ -72,10 +72,11 @@ def test_a_crop_shows_the_same_boundaries_as_the_whole(tmp_path: Path) -> None:
     rig, sequence, _ = a_scan_one_way(tmp_path)
     corners = np.array([[60.0, 40.0], [140.0, 40.0], [60.0, 90.0], [140.0, 90.0]])
     view = BoardView("p1", "s1", "board", np.arange(4), corners)
-    crop = crop_around([view])
+    box = box_around(view)
+    crop = crop_around([box])
     assert crop == (slice(15, 116), slice(20, 181))  # half a corner box more on each side
-    whole = boundaries_near(decode_sequence(sequence, rig.pairs[0]), view)
-    cut = boundaries_near(decode_sequence(sequence, rig.pairs[0], crop=crop), view, crop)
+    whole = boundaries_near(decode_sequence(sequence, rig.pairs[0]), box)
+    cut = boundaries_near(decode_sequence(sequence, rig.pairs[0], crop=crop), box, crop)
     inside = np.all((whole.pixels > [22, 17]) & (whole.pixels < [178, 113]), axis=1)
     assert inside.sum() > 1500
     found = {(i, round(v)): u for i, (u, v) in zip(cut.index, cut.pixels, strict=True)}

@@ -15,7 +15,7 @@ from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import PlanarView, planar_view
 from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera, locate_board
-from bodyscan.calibration.striped_view import boundaries_near, on_board
+from bodyscan.calibration.striped_view import boundaries_near, box_around, on_board
 from bodyscan.calibration.zhang import homography
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.transforms import RigidTransform
@@ -122,7 +122,7 @@ def locate(
             target.projector,
             target.board,
             camera_from_board[shot.view.shot],
-            boundaries_near(shot.stripes, shot.view),
+            boundaries_near(shot.stripes, box_around(shot.view)),
             number,
             bin_px=bin_px,
         )
@@ -155,7 +155,7 @@ def _by_homography(
     number: int,
 ) -> BoundaryPoints:
     """A board's boundaries, placed on it by the corners around them alone."""
-    near = boundaries_near(shot.stripes, shot.view)
+    near = boundaries_near(shot.stripes, box_around(shot.view))
     onto_board = np.linalg.inv(homography(view.points[:, :2], view.pixels))
 
     def onto_plane(pixels: Array) -> Array:
