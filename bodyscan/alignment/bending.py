@@ -53,9 +53,10 @@ def bend(
     valid = image.valid
     if not valid.any():
         return image
-    pixel_mm = float(np.median(image.points[::8, ::8, 2][valid[::8, ::8]])) / image.camera.alpha
+    few = image.every(8)
+    pixel_mm = float(np.median(image.points[few][..., 2][valid[few]])) / image.camera.alpha
     size = max(1, round(BLOCK_MM / pixel_mm)) if np.isfinite(pixel_mm) else 1
-    pixel = _one_in_each_block(image.sigma_mm, size)
+    pixel = _one_in_each_block(image.sigma_mm, image.corner, size)
     block = pixel >= 0
     rows, columns = np.divmod(pixel[block], valid.shape[1])
     chosen = image.points[rows, columns].astype(np.float64)
@@ -71,6 +72,7 @@ def bend(
         points,
         turned,
         image.sigma_mm,
+        image.corner,
         size,
         (cell, depth),
         (camera_from_rig.apply(cells.centres), seen_from(field, rig_from_camera)),
@@ -79,22 +81,27 @@ def bend(
 
 
 @compiled
-def _one_in_each_block(sigma_mm: Floats, size: int) -> Numbers:
-    """(h, w) number of the measured pixel nearest to the middle of each block, -1 where none is."""
+def _one_in_each_block(sigma_mm: Floats, corner: tuple[int, int], size: int) -> Numbers:
+    """(h, w) number of the measured pixel nearest to the middle of each block, -1 where none is.
+
+    corner: where the part of the image begins; blocks are counted from the image's own."""
     height, width = sigma_mm.shape
-    found = np.full((-(-height // size), -(-width // size)), np.int32(-1))
+    top, left = corner
+    above, before = top // size, left // size
+    blocks = -(-(top + height) // size) - above, -(-(left + width) // size) - before
+    found = np.full(blocks, np.int32(-1))
     nearest = np.full(found.shape, np.inf)
     middle = 0.5 * (size - 1)
     for v in range(height):
-        row = v // size
+        row = (top + v) // size
         for u in range(width):
             if not np.isfinite(sigma_mm[v, u]):
                 continue
-            column = u // size
-            off = (v - row * size - middle) ** 2 + (u - column * size - middle) ** 2
-            if off < nearest[row, column]:
-                nearest[row, column] = off
-                found[row, column] = v * width + u
+            column = (left + u) // size
+            off = (top + v - row * size - middle) ** 2 + (left + u - column * size - middle) ** 2
+            if off < nearest[row - above, column - before]:
+                nearest[row - above, column - before] = off
+                found[row - above, column - before] = v * width + u
     return found
 
 
@@ -103,6 +110,7 @@ def _bend(
     points: Floats,
     normals: Floats,
     sigma_mm: Floats,
+    corner: tuple[int, int],
     size: int,
     blocks: tuple[Numbers, Floats],
     motion: tuple[Array, Array],
@@ -115,24 +123,26 @@ def _bend(
     cell, depth = blocks
     centres, fields = motion
     high, wide = cell.shape
+    above, before = corner[0] // size, corner[1] // size
     shift, slope = np.empty(3), np.empty((3, 3))
     kinds, weights = np.empty(4, np.int64), np.empty(4)
     for v in range(sigma_mm.shape[0]):
-        y = (v + 0.5) / size - 0.5
+        y = (corner[0] + v + 0.5) / size - 0.5
         top = int(np.floor(y))
         for u in range(sigma_mm.shape[1]):
             if not np.isfinite(sigma_mm[v, u]):
                 continue
-            x = (u + 0.5) / size - 0.5
+            x = (corner[1] + u + 0.5) / size - 0.5
             left = int(np.floor(x))
             count, total = 0, 0.0
-            for corner in range(4):
-                row, column = top + corner // 2, left + corner % 2
-                if row < 0 or column < 0 or row >= high or column >= wide:
+            for side in range(4):
+                row, column = top + side // 2, left + side % 2
+                i, j = row - above, column - before
+                if i < 0 or j < 0 or i >= high or j >= wide:
                     continue
-                there = cell[row, column]
-                own = row == v // size and column == u // size
-                near = abs(depth[row, column] - points[v, u, 2]) < SAME_SURFACE_MM
+                there = cell[i, j]
+                own = row == (corner[0] + v) // size and column == (corner[1] + u) // size
+                near = abs(depth[i, j] - points[v, u, 2]) < SAME_SURFACE_MM
                 if there < 0 or not (own or near):
                     continue
                 weight = (1.0 - abs(y - row)) * (1.0 - abs(x - column))

@@ -79,10 +79,11 @@ def alignment_points(image: RangeImage, spacing_mm: float, rim_px: int = RIM_PX)
     window = np.ones((2 * rim_px + 1, 2 * rim_px + 1), np.uint8)
     valid = image.valid
     inner = cv2.erode(valid.view(np.uint8), window) > 0
-    depth = image.points[::8, ::8, 2][valid[::8, ::8]]
+    few = image.every(8)
+    depth = image.points[few][..., 2][valid[few]]
     pixel_mm = float(np.median(depth)) / image.camera.alpha if len(depth) else spacing_mm
     step = max(1, round(spacing_mm / pixel_mm))
-    some = slice(step // 2, None, step), slice(step // 2, None, step)
+    some = image.every(step, step // 2)
     seen = valid[some]
     points, normals = (a[some][seen].astype(np.float64) for a in (image.points, image.normals))
     facing = -np.einsum("nc,nc->n", points, normals) / np.linalg.norm(points, axis=-1)
@@ -114,6 +115,7 @@ def match_projected(
         projection_table(image.camera),
         (source.points, source.normals, source.sigma_mm, source.rim),
         (image.points, image.normals, image.sigma_mm, target.inner),
+        image.corner,
         reach_mm,
         (points, normals, distances, sigma_mm, number),
     )
@@ -132,13 +134,15 @@ def _match_projected(
     projection: Table,
     source: tuple[Array, Array, Array, Mask],
     target: tuple[Floats, Floats, Floats, Mask],
+    corner: tuple[int, int],
     reach_mm: float,
     matches: tuple[Array, Array, Array, Array, Indices],
 ) -> int:
     """How many of the source's points were matched; what of them `matches` holds, target frame.
 
     target_from_source: (3, 4).  source: points (N, 3), normals (N, 3), sigma_mm (N,), rim (N,).
-    target: points (H, W, 3), normals (H, W, 3), sigma_mm (H, W), inner (H, W).
+    target: points (H, W, 3), normals (H, W, 3), sigma_mm (H, W), inner (H, W), of the part of its
+    image that begins at the corner.
     matches: the arrays of `Matches`, room for N.
     """
     source_points, source_normals, source_sigma, rim = source
@@ -157,9 +161,9 @@ def _match_projected(
         if -_dot(point, normal) < EDGE_ON * far:
             continue
         u, v = look_up(projection, point[0] / point[2], point[1] / point[2])
-        if not (-0.5 < u < width - 0.5 and -0.5 < v < height - 0.5):
+        if not (-0.5 < u - corner[1] < width - 0.5 and -0.5 < v - corner[0] < height - 0.5):
             continue
-        row, column = int(np.rint(v)), int(np.rint(u))
+        row, column = int(np.rint(v)) - corner[0], int(np.rint(u)) - corner[1]
         if not inner[row, column]:
             continue
         across = _vector(target_normals[row, column])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.lens_sheets import LensSheets
@@ -58,6 +57,8 @@ def fit_pinhole(points: Array, s: Array) -> PinholeProjector:
 
     def residuals(flat: Array) -> Array:
         return (scaled @ flat[:4]) / (scaled @ flat[4:]) - t
+
+    from scipy.optimize import least_squares  # a scan, which fits none, need not wait for it
 
     scale = 3.0 * spread(residuals(start), 1e-9)
     solved = least_squares(residuals, start, loss="cauchy", f_scale=scale).x.reshape(2, 4)

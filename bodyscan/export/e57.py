@@ -49,8 +49,8 @@ def write_e57(
                 "cartesianX": x,
                 "cartesianY": y,
                 "cartesianZ": z,
-                "rowIndex": rows,
-                "columnIndex": columns,
+                "rowIndex": image.corner[0] + rows,
+                "columnIndex": image.corner[1] + columns,
             }
             data |= {f"color{name}": grey for name in ("Red", "Green", "Blue")}
             pose = rig_from_camera[image.pair]

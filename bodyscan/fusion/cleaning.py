@@ -15,7 +15,7 @@ import numpy as np
 from bodyscan.arrays import Array, Bytes, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.errors import ScanFailed
-from bodyscan.geometry.crop import crop_of
+from bodyscan.geometry.crop import crop_of, widened
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
@@ -28,6 +28,7 @@ QUANTUM_MM = 0.25  # cv2.filterSpeckles works on 16-bit integers: +-8 m in steps
 # Of dark gaps:
 WIDEST_GAP_PX = 7  # of the gap and half of its slopes: several times the blur
 DARKER = 2.0  # times, than the surfaces around
+ROOM_PX = 8  # around a part that is kept: farther than any later window reaches beyond a rim
 GAP_MARGIN_PX = 1  # beside what is so dark, where the two mix
 LEAST_STEP = 30  # grey levels; less may be noise on something dark
 
@@ -81,12 +82,18 @@ def require_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:
 
 
 def apply_mask(image: RangeImage, kept: Mask) -> RangeImage:
-    """The range image with nothing measured where `kept` (height, width) is false."""
+    """The range image with nothing measured where `kept` (h, w) is false."""
     return replace(image, sigma_mm=np.where(kept, image.sigma_mm, np.float32(np.nan)))
 
 
+def cut_to_volume(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> RangeImage:
+    """With points about what lies inside the scan volume alone; cleaning leaves no others."""
+    box = crop_of(inside(image, rig_from_camera, volume)) or (slice(0, 1), slice(0, 1))
+    return image.cut(widened(box, ROOM_PX))
+
+
 def inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> Mask:
-    """(height, width): measured, and within the scan volume's upright cylinder."""
+    """(h, w): measured, and within the scan volume's upright cylinder."""
     within = np.empty(image.sigma_mm.shape, np.bool_)
     size = (volume.radius_mm, volume.bottom_mm, volume.top_mm)
     _inside(image.points, image.sigma_mm, rig_from_camera.matrix[:3], size, within)
@@ -94,14 +101,14 @@ def inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -
 
 
 def in_front_of(image: RangeImage, empty: RangeImage) -> Mask:
-    """(height, width): measured in front of what the same camera sees without a subject.
+    """(h, w): measured in front of what the same camera sees without a subject.
 
     The nearest background of the pixels around counts, for the edges of things in the room.
     """
     window = np.ones((3, 3), np.uint8)
-    far = np.where(empty.valid, empty.points[..., 2], np.float32(np.inf))
+    far = np.where(empty.open_depth > 0.0, empty.open_depth, np.float32(np.inf))
     with np.errstate(invalid="ignore"):
-        return image.points[..., 2] < cv2.erode(far, window) - BACKGROUND_MM
+        return image.points[..., 2] < cv2.erode(far, window)[image.part] - BACKGROUND_MM
 
 
 def drop_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -> Floats:

@@ -48,9 +48,9 @@ def no_use(cloud: BodyCloud) -> None:
 class Scan:
     """A body model, how it came about and whether it is good.  measured: points of each pair's
     cleaned range image.  failed: pairs that gave none, with the reason.  range_images: cleaned, of
-    the pairs that saw the subject, carried to one moment; rig_from_camera: where each stood to it,
-    after alignment.  person: how a body that moved did, part by part.  notes: what was said of the
-    range images, such as what of their stripes was not used.
+    the pairs that saw the subject, cut to where they did and carried to one moment; rig_from_camera:
+    where each stood to it, after alignment.  person: how a body that moved did, part by part.  notes:
+    what was said of the range images, such as what of their stripes was not used.
     """
 
     cloud: BodyCloud

@@ -109,7 +109,7 @@ def _surface(
         image.pair,
         image.camera,
         rig_from_camera,
-        (box[1].start, box[0].start),
+        (image.corner[1] + box[1].start, image.corner[0] + box[0].start),
         number,
         points[:count],
         normals[:count],

@@ -88,7 +88,10 @@ class _Look:
         column = np.where(inside, np.rint(u), 0).astype(np.intp)
         row = np.where(inside, np.rint(v), 0).astype(np.intp)
         facing = -np.sum(seen * turned, axis=1) > FACING * np.linalg.norm(seen, axis=1)
-        shown = inside & image.valid[row, column]
-        apart = np.abs(np.sum((image.points[row, column] - seen) * turned, axis=1))
-        white = inside & (image.colours[row, column] >= WHITE)
+        own = np.stack([row, column], axis=-1) - image.corner
+        kept = inside & ((own >= 0) & (own < image.sigma_mm.shape)).all(axis=1)
+        here = tuple(np.where(kept[:, None], own, 0).T)
+        shown = kept & image.valid[here]
+        apart = np.abs(np.sum((image.points[here] - seen) * turned, axis=1))
+        white = inside & (image.lit[row, column] >= WHITE)
         return _Look(inside & facing, shown, shown & (apart < REACH_MM), white)

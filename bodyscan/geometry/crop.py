@@ -23,3 +23,9 @@ def ends_of(crop: Crop) -> tuple[int, int, int, int]:
     """Top, bottom, left and right of a crop, for compiled functions."""
     rows, columns = crop
     return rows.start, rows.stop, columns.start, columns.stop
+
+
+def widened(crop: Crop, margin: int) -> Crop:
+    """With so many more rows and columns on every side, as far as there are any before the first."""
+    rows, columns = (slice(max(side.start - margin, 0), side.stop + margin) for side in crop)
+    return rows, columns

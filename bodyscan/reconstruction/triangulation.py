@@ -60,7 +60,8 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
             agreement = replace(agreement, apart_stripes=apart, stripes=counted)
         _require_fit(pair, stripes, agreement)
     normals = grid_normals(points, np.isfinite(sigma_mm))
-    images = (stripes.lit, stripes.beyond)
+    # A copy: the lit image is one of a stack, which would stay as long as it does.
+    images = (stripes.lit.copy(), stripes.beyond)
     return RangeImage(
         pair.name, camera, points, normals, sigma_mm, *images, agreement, common_mm=common_mm
     )

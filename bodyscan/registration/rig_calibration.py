@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +11,6 @@ from bodyscan.arrays import Floats
 from bodyscan.calibration.pair import PairCalibration
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.rig_solve import RigSolution, corner_residuals
 from bodyscan.rig.rig import Rig
 
 
@@ -48,25 +46,3 @@ class RigCalibration:
     notes: tuple[str, ...]
     advice: tuple[str, ...] = ()
     seen: dict[str, SeenCorners] = field(default_factory=dict)
-
-
-def seen_corners(placed: RigSolution, names: Iterable[str]) -> dict[str, SeenCorners]:
-    """By the pair's name, for those of `names` that were placed."""
-    number = {target: k for k, target in enumerate(sorted(placed.rig_from_board))}
-    found = {}
-    for name in sorted(set(names) & set(placed.rig_from_camera)):
-        own = [view for view in placed.views if view.pair == name]
-        if not own:
-            continue
-        residuals = [
-            corner_residuals(view, placed.cameras, placed.rig_from_camera, placed.rig_from_board)
-            for view in own
-        ]
-        found[name] = SeenCorners(
-            np.concatenate([view.pixels for view in own]).astype(np.float32),
-            np.concatenate(residuals).astype(np.float32),
-            np.repeat([number[v.target] for v in own], [len(v.pixels) for v in own]).astype(
-                np.int16
-            ),
-        )
-    return found

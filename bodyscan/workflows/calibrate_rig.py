@@ -26,9 +26,10 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, step
 from bodyscan.registration.board_checks import check_board_size, describe_findings
 from bodyscan.registration.references import find_size, resized, solving_views
-from bodyscan.registration.rig_calibration import RigCalibration, seen_corners
+from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
+from bodyscan.registration.seen_corners import seen_corners
 from bodyscan.registration.storage import keep_former, save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig

@@ -11,6 +11,7 @@ import numpy as np
 
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.errors import BodyscanError, ScanFailed, listed
+from bodyscan.fusion.cleaning import cut_to_volume
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.reconstruction.range_image import RangeImage
@@ -28,10 +29,15 @@ stripes that cross were not used."""
 
 
 def reconstruct_sequence(
-    calibration: RigCalibration, captures: Captures, sequence: ImageSequence
+    calibration: RigCalibration,
+    captures: Captures,
+    sequence: ImageSequence,
+    *,
+    volume_only: bool = False,
 ) -> Reconstructed:
     """What one calibrated pair saw in one shot, within the scan volume and a little around it.
 
+    volume_only: keep the part of the picture that shows something inside alone, `RangeImage.cut`.
     Raises ImageError and DecodingFailed as `decode_sequence` does.
     """
     pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
@@ -52,6 +58,8 @@ def reconstruct_sequence(
     if frame_ms is not None and moments:
         velocity = None if motion is None else motion.velocity
         image = replace(image, time_ms=MS * moments[0].moment, velocity=velocity)
+    if volume_only:
+        image = cut_to_volume(image, at, calibration.rig.volume)
     return image, tuple(responses_in(stripes)), motion, stripes.crossing_fault
 
 
@@ -61,11 +69,14 @@ def reconstruct_range_images(
     progress: Progress = silent,
     *,
     made: Mapping[ImageSequence, Reconstructed] = MappingProxyType({}),
+    volume_only: bool = False,
 ) -> Outcome[list[RangeImage]]:
     """The range image of every calibrated pair; pairs that gave none are failures.
 
     They show the scan volume and a little around it. made: those of sequences that were made while
-    others still arrived. Raises ScanFailed if no pair gives one.
+    others still arrived.  volume_only: see `reconstruct_sequence`.
+
+    Raises ScanFailed if no pair gives one.
     """
     failed = {
         pair.name: calibration.failed.get(pair.name, "is not calibrated")
@@ -82,7 +93,9 @@ def reconstruct_range_images(
     sequences = [s for s in captures.sequences if s.has_stripes and s.pair not in failed]
 
     def reconstruct(sequence: ImageSequence) -> Reconstructed:
-        return made.get(sequence) or reconstruct_sequence(calibration, captures, sequence)
+        return made.get(sequence) or reconstruct_sequence(
+            calibration, captures, sequence, volume_only=volume_only
+        )
 
     found, errors = attempt_each(
         reconstruct, sequences, BodyscanError, stage="range images", progress=progress

@@ -50,7 +50,8 @@ class Resident:
 
         def make(sequence: ImageSequence) -> _Made:
             stamps = _stamps(captures, sequence)
-            return _Made(reconstruct_sequence(self.calibration, captures, sequence), stamps)
+            made = reconstruct_sequence(self.calibration, captures, sequence, volume_only=True)
+            return _Made(made, stamps)
 
         made, _ = attempt_each(make, wanted, BodyscanError, stage="range images")
         self._made.setdefault(folder, {}).update(made)

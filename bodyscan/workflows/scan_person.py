@@ -31,8 +31,9 @@ def scan_person(
     made: see `reconstruct_range_images`.  announce, merged: see `fuse`.
     Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left.
     """
-    images = reconstruct_range_images(calibration, captures, progress, made=made)
-    background = reconstruct_range_images(calibration, empty, progress).value if empty else ()
+    images = reconstruct_range_images(calibration, captures, progress, made=made, volume_only=True)
+    nobody = empty and reconstruct_range_images(calibration, empty, progress, volume_only=True)
+    background = nobody.value if nobody else ()
     return fuse(
         calibration,
         images,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ring import looking_at
@@ -9,7 +11,10 @@ from ring import looking_at
 from bodyscan.alignment.bending import bend
 from bodyscan.alignment.body_cells import BodyCells, modulated, normal_field, rigid_fields
 from bodyscan.alignment.cell_speeds import CellSpeeds
+from bodyscan.alignment.matching import alignment_points, match_projected
+from bodyscan.fusion.smoothing import smooth
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.crop import WHOLE, crop_of, widened
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.velocity import SurfaceSpeeds
@@ -109,3 +114,34 @@ def test_a_swelling_has_no_steps(ball: tuple[RangeImage, BodyCells]) -> None:
     # 4 mm / 100 mm^2 bend by 0.06 mm over half a cell; at the ball's rim cells have one neighbour less.
     assert np.sqrt(np.mean(off**2)) < 0.06
     assert np.percentile(np.abs(off), 99) < 0.2
+
+
+def test_what_is_cut_away_changes_nothing(ball: tuple[RangeImage, BodyCells]) -> None:
+    """A box that leaves nothing measured out, at no multiple of any step or block."""
+    image, cells = ball
+    whole = replace(image, beyond=~image.valid)
+    box = widened(crop_of(image.valid) or WHOLE, 5)
+    cut = whole.cut(box)
+    assert cut.sigma_mm.shape < image.sigma_mm.shape
+    np.testing.assert_array_equal(cut.open_depth, whole.open_depth)
+    field = rigid_fields(cells, CENTRE, 1.0) @ np.array([0.004, -0.003, 0.002, 1.0, -2.0, 3.0])
+    bent = [bend(each, PLACE, cells, field) for each in (whole, cut)]
+    np.testing.assert_array_equal(bent[0].points[box], bent[1].points)
+    np.testing.assert_array_equal(bent[0].normals[box], bent[1].normals)
+    seen = [alignment_points(each, 7.0) for each in bent]
+    nearby = PLACE @ RigidTransform.from_rotation_vector([0.0, 0.01, 0.0], [4.0, 0.0, 0.0])
+    matched = [match_projected(seen[0], each, nearby, PLACE, 6.0) for each in seen]
+    assert len(matched[0].distances) > 500
+    smoothed = [smooth(each, PLACE, 7.0) for each in bent]
+    for one, other in (seen, matched, smoothed):
+        for name in (
+            "points",
+            "normals",
+            "sigma_mm",
+            "rim",
+            "distances",
+            "number",
+            "corner",
+            "colours",
+        ):
+            assert np.array_equal(getattr(one, name, 0), getattr(other, name, 0)), name

@@ -9,7 +9,9 @@ import pytest
 from ray_cast_scan import Scan, load_rig
 
 from bodyscan.evaluation.surface import signed_distances
-from bodyscan.fusion.cleaning import clean, drop_flying_pixels, inside
+from bodyscan.fusion.cleaning import clean, cut_to_volume, drop_flying_pixels, inside
+from bodyscan.fusion.surface_check import check_surface
+from bodyscan.mesh.body import BodyMesh
 from bodyscan.reconstruction.range_image import RangeImage
 
 NOISE_MM = 0.3
@@ -115,3 +117,38 @@ def test_threads_change_nothing(scan: Scan, cleaned: list[RangeImage], workers: 
     again = clean(scan.range_images[:4], scan.rig_from_camera, load_rig().volume, workers=workers)
     for one, other in zip(again, cleaned, strict=False):
         np.testing.assert_array_equal(one.points, other.points)
+
+
+def test_what_is_cut_to_the_volume_is_cleaned_and_checked_alike(
+    scan: Scan, cleaned: list[RangeImage]
+) -> None:
+    volume, there = load_rig().volume, scan.rig_from_camera
+    cut = [cut_to_volume(image, there[image.pair], volume) for image in scan.range_images]
+    alike = clean(cut, there, volume)
+    for one, other in zip(cleaned, alike, strict=True):
+        np.testing.assert_array_equal(one.sigma_mm[other.part], other.sigma_mm)
+        assert one.valid.sum() == other.valid.sum()
+    vertices, faces = scan.truth.vertices, scan.truth.faces
+    none = np.zeros(vertices.shape)
+    mesh = BodyMesh(
+        vertices,
+        faces,
+        none.astype(np.float32),
+        none.astype(np.uint8),
+        none[:, 0].astype(np.float32),
+        np.zeros(len(faces), bool),
+    )
+    checks = [check_surface(mesh, images, there) for images in (cleaned, alike)]
+    assert len(checks[0].yields) == len(cleaned)
+    assert checks[0].yields == checks[1].yields
+    first = scan.range_images[0]
+    behind = replace(first, points=first.points * np.float32(1.01))
+    shown = [
+        clean([some], there, volume, empty=[nobody])[0].valid.sum()
+        for some, nobody in (
+            (first, behind),
+            (cut[0], cut_to_volume(behind, there[first.pair], volume)),
+        )
+    ]
+    assert shown[0] == shown[1]
+    assert shown[0] > 0
