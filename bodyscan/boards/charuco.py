@@ -169,7 +169,7 @@ def _refine(
         return refine_corners(image, at.apply(points), along, bright_diagonal, marker_gap=gap)
 
     pixels, good = refine(board_map)
-    if good.sum() >= MIN_CORNERS_FOR_LENS:
+    if MIN_CORNERS_FOR_LENS <= good.sum() < len(good):
         again, good_again = refine(fit_board_map(points[good], pixels[good]))
         pixels = np.where(good[:, None], pixels, again)
         good = good | good_again

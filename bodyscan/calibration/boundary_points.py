@@ -77,10 +77,11 @@ def boundary_points(
     height: Height | None = None,
 ) -> BoundaryPoints:
     """Carry boundary pixels (N, 2) of one shot onto its board, flat unless its height is given."""
-    across = np.array([0.0, 0.5]) if direction == "horizontal" else np.array([0.5, 0.0])
+    rays, across = camera.rays(pixels), 1 if direction == "horizontal" else 0
+    half = np.zeros_like(rays)
+    half[:, :2] = 0.5 * camera.rays_by_pixels(rays)[..., across]
     here, after, before = (
-        points_on_board(camera, camera_from_board, pixels + step, height)
-        for step in (0.0 * across, across, -across)
+        rays_on_board(rays + step, camera_from_board, height) for step in (0.0 * half, half, -half)
     )
     return BoundaryPoints(index, np.full(len(index), board), here, after - before, sigma_px)
 

@@ -91,6 +91,13 @@ class Camera:
         normalized = self.lens.undistort(self.normalized_from_pixels(pixels))
         return np.concatenate([normalized, np.ones_like(normalized[..., :1])], axis=-1)
 
+    def rays_by_pixels(self, rays: Array) -> Array:
+        """Derivatives (..., 2, 2) of the (x, y) of rays (..., 3), whose z is 1, by their pixels."""
+        by_ray = self.matrix[:2, :2] @ self.lens.by_point(rays[..., :2])
+        (a, b), (c, d) = np.moveaxis(by_ray, (-2, -1), (0, 1))
+        inverse = np.stack([d, -b, -c, a], axis=-1) / (a * d - b * c)[..., None]
+        return inverse.reshape(*rays.shape[:-1], 2, 2)
+
     def pixel_rays(self) -> Array:
         """Rays through every pixel's centre, (height, width, 3)."""
         u, v = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))

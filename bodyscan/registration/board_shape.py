@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_form import BoardFace
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain
@@ -76,10 +76,14 @@ class BoardShape:
         away = np.abs(self.points[:, 2] - np.median(points[:, 2]))
         return BoardFace.through((self.points + self.offsets)[away <= away.min() + 1e-3])
 
+    def numbers(self, points: Array) -> Indices:
+        """(M,) which of its corners nominal points (M, 3) are, -1 for unknown ones."""
+        number = {key: k for k, key in enumerate(_keys(self.points))}
+        return np.array([number.get(key, -1) for key in _keys(points)], np.int64)
+
     def applied(self, points: Array) -> Array:
         """Nominal points (M, 3) of this board -> where they lie; unknown ones stay."""
-        number = {key: k for k, key in enumerate(_keys(self.points))}
-        chosen = np.array([number.get(key, -1) for key in _keys(points)])
+        chosen = self.numbers(points)
         return points + np.where(chosen[:, None] >= 0, self.offsets[chosen], 0.0)
 
 
@@ -120,7 +124,7 @@ def with_same_shapes(
     """Shapes estimated anew where `found` has some: with other lenses, or other views."""
     if not found.shapes:
         return replace(found, solution=solution, views=list(views))
-    return replace(_estimate(views, solution, root, True), notes=found.notes)
+    return replace(_estimate(views, solution, root, True, found.shapes), notes=found.notes)
 
 
 def in_shape(view: LocatedView, shapes: Mapping[str, BoardShape]) -> LocatedView:
@@ -140,30 +144,45 @@ def _said(name: str, shape: BoardShape) -> str:
 
 
 def _estimate(
-    views: Sequence[LocatedView], solution: JointSolution, root: str, refine_cameras: bool
+    views: Sequence[LocatedView],
+    solution: JointSolution,
+    root: str,
+    refine_cameras: bool,
+    start: Mapping[str, BoardShape] | None = None,
 ) -> ShapedSolution:
-    """Shapes and everything else in turn, until both stand."""
-    nominal = {
-        name: np.unique(
-            np.round(np.concatenate([v.points for v in views if v.board == name]), DIGITS) + 0.0,
-            axis=0,
-        )
-        for name in sorted({view.board for view in views})
-    }
-    shapes = {name: BoardShape(p, np.zeros_like(p)) for name, p in nominal.items()}
-    shaped = list(views)
+    """Shapes and everything else in turn, until both stand; from the boards as described, or shapes
+    that the solution has."""
+    shapes = _flat(views)
+    if start:
+        shapes = {
+            name: replace(shape, offsets=start[name].applied(shape.points) - shape.points)
+            for name, shape in shapes.items()
+        }
+    shaped = [in_shape(view, shapes) for view in views]
+    numbers = [shapes[view.board].numbers(view.points) for view in views]
     for _ in range(ROUNDS):
-        steps = _corner_steps(views, shaped, shapes, solution)
+        steps = _corner_steps(shaped, numbers, shapes, solution)
         shapes = {
             name: _without_motion(replace(shape, offsets=shape.offsets + HASTE * steps[name]))
             for name, shape in shapes.items()
         }
-        shaped = [replace(v, points=shapes[v.board].applied(v.points)) for v in views]
+        shaped = [
+            replace(view, points=view.points + shapes[view.board].offsets[own])
+            for view, own in zip(views, numbers, strict=True)
+        ]
         solution = solve_fully(shaped, solution, root=root, refine_cameras=refine_cameras)
         moved = (np.sqrt(np.mean(steps[name] ** 2)) / s.diagonal for name, s in shapes.items())
         if max(moved) < SETTLED:
             break
     return ShapedSolution(solution, shaped, shapes, ())
+
+
+def _flat(views: Sequence[LocatedView]) -> dict[str, BoardShape]:
+    """All corners that any view shows, by board, where they should be."""
+    boards = sorted({view.board for view in views})
+    seen = (np.concatenate([v.points for v in views if v.board == name]) for name in boards)
+    nominal = (np.unique(np.round(points, DIGITS) + 0.0, axis=0) for points in seen)
+    return {n: BoardShape(p, np.zeros_like(p)) for n, p in zip(boards, nominal, strict=True)}
 
 
 def _without_motion(shape: BoardShape) -> BoardShape:
@@ -177,13 +196,13 @@ def _without_motion(shape: BoardShape) -> BoardShape:
 
 
 def _corner_steps(
-    views: Sequence[LocatedView],
     shaped: Sequence[LocatedView],
+    numbers: Sequence[Indices],
     shapes: Mapping[str, BoardShape],
     solution: JointSolution,
 ) -> dict[str, Array]:
     """A Gauss-Newton step (N, 3) mm of every corner by itself, held near the nominal board."""
-    information, pull, variance = _corner_equations(views, shaped, shapes, solution)
+    information, pull, variance = _corner_equations(shaped, numbers, shapes, solution)
     steps = {}
     for name, shape in shapes.items():
         held = variance / (PRIOR * shape.diagonal) ** 2
@@ -195,12 +214,9 @@ def _corner_steps(
 
 def _gain_per_unknown(views: Sequence[LocatedView], solution: JointSolution) -> float:
     """By how many variances a free corner would lower the squared residuals, per coordinate."""
-    shapes = {
-        name: BoardShape(p, np.zeros_like(p))
-        for name in sorted({view.board for view in views})
-        for p in [np.unique(np.concatenate([v.points for v in views if v.board == name]), axis=0)]
-    }
-    information, pull, variance = _corner_equations(views, views, shapes, solution)
+    shapes = _flat(views)
+    numbers = [shapes[view.board].numbers(view.points) for view in views]
+    information, pull, variance = _corner_equations(views, numbers, shapes, solution)
     gain, unknowns = 0.0, 0
     for name in shapes:
         inverse = np.linalg.pinv(information[name], rcond=1e-6, hermitian=True)
@@ -210,36 +226,48 @@ def _gain_per_unknown(views: Sequence[LocatedView], solution: JointSolution) -> 
 
 
 def _corner_equations(
-    views: Sequence[LocatedView],
     shaped: Sequence[LocatedView],
+    numbers: Sequence[Indices],
     shapes: Mapping[str, BoardShape],
     solution: JointSolution,
 ) -> tuple[dict[str, Array], dict[str, Array], float]:
-    """J^T W J (N, 3, 3), J^T W r (N, 3) of each board's corners, and the variance in px2."""
-    parts = []
-    for view in shaped:
-        camera = solution.cameras[view.pair]
-        camera_from_board = (
-            solution.root_from_camera[view.pair].inverse() @ solution.root_from_board[view.target]
-        )
-        points = camera_from_board.apply(view.points)
-        _, by_point = camera.jacobians(points)
-        parts.append((by_point @ camera_from_board.rotation, camera.project(points) - view.pixels))
-    residuals = np.concatenate([r.ravel() for _, r in parts])
-    weights = CORNERS.weights(residuals / CORNERS.spread_of(residuals))
-    variance = float(np.sum(weights * residuals**2) / np.sum(weights))
-    information = {name: np.zeros((len(s.points), 3, 3)) for name, s in shapes.items()}
-    pull = {name: np.zeros((len(s.points), 3)) for name, s in shapes.items()}
-    number = {name: {key: k for k, key in enumerate(_keys(s.points))} for name, s in shapes.items()}
-    cuts = np.cumsum([r.size for _, r in parts])[:-1]
-    for view, (jacobian, residual), weight in zip(
-        views, parts, np.split(weights, cuts), strict=True
-    ):
-        chosen = np.array([number[view.board][key] for key in _keys(view.points)])
-        weighted = jacobian * weight.reshape(-1, 2, 1)
-        information[view.board][chosen] += np.einsum("npi,npj->nij", weighted, jacobian)
-        pull[view.board][chosen] += np.einsum("npi,np->ni", weighted, residual)
-    return information, pull, variance
+    """J^T W J (N, 3, 3), J^T W r (N, 3) of each board's corners, and the variance in px2.
+
+    shaped: with points where they are thought to lie; numbers: which corners of their board's shape
+    these are.
+    """
+    ends = np.cumsum([len(shape.points) for shape in shapes.values()])
+    first = dict(zip(shapes, [0, *ends[:-1].tolist()], strict=True))
+    corners, parts = [], []
+    for pair in sorted({view.pair for view in shaped}):
+        own = [k for k, view in enumerate(shaped) if view.pair == pair]
+        corners += [first[shaped[k].board] + numbers[k] for k in own]
+        parts.append(_by_corner([shaped[k] for k in own], solution))
+    number = np.concatenate(corners)
+    jacobian, residuals = (np.concatenate(part) for part in zip(*parts, strict=True))
+    weights = CORNERS.weights(residuals.ravel() / CORNERS.spread_of(residuals.ravel()))
+    variance = float(np.sum(weights * residuals.ravel() ** 2) / np.sum(weights))
+    weighted = np.swapaxes(jacobian * weights.reshape(-1, 2, 1), 1, 2)
+    information, pull = np.zeros((ends[-1], 3, 3)), np.zeros((ends[-1], 3))
+    np.add.at(information, number, weighted @ jacobian)
+    np.add.at(pull, number, (weighted @ residuals[..., None])[..., 0])
+    return (
+        dict(zip(shapes, np.split(information, ends[:-1]), strict=True)),
+        dict(zip(shapes, np.split(pull, ends[:-1]), strict=True)),
+        variance,
+    )
+
+
+def _by_corner(views: Sequence[LocatedView], solution: JointSolution) -> tuple[Array, Array]:
+    """Derivatives (N, 2, 3) px/mm of what one pair sees of corners by their places on their boards,
+    and the residuals (N, 2) px."""
+    pair = views[0].pair
+    camera, camera_from_root = solution.cameras[pair], solution.root_from_camera[pair].inverse()
+    placed = [camera_from_root @ solution.root_from_board[view.target] for view in views]
+    points = np.concatenate([p.apply(view.points) for p, view in zip(placed, views, strict=True)])
+    turns = np.repeat([p.rotation for p in placed], [len(view.points) for view in views], axis=0)
+    pixels = np.concatenate([view.pixels for view in views])
+    return camera.jacobians(points)[1] @ turns, camera.project(points) - pixels
 
 
 def _hold_out(

@@ -34,6 +34,16 @@ def test_projecting_a_ray_gives_its_pixel_back(camera: Camera) -> None:
 
 
 @given(cameras)
+def test_slopes_of_rays_are_derivatives_by_their_pixels(camera: Camera) -> None:
+    pixels = np.random.default_rng(3).uniform([100.0, 100.0], [500.0, 400.0], (50, 2))
+    slopes = camera.rays_by_pixels(camera.rays(pixels))
+    for axis, step in enumerate(1e-3 * np.eye(2)):
+        apart = camera.rays(pixels + step) - camera.rays(pixels - step)
+        # A lens bends by less than 1e-6 of the slope over so little, and rays are good to 1e-14.
+        np.testing.assert_allclose(slopes[..., axis], apart[:, :2] / 2e-3, atol=1e-10)
+
+
+@given(cameras)
 def test_distortion_is_that_of_equations_3_to_5(camera: Camera) -> None:
     points = camera.rays(pixels_of(camera)).reshape(-1, 3) * 700.0
     ideal = points @ camera.matrix.T
