@@ -22,6 +22,7 @@ from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BodyscanError
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.measurement.measurements import Measurements
 from bodyscan.outcome import Outcome
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -36,6 +37,7 @@ class Sound:
     """A rig and a subject, simulated: what the scan is without any fault.
 
     other: range images of another person.  vertices, faces: the subject's true surface, rig frame.
+    girths: of that.
     """
 
     calibration: RigCalibration
@@ -44,6 +46,7 @@ class Sound:
     person: Path
     vertices: Array
     faces: Indices
+    girths: Measurements
 
 
 Case = tuple[RigCalibration, Outcome[list[RangeImage]]]

@@ -20,7 +20,7 @@ from benchmarks.full_size import PROJECT, run_commands
 from benchmarks.true_calibration import calibration_from_truth
 from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BodyscanError
-from bodyscan.evaluation.body import girth_errors
+from bodyscan.evaluation.body import compare_girths, true_girths
 from bodyscan.fusion.scan import fuse
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
@@ -106,7 +106,8 @@ def _sound(rig: str, subject: str, preset: str) -> Sound:
     )
     truth = o3d.io.read_triangle_mesh(str(workspace / "truth" / "subject.ply"))
     vertices, faces = np.asarray(truth.vertices), np.asarray(truth.triangles).astype(np.int64)
-    return Sound(calibration, images, others, person, vertices, faces)
+    girths = true_girths(vertices, faces)
+    return Sound(calibration, images, others, person, vertices, faces, girths)
 
 
 def _told(found: Sequence[Found], columns: Sequence[tuple[str, str]]) -> str:
@@ -203,7 +204,7 @@ def _judge(rig: str, subject: str, fault: Fault, sound: Sound) -> Found:
     except BodyscanError as error:
         return Found(rig, subject, fault.name, "refused", None, True, str(error))
     try:
-        errors = girth_errors(scan.mesh, sound.vertices, sound.faces)
+        errors = compare_girths(scan.mesh, sound.girths)
         worst = errors.worst_mm if np.isfinite(errors.worst_mm) else None
     except BodyscanError:  # of a body cut short no girth is given
         worst = None

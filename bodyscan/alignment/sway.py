@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.pose_covariance import PoseCovariance, position_sigma
 from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.settings import BODY_CENTRE_MM, AlignmentSettings
@@ -71,6 +71,14 @@ class SwayPrior:
 def centre_shifts(motion: Array) -> Array:
     """(P, 3) mm: how far motions (P, 6) carry the body's centre."""
     return motion[:, 3:] + np.cross(motion[:, :3], BODY_CENTRE)
+
+
+def centre_sigmas(boards: PoseCovariance) -> dict[str, float]:
+    """mm, of each pair: how far its place alone may put the body's centre off."""
+    return {
+        name: float(np.linalg.norm(position_sigma(boards, name, BODY_CENTRE)))
+        for name in boards.names
+    }
 
 
 def bound_motions(

@@ -13,7 +13,7 @@ from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.evaluation.surface import covered_spots, sample_surface
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
-from bodyscan.measurement.measurements import Slice, measure
+from bodyscan.measurement.measurements import Measurements, Slice, measure
 from bodyscan.mesh.body import BodyMesh
 
 STEP_MM = 20.0
@@ -67,10 +67,19 @@ def girth_errors(
     mesh: BodyMesh, vertices: Array, faces: Indices, *, mean_breath: bool = False
 ) -> GirthErrors:
     """mesh in the truth's frame; vertices, faces: the truth, at mean breath or at the mesh's moment."""
-    truth = _as_measured(vertices, faces)
+    return compare_girths(mesh, true_girths(vertices, faces), mean_breath=mean_breath)
+
+
+def true_girths(vertices: Array, faces: Indices) -> Measurements:
+    """Of the trunk of the truth, every `STEP_MM`."""
     stature = float(vertices[:, 2].max())
     levels = np.arange(TORSO[0] * stature, TORSO[1] * stature, STEP_MM).tolist()
-    ours, true = measure(mesh, levels, mean_breath=mean_breath), measure(truth, levels)
+    return measure(_as_measured(vertices, faces), levels)
+
+
+def compare_girths(mesh: BodyMesh, true: Measurements, *, mean_breath: bool = False) -> GirthErrors:
+    """mesh in the truth's frame.  true: see `true_girths`."""
+    ours = measure(mesh, [one.height_mm for one in true.slices], mean_breath=mean_breath)
     errors = {
         one.height_mm: error
         for one, other in zip(ours.slices, true.slices, strict=True)

@@ -7,10 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erfc
 
 from bodyscan.fusion.comparing import Evidence, Numbers
+from bodyscan.fusion.smoothing import SmoothSurface
+from bodyscan.fusion.thinning import Samples
 
 Counts = NDArray[np.int64]
+TINY_MM = 1e-6
 MOST_OF_IT = 0.5
 """A group is blamed if less than so much of the share is left without it."""
 
@@ -18,17 +22,24 @@ MOST_OF_IT = 0.5
 @dataclass(frozen=True, eq=False)
 class Contradictions:
     """pairs: P of them.  asked: (P, P), how often the pair of the row said something of points of
-    the column's; against: how often it was that there is no surface."""
+    the column's; against: how often it was that there is no surface.  by_noise: the share of all that
+    would be so of one surface, for what both points' sigmas hold."""
 
     pairs: tuple[str, ...]
     asked: Counts
     against: Counts
+    by_noise: float = 0.0
 
     @staticmethod
     def of(
-        pairs: Sequence[str], evidence: Sequence[Evidence], starts: NDArray[np.intp]
+        pairs: Sequence[str],
+        evidence: Sequence[Evidence],
+        samples: Samples,
+        surfaces: Sequence[SmoothSurface],
+        agreement_mm: float,
     ) -> Contradictions:
-        """evidence: of each pair about all samples; those of pair k begin at starts[k]."""
+        """evidence: of each pair, the surface with its number, about all samples."""
+        starts = samples.starts
 
         def counted(index: Numbers) -> Counts:
             owner = np.searchsorted(starts, index, side="right") - 1
@@ -36,12 +47,26 @@ class Contradictions:
 
         against = np.array([counted(one.against_index) for one in evidence])
         agreed = np.array([counted(one.index) for one in evidence])
-        return Contradictions(tuple(pairs), agreed + against, against)
+        sigma = np.concatenate(
+            [
+                np.hypot(samples.sigma_mm[index], surface.sigma_mm[at])
+                for one, surface in zip(evidence, surfaces, strict=True)
+                for index, at in ((one.index, one.at), (one.against_index, one.against_at))
+            ]
+        )
+        beyond = erfc(agreement_mm / (np.sqrt(2.0) * np.maximum(sigma, TINY_MM)))
+        by_noise = float(beyond.mean()) if len(beyond) else 0.0
+        return Contradictions(tuple(pairs), agreed + against, against, by_noise)
 
     @property
     def share(self) -> float:
         """Of all that one pair said of another's points, what spoke against them."""
         return float(self.against.sum() / max(self.asked.sum(), 1))
+
+    @property
+    def beyond_noise(self) -> float:
+        """What noise does not explain of the share."""
+        return self.share - self.by_noise
 
     def blamed(self, groups: Mapping[str, frozenset[str]]) -> str:
         """The smallest of the groups without which the others agree best; "" if none makes a

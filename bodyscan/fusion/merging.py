@@ -65,4 +65,5 @@ def merge(
         evidence = list(compared)
     grey = even_brightness(samples, surfaces, evidence)
     cloud = average(samples, surfaces, evidence, grey, workers)
-    return MergedCloud(cloud, Contradictions.of(list(shown), evidence, samples.starts))
+    found = Contradictions.of(list(shown), evidence, samples, surfaces, settings.agreement_mm)
+    return MergedCloud(cloud, found)

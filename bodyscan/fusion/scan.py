@@ -18,7 +18,7 @@ from bodyscan.alignment.pole_steps import (
     loosened,
     motions_between,
 )
-from bodyscan.alignment.sway import SwayPrior
+from bodyscan.alignment.sway import SwayPrior, centre_sigmas
 from bodyscan.arrays import Array
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.merging import merge
@@ -131,6 +131,7 @@ def fuse(
             person=person,
             shifted=shifted,
             search=search,
+            boards_mm=centre_sigmas(calibration.covariance),
         )
 
     with step(progress, "judging"):

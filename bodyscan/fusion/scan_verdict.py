@@ -32,8 +32,14 @@ SOME_DISAGREEMENT_MM, DISAGREEMENT_SIGMAS = 0.4, 2.0
 GIRTH_PER_MM = 2.0 * np.pi
 """mm that a girth is wrong by, where its surface stands 1 mm off all round"""
 SOME_CONTRADICTED, MOST_CONTRADICTED = 0.005, 0.02  # below 0.001 where all is well
-SOME_MOTION_MM, MOST_MOTION_MM = 3.0, 6.0
-SOME_LEFT_MM, MOST_LEFT_MM = 0.6, 2.0  # standard deviations; 4 and 13 mm of a girth
+CALIBRATED_SIGMAS = 3.0
+"""Pairs that alignment moves by less may stand as the boards left it open; nobody moved."""
+LEFT_OF_MOTION = 0.2
+"""What no motion of the whole body explains, arms and breath, of how far a pair saw a person move."""
+TWICE, THRICE = 2.0, 3.0
+"""times the girth that is usable: of all of a motion; of what following a person left."""
+SOME_MOTION_MM = UseLimits().usable_girth_mm / GIRTH_PER_MM / LEFT_OF_MOTION
+SOME_LEFT_MM = UseLimits().usable_girth_mm / GIRTH_PER_MM
 CELL_MM = 50.0
 SIDE_BY_SIDE = 0.4  # of the taller one's height
 SMALL_PIECE = 0.01
@@ -47,6 +53,12 @@ TRUNK_MM2 = 25_000.0
 """An outline as large is no arm's: raised arms beside a neck are as large as it."""
 LIMB_MM2 = 1500.0
 """A wrist; fingers are less."""
+FINGERTIPS = 0.33
+"""of the height: hands that hang down end at 0.37"""
+THING_MM2 = 300.0
+"""A stick of 20 mm."""
+MOST_RINGS = 5
+"""Both hands on the hips, or held by one another, thighs, knees and heels that touch: five."""
 OUTSIDE_MM = 15.0
 SOME_OUTSIDE, MOST_OUTSIDE = 0.01, 0.2
 RIM_MM, AT_RIM = 10.0, 3e-4
@@ -80,6 +92,7 @@ def grade_scan(
     person: PersonMotion | None = None,
     shifted: Sequence[PoleStep] = (),
     search: StepSearch | None = None,
+    boards_mm: Mapping[str, float] | None = None,
 ) -> Verdict:
     """The worst of all findings decides; the reasons come worst first. mesh: None while there is none
     yet: what it alone would show is left out. use: how wrong a girth may be. seams: see
@@ -91,6 +104,7 @@ def grade_scan(
 
     agreements: of pairs that project stripes of two directions.  person: how a body that moved did.
     shifted: poles that moved since the calibration.  search: what the pairs' motions are besides.
+    boards_mm: how exactly each pair's place is known, see `centre_sigmas`.
 
     A check that fails by itself leaves the scan usable at best, and says so.
     """
@@ -103,9 +117,9 @@ def grade_scan(
         "directions": lambda: _directions(agreements or {}),
         "seams": lambda: _seams(seams, use),
         "poles": lambda: _shifted(shifted),
-        "places": lambda: _own_places(search, use),
+        "places": lambda: _own_places(search, use, boards_mm or {}),
         "disagreement": lambda: _disagreement(alignment),
-        "motion": lambda: _motion(None if shifted else alignment, person),
+        "motion": lambda: _motion(None if shifted else alignment, person, use, boards_mm or {}),
         "contradictions": lambda: _contradictions(contradictions, seams),
         "pieces": lambda: _company(cloud),
         "limbs": lambda: _limbs(shape) if shape else (),
@@ -193,10 +207,17 @@ def _shifted(steps: Sequence[PoleStep]) -> Iterator[Finding]:
         )
 
 
-def _own_places(search: StepSearch | None, use: UseLimits) -> Iterator[Finding]:
-    """Pairs that stand off where no sway takes them; head and arms of people may, by themselves."""
-    off = search.own_mm * GIRTH_PER_MM if search else 0.0
-    if search is None or off <= use.good_girth_mm:
+def _own_places(
+    search: StepSearch | None, use: UseLimits, boards_mm: Mapping[str, float]
+) -> Iterator[Finding]:
+    """Pairs that stand off where neither sway nor the boards' own error takes them; head and arms of
+    people may, by themselves."""
+    if search is None:
+        return
+    boards = np.array(list(boards_mm.values()) or [0.0])
+    expected = float(np.sqrt(np.mean(boards**2) / 3.0))  # along one axis
+    off = float(np.sqrt(max(search.own_mm**2 - expected**2, 0.0))) * GIRTH_PER_MM
+    if off <= use.good_girth_mm:
         return
     sways = search.sway_mm > STILL_MM
     yield (
@@ -220,32 +241,45 @@ def _disagreement(alignment: Alignment | None) -> Iterator[Finding]:
         )
 
 
-def _motion(alignment: Alignment | None, person: PersonMotion | None) -> Iterator[Finding]:
-    """Of a person who was followed, what that left; of others, how far the pairs were moved."""
+def _motion(
+    alignment: Alignment | None,
+    person: PersonMotion | None,
+    use: UseLimits,
+    boards_mm: Mapping[str, float],
+) -> Iterator[Finding]:
+    """Of a person who was followed, what that left; of others, how far the pairs were moved, and by
+    more than they may stand off themselves."""
     for part in person.parts if person else ():
-        if part.left_mm > SOME_LEFT_MM:
+        costs = part.left_mm * GIRTH_PER_MM
+        if costs > use.usable_girth_mm:
             yield (
-                "repeat" if part.left_mm > MOST_LEFT_MM else "usable",
+                "repeat" if costs > THRICE * use.usable_girth_mm else "usable",
                 f"the {part.name} moved by {part.moved_mm:.1f} mm while it was scanned; corrected "
                 f"to {part.left_mm:.1f} mm: repeat if you need it better",
             )
     if person or alignment is None or not alignment.motion_mm:
         return
-    name, motion = max(alignment.motion_mm.items(), key=lambda item: item[1])
-    if motion > SOME_MOTION_MM:
+    beyond = {
+        name: np.sqrt(max(mm**2 - (CALIBRATED_SIGMAS * boards_mm.get(name, 0.0)) ** 2, 0.0))
+        for name, mm in alignment.motion_mm.items()
+    }
+    name = max(beyond, key=lambda one: beyond[one])
+    costs = beyond[name] * LEFT_OF_MOTION * GIRTH_PER_MM
+    if costs > use.usable_girth_mm:
         yield (
-            "repeat" if motion > MOST_MOTION_MM else "usable",
-            f"the person moved by {motion:.1f} mm (pair {name}) between the pairs' captures",
+            "repeat" if costs > TWICE * use.usable_girth_mm else "usable",
+            f"the person moved by {alignment.motion_mm[name]:.1f} mm (pair {name}) between the pairs' "
+            "captures",
         )
 
 
 def _contradictions(found: Contradictions | None, seams: SeamReport | None) -> Iterator[Finding]:
     """Pairs that see through each other's surfaces, which points near each other do not tell."""
-    if found is None or found.share <= SOME_CONTRADICTED:
+    if found is None or found.beyond_noise <= SOME_CONTRADICTED:
         return
     blamed = found.blamed(seams.groups) if seams else ""
     yield (
-        "repeat" if found.share > MOST_CONTRADICTED else "usable",
+        "repeat" if found.beyond_noise > MOST_CONTRADICTED else "usable",
         f"{f'{blamed} and the others' if blamed else 'the pairs'} contradict each other: "
         f"{found.share:.1%} of what pairs say of one another's points is that there is no surface; "
         + (
@@ -280,11 +314,12 @@ def _company(cloud: BodyCloud) -> Iterator[Finding]:
 
 
 def _limbs(mesh: BodyMesh) -> Iterator[Finding]:
-    """More trunks, legs or arms side by side than one person has, whatever touches."""
+    """More trunks, legs or arms side by side than one person has, whatever touches, and what stands
+    beside the legs of one who stands."""
     top = float(mesh.vertices[:, 2].max())
     heights = mesh.vertices[mesh.faces, 2]
     low, high = heights.min(axis=1), heights.max(axis=1)
-    doubled, many = [], []
+    doubled, many, beside = [], [], []
     for share in LEVELS:
         level = share * top
         faces = mesh.faces[(low < level) & (high >= level)]
@@ -297,6 +332,8 @@ def _limbs(mesh: BodyMesh) -> Iterator[Finding]:
             doubled.append(level)
         elif np.sum(areas > LIMB_MM2) > (4 if legs else 3):
             many.append(level)
+        elif share < FINGERTIPS and np.sum(areas > THING_MM2) > 2:
+            beside.append(level)
     if len(doubled) > 1:
         yield (
             "repeat",
@@ -308,6 +345,13 @@ def _limbs(mesh: BodyMesh) -> Iterator[Finding]:
             "usable",
             f"more limbs than one person has at heights from {min(many):.0f} to {max(many):.0f} mm: is "
             "somebody or something else in the volume, or a pair that does not belong?",
+        )
+
+    if len(beside) > 1:
+        yield (
+            "usable",
+            f"more than two legs at heights from {min(beside):.0f} to {max(beside):.0f} mm: is a "
+            "stick, a rail, a chair or an animal in the volume? What touches the body is taken for it",
         )
 
 
@@ -336,7 +380,15 @@ def _omissions(cloud: BodyCloud, mesh: BodyMesh) -> Iterator[Finding]:
 
 def _contacts(mesh: BodyMesh) -> Iterator[Finding]:
     middle = 0.5 * (mesh.vertices[:, 1].min() + mesh.vertices[:, 1].max())
-    for ring in rings(mesh.vertices, mesh.faces):
+    found = rings(mesh.vertices, mesh.faces)
+    if len(found) > MOST_RINGS:
+        yield (
+            "usable",
+            f"{len(found)} closed rings, more than parts of a body that touch make: is something "
+            "else in the volume, do pairs not fit the others?",
+        )
+        return
+    for ring in found:
         side = "left" if ring.y_mm > middle else "right"
         yield (
             "usable",

@@ -47,5 +47,6 @@ def point_covariance(motion_covariance: Array, point: Array) -> Array:
 
 
 def position_sigma(covariance: PoseCovariance, name: str, position: Array) -> Array:
-    """(3,) mm: standard deviation of a pair's camera centre (3,) along the rig's axes."""
+    """(3,) mm: standard deviation, along the rig's axes, of what the pair puts at `position` (3,), such
+    as its camera's centre."""
     return np.sqrt(np.diag(point_covariance(covariance.of(name), position)))
