@@ -54,7 +54,7 @@ def cloud_of(points: Array) -> BodyCloud:
     ones = np.ones(count, np.float32)
     return BodyCloud(
         points,
-        np.tile(np.float32([1.0, 0.0, 0.0]), (count, 1)),
+        np.tile(np.array([1.0, 0.0, 0.0], np.float32), (count, 1)),
         ones,
         np.zeros((count, 3), np.uint8),
         ones.astype(np.uint8),
