@@ -126,14 +126,21 @@ class BoardErrors:
 
 def board_errors(data: BoundaryPoints) -> BoardErrors:
     """From the points themselves, which lie on their boards."""
-    effects, normals = np.ones_like(data.points), np.empty_like(data.points)
-    for board in np.unique(data.board):
-        own = data.board == board
-        centred = data.points[own] - data.points[own].mean(axis=0)
-        _, axes = np.linalg.eigh(centred.T @ centred)
-        place = centred @ axes[:, 1:]
-        effects[own, 1:] = place / np.maximum(place.std(axis=0), 1e-9)
-        normals[own] = axes[:, 0]
-    outward = np.sum(normals * data.points, axis=1)
-    along_ray = data.points / outward[:, None]
-    return BoardErrors(effects, along_ray, np.abs(outward / data.points[:, 2]))
+    _, board = np.unique(data.board, return_inverse=True)
+    count = np.bincount(board)[:, None]
+    centred = data.points - (_by_board(data.points, board) / count)[board]
+    products = (centred[:, :, None] * centred[:, None]).reshape(-1, 9)
+    squares, axes = np.linalg.eigh(_by_board(products, board).reshape(-1, 3, 3))
+    size = np.sqrt(np.maximum(squares[:, 1:] / count, 1e-18))
+    place = np.einsum("ni,nij->nj", centred, axes[board][..., 1:]) / size[board]
+    outward = np.einsum("ni,ni->n", axes[board][..., 0], data.points)
+    return BoardErrors(
+        np.column_stack([np.ones(len(place)), place]),
+        data.points / outward[:, None],
+        np.abs(outward / data.points[:, 2]),
+    )
+
+
+def _by_board(values: Array, board: Indices) -> Array:
+    """Sums (B, K) of values (N, K) over the points of each board."""
+    return np.stack([np.bincount(board, column) for column in values.T], axis=-1)

@@ -83,7 +83,7 @@ def _blocks(sheets: SmoothSheets, data: BoundaryPoints) -> tuple[Block, Block]:
         offset = _offset(sheets, data)
     by_parameter = offset.by_parameter
     assert by_parameter is not None
-    leverage = np.abs(np.sum(offset.by_point * data.per_pixel, axis=1))
+    leverage = np.abs(np.einsum("ni,ni->n", offset.by_point, data.per_pixel))
     sigma = np.maximum(leverage, 1e-12) * np.hypot(data.sigma_px, FLOOR_PX)
     # Sheets that leave points behind the projector are no sheets.
     value = np.where(offset.reach > 0.0, offset.value, np.nan)
@@ -105,7 +105,7 @@ def _of_boards(
     """What each board's error on its own adds to the covariance (a sandwich, boards as clusters)."""
     points, noise = solution.blocks[0], solution.covariance
     errors = board_errors(data)
-    off = np.sum(by_point * errors.along_ray, axis=1)
+    off = np.einsum("ni,ni->n", by_point, errors.along_ray)
     weights = solution.weights[0] / (points.sigma * solution.spreads[0]) ** 2
     effects = errors.effects * (off * weights)[:, None]
     total = np.zeros_like(noise)
