@@ -117,7 +117,12 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
 
     Raises FailedWork when they cannot be written.
     """
-    from bodyscan.jobs.summary import to_repeat, write_out_manifest, write_summary
+    from bodyscan.jobs.summary import (
+        drifted,
+        to_repeat,
+        write_out_manifest,
+        write_summary,
+    )
 
     try:
         with for_owner_only():
@@ -130,12 +135,14 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
             remedy="make room, then start the same batch again: what is done stays done",
         ) from error
     aside = [outcome.job for outcome in outcomes if outcome.state != "done"]
+    done = [job for job in jobs if job.name not in aside]
     return {
         "event": "summary",
         "jobs": len(jobs),
         "done": len(jobs) - len(aside),
         "ran": sum(bool(outcome.stages) for outcome in outcomes),
         "set_aside": aside,
-        "repeat": to_repeat([job for job in jobs if job.name not in aside]),
+        "repeat": to_repeat(done),
+        "drifted": {one.pair: round(one.shift_mm, 2) for one in drifted(done)},
         "table": str(table),
     }

@@ -95,6 +95,7 @@ class _Screen:
         said = f"{event['done']} of {event['jobs']} jobs done ({event['ran']} of them now)"
         said += f", {aside} set aside" if aside else ""
         said += f"\nto be scanned again: {', '.join(event['repeat'])}" if event["repeat"] else ""
+        said += _drift_text(event["drifted"])
         self._bars.console.print(Text(f"{said}\ntable: {event['table']}"), soft_wrap=True)
 
     def _progress(self, event: dict[str, Any]) -> None:
@@ -150,3 +151,15 @@ def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _drift_text(drifted: dict[str, float]) -> str:
+    """drifted: mm, of pairs by name."""
+    if not drifted:
+        return ""
+    name, mm = next(iter(drifted.items()))
+    more = f", {len(drifted) - 1} more likewise" if len(drifted) > 1 else ""
+    return (
+        f"\nevery scan moves pair {name} by {mm:.1f} mm the same way{more}: no sway does; the rig or "
+        "its cameras changed since the calibration, calibrate again"
+    )

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from bodyscan.alignment.pair_drift import PairDrift, mean_drift
 from bodyscan.arrays import Array
 from bodyscan.files.atomic import write_json, write_text
 from bodyscan.files.hashing import file_hash
@@ -71,6 +72,16 @@ def to_repeat(jobs: Sequence[Job]) -> list[str]:
         job.name: read_record(job.folder / "scan" / "scan.json").get("verdict") for job in jobs
     }
     return [name for name, verdict in verdicts.items() if verdict and verdict["grade"] == "repeat"]
+
+
+def drifted(jobs: Sequence[Job]) -> list[PairDrift]:
+    """Pairs that the scans of each calibration all move the same way, farthest first: sway does not."""
+    shifts: dict[tuple[Path | None, str], list[Array]] = {}
+    for job in jobs:
+        for pair, shift in _motions(job).items():
+            shifts.setdefault((job.calibration, pair), []).append(shift)
+    found = [mean_drift(pair, np.array(own)) for (_, pair), own in shifts.items()]
+    return sorted((one for one in found if one.moved), key=lambda one: -one.shift_mm)
 
 
 def _row(job: Job, outcome: JobResult) -> dict[str, Any]:

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from bodyscan.alignment.pair_drift import FEWEST_SCANS
 from bodyscan.captures.folder import Captures, join_captures, open_check
 from bodyscan.errors import BadInput, FailedWork
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.workflows.check_boards import BoardCheck, check_boards, move_line, repaired
-from bodyscan.workflows.check_scans import FEWEST_SCANS, ScanCheck, check_scans
+from bodyscan.workflows.check_scans import ScanCheck, check_scans
 
 
 @dataclass(frozen=True, eq=False)

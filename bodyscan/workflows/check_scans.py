@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import networkx as nx
 import numpy as np
-from scipy.special import fdtri
 
 from bodyscan.alignment.icp import Alignment, align
+from bodyscan.alignment.pair_drift import LEAST_MM, PairDrift, mean_drift
 from bodyscan.alignment.pole_steps import StepSearch, find_steps, motions_between
 from bodyscan.alignment.sway import BODY_CENTRE
-from bodyscan.arrays import Array
 from bodyscan.captures.folder import Captures
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.geometry.transforms import RigidTransform
@@ -21,35 +20,10 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import AlignmentSettings
 from bodyscan.workflows.range_images import reconstruct_range_images
 
-FEWEST_SCANS = 3
-"""A person sways by as much as a pair may have moved: from so many scans on the two are told apart."""
-BY_CHANCE, LEAST_MM = 1e-4, 0.3
-LEAST_SIGMA_MM = 0.05
 OVERLAP_MM = 0.5
 MOST_UNSEEN_MM = 5.0
 """A pole that moved by less alignment takes out of a scan: girths are still good to 2 mm
 (docs/results.md, faults)."""
-
-
-@dataclass(frozen=True)
-class PairDrift:
-    """shift: mean motion (3,) mm at the body's centre that its overlaps asked for, rig axes; sigma_mm
-    of it, from how much it varies from scan to scan; None with fewer than three scans.  limit_mm:
-    beyond it chance is out of the question."""
-
-    pair: str
-    shift: tuple[float, float, float]
-    sigma_mm: float | None
-    limit_mm: float
-
-    @property
-    def shift_mm(self) -> float:
-        return float(np.linalg.norm(self.shift))
-
-    @property
-    def moved(self) -> bool:
-        """The same motion in every scan, which no sway explains."""
-        return self.shift_mm > self.limit_mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +99,12 @@ def judge_scans(
         ).reshape(-1, 3)
         for name, at in rig_from_camera.items()
     }
-    pairs = [_drift(name, own) for name, own in sorted(shifts.items()) if len(own)]
+    pairs = [mean_drift(name, own) for name, own in sorted(shifts.items()) if len(own)]
     together = []
     for pole in sorted(set(poles.values())):
         own = [shifts[n] for n in sorted(shifts) if poles.get(n) == pole and len(shifts[n])]
         if len(own) > 1 and len({len(one) for one in own}) == 1:
-            together.append(_drift(f"pole {pole}", np.mean(own, axis=0)))
+            together.append(mean_drift(f"pole {pole}", np.mean(own, axis=0)))
     if moments_ms is None:
         moments_ms = [dict.fromkeys(found.rig_from_camera) for found in alignments]
     motions = [
@@ -154,16 +128,3 @@ def _apart(alignments: Sequence[Alignment]) -> tuple[tuple[str, ...], ...]:
         graph.add_edges_from((overlap.source, overlap.target) for overlap in found.overlaps)
     groups = sorted((tuple(sorted(group)) for group in nx.connected_components(graph)), key=len)
     return tuple(groups[::-1]) if len(groups) > 1 else ()
-
-
-def _drift(name: str, shifts: Array) -> PairDrift:
-    """shifts: (scans, 3) mm."""
-    scans = len(shifts)
-    x, y, z = (float(value) for value in shifts.mean(axis=0))
-    if scans < FEWEST_SCANS:
-        return PairDrift(name, (x, y, z), None, np.inf)
-    varies = float(np.sqrt(shifts.var(axis=0, ddof=1).sum() / scans))
-    sigma = max(varies, LEAST_SIGMA_MM)
-    # Hotelling's test with one variance for all axes: the ratio of squares has an F distribution.
-    times = float(np.sqrt(fdtri(3, 3 * (scans - 1), 1.0 - BY_CHANCE)))
-    return PairDrift(name, (x, y, z), sigma, max(times * sigma, LEAST_MM))

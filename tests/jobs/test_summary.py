@@ -14,7 +14,7 @@ from cheap_batch import jobs_of
 from bodyscan.arrays import Array
 from bodyscan.jobs.batch import seconds_left
 from bodyscan.jobs.job import Job
-from bodyscan.jobs.summary import to_repeat, write_summary
+from bodyscan.jobs.summary import drifted, to_repeat, write_summary
 from bodyscan.jobs.supervision import JobResult
 from bodyscan.settings import BODY_CENTRE_MM
 
@@ -81,6 +81,15 @@ def test_drift_is_what_neighbours_in_time_have_in_common(day: tuple[list[Job], P
     assert table[0]["pairs_measured"] == "1"
     assert table[3]["verdict_reasons"] == "moved, a lot"
     assert to_repeat(jobs) == ["s3"]
+
+
+def test_a_pair_that_all_scans_move_alike_is_told_from_one_that_sways(
+    day: tuple[list[Job], Path],
+) -> None:
+    """b by 3 mm on the mean of five scans; a sways by 0.5 mm along each axis."""
+    jobs, _ = day
+    assert [one.pair for one in drifted(jobs[4:])] == ["b"]
+    assert drifted(jobs[:2]) == []
 
 
 def test_two_scans_tell_no_drift_from_sway(day: tuple[list[Job], Path]) -> None:
