@@ -7,13 +7,14 @@ off, sparse. It knows neither skew nor pixels that are not square, so `full_solv
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
 
 from bodyscan.arrays import Array
+from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
@@ -57,9 +58,10 @@ def solve_jointly(
     points = _add_points(model, views)
     if not points:  # a single view of a camera that is known; `full_solve` needs no start
         return start
+    seen = _seen_by_colmap(views, cameras)
     for number, target in enumerate(targets, start=1):
         group = [view for view in views if view.target == target]
-        _add_frame(model, number, group, ids, cameras, points, start.root_from_board[target])
+        _add_frame(model, number, group, ids, seen, points, start.root_from_board[target])
     # What others found of a camera, and how well, Ceres is not told: `full_solve` goes by it.
     known = [ids[name] for name in names if cameras[name].prior is not None]
     _adjust(model, refine_cameras, loss_px, known)
@@ -103,6 +105,19 @@ def colmap_pixels(camera: Camera, pixels: Array) -> Array:
     )
     square[..., 1] = camera.v0 + (square[..., 1] - camera.v0) * camera.alpha / camera.beta
     return square + COLMAP_PIXEL_CENTRE
+
+
+def _seen_by_colmap(
+    views: Sequence[LocatedView], cameras: Mapping[str, Camera]
+) -> dict[ViewKey, Array]:
+    """`colmap_pixels` of each view, those of one camera together."""
+    seen: dict[ViewKey, Array] = {}
+    for pair in sorted({view.pair for view in views}):
+        own = [view for view in views if view.pair == pair]
+        pixels = colmap_pixels(cameras[pair], np.concatenate([view.pixels for view in own]))
+        cuts = np.cumsum([len(view.pixels) for view in own])[:-1]
+        seen |= zip((view.key for view in own), np.split(pixels, cuts), strict=True)
+    return seen
 
 
 def _refined(camera: Camera, solved: pycolmap.Camera) -> Camera:
@@ -165,7 +180,7 @@ def _add_frame(
     number: int,
     group: Sequence[LocatedView],
     ids: dict[str, int],
-    cameras: dict[str, Camera],
+    seen: Mapping[ViewKey, Array],
     points: dict[tuple[str, tuple[float, ...]], int],
     root_from_board: RigidTransform,
 ) -> None:
@@ -177,7 +192,7 @@ def _add_frame(
     frame.rig_from_world = _rigid3d(root_from_board)
     model.add_frame(frame)
     for image_id, view in enumerate(group, start=first_image):
-        pixels = colmap_pixels(cameras[view.pair], view.pixels)
+        pixels = seen[view.key]
         image = pycolmap.Image(
             name=f"{view.shot}/{view.board}/{view.pair}",
             keypoints=pixels,
