@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from bodyscan.cli.main import app
+from bodyscan.cli.main import app, main
 from bodyscan.cli.options import SHARED
 from bodyscan.settings import ExportSettings, RigExportSettings, ScanSettings
 
@@ -19,15 +21,39 @@ RIGS = Path(__file__).parents[1] / "rigs"
 HEAVY = ("open3d", "pycolmap", "cv2", "scipy", "numba")
 
 
-def bodyscan(*arguments: object) -> subprocess.CompletedProcess[str]:
+Done = subprocess.CompletedProcess[str]
+Command = Callable[..., Done]
+
+
+def in_a_process(*arguments: object) -> Done:
     line = [sys.executable, "-m", "bodyscan", *map(str, arguments)]
     return subprocess.run(line, capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.fixture
+def bodyscan(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
+    """The command line without the second that a process of its own takes to begin."""
+    monkeypatch.setattr("bodyscan.cli.main.run_interruptibly", lambda work: work())
+    monkeypatch.setattr("bodyscan.cli.main.keep_freed_memory", lambda: None)
+
+    def run(*arguments: object) -> Done:
+        line = ["bodyscan", *map(str, arguments)]
+        monkeypatch.setattr(sys, "argv", line)
+        mask = os.umask(0o077)
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main()
+        os.umask(mask)
+        said = capfd.readouterr()
+        return subprocess.CompletedProcess(line, int(str(end.value.code)), said.out, said.err)
+
+    return run
 
 
 def test_bad_input_exits_with_2_and_no_traceback(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     rig.write_text("version: 1\nname: x\nboards: []\npears: []\n")
-    done = bodyscan("calibrate-rig", rig)
+    done = in_a_process("calibrate-rig", rig)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert f"{rig}:4" in done.stderr
@@ -35,19 +61,19 @@ def test_bad_input_exits_with_2_and_no_traceback(tmp_path: Path) -> None:
 
 
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:
-    done = bodyscan("calibrate-rig", tmp_path / "missing.yaml", "--debug")
+    done = in_a_process("check", tmp_path / "missing.yaml", "--debug")
     assert done.returncode != 0
     assert "Traceback" in done.stderr
 
 
-def test_a_missing_calibration_is_bad_input(tmp_path: Path) -> None:
+def test_a_missing_calibration_is_bad_input(tmp_path: Path, bodyscan: Command) -> None:
     done = bodyscan("scan", tmp_path, "--calibration", tmp_path)
     assert done.returncode == 2
     assert "calibration.json" in done.stderr
     assert "calibrate-rig" in done.stderr
 
 
-def test_a_wrong_setting_is_named_before_the_work(tmp_path: Path) -> None:
+def test_a_wrong_setting_is_named_before_the_work(tmp_path: Path, bodyscan: Command) -> None:
     done = bodyscan("scan", tmp_path, "--calibration", tmp_path, "--set", "mesh.deth=8")
     assert done.returncode == 2
     assert "--set mesh.deth: is not a key known here (did you mean 'depth'?)" in done.stderr
@@ -67,13 +93,13 @@ def test_check_and_help_import_nothing_heavy() -> None:
         assert done.stdout.rstrip().endswith("heavy: []"), done.stdout
 
 
-def test_no_captures_is_named() -> None:
+def test_no_captures_is_named(bodyscan: Command) -> None:
     done = bodyscan("check", RIGS / "three-pole-12.yaml")
     assert done.returncode == 2
     assert "captures/calibration" in done.stdout
 
 
-def test_the_version_needs_no_command() -> None:
+def test_the_version_needs_no_command(bodyscan: Command) -> None:
     done = bodyscan("--version")
     assert done.returncode == 0
     assert done.stdout.startswith("bodyscan ")
@@ -88,7 +114,7 @@ def parameters(name: str) -> dict[str, inspect.Parameter]:
     return dict(inspect.signature(command).parameters)
 
 
-def test_commands_stand_in_three_groups() -> None:
+def test_commands_stand_in_three_groups(bodyscan: Command) -> None:
     said = bodyscan("--help").stdout
     places = [said.index(group) for group in ("Builder", "Operator", "Laboratory")]
     assert places == sorted(places)
@@ -115,7 +141,7 @@ def test_the_page_of_commands_is_as_the_commands_are() -> None:
     assert page() == (docs / "commands.md").read_text("utf-8"), "run docs/write_commands.py"
 
 
-def test_json_is_one_document_that_says_what_was_made(tmp_path: Path) -> None:
+def test_json_is_one_document_that_says_what_was_made(tmp_path: Path, bodyscan: Command) -> None:
     done = bodyscan("patterns", RIGS / "one-pair.yaml", "--out", tmp_path, "--width", 300,
                     "--height", 48, "--json")  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -128,7 +154,7 @@ def test_json_is_one_document_that_says_what_was_made(tmp_path: Path) -> None:
     assert document["notes"]  # stripes that cannot be equally wide on so few pixels
 
 
-def test_json_says_what_went_wrong_too(tmp_path: Path) -> None:
+def test_json_says_what_went_wrong_too(tmp_path: Path, bodyscan: Command) -> None:
     done = bodyscan("scan", tmp_path, "--calibration", tmp_path, "--json")
     assert done.returncode == 2
     document = json.loads(done.stdout)
@@ -137,7 +163,7 @@ def test_json_says_what_went_wrong_too(tmp_path: Path) -> None:
     assert "calibrate-rig" in document["error"]["remedy"]
 
 
-def test_quiet_says_nothing_but_errors(tmp_path: Path) -> None:
+def test_quiet_says_nothing_but_errors(tmp_path: Path, bodyscan: Command) -> None:
     done = bodyscan("patterns", RIGS / "one-pair.yaml", "--out", tmp_path, "--width", 300,
                     "--height", 48, "--quiet")  # fmt: skip
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

@@ -190,7 +190,16 @@ def test_a_girth_is_uncertain_by_what_all_around_it_shares() -> None:
 
 
 def test_without_times_every_pair_has_a_free_stance(standing: LivingScan) -> None:
-    aligned, alignment, followed = together(standing, timed=False)
+    # Of eight of the sixteen: each has its own unknowns, and the work grows with their cube.
+    some = [k for k, image in enumerate(standing.images) if image.pair[-1] in "23"]
+    half = replace(
+        standing,
+        images=[standing.images[k] for k in some],
+        rig_from_camera={
+            standing.images[k].pair: standing.rig_from_camera[standing.images[k].pair] for k in some
+        },
+    )
+    aligned, alignment, followed = together(half, timed=False)
     assert followed is not None
     assert followed.moment_ms is None
     # Its moment is the mean of all, which nobody knows: how well overlaps agree is what there is.

@@ -72,6 +72,7 @@ def test_looking_for_few_markers_finds_those_as_well(dictionary: str) -> None:
     np.testing.assert_array_equal(every.corners[concerned][order[0]], some.corners[order[1]])
 
 
+@pytest.mark.slow
 def test_two_boards_of_one_dictionary_are_both_found() -> None:
     """Markers are looked for once, as far as the board with the highest numbers needs them."""
     second = MARKED.model_copy(update={"name": "second", "first_marker": 400})
@@ -91,12 +92,14 @@ def test_either_of_the_two_historic_layouts_is_recognised(picture: Bytes) -> Non
     assert "legacy_layout: false" in appearance_notes(rig, [view])[0]
 
 
+@pytest.mark.slow
 def test_a_column_too_many_is_refused_and_the_right_number_named(picture: Bytes) -> None:
     described = MARKED.model_copy(update={"columns": 10})
     assert found(picture, described) == []
     assert "board of 9 columns x 8 rows, not 10 x 8" in describe_unfound(picture, described)
 
 
+@pytest.mark.slow
 def test_columns_and_rows_that_are_exchanged_are_named(picture: Bytes) -> None:
     described = MARKED.model_copy(update={"columns": 8, "rows": 9})
     assert found(picture, described) == []
@@ -122,12 +125,14 @@ def test_markers_of_another_size_are_named(picture: Bytes) -> None:
     assert float(told[1]) == pytest.approx(share, rel=0.1)
 
 
+@pytest.mark.slow
 def test_another_dictionary_is_named(picture: Bytes) -> None:
     described = MARKED.model_copy(update={"dictionary": "DICT_5X5_1000"})
     assert found(picture, described) == []
     assert "0 markers of DICT_5X5_1000, but 3" in describe_unfound(picture, described)
 
 
+@pytest.mark.slow
 def test_another_grid_is_named() -> None:
     plain = Board(name="plain", columns=9, rows=7, square_mm=30, margin_mm=20)
     image = render([(plain, view_of(plain, 20, 60, 20, fill=0.6))])

@@ -7,8 +7,9 @@ import pytest
 from picture_boards import HEIGHT, NOISE_PX, WIDTH, seen
 
 from bodyscan.calibration.board_views import PlanarView
-from bodyscan.calibration.lens_choice import calibrate_with_best_lens, places
+from bodyscan.calibration.lens_choice import calibrate_with_lenses, places
 from bodyscan.errors import DegeneratePoses
+from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
@@ -25,7 +26,7 @@ CASES = [
 @pytest.mark.parametrize(("lens", "kind"), CASES)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_lens_that_there_is_is_chosen(lens: Lens, kind: str, seed: int) -> None:
-    found = calibrate_with_best_lens(seen(lens, shots=16, seed=seed), WIDTH, HEIGHT)
+    found = calibrate_with_lenses(FAMILY, seen(lens, shots=16, seed=seed), WIDTH, HEIGHT)
     assert found.camera.lens.kind == kind
     (chosen,) = (tried for tried in found.lenses if tried.chosen)
     assert chosen.kind == kind
@@ -39,7 +40,7 @@ def test_a_board_whose_corners_are_mixed_up_does_not_choose() -> None:
     views = seen(Radial(-0.3, 0.1), shots=14)
     mixed = views[3].pixels[np.random.default_rng(0).permutation(len(views[3].pixels))]
     views[3] = PlanarView(views[3].shot, views[3].points, mixed)
-    assert calibrate_with_best_lens(views, WIDTH, HEIGHT).camera.lens.kind == "radial"
+    assert calibrate_with_lenses(FAMILY, views, WIDTH, HEIGHT).camera.lens.kind == "radial"
 
 
 def test_boards_that_stood_still_are_one_place() -> None:
@@ -51,11 +52,11 @@ def test_boards_that_stood_still_are_one_place() -> None:
 def test_in_too_few_places_the_simplest_lens_stays_untried() -> None:
     # The same three poses ten times: 30 views, of which none says anything about another.
     views = seen(Brown(-0.3, 0.1, 1.5e-3, -1e-3, 0.0), shots=3, again=10)
-    found = calibrate_with_best_lens(views, WIDTH, HEIGHT)
+    found = calibrate_with_lenses(FAMILY, views, WIDTH, HEIGHT)
     assert found.camera.lens.kind == "radial"
     assert found.lenses == ()
 
 
 def test_two_poses_are_refused() -> None:
     with pytest.raises(DegeneratePoses):
-        calibrate_with_best_lens(seen(Radial(), shots=2), WIDTH, HEIGHT)
+        calibrate_with_lenses(FAMILY, seen(Radial(), shots=2), WIDTH, HEIGHT)

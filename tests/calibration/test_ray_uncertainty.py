@@ -8,8 +8,9 @@ from picture_boards import HEIGHT, MIDDLE, NOISE_PX, POINTS, WIDTH
 
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.camera import CameraCalibration
-from bodyscan.calibration.lens_choice import calibrate_with_best_lens
+from bodyscan.calibration.lens_choice import calibrate_with_lenses
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.lenses.rational import Rational
@@ -31,7 +32,7 @@ def calibrated(lens: Lens, reach: float, seed: int) -> tuple[Camera, CameraCalib
         placed = RigidTransform(turn, where - turn @ MIDDLE).apply(POINTS)
         noisy = true.project(placed) + rng.normal(0.0, NOISE_PX, (len(POINTS), 2))
         views.append(PlanarView(f"s{k}", POINTS, noisy))
-    return true, calibrate_with_best_lens(views, WIDTH, HEIGHT)
+    return true, calibrate_with_lenses(FAMILY, views, WIDTH, HEIGHT)
 
 
 def errors_px(true: Camera, found: Camera, covered: float) -> np.ndarray:

@@ -62,6 +62,7 @@ def known(off: np.ndarray, rows: slice) -> float:
     return float(np.isfinite(off[rows, 5:-5]).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", [GRAY, WAVES], ids=lambda code: str(code["code"]))
 def test_hair_and_skin_come_in_one_scan(code: dict[str, Any]) -> None:
     (short, s), (long, _) = exposed(code, 1.0), exposed(code, 16.0)

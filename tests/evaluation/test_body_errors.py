@@ -78,6 +78,7 @@ def test_sway_left_in_is_told_and_a_common_motion_is_not() -> None:
     assert apart.apart_mm == pytest.approx(0.3)
 
 
+@pytest.mark.slow
 def test_only_what_camera_and_projector_see_counts() -> None:
     vertices, faces = column(150.0)
     seen, covered = coverage_of_seen(vertices, vertices, faces, pairs([RigidTransform.identity()]))

@@ -28,9 +28,9 @@ def placed_ring(
 
 
 def test_honest_halves_differ_by_what_they_promise() -> None:
-    found = [compare_halves(*placed_ring(seed), seed=seed) for seed in range(5)]
+    found = [compare_halves(*placed_ring(seed), seed=seed) for seed in range(3)]
     ratios = [comparison.over_expected for comparison in found]
-    # 5 x 30 independent normalised differences: 1 +- 0.06, and covariances good to 15 % or so.
+    # 3 x 30 independent normalised differences: 1 +- 0.08, and covariances good to 15 % or so.
     assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.25
     shifts = np.concatenate([c.shifts_mm / c.sigmas_mm for c in found])
     assert 0.7 < np.sqrt(np.mean(shifts**2)) < 1.35  # components of one pair go together: wider

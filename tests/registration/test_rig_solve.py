@@ -40,14 +40,14 @@ def test_twelve_cameras_are_placed() -> None:
 def test_sigmas_of_positions_are_honest() -> None:
     placings, cameras = ring_of_cameras(heights=(700, 1200))
     normalized = []
-    for seed in range(12):
+    for seed in range(6):
         views, _ = ring_views(placings, cameras, shots=20, seed=seed)
         placed = solve_rig(ring_rig(placings), views, cameras).value
         for name, error in centre_errors(placed, placings).items():
             if name != "p1-1":
                 sigma = position_sigma(placed.covariance, name, placings[name].translation)
                 normalized.append(error / sigma)
-    # 12 x 5 x 3 draws, correlated within a seed (12 x 6 independent ones at worst): 1 +- 0.1.
+    # 6 x 5 x 3 draws, correlated within a seed (6 x 6 independent ones at worst): 1 +- 0.12.
     assert 0.75 < np.sqrt(np.mean(np.square(normalized))) < 1.3
 
 
@@ -137,6 +137,7 @@ def test_exchanged_shots_of_an_ambiguous_board_are_told_from_the_others() -> Non
     assert "two shots exchanged" in str(caught.value)
 
 
+@pytest.mark.slow
 def test_the_board_can_fix_the_frame() -> None:
     placings, cameras = ring_of_cameras()
     views, truth = ring_views(placings, cameras)

@@ -119,5 +119,5 @@ def test_a_name_that_is_taken_is_refused() -> None:
         codes.register(Another)
     with pytest.raises(ValueError, match="kind 'pattern' are others already"):
         codes.register(Clash)
-    assert "shifted-binary" not in codes.code_names()
+    assert Clash.kinds[0] not in codes.image_kinds()
     assert issubclass(Clash, StripeCode)

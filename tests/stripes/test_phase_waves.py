@@ -323,6 +323,7 @@ def test_periods_may_be_counted() -> None:
     assert described({"periods": (12, 1)}).waves == described({"period": (20, 240)}).waves
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("taken", "given", "named"),
     [

@@ -1,16 +1,18 @@
-"""A batch of cheap jobs in a process of its own, and what it left."""
+"""A batch of cheap jobs, each in a process of its own, and what it left."""
 
 from __future__ import annotations
 
+import io
 import json
-import subprocess
 import sys
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cheap_job
 
+from bodyscan.errors import BodyscanError
 from bodyscan.files.hashing import file_hash, files_below
 from bodyscan.jobs.discovery import find_jobs
 from bodyscan.jobs.job import Job
@@ -46,11 +48,14 @@ def batch_command(scans: Path, out: Path, workers: int = 2) -> list[str]:
 
 
 def run_cheap(scans: Path, out: Path, workers: int = 2) -> Done:
-    command = batch_command(scans, out, workers)
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    return Done(
-        done.returncode, [json.loads(line) for line in done.stdout.splitlines()], done.stderr
-    )
+    """As `batch_command`, without the process around the jobs' own."""
+    told, errors = io.StringIO(), ""
+    try:
+        with redirect_stdout(told):
+            code = cheap_job.batch(scans, out, workers)
+    except BodyscanError as error:
+        code, errors = error.exit_code, str(error)
+    return Done(code, [json.loads(line) for line in told.getvalue().splitlines()], errors)
 
 
 def jobs_of(scans: Path, out: Path, *changes: str) -> list[Job]:

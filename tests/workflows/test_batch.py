@@ -42,7 +42,7 @@ def endings(result: Result) -> dict[str, dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def day(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A day's scans, some of which hold what a bad disk or a bad person may put there."""
+    """A day's scans, one of them with what a bad disk leaves."""
     day = tmp_path_factory.mktemp("day")
     person = workspace.folder / "captures" / "person"
     shutil.copytree(workspace.folder / "calibration", day / "calibration")
@@ -51,6 +51,10 @@ def day(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Path:
     first, second = (day / "scans" / "hurt" / "s01" / pair for pair in ("p1-2", "p1-3"))
     (first / "lit.png").write_bytes((first / "lit.png").read_bytes()[:5000])
     (second / "lit.png").write_bytes(_huge_png())
+    return day
+
+
+def put_what_a_bad_person_may(day: Path) -> None:
     for name, text in {
         "laughs": _billion_laughs(),
         "climbing": "kind: scan\nshots: [{name: ../../anna/s01}]\n",
@@ -60,13 +64,13 @@ def day(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (day / "scans" / "link").symlink_to("/etc")
     (day / "scans" / "inner").mkdir()
     (day / "scans" / "inner" / "s01").symlink_to("/etc")
-    return day
 
 
 @pytest.fixture(scope="module")
 def night(day: Path) -> tuple[Result, Result]:
-    """The batch over that day, stopped after the first stage, then finished."""
+    """The batch over that day, stopped after the first stage, then finished with what came since."""
     first = batch(day, *SMALL, "--json", "--until", "scan")
+    put_what_a_bad_person_may(day)
     return first, batch(day, *SMALL, "--json")
 
 
@@ -74,7 +78,7 @@ def test_good_scans_are_fused_and_bad_ones_are_named(
     day: Path, night: tuple[Result, Result]
 ) -> None:
     first, second = night
-    assert first.exit_code == second.exit_code == 1, second.output
+    assert second.exit_code == 1, second.output
     odd = next(name for name in endings(first) if name.startswith("q-"))
     good = {"anna", odd, "hurt"}
     assert {n for n, end in endings(second).items() if end["state"] == "done"} == good

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_workspace import Workspace, run
+from small_workspace import run
 
 from bodyscan.files.hashing import file_hash, files_below
 
@@ -22,9 +22,9 @@ OWN = {"state.json", "log.txt", "lock", "batch.lock", "summary.csv"}
 
 
 @pytest.fixture(scope="module")
-def day(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def day(example: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     day = tmp_path_factory.mktemp("watched")
-    shutil.copytree(workspace.folder / "calibration", day / "calibration")
+    shutil.copytree(example / "made" / "calibration", day / "calibration")
     return day
 
 
@@ -56,12 +56,10 @@ def feed(person: Path, scan: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_arrives_is_fused_as_a_batch_would_and_never_twice(
-    workspace: Workspace, day: Path
-) -> None:
+def test_what_arrives_is_fused_as_a_batch_would_and_never_twice(example: Path, day: Path) -> None:
     (day / "inbox").mkdir()
     process = watch(day, "out")
-    feed(workspace.folder / "captures" / "person", day / "inbox" / "anna")
+    feed(example / "pole" / "captures" / "person", day / "inbox" / "anna")
     stages = [e for e in events(process, "stage") if e["event"] == "stage"]
     assert stages[0]["stage"] == "scan"
     process.send_signal(signal.SIGKILL)
@@ -98,6 +96,7 @@ def _bytes(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): file_hash(path) for path in paths}
 
 
+@pytest.mark.slow
 def test_a_calibration_that_cannot_be_used_is_said_at_once(tmp_path: Path) -> None:
     shutil.copytree(STORED, tmp_path / "calibration")
     (tmp_path / "calibration" / "calibration.npz").write_bytes(b"no arrays")
