@@ -86,19 +86,6 @@ Scan = tuple[Mapping[str, Array], Mapping[str, float | None]]
 origin, a translation.  moments_ms: when each saw the person; None where that is not known."""
 
 
-def find_pole_step(
-    motions: Mapping[str, Array],
-    moments_ms: Mapping[str, float | None],
-    poles: Mapping[str, str],
-    freed: Collection[str] = (),
-) -> PoleStep | None:
-    """The pole that moved by itself, or the pair, if one did: see `Scan`.  Of pairs whose moment is not
-    known nobody can tell in one scan.  poles: as in `moving_alone`.  freed: pairs of poles that are
-    known to have moved: is there another?
-    """
-    return find_steps([(motions, moments_ms)], poles, freed).step
-
-
 @dataclass(frozen=True)
 class StepSearch:
     """step: the pole or pair that stands off in all scans, if one does.  least_mm: from which on it
@@ -116,7 +103,9 @@ def find_steps(
     scans: Sequence[Scan], poles: Mapping[str, str], freed: Collection[str] = ()
 ) -> StepSearch:
     """From one scan, or several since the calibration: a person sways otherwise in each, while what was
-    moved stands off by the same in all.  poles: as in `moving_alone`."""
+    moved stands off by the same in all.  Of pairs whose moment is not known nobody can tell in one
+    scan.  poles: as in `moving_alone`.  freed: pairs of poles that are known to have moved: is there
+    another?"""
     several = len(scans) >= SEVERAL
     seen = _Seen.of(scans, poles, freed, timed=not several)
     if len(set(seen.names)) < FEWEST:

@@ -41,7 +41,7 @@ class BoardMap:
         return np.stack(columns, axis=-1)
 
 
-def fit_board_map(printed: Array, pixels: Array, *, lens: bool = True) -> BoardMap:
+def fit_board_map(printed: Array, pixels: Array) -> BoardMap:
     """Least squares fit to printed points (N, 2) mm and their image points (N, 2) px, N >= 4.
 
     The polynomial is cubic or quadratic, or missing, as the number of points allows; a slight
@@ -52,9 +52,7 @@ def fit_board_map(printed: Array, pixels: Array, *, lens: bool = True) -> BoardM
     homography = cv2.findHomography(printed, pixels, 0)[0]
     if homography is None:
         homography = np.full((3, 3), np.nan)
-    degree = 0
-    if lens:
-        degree = 3 if len(printed) >= 40 else 2 if len(printed) >= 20 else 0
+    degree = 3 if len(printed) >= 40 else 2 if len(printed) >= 20 else 0
     design = _monomials((printed - middle) / size, degree)
     residual = pixels - _project(homography, printed)
     ridge = 1e-3 * len(printed) * np.eye(design.shape[1])

@@ -67,7 +67,7 @@ class JointFit(Generic[Sheets]):
     """What fits corners and stripes together; covariance (P, P) of the camera.  forms: of the boards
     by name.
 
-    corners_rms_px and stripes_rms_px are robustly weighted.
+    corners_rms_px is robustly weighted.
     """
 
     camera: Camera
@@ -75,7 +75,6 @@ class JointFit(Generic[Sheets]):
     sheets: Sheets
     camera_covariance: Array
     corners_rms_px: float
-    stripes_rms_px: float
     forms: dict[str, BoardForm]
 
 
@@ -257,16 +256,12 @@ def _fit(
     state = solution.state
     first = state.first_pose
     corners = np.concatenate([_corner_residuals(state, k, b) for k, b in enumerate(boards)])
-    offsets = [
-        _offsets(state, k, b, _rays(state.camera, b)) * b.sigma_px for k, b in enumerate(boards)
-    ]
     return JointFit(
         state.camera,
         {b.view.shot: pose for b, pose in zip(boards, state.poses, strict=True)},
         state.sheets.with_covariance(_of_depths(state, boards, covariance)),
         covariance[:first, :first],
         _weighted_rms(corners, CORNERS) * np.sqrt(2.0),
-        _weighted_rms(np.concatenate(offsets), STRIPES),
         state.forms,
     )
 

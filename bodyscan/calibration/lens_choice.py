@@ -26,7 +26,6 @@ from bodyscan.calibration.camera import (
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain, shared_weights
 from bodyscan.calibration.ray_uncertainty import ray_uncertainty
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform
@@ -64,16 +63,6 @@ class _HeldOut:
     def stacked(self) -> Array:
         """(N, 2) of all views."""
         return np.concatenate(self.residuals)
-
-
-def calibrate_with_best_lens(
-    views: Sequence[PlanarView], width: int, height: int
-) -> CameraCalibration:
-    """As `calibrate_camera`, with the lens of the family that held-out boards choose.
-
-    Raises DegeneratePoses as it does.
-    """
-    return calibrate_with_lenses(FAMILY, views, width, height)
 
 
 def calibrate_with_lenses(

@@ -22,8 +22,8 @@ def homography(plane: Array, pixels: Array) -> Array:
     Normalised direct linear transformation (Hartley 1997).
     """
     plane_norm, pixel_norm = _normalization(plane), _normalization(pixels)
-    x, y = (_homogeneous(plane) @ plane_norm.T)[:, :2].T
-    u, v = (_homogeneous(pixels) @ pixel_norm.T)[:, :2].T
+    x, y = (homogeneous(plane) @ plane_norm.T)[:, :2].T
+    u, v = (homogeneous(pixels) @ pixel_norm.T)[:, :2].T
     zero, one = np.zeros_like(x), np.ones_like(x)
     rows_u = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
     rows_v = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1)
@@ -128,5 +128,5 @@ def _normalization(points: Array) -> Array:
     return np.array([[scale, 0, -scale * mean[0]], [0, scale, -scale * mean[1]], [0, 0, 1.0]])
 
 
-def _homogeneous(points: Array) -> Array:
+def homogeneous(points: Array) -> Array:
     return np.column_stack([points, np.ones(len(points))])

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from bodyscan.arrays import Array
+from bodyscan.geometry.robust import rms
 
 DEGREE = 6
 
@@ -44,7 +45,7 @@ def flatness(points: Array, degree: int = DEGREE) -> Flatness:
     normal, offset = best_plane(points)
     distances = points @ normal - offset
     smooth = smooth_part(points, distances, degree)
-    return Flatness(len(points), normal, offset, _rms(distances), _rms(smooth))
+    return Flatness(len(points), normal, offset, rms(distances), rms(smooth))
 
 
 def smooth_part(points: Array, values: Array, degree: int = DEGREE) -> Array:
@@ -58,7 +59,3 @@ def smooth_part(points: Array, values: Array, degree: int = DEGREE) -> Array:
     total = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)).ravel()
     rows = rows[:, total <= degree]
     return np.asarray(rows @ np.linalg.lstsq(rows, values, rcond=None)[0], np.float64)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -25,8 +25,6 @@ def add_pose_variance(
     cloud: BodyCloud,
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PoseCovariance,
-    *,
-    workers: int = THREADS,
 ) -> BodyCloud:
     """The cloud with sigmas along the normals that allow for the pairs' poses too.
 
@@ -36,13 +34,13 @@ def add_pose_variance(
     centres = np.array([placing.translation for placing in rig_from_camera.values()])
     covariances = np.array([prior.of(name) for name in rig_from_camera])
     placing_mm = np.empty(len(cloud.points))
-    ends = np.linspace(0, len(placing_mm), workers + 1).astype(int)
+    ends = np.linspace(0, len(placing_mm), THREADS + 1).astype(int)
 
     def fill(start: int, end: int) -> None:
         part = slice(start, end)
         _placing(cloud.points[part], cloud.normals[part], centres, covariances, placing_mm[part])
 
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         list(pool.map(fill, ends[:-1], ends[1:]))
     return replace(cloud, sigma_mm=np.hypot(cloud.sigma_mm, placing_mm).astype(np.float32))
 

@@ -92,11 +92,9 @@ def judge_seams(
     images: Sequence[RangeImage],
     rig_from_camera: Mapping[str, RigidTransform],
     poles: Mapping[str, str],
-    *,
-    workers: int = THREADS,
 ) -> SeamReport:
     """images: cleaned.  poles: of each pair that stands on one."""
-    seams = find_seams(images, rig_from_camera, workers=workers)
+    seams = find_seams(images, rig_from_camera)
     names = [image.pair for image in images]
     groups = moving_alone(names, poles)
     seen = {image.pair: np.count_nonzero(image.valid) for image in images}
@@ -107,11 +105,9 @@ def judge_seams(
 def find_seams(
     images: Sequence[RangeImage],
     rig_from_camera: Mapping[str, RigidTransform],
-    *,
-    workers: int = THREADS,
 ) -> tuple[Seam, ...]:
     """Of every two pairs that saw the same surface, after alignment; images: cleaned."""
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         seen = list(pool.map(lambda im: alignment_points(im, SPACING_MM, SEAM_RIM_PX), images))
         found = pool.map(lambda two: _seam(two[0], two[1], rig_from_camera), combinations(seen, 2))
         return tuple(seam for seam in found if len(seam.apart_mm))

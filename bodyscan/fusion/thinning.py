@@ -93,9 +93,7 @@ def voxel_size_for(points: Floats, wanted: int) -> float:
     return size
 
 
-def one_per_voxel(
-    points: Floats, second_rate: Mask, voxel_mm: float, *, workers: int = THREADS
-) -> NDArray[np.intp]:
+def one_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDArray[np.intp]:
     """Indices of one point in each occupied voxel: the nearest to its centre.
 
     `second_rate` (N,) points are taken only where a voxel has no other.
@@ -104,11 +102,11 @@ def one_per_voxel(
     chosen = np.zeros(len(points), np.bool_)
 
     def choose(layer: int) -> None:
-        found = _Voxels.of(points, box, voxel_mm, workers, layer)
+        found = _Voxels.of(points, box, voxel_mm, THREADS, layer)
         _choose(points, second_rate, box[0], scale, found.point, found.number, found.count, chosen)
 
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(choose, range(workers)))
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(choose, range(THREADS)))
     return np.flatnonzero(chosen)
 
 

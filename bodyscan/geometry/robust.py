@@ -1,4 +1,4 @@
-"""How far residuals spread where some are wrong, and how little the wrong ones then count."""
+"""How far residuals spread, also where some are wrong, and how little the wrong ones then count."""
 
 from __future__ import annotations
 
@@ -8,6 +8,15 @@ from bodyscan.arrays import Array
 
 SIGMAS_PER_MEDIAN = 1.4826
 """Standard deviation over median absolute value of normally distributed residuals, 1 / 0.6745."""
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def rms_length(vectors: Array) -> float:
+    """Of vectors (N, D)."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
 def spread(residuals: Array, least: float = 1e-12) -> float:

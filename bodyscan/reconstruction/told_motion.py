@@ -18,7 +18,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, minimize
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.ray_depths import intersect_rays
-from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, rms
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.geometry.velocity import SurfaceSpeeds, Velocity
 from bodyscan.reconstruction.speed_field import CellSpeeds, FieldFit, Knots, fit_field, unexplained
@@ -90,11 +90,11 @@ def tell_motion(camera: Camera, sheets: LightSheets, comb: Comb) -> StripeMotion
         doubt=np.abs(filled[1]),
         cell_px=cells.px,
         velocity=_velocity(fit, teeth, _seen(speeds, teeth, lost, share), share),
-        speed_mm=_rms(speed[known]),
+        speed_mm=rms(speed[known]),
         mm_per_stripe=float(np.median(np.abs(teeth.per_stripe))),
-        doubt_mm=_rms(np.sqrt(lost[known])),
+        doubt_mm=rms(np.sqrt(lost[known])),
         explained=fit.explained,
-        is_significant=_rms(speed[known]) > SIGMAS * teeth.common
+        is_significant=rms(speed[known]) > SIGMAS * teeth.common
         and (fit.is_bent or fit.explained > 6.0 + SIGMAS * np.sqrt(12.0)),
     )
 
@@ -209,7 +209,3 @@ def _velocity(fit: FieldFit, teeth: _Teeth, seen: SurfaceSpeeds, share: float) -
     off = share * np.repeat([np.linalg.norm(part) for part in np.split(fit.twist, 2)], 3)
     covariance = fit.covariance[:6, :6] + np.outer(shared, shared) + np.diag(off**2)
     return Velocity(twist, about_camera @ covariance @ about_camera.T, seen)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -15,6 +15,7 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_form import BoardFace
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain
+from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import rigid_fit
 from bodyscan.registration.full_solve import solve_fully
@@ -54,7 +55,7 @@ class BoardShape:
 
     @property
     def rms_mm(self) -> float:
-        return float(np.sqrt(np.mean(np.sum(self.offsets**2, axis=1))))
+        return rms_length(self.offsets)
 
     @property
     def out_of_plane_mm(self) -> float:

@@ -13,6 +13,7 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import BadInput, FailedWork
 from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.registration.view_graph import view_graph
@@ -51,7 +52,7 @@ class HalvesComparison:
     @property
     def summary(self) -> str:
         """One line."""
-        shift, sigma = _rms_length(self.shifts_mm), _rms_length(self.sigmas_mm)
+        shift, sigma = rms_length(self.shifts_mm), rms_length(self.sigmas_mm)
         without = f" (without {', '.join(self.apart)}, not known from a half)" if self.apart else ""
         return (
             f"solved from either half of the shots, cameras{without} differ by {shift:.3f} mm RMS "
@@ -90,7 +91,7 @@ def compare_halves(rig: Rig, placed: RigSolution, *, seed: int = 0) -> HalvesCom
     known = keep @ placed.covariance.among(names) @ keep.T
     shifts = np.einsum("pij,pj->pi", twist_jacobian(centres), differences.reshape(-1, 6))
     sigmas = _centre_sigmas(covariance, centres)
-    expected, whole = _rms_length(sigmas), _rms_length(_centre_sigmas(known, centres))
+    expected, whole = rms_length(sigmas), rms_length(_centre_sigmas(known, centres))
     if expected > TIMES_WHOLE * whole:
         raise FailedWork(
             f"halves of the shots should differ by {expected:.2g} mm where all shots know the rig to "
@@ -178,10 +179,6 @@ def _centre_sigmas(covariance: Array, centres: Array) -> Array:
     own = covariance.reshape(count, 6, count, 6)[range(count), :, range(count)]
     variance = np.einsum("pii->pi", shown @ own @ shown.transpose(0, 2, 1))
     return np.sqrt(np.maximum(variance, 0.0))
-
-
-def _rms_length(vectors: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
 def _without_common_motion(centres: Array, ahead: Array) -> Array:

@@ -16,6 +16,7 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import Block, Noise, minimize
+from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.view_graph import Target
@@ -53,14 +54,14 @@ class BoardFit:
     @property
     def rms_px(self) -> Array:
         """(V,) of each view."""
-        return np.array([_rms(residuals) for residuals in self.residuals])
+        return np.array([rms_length(residuals) for residuals in self.residuals])
 
 
 def single_view_errors(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> Array:
     """RMS px (V,) of each view about the pose it was located at by itself."""
     return np.array(
         [
-            _rms(
+            rms_length(
                 cameras[view.pair].project(view.camera_from_board.apply(view.points)) - view.pixels
             )
             for view in views
@@ -220,17 +221,13 @@ def _error(view: LocatedView, solution: JointSolution, placing: RigidTransform) 
     camera_from_root = solution.root_from_camera[view.pair].inverse()
     camera_from_board = camera_from_root @ placing
     seen = solution.cameras[view.pair].project(camera_from_board.apply(view.points))
-    return _rms(seen - view.pixels)
+    return rms_length(seen - view.pixels)
 
 
 def _placing(group: Sequence[LocatedView], solution: JointSolution) -> RigidTransform:
     """Of the views' board; where none of them took part in the solve, the first one's own."""
     own = solution.root_from_camera[group[0].pair] @ group[0].camera_from_board
     return solution.root_from_board.get(group[0].target, own)
-
-
-def _rms(residuals: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
 
 
 def _names(views: Sequence[LocatedView]) -> str:

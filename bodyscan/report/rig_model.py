@@ -17,7 +17,7 @@ LEAST_MM = 1e-3
 """A rig of one pair is known by definition: there is nothing to draw larger."""
 FRUSTUM_MM = 220.0
 RINGS, SECTORS = 16, 24
-GROUND, BOARD, VOLUME = (150, 158, 170), (190, 197, 207), (120, 130, 145)
+BOARD, VOLUME = (190, 197, 207), (120, 130, 145)
 AXES = ((200, 40, 40), (30, 140, 60), (40, 80, 200))
 
 

@@ -20,6 +20,7 @@ from bodyscan.evaluation.surface import Deviation, deviation, normalized_errors,
 from bodyscan.export.scan import transform_mesh
 from bodyscan.files.atomic import write_bytes
 from bodyscan.fusion.storage import StoredScan, load_scan
+from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.topology import topology
 from bodyscan.optional import optional
@@ -44,7 +45,7 @@ class RigDeviation:
 
     @property
     def centres_rms_mm(self) -> float:
-        return float(np.sqrt(np.mean(np.sum(self.centres_mm**2, axis=1))))
+        return rms_length(self.centres_mm)
 
     @property
     def rotations_rms_deg(self) -> float:

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.linalg import rq
 
 from bodyscan.arrays import Array
+from bodyscan.calibration.zhang import homogeneous
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -17,8 +18,8 @@ def projection_matrix(points: Array, pixels: Array) -> Array:
     Direct linear transformation with Hartley's scaling (Abdel-Aziz and Karara 1971).
     """
     space, image = _scaling(points), _scaling(pixels)
-    x = _homogeneous(points) @ space.T
-    u, v = (_homogeneous(pixels) @ image.T)[:, :2].T
+    x = homogeneous(points) @ space.T
+    u, v = (homogeneous(pixels) @ image.T)[:, :2].T
     zero = np.zeros_like(x)
     rows = np.concatenate(
         [
@@ -67,7 +68,3 @@ def _scaling(places: Array) -> Array:
     matrix[:size] *= scale
     matrix[:size, size] = -scale * mean
     return matrix
-
-
-def _homogeneous(places: Array) -> Array:
-    return np.column_stack([places, np.ones(len(places))])

@@ -41,11 +41,6 @@ def register(*codes: type[StripeCode]) -> None:
         _CODES[name] = code
 
 
-def code_names() -> tuple[str, ...]:
-    """As rig files have them."""
-    return tuple(_CODES)
-
-
 def image_kinds() -> tuple[ImageKind, ...]:
     """The kinds of images of all codes."""
     return tuple(dict.fromkeys(kind for code in _CODES.values() for kind in code.kinds))
