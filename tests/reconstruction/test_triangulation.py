@@ -31,6 +31,7 @@ def test_sigma_follows_from_the_decoding() -> None:
     depth = np.full(rays.shape[:2], 480.0)
     stripes = stripe_map(depth)
     image = reconstruct_range_image(pair(), stripes)
+    assert not np.shares_memory(image.colours, stripes.lit)  # one of a stack of images
     shifted = reconstruct_range_image(
         pair(), StripeMap(**{**vars(stripes), "s": (stripes.s + 0.01).astype(np.float32)})
     )
