@@ -80,13 +80,16 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class BodyMotion:
-    """amplitudes: (n,) of all kinds' fields and courses; covariance: (n, n) of them. usual: (6,) the
-    sway that its unit is."""
+    """amplitudes: (n,) of all kinds' fields and courses.  usual: (6,) the sway that its unit is.
+
+    inverse, units: of their covariance the lower triangle (n, n), in units (n,).
+    """
 
     kinds: tuple[Kind, ...]
     usual: Array
     amplitudes: Array
-    covariance: Array
+    inverse: Array
+    units: Array
 
     @staticmethod
     def start(
@@ -108,13 +111,24 @@ class BodyMotion:
             Kind("breath", breath, Courses.of(of_breath, seconds), BREATH_MM, usual=BREATH_MM),
         )
         count = sum(kind.count for kind in kinds)
-        return BodyMotion(kinds, sway, np.zeros(count), np.zeros((count, count)))
+        return BodyMotion(kinds, sway, np.zeros(count), np.zeros((count, count)), np.ones(count))
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
         """Where each kind's amplitudes stand."""
         ends = np.cumsum([0, *(kind.count for kind in self.kinds)]).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(n, n) of the amplitudes."""
+        lower = np.tril(self.inverse)
+        return (lower + np.tril(lower, -1).T) * self.units[:, None] * self.units
+
+    @property
+    def variances(self) -> Array:
+        """(n,) of the amplitudes: all that a round needs of the covariance."""
+        return np.diag(self.inverse) * self.units * self.units
 
     @cached_property
     def fields(self) -> Array:
@@ -161,7 +175,8 @@ class BodyMotion:
             )
             for k in self.kinds
         ]
-        normal, right = np.zeros((len(self.amplitudes),) * 2), np.zeros(len(self.amplitudes))
+        count = len(self.amplitudes)
+        normal, right = np.zeros((count, count), order="F"), np.zeros(count)
         for g, kind in enumerate(self.kinds):
             own, rows = slice(ends[g], ends[g + 1]), self.slices[g]
             right[rows] = (pull[:, own].T @ apart[g]).ravel()
@@ -183,23 +198,26 @@ class BodyMotion:
         return basis.T @ (seen.information @ fields).reshape(basis.shape), basis.T @ wanted.ravel()
 
     def _settled(self, normal: Array, right: Array) -> BodyMotion:
-        """With the solution of normal equations of which the lower triangle counts, and the prior."""
-        normal = normal.copy()
+        """With the solution of normal equations of which the lower triangle counts, and the prior.
+
+        They grow with the pairs: their matrix lies as LAPACK wants it, which works in its place.
+        """
+        normal = normal.copy(order="F")
         for kind, own in zip(self.kinds, self.slices, strict=True):
             normal[own, own] += kind.prior
-        size = 1.0 / np.sqrt(np.diag(normal))
-        factor = cho_factor(normal * size[:, None] * size, lower=True, check_finite=False)
-        lower = np.tril(dpotri(factor[0], lower=True)[0])
-        covariance = (lower + np.tril(lower, -1).T) * size[:, None] * size
-        return replace(
-            self, amplitudes=size * cho_solve(factor, size * right), covariance=covariance
-        )
+        units = 1.0 / np.sqrt(np.diag(normal))
+        normal *= units[:, None]
+        normal *= units
+        factor = cho_factor(normal, lower=True, overwrite_a=True, check_finite=False)
+        amplitudes = units * cho_solve(factor, units * right, check_finite=False)
+        inverse, _ = dpotri(factor[0], lower=True, overwrite_c=True)
+        return replace(self, amplitudes=amplitudes, inverse=inverse, units=units)
 
     def _resized(self) -> BodyMotion:
         """Each kind as large as the evidence says (MacKay 1992): what it does not ask for shrinks."""
-        kinds = []
+        kinds, variances = [], self.variances
         for kind, some in zip(self.kinds, self.slices, strict=True):
-            told = kind.count - np.trace(self.covariance[some, some]) / kind.size**2
+            told = kind.count - np.sum(variances[some]) / kind.size**2
             size = np.sqrt(np.sum(self.amplitudes[some] ** 2) / max(told, 1e-6))
             kinds.append(kind.resized(float(size)) if kind.moves else kind)
         return replace(self, kinds=tuple(kinds))

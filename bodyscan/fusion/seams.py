@@ -181,5 +181,8 @@ def _patches(matches: Matches) -> tuple[Array, Array]:
 
 def _medians(values: Array, number: Indices, count: Indices) -> Array:
     """Of the values of each number, from 0."""
-    ordered = values[np.lexsort((values, number))]
+    rising = np.argsort(values)
+    # Few patches: numbers of 16 bits are sorted in one pass.
+    few = number[rising].astype(np.min_scalar_type(len(count)))
+    ordered = values[rising[np.argsort(few, kind="stable")]]
     return ordered[np.cumsum(count) - count + count // 2]
