@@ -109,14 +109,16 @@ def check(
     silent = rig.calibration or rig.is_known
     warnings = [] if silent else [f"{rig_path}: names no calibration captures"]
     warnings += odd_sizes(rig)
-    if calibration and rig.is_known:
-        warnings += [f"{fault}; all its pairs are `known`: `bodyscan import`" for fault in too_few]
+    if calibration and rig.is_known and too_few:
+        warnings += ["all pairs are `known`: `bodyscan import` takes them as they are"]
     warnings += [NO_INVERSES] if any(map(_lacks_inverses, sequences)) else []
     warnings += _coarse_images(sequences)
     warnings += filter(None, map(describe_unlisted_images, captures))
     if len(rig.pairs) > 1:  # one camera alone agrees with itself
         warnings += [_turned(board) for board in rig.boards if board.looks_same_turned]
-    warnings += filter(None, map(_few, rig.pairs, counts)) if calibration else ()
+    warnings += (
+        filter(None, map(_few, rig.pairs, counts)) if calibration and not rig.is_known else ()
+    )
     return CheckReport(
         rig_path=Path(rig_path),
         rig=rig,

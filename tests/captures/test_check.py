@@ -312,4 +312,5 @@ def test_a_shot_with_another_suffix_is_not_passed_over_in_silence(tmp_path: Path
 def test_a_rig_that_is_known_needs_no_poses(captures: Path, tmp_path: Path) -> None:
     report = check(real_rig_file("two-frequency", captures, tmp_path))
     assert report.ok, report_lines(report)
-    assert any("bodyscan import" in warning for warning in report.warnings)
+    assert sum("bodyscan import" in warning for warning in report.warnings) == 1
+    assert not any("poses" in warning or "sequences" in warning for warning in report.warnings)
