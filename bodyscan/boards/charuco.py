@@ -52,7 +52,10 @@ def detect_markers(
 
 
 def markers_concerned(board: Board) -> int:
-    """How many of its dictionary's first markers a board has, and those that it would go on with."""
+    """How many of its dictionary's first markers a board has, and those that it would go on with; of
+    one with two faces, whose back has these, only its own."""
+    if board.faces == 2:
+        return board.first_marker + board.marker_count
     longer = board.model_copy(update={"rows": board.rows + 2})
     return board.first_marker + longer.marker_count + board.columns
 

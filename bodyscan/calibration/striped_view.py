@@ -80,7 +80,8 @@ def boundaries_near(stripes: StripeMap, box: Box, crop: Crop = WHOLE) -> BoardBo
     crop: rows and columns of the image that the stripe map is of."""
     low, high = box
     pixels = stripes.boundary_pixels + [crop[1].start or 0, crop[0].start or 0]
-    near = np.all((pixels >= low) & (pixels <= high), axis=1)
+    (u, v), (left, top), (right, bottom) = pixels.T, low, high
+    near = (u >= left) & (u <= right) & (v >= top) & (v <= bottom)
     return BoardBoundaries(
         stripes.boundary_index[near],
         pixels[near],
