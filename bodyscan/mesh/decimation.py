@@ -4,6 +4,10 @@ strays.
 
 from __future__ import annotations
 
+import hashlib
+from dataclasses import dataclass, field
+from functools import lru_cache
+
 import numpy as np
 import open3d as o3d
 from scipy.spatial import cKDTree
@@ -27,11 +31,29 @@ def decimate(mesh: BodyMesh, *, faces: int = 50_000, within_mm: float = 0.19) ->
     Quadric decimation (Garland and Heckbert 1997), which knows no such limit, and a few more faces
     where it went too far (some hundred at 50,000; many more where so few faces cannot do). Vertices
     take colour and sigma from the nearest vertex of the full mesh. A mesh that is small enough is
-    returned as it is.
+    returned as it is. The last result is remembered by what the mesh holds: a job exports it and
+    then reports on it, each time read from the file.
     Raises ScanFailed if the surface does not stay closed.
     """
     if len(mesh.faces) <= faces:
         return mesh
+    digest = hashlib.sha256()
+    for part in (mesh.vertices, mesh.faces, mesh.colours, mesh.sigma_mm):
+        digest.update(np.ascontiguousarray(part).data)
+    return _decimated(_Content(digest.digest(), mesh), faces, within_mm)
+
+
+@dataclass(frozen=True)
+class _Content:
+    """A mesh that equals others by its digest."""
+
+    digest: bytes
+    mesh: BodyMesh = field(compare=False)
+
+
+@lru_cache(1)
+def _decimated(content: _Content, faces: int, within_mm: float) -> BodyMesh:
+    mesh = content.mesh
     full = o3d.t.geometry.TriangleMesh(
         o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.int32))
     )

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import open3d as o3d
 
-from bodyscan.mesh.decimation import NearestSurface, refine_to_tolerance
-from bodyscan.mesh.topology import topology
+from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.decimation import NearestSurface, decimate, refine_to_tolerance
+from bodyscan.mesh.topology import topology, vertex_normals
 
 
 def ball(resolution: int) -> tuple[np.ndarray, np.ndarray]:
@@ -69,3 +72,21 @@ def test_a_spike_that_was_lost_comes_back() -> None:
     found = refine_to_tolerance(*coarse, spiked, fine[1], 0.5)
     assert farthest((spiked, fine[1]), found) < 0.55
     assert topology(*found).manifold
+
+
+def test_the_same_mesh_read_twice_is_decimated_once() -> None:
+    vertices, faces = ball(30)
+    shape = len(vertices), 3
+    some = BodyMesh(
+        vertices,
+        faces,
+        vertex_normals(vertices, faces),
+        np.zeros(shape, np.uint8),
+        np.full(len(vertices), 0.1, np.float32),
+        np.zeros(len(faces), bool),
+    )
+    small = decimate(some, faces=1000, within_mm=2.0)
+    assert len(small.faces) < 1100
+    assert decimate(replace(some, vertices=vertices.copy()), faces=1000, within_mm=2.0) is small
+    darker = replace(some, colours=np.ones(shape, np.uint8))
+    assert decimate(darker, faces=1000, within_mm=2.0).colours.min() == 1
