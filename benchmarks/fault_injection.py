@@ -80,6 +80,7 @@ def faults() -> Iterator[Fault]:
     yield Fault("two people hand in hand", ("two people", "two bodies", "person"), _two_people)
     yield Fault("hand on hip", ("closed ring",), _hand_on_hip)
     yield Fault("long hair, black", ("nothing was measured",), _hair)
+    yield Fault("a stick beside the legs", ("stick",), _stick)
     yield Fault("a chair behind the legs", ("piece", "ring", "not in the mesh", "chair"), _chair)
 
 
@@ -158,7 +159,27 @@ def _image_faults() -> Iterator[Fault]:
     def blurred(grey: Bytes) -> Bytes:
         return np.asarray(cv2.GaussianBlur(grey, (0, 0), 3.0))
 
+    def longer(grey: Bytes) -> Bytes:
+        height, width = grey.shape[:2]
+        zoom = cv2.getRotationMatrix2D((0.5 * (width - 1), 0.5 * (height - 1)), 0.0, 1.003)
+        return np.asarray(cv2.warpAffine(grey, zoom, (width, height), flags=cv2.INTER_CUBIC))
+
+    def torn(grey: Bytes) -> Bytes:
+        half = len(grey) // 2
+        return np.concatenate([grey[:half], grey[half + 1 :], grey[-1:]])
+
+    def renumbered(folder: Path) -> None:
+        paths = sorted(folder.glob("*.png"))
+        later = [path.read_bytes() for path in paths[9:]]
+        for path, content in zip(paths[8:], later, strict=False):
+            path.unlink()
+            path.write_bytes(content)
+
     changes: dict[str, Callable[[Path], None]] = {
+        "mirrored": each(lambda grey: np.ascontiguousarray(grey[:, ::-1])),
+        "focal length 0.3 % longer": each(longer),
+        "a row lost": each(torn),
+        "a frame lost, those after it moved up": renumbered,
         "three times overexposed": each(lambda grey: cv2.convertScaleAbs(grey, alpha=3.0)),
         "a tenth of the light": each(lambda grey: cv2.convertScaleAbs(grey, alpha=0.1)),
         "out of focus": each(blurred),
@@ -211,6 +232,14 @@ def _hand_on_hip(sound: Sound) -> Case:
     turn = o3d.geometry.get_rotation_matrix_from_axis_angle([-np.pi / 2, 0.0, 0.0])
     bar = np.asarray(made.vertices) @ turn.T + [-10.0, 260.0, 850.0]
     return _cast(sound, [(sound.vertices, sound.faces), (bar, np.asarray(made.triangles))])
+
+
+def _stick(sound: Sound) -> Case:
+    """From the floor to above the hand that holds it."""
+    hand = sound.vertices[np.argmax(sound.vertices[:, 1])]
+    made = o3d.geometry.TriangleMesh.create_cylinder(20.0, 1000.0, resolution=40)
+    stick = np.asarray(made.vertices) + [hand[0], hand[1] + 5.0, 510.0]
+    return _cast(sound, [(sound.vertices, sound.faces), (stick, np.asarray(made.triangles))])
 
 
 def _chair(sound: Sound) -> Case:

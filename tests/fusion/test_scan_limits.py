@@ -314,3 +314,28 @@ def test_cameras_that_stand_on_one_side(scan: MadeScan, apart_deg: float, said: 
     way = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(2)])
     words = told(scan.cloud, scan.mesh, cameras=middle + 2000.0 * way)[1]
     assert ("one side only was seen" in words) == said
+
+
+def test_two_thick_legs_are_of_one_person() -> None:
+    """29,000 mm2 each, more than an arm beside a neck has."""
+    legs = [((0.0, y), (170.0, 170.0), 0.0, LEGS_END) for y in (100.0, -100.0)]
+    assert "more than one person" not in said_of([STANDING[0], *legs])
+
+
+def test_soles_are_never_seen(scan: MadeScan) -> None:
+    height = np.repeat(np.arange(0.0, TALL_MM, 50.0) + 25.0, 100)
+    check = SurfaceCheck(height, np.ones(len(height)), height < 50.0, {}, {})
+    assert told(scan.cloud, surface=check) == ("good", "")
+
+
+@pytest.mark.parametrize(("below_mm", "said"), [(4.0, True), (6.0, False)])
+def test_the_crown_is_a_dome_s_top(scan: MadeScan, below_mm: float, said: bool) -> None:
+    heights = np.concatenate([np.linspace(0.0, 1480.0, 1000), np.full(20, 1500.0 - below_mm)])
+    check = SurfaceCheck(
+        np.append(heights, 1500.0),
+        np.ones(len(heights) + 1),
+        np.append(heights > 1485.0, False),
+        {},
+        {},
+    )
+    assert ("nothing was measured of the crown" in told(scan.cloud, surface=check)[1]) == said
