@@ -36,6 +36,9 @@ SMALLEST_MM = 1e-3
 BREATH_MM = 1.5
 """A chest or belly rises by 2 to 8 mm at rest; 4 are 1.4 of standard deviation. Limbs' motion would
 explain most of a breath too, so that evidence alone makes it too small: there is this or none."""
+PARTS_MM = 0.5
+"""By so much parts above the legs may have moved where nothing was seen of it, a third of a breath:
+evidence sizes the parts of the whole body at once, and legs that stood still say nothing of a hip."""
 ANY = 0.1
 """Of what is usual; a statue that sways shows a thirtieth, calibrations bend by less."""
 
@@ -82,12 +85,14 @@ class Kind:
 class BodyMotion:
     """amplitudes: (n,) of all kinds' fields and courses.  usual: (6,) the sway that its unit is.
 
-    inverse, units: of their covariance the lower triangle (n, n), in units (n,).
+    normal: (n, n), what was seen of them, without any prior.  inverse, units: of their covariance, in
+    units (n,).  Of both matrices the lower triangle counts.
     """
 
     kinds: tuple[Kind, ...]
     usual: Array
     amplitudes: Array
+    normal: Array
     inverse: Array
     units: Array
 
@@ -111,7 +116,8 @@ class BodyMotion:
             Kind("breath", breath, Courses.of(of_breath, seconds), BREATH_MM, usual=BREATH_MM),
         )
         count = sum(kind.count for kind in kinds)
-        return BodyMotion(kinds, sway, np.zeros(count), np.zeros((count, count)), np.ones(count))
+        nothing = np.zeros((count, count))
+        return BodyMotion(kinds, sway, np.zeros(count), nothing, nothing, np.ones(count))
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -185,10 +191,18 @@ class BodyMotion:
                 normal[rows, self.slices[h]] = _products(block, apart[g], apart[h]).reshape(
                     kind.count, other.count
                 )
-        motion = self._settled(normal, right)
+        motion = replace(self, normal=normal)._settled(right)
         for _ in range(SIZINGS):
-            motion = motion._resized()._settled(normal, right)
+            motion = motion._resized()._settled(right)
         return motion
+
+    def doubted(self) -> Array:
+        """(n, n) covariance of the amplitudes, had parts moved as people's do."""
+        kinds = (
+            replace(kind, size=max(kind.size, PARTS_MM)) if kind.name == "parts" else kind
+            for kind in self.kinds
+        )
+        return replace(self, kinds=tuple(kinds))._settled(self.amplitudes).covariance
 
     def _asked(self, seen: CellEvidence, apart: Array) -> tuple[Array, Array]:
         """What an overlap asks of the fields, (M, M) and (M,); apart: (C, 12) of its two pairs now."""
@@ -197,12 +211,12 @@ class BodyMotion:
         wanted = np.einsum("cij,cj->ci", seen.information, apart[seen.cells]) - seen.gradient
         return basis.T @ (seen.information @ fields).reshape(basis.shape), basis.T @ wanted.ravel()
 
-    def _settled(self, normal: Array, right: Array) -> BodyMotion:
-        """With the solution of normal equations of which the lower triangle counts, and the prior.
+    def _settled(self, right: Array) -> BodyMotion:
+        """With the solution of the normal equations and the prior.
 
         They grow with the pairs: their matrix lies as LAPACK wants it, which works in its place.
         """
-        normal = normal.copy(order="F")
+        normal = self.normal.copy(order="F")
         for kind, own in zip(self.kinds, self.slices, strict=True):
             normal[own, own] += kind.prior
         units = 1.0 / np.sqrt(np.diag(normal))

@@ -14,6 +14,8 @@ MOST = 95.0
 ONE_WAY = 0.6  # of a breath's displacements goes outwards together
 SURE_SIGMAS = 4.0
 SHOWS = 0.5  # of a breath
+NEEDED_MM = 0.3
+"""Left of a part's motion: 2 mm of a girth. Who needs the part better is told to scan again."""
 
 
 @dataclass(frozen=True)
@@ -54,14 +56,35 @@ class PersonMotion:
         )
 
     @property
+    def summary(self) -> str:
+        """What it comes to for the operator; empty where no part was seen."""
+        if not self.parts:
+            return ""
+        left = np.sqrt(np.mean([part.left_mm**2 for part in self.parts]))
+        said = (
+            f"moved {max(part.moved_mm for part in self.parts):.0f} mm while being scanned; "
+            f"corrected to {left:.2f} mm"
+        )
+        loose = [part for part in self.parts if part.left_mm > NEEDED_MM]
+        if not loose:
+            return said
+        named = ", ".join(f"the {part.name} ({part.left_mm:.1f} mm)" for part in loose)
+        return f"{said}; repeat if you need {named}"
+
+    @property
     def lines(self) -> tuple[str, ...]:
-        """For the operator."""
+        """For the operator, after the summary."""
+        return (*(part.words for part in self.parts), *self.beside_parts)
+
+    @property
+    def beside_parts(self) -> tuple[str, ...]:
+        """Of what the parts have in common: the breath."""
         breath = (
             "breath could not be told from other motion"
             if self.breathed_mm is None
             else f"breathed by {self.breathed_mm:.1f} mm, carried to one moment"
         )
-        return (*(part.words for part in self.parts), breath, *self._fullness)
+        return (breath, *self._fullness)
 
     @property
     def _fullness(self) -> tuple[str, ...]:

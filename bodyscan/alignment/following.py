@@ -23,6 +23,7 @@ from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.limbs import LIMBS
 from bodyscan.alignment.matching import AlignmentPoints, Matches
 from bodyscan.alignment.overlaps import COARSE, OverlapPoints, each_overlap, match_overlap
+from bodyscan.alignment.part_names import LEGS, PARTS, name_parts
 from bodyscan.alignment.sway import BODY_CENTRE, SwayPrior, centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.pose_covariance import PoseCovariance
@@ -309,7 +310,11 @@ def _cell_sigmas(motion: BodyMotion, cells: BodyCells, seen: Mask) -> Array:
     off, normals = cells.centres[there] - BODY_CENTRE, cells.normals[there]
     whole = np.linalg.qr(np.hstack([np.cross(off, normals), normals]))[0]
     rows -= whole @ (whole.T @ rows)
+    # Legs stand on the floor: what overlaps do not ask for, they did not do.
+    stands = np.isin(name_parts(cells)[there], [PARTS.index(leg) for leg in LEGS])
     variance = np.sum((rows @ motion.covariance) * rows, axis=1)
+    others = rows[~stands]
+    variance[~stands] = np.sum((others @ motion.doubted()) * others, axis=1)
     size = len(cells.landmarks)
     mean = np.bincount(mark, variance, size) / np.maximum(np.bincount(mark, minlength=size), 1)
     near = (

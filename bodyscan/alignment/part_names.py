@@ -8,6 +8,7 @@ from bodyscan.alignment.body_cells import BodyCells
 from bodyscan.arrays import Array, Indices
 
 PARTS = ("trunk", "head", "left arm", "right arm", "left leg", "right leg")
+LEGS = PARTS[-2:]
 # Shares of the stature (Drillis and Contini 1966, rounded): where head and legs begin, how far it is
 # through the body from the navel to a fingertip at least, and from there to the shoulder.
 NECK, NAVEL, CROTCH, KNEE, TO_FINGERTIP, ARM = 0.86, 0.6, 0.47, 0.29, 0.35, 0.38

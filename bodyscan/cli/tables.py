@@ -101,7 +101,7 @@ def scan_table(scan: Scan) -> Table:
         for name, sigmas in scan.alignment.refused.items():
             table.add_row("left where it was", f"{name} (would have moved by {sigmas:.1f} sigmas)")
     if scan.person is not None:
-        for line in scan.person.lines:
+        for line in filter(None, (scan.person.summary, *scan.person.lines)):
             table.add_row("the person", line)
     return table
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -132,6 +133,9 @@ def fuse(
             shifted=shifted,
             search=search,
             boards_mm=centre_sigmas(calibration.covariance),
+            silent=_silent(
+                calibration.rig.poles, [*points, *failed], [image.pair for image in seen]
+            ),
         )
 
     with step(progress, "judging"):
@@ -146,6 +150,15 @@ def fuse(
         verdict = graded(surface, held)
     images, notes = tuple(seen), measured.notes
     return Scan(cloud, surface, alignment, points, failed, verdict, images, placing, person, notes)
+
+
+def _silent(
+    poles: Mapping[str, str], asked: Sequence[str], seeing: Sequence[str]
+) -> tuple[str, ...]:
+    """Poles of which no pair saw anybody. One pair alone may look over a child's head."""
+    count = Counter(poles[name] for name in asked if name in poles)
+    seen = {poles.get(name) for name in seeing}
+    return tuple(pole for pole, pairs in count.items() if pairs > 1 and pole not in seen)
 
 
 def _moved(

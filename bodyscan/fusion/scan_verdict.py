@@ -40,6 +40,10 @@ TWICE, THRICE = 2.0, 3.0
 """times the girth that is usable: of all of a motion; of what following a person left."""
 SOME_MOTION_MM = UseLimits().usable_girth_mm / GIRTH_PER_MM / LEFT_OF_MOTION
 SOME_LEFT_MM = UseLimits().usable_girth_mm / GIRTH_PER_MM
+CAMERA_MM, TURNED_DEG, STAYED = 1000.0, 5.0, 0.25
+"""A pole that is bumped turns about its foot, and its view of the body goes along: where the body's
+middle stays within a quarter of that, and the turn is no bump's, it was the body that turned. Few
+cameras stand nearer to it than this."""
 CELL_MM = 50.0
 SIDE_BY_SIDE = 0.4  # of the taller one's height
 SMALL_PIECE = 0.01
@@ -93,6 +97,7 @@ def grade_scan(
     shifted: Sequence[PoleStep] = (),
     search: StepSearch | None = None,
     boards_mm: Mapping[str, float] | None = None,
+    silent: Sequence[str] = (),
 ) -> Verdict:
     """The worst of all findings decides; the reasons come worst first. mesh: None while there is none
     yet: what it alone would show is left out. use: how wrong a girth may be. seams: see
@@ -105,6 +110,7 @@ def grade_scan(
     agreements: of pairs that project stripes of two directions.  person: how a body that moved did.
     shifted: poles that moved since the calibration.  search: what the pairs' motions are besides.
     boards_mm: how exactly each pair's place is known, see `centre_sigmas`.
+    silent: poles of which no pair saw anybody.
 
     A check that fails by itself leaves the scan usable at best, and says so.
     """
@@ -113,6 +119,7 @@ def grade_scan(
     shape = mesh if filled <= MOST_FILLED else None
     checks: dict[str, Callable[[], Iterable[Finding]]] = {
         "pairs": lambda: _pairs(failed, alignment),
+        "presence": lambda: _silent(silent),
         "calibration": lambda: _calibration(unjudged),
         "directions": lambda: _directions(agreements or {}),
         "seams": lambda: _seams(seams, use),
@@ -156,6 +163,16 @@ def _pairs(failed: Mapping[str, str], alignment: Alignment | None) -> Iterator[F
         )
 
 
+def _silent(poles: Sequence[str]) -> Iterator[Finding]:
+    """How much of the body that costs is for the gaps to say."""
+    for name in poles:
+        yield (
+            "usable",
+            f"pole {name} saw nobody where the others saw a person: did the person leave, or come, "
+            "while poles took turns, or was its projector off?",
+        )
+
+
 def _calibration(unjudged: Sequence[str]) -> Iterator[Finding]:
     if unjudged:
         yield (
@@ -183,8 +200,9 @@ def _seams(seams: SeamReport | None, use: UseLimits) -> Iterator[Finding]:
         yield (
             "repeat" if misfit.step_mm * GIRTH_PER_MM > use.usable_girth_mm else "usable",
             f"{misfit.name} does not fit the others: where their surfaces meet it stands "
-            f"{misfit.step_mm:.2g} mm off; was it moved since the calibration, is it from another "
-            "scan or another person, were cables or folders exchanged?",
+            f"{misfit.step_mm:.2g} mm off; did the person turn or step aside meanwhile, was it moved "
+            "since the calibration, is it from another scan or another person, were cables or folders "
+            "exchanged?",
         )
     for group in seams.untied:
         yield (
@@ -199,6 +217,14 @@ def _shifted(steps: Sequence[PoleStep]) -> Iterator[Finding]:
     stands elsewhere or measures wrongly (another lens, rows lost), which no placing mends, nobody can
     tell. And where several moved, nothing but what the overlaps tie holds the body's size."""
     for step in steps:
+        gone = np.radians(step.turn_deg) * CAMERA_MM
+        if step.turn_deg > TURNED_DEG and step.shift_mm < STAYED * gone:
+            yield (
+                "repeat",
+                f"the person turned by {step.turn_deg:.0f} degrees before or after {step.name} fired: "
+                f"a pole that moved would have gone {gone:.0f} mm round the body's middle for that",
+            )
+            continue
         yield (
             "repeat" if len(step.pairs) == 1 or len(steps) > 1 else "usable",
             f"{step.name} stands {step.shift_mm:.1f} mm from where the calibration has it, turned by "
@@ -283,7 +309,8 @@ def _contradictions(found: Contradictions | None, seams: SeamReport | None) -> I
         f"{f'{blamed} and the others' if blamed else 'the pairs'} contradict each other: "
         f"{found.share:.1%} of what pairs say of one another's points is that there is no surface; "
         + (
-            f"was {blamed} moved since the calibration, is it from another scan, "
+            f"did the person turn or step aside meanwhile, was {blamed} moved since the calibration, "
+            "is it from another scan, "
             if blamed
             else "is this the calibration of this rig, has nothing moved since, "
         )

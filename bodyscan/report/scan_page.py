@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bodyscan.alignment.body_parts import PersonMotion
+from bodyscan.alignment.body_parts import PartMotion, PersonMotion
 from bodyscan.evaluation.comparison import Comparison, compare_surfaces
 from bodyscan.fusion import scan_verdict as limits
 from bodyscan.fusion.scan_facts import read_facts, told_verdict
@@ -213,8 +213,9 @@ def _person(person: Mapping[str, Any]) -> Section:
         (part["name"], part["moved_mm"], part["left_mm"], 100.0 * part["seen_once"])
         for part in person["parts"]
     )
+    keys = ("name", "moved_mm", "left_mm", "seen_once")
     told = PersonMotion(
-        (),
+        tuple(PartMotion(*(part[key] for key in keys)) for part in person["parts"]),
         person["breathed_mm"],
         person.get("moment_ms"),
         person.get("fuller_mm"),
@@ -223,8 +224,9 @@ def _person(person: Mapping[str, Any]) -> Section:
     when = "the mean of all pairs"
     if told.moment_ms is not None:
         when = f"{told.moment_ms / 1000.0:.2f} s after the scan began"
-    intro = f"The person moved while being scanned. Cloud and mesh show the body as of {when}."
-    return Section("The person", [Table(columns, rows), Lines(told.lines)], intro)
+    what = told.summary or "moved while being scanned"
+    intro = f"The person {what}. Cloud and mesh show the body as of {when}."
+    return Section("The person", [Table(columns, rows), Lines(told.beside_parts)], intro)
 
 
 def _pictures(scan: StoredScan) -> Section:

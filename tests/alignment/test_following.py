@@ -11,7 +11,8 @@ from ray_cast_scan import load_rig
 from scipy.spatial import cKDTree
 
 from bodyscan.alignment.bending import at_once
-from bodyscan.alignment.body_parts import PersonMotion
+from bodyscan.alignment.body_motion import PARTS_MM, BodyMotion
+from bodyscan.alignment.body_parts import PartMotion, PersonMotion
 from bodyscan.alignment.breath import breathing
 from bodyscan.alignment.following import Followed, follow, sigmas_around
 from bodyscan.alignment.icp import Alignment, align
@@ -120,6 +121,16 @@ def test_the_operator_hears_what_each_part_did(
     assert "left arm moved by" in person.lines[2]
 
 
+def test_who_needs_a_part_better_is_told_so() -> None:
+    parts = PartMotion("trunk", 3.0, 0.1, 0.2), PartMotion("left arm", 8.6, 0.4, 0.5)
+    person = PersonMotion(parts, None, None)
+    assert person.summary == (
+        "moved 9 mm while being scanned; corrected to 0.29 mm; repeat if you need the left arm "
+        "(0.4 mm)"
+    )
+    assert "repeat" not in replace(person, parts=parts[:1]).summary
+
+
 def test_parts_are_named_whichever_way_a_person_faces(
     standing: LivingScan, found: tuple[Alignment, Alignment, Followed | None]
 ) -> None:
@@ -223,3 +234,20 @@ def test_who_only_sways_is_carried_along_time() -> None:
     truth = scan.body.at(scan.middle_s)
     rigid = errors_mm(truth, surface(scan, aligned, None))
     assert rms(errors_mm(truth, surface(scan, alignment, followed))) < 0.7 * rms(rigid)
+
+
+def test_what_stood_still_does_not_vouch_for_a_hip(
+    found: tuple[Alignment, Alignment, Followed | None],
+) -> None:
+    """Parts of people move by half a millimetre: by less no evidence makes them certain."""
+    _, _, followed = found
+    assert followed is not None
+    seconds = [0.0, 1.0]
+    boards, sway = 1e-8 * np.eye(12), np.full(6, 1e-3)
+    motion = BodyMotion.start(followed.cells, seconds, boards, sway)
+    still = tuple(replace(kind, size=0.01) if kind.moves else kind for kind in motion.kinds)
+    motion = replace(motion, kinds=still)
+    parts = motion.slices[[kind.name for kind in motion.kinds].index("parts")]
+    known = np.sqrt(np.diag(motion.doubted()))
+    np.testing.assert_allclose(known[parts], PARTS_MM)
+    np.testing.assert_allclose(np.delete(known[12:], np.arange(len(known))[parts] - 12), 0.01)

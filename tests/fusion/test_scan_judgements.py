@@ -164,6 +164,26 @@ def test_two_poles_that_moved_leave_nothing_to_hold_the_size(scan: MadeScan) -> 
     assert all(f"{step.name} stands 3.0 mm" in str(verdict) for step in steps)
 
 
+def test_who_turns_stays_where_he_is(scan: MadeScan) -> None:
+    """As a pole that is turned about its own foot does not."""
+    pairs = frozenset({"p1-1", "p1-2"})
+    person, pole = PoleStep("pole p1", pairs, 5.0, 14.0), PoleStep("pole p1", pairs, 200.0, 14.0)
+    said = [
+        grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=[step])
+        for step in (person, pole)
+    ]
+    assert "the person turned by 14 degrees" in str(said[0])
+    assert said[0].grade == "repeat"
+    assert "pole p1 stands 200.0 mm from where" in str(said[1])
+
+
+def test_a_pole_that_saw_nobody_is_named(scan: MadeScan) -> None:
+    verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), silent=["p3"])
+    assert verdict.grade == "usable"
+    assert "pole p3 saw nobody" in str(verdict)
+    assert "did the person leave" in str(verdict)
+
+
 def test_a_pair_that_does_not_fit_is_to_be_repeated(scan: MadeScan) -> None:
     found = Alignment({}, {"p1": 0.1}, {"p2": 7.0}, ())
     verdict = graded(scan, found)

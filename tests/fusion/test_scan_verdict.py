@@ -12,6 +12,7 @@ import pytest
 from ray_cast_scan import Truth, cast_scan, load_body, load_rig, nominal_placings, without
 
 from bodyscan.errors import ScanFailed
+from bodyscan.fusion.cleaning import apply_mask
 from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.scan import Scan, fuse
 from bodyscan.geometry.pose_covariance import PoseCovariance
@@ -178,6 +179,35 @@ def test_half_the_pairs_give_half_a_body(images: list[RangeImage]) -> None:
     scan = fused(one_pole, failed={"p1-2": "is missing", "p3-2": "is missing"})
     assert scan.verdict.grade == "repeat"
     assert "of the surface is filled" in said(scan)
+    assert "saw nobody" not in said(scan)
+
+
+def test_who_left_is_missed(images: list[RangeImage]) -> None:
+    """Before the third pole fires. Of a child the highest pair sees nothing either."""
+    seen = [
+        image if image.pair[:2] != "p3" else apply_mask(image, np.zeros(image.valid.shape, bool))
+        for image in images
+    ]
+    heard: list[Verdict] = []
+
+    class Enough(Exception):
+        """The mesh would say no more of it."""
+
+    def hear(verdict: Verdict, *, final: bool) -> None:
+        heard.append(verdict)
+        raise Enough
+
+    with pytest.raises(Enough):
+        fused(seen, announce=hear)
+    assert heard[0].grade != "good"
+    assert "pole p3 saw nobody" in str(heard[0])
+    alone = [
+        image if image.pair != "p3-4" else apply_mask(image, np.zeros(image.valid.shape, bool))
+        for image in images
+    ]
+    with pytest.raises(Enough):
+        fused(alone, announce=hear)
+    assert "saw nobody" not in str(heard[1])
 
 
 def test_what_no_camera_of_the_rig_could_see_is_no_reason_to_repeat(

@@ -50,6 +50,7 @@ def test_the_verdict_comes_first_with_its_reason_as_text(html: str) -> None:
 
 def test_what_the_person_did_is_said_part_by_part(html: str) -> None:
     body = html[html.index("<h2") :]
+    assert "The person moved 5 mm while being scanned; corrected to 0.17 mm." in body
     assert "as of 1.04 s after the scan began" in body
     assert "left arm" in body
     assert "breathed by 2.2 mm, carried to one moment" in body
