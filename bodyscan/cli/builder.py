@@ -11,6 +11,8 @@ from bodyscan.cli.console import Output, add_command
 from bodyscan.cli.options import (
     Calibration,
     CalibrationArgument,
+    CalibrationOut,
+    FollowLinks,
     OutFolder,
     OverwriteCalibration,
     RigFile,
@@ -83,9 +85,7 @@ def patterns(
 def calibrate_rig(
     output: Output,
     rig_file: RigFile,
-    out: Annotated[
-        Path | None, typer.Option(help="Default: `calibration` beside the rig file.")
-    ] = None,
+    out: CalibrationOut = None,
     overwrite: OverwriteCalibration = False,
 ) -> None:
     """Calibrate every pair of a rig and join them in one frame."""
@@ -99,9 +99,7 @@ def calibrate_rig(
 def import_(
     output: Output,
     rig_file: RigFile,
-    out: Annotated[
-        Path | None, typer.Option(help="Default: `calibration` beside the rig file.")
-    ] = None,
+    out: CalibrationOut = None,
     sigma_px: Annotated[
         float | None,
         typer.Option(
@@ -149,10 +147,7 @@ def check_calibration(
         Path | None,
         typer.Option(help="Write a calibration with the moves corrected into this folder."),
     ] = None,
-    follow_links: Annotated[
-        bool,
-        typer.Option("--follow-links", help="Images may be links that lead out of FOLDER."),
-    ] = False,
+    follow_links: FollowLinks = False,
     overwrite: OverwriteCalibration = False,
 ) -> None:
     """Say whether anything in the rig has moved, and if so which pair or pole, and how far."""

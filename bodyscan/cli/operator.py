@@ -18,6 +18,7 @@ from bodyscan.cli.options import (
     Anyway,
     Calibration,
     Changes,
+    FollowLinks,
     OutFolder,
     Overwrite,
     Result,
@@ -61,10 +62,7 @@ def scan(
         typer.Option(help="Captures of the empty rig: what they show is cut away."),
     ] = None,
     changes: Changes = None,
-    follow_links: Annotated[
-        bool,
-        typer.Option("--follow-links", help="Images may be links that lead out of FOLDER."),
-    ] = False,
+    follow_links: FollowLinks = False,
     overwrite: Overwrite = False,
     e57: Annotated[
         bool, typer.Option("--e57", help="Write each pair's raw cloud too: `raw.e57` (pye57).")

@@ -33,6 +33,12 @@ OverwriteCalibration = Annotated[
         "--overwrite", help="Replace the calibration that lies there; it is kept in `history`."
     ),
 ]
+CalibrationOut = Annotated[
+    Path | None, typer.Option("--out", help="Default: `calibration` beside the rig file.")
+]
+FollowLinks = Annotated[
+    bool, typer.Option("--follow-links", help="Images may be links that lead out of FOLDER.")
+]
 Anyway = Annotated[
     bool, typer.Option("--anyway", help="Even of a scan whose verdict is to repeat it.")
 ]

@@ -23,7 +23,7 @@ from bodyscan.registration.storage import calibration_id
 from bodyscan.report.acceptance_page import acceptance_page
 from bodyscan.report.page import render
 from bodyscan.verdict import Verdict
-from bodyscan.workflows.accept import read_plates, read_spheres
+from bodyscan.workflows.read_artefacts import read_plates, read_spheres
 
 
 @dataclass(frozen=True)

@@ -103,14 +103,7 @@ def join_rig(
         failures = {name: reason.partition("\n")[0] for name, reason in failures.items()}
     cameras = replace(cameras, failures=boards.blamed_on_images(failures, captures))
     if not cameras.value:
-        shown = [note for note in boards.notes if "no board found:" in note]
-        # One image for each thing that images show instead, however many markers were counted.
-        seen: dict[str, str] = {}
-        for note in shown:
-            seen.setdefault(COUNTED.sub("", note.partition("no board found:")[2]), note)
-        findings = describe_findings(rig, boards.value, searched)
-        remedy = "\n  ".join([*filter(None, [findings]), *list(seen.values())[:MOST_SEEN]])
-        raise _nothing_calibrated(rig, cameras.failures, remedy)
+        raise _nothing_calibrated(rig, cameras.failures, _seen_instead(rig, boards, searched))
     with step(progress, "joining the pairs"):
         views = solving_views(rig, boards.value)
         located = locate_views(rig, views, cameras.value)
@@ -144,6 +137,18 @@ def join_rig(
         seen=seen_corners(placed, pairs),
     )
     return JoinedRig(calibration, placed, boards.value, searched)
+
+
+def _seen_instead(rig: Rig, boards: FoundBoards, searched: int) -> str:
+    """What images show that have no board as described, one image for each such thing, however many
+    markers were counted."""
+    shown: dict[str, str] = {}
+    for note in boards.notes:
+        _, found, what = note.partition("no board found:")
+        if found:
+            shown.setdefault(COUNTED.sub("", what), note)
+    findings = describe_findings(rig, boards.value, searched)
+    return "\n  ".join([*filter(None, [findings]), *list(shown.values())[:MOST_SEEN]])
 
 
 def _nothing_calibrated(rig: Rig, failed: Mapping[str, str], remedy: str = "") -> FailedWork:

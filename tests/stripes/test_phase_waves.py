@@ -263,6 +263,7 @@ def changed(change: str, coded: np.ndarray) -> np.ndarray:
     return result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -281,6 +282,7 @@ def test_images_in_another_order_are_named(change: str, said: str) -> None:
     assert said in str(refused.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("projected", "said"),
     [

@@ -194,6 +194,7 @@ def test_the_same_frames_give_the_same_bytes() -> None:
     assert one.boundary_pixels.tobytes() == other.boundary_pixels.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pose", [0, 1, 2, 4])
 def test_real_stripes_on_a_real_board_are_smooth(captures: Path, pose: int) -> None:
     folder = captures / "procam-board" / f"capture_{pose}"
