@@ -12,7 +12,9 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from types import FrameType
+from typing import NoReturn
 
 STOPPED = 130  # as shells have it: 128 + SIGINT
 GRACE_S = 1.0  # for taking away what is half written
@@ -32,7 +34,7 @@ class _Asked(Exception):
 def run_interruptibly(work: Callable[[], int]) -> int:
     """The exit code of `work`, run in a child; of a signal 128 and its number, and a line that says so.
 
-    It returns in the child too: whoever calls this ends with the code.
+    It returns in the parent alone; the child ends with the code.
     """
     if not hasattr(os, "fork"):
         return work()
@@ -44,7 +46,7 @@ def run_interruptibly(work: Callable[[], int]) -> int:
     parent = os.getpid()
     child = os.fork()
     if child == 0:
-        return _work(work, parent)
+        _work(work, parent)
     try:
         return _code(os.waitpid(child, 0)[1])
     except _Asked as asked:
@@ -54,7 +56,7 @@ def run_interruptibly(work: Callable[[], int]) -> int:
         return 128 + int(asked.args[0])
 
 
-def _work(work: Callable[[], int], parent: int) -> int:
+def _work(work: Callable[[], int], parent: int) -> NoReturn:
     """In the child: a Ctrl-C of the terminal reaches both, so only the parent's word counts."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -67,8 +69,12 @@ def _work(work: Callable[[], int], parent: int) -> int:
         code = STOPPED
     if code == STOPPED:
         _say_stopped()
-        os._exit(code)  # without waiting for threads: nobody wants any more what they do
-    return code
+    with suppress(OSError):  # nobody reads it any more
+        sys.stdout.flush()
+        sys.stderr.flush()
+    # Without waiting for threads, of which nobody wants anything any more, and for Python to give back
+    # memory and modules one by one: half a second after a scan.
+    os._exit(code)
 
 
 def _code(status: int) -> int:

@@ -325,6 +325,8 @@ def _company(cloud: BodyCloud) -> Iterator[Finding]:
     taken[tuple(cells.T)] = True
     label = ndimage.label(taken, np.ones((3, 3, 3)))[0][tuple(cells.T)]
     share = np.bincount(label)[1:] / len(label)
+    if len(share) == 1:
+        return
     order = np.argsort(-share)
     extents = [np.percentile(cloud.points[label == k + 1, 2], [1, 99]) for k in order[:4]]
     low, high = extents[0]

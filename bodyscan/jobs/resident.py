@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -36,6 +37,9 @@ def main() -> int:
         tell(unusable=str(error))
         return error.exit_code
     kinds = _kinds(resident)
+    import_module(
+        "bodyscan.workflows.scan_folder"
+    )  # now, not while the first verdict is waited for
     tell(ready=True)
     while True:
         request = requests.get()
