@@ -36,8 +36,8 @@ MOST_FOLDS = 6
 SETTLED = 1e-2
 """Variances: a tenth of a standard deviation of the camera changes nothing of what is held out."""
 UNDAMPED = 1e-9
-"""Fits begin beside their minimum, where whole steps are right; damped ones creep along what boards
-hardly tell of a lens."""
+"""Fits without a fold begin beside their minimum, where whole steps are right; damped ones creep along
+what boards hardly tell of a lens."""
 NEAR = 0.05
 """Boards are at one place where corners moved by less than this share of the board's own size in the
 picture: they try the lens where it was tried before."""
@@ -121,7 +121,7 @@ def _fit(
         [pose.apply(view.points) for pose, view in zip(poses, views, strict=True)]
     )
     lens = kind().nearest(camera.lens, ideal[:, :2] / ideal[:, 2:])
-    return fit_camera(replace(camera, lens=lens), poses, views, damping=UNDAMPED)
+    return fit_camera(replace(camera, lens=lens), poses, views)
 
 
 def places(views: Sequence[PlanarView]) -> Indices:

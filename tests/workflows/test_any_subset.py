@@ -142,7 +142,13 @@ def test_any_subset_of_images_with_stripes_does_too(
     }
 
     def decoded(
-        _rig: Rig, _captures: Captures, wanted: Views, _progress: Progress, *, keep: Keep
+        _rig: Rig,
+        _captures: Captures,
+        wanted: Views,
+        _progress: Progress,
+        *,
+        box: object,
+        keep: Keep,
     ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
         keys = {view.key: view for view in wanted}
         return Outcome({key: keep(keys[key], striped[key]) for key in keys if key in striped})
