@@ -228,9 +228,14 @@ def _two_people(sound: Sound) -> Case:
 
 
 def _hand_on_hip(sound: Sound) -> Case:
-    made = o3d.geometry.TriangleMesh.create_cylinder(25.0, 280.0, resolution=40)
+    """A bar from the trunk to the middle of the left forearm, whose other end is the hand's."""
+    x, y, z = sound.vertices[np.abs(sound.vertices[:, 2] - 850.0) < 15.0].T
+    arm = y > 0.7 * y.max()
+    length = float(y[arm].mean()) - 120.0
+    made = o3d.geometry.TriangleMesh.create_cylinder(25.0, length, resolution=40)
     turn = o3d.geometry.get_rotation_matrix_from_axis_angle([-np.pi / 2, 0.0, 0.0])
-    bar = np.asarray(made.vertices) @ turn.T + [-10.0, 260.0, 850.0]
+    middle = [float(x[arm].mean()), 120.0 + 0.5 * length, float(z.mean())]
+    bar = np.asarray(made.vertices) @ turn.T + middle
     return _cast(sound, [(sound.vertices, sound.faces), (bar, np.asarray(made.triangles))])
 
 

@@ -88,7 +88,8 @@ def check_illumination(seen: Mask, lit: NDArray[Any]) -> None:
     if np.mean(seen) < MIN_SHARE_LIT:
         raise DecodingFailed(
             f"the projector lights only {np.mean(seen):.2%} of the picture",
-            remedy="see whether the projector is on, and whether lit and dark frames differ",
+            remedy="see whether the projector is on, and whether lit and dark frames differ or one is "
+            "missing, so that those behind it moved up",
         )
     saturated = np.mean(lit[seen] >= SATURATED)
     if saturated > MAX_SHARE_SATURATED:
