@@ -16,14 +16,12 @@ from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.reconstruction.told_motion import tell_motion
 from bodyscan.rig.frame_names import FrameNames, ImageNames
 from bodyscan.stripes.comb import Comb
-from bodyscan.stripes.one_moment import Moments, StripeMotion
+from bodyscan.stripes.one_moment import LEAP_MM, Moments, StripeMotion
 from bodyscan.stripes.stripe_code import StripeCode
 
 MS = 1000.0
 FASTEST_MM_S = 40.0
 """In depth, RMS over what a pair sees: more than twice what the restless do."""
-LEAP_MM = 2.0
-"""Nor is a leap of less than this named: from there on fine stripes are taken for their neighbours."""
 
 
 def sequence_moments(

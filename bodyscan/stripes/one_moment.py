@@ -20,6 +20,9 @@ LEAPT = 0.25
 the body that leapt alone leaves as much."""
 TORN = 4.0
 """Times what steady motion explains: motion back and forth is not steady either, and shorter."""
+SUDDEN, LEAP_MM = 30.0, 2.0
+"""A leap that explains so many times as much, 12 at most where people moved, is none of a body, however
+fast those are; from 2 mm on fine stripes are taken for their neighbours, and less is not named."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +138,8 @@ def _check_whole(
         if leap is not None:
             leaps.append((leap.explained, leap.speed_mm * lasted, first))
     explained, apart_mm, first = max(leaps, default=(0.0, 0.0, 0))
-    if explained > TORN * motion.explained and apart_mm > moments.most_mm:
+    most_mm = moments.most_mm if explained < SUDDEN * motion.explained else LEAP_MM
+    if explained > TORN * motion.explained and apart_mm > most_mm:
         raise DecodingFailed(
             f"from about bit {order[first]} on, patterns show the subject some {apart_mm:.1f} mm"
             " in depth from where those before show it",
