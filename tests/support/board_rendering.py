@@ -124,19 +124,18 @@ def _paint(fine: Floats, board: Board, view: View, white: float, black: float) -
     x, y = _met(view, depth, *np.meshgrid(u, v))
     if face:
         x = size[0] - x
+    print_, scale = _print(board, face, white, black)
+    # In the print's pixels, while there are 64 times fewer of them.
+    per_mm = scale / board.square_mm
     x, y = (
-        cv2.resize(part.astype(np.float32), None, fx=n, fy=n)[n:-n, n:-n]
-        / np.float32(board.square_mm)
+        cv2.resize((part * per_mm - 0.5).astype(np.float32), None, fx=n, fy=n)[n:-n, n:-n]
         for part in (x, y)
     )
-    margin = board.margin_mm / board.square_mm
-    inside = (x >= -margin) & (x <= board.columns + margin)
-    inside &= (y >= -margin) & (y <= board.rows + margin)
-    print_, scale = _print(board, face, white, black)
-    colours = cv2.remap(
-        print_, x * scale - 0.5, y * scale - 0.5, cv2.INTER_NEAREST, borderValue=(white,)
-    )
-    np.copyto(fine[low[1] * n : high[1] * n, low[0] * n : high[0] * n], colours, where=inside)
+    first = -board.margin_mm * per_mm - 0.5
+    last = (size + board.margin_mm) * per_mm - 0.5
+    inside = cv2.inRange(x, first, last[0]) & cv2.inRange(y, first, last[1])
+    colours = cv2.remap(print_, x, y, cv2.INTER_NEAREST, borderValue=(white,))
+    np.copyto(fine[low[1] * n : high[1] * n, low[0] * n : high[0] * n], colours, where=inside > 0)
 
 
 def _met(view: View, depth: float, u: Indices, v: Indices) -> tuple[Array, Array]:
