@@ -84,7 +84,8 @@ each camera, carried into the rig frame by the two estimated placings, and how f
 Nothing hides a point; errors of lenses (which partly make up for those of the placings) and of the
 light are not in it.
 
-Others on the same corners of the first seed, each camera calibrated by itself before by us; which end
+Others on the same corners of the first seed, each camera calibrated by itself before by us with k1 and
+k2, which is the lens that these cameras have; which end
 of a plain board is which is told to them. Here all are carried by one motion onto the true camera
 centres, since they know no rig frame. Ratios to ours in brackets. By default aniposelib refines the
 lenses too, with one focal length a camera, which these cameras do not have; "lenses kept": it does not.
@@ -115,10 +116,20 @@ def _run(seen: SeenRig) -> tuple[SeenRig, RigSolution, dict[str, Camera], Scored
     calibrated = calibrate_cameras(seen.rig, seen.views).value
     located = locate_views(seen.rig, seen.views, calibrated).value
     cameras = {name: found.camera for name, found in calibrated.items()}
+    given = calibrate_cameras(_with_lens(seen.rig, "radial"), seen.views).value
     wall, cpu = time.perf_counter(), time.process_time()
     placed = solve_rig(seen.rig, located, cameras).value
     seconds = time.perf_counter() - wall, time.process_time() - cpu
-    return seen, placed, cameras, _score(seen, placed.rig_from_camera, *seconds)
+    others = {name: found.camera for name, found in given.items()}
+    return seen, placed, others, _score(seen, placed.rig_from_camera, *seconds)
+
+
+def _with_lens(rig: Rig, lens: str) -> Rig:
+    pairs = tuple(
+        pair.model_copy(update={"camera": pair.camera.model_copy(update={"lens": lens})})
+        for pair in rig.pairs
+    )
+    return rig.model_copy(update={"pairs": pairs})
 
 
 def _score(

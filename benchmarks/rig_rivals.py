@@ -70,6 +70,8 @@ def stereo_chain(corners: Corners) -> Found:
     tree = minimum_spanning_tree(-np.triu(common, 1))
     order, before = breadth_first_order(tree, 0, directed=False)
     found = np.tile(np.eye(4), (len(pixels), 1, 1))
+    # Without that flag a lens's terms below the fraction are taken for zero.
+    rational = cv2.CALIB_RATIONAL_MODEL if corners["lenses"][:, 5:].any() else 0
     for name in order[1:]:
         first = before[name]
         both = seen[first] & seen[name]
@@ -83,7 +85,7 @@ def stereo_chain(corners: Corners) -> Found:
             corners["matrices"][name],
             corners["lenses"][name],
             tuple(int(v) for v in corners["size"]),
-            flags=cv2.CALIB_FIX_INTRINSIC,
+            flags=cv2.CALIB_FIX_INTRINSIC | rational,
             criteria=(cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9),
         )
         found[name] = _stacked(rotation[None], shift.reshape(1, 3))[0] @ found[first]
