@@ -22,7 +22,7 @@ from bodyscan.reconstruction.range_image import RangeImage
 Result = TypeVar("Result")
 
 COARSE = slice(None, None, 4)
-"""Of the points; all take part but at the end."""
+"""Of the points; all of them take part only in the last rounds."""
 
 
 @dataclass(frozen=True, eq=False)
