@@ -30,6 +30,7 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.registration.seen_corners import seen_corners
+from bodyscan.registration.soundness import find_faults
 from bodyscan.registration.storage import keep_former, save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
@@ -136,6 +137,13 @@ def join_rig(
         tuple(captures.relative(note) for note in notes),
         seen=seen_corners(placed, pairs),
     )
+    for place, what in find_faults(calibration):
+        raise FailedWork(
+            f"the boards together give what no rig can be: {place} {what}",
+            where=f"rig {rig.name}",
+            remedy="are corners mixed up in some views, or shots of different moments listed as one? "
+            "Leave out the shots in doubt",
+        )
     return JoinedRig(calibration, placed, boards.value, searched)
 
 

@@ -31,12 +31,13 @@ from bodyscan.calibration.known_pair import read_known_camera
 from bodyscan.calibration.lens_choice import calibrate_with_lenses
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_board_image
-from bodyscan.errors import BadInput, BodyscanError
+from bodyscan.errors import BadInput, BodyscanError, DegeneratePoses
 from bodyscan.files.corners_vnl import Corners, write_corners
 from bodyscan.geometry.lenses import FAMILY, LENSES
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, threaded
 from bodyscan.registration.board_appearance import appearance_notes, without_odd_mirrored
+from bodyscan.registration.soundness import camera_faults
 from bodyscan.rig.known import Known
 from bodyscan.rig.pair import AUTO
 from bodyscan.rig.rig import Rig
@@ -189,6 +190,16 @@ def calibrate_cameras(
     """
 
     def calibrate(name: str) -> CameraCalibration:
+        found = fitted(name)
+        for place, what in camera_faults(found.camera, rig.pair(name), "camera"):
+            raise DegeneratePoses(
+                f"what fits its boards best is no camera: {place} {what}",
+                remedy="are corners mixed up in some of its views, or its boards not as described? "
+                "Leave out the shots in doubt",
+            )
+        return found
+
+    def fitted(name: str) -> CameraCalibration:
         spec = rig.pair(name).camera
         own = [v for v in views if v.pair == name and has_enough_corners(v, rig.board(v.board))]
         planar = [planar_view(view, rig.board(view.board)) for view in own]

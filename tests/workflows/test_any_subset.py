@@ -24,7 +24,7 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import RigFrame
-from bodyscan.workflows import calibrate_rig
+from bodyscan.workflows import calibrate_rig, find_boards
 from bodyscan.workflows.calibrate_rig import join_rig
 from bodyscan.workflows.decode import Keep
 from bodyscan.workflows.find_boards import FoundBoards
@@ -186,6 +186,23 @@ def test_a_camera_with_one_view_is_left_out_and_named() -> None:
     found = calibrated(boards, [v for v in boards.views if v.pair != "c3" or v.shot == "s02"])
     assert sorted(found.pairs) == ["c1", "c2", "c4"]
     assert "at least 3" in found.failed["c3"]
+
+
+def test_what_no_camera_can_be_is_left_out_and_never_written(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An example that the first test drew: of half of the views one in five has its corners mixed up,
+    and a focal length of -4 px fits c2's best."""
+    boards = seen(3, shots=8)
+    rng = np.random.default_rng(80)
+    views = mixed_up([view for view in boards.views if rng.random() < 0.5], rng)
+    cameras = find_boards.calibrate_cameras(boards.rig, views)
+    assert sorted(cameras.value) == ["c1", "c3"]
+    assert "alpha is not a focal length" in cameras.failures["c2"]
+    # Whatever else such a camera may come from, what the solve makes of it is not kept.
+    monkeypatch.setattr(find_boards, "camera_faults", lambda *_: ())
+    with pytest.raises(FailedWork, match="what no rig can be"):
+        calibrated(boards, views)
 
 
 def test_shots_that_one_camera_saw_tie_nothing_together() -> None:
