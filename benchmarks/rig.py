@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.board_images import SeenRig, see_boards
-from benchmarks.rivals import RIVALS, run_rival
+from benchmarks.rivals import RIVALS, run_rival, with_lens
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.pose_covariance import position_sigma
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
@@ -116,20 +117,15 @@ def _run(seen: SeenRig) -> tuple[SeenRig, RigSolution, dict[str, Camera], Scored
     calibrated = calibrate_cameras(seen.rig, seen.views).value
     located = locate_views(seen.rig, seen.views, calibrated).value
     cameras = {name: found.camera for name, found in calibrated.items()}
-    given = calibrate_cameras(_with_lens(seen.rig, "radial"), seen.views).value
     wall, cpu = time.perf_counter(), time.process_time()
     placed = solve_rig(seen.rig, located, cameras).value
     seconds = time.perf_counter() - wall, time.process_time() - cpu
-    others = {name: found.camera for name, found in given.items()}
-    return seen, placed, others, _score(seen, placed.rig_from_camera, *seconds)
-
-
-def _with_lens(rig: Rig, lens: str) -> Rig:
-    pairs = tuple(
-        pair.model_copy(update={"camera": pair.camera.model_copy(update={"lens": lens})})
-        for pair in rig.pairs
+    return (
+        seen,
+        placed,
+        with_lens(Radial(), placed.views, cameras),
+        _score(seen, placed.rig_from_camera, *seconds),
     )
-    return rig.model_copy(update={"pairs": pairs})
 
 
 def _score(

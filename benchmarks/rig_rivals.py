@@ -2,8 +2,9 @@
 
 Run as a script of its own, by whichever Python has the rival installed; needs numpy, scipy and OpenCV.
 corners.npz: pixels (C, F, N, 2), NaN where not seen; points (N, 3) mm; size (2,); grid (squares across,
-down, mm a square); matrices (C, 3, 3) and lenses (C, 5), each camera calibrated by itself.  found.npz:
-`camera_from_first` (C, 4, 4), `matrices` and `lenses` as the rival leaves them, `seconds` (wall, CPU).
+down, mm a square); matrices (C, 3, 3) and lenses (C, 4 to 8), each camera calibrated by itself.
+found.npz: `camera_from_first` (C, 4, 4), `matrices` and `lenses` as the rival leaves them, `seconds`
+(wall, CPU).
 """
 
 from __future__ import annotations
@@ -25,10 +26,11 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Corners = dict[str, Any]
 Found = tuple[Array, Array, Array]
-"""camera_from_first (C, 4, 4), matrices (C, 3, 3), lenses (C, 5)."""
+"""camera_from_first (C, 4, 4), matrices (C, 3, 3), lenses (C, 8)."""
 
 FEWEST = 8
-KEEP = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+RADIAL = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+"""Terms that a lens given without them does not get either."""
 
 
 def opencv_multiview(corners: Corners, *, partly: bool = False) -> Found:
@@ -44,6 +46,7 @@ def opencv_multiview(corners: Corners, *, partly: bool = False) -> Found:
     pixels, seen, mask, points = pixels[:, used], seen[:, used], mask[:, used], points[used]
     count = len(mask)
     marked = np.where(seen[..., None], pixels, -1.0).astype(np.float32)
+    terms = 0 if corners["lenses"][:, 2:].any() else RADIAL
     _, matrices, lenses, rotations, shifts = cv2.calibrateMultiview(
         list((points / 1000.0).astype(np.float32)),
         [list(marked[k]) for k in range(count)],
@@ -54,13 +57,13 @@ def opencv_multiview(corners: Corners, *, partly: bool = False) -> Found:
         list(corners["lenses"]),
         None,
         None,
-        flagsForIntrinsics=np.full((count, 1), KEEP, np.int32),
+        flagsForIntrinsics=np.full((count, 1), cv2.CALIB_USE_INTRINSIC_GUESS | terms, np.int32),
         flags=cv2.CALIB_USE_INTRINSIC_GUESS,
     )
     vectors = [np.asarray(r, float) for r in rotations]
     turns = [cv2.Rodrigues(r)[0] if r.size == 3 else r.reshape(3, 3) for r in vectors]
     placings = _stacked(np.array(turns), 1000.0 * np.array(shifts, float).reshape(count, 3))
-    return placings, np.array(matrices, float), np.array([np.ravel(lens)[:5] for lens in lenses])
+    return placings, np.array(matrices, float), _padded(lenses)
 
 
 def stereo_chain(corners: Corners) -> Found:
@@ -152,7 +155,7 @@ def aniposelib(corners: Corners, *, lenses_kept: bool = False) -> Found:
     return (
         camera_from_world @ np.linalg.inv(camera_from_world[0]),
         np.array([c.get_camera_matrix() for c in group.cameras], float),
-        np.array([np.ravel(c.get_distortions())[:5] for c in group.cameras], float),
+        _padded([c.get_distortions() for c in group.cameras]),
     )
 
 
@@ -208,7 +211,7 @@ def caliscope(corners: Corners) -> Found:
     return (
         camera_from_world @ np.linalg.inv(camera_from_world[0]),
         np.array([c.matrix for c in found], float),
-        np.array([np.ravel(c.distortions)[:5] for c in found], float),
+        _padded([c.distortions for c in found]),
     )
 
 
@@ -234,6 +237,15 @@ def _faces_apart(corners: Corners) -> tuple[Array, Array]:
 def _seen(corners: Corners) -> tuple[Array, Mask]:
     pixels = np.asarray(corners["pixels"], float)
     return pixels, np.isfinite(pixels[..., 0])
+
+
+def _padded(lenses: Any) -> Array:
+    """(C, 8): OpenCV takes missing coefficients for zero."""
+    found = np.zeros((len(lenses), 8))
+    for row, lens in zip(found, lenses, strict=True):
+        own = np.ravel(np.asarray(lens, float))[:8]
+        row[: len(own)] = own
+    return found
 
 
 def _stacked(rotations: Array, shifts: Array) -> Array:

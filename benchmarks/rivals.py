@@ -15,9 +15,11 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
-from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.board_views import LocatedView, PlanarView
+from bodyscan.calibration.camera import calibrate_camera
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import lens_from_opencv
+from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 
@@ -77,6 +79,21 @@ def run_rival(
         },
         *(float(s) for s in found["seconds"]),
     )
+
+
+def with_lens(
+    lens: Lens, views: Sequence[LocatedView], cameras: Mapping[str, Camera]
+) -> dict[str, Camera]:
+    """Each camera calibrated by itself from its views, with a lens that rivals know."""
+    return {
+        name: calibrate_camera(
+            [PlanarView(v.shot, v.points, v.pixels) for v in views if v.pair == name],
+            camera.width,
+            camera.height,
+            lens,
+        ).camera
+        for name, camera in cameras.items()
+    }
 
 
 def without_skew(views: Sequence[LocatedView], cameras: Mapping[str, Camera]) -> list[LocatedView]:
