@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from bodyscan.verdict import Verdict
 
 # Tables keep their lines whole when the output goes into a file.
-CONSOLE = Console() if sys.stdout.isatty() else Console(width=120)
+CONSOLE = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 120)
 ERRORS = Console(stderr=True)
 MOST_NOTES = 20  # are shown without --verbose, the first line of each
 WIDEST = 10_000  # columns: no table is as wide
