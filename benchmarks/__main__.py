@@ -43,6 +43,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "four-pole": full_size.four_pole,
     "living": full_size.living,
     "sigmas": sigmas.report,
+    "sigmas-rigs": sigmas.rigs,
     "one-solve": one_solve.report,
     "fusion": fusion.report,
     "faults": faults.report,
@@ -58,7 +59,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "lens": lens.report,
     "mutants": mutants.report,
 }
-SLOW = ("mutants", "day")
+SLOW = ("mutants", "day", "sigmas-rigs")
 """Run when named, not with all."""
 
 
