@@ -16,6 +16,7 @@ from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.stripe_agreement import board_offsets
 from bodyscan.calibration.striped_view import BoardBoundaries, boundaries_on_boards
 from bodyscan.captures.folder import open_captures
+from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.workflows.calibrate_rig import join_rig, striped
@@ -46,9 +47,9 @@ how far off they are along their normals, and how far the pair's stripes measure
 
 | | mm RMS |
 |---|---|
-| boards off their true places | {_rms(off):.4f} |
-| what their stripes say of it | {_rms(told):.4f} |
-| boards, less the best multiple ({share:+.2f}) of what stripes say | {_rms(left):.4f} |
+| boards off their true places | {rms(off):.4f} |
+| what their stripes say of it | {rms(told):.4f} |
+| boards, less the best multiple ({share:+.2f}) of what stripes say | {rms(left):.4f} |
 
 Correlation of the two: {np.corrcoef(off, told)[0, 1]:+.2f}.
 """
@@ -79,7 +80,3 @@ def _errors(
         points = boundaries_on_boards(name, pair.camera, projector, shots)
         both = np.array([off, board_offsets(points, pair.sheets)])
         yield both - both.mean(axis=1, keepdims=True)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -15,6 +15,7 @@ from benchmarks.full_size import run_commands
 from bodyscan.arrays import Array
 from bodyscan.evaluation.surface import signed_distances
 from bodyscan.fusion.storage import load_scan
+from bodyscan.geometry.robust import rms
 from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.calibrating import calibrate_ours
 from bodyscan.laboratory.chapter.captures import TARGET, take_captures
@@ -113,10 +114,10 @@ def _unit_row(boards: int, light: str, seeds: Sequence[PointSigma]) -> str:
 
 
 def _rig_row(preset: str, seeds: Sequence[RigErrors]) -> str:
-    centres, cloud = [_rms(s.centres) for s in seeds], [_rms(s.cloud) for s in seeds]
+    centres, cloud = [rms(s.centres) for s in seeds], [rms(s.cloud) for s in seeds]
     apart = np.mean(np.abs(np.concatenate([s.centres for s in seeds])) > 3.0)
     beyond = np.mean(np.abs(np.concatenate([s.cloud for s in seeds])) > 3.0)
-    size = _rms(np.concatenate([s.cloud_mm for s in seeds]))
+    size = rms(np.concatenate([s.cloud_mm for s in seeds]))
     return (
         f"| {preset} | {_each(centres)} | {100 * apart:.1f} % | {_each(cloud)} | "
         f"{100 * beyond:.2f} % | {size:.3f} |"
@@ -124,8 +125,4 @@ def _rig_row(preset: str, seeds: Sequence[RigErrors]) -> str:
 
 
 def _each(spreads: Sequence[float]) -> str:
-    return f"{_rms(np.array(spreads)):.2f} ({', '.join(f'{one:.2f}' for one in spreads)})"
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    return f"{rms(np.array(spreads)):.2f} ({', '.join(f'{one:.2f}' for one in spreads)})"

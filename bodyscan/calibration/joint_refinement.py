@@ -313,10 +313,8 @@ def _rays(camera: Camera, board: StripedBoard) -> Array:
 def _ray_slopes(camera: Camera, rays: Array) -> Array:
     """(2, N, 2, P): how rays turn with the camera's parameters while their pixels stay, which undoes
     what the parameters do to the pixels of rays that stay."""
-    by_parameter, by_point = camera.jacobians(rays.reshape(-1, 3))
-    (a, b), (c, d) = by_point[:, :, :2].transpose(1, 2, 0)
-    inverse = np.stack([d, -b, -c, a], axis=-1).reshape(-1, 2, 2) / (a * d - b * c)[:, None, None]
-    return -(inverse @ by_parameter).reshape(*rays.shape[:2], 2, -1)
+    by_parameter, _ = camera.jacobians(rays.reshape(-1, 3))
+    return -(camera.rays_by_pixels(rays) @ by_parameter.reshape(*rays.shape[:2], 2, -1))
 
 
 def _offsets(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:

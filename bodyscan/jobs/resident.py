@@ -37,9 +37,8 @@ def main() -> int:
         tell(unusable=str(error))
         return error.exit_code
     kinds = _kinds(resident)
-    import_module(
-        "bodyscan.workflows.scan_folder"
-    )  # now, not while the first verdict is waited for
+    # Now, not while the first verdict is waited for.
+    import_module("bodyscan.workflows.scan_folder")
     tell(ready=True)
     while True:
         request = requests.get()
