@@ -1,14 +1,16 @@
 """Faults put into captures of two subjects on both rigs: what the verdict says, and what they cost.
 
 At half size, the people alone: their rigs are calibrated by `calibration_from_truth`. What was rendered
-in bench/faults stays, 2 minutes each on two idle cores; a fault takes some 10 s.
+in bench/faults stays, 2 minutes each on two idle cores; a fault takes some 10 s. Each core does a column.
 python -m benchmarks.faults RIG SUBJECT [WORDS] prints one column, of faults whose names hold WORDS.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,14 +26,20 @@ from bodyscan.evaluation.body import compare_girths, true_girths
 from bodyscan.fusion.scan import fuse
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
+from bodyscan.progress import THREADS
 from bodyscan.settings import FusionSettings, MeshSettings, ScanSettings
 from bodyscan.workflows.range_images import reconstruct_range_images
 
 FOLDER = PROJECT / "bench" / "faults"
 RIGS = ("three-pole-12", "four-pole-16")
 SUBJECTS = ("woman_average", "man_average")
-PRESETS = ("mannequin", "standing")
-LIVING = "a living person"
+KINDS = {
+    "mannequin": ["--subject-preset", "mannequin"],
+    "standing": ["--subject-preset", "standing"],
+    "ideal": ["--subject-preset", "mannequin", "--preset", "ideal"],
+}
+"""How a subject is rendered: workshop devices, but for ideal ones."""
+IDEAL, LIVING = "ideal devices", "a living person"
 SWAY_MM, SWAYS = 5.0, 3
 SETTINGS = ScanSettings(
     fusion=FusionSettings(points=250_000), mesh=MeshSettings(depth=8, reach_mm=8.0)
@@ -59,33 +67,41 @@ def report() -> str:
     columns = [(rig, subject) for rig in RIGS for subject in SUBJECTS]
     for column in columns:
         _simulate(*column)
-        found += _of(*column)
+    with ProcessPoolExecutor(THREADS, multiprocessing.get_context("spawn")) as pool:
+        for judged in pool.map(_of, *zip(*columns, strict=True)):
+            found += judged
     return _told(found, columns)
 
 
-def _workspace(rig: str, subject: str, preset: str) -> Path:
-    return FOLDER / f"{rig}-{subject}-{preset}"
+def _workspace(rig: str, subject: str, kind: str) -> Path:
+    return FOLDER / f"{rig}-{subject}-{kind}"
 
 
 def _simulate(rig: str, subject: str) -> None:
     """At half size; the other subject too, whom faults mix in. A mirror's smile is left out:
     `calibration_from_truth` has true planes."""
     other = next(name for name in SUBJECTS if name != subject)
-    for who, preset in ((subject, PRESETS[0]), (other, PRESETS[0]), (subject, PRESETS[1])):
-        workspace = _workspace(rig, who, preset)
+    for who, kind in (*((subject, kind) for kind in KINDS), (other, "mannequin")):
+        workspace = _workspace(rig, who, kind)
         made: list[object] = [PROJECT / "rigs" / f"{rig}.yaml", "--out", workspace]
         made += ["--scale", 0.5, "--subject", PROJECT / "data" / "subjects" / f"{who}.ply"]
-        made += ["--subject-preset", preset, "--board-shots", 0]
-        made += ["--set", "projection.smile_stripes=0"]
+        made += [*KINDS[kind], "--board-shots", 0, "--set", "projection.smile_stripes=0"]
         run_commands({"simulate": made}, workspace)
 
 
 def _of(rig: str, subject: str) -> list[Found]:
-    sound, moving = (_sound(rig, subject, preset) for preset in PRESETS)
     return [
-        *(_judge(rig, subject, fault, sound) for fault in (*_nothing(), *faults())),
-        *(_judge(rig, subject, fault, moving) for fault in _living()),
+        _judge(rig, subject, fault, sound)
+        for kind, listed in _listed().items()
+        for sound in [_sound(rig, subject, kind)]
+        for fault in listed
     ]
+
+
+def _listed() -> dict[str, list[Fault]]:
+    """By the kind of captures that they are put into; sound scans first."""
+    ideal = [replace(fault, name=f"{fault.name}, {IDEAL}") for fault in _nothing()[:2]]
+    return {"mannequin": [*_nothing(), *faults()], "standing": [*_living()], "ideal": ideal}
 
 
 def _living() -> Iterator[Fault]:
@@ -94,12 +110,12 @@ def _living() -> Iterator[Fault]:
         yield replace(fault, name=f"{fault.name}, {LIVING}")
 
 
-def _sound(rig: str, subject: str, preset: str) -> Sound:
-    workspace = _workspace(rig, subject, preset)
+def _sound(rig: str, subject: str, kind: str) -> Sound:
+    workspace = _workspace(rig, subject, kind)
     calibration = calibration_from_truth(workspace)
     person = workspace / "captures" / "person"
     other = next(name for name in SUBJECTS if name != subject)
-    stranger = _workspace(rig, other, PRESETS[0])
+    stranger = _workspace(rig, other, "mannequin")
     images, others = (
         reconstruct_range_images(calibration, open_scan(calibration.rig, folder)).value
         for folder in (person, stranger / "captures" / "person")
@@ -138,7 +154,7 @@ def _told(found: Sequence[Found], columns: Sequence[tuple[str, str]]) -> str:
     targets = "\n".join(f"| {what} | {target} | {number} |" for what, target, number in goals)
     return f"""## Faults, and what becomes of them (synthetic)
 
-{len(wrong)} faults and {len(sound)} sound scans, of half-size captures
+{len(wrong)} faults and {len(sound)} sound scans, of half-size captures by workshop devices, or ideal ones
 (`python -m benchmarks faults`): the verdict, and the worst error in mm of a tape girth of the trunk
 that is given as measured (- where none is). A star: the verdict does not name the cause.
 
@@ -217,9 +233,9 @@ if __name__ == "__main__":
     chosen = (sys.argv[1], sys.argv[2])
     _simulate(*chosen)
     judged: list[Found] = []
-    for preset, listed in zip(PRESETS, ([*_nothing(), *faults()], [*_living()]), strict=True):
+    for kind, listed in _listed().items():
         asked = [fault for fault in listed if " ".join(sys.argv[3:]) in fault.name]
-        own = _sound(*chosen, preset) if asked else None
+        own = _sound(*chosen, kind) if asked else None
         for fault in asked:
             assert own is not None
             one = _judge(*chosen, fault, own)
