@@ -1,7 +1,7 @@
 """Faults put into captures of two subjects on both rigs: what the verdict says, and what they cost.
 
 At half size, the people alone: their rigs are calibrated by `calibration_from_truth`. What was rendered
-in bench/faults stays, 2 minutes each on two idle cores; a fault takes some 10 s. Each core does a column.
+in bench/faults stays, 2 minutes each on two idle cores; a fault takes some 10 s, a core a column.
 python -m benchmarks.faults RIG SUBJECT [WORDS] prints one column, of faults whose names hold WORDS.
 """
 
@@ -154,8 +154,8 @@ def _told(found: Sequence[Found], columns: Sequence[tuple[str, str]]) -> str:
     targets = "\n".join(f"| {what} | {target} | {number} |" for what, target, number in goals)
     return f"""## Faults, and what becomes of them (synthetic)
 
-{len(wrong)} faults and {len(sound)} sound scans, of half-size captures by workshop devices, or ideal ones
-(`python -m benchmarks faults`): the verdict, and the worst error in mm of a tape girth of the trunk
+{len(wrong)} faults and {len(sound)} sound scans, of half-size captures by workshop devices where none
+are said (`python -m benchmarks faults`): the verdict, and the worst error in mm of a tape girth of the trunk
 that is given as measured (- where none is). A star: the verdict does not name the cause.
 
 | | target | found |
