@@ -155,8 +155,8 @@ def _told(found: Sequence[Found], columns: Sequence[tuple[str, str]]) -> str:
     return f"""## Faults, and what becomes of them (synthetic)
 
 {len(wrong)} faults and {len(sound)} sound scans, of half-size captures by workshop devices where none
-are said (`python -m benchmarks faults`): the verdict, and the worst error in mm of a tape girth of the trunk
-that is given as measured (- where none is). A star: the verdict does not name the cause.
+are said (`python -m benchmarks faults`): the verdict, and the worst error in mm of a tape girth of the
+trunk that is given as measured (- where none is). A star: the verdict does not name the cause.
 
 | | target | found |
 |---|---|---|
