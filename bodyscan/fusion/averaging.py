@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.compiled import compiled
 from bodyscan.fusion.brightness import EvenGrey
-from bodyscan.fusion.comparing import Evidence
+from bodyscan.fusion.evidence import Evidence
 from bodyscan.fusion.quadratics import NORMAL_MEDIAN
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples

@@ -16,7 +16,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.compiled import compiled
-from bodyscan.fusion.comparing import Evidence
+from bodyscan.fusion.evidence import Evidence
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples
 

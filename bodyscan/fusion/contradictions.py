@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from bodyscan.fusion.comparing import Evidence, Numbers
+from bodyscan.fusion.evidence import Evidence, Numbers
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples
 

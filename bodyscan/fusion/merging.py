@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from bodyscan.fusion.averaging import average
 from bodyscan.fusion.brightness import even_brightness
-from bodyscan.fusion.comparing import compare
 from bodyscan.fusion.contradictions import Contradictions
+from bodyscan.fusion.evidence import compare
 from bodyscan.fusion.smoothing import smooth
 from bodyscan.fusion.thinning import take_samples
 from bodyscan.geometry.transforms import RigidTransform

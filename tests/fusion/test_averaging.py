@@ -10,7 +10,7 @@ from flat_walls import ASIDE, WALL_MM, wall
 
 from bodyscan.fusion.averaging import average, scatter
 from bodyscan.fusion.brightness import EvenGrey
-from bodyscan.fusion.comparing import Evidence, compare
+from bodyscan.fusion.evidence import Evidence, compare
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples, take_samples
 from bodyscan.geometry.transforms import RigidTransform
