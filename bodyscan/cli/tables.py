@@ -10,6 +10,7 @@ from rich.table import Table
 
 from bodyscan.fusion.scan import Scan
 from bodyscan.geometry.pose_covariance import position_sigma
+from bodyscan.mesh.regions import covered_shares, shares
 from bodyscan.registration.rig_calibration import RigCalibration
 
 
@@ -93,6 +94,10 @@ def scan_table(scan: Scan) -> Table:
     table.add_row("sigma of a point, median", f"{np.nanmedian(cloud.sigma_mm):.3f} mm")
     table.add_row("faces of the mesh", f"{len(surface.faces):,}")
     table.add_row("of its surface filled", f"{100.0 * surface.filled_share:.1f} %")
+    covered = covered_shares(cloud.regions)
+    if covered:
+        told = ", ".join(f"{name} {100.0 * share:.1f} %" for name, share in covered.items())
+        table.add_row("of the points no skin", told)
     if scan.alignment is not None:
         before, after = scan.alignment.rms_before_mm, scan.alignment.rms_after_mm
         table.add_row("overlaps before, after alignment", f"{before:.3f}, {after:.3f} mm RMS")
@@ -114,5 +119,6 @@ def scan_figures(scan: Scan) -> dict[str, Any]:
         "faces": len(scan.mesh.faces),
         "sigma_mm": float(np.nanmedian(scan.cloud.sigma_mm)),
         "filled_share": scan.mesh.filled_share,
+        "regions": None if scan.cloud.regions is None else shares(scan.cloud.regions),
         "sway_mm": scan.alignment.motion_mm if scan.alignment else None,
     }

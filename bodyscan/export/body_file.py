@@ -14,6 +14,7 @@ from bodyscan.files.atomic import write_json
 from bodyscan.files.registry import unknown_format
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.regions import NAMES
 from bodyscan.mesh.slivers import without_slivers
 from bodyscan.mesh.topology import face_areas
 from bodyscan.version import __version__
@@ -75,6 +76,8 @@ def description(
         "defaced": origin.defaced,
         "kind": "cloud" if isinstance(body, BodyCloud) else "mesh",
     }
+    if "regions" in format_.holds and body.regions is not None:
+        said["regions"] = list(NAMES)
     if isinstance(body, BodyCloud):
         return said | {"points": len(body.points), "sigma_mm": _middle(body.sigma_mm)}
     areas = face_areas(body.vertices, body.faces)

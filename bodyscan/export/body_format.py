@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from bodyscan.files.registry import Registry
 
-Content = Literal["mesh", "cloud", "colours", "normals", "sigma", "filled"]
+Content = Literal["mesh", "cloud", "colours", "normals", "sigma", "filled", "regions"]
 
 
 @dataclass(frozen=True)

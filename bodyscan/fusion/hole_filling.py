@@ -8,7 +8,7 @@ space opens them. And so is what lies below the floor.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +62,7 @@ def likely_distances(
     """
     cell_mm = max(CELL_MM, finest_mm)
     bricks = _grid_around(cloud.points, cell_mm)
-    some = _every(cloud, max(1, len(cloud.points) // ENOUGH_POINTS))
+    some = cloud.every(max(1, len(cloud.points) // ENOUGH_POINTS))
     reach_cells = max(REACH_MM / cell_mm, REACH_CELLS)
     splatted = splat(some, bricks, reach_cells)
     values, weights = (dense_of(part, bricks.table.shape) for part in splatted)
@@ -96,10 +96,6 @@ def _mirror(values: Floats | Mask, below: int, where: Mask) -> None:
         under = np.s_[..., below - count : below]
         above = values[..., below : below + count][..., ::-1]
         values[under] = np.where(where[under], above, values[under])
-
-
-def _every(cloud: BodyCloud, step: int) -> BodyCloud:
-    return BodyCloud(*(getattr(cloud, part.name)[::step] for part in fields(cloud)))
 
 
 def _grid_around(points: Array, cell_mm: float) -> Bricks:

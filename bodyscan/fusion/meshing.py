@@ -14,6 +14,7 @@ from bodyscan.fusion.support import fit_to_points, support
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.bricks import SIDE, Bricks
+from bodyscan.mesh.regions import UNSURE
 from bodyscan.mesh.repair import largest_piece
 from bodyscan.mesh.surface_nets import surface_nets
 from bodyscan.mesh.topology import topology, vertex_normals
@@ -86,7 +87,7 @@ def signed_distances(
 def attach_attributes(
     vertices: Array, faces: Indices, cloud: BodyCloud, reach_mm: float
 ) -> BodyMesh:
-    """Brought onto the points, with normals, the points' colours and sigmas, and what was filled.
+    """Brought onto the points, with normals, what the points know, and what was filled.
 
     A grid's vertices are as exact as its cells are small; they move along their normals to where
     the points around say, less the farther these are.
@@ -102,4 +103,7 @@ def attach_attributes(
         cloud.colours[around.nearest],
         sigma_mm,
         np.any(np.isnan(sigma_mm)[faces], axis=1),
+        regions=None
+        if cloud.regions is None
+        else np.where(around.measured, cloud.regions[around.nearest], np.uint8(UNSURE)),
     )

@@ -25,6 +25,7 @@ from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
+from bodyscan.fusion.regions import label_regions
 from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.seams import judge_seams
 from bodyscan.fusion.surface_check import SurfaceCheck, check_surface
@@ -111,6 +112,8 @@ def fuse(
         cloud = add_pose_variance(fused.cloud, there, known)
         if followed:
             cloud = add_motion_variance(fused.cloud, cloud, followed)
+        regions = label_regions(cloud, seen, there, settings.fusion.window_mm)
+        cloud = replace(cloud, regions=regions)
     person = PersonMotion.of(followed) if followed else None
     points = {image.pair: int(image.valid.sum()) for image in cleaned}
     failed = dict(measured.failures)

@@ -78,6 +78,7 @@ class _Facts(_Part):
     verdict: _Verdict | None = None
     sha256: _Hashes | None = None
     counts: dict[str, float] = {}
+    regions: dict[str, float] | None = None
     measured: dict[str, int] = {}
     failed: dict[str, str] = {}
     alignment: _Alignment | None = None

@@ -71,12 +71,22 @@ def smooth(
         return None
     common = np.zeros((1, 1), np.float32) if image.common_mm is None else image.common_mm
     common = np.broadcast_to(common, image.sigma_mm.shape)
-    inverse, noise = _inverse_depths(image.points, image.sigma_mm, common, ends_of(box))
-    some = inverse[::EVERY]
-    pixel_mm = float(np.median(1.0 / some[some > 0])) / image.camera.alpha
-    reach = int(np.clip(round(0.5 * window_mm / pixel_mm), 2, 6))
+    inverse, noise = inverse_depths(image.points, image.sigma_mm, common, ends_of(box))
+    pixel_mm = pixel_size(inverse, image.camera)
+    reach = window_reach(inverse, image.camera, window_mm)
     fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm)
     return _surface(image, common, rig_from_camera, box, fit, fitted, reach)
+
+
+def pixel_size(inverse: Floats, camera: Camera) -> float:
+    """mm from pixel to pixel on what is half-way deep; inverse: 1/z, 0 where nothing was measured."""
+    some = inverse[::EVERY]
+    return float(np.median(1.0 / some[some > 0])) / camera.alpha
+
+
+def window_reach(inverse: Floats, camera: Camera, window_mm: float) -> int:
+    """Pixels to either side of a window's middle."""
+    return int(np.clip(round(0.5 * window_mm / pixel_size(inverse, camera)), 2, 6))
 
 
 def _surface(
@@ -130,7 +140,7 @@ def _distance_to_rim(depth: Floats, jump: float) -> Floats:
 
 
 @compiled
-def _inverse_depths(
+def inverse_depths(
     points: Floats, sigma_mm: Floats, common_mm: Floats, ends: tuple[int, int, int, int]
 ) -> tuple[Floats, Floats]:
     """1/z and its standard deviation (h, w), less what neighbours share, 0 where nothing was measured,

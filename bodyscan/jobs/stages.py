@@ -150,8 +150,8 @@ def results_of(stage: str) -> Callable[[Job], dict[str, Path]]:
 
 KINDS: Kinds = {
     "fuse": (
-        Stage("scan", 4, ("alignment", "fusion", "mesh"), scan_inputs, run_scan),
-        Stage("export", 2, ("export",), results_of("scan"), run_export),
+        Stage("scan", 5, ("alignment", "fusion", "mesh"), scan_inputs, run_scan),
+        Stage("export", 3, ("export",), results_of("scan"), run_export),
         Stage("report", 1, (), results_of("scan"), run_report),
     ),
     "calibrate": (

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
+from bodyscan.mesh.regions import of_faces
 from bodyscan.mesh.topology import drop_unused_vertices, face_areas
 
 
@@ -17,6 +19,7 @@ class BodyCloud:
     points: (N, 3) float64, mm.  normals: (N, 3) float32, unit, outward.
     sigma_mm: (N,) float32, standard deviation along the normal.
     colours: (N, 3) uint8, red, green, blue.  pairs_seen: (N,) uint8, how many pairs measured it.
+    regions: (N,) uint8, what each is of `regions.NAMES`; None where nothing is known of that.
     """
 
     points: Array
@@ -24,6 +27,15 @@ class BodyCloud:
     sigma_mm: Floats
     colours: Bytes
     pairs_seen: Bytes
+    regions: Bytes | None = None
+
+    def every(self, step: int) -> BodyCloud:
+        """One point in so many."""
+        parts: dict[str, Any] = {part.name: getattr(self, part.name) for part in fields(self)}
+        some: dict[str, Any] = {
+            name: None if part is None else part[::step] for name, part in parts.items()
+        }
+        return BodyCloud(**some)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +55,7 @@ class BodyMesh:
     colours: (V, 3) uint8.  sigma_mm: (V,) float32, NaN on filled vertices.
     filled: (F,) bool, faces that no pair measured and that were filled to close the mesh.
     breath: of a person who was followed, how to come to mean breath.
+    regions: (V,) uint8, as those of a cloud; unsure on filled vertices.
     """
 
     vertices: Array
@@ -52,6 +65,12 @@ class BodyMesh:
     sigma_mm: Floats
     filled: Mask
     breath: BreathAt | None = None
+    regions: Bytes | None = None
+
+    @property
+    def face_regions(self) -> Bytes | None:
+        """(F,) uint8, what two corners at least are."""
+        return None if self.regions is None else of_faces(self.regions, self.faces)
 
     @property
     def filled_share(self) -> float:
@@ -69,11 +88,16 @@ class BodyMesh:
     def measured_part(self) -> BodyMesh:
         """The open surface that is left without the filled faces."""
         vertices, faces, used = drop_unused_vertices(self.vertices, self.faces[~self.filled])
+        return self.part(vertices, faces, used, np.zeros(len(faces), bool))
+
+    def part(self, vertices: Array, faces: Indices, used: Indices, filled: Mask) -> BodyMesh:
+        """What is left with the vertices `used` (U,) alone, and faces (F, 3) of these."""
         return BodyMesh(
             vertices,
             faces,
             self.normals[used],
             self.colours[used],
             self.sigma_mm[used],
-            np.zeros(len(faces), bool),
+            filled,
+            regions=None if self.regions is None else self.regions[used],
         )

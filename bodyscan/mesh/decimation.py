@@ -30,15 +30,16 @@ def decimate(mesh: BodyMesh, *, faces: int = 50_000, within_mm: float = 0.19) ->
 
     Quadric decimation (Garland and Heckbert 1997), which knows no such limit, and a few more faces
     where it went too far (some hundred at 50,000; many more where so few faces cannot do). Vertices
-    take colour and sigma from the nearest vertex of the full mesh. A mesh that is small enough is
-    returned as it is. The last result is remembered by what the mesh holds: a job exports it and
+    take colour, sigma and region from the nearest one of the full mesh. A mesh that is small enough
+    is returned as it is. The last result is remembered by what the mesh holds: a job exports it and
     then reports on it, each time read from the file.
     Raises ScanFailed if the surface does not stay closed.
     """
     if len(mesh.faces) <= faces:
         return mesh
     digest = hashlib.sha256()
-    for part in (mesh.vertices, mesh.faces, mesh.colours, mesh.sigma_mm):
+    regions = () if mesh.regions is None else (mesh.regions,)
+    for part in (mesh.vertices, mesh.faces, mesh.colours, mesh.sigma_mm, *regions):
         digest.update(np.ascontiguousarray(part).data)
     return _decimated(_Content(digest.digest(), mesh), faces, within_mm)
 
@@ -80,6 +81,7 @@ def _decimated(content: _Content, faces: int, within_mm: float) -> BodyMesh:
         mesh.colours[nearest],
         sigma_mm,
         np.any(np.isnan(sigma_mm)[corners], axis=1),
+        regions=None if mesh.regions is None else mesh.regions[nearest],
     )
 
 

@@ -16,6 +16,7 @@ from bodyscan.errors import ResultError
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.files.regular import read_regular
 from bodyscan.mesh.body import BodyCloud, BodyMesh, BreathAt
+from bodyscan.mesh.regions import NAMES
 
 Records = NDArray[np.void]
 
@@ -49,31 +50,44 @@ def _vertex(*extra: tuple[str, str, str]) -> Element:
     )
 
 
-CLOUD: tuple[Element, ...] = (_vertex(("pairs_seen", "u1", "uchar")),)
-_FACE = Element(
-    "face",
-    np.dtype([("count", "u1"), ("corners", "<i4", 3), ("filled", "u1")]),
-    ("list uchar int vertex_indices", "uchar filled"),
-)
-MESH: tuple[Element, ...] = (_vertex(), _FACE)
-_BREATH = ("breath_mm", "<f4", "float"), ("breath_sigma_mm", "<f4", "float")
-BREATHING: tuple[Element, ...] = (_vertex(*_BREATH), _FACE)
-"""A mesh that knows the way to mean breath."""
+_REGION = ("region", "u1", "uchar")
+
+
+def _cloud(*, regions: bool) -> tuple[Element, ...]:
+    return (_vertex(("pairs_seen", "u1", "uchar"), *([_REGION] if regions else [])),)
+
+
+def _mesh(*, breathes: bool, regions: bool) -> tuple[Element, ...]:
+    """breathes: it knows the way to mean breath.  regions: what its vertices and faces are."""
+    breath = [("breath_mm", "<f4", "float"), ("breath_sigma_mm", "<f4", "float")]
+    vertex = _vertex(*(breath if breathes else []), *([_REGION] if regions else []))
+    fields = [("count", "u1"), ("corners", "<i4", 3), ("filled", "u1")]
+    properties = ["list uchar int vertex_indices", "uchar filled"]
+    if regions:
+        fields, properties = [*fields, ("region", "u1")], [*properties, "uchar region"]
+    return vertex, Element("face", np.dtype(fields), tuple(properties))
 
 
 def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
-    """Write a cloud or a mesh in mm, rig frame. A mesh's faces carry a uchar `filled` (0 or 1)."""
+    """Write a cloud or a mesh in mm, rig frame. A mesh's faces carry a uchar `filled` (0 or 1), and
+    where it is known points, vertices and faces a uchar `region` (of `regions.NAMES`)."""
+    regions = body.regions is not None
     if isinstance(body, BodyCloud):
-        elements, records = CLOUD, [_vertex_records(CLOUD[0], body, body.points)]
+        elements = _cloud(regions=regions)
+        records = [_vertex_records(elements[0], body, body.points)]
         records[0]["pairs_seen"] = body.pairs_seen
     else:
-        elements = MESH if body.breath is None else BREATHING
-        faces = np.empty(len(body.faces), MESH[1].fields)
+        elements = _mesh(breathes=body.breath is not None, regions=regions)
+        faces = np.empty(len(body.faces), elements[1].fields)
         faces["count"], faces["corners"], faces["filled"] = 3, body.faces, body.filled
         records = [_vertex_records(elements[0], body, body.vertices), faces]
         if body.breath is not None:
             records[0]["breath_mm"] = body.breath.mm
             records[0]["breath_sigma_mm"] = body.breath.sigma_mm
+        if regions:
+            faces["region"] = body.face_regions
+    if regions:
+        records[0]["region"] = body.regions
     with atomic_replacement(Path(path)) as temporary, temporary.open("wb") as stream:
         stream.write(_header(elements, [len(some) for some in records]))
         for some in records:
@@ -82,13 +96,17 @@ def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
 
 def read_ply_cloud(path: Path) -> BodyCloud:
     """A cloud that `write_ply` wrote. Raises ResultError if the file is not one."""
-    (vertices,) = _read(Path(path), (CLOUD,), "cloud")
-    return BodyCloud(*_vertex_arrays(vertices), vertices["pairs_seen"].copy())
+    kinds = [_cloud(regions=regions) for regions in (True, False)]
+    (vertices,) = _read(Path(path), kinds, "cloud")
+    regions = _regions(vertices, path)
+    return BodyCloud(*_vertex_arrays(vertices), vertices["pairs_seen"].copy(), regions)
 
 
 def read_ply_mesh(path: Path) -> BodyMesh:
     """A mesh that `write_ply` wrote. Raises ResultError if the file is not one."""
-    vertices, faces = _read(Path(path), (MESH, BREATHING), "mesh")
+    states = (False, True)
+    kinds = [_mesh(breathes=breathes, regions=regions) for breathes in states for regions in states]
+    vertices, faces = _read(Path(path), kinds, "mesh")
     points, normals, sigma_mm, colours = _vertex_arrays(vertices)
     corners = faces["corners"].astype(np.int64)
     if corners.size and (corners.min() < 0 or corners.max() >= len(points)):
@@ -96,7 +114,18 @@ def read_ply_mesh(path: Path) -> BodyMesh:
     breath = None
     if "breath_mm" in (vertices.dtype.names or ()):
         breath = BreathAt(vertices["breath_mm"].copy(), vertices["breath_sigma_mm"].copy())
-    return BodyMesh(points, corners, normals, colours, sigma_mm, faces["filled"] != 0, breath)
+    filled, regions = faces["filled"] != 0, _regions(vertices, path)
+    return BodyMesh(points, corners, normals, colours, sigma_mm, filled, breath, regions)
+
+
+def _regions(vertices: Records, path: Path) -> Bytes | None:
+    """None of a file of before there were any."""
+    if "region" not in (vertices.dtype.names or ()):
+        return None
+    regions: Bytes = vertices["region"].copy()
+    if regions.size and regions.max() >= len(NAMES):
+        raise ResultError(f"has a region {regions.max()}, which is none", where=str(path))
+    return regions
 
 
 def _vertex_records(element: Element, body: BodyCloud | BodyMesh, positions: Array) -> Records:

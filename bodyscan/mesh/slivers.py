@@ -26,11 +26,4 @@ def without_slivers(mesh: BodyMesh) -> BodyMesh:
     faces = first[group][mesh.faces]
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     vertices, faces, used = drop_unused_vertices(mesh.vertices, faces[whole])
-    return BodyMesh(
-        vertices,
-        faces,
-        mesh.normals[used],
-        mesh.colours[used],
-        mesh.sigma_mm[used],
-        mesh.filled[whole],
-    )
+    return mesh.part(vertices, faces, used, mesh.filled[whole])

@@ -14,6 +14,7 @@ from small_bodies import ball, points
 from bodyscan.errors import ResultError
 from bodyscan.mesh.body import BodyCloud, BodyMesh, BreathAt
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
+from bodyscan.mesh.regions import DARK_CLOTH, HAIR, SKIN, UNSURE, of_faces
 
 
 def assert_same(one: BodyCloud | BodyMesh, other: BodyCloud | BodyMesh) -> None:
@@ -51,8 +52,35 @@ def test_the_way_to_mean_breath_is_kept(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(seen.triangles), mesh.faces)
 
 
+def test_what_each_place_is_is_kept(tmp_path: Path) -> None:
+    mesh, cloud = ball(), points()
+    rng = np.random.default_rng(1)
+    mesh = replace(mesh, regions=rng.integers(0, 4, len(mesh.vertices)).astype(np.uint8))
+    cloud = replace(cloud, regions=rng.integers(0, 4, len(cloud.points)).astype(np.uint8))
+    write_ply(tmp_path / "mesh.ply", mesh)
+    write_ply(tmp_path / "cloud.ply", cloud)
+    assert_same(read_ply_mesh(tmp_path / "mesh.ply"), mesh)
+    assert_same(read_ply_cloud(tmp_path / "cloud.ply"), cloud)
+    dots = o3d.t.io.read_point_cloud(str(tmp_path / "cloud.ply"))
+    np.testing.assert_array_equal(dots.point.region.numpy()[:, 0], cloud.regions)
+
+
+def test_a_region_that_there_is_not_is_refused(tmp_path: Path) -> None:
+    cloud = replace(points(), regions=np.full(500, 9, np.uint8))
+    write_ply(tmp_path / "cloud.ply", cloud)
+    with pytest.raises(ResultError, match="region 9"):
+        read_ply_cloud(tmp_path / "cloud.ply")
+
+
+def test_a_face_is_what_most_of_its_corners_are() -> None:
+    regions = np.array([SKIN, HAIR, HAIR, DARK_CLOTH], np.uint8)
+    faces = np.array([[0, 1, 2], [1, 0, 2], [1, 2, 0], [0, 1, 3], [0, 0, 0]])
+    np.testing.assert_array_equal(of_faces(regions, faces), [HAIR, HAIR, HAIR, UNSURE, SKIN])
+
+
 def test_an_empty_cloud_can_be_stored(tmp_path: Path) -> None:
-    cloud = BodyCloud(*(getattr(points(), field.name)[:0] for field in fields(BodyCloud)))
+    cloud = replace(points(), regions=np.zeros(500, np.uint8))
+    cloud = BodyCloud(*(getattr(cloud, field.name)[:0] for field in fields(BodyCloud)))
     write_ply(tmp_path / "empty.ply", cloud)
     assert len(read_ply_cloud(tmp_path / "empty.ply").points) == 0
 

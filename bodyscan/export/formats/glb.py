@@ -21,13 +21,16 @@ POINTS, TRIANGLES = 0, 4
 
 
 def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
-    """Write a mesh or a cloud; a mesh's vertices carry `_FILLED`, 1 where nothing was measured."""
+    """Write a mesh or a cloud; a mesh's vertices carry `_FILLED`, 1 where nothing was measured, and
+    where it is known all carry `_REGION`, of `regions.NAMES`."""
     points = body.points if isinstance(body, BodyCloud) else body.vertices
     attributes = {
         "POSITION": _y_up(points) / 1000.0,
         "NORMAL": _y_up(body.normals),
         "COLOR_0": _linear(body.colours),
     }
+    if body.regions is not None:
+        attributes["_REGION"] = body.regions
     indices = None
     if isinstance(body, BodyMesh):
         attributes["_FILLED"] = np.isnan(body.sigma_mm)
@@ -115,7 +118,7 @@ def _document(
 
 FORMAT = BodyFormat(
     write_glb,
-    holds=frozenset({"mesh", "cloud", "colours", "normals", "filled"}),
+    holds=frozenset({"mesh", "cloud", "colours", "normals", "filled", "regions"}),
     unit="m",
     axes=("left", "up", "front"),
 )

@@ -7,5 +7,5 @@ from bodyscan.mesh.ply import write_ply
 
 FORMAT = BodyFormat(
     write_ply,
-    holds=frozenset({"mesh", "cloud", "colours", "normals", "sigma", "filled"}),
+    holds=frozenset({"mesh", "cloud", "colours", "normals", "sigma", "filled", "regions"}),
 )

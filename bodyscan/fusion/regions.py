@@ -1,0 +1,195 @@
+"""What the points of a cloud are: skin, hair, dark cloth; by how dark they are, how rough, and where.
+
+One person's skin is as bright as itself within a factor of two, moles and lips and what is left of
+shading among it. Black cloth and dark hair are darker than a third of that; what lies between is not
+decided. Hair and cloth differ in place first: hair grows on the head and hangs from there. And
+hair is rough by what its strands and locks stand apart, where noise lets that be seen at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from bodyscan.alignment.part_names import NECK
+from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
+from bodyscan.fusion.brightness import DARKEST
+from bodyscan.fusion.roughness import Misfits, misfits
+from bodyscan.geometry.crop import crop_of
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyCloud
+from bodyscan.mesh.regions import DARK_CLOTH, HAIR, SKIN, UNSURE
+from bodyscan.reconstruction.range_image import RangeImage
+
+DARK, DIM = 1 / 3, 1 / 2
+"""Of the subject's usual brightness. Moles have 0.45 of the skin around; black hair and cloth reflect
+3 to 6 % of the light, skin 10 (very dark) to 65 %."""
+SOME_BRIGHTER = 0.1
+"""Of the points, by so much that the usual ones would be dark beside them: which of the two is skin,
+under black clothes or white ones, is then not known."""
+CELL_MM = 30.0
+"""Less than what hair and a collar are apart; some hundred pixels."""
+SMALLEST = 3e-4
+"""Of the points: 5 cm2 of a person, less than any girth notices."""
+MOST = 0.5
+"""Of a cell's points: what is dim among the dark is dark, and what is bright a highlight."""
+ROUGH, ROUGH_MM = 3.0, 0.2
+"""Times what sigmas say, which on dark surfaces were seen to be wrong by two; and half of what locks of
+hair stand apart, as far as that is left in a window of 7 mm."""
+FEWEST = 50  # pixels that tell how rough a cell is
+HEAD_WIDE = 0.12  # of the stature: about the body's axis, what leans forward and has long hair
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """A grid of cubes around the body: its lowest corner, mm, and how many there are each way."""
+
+    origin: Array
+    shape: tuple[int, ...]
+
+    @staticmethod
+    def around(points: Array) -> _Cells:
+        low, high = points.min(axis=0), points.max(axis=0)
+        # A layer besides on all sides, so that neighbours exist.
+        shape = np.floor((high - low) / CELL_MM).astype(int) + 3
+        return _Cells(low - CELL_MM, tuple(shape.tolist()))
+
+    @property
+    def count(self) -> int:
+        return int(np.prod(self.shape))
+
+    @property
+    def centres(self) -> Array:
+        """(count, 3) mm."""
+        place = np.stack(np.unravel_index(np.arange(self.count), self.shape), axis=-1)
+        return self.origin + CELL_MM * (place + 0.5)
+
+    def find(self, points: Array) -> Indices:
+        """(N,) number of the cell of each point (N, 3); the nearest of what is outside."""
+        place = np.floor((points - self.origin) / CELL_MM).astype(np.int64)
+        return np.ravel_multi_index(tuple(place.T), self.shape, mode="clip")
+
+    def patches(self, taken: Mask) -> Indices:
+        """(count,) number of the patch of neighbours that a cell belongs to, 0: not taken."""
+        label = ndimage.label(taken.reshape(self.shape), np.ones((3, 3, 3)))[0]
+        return np.asarray(label.ravel(), np.int64)
+
+    def mostly(self, said: Mask, among: Mask) -> Mask:
+        """(count,) where of a cell and its neighbours that are `among` more than half are `said`."""
+        counts = [
+            ndimage.uniform_filter(some.reshape(self.shape).astype(float), 3).ravel()
+            for some in (said & among, among)
+        ]
+        return np.asarray(counts[0] > MOST * counts[1] + 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class _Texture:
+    """Of each cell (count,): whether that is known; whether it is rough beyond noise; whether it is
+    smooth, noise and all."""
+
+    known: Mask
+    rough: Mask
+    smooth: Mask
+
+
+def label_regions(
+    cloud: BodyCloud,
+    range_images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    window_mm: float,
+) -> Bytes:
+    """(N,) of each point its number in `mesh.regions.NAMES`.
+
+    range_images: what the cloud was merged from.  window_mm: over which they were smoothed. All are
+    unsure where the images are too dark, or so much is so bright that it is open what is skin.
+    """
+    grey = cloud.colours[:, 0].astype(np.float32)
+    usual = float(np.median(grey))
+    if DARK * usual < DARKEST or np.mean(grey > usual / DARK) > SOME_BRIGHTER:
+        return np.full(len(grey), UNSURE, np.uint8)
+    cells = _Cells.around(cloud.points)
+    cell, dark = cells.find(cloud.points), grey < DARK * usual
+    own, darks = (np.bincount(some, minlength=cells.count) for some in (cell, cell[dark]))
+    covered = darks > MOST * own
+    patch = cells.patches(darks > 0)
+    head = _head(cloud.points, cells.centres)
+    texture = _texture(cells, patch > 0, head, range_images, rig_from_camera, window_mm)
+    told = texture.known & covered
+    rough, smooth = cells.mostly(texture.rough, told), cells.mostly(texture.smooth, told)
+
+    large = np.bincount(patch, darks) >= SMALLEST * len(grey)
+    on_head = np.isin(patch, patch[head & covered])
+    kind = np.where(
+        head,
+        np.where(smooth, DARK_CLOTH, HAIR),
+        np.where(
+            on_head,
+            np.where(rough, HAIR, np.where(smooth, DARK_CLOTH, UNSURE)),
+            np.where(rough, UNSURE, DARK_CLOTH),
+        ),
+    )
+    kind[~large[patch]] = UNSURE
+    # Fair hair is as bright as skin.
+    bare = head & (darks == 0)
+    shaggy = bare & cells.mostly(texture.rough, texture.known & bare)
+    bright = np.where(covered | shaggy, UNSURE, SKIN)
+    dim = np.where(covered, kind, UNSURE)
+    found = np.where(dark, kind[cell], np.where(grey < DIM * usual, dim[cell], bright[cell]))
+    return found.astype(np.uint8)
+
+
+def _head(points: Array, places: Array) -> Mask:
+    """(M,) which places (M, 3) lie on the head of a body that stands."""
+    top = points[:, 2].max()
+    above = points[points[:, 2] > 0.5 * top, :2]
+    across = np.linalg.norm(places[:, :2] - np.median(above, axis=0), axis=1)
+    return np.asarray((places[:, 2] > NECK * top) & (across < HEAD_WIDE * top))
+
+
+def _texture(
+    cells: _Cells,
+    dark: Mask,
+    head: Mask,
+    range_images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    window_mm: float,
+) -> _Texture:
+    """Of what is dark, and of the head; elsewhere neither is told."""
+    asked, found = dark | head, []
+    for image in range_images:
+        valid, at = image.valid, rig_from_camera[image.pair]
+        wanted = np.zeros(valid.shape, bool)
+        wanted[valid] = asked[cells.find(at.apply(image.points[valid].astype(np.float64)))]
+        box = crop_of(wanted)
+        if box is not None:
+            found.append(misfits(image, at, box, window_mm))
+    if not found:
+        nowhere = np.zeros(cells.count, bool)
+        return _Texture(nowhere, nowhere, nowhere)
+    return _told(cells, found)
+
+
+def _told(cells: _Cells, found: Sequence[Misfits]) -> _Texture:
+    cell = np.concatenate([cells.find(one.points) for one in found])
+    off = np.concatenate([one.misfit_mm for one in found])
+    over = off / np.concatenate([one.expected_mm for one in found])
+    known = np.bincount(cell, minlength=cells.count) >= FEWEST
+    seen_mm = SIGMAS_PER_MEDIAN * _medians(off, cell, cells.count)
+    sigmas = SIGMAS_PER_MEDIAN * _medians(over, cell, cells.count)
+    rough = known & (sigmas > ROUGH) & (seen_mm > ROUGH_MM)
+    return _Texture(known, rough, known & (seen_mm < ROUGH_MM))
+
+
+def _medians(values: Floats, group: Indices, count: int) -> Array:
+    """(count,) of each group's values (N,); 0 of one without."""
+    order = np.lexsort((values, group))
+    sizes = np.bincount(group, minlength=count)
+    middle = np.cumsum(sizes) - sizes + sizes // 2
+    found = np.zeros(count)
+    found[sizes > 0] = values[order][middle[sizes > 0]]
+    return found

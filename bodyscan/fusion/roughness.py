@@ -1,0 +1,52 @@
+"""How rough a measured surface is, beside what its sigmas say that noise makes of a smooth one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from bodyscan.arrays import Array, Floats
+from bodyscan.fusion.quadratics import close_holes, fit_full_windows, window_basis
+from bodyscan.fusion.smoothing import inverse_depths, window_reach
+from bodyscan.geometry.crop import Crop, ends_of
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.reconstruction.range_image import RangeImage
+
+
+@dataclass(frozen=True, eq=False)
+class Misfits:
+    """Of pixels that have a whole window around them, N of them.
+
+    points: (N, 3) mm, rig frame.  misfit_mm: (N,) off the smooth surface through the window, along
+    the ray.  expected_mm: (N,) what that is by noise, standard deviation.
+    """
+
+    points: Array
+    misfit_mm: Floats
+    expected_mm: Floats
+
+
+def misfits(
+    image: RangeImage, rig_from_camera: RigidTransform, box: Crop, window_mm: float
+) -> Misfits:
+    """Of the pixels in a box of a range image, to the quadratic in a window of about `window_mm`."""
+    sigma_mm, points = image.sigma_mm[box], image.points[box]
+    common = np.zeros_like(sigma_mm) if image.common_mm is None else image.common_mm[box]
+    whole = (slice(0, sigma_mm.shape[0]), slice(0, sigma_mm.shape[1]))
+    inverse, noise = inverse_depths(points, sigma_mm, common, ends_of(whole))
+    valid = inverse > 0
+    reach = window_reach(inverse, image.camera, window_mm)
+    closed, there = close_holes(inverse, valid)
+    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    full = valid & (cv2.erode(there.astype(np.uint8), window, borderValue=0) > 0)
+    off = (inverse - fit_full_windows(closed, noise, reach).value)[full]
+    seen = points[full]
+    # Along the ray a point moves by its length over z times dz, and dz is z squared times d(1/z).
+    length = np.linalg.norm(seen, axis=1) * seen[:, 2]
+    basis = window_basis(reach)
+    own_share = np.linalg.inv(basis.T @ basis)[0, 0]
+    left = np.float32(np.sqrt(1.0 - own_share))  # of a pixel's own noise in its misfit
+    placed = rig_from_camera.apply(seen.astype(np.float64))
+    return Misfits(placed, np.abs(off) * length, left * noise[full] * length)
