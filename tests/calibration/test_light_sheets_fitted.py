@@ -183,8 +183,8 @@ def test_sigma_tells_how_far_off_the_sheets_are() -> None:
         measured = intersect_rays(fit.sheets, rays, index.astype(float))
         off = measured.depth - scene.on_plane(pixels, pose)[:, 2]
         pulls.append(np.sqrt(np.nanmean(off**2 / measured.variance_mm2)))
-    # Three boards tell their own error badly: within a factor of two, over four calibrations.
-    assert 0.5 < np.sqrt(np.mean(np.square(pulls))) < 2.0
+    # Errors are common to the plane, so these are four draws: 1 +- 0.35.
+    assert 0.5 < np.sqrt(np.mean(np.square(pulls))) < 1.7
 
 
 def test_two_boards_are_enough() -> None:

@@ -64,7 +64,7 @@ def test_a_camera_seen_by_boards_in_its_middle_says_how_little_it_knows_of_its_r
         assert np.median(sigma[rim]) > 20.0 * np.median(sigma[7:10, 9:12])
         ratios.append((errors_px(true, found.camera, 0.18) / sigma)[rim])
     # A rim's errors go together: there are six of them, and these lenses are mild ones.
-    assert 0.05 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 
 def test_boards_all_over_the_picture_know_it_all() -> None:

@@ -108,7 +108,8 @@ def test_a_pair_that_does_not_fit_in_a_half_is_left_out_and_named() -> None:
     )
     found = compare_halves(rig, replace(placed, views=views))
     assert found.apart == ("p2-2",)
-    assert 0.5 < found.over_expected < 2.0
+    # Of the other pairs, 30 differences that are not quite independent: 1 +- 0.15 at least.
+    assert 0.65 < found.over_expected < 1.4
 
 
 @pytest.mark.parametrize("shots", [2, 3, 5])

@@ -172,7 +172,8 @@ def test_bent_grey_levels_are_read_as_straight_ones(good: Sequence) -> None:
     assert both.sum() > 0.95 * np.isfinite(right.s).sum()
     error = (found.s - good.s)[both]
     assert np.sqrt(np.mean(error**2)) < 2.0 * np.sqrt(np.mean((right.s - good.s)[both] ** 2))
-    assert 0.5 < np.sqrt(np.mean((error / found.sigma[both]) ** 2)) < 1.5
+    # Noise-free images: sigma allows for grey levels rounded, and 1 would need noise.
+    assert 0.5 < np.sqrt(np.mean((error / found.sigma[both]) ** 2)) < 1.25
 
 
 @pytest.mark.parametrize("made", ["lit", "dark", "both"])
@@ -220,7 +221,7 @@ def test_a_finest_bit_that_no_lens_shows_costs_pixels_not_the_capture(good: Sequ
     assert told.mean() > 0.3
     error = (found.s - good.s)[told]
     assert np.mean(np.abs(error) < 1.0) > 0.99
-    assert 0.3 < np.sqrt(np.mean((error / found.sigma[told]) ** 2)) < 2.0
+    assert 0.8 < np.sqrt(np.mean((error / found.sigma[told]) ** 2)) < 1.25
     with pytest.raises(DecodingFailed, match="bit 6 look alike"):
         read(with_frame(blurred, "inverses", BITS - 1, blurred.patterns[BITS - 1]))
 

@@ -87,11 +87,10 @@ def test_sigmas_say_how_far_off_values_are_in_dim_light(stripe_px: float, light:
     seen = read(sequence, stripes)
     lit = np.isfinite(sequence.s) & np.isfinite(seen.s)
     assert lit.sum() > 0.985 * np.isfinite(sequence.s).sum()
-    # Noise rules here: ratios of 1 would be perfect; a floor of 0.015 px lowers those of the brighter.
-    ratio = robust((seen.s - sequence.s)[lit] / seen.sigma[lit])
-    assert 0.5 < ratio < 1.2
-    ratio = robust(boundary_errors(seen, s_at) / seen.boundary_sigma_px)
-    assert 0.6 < ratio < 1.2
+    # Noise rules where light is dim, and 1 would be perfect; a floor of 0.015 px lowers the brighter's.
+    least = 0.8 if light < 20.0 else 0.6
+    assert least < robust((seen.s - sequence.s)[lit] / seen.sigma[lit]) < 1.25
+    assert least < robust(boundary_errors(seen, s_at) / seen.boundary_sigma_px) < 1.25
 
 
 def test_vertical_stripes_are_horizontal_ones_transposed() -> None:
