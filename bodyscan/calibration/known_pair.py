@@ -151,14 +151,36 @@ def _pose(
 
 
 def _projector(found: FoundCamera, code: StripeCode) -> Camera:
-    """Where the file does not say how large the projector's picture is, a stripe is a pixel."""
+    """Where the file does not say how large the projector's picture is, a stripe is a pixel.
+
+    Stripes divide the picture evenly, or they are not those of this projector; and where waves begin
+    (`origin`) is counted in stripes, so that another width of them moves the waves.
+    """
     stripes = {way.direction: way.stripes for way in code.directions}
     if found.size is None:
         u0, v0 = float(found.matrix[0, 2]), float(found.matrix[1, 2])
         width = stripes.get("vertical", max(round(2.0 * u0), 1))
         return found.projector(width, stripes.get("horizontal", max(round(2.0 * v0), 1)))
-    for direction, count in stripes.items():
+    for way in code.directions:
+        direction, count, origin = way.direction, way.stripes, getattr(way, "origin", None)
         size = found.size[0 if direction == "vertical" else 1]
+        if count < size and origin:
+            raise CalibrationFileError(
+                f"has a projector of {found.size[0]} x {found.size[1]} px, but its waves begin at "
+                f"`origin: {origin:g}` of {count} stripes: in stripes wider than a pixel they "
+                "begin elsewhere",
+                where=found.where,
+                remedy=f"write `stripes: {size}` for {direction} stripes in the rig file, and `origin` "
+                "in pixels",
+            )
+        if count < size and size % count and way.has_edges:
+            raise CalibrationFileError(
+                f"has a projector of {found.size[0]} x {found.size[1]} px, which {count} {direction} "
+                f"stripes do not divide evenly ({size / count:.4g} px each)",
+                where=found.where,
+                remedy="correct `stripes` or `direction` in the rig file, or give the file of this "
+                "projector",
+            )
         if count > size:
             raise CalibrationFileError(
                 f"has a projector of {found.size[0]} x {found.size[1]} px, across which there are "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from bodyscan.calibration.fitted_projector import FittedProjector, fit_projector
@@ -13,6 +13,8 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.interchange.rig_format import RIG_FORMATS, RigCameras, RigFormat, projector_name
 from bodyscan.outcome import Outcome
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.rig.rig import Rig
+from bodyscan.stripes.codes.gray import PATTERN
 
 
 def export_rig(
@@ -59,7 +61,29 @@ def projectors_of(calibration: RigCalibration) -> Outcome[RigCameras]:
         rig_from_camera = calibration.rig_from_camera[name]
         found[own] = fitted.camera, rig_from_camera @ fitted.projector_from_camera.inverse()
         notes.append(f"{name}: {_described(pair, fitted)}")
-    return Outcome(found, tuple(notes))
+    written = [name for name in calibration.pairs if projector_name(name) in found]
+    return Outcome(found, (*notes, *_first_codes(calibration.rig, written)))
+
+
+def _first_codes(rig: Rig, written: Sequence[str]) -> Iterator[str]:
+    """That another first code would move the pictures: nothing that is scanned shows it."""
+    alike: dict[str, list[str]] = {}
+    for name in written:
+        code = rig.pair(name).projector
+        for way in code.directions if code else ():
+            if getattr(way, "first_code", None) != 0:
+                continue
+            codes = 1 << way.image_counts[PATTERN]
+            middle = (codes - way.stripes) // 2
+            if middle > 1:
+                said = (
+                    f"the first of {way.stripes} {way.direction} stripes is taken to have code 0 of "
+                    f"{codes}; if it has another, such as {middle} where they lie in the middle, give "
+                    "`first_code` in the rig file: the written projector is off by as many pixels"
+                )
+                alike.setdefault(said, []).append(name)
+    for said, names in alike.items():
+        yield f"{', '.join(names)}: {said}"
 
 
 def _write(

@@ -221,13 +221,17 @@ def _mistakes(
 
 
 def _other_periods(period: float, stripes: int) -> Iterator[tuple[str, float]]:
-    """Periods near one, as people give them: whole numbers over all stripes, or of stripes in one."""
+    """Periods near one, twice and half of it, as people give them: whole numbers over all stripes, or
+    of stripes in one."""
     for key, given in (("periods", stripes / period), ("period", period)):
         whole = round(given)
         if whole < 2 or abs(given - whole) > WHOLE * given:
             continue
         reach = max(NEAREST_TRIED, round(SHARE_TRIED * whole))
-        for other in range(max(2, whole - reach), min(whole + reach, stripes // 2) + 1):
+        near = range(max(2, whole - reach), min(whole + reach, stripes // 2) + 1)
+        twice = 2 * whole if 2 * whole <= stripes // 2 else whole
+        half = whole // 2 if whole % 2 == 0 and whole > 2 else whole
+        for other in dict.fromkeys((*near, twice, half)):
             if other != whole:
                 length = stripes / other if key == "periods" else float(other)
                 yield f"`{key}` had {other} in place of {whole}", length

@@ -331,6 +331,8 @@ def test_periods_may_be_counted() -> None:
     [
         ({"period": (15, 240)}, {"periods": (15, 1)}, "`periods` had 16 in place of 15"),
         ({"period": (18, 20, 23)}, {"period": (18, 21, 23)}, "`period` had 20 in place of 21"),
+        ({"period": (30, 240)}, {"periods": (16, 1)}, "`periods` had 8 in place of 16"),
+        ({"period": (20, 240)}, {"periods": (6, 1)}, "`periods` had 12 in place of 6"),
     ],
 )
 def test_a_period_that_is_wrong_is_told_with_the_one_that_fits(

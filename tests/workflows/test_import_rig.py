@@ -222,6 +222,13 @@ def test_a_pair_that_cannot_be_read_costs_that_pair(folder: Path) -> None:
     [
         (("camera", "width"), 640, r"1280 x 1024 px, the rig file says 640 x 1024"),
         (("projector", "stripes"), 1100, r"1024 x 768 px, across which there are no 1100 vertical"),
+        (("projector", "stripes"), 500, r"which 500 vertical stripes do not divide evenly"),
+        (
+            ("projector",),
+            {"code": "phase-shift", "stripes": 512, "periods": [16, 1], "origin": 0.5}
+            | {"direction": "vertical"},
+            r"waves begin at `origin: 0.5` of 512 stripes",
+        ),
         (("known", "projector", "rotation"), "K_light_a", r"K_light_a: is not a rotation"),
         (("known", "camera", "distortion"), "S_light_a", None),
         (("known", "file"), "nowhere.yaml", r"there is no such file"),
