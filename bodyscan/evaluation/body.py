@@ -18,7 +18,7 @@ from bodyscan.mesh.body import BodyMesh
 
 STEP_MM = 20.0
 TORSO = (0.46, 0.86)  # of the stature: crotch to shoulders
-WHOLE = 0.97  # of a girth measured; what is filled is a guess and said to be one
+WHOLE = 0.97  # of a girth measured, and no hair; what is filled is a guess and said to be one
 STEEPEST_COSINE = 0.17  # seen at more than 80 degrees does not count as seen
 SPOTS = 60_000
 
@@ -97,7 +97,7 @@ def compare_girths(mesh: BodyMesh, true: Measurements, *, mean_breath: bool = Fa
 
 def _trunk_error(ours: Slice, true: Slice) -> float | None:
     one, other = ours.of("trunk"), true.of("trunk")
-    if one is None or other is None or one.measured < WHOLE:
+    if one is None or other is None or one.measured_skin < WHOLE:
         return None
     return one.tape_mm - other.tape_mm
 

@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyscan.arrays import Array, Mask
+from bodyscan.arrays import Array, Bytes, Mask
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
+from bodyscan.measurement.head import HeadTop, estimate_head_top
 from bodyscan.measurement.outline import Range, holds_middle, outline
 from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.regions import HAIR, NAMES, SKIN, UNSURE, shares
 from bodyscan.mesh.rings import LAYER_MM, rings
 from bodyscan.mesh.slices import Loop, loops_at
 from bodyscan.mesh.topology import face_areas, signed_volume
@@ -20,6 +22,9 @@ from bodyscan.mesh.topology import face_areas, signed_volume
 STEP_MM = 100.0
 SPECK_MM2 = 50.0  # less than a fingertip
 CROWN_MM = 20.0
+MOSTLY = 0.5
+HEAD_MM, FACE_MM = 150.0, 250.0
+"""From a crown sidewards, what a head reaches at most; down to the chin."""
 HAND_MM = 200.0
 """Below where a hand begins to touch the body it may go on to touch."""
 
@@ -36,7 +41,8 @@ class Girth:
 
     A trunk that filled surface joins to arms is cut there, and closed straight.
     breath_sigma_mm: standard deviation of girth_mm and tape_mm by what is not known of the breath; None
-    where nothing is.
+    where nothing is.  regions: shares of girth_mm that run over skin, hair, dark cloth and what is
+    unsure, by their names; None where that is not known.
     """
 
     part: str
@@ -50,6 +56,12 @@ class Girth:
     girth_range_mm: Range
     tape_range_mm: Range
     breath_sigma_mm: float | None = None
+    regions: dict[str, float] | None = None
+
+    @property
+    def measured_skin(self) -> float:
+        """Share of girth_mm that was measured and is no hair."""
+        return self.measured - (self.regions[NAMES[HAIR]] if self.regions else 0.0)
 
 
 @dataclass(frozen=True)
@@ -67,9 +79,11 @@ class Slice:
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """stature_mm: highest point over the floor, in pose.  stature_measured: share of the crown's
-    surface (its top 20 mm) that was measured.  measured: share of the whole surface.
-    at_mean_breath: whether the breath of the scan's own moment was taken out.
+    """stature_mm: highest point over the floor, in pose, of hair where there is some.
+    stature_measured: share of the crown's surface (its top 20 mm) that was measured.  measured: share
+    of the whole surface.  at_mean_breath: whether the breath of the scan's own moment was taken out.
+    crown: the region that most of the measured crown is; None where that is not known.  head: where
+    the head ends, under hair too; None where nothing says so.  regions: shares of the area.
     """
 
     stature_mm: float
@@ -80,6 +94,9 @@ class Measurements:
     slices: tuple[Slice, ...]
     rig_from_body: RigidTransform
     at_mean_breath: bool = False
+    crown: str | None = None
+    head: HeadTop | None = None
+    regions: dict[str, float] | None = None
 
 
 def measure(
@@ -118,16 +135,42 @@ def measure(
         ]
     areas = face_areas(mesh.vertices, mesh.faces)
     crown = mesh.vertices[mesh.faces, 2].max(axis=1) > stature - CROWN_MM
+    kinds, crown_measured = mesh.face_regions, _share(areas, ~mesh.filled, crown)
+    top = _crown_region(areas, kinds, crown & ~mesh.filled)
+    head = _head_top(vertices, mesh, stature, top) if crown_measured > MOSTLY else None
     return Measurements(
         stature,
-        _share(areas, ~mesh.filled, crown),
+        crown_measured,
         signed_volume(mesh.vertices, mesh.faces) / 1e6,
         float(areas.sum()) / 1e6,
         _share(areas, ~mesh.filled, np.ones_like(crown)),
         tuple(found for found in slices if found is not None),
         frame,
         breathes,
+        top,
+        head,
+        None if kinds is None else shares(kinds, areas),
     )
+
+
+def _crown_region(areas: Array, kinds: Bytes | None, crown: Mask) -> str | None:
+    """What more than half of it is, or "unsure"."""
+    if kinds is None or not crown.any():
+        return None
+    found = shares(kinds[crown], areas[crown])
+    return next((name for name, share in found.items() if share > MOSTLY), NAMES[UNSURE])
+
+
+def _head_top(vertices: Array, mesh: BodyMesh, stature: float, crown: str | None) -> HeadTop | None:
+    """Of a bare crown that itself; or else what the skin around says. vertices: body frame."""
+    if mesh.regions is None or crown is None:
+        return None
+    top = vertices[:, 2] > stature - CROWN_MM
+    if crown == NAMES[SKIN]:
+        return HeadTop(stature, float(np.nanmedian(mesh.sigma_mm[top])))
+    beside = np.linalg.norm(vertices[:, :2] - np.median(vertices[top, :2], axis=0), axis=1)
+    skin = (mesh.regions == SKIN) & (beside < HEAD_MM) & (vertices[:, 2] > stature - FACE_MM)
+    return estimate_head_top(vertices[skin], stature)
 
 
 def _doubted(level: Slice, fuller: Slice | None) -> Slice:
@@ -186,7 +229,7 @@ def _contacts(vertices: Array, mesh: BodyMesh) -> list[_Contact]:
 
 
 def _loops(vertices: Array, mesh: BodyMesh, height_mm: float) -> tuple[Loop, ...]:
-    loops = loops_at(vertices, mesh.faces, height_mm, mesh.filled)
+    loops = loops_at(vertices, mesh.faces, height_mm, mesh.filled, mesh.face_regions)
     return tuple(loop for loop in loops if loop.area_mm2 > SPECK_MM2)
 
 
@@ -238,4 +281,5 @@ def _girth(part: str, meshed: Loop) -> Girth:
         loop.measured_share,
         found.girth_range_mm,
         found.tape_range_mm,
+        regions=loop.region_shares,
     )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
-from bodyscan.mesh.regions import of_faces
+from bodyscan.mesh.regions import UNSURE, of_faces
 from bodyscan.mesh.topology import drop_unused_vertices, face_areas
 
 
@@ -69,8 +69,10 @@ class BodyMesh:
 
     @property
     def face_regions(self) -> Bytes | None:
-        """(F,) uint8, what two corners at least are."""
-        return None if self.regions is None else of_faces(self.regions, self.faces)
+        """(F,) uint8, what two corners at least are; unsure where filled."""
+        if self.regions is None:
+            return None
+        return np.where(self.filled, np.uint8(UNSURE), of_faces(self.regions, self.faces))
 
     @property
     def filled_share(self) -> float:

@@ -10,7 +10,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
-from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.arrays import Array, Bytes, Indices, Mask
+from bodyscan.mesh.regions import UNSURE, shares
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,11 +21,13 @@ class Loop:
     segments: (N, 2, 2) from (x, y) to (x, y), in no order, each with the body on its left seen
     from above.  measured: (N,) whether the segment runs across a measured face.  ends: (N, 2), the
     numbers of the mesh's edges that each starts and ends on; its neighbours have the same.
+    regions: (N,) of the faces, if they are known.
     """
 
     segments: Array
     measured: Mask
     ends: Indices
+    regions: Bytes | None = None
 
     @property
     def lengths(self) -> Array:
@@ -59,6 +62,11 @@ class Loop:
     def measured_share(self) -> float:
         """Of the girth, how much runs across measured faces."""
         return float(self.lengths[self.measured].sum() / max(self.girth_mm, 1e-12))
+
+    @property
+    def region_shares(self) -> dict[str, float] | None:
+        """Of the girth, how much runs across each region."""
+        return None if self.regions is None else shares(self.regions, self.lengths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +119,9 @@ def joined(loop: Loop, runs: Sequence[Run]) -> Loop:
         np.concatenate([loop.segments[own], across]),
         np.concatenate([loop.measured[own], np.zeros(len(across), bool)]),
         np.concatenate([loop.ends[own], numbers]),
+        None
+        if loop.regions is None
+        else np.concatenate([loop.regions[own], np.full(len(across), UNSURE, np.uint8)]),
     )
 
 
@@ -138,12 +149,17 @@ def _stretches(ends: Indices, measured: Mask, count: int) -> Indices:
 
 
 def loops_at(
-    vertices: Array, faces: Indices, height_mm: float, filled: Mask | None = None
+    vertices: Array,
+    faces: Indices,
+    height_mm: float,
+    filled: Mask | None = None,
+    regions: Bytes | None = None,
 ) -> tuple[Loop, ...]:
     """The loops of the slice z = height_mm, largest area first; () where the plane misses the mesh.
 
-    vertices (V, 3) mm, faces (F, 3) outward, of a closed mesh; filled (F,) marks made-up faces.
-    A vertex that lies exactly in the plane counts as above it, so that loops always close.
+    vertices (V, 3) mm, faces (F, 3) outward, of a closed mesh; filled (F,) marks made-up faces,
+    regions (F,) what they are. A vertex that lies exactly in the plane counts as above it, so that
+    loops always close.
     """
     above = (vertices[:, 2] >= height_mm)[faces]
     count = above.sum(axis=1)
@@ -161,7 +177,11 @@ def loops_at(
     measured = np.ones(crossed.size, bool) if filled is None else ~filled[crossed]
     order = np.argsort(labels, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
-    loops = [Loop(segments[part], measured[part], ends[part]) for part in parts]
+    kinds = None if regions is None else regions[crossed]
+    loops = [
+        Loop(segments[part], measured[part], ends[part], None if kinds is None else kinds[part])
+        for part in parts
+    ]
     return tuple(sorted(loops, key=lambda loop: -loop.area_mm2))
 
 

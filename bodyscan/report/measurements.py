@@ -10,6 +10,7 @@ from rich.table import Table
 
 from bodyscan.measurement.measurements import Measurements
 from bodyscan.measurement.outline import Range
+from bodyscan.mesh.regions import DARK_CLOTH, HAIR, NAMES, SKIN
 from bodyscan.version import __version__
 
 MOSTLY = 0.5
@@ -23,16 +24,33 @@ def tables(measured: Measurements) -> Iterator[Table]:
     body = Table("", "", title="body", show_header=False)
     body.columns[1].justify = "right"
     guess = "" if measured.stature_measured >= MOSTLY else " (guessed: the crown was not measured)"
-    body.add_row("stature in pose", f"{measured.stature_mm:.1f} mm{guess}")
+    of = {NAMES[HAIR]: " (top of the hair)", NAMES[DARK_CLOTH]: " (of a cap or hood)"}
+    which = of.get(measured.crown or "", guess)
+    body.add_row("stature in pose", f"{measured.stature_mm:.1f} mm{which}")
+    if measured.head is not None and measured.crown != NAMES[SKIN]:
+        head = measured.head
+        body.add_row("of the head", f"{head.height_mm:.0f} ± {head.sigma_mm:.0f} mm (estimate)")
     body.add_row("volume", f"{measured.volume_l:.2f} l")
     body.add_row("area", f"{measured.area_m2:.3f} m2")
     body.add_row("of it measured", f"{100.0 * measured.measured:.1f} %")
+    over = _covered(measured.regions)
+    if over:
+        body.add_row("of it covered", over)
     yield body
     breath = ", at mean breath" if measured.at_mean_breath else ""
     slices = Table(title=f"horizontal slices{breath}, mm")
-    headings = ("height", "part", "tape (hull)", "along surface", "width", "depth", "measured")
+    headings = (
+        "height",
+        "part",
+        "tape (hull)",
+        "along surface",
+        "width",
+        "depth",
+        "measured",
+        "over",
+    )
     for heading in headings:
-        slices.add_column(heading, justify="left" if heading == "part" else "right")
+        slices.add_column(heading, justify="left" if heading in ("part", "over") else "right")
     for level in sorted(measured.slices, key=lambda level: -level.height_mm):
         for girth in level.girths:
             slices.add_row(
@@ -43,9 +61,16 @@ def tables(measured: Measurements) -> Iterator[Table]:
                 f"{girth.width_mm:.1f}",
                 f"{girth.depth_mm:.1f}",
                 f"{100.0 * girth.measured:.0f} %",
-                style="" if girth.measured >= LITTLE else "yellow",
+                _covered(girth.regions),
+                style="" if girth.measured_skin >= LITTLE else "yellow",
             )
     yield slices
+
+
+def _covered(regions: Mapping[str, float] | None) -> str:
+    """What it runs over that is no skin, where that is more than a little."""
+    parts = ((name, (regions or {}).get(name, 0.0)) for name in (NAMES[HAIR], NAMES[DARK_CLOTH]))
+    return ", ".join(f"{name} {100.0 * part:.0f} %" for name, part in parts if part > 1.0 - LITTLE)
 
 
 def _told(value: float, between: Range) -> str:
@@ -67,6 +92,10 @@ def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> d
         "verdict": facts.get("verdict"),
         "stature_mm": measured.stature_mm,
         "stature_measured": measured.stature_measured,
+        "crown": measured.crown,
+        "head_mm": measured.head and measured.head.height_mm,
+        "head_sigma_mm": measured.head and measured.head.sigma_mm,
+        "regions": measured.regions,
         "volume_l": measured.volume_l,
         "area_m2": measured.area_m2,
         "measured": measured.measured,

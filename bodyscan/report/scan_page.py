@@ -16,6 +16,7 @@ from bodyscan.fusion import scan_verdict as limits
 from bodyscan.fusion.scan_facts import read_facts, told_verdict
 from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.mesh.holes import holes
+from bodyscan.mesh.regions import covered_shares
 from bodyscan.mesh.topology import topology
 from bodyscan.report import charts
 from bodyscan.report.body_model import layers, light_mesh, shape_of
@@ -153,6 +154,12 @@ def _numbers(scan: StoredScan) -> Numbers:
             "closed" if shape.closed and shape.manifold else "open",
             "",
             f"{shape.components} piece(s); closed: every edge belongs to two faces",
+        ),
+        *(
+            Number(
+                name, 100.0 * share, "% of points", "by brightness, roughness and place", digits=1
+            )
+            for name, share in covered_shares(scan.cloud.regions).items()
         ),
         Number("volume", shape.volume_mm3 / 1e6, "l", "inside the mesh", digits=2),
     ]
