@@ -6,10 +6,12 @@ Written for the simulator alone; it shares nothing with `bodyscan.geometry.camer
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from bodyscan.arrays import Array, Floats
+from bodyscan.compiled import compiled
 
 _TABLE = 1 << 15
 _NEWTON = 6
@@ -42,8 +44,8 @@ class TrueCamera:
         Eq. 3 and 4 as they stand: the ideal point is pushed away from [u0, v0].
         """
         if self._off_centre:
-            moved = self._bent(points[..., :2] / points[..., 2:])
-            x, y = moved[..., 0], moved[..., 1]
+            lens = (self.k1, self.k2, self.k3, self.p1, self.p2)
+            x, y = bend(points[..., 0] / points[..., 2], points[..., 1] / points[..., 2], *lens)
             u = self.alpha * x + self.gamma * y + self.u0
             return np.stack([u, self.beta * y + self.v0], axis=-1)
         x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
@@ -79,36 +81,57 @@ class TrueCamera:
     def _off_centre(self) -> bool:
         return bool(self.p1 or self.p2 or self.k3)
 
-    def _bent(self, ideal: Array) -> Array:
-        """Normalized coordinates (..., 2) behind the lens (Brown 1966)."""
-        x, y = ideal[..., 0], ideal[..., 1]
-        square = x**2 + y**2
-        grown = 1.0 + square * (self.k1 + square * (self.k2 + square * self.k3))
-        aside = 2.0 * self.p1 * x * y + self.p2 * (square + 2.0 * x**2)
-        down = self.p1 * (square + 2.0 * y**2) + 2.0 * self.p2 * x * y
-        return np.stack([x * grown + aside, y * grown + down], axis=-1)
-
     def _unbent(self, real: Array) -> Array:
-        """What the lens bends to `real` (..., 2), by Newton's method, slopes by differences."""
-        ideal, step = real.copy(), 1e-6
-        for _ in range(_NEWTON):
-            bent = self._bent(ideal)
-            by_x = (self._bent(ideal + [step, 0.0]) - bent) / step
-            by_y = (self._bent(ideal + [0.0, step]) - bent) / step
-            short = real - bent
-            size = by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0]
-            if np.any(size <= 0):
-                raise ValueError("the lens folds the image over: no ray belongs to its corners")
-            dx = (short[..., 0] * by_y[..., 1] - short[..., 1] * by_y[..., 0]) / size
-            dy = (short[..., 1] * by_x[..., 0] - short[..., 0] * by_x[..., 1]) / size
-            ideal = ideal + np.stack([dx, dy], axis=-1)
-        return ideal
+        """What the lens bends to `real` (..., 2)."""
+        ideal = real.reshape(-1, 2).copy()
+        if not unbend(ideal, np.array([self.k1, self.k2, self.k3, self.p1, self.p2])):
+            raise ValueError("the lens folds the image over: no ray belongs to its corners")
+        return ideal.reshape(real.shape)
 
     def grid(self, rows: slice | None = None) -> Array:
         """Pixel centres of some rows (all by default), (rows, width, 2)."""
         v = np.arange(self.height, dtype=float)[rows or slice(None)]
         u, v = np.meshgrid(np.arange(self.width, dtype=float), v)
         return np.stack([u, v], axis=-1)
+
+
+def bend(x: Any, y: Any, k1: float, k2: float, k3: float, p1: float, p2: float) -> tuple[Any, Any]:
+    """Normalized coordinates, numbers or arrays, behind the lens (Brown 1966)."""
+    square = x * x + y * y
+    grown = 1.0 + square * (k1 + square * (k2 + square * k3))
+    aside = 2.0 * p1 * x * y + p2 * (square + 2.0 * (x * x))
+    down = p1 * (square + 2.0 * (y * y)) + 2.0 * p2 * x * y
+    return x * grown + aside, y * grown + down
+
+
+_bend = compiled(bend)
+
+
+@compiled
+def unbend(places: Array, lens: Array) -> bool:
+    """Put in for places (N, 2) what the lens (k1, k2, k3, p1, p2) bends to them, by Newton's method,
+    slopes by differences; False, and nothing of use, where it folds the image over."""
+    k1, k2, k3, p1, p2 = lens
+    step = 1e-6
+    for i in range(len(places)):
+        u, v = places[i]
+        x, y = u, v
+        for _ in range(_NEWTON):
+            bent_x, bent_y = _bend(x, y, k1, k2, k3, p1, p2)
+            right_x, right_y = _bend(x + step, y, k1, k2, k3, p1, p2)
+            below_x, below_y = _bend(x, y + step, k1, k2, k3, p1, p2)
+            xx, yx = (right_x - bent_x) / step, (right_y - bent_y) / step
+            xy, yy = (below_x - bent_x) / step, (below_y - bent_y) / step
+            size = xx * yy - yx * xy
+            if size <= 0:
+                return False
+            short_x, short_y = u - bent_x, v - bent_y
+            x, y = (
+                x + (short_x * yy - short_y * xy) / size,
+                y + (short_y * xx - short_x * yx) / size,
+            )
+        places[i, 0], places[i, 1] = x, y
+    return True
 
 
 def sample_offsets(count: int) -> Array:

@@ -139,3 +139,17 @@ def mean_light(
                 total += weight[r, c, k] * table[index[r, c, k]]
             mean[r, c] = total / np.float32(samples)
     return mean
+
+
+@compiled
+def least(samples: Floats) -> Floats:
+    """(R, C) the least of samples (R, C, K)."""
+    rows, columns, count = samples.shape
+    result = np.empty((rows, columns), np.float32)
+    for r in range(rows):
+        for c in range(columns):
+            value = samples[r, c, 0]
+            for k in range(1, count):
+                value = min(value, samples[r, c, k])
+            result[r, c] = value
+    return result

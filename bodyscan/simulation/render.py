@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import cv2
@@ -19,9 +19,9 @@ from bodyscan.simulation.lamps import Lamps, laser_light
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.patterns import projected_patterns
 from bodyscan.simulation.projector import Projector
-from bodyscan.simulation.ray_ends import RayEnds, ends_of_rays, mean_light
+from bodyscan.simulation.ray_ends import ends_of_rays, least, mean_light
 from bodyscan.simulation.scene import Scene
-from bodyscan.simulation.sensor import add_speckle, blur, off_focus, shade
+from bodyscan.simulation.sensor import add_speckle, blur, blurs_of, off_focus, shade
 from bodyscan.simulation.settings import InterReflection, Projection
 from bodyscan.simulation.skin import spread_light
 from bodyscan.simulation.view import Band, View
@@ -69,12 +69,15 @@ def render_pair(
     inter_reflection: InterReflection | None = None,
     moving: Moving | None = None,
     flicker: Mapping[str, Brightness] | None = None,
+    empty: EmptyRoom | None = None,
 ) -> dict[str, Floats]:
     """Images without sensor noise, (height, width) float32 grey levels, by frame name.
 
     scene: in the camera's frame.  rng: for the laser's jitter and speckle.  moving: pixels near it are
     cast anew for every frame; shadows that it throws on what is still stay where they are.  flicker:
-    of frames that are not as bright as the others (its gain is left to `sensor.expose`).
+    of frames that are not as bright as the others (its gain is left to `sensor.expose`).  empty: the
+    room that the scene's last surfaces are, seen by the same view in the same light before anything
+    stood in it: then only what else changes is cast; the images are the same.
     With `sequence` the whole stripe sequence (lit, dark and those of the code: Gray with inverses
     if none is given), else lit alone. The dark image of a stripe-index rig, which its instrument
     keeps to itself, is named "". `sensor.expose` makes 8-bit images of them.
@@ -85,7 +88,8 @@ def render_pair(
     dark = frames.dark if code.uses_dark else None if code.is_projected else ""
     unlit = () if dark is None or not sequence else (dark,)
     source = _Source(projector, lamps, projection)
-    seen = _see(scene, view, source, lit, unlit, moving.surfaces if moving else 0)
+    every = _rays(scene, view, source) if empty is None else empty.with_what_stands_in(scene)
+    seen = _see(every, view, source, lit, unlit, moving.surfaces if moving else 0)
     if moving is not None:
         _see_again(seen, view, source, lit, moving)
     if inter_reflection is not None and inter_reflection.facet_mm > 0:
@@ -99,12 +103,11 @@ def render_pair(
         if name in seen.laser:
             seen.laser[name] *= np.float32(now.laser)
             seen.ambient[name] = seen.ambient[name] * np.float32(now.room)
-    shading, focus = shade(view.camera, view.optics), off_focus(seen.depth, lamps.focus_mm)
+    shading = shade(view.camera, view.optics)
+    blurs = blurs_of(view.optics, off_focus(seen.depth, lamps.focus_mm))
     return {
         name: blur(
-            (add_speckle(light, projection.speckle, rng) + seen.ambient[name]) * shading,
-            view.optics,
-            focus,
+            (add_speckle(light, projection.speckle, rng) + seen.ambient[name]) * shading, blurs
         )
         for name, light in seen.laser.items()
     }
@@ -139,28 +142,26 @@ class _Seen:
 
 
 def _see(
-    scene: Scene,
+    every: Iterator[tuple[Band, _LitRays]],
     view: View,
     source: _Source,
     lit: Mapping[str, LightTable],
     unlit: tuple[str, ...],
     moving_surfaces: int,
 ) -> _Seen:
-    """Every frame of a scene in which nothing moves; its first surfaces will."""
+    """Every frame of a scene in which nothing moves; its first surfaces will.  every: its bands."""
     shape = (view.camera.height, view.camera.width)
     laser = {name: np.zeros(shape, np.float32) for name in (*lit, *unlit)}
     ambient, albedo, depth = (np.zeros(shape, np.float32) for _ in range(3))
     near, skin = np.zeros(shape, bool), np.zeros(shape, np.float32)
     glossy = lit if source.lamps.skin.gloss > 0 else {}
     gloss = {name: np.zeros(shape, np.float32) for name in glossy}
-    for band in view.bands:
-        place, rays = band.place, _LitRays.of(scene, band, source)
+    for band, rays in every:
+        place = band.place
         for name, table in lit.items():
             laser[name][place] = rays.light(table)
-        ambient[place], albedo[place] = rays.ambient(), rays.ends.albedo.mean(axis=-1)
-        depth[place] = rays.ends.depth.min(axis=-1)
-        near[place] = (rays.ends.surface < moving_surfaces).any(axis=-1)
-        skin[place] = rays.ends.skin.mean(axis=-1)
+        ambient[place], albedo[place], depth[place] = rays.ambient, rays.albedo, rays.depth
+        near[place], skin[place] = rays.surface < moving_surfaces, rays.skin
         for name in gloss:
             gloss[name][place] = rays.mirrored(lit[name])
     return _Seen(laser, dict.fromkeys(laser, ambient), depth, near, gloss, skin, albedo)
@@ -177,7 +178,7 @@ def _see_again(
         seen.ambient[name] = seen.ambient[name].copy()
         for band in bands:
             rays, chosen = _LitRays.of(scene, band, source), near[band.place]
-            np.copyto(seen.ambient[name][band.place], rays.ambient(), where=chosen)
+            np.copyto(seen.ambient[name][band.place], rays.ambient, where=chosen)
             if name in lit:
                 np.copyto(seen.laser[name][band.place], rays.light(lit[name]), where=chosen)
             if name in seen.gloss:
@@ -188,21 +189,34 @@ def _see_again(
 class _LitRays:
     """A band's rays, with the projector's light where they end.
 
-    weight, gloss: (R, C, K) grey level under full light, scattered and mirrored.  index: into a table
-    of light.
+    weight, gloss: (R, C, K) grey level under full light, scattered and mirrored.  index: (R, C, K)
+    into a table of light.  ambient: (R, C) grey level by the room's own light.  albedo, skin: (R, C)
+    means.  depth, surface: (R, C) the least.
     """
 
-    ends: RayEnds
     weight: Floats
     gloss: Floats
     index: NDArray[np.int32]
+    ambient: Floats
+    albedo: Floats
+    skin: Floats
+    depth: Floats
+    surface: Floats
 
     @staticmethod
     def of(scene: Scene, band: Band, source: _Source) -> _LitRays:
         ends = ends_of_rays(scene, band, source.projector, source.lamps)
         blurs = _blur_rows(ends.depth, source.projection, source.lamps)
-        index = table_index(ends.s, source.projector.stripes, blurs)
-        return _LitRays(ends, ends.white * ends.albedo, ends.gloss, index)
+        return _LitRays(
+            weight=ends.white * ends.albedo,
+            gloss=ends.gloss,
+            index=table_index(ends.s, source.projector.stripes, blurs),
+            ambient=(ends.room * ends.albedo).mean(axis=-1),
+            albedo=ends.albedo.mean(axis=-1),
+            skin=ends.skin.mean(axis=-1),
+            depth=least(ends.depth),
+            surface=least(ends.surface),
+        )
 
     def light(self, table: LightTable) -> Floats:
         """(R, C) grey level of one frame."""
@@ -212,9 +226,67 @@ class _LitRays:
         """(R, C) the part of one frame that glossy skin mirrors."""
         return mean_light(self.gloss, self.index, table.values.ravel())
 
-    def ambient(self) -> Floats:
-        """(R, C) grey level by the room's own light."""
-        return np.asarray((self.ends.room * self.ends.albedo).mean(axis=-1), np.float32)
+    def with_columns(self, columns: slice, part: _LitRays) -> _LitRays:
+        """These, with others in some columns."""
+        whole = {field.name: getattr(self, field.name).copy() for field in fields(self)}
+        for name, values in whole.items():
+            values[:, columns] = getattr(part, name)
+        return _LitRays(**whole)
+
+
+def _rays(scene: Scene, view: View, source: _Source) -> Iterator[tuple[Band, _LitRays]]:
+    return ((band, _LitRays.of(scene, band, source)) for band in view.bands)
+
+
+@dataclass(frozen=True, eq=False)
+class EmptyRoom:
+    """What a view sees of a room that nothing stands in: most of it is the same in every shot.
+
+    rays: of each band, surfaces numbered beyond those of any scene.  corners, towards: of each band,
+    (R + 1, C + 1, 3), where the rays between its pixels end, and the way from there to their light,
+    NaN where none arrives.  steps: of each band, between two rays at most, along x and y at z = 1.
+    """
+
+    source: _Source
+    view: View
+    rays: tuple[_LitRays, ...]
+    corners: tuple[Floats, ...]
+    towards: tuple[Floats, ...]
+    steps: tuple[float, ...]
+
+    @staticmethod
+    def of(
+        room: Scene, view: View, projector: Projector, lamps: Lamps, projection: Projection
+    ) -> EmptyRoom:
+        source = _Source(projector, lamps, projection)
+        rays = [
+            replace(own, surface=np.full_like(own.surface, np.inf))
+            for _, own in _rays(room, view, source)
+        ]
+        corners = [
+            room.cast(band.corners.reshape(-1, 3)).points.reshape(band.corners.shape)
+            for band in view.bands
+        ]
+        towards = [projector.source(projector.stripe(ends)) - ends for ends in corners]
+        steps = [
+            max(float(np.abs(np.diff(band.corners, axis=k)).max()) for k in (0, 1))
+            for band in view.bands
+        ]
+        return EmptyRoom(source, view, tuple(rays), tuple(corners), tuple(towards), tuple(steps))
+
+    def with_what_stands_in(self, scene: Scene) -> Iterator[tuple[Band, _LitRays]]:
+        """Each band's rays, cast anew between the columns where something shows or throws shadow."""
+        known = (self.view.bands, self.rays, self.corners, self.towards, self.steps)
+        for band, rays, ends, towards, step in zip(*known, strict=True):
+            changed = scene.may_change(band.corners, ends, towards, step)
+            columns = np.flatnonzero(changed.any(axis=0))
+            if not columns.size:
+                yield band, rays
+                continue
+            part = band.between(
+                max(int(columns[0]) - 1, 0), min(int(columns[-1]), band.columns.stop - 1)
+            )
+            yield band, rays.with_columns(part.columns, _LitRays.of(scene, part, self.source))
 
 
 def _reached(near: Mask, depth: Floats, reach_mm: float, camera: TrueCamera) -> Mask:

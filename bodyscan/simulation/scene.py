@@ -85,7 +85,9 @@ class Scene:
     def __init__(self, surfaces: Sequence[Surface]) -> None:
         self.surfaces = tuple(surfaces)
         self._doubtful = np.array([not surface.open_to_light for surface in surfaces] + [False])
-        self._ball = _ball(surface for surface in surfaces if not surface.encloses)
+        standing = [surface for surface in surfaces if not surface.encloses]
+        self._ball = _ball(standing)
+        self._outline = _outline(standing)
         self._rays = o3d.t.geometry.RaycastingScene(nthreads=_THREADS)
         self._finish = [_Finish.of(surface) for surface in self.surfaces]
         for surface in self.surfaces:
@@ -163,6 +165,20 @@ class Scene:
         )
         return np.asarray(~hidden.numpy())
 
+    def may_change(self, directions: Floats, ends: Floats, towards: Floats, step: float) -> Mask:
+        """(R, C) where what stands here may show, or throw its shadow, in an empty room.
+
+        directions: (R, C, 3) neighbouring rays from the origin, z = 1.  ends, towards: (R, C, 3) where
+        they end in the empty room, and the way from there to the light's source, NaN without light.
+        step: between two of the rays at most; nothing shows or is dark between two that are not told.
+        """
+        (left, top), (right, bottom) = self._outline
+        x, y = directions[..., 0], directions[..., 1]
+        shows = (x > left - step) & (x < right + step) & (y > top - step) & (y < bottom + step)
+        middle, radius = self._ball
+        aside = _distance_squared(ends.reshape(-1, 3), towards.reshape(-1, 3), middle)
+        return shows | (aside.reshape(shows.shape) < (radius + step * ends[..., 2]) ** 2)
+
     def is_shadowed(self, points: Floats, towards: Floats, surface: NDArray[np.uint32]) -> Mask:
         """Whether something stands between points (N, 3) on surfaces and their light's source.
 
@@ -191,6 +207,15 @@ def _ball(surfaces: Iterable[Surface]) -> tuple[Array, float]:
         return np.zeros(3), 0.0
     low, high = np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))
     return (low + high) / 2.0, float(np.linalg.norm(high - low)) / 2.0
+
+
+def _outline(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
+    """The least and the greatest x / z and y / z of what stands there, (2,) each."""
+    vertices = np.concatenate([np.zeros((0, 3)), *(one.vertices for one in surfaces)])
+    if np.any(vertices[:, 2] <= 1.0):  # beside the camera: it may show anywhere
+        return np.full(2, -np.inf), np.full(2, np.inf)
+    ways = vertices[:, :2] / vertices[:, 2:]
+    return ways.min(axis=0, initial=np.inf), ways.max(axis=0, initial=-np.inf)
 
 
 def _distance_squared(points: Floats, ways: Floats, middle: Array) -> Floats:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 
 from bodyscan.arrays import Bytes, Floats
+from bodyscan.compiled import compiled
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.settings import Lighting, Noise, Optics
 
@@ -48,9 +51,26 @@ def expose(
     if fixed is not None:
         image = image * fixed.gain + fixed.grey
     electrons = noise.electrons_per_grey * noise.photons
-    spread = np.sqrt(np.maximum(image, 0.0) / electrons + noise.read_grey**2)
-    noisy = image + spread * rng.standard_normal(image.shape, dtype=np.float32)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    draws = rng.standard_normal(image.shape, dtype=np.float32)
+    grey = np.empty(image.shape, np.uint8)
+    read = np.float32(noise.read_grey**2)
+    digitise(image, draws, np.float32(electrons), read, grey)
+    return grey
+
+
+@compiled
+def digitise(
+    image: Floats, draws: Floats, electrons: np.float32, read: np.float32, grey: Bytes
+) -> None:
+    """Fill in 8 bits (H, W) of an image (H, W) with noise: normal draws (H, W) times its spread, of
+    `electrons` for each grey level, and the square of read noise."""
+    low, high = np.float32(0.0), np.float32(255.0)
+    for v in range(image.shape[0]):
+        for u in range(image.shape[1]):
+            value = image[v, u]
+            spread = np.sqrt(max(value, low) / electrons + read)
+            noisy = np.rint(value + spread * draws[v, u])
+            grey[v, u] = np.uint8(min(max(noisy, low), high))
 
 
 def add_speckle(image: Floats, size: float, rng: np.random.Generator) -> Floats:
@@ -63,6 +83,7 @@ def add_speckle(image: Floats, size: float, rng: np.random.Generator) -> Floats:
     )
 
 
+@lru_cache(maxsize=4)
 def shade(camera: TrueCamera, optics: Optics) -> Floats | float:
     """Vignetting: the share of light that arrives, (height, width)."""
     if optics.vignetting <= 0:
@@ -77,18 +98,28 @@ def off_focus(depth: Floats, focus_mm: float) -> Floats:
     return np.minimum(np.abs(np.float32(focus_mm) / depth - 1.0), 1.0)
 
 
-def blur(image: Floats, optics: Optics, out_of_focus: Floats | None) -> Floats:
-    """The lens's Gaussian blur; wider where the scene is out of focus (0..1), if that is given."""
-    if optics.defocus_px <= 0 or out_of_focus is None:
-        return _gaussian(image, optics.blur_px)
+def blurs_of(optics: Optics, out_of_focus: Floats) -> list[tuple[float, Floats | None]]:
+    """The lens's Gaussian blurs, px, and the share (H, W) that each has in a pixel, None for all of
+    it: the blur is wider where the scene is out of focus (0..1)."""
+    if optics.defocus_px <= 0:
+        return [(optics.blur_px, None)]
     place = out_of_focus * (_FOCUS_STEPS - 1)
-    result = np.zeros_like(image)
+    blurs: list[tuple[float, Floats | None]] = []
     for step in range(_FOCUS_STEPS):
         share = np.maximum(1.0 - np.abs(place - step), 0.0).astype(np.float32)
-        if not share.any():
-            continue
         wide = np.hypot(optics.blur_px, optics.defocus_px * step / (_FOCUS_STEPS - 1))
-        result += share * _gaussian(image, float(wide))
+        if share.any():
+            blurs.append((float(wide), share))
+    return blurs
+
+
+def blur(image: Floats, blurs: Sequence[tuple[float, Floats | None]]) -> Floats:
+    """An image (H, W) as the lens blurs it."""
+    result = np.zeros_like(image)
+    for wide, share in blurs:
+        if share is None:
+            return _gaussian(image, wide)
+        result += share * _gaussian(image, wide)
     return result
 
 

@@ -25,7 +25,7 @@ from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.living import LivingBody, bring_to_life, moves, save_body
 from bodyscan.simulation.patterns import refuse_unknown_code, refuse_unknown_frames
 from bodyscan.simulation.plan import default_shots, plan_boards
-from bodyscan.simulation.render import Moving, render_pair
+from bodyscan.simulation.render import EmptyRoom, Moving, render_pair
 from bodyscan.simulation.room import build_room
 from bodyscan.simulation.scene import Scene, Surface
 from bodyscan.simulation.sensor import FixedPattern, expose, exposure, fixed_pattern
@@ -201,9 +201,10 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
         rays = np.random.default_rng([truth.seed, _RAYS, number])
         view = View.of(pair.camera, truth.settings.optics, rays)
         fixed = sensor_of(pair.camera, truth.settings, truth.seed, number)
+        empty = see_empty(pair, view, room, truth.settings)
         for task in tasks[pair.name]:
             noise = np.random.default_rng([truth.seed, _NOISE, number, task.number])
-            render_task(rig, pair, view, room, task, truth.settings, out, noise, fixed)
+            render_task(rig, pair, view, room, task, truth.settings, out, noise, fixed, empty)
             tell()
 
     threaded(work, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
@@ -240,11 +241,13 @@ def render_task(
     out: Path,
     rng: np.random.Generator,
     fixed: FixedPattern | None = None,
+    empty: EmptyRoom | None = None,
 ) -> None:
-    """One pair, one shot: cast, expose, write. fixed: of the camera's sensor."""
+    """One pair, one shot: cast, expose, write. fixed: of the camera's sensor.  empty: the room as
+    `see_empty` saw it, for pairs that take more than one shot."""
     camera_from_rig = pair.rig_from_camera.inverse()
     camera_from_surfaces = camera_from_rig @ task.rig_from_surfaces
-    around = [surface.moved(camera_from_rig) for surface in room]
+    around = _around(pair, room)
 
     def scene_with(surfaces: Sequence[Surface]) -> Scene:
         return Scene([*(surface.moved(camera_from_surfaces) for surface in surfaces), *around])
@@ -259,17 +262,7 @@ def render_task(
     if task.body is not None:
         reach = _reach(task.body, list(task.frames_ms.values()))
         moving = Moving(len(task.surfaces), scene_at, reach)
-    light, reach = settings.lighting, pair.reach_mm
-    window = camera_from_rig.rotate(np.array(light.window_from) / np.linalg.norm(light.window_from))
-    lamps = Lamps(
-        light.laser_grey,
-        light.ambient_grey,
-        _BRIGHT_AT * reach,
-        reach,
-        light.window_grey,
-        tuple(window.tolist()),
-        settings.skin,
-    )
+    light = settings.lighting
     code = rig.pair(pair.name).projector
     taken = settings.pace.order or rig.frames.of_sequence(code)
     flicker = draw_flicker(taken, settings, rng.spawn(1)[0])
@@ -277,7 +270,7 @@ def render_task(
         scene,
         view,
         pair.projector,
-        lamps,
+        _lamps(pair, settings),
         settings.projection,
         rng,
         frames=rig.frames,
@@ -286,6 +279,7 @@ def render_task(
         inter_reflection=settings.inter_reflection,
         moving=moving,
         flicker=flicker,
+        empty=empty,
     )
     length = exposure(images[rig.frames.lit or "lit"], task.bright_grey, light)
     exposed = {
@@ -302,6 +296,34 @@ def render_task(
     for frame, image in exposed.items():
         name = fill(rig.files, shot=task.shot, pair=pair.name, frame=frame)
         files.write_image(out / task.folder / name, image)
+
+
+def see_empty(
+    pair: TruePair, view: View, room: Sequence[Surface], settings: SimulationSettings
+) -> EmptyRoom:
+    """The room as a pair sees it before anything stands there."""
+    scene, lamps = Scene(_around(pair, room)), _lamps(pair, settings)
+    return EmptyRoom.of(scene, view, pair.projector, lamps, settings.projection)
+
+
+def _around(pair: TruePair, room: Sequence[Surface]) -> list[Surface]:
+    """The room in the camera's frame."""
+    return [surface.moved(pair.rig_from_camera.inverse()) for surface in room]
+
+
+def _lamps(pair: TruePair, settings: SimulationSettings) -> Lamps:
+    light, reach = settings.lighting, pair.reach_mm
+    way = np.array(light.window_from) / np.linalg.norm(light.window_from)
+    window = pair.rig_from_camera.inverse().rotate(way)
+    return Lamps(
+        light.laser_grey,
+        light.ambient_grey,
+        _BRIGHT_AT * reach,
+        reach,
+        light.window_grey,
+        tuple(window.tolist()),
+        settings.skin,
+    )
 
 
 def _reach(body: LivingBody, moments_ms: Sequence[float]) -> float:

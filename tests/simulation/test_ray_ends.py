@@ -11,7 +11,7 @@ from bodyscan.arrays import Floats, Mask
 from bodyscan.rig.board import Board
 from bodyscan.simulation import ray_ends
 from bodyscan.simulation.board import board_print
-from bodyscan.simulation.ray_ends import ends_of_rays, interpolate, mean_light
+from bodyscan.simulation.ray_ends import ends_of_rays, interpolate, least, mean_light
 from bodyscan.simulation.render import render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
 from bodyscan.simulation.settings import BoardMaking, Projection
@@ -96,3 +96,4 @@ def test_light_of_a_pixel_is_the_mean_over_its_samples() -> None:
     index = rng.integers(0, 50, weight.shape, dtype=np.int32)
     plain = (weight * table[index]).mean(axis=-1)
     assert mean_light(weight, index, table) == pytest.approx(plain, rel=1e-6)
+    assert np.array_equal(least(weight), weight.min(axis=-1))

@@ -16,9 +16,9 @@ from bodyscan.simulation.gray import code_bits
 from bodyscan.simulation.layout import build_mirror, build_pinhole
 from bodyscan.simulation.lens import TrueCamera
 from bodyscan.simulation.projector import MirrorProjector, PinholeProjector
-from bodyscan.simulation.render import pixel_truth, render_pair
+from bodyscan.simulation.render import EmptyRoom, pixel_truth, render_pair
 from bodyscan.simulation.scene import Scene, Surface, grid_surface
-from bodyscan.simulation.sensor import blur, expose
+from bodyscan.simulation.sensor import blur, blurs_of, digitise, expose
 from bodyscan.simulation.settings import Noise, Optics, Projection
 from bodyscan.simulation.view import View
 
@@ -214,7 +214,7 @@ def test_camera_out_of_focus_blurs_what_is_near() -> None:
     off = np.zeros_like(image)
     off[:, :40] = 1.0
     optics = Optics(blur_px=0.6, defocus_px=2.0)
-    result = blur(image, optics, off)[20]
+    result = blur(image, blurs_of(optics, off))[20]
     u = np.arange(80)
     near, far = result[:40] / result[:40].sum(), result[40:] / result[40:].sum()
     # the pixel itself is not part of the blur here: the line is one sample wide
@@ -236,3 +236,35 @@ def test_lit_alone_is_the_lit_frame_of_the_sequence() -> None:
     alone = render(surfaces, sequence=False)
     assert list(alone) == ["lit"]
     assert (alone["lit"] == render(surfaces)["lit"]).all()
+
+
+def test_a_room_once_seen_empty_changes_no_image() -> None:
+    """Only between the columns of the ball and of its shadow are rays cast anew."""
+    room = wall(1500.0, encloses=True)
+    scene = Scene([ball([120.0, 30.0, 900.0], 60.0), room])
+    soft = Projection(blur_stripes=0.3, defocus_stripes=1.0)
+    rays, light = view(), projector(projection=soft)
+
+    def images(empty: EmptyRoom | None) -> dict[str, Floats]:
+        rng = np.random.default_rng(0)
+        return render_pair(scene, rays, light, LAMPS, soft, rng, empty=empty)
+
+    empty = EmptyRoom.of(Scene([room]), rays, light, LAMPS, soft)
+    anew, known = images(None), images(empty)
+    assert all(np.array_equal(anew[name], known[name]) for name in anew)
+    bare = render_pair(Scene([room]), rays, light, LAMPS, soft, np.random.default_rng(0))
+    changed = np.flatnonzero((bare["lit"] != anew["lit"]).any(axis=0))
+    ((_, cast),) = empty.with_what_stands_in(scene)
+    recast = np.flatnonzero((cast.surface < np.inf).any(axis=0))
+    assert 0 < changed[0] - recast[0] < 20
+    assert changed[-1] <= recast[-1] < 159
+
+
+def test_a_sensor_adds_noise_as_large_as_it_says_and_rounds() -> None:
+    rng = np.random.default_rng(0)
+    image = rng.uniform(-5.0, 260.0, (20, 30)).astype(np.float32)
+    draws, grey = rng.standard_normal(image.shape).astype(np.float32), np.empty((20, 30), np.uint8)
+    digitise(image, draws, np.float32(50.0), np.float32(0.25), grey)
+    spread = np.sqrt(np.maximum(image, np.float32(0.0)) / np.float32(50.0) + np.float32(0.25))
+    plain = np.clip(np.rint(image + spread * draws), 0, 255).astype(np.uint8)
+    assert np.array_equal(grey, plain)
