@@ -12,6 +12,7 @@ from bodyscan.alignment.bending import at_once
 from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.following import Followed, follow
 from bodyscan.alignment.icp import Alignment, align
+from bodyscan.alignment.oblique_light import LightLine, ObliqueLight, take_out
 from bodyscan.alignment.pole_steps import (
     PoleStep,
     StepSearch,
@@ -52,7 +53,8 @@ class Scan:
     cleaned range image.  failed: pairs that gave none, with the reason.  range_images: cleaned, of
     the pairs that saw the subject, cut to where they did and carried to one moment; rig_from_camera:
     where each stood to it, after alignment.  person: how a body that moved did, part by part.  notes:
-    what was said of the range images, such as what of their stripes was not used.
+    what was said of the range images, such as what of their stripes was not used.  oblique_light: how
+    far aside light comes out of the skin, as far as overlaps tell it.
     """
 
     cloud: BodyCloud
@@ -65,6 +67,7 @@ class Scan:
     rig_from_camera: dict[str, RigidTransform]
     person: PersonMotion | None = None
     notes: tuple[str, ...] = ()
+    oblique_light: ObliqueLight | None = None
 
 
 def fuse(
@@ -92,9 +95,15 @@ def fuse(
     alignment, followed, known = None, None, calibration.covariance
     shifted: list[PoleStep] = []
     search: StepSearch | None = None
+    oblique: ObliqueLight | None = None
     if settings.alignment.matching != "none" and len(seen) > 1:
         with step(progress, "aligning"):
             found = align(seen, placing, known, settings.alignment)
+            lines = _light_lines(seen, calibration)
+            if lines:
+                seen, found, oblique = take_out(
+                    seen, placing, found, lines, known, settings.alignment
+                )
             believed = known
             while moved := (search := _moved(seen, placing, found, calibration, shifted)).step:
                 shifted.append(moved)
@@ -152,7 +161,20 @@ def fuse(
         held = check_surface(surface, at_once_or_empty, placing)
         verdict = graded(surface, held)
     images, notes = tuple(seen), measured.notes
-    return Scan(cloud, surface, alignment, points, failed, verdict, images, placing, person, notes)
+    return Scan(
+        cloud, surface, alignment, points, failed, verdict, images, placing, person, notes, oblique
+    )
+
+
+def _light_lines(
+    seen: Sequence[RangeImage], calibration: RigCalibration
+) -> dict[str, LightLine] | None:
+    """Of each pair; None where points are of stripes of both directions, which oblique light moves
+    each their own way."""
+    sheets = {image.pair: calibration.pairs[image.pair].sheets for image in seen}
+    if any(image.agreement for image in seen):
+        return None
+    return {name: LightLine.of(one) for name, one in sheets.items() if one is not None}
 
 
 def _silent(

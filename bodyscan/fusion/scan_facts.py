@@ -61,6 +61,12 @@ class _Person(_Part):
     moment_ms: float | None
 
 
+class _ObliqueLight(_Part):
+    reach_mm: float
+    sigma_mm: float
+    taken_out: bool
+
+
 class _Hashes(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
     cloud: str = Field(alias="cloud.ply")
@@ -82,6 +88,7 @@ class _Facts(_Part):
     measured: dict[str, int] = {}
     failed: dict[str, str] = {}
     alignment: _Alignment | None = None
+    oblique_light: _ObliqueLight | None = None
     person: _Person | None = None
 
 

@@ -107,6 +107,7 @@ def save_scan(
             "measured": scan.measured,
             "failed": scan.failed,
             "alignment": _alignment(scan),
+            "oblique_light": _oblique_light(scan),
             "person": asdict(scan.person) if scan.person else None,
         },
     )
@@ -199,6 +200,11 @@ def _alignment(scan: Scan) -> dict[str, Any] | None:
             for overlap in alignment.overlaps
         ],
     }
+
+
+def _oblique_light(scan: Scan) -> dict[str, Any] | None:
+    found = scan.oblique_light
+    return None if found is None else asdict(found) | {"taken_out": found.told}
 
 
 def _number(value: Any) -> Any:

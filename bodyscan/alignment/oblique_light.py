@@ -1,0 +1,266 @@
+"""Light that enters skin obliquely and comes out aside: seen as a disagreement of pairs, and undone.
+
+Under the surface light goes on as it was refracted, and what a camera sees entered a little before,
+against the way the light came: by `reach_mm` times the tangent of the refracted angle. A pixel so
+shows the stripe of a place beside, and its depth is wrong by where that stripe's sheet lies on the
+pixel's ray: by more where the surface leans over against the sheet, to the other side where the
+projector stands on the other side of the camera. Pairs that see the same skin under different
+slopes disagree by that, whatever the skin is like otherwise, and one length explains all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from bodyscan.alignment.icp import Alignment, align
+from bodyscan.alignment.overlap_equations import LEAST_SPREAD_MM
+from bodyscan.alignment.overlaps import OverlapPoints, each_overlap, match_overlap
+from bodyscan.alignment.sway import SwayPrior
+from bodyscan.arrays import Array, Floats
+from bodyscan.geometry.light_planes import LightSheets
+from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.robust import spread
+from bodyscan.geometry.scaled_systems import solve_scaled
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.progress import THREADS
+from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.settings import AlignmentSettings
+
+REFRACTION = 1.4
+"""Index of skin (Tuchin, Tissue Optics, 2015: 1.36 to 1.45)."""
+STRIPES = 32
+WINDOW_MM = 7.0
+"""Over which normals are averaged: those of five pixels are as noisy as the effect is large."""
+MOST_LIFT = 4.0
+"""Of a point along its ray, times the reach: more it is nowhere but where light grazes."""
+ROUNDS = 2
+"""After the first, each leaves a tenth of what was left."""
+FEWEST_IMAGES = 4
+"""Without any one of them the rest still has to be several."""
+TOLD_SIGMAS, LEAST_MM = 4.0, 0.05
+"""From which on it is believed: a surface that leans by 20 degrees then stands off by as much, which
+makes 0.3 mm of a girth."""
+FLATTEST = 0.1
+"""Cosine, of light, ray and sheet: flatter than that the effect has no size, nothing is measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class LightLine:
+    """Where a projector's sheets meet, camera frame.  origin: (3,) mm, the place of that line which is
+    nearest to the camera, taken for where light comes from.  along: (3,) unit."""
+
+    origin: Array
+    along: Array
+
+    @staticmethod
+    def of(sheets: LightSheets) -> LightLine:
+        planes = sheets.tangent_planes(np.linspace(0.0, sheets.stripes, STRIPES + 2)[1:-1])
+        planes = planes[np.isfinite(planes).all(axis=1)]
+        left, sizes, right = np.linalg.svd(planes[:, :3], full_matrices=False)
+        two = left[:, :2].T @ -planes[:, 3] / sizes[:2]
+        return LightLine(two @ right[:2], right[2])
+
+    def lift(self, points: Array, normals: Array) -> Array:
+        """How far points (N, 3) with unit normals (N, 3) towards the camera, camera frame, are seen
+        from where they are: (N,) mm along their rays, away from the camera, for a reach of 1 mm; NaN
+        where light or camera graze the surface or each other."""
+        light = points - self.origin
+        light /= np.linalg.norm(light, axis=1, keepdims=True)
+        ray = points / np.linalg.norm(points, axis=1, keepdims=True)
+        sheet = np.cross(self.along, light)
+        sheet /= np.linalg.norm(sheet, axis=1, keepdims=True)
+        facing = -np.sum(light * normals, axis=1)
+        refracted = np.sqrt(1.0 - (1.0 - facing**2) / REFRACTION**2)
+        # Light lies in its sheet: across it, it goes aside by what the normal leans over.
+        aside = facing * np.sum(sheet * normals, axis=1) / (REFRACTION * refracted)
+        across = np.sum(sheet * ray, axis=1)
+        seen = -np.sum(ray * normals, axis=1)
+        clear = (facing > FLATTEST) & (seen > FLATTEST) & (np.abs(across) > FLATTEST**2)
+        return np.where(clear, -aside / np.where(clear, across, 1.0), np.nan)
+
+
+@dataclass(frozen=True)
+class ObliqueLight:
+    """reach_mm: how far aside light comes out, over the tangent of the refracted angle; sigma_mm: of
+    that, from how much every single pair says in it."""
+
+    reach_mm: float
+    sigma_mm: float
+
+    @property
+    def told(self) -> bool:
+        """Whether it is there; light never comes out before where it entered."""
+        return self.reach_mm > max(TOLD_SIGMAS * self.sigma_mm, LEAST_MM)
+
+    @property
+    def most_mm(self) -> float:
+        """What it may be."""
+        return abs(self.reach_mm) + self.sigma_mm
+
+
+@dataclass(frozen=True, eq=False)
+class _Shared:
+    """What an overlap says: J^T W J (7, 7) and J^T W d (7,), by the source's motion and the reach."""
+
+    information: Array
+    gradient: Array
+
+
+def take_out(
+    images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    found: Alignment,
+    lines: Mapping[str, LightLine],
+    prior: PoseCovariance,
+    settings: AlignmentSettings,
+) -> tuple[list[RangeImage], Alignment, ObliqueLight | None]:
+    """The images without the effect, if it is told, and how they then align; else all as it was, but
+    where it could be there unseen: then that is in the points' sigmas.
+
+    found: the images' alignment from `rig_from_camera`, which had to make up for it as poses can; so
+    what is left is asked for again.
+    """
+    first = find_oblique_light(images, found.rig_from_camera, lines, prior, settings)
+    if first is None or not first.told:
+        seen = list(images)
+        if first is not None and first.sigma_mm > LEAST_MM:
+            unknown = ObliqueLight(0.0, first.sigma_mm)
+            seen = [undo(image, lines[image.pair], unknown) for image in images]
+        return seen, found, first
+    total, seen = first, list(images)
+    for _ in range(ROUNDS):
+        seen = [undo(image, lines[image.pair], total) for image in images]
+        found = align(seen, rig_from_camera, prior, settings)
+        rest = find_oblique_light(seen, found.rig_from_camera, lines, prior, settings)
+        if rest is None:
+            break
+        total = ObliqueLight(total.reach_mm + rest.reach_mm, rest.sigma_mm)
+    return seen, found, total
+
+
+def find_oblique_light(
+    images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    lines: Mapping[str, LightLine],
+    prior: PoseCovariance,
+    settings: AlignmentSettings,
+    *,
+    workers: int = THREADS,
+) -> ObliqueLight | None:
+    """One length for all overlaps, with the pairs' motions: what these explain as well counts for none.
+
+    rig_from_camera: aligned, so that what is left is small.  lines: of every image's projector. None
+    where fewer than four images overlap.
+    """
+    names = [image.pair for image in images]
+    placed = [rig_from_camera[name] for name in names]
+
+    def points(image: RangeImage) -> OverlapPoints:
+        return OverlapPoints.of(replace(image, normals=_steady(image)), settings.spacing_mm)
+
+    with ThreadPoolExecutor(workers) as pool:
+        clouds = list(pool.map(points, images))
+
+        def of_two(i: int, j: int) -> _Shared | None:
+            reach, fewest = settings.least_reach_mm, settings.fewest
+            found = match_overlap(clouds[i], clouds[j], placed[i], placed[j], reach, fewest)
+            if found is None:
+                return None
+            places = found.points, found.normals
+            apart = _apart(lines[names[i]], placed[i], *places)
+            apart -= _apart(lines[names[j]], placed[j], *places)
+            return _shared(*places, found.distances, found.sigma_mm, apart, settings.correlated)
+
+        overlaps = each_overlap(pool, len(names), of_two)
+    seen = sorted({k for both in overlaps for k in both})
+    if len(seen) < FEWEST_IMAGES:
+        return None
+    held = np.asarray(np.linalg.inv(SwayPrior.of(settings).covariance(names, prior)), np.float64)
+    without = np.array([_reach(overlaps, held, one) for one in seen])
+    # Jackknife (Tukey 1958): images err each by itself, points of one image alike.
+    sigma = np.sqrt((len(seen) - 1) / len(seen) * np.sum((without - without.mean()) ** 2))
+    return ObliqueLight(_reach(overlaps, held), float(sigma))
+
+
+def undo(image: RangeImage, line: LightLine, found: ObliqueLight) -> RangeImage:
+    """The range image with its points where the surface is, and what is not known of that in their
+    sigmas; where light or camera graze the surface, all of it."""
+    valid = image.valid
+    points, normals = image.points[valid].astype(np.float64), _steady(image)[valid]
+    lift = line.lift(points, normals.astype(np.float64))
+    known = np.isfinite(lift)
+    unsure = np.where(known, found.sigma_mm * np.abs(lift), MOST_LIFT * found.most_mm)
+    length = np.linalg.norm(points, axis=1, keepdims=True)
+    moved = np.where(known, found.reach_mm * lift, 0.0)[:, None] / length
+    common = np.zeros_like(image.sigma_mm) if image.common_mm is None else image.common_mm.copy()
+    placed, sigma_mm = image.points.copy(), image.sigma_mm.copy()
+    placed[valid] = points * (1.0 - moved)
+    sigma_mm[valid], common[valid] = (
+        np.hypot(one[valid], unsure).astype(np.float32) for one in (sigma_mm, common)
+    )
+    return replace(image, points=placed, sigma_mm=sigma_mm, common_mm=common)
+
+
+def _steady(image: RangeImage) -> Floats:
+    """(h, w, 3) unit normals, each the mean of those around; so rims have some too."""
+    known = np.isfinite(image.normals[..., 2]) & image.valid
+    if not known.any():
+        return image.normals
+    pixel_mm = float(np.median(image.points[known][:, 2])) / image.camera.alpha
+    side = 2 * max(1, round(0.5 * WINDOW_MM / pixel_mm)) + 1
+    total = cv2.blur(np.where(known[..., None], image.normals, np.float32(0.0)), (side, side))
+    length = np.linalg.norm(total, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        return np.where(length > 1e-3, total / length, np.float32(np.nan)).astype(np.float32)
+
+
+def _apart(
+    line: LightLine, rig_from_camera: RigidTransform, points: Array, normals: Array
+) -> Array:
+    """(N,) mm along normals (N, 3) by which a pair sees points (N, 3), rig frame, off their places, for
+    a reach of 1 mm."""
+    camera_from_rig = rig_from_camera.inverse()
+    seen, across = camera_from_rig.apply(points), camera_from_rig.rotate(normals)
+    facing = np.sum(seen * across, axis=1) / np.linalg.norm(seen, axis=1)
+    return line.lift(seen, across) * facing
+
+
+def _shared(
+    points: Array,
+    normals: Array,
+    distances: Array,
+    sigma_mm: Array,
+    apart: Array,
+    correlated: float,
+) -> _Shared:
+    """As `OverlapEquations`, the reach as the last unknown; matches without `apart` say nothing."""
+    rows = np.column_stack([np.cross(points, normals), normals, apart])
+    variance = sigma_mm**2 + spread(distances, LEAST_SPREAD_MM) ** 2
+    weight = np.isfinite(apart) / (variance + 0.25 * distances**2) / correlated
+    rows[~np.isfinite(apart)] = 0.0
+    weighted = rows.T * weight
+    return _Shared(weighted @ rows, weighted @ distances)
+
+
+def _reach(
+    overlaps: Mapping[tuple[int, int], _Shared], held: Array, without: int | None = None
+) -> float:
+    """The length that explains the overlaps best, of all images or without one; held: (6P, 6P) inverse
+    covariance of the pairs' motions."""
+    size = len(held)
+    normal, right = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
+    normal[:size, :size] = held
+    for (a, b), one in overlaps.items():
+        if without in (a, b):
+            continue
+        # The target's motion has the opposite effect; `apart` is of both.
+        signed = np.concatenate([np.eye(7)[:, :6], -np.eye(7)[:, :6], np.eye(7)[:, 6:]], axis=1)
+        at = np.concatenate([6 * a + np.arange(6), 6 * b + np.arange(6), [size]])
+        normal[np.ix_(at, at)] += signed.T @ one.information @ signed
+        right[at] += signed.T @ one.gradient
+    return float(solve_scaled(normal, right)[-1])
