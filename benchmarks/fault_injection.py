@@ -71,6 +71,8 @@ def faults() -> Iterator[Fault]:
             yield _moved(f"pole {pole}", f"turned {degrees:g} deg", 0.0, way, degrees)
         yield Fault(f"pole {pole}: another person's", (f"pole {pole}",), _another(pole))
     yield _moved("pole p2", "of an earlier scan: 8 mm and 2 deg", 8.0, 1, 2.0)
+    for mm in (2.0, 5.0):
+        yield _all_out(mm)
     for mm in (2.0, 5.0, 15.0):
         yield _moved("pair p1-2", f"out {mm:g} mm", mm, 0, 0.0)
     yield _moved("pair p1-2", "turned 2 deg", 0.0, 0, 2.0)
@@ -92,6 +94,26 @@ def faults_of_the_living() -> Iterator[Fault]:
     yield _moved("pole p2", "turned 2 deg", 0.0, 1, 2.0)
     yield Fault("pole p2: another person's", ("pole p2",), _another("p2"))
     yield _moved("pair p1-2", "out 5 mm", 5.0, 0, 0.0)
+    yield _all_out(3.0)
+
+
+def _all_out(mm: float) -> Fault:
+    """As if the frame that carries the poles had been put up anew, or grown."""
+
+    def inject(sound: Sound) -> Case:
+        placed, poles = sound.calibration.rig_from_camera, sound.calibration.rig.poles
+        outward = {}
+        for pole in set(poles.values()):
+            own = [at.translation for name, at in placed.items() if poles[name] == pole]
+            way = np.mean(own, axis=0) * [1.0, 1.0, 0.0]
+            outward[pole] = mm * way / np.linalg.norm(way)
+        moved = {
+            name: RigidTransform(at.rotation, at.translation + outward[poles[name]])
+            for name, at in placed.items()
+        }
+        return replace(sound.calibration, rig_from_camera=moved), Outcome(sound.images)
+
+    return Fault(f"all poles: out {mm:g} mm", ("pole p",), inject)
 
 
 def _moved(what: str, how: str, mm: float, way: int, degrees: float) -> Fault:

@@ -105,21 +105,21 @@ def find_steps(
     """From one scan, or several since the calibration: a person sways otherwise in each, while what was
     moved stands off by the same in all.  Of pairs whose moment is not known nobody can tell in one
     scan.  poles: as in `moving_alone`.  freed: pairs of poles that are known to have moved: is there
-    another?"""
+    another?  Where each pole moved, the one that stands off farthest is the step."""
     several = len(scans) >= SEVERAL
     seen = _Seen.of(scans, poles, freed, timed=not several)
     if len(set(seen.names)) < FEWEST:
         return StepSearch(None, np.inf)
     nothing = np.zeros(len(seen.names))
-    still, believed, sway_mm, own_mm = _evidence(seen, SWAY_MM, nothing, np.zeros(1))
+    still, believed, sway_mm, own_mm = _evidence(seen, SWAY_MM, np.diag(nothing), np.zeros(1))
     found: list[tuple[float, PoleStep]] = []
-    least = STEP_MM
+    least, hidden = STEP_MM, bool(freed)
     for name, pairs in moving_alone(sorted(set(seen.names)), poles).items():
         own = np.array([pair in pairs for pair in seen.names])
         if not pairs.isdisjoint(freed) or not set(seen.names) - pairs - set(freed):
             continue
         if not several and seen.sway[np.ix_(own, ~own)].max() <= NEARLY:
-            least = np.inf
+            least, hidden = np.inf, hidden or len(pairs) > 1
             continue
         spread = 1.0 / np.sqrt(own @ np.linalg.solve(believed, own.astype(float)))
         least = max(least, TOLD_SIGMAS * float(spread))
@@ -128,12 +128,18 @@ def find_steps(
         if not free and sway_mm > STILL_MM:
             least = np.inf
         swayed = SWAY_MM if free else SWAY_MM[SWAY_MM < STILL_MM]
-        gain = _evidence(seen, swayed, own.astype(float), STEPS_MM)[0] - still
+        gain = _evidence(seen, swayed, np.outer(own, own), STEPS_MM)[0] - still
         motions = [{n: m[n] for n in m if n in seen.names and n not in freed} for m, _ in scans]
         found.append((gain, PoleStep.of(name, pairs, _mean(motions))))
     if not found:
         return StepSearch(None, np.inf)
     gain, step = max(found, key=lambda one: one[0])
+    if not hidden:
+        # Of poles that all moved outwards none moved by itself, and the body comes out too thin.
+        each = _evidence(seen, SWAY_MM, _alike(seen.names, poles), STEPS_MM)[0] - still
+        if each > max(gain, SURE):
+            gain = each
+            step = max((one for _, one in found), key=lambda one: (len(one.pairs), one.shift_mm))
     lever = np.radians(step.turn_deg) * ARM_MM
     moved = gain > SURE and np.hypot(step.shift_mm, lever) > STEP_MM
     return StepSearch(step if moved else None, least, sway_mm, own_mm)
@@ -203,18 +209,24 @@ def _stances(moments_ms: Sequence[float | None]) -> Array:
     return np.where(np.isnan(apart), np.eye(len(seconds)), of_stance(np.nan_to_num(apart)))
 
 
+def _alike(names: Sequence[str], poles: Mapping[str, str]) -> Array:
+    """(N, N) 1 for pairs of one pole."""
+    side = [poles.get(name, name) for name in names]
+    return np.equal.outer(side, side).astype(float)
+
+
 def _evidence(
-    seen: _Seen, sways_mm: Array, own: Array, steps_mm: Array
+    seen: _Seen, sways_mm: Array, stepped: Array, steps_mm: Array
 ) -> tuple[float, Array, float, float]:
     """Logarithm of the likelihood of the motions, at the sizes of sway, step and noise that explain
-    them best, the covariance (N, N) that these make, sway and noise.  own: (N,) 1 for what has the
-    step."""
+    them best, the covariance (N, N) that these make, sway and noise.  stepped: (N, N), 1 for two that
+    have the same step."""
     size = len(seen.names)
     noise2, sway2, step2 = np.meshgrid(NOISE_MM**2, sways_mm**2, steps_mm**2, indexing="ij")
     covariance = (
         noise2.ravel()[:, None, None] * np.eye(size)
         + sway2.ravel()[:, None, None] * seen.sway
-        + step2.ravel()[:, None, None] * np.outer(own, own)
+        + step2.ravel()[:, None, None] * stepped
         + seen.free
     )
     motions = np.broadcast_to(seen.motions, (len(covariance), *seen.motions.shape))
