@@ -25,7 +25,7 @@ def test_ten_kills_leave_the_same_bytes_as_none(
     there: dict[str, int] = {}
     for _ in range(10):
         process = subprocess.Popen(batch_command(scans, out), stdout=subprocess.DEVNULL)
-        time.sleep(moments.uniform(0.3, 1.6))
+        time.sleep(moments.uniform(0.3, 0.9))
         process.kill()
         process.wait()
         _wait_for(lambda: not any(_is_held(job.folder / "lock") for job in jobs_of(scans, out)))

@@ -123,17 +123,19 @@ def test_the_true_surface_is_the_subject_in_the_rig_frame(simulated: Path) -> No
     toes = vertices[vertices[:, 2] < 60]
     assert nose[:, 0].max() > 1.2 * -nose[:, 0].min()  # the face is in front, towards +x
     assert toes[:, 0].max() > 0
-    assert mesh.is_watertight()
+    assert mesh.is_edge_manifold(allow_boundary_edges=False)
 
 
 def test_the_same_arguments_give_the_same_bytes_in_any_order_of_work(tmp_path: Path) -> None:
     one, twelve = (PROJECT / "rigs" / f"{name}.yaml" for name in ("one-pair", "three-pole-12"))
     for workers in (1, 3):
         out = tmp_path / str(workers)
-        simulate(one, out / "one", scale=0.2, board_shots=2, workers=workers)
-        simulate(twelve, out / "twelve", scale=0.05, board_shots=2, workers=workers)
+        simulate(one, out / "one", scale=0.1, board_shots=2, workers=workers)
+        simulate(
+            twelve, out / "twelve", scale=0.05, board_shots=2, workers=workers, settings=SMALL,
+        )  # fmt: skip
     assert hashes(tmp_path / "1") == hashes(tmp_path / "3")
-    simulate(one, tmp_path / "other", scale=0.2, board_shots=2, seed=1)
+    simulate(one, tmp_path / "other", scale=0.1, board_shots=2, seed=1)
     first, other = hashes(tmp_path / "1" / "one"), hashes(tmp_path / "other")
     assert first["rig.yaml"] == other["rig.yaml"]
     assert (

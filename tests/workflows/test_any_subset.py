@@ -92,7 +92,7 @@ def without(data: st.DataObject, names: Sequence[str], what: str) -> set[str]:
 
 
 @given(data=st.data())
-@settings(max_examples=15)
+@settings(max_examples=8)
 def test_any_subset_gives_a_calibration_or_a_refusal(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
@@ -120,7 +120,7 @@ def test_any_subset_gives_a_calibration_or_a_refusal(
 
 
 @given(data=st.data())
-@settings(max_examples=4)
+@settings(max_examples=3)
 def test_any_subset_of_images_with_stripes_does_too(
     detected: Detected, data: st.DataObject
 ) -> None:
