@@ -186,10 +186,12 @@ def _told(cells: _Cells, found: Sequence[Misfits]) -> _Texture:
 
 
 def _medians(values: Floats, group: Indices, count: int) -> Array:
-    """(count,) of each group's values (N,); 0 of one without."""
-    order = np.lexsort((values, group))
+    """(count,) of each group's values (N,), none below 0; 0 of one without."""
+    # The bits of floats that are not negative are in the floats' order: one sort of plain numbers.
+    bits = np.asarray(values, np.float32).view(np.uint32)
+    keys = np.sort((group.astype(np.uint64) << np.uint64(32)) | bits)
     sizes = np.bincount(group, minlength=count)
-    middle = np.cumsum(sizes) - sizes + sizes // 2
+    middle = (np.cumsum(sizes) - sizes + sizes // 2)[sizes > 0]
     found = np.zeros(count)
-    found[sizes > 0] = values[order][middle[sizes > 0]]
+    found[sizes > 0] = keys[middle].astype(np.uint32).view(np.float32)
     return found

@@ -121,8 +121,6 @@ def fuse(
         cloud = add_pose_variance(fused.cloud, there, known)
         if followed:
             cloud = add_motion_variance(fused.cloud, cloud, followed)
-        regions = label_regions(cloud, seen, there, settings.fusion.window_mm)
-        cloud = replace(cloud, regions=regions)
     person = PersonMotion.of(followed) if followed else None
     points = {image.pair: int(image.valid.sum()) for image in cleaned}
     failed = dict(measured.failures)
@@ -153,6 +151,9 @@ def fuse(
     with step(progress, "judging"):
         seams = judge_seams(seen, there, calibration.rig.poles)
         announce(graded(None, None), final=False)
+    with step(progress, "naming regions"):
+        regions = label_regions(cloud, seen, there, settings.fusion.window_mm)
+        cloud = replace(cloud, regions=regions)
     merged(cloud)
     with step(progress, "meshing"):
         surface = _breathing(mesh(cloud, settings.mesh, images, placing), followed)
