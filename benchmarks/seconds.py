@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import full_size
+from benchmarks.arrivals import answers
 
 RUNS = 5
 PROJECT = Path(__file__).parents[1]
@@ -32,6 +33,7 @@ def report(workspace: Path | None = None) -> str:
             _command(["scan", str(person), *at, "--out", f"{folder}/scan-{k}"]) for k in range(RUNS)
         ]
         jobs = _batch(person, calibration, Path(folder))
+    arrived = answers(person, calibration, RUNS)
     yardstick, ours = statistics.median(reading), statistics.median(own)
     rows = "\n".join(
         _row(name, times, yardstick, ours)
@@ -41,14 +43,18 @@ def report(workspace: Path | None = None) -> str:
             "`bodyscan scan`, cold: from the command to its end": cold,
             "a job of `bodyscan batch`, one at a time (scan, export, report)": jobs,
             "`bodyscan.scan` in a warm process: cloud and mesh, nothing written": warm,
+            "`bodyscan watch`: from the last image to the verdict": [a.verdict for a in arrived],
+            "`bodyscan watch`: to the mesh, kept, and the final verdict": [a.mesh for a in arrived],
+            "`bodyscan watch`: to the end of the job, exports and report": [a.end for a in arrived],
         }.items()
     )
     return f"""## Seconds
 
 The person of `{workspace.name}`: 12 pairs, 22 images each, default settings. Seconds of wall clock
 over {RUNS} runs each, one after the other; the first has a column of its own, since that is what one
-has who starts it once. Ratios are of medians to reading the same images, by OpenCV and by our own
-reader, in the same run of this benchmark.
+has who starts it once. For `watch`, which stays, images arrive one by one, 120 a second and pair after
+pair, after one scan that is not counted. Ratios are of medians to reading the same images, by OpenCV
+and by our own reader, in the same run of this benchmark.
 
 | | first | median | least | most | to OpenCV | to our reader |
 |---|---|---|---|---|---|---|

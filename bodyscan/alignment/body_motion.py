@@ -25,6 +25,7 @@ from bodyscan.alignment.moments import Courses, of_breath, of_stance
 from bodyscan.alignment.sway import BODY_CENTRE
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.scaled_systems import invert_scaled
+from bodyscan.progress import threaded
 
 PART_MM = 350.0  # how far what moves as one reaches: an arm, a thigh, a shoulder girdle
 LEAST_PART = 0.02
@@ -168,8 +169,14 @@ class BodyMotion:
         anew. evidence: by pairs (a, b).  speeds: by pair, as its own stripes tell them."""
         names, speeds = [kind.name for kind in self.kinds], speeds or {}
         now = self.displacements(names)
-        asked = [self._asked(e, now[a] - now[b]) for (a, b), e in evidence.items()]
-        asked += [told.asked(self.fields) for told in speeds.values()]
+        fields = self.fields  # made once, not by every thread
+
+        def asked_of(overlap: tuple[tuple[int, int], CellEvidence]) -> tuple[Array, Array]:
+            (a, b), seen = overlap
+            return self._asked(seen, now[a] - now[b])
+
+        asked = threaded(asked_of, evidence.items(), stage="aligning")
+        asked += threaded(lambda told: told.asked(fields), speeds.values(), stage="aligning")
         squares, pulls = zip(*asked, strict=True)
         square, pull = np.array(squares), np.array(pulls)
         first, second = np.array(list(evidence)).T

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bodyscan.files.regular import open_regular
+from bodyscan.progress import threaded
 
 _BLOCK = 1 << 20
 
@@ -29,7 +30,9 @@ def file_hash(path: Path) -> str:
 
 def file_hashes(files: Mapping[str, Path]) -> dict[str, str]:
     """Name -> SHA-256 of each file, sorted by name."""
-    return {name: file_hash(files[name]) for name in sorted(files)}
+    names = sorted(files)
+    hashes = threaded(lambda name: file_hash(files[name]), names, stage="hashing")
+    return dict(zip(names, hashes, strict=True))
 
 
 def files_below(folder: Path) -> Iterator[Path]:
