@@ -170,12 +170,12 @@ def fuse(
 def _light_lines(
     seen: Sequence[RangeImage], calibration: RigCalibration
 ) -> dict[str, LightLine] | None:
-    """Of each pair; None where points are of stripes of both directions, which oblique light moves
-    each their own way."""
-    sheets = {image.pair: calibration.pairs[image.pair].sheets for image in seen}
-    if any(image.agreement for image in seen):
-        return None
-    return {name: LightLine.of(one) for name, one in sheets.items() if one is not None}
+    """Of each pair; None where one has no sheets of light, or points are of stripes of both
+    directions, which oblique light moves each their own way."""
+    pairs = [calibration.pairs.get(image.pair) for image in seen]
+    sheets = {pair.name: pair.sheets for pair in pairs if pair is not None}
+    lines = {name: LightLine.of(one) for name, one in sheets.items() if one is not None}
+    return None if len(lines) < len(seen) or any(one.agreement for one in seen) else lines
 
 
 def _silent(
