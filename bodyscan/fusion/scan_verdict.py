@@ -13,6 +13,7 @@ from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.pole_steps import STILL_MM, PoleStep, StepSearch
 from bodyscan.arrays import Array
 from bodyscan.fusion.contradictions import Contradictions
+from bodyscan.fusion.proportions import odd_proportions
 from bodyscan.fusion.seams import SeamReport, find_misfits
 from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -130,6 +131,7 @@ def grade_scan(
         "contradictions": lambda: _contradictions(contradictions, seams),
         "pieces": lambda: _company(cloud),
         "limbs": lambda: _limbs(shape) if shape else (),
+        "proportions": lambda: odd_proportions(shape) if shape else (),
         "cuts": lambda: _cuts(cloud, volume),
         "omissions": lambda: _omissions(cloud, mesh) if mesh else (),
         "contacts": lambda: _contacts(shape) if shape else (),
@@ -400,10 +402,12 @@ def _omissions(cloud: BodyCloud, mesh: BodyMesh) -> Iterator[Finding]:
     share = float(np.mean(outside))
     if share > SOME_OUTSIDE:
         low, high = np.percentile(some[outside, 2], [1, 99])
+        tall = high - low > SIDE_BY_SIDE * float(mesh.vertices[:, 2].max())
         yield (
             "repeat" if share > MOST_OUTSIDE else "usable",
             f"{share:.0%} of the points, between {low:.0f} and {high:.0f} mm (z), are not in the mesh,"
-            " which is one piece: see whether `volume` holds anything else",
+            f" which is one piece: {'do two people stand in the volume? S' if tall else 's'}ee whether "
+            "`volume` holds anything else",
         )
 
 

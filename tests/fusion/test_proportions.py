@@ -1,0 +1,75 @@
+"""What is carried, and who lies, is asked about; people of any size are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+import pytest
+from ray_cast_scan import ROOT, Truth, load_body
+
+from bodyscan.fusion.proportions import odd_proportions
+from bodyscan.mesh.body import BodyMesh
+
+SUBJECTS = ("woman_average", "man_average")
+SIZES = {"as they are": (1, 1, 1), "a child": (0.7, 0.7, 0.7), "2 m": (1.2, 1.2, 1.2)}
+SIZES |= {"heavy": (1.4, 1.3, 1.0), "thin": (0.8, 0.85, 1.0)}
+
+
+@pytest.fixture(scope="module", params=SUBJECTS)
+def body(request: pytest.FixtureRequest) -> Truth:
+    return load_body(ROOT / "data" / "subjects" / f"{request.param}.ply", subdivisions=0)
+
+
+def asked(*parts: Truth) -> str:
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([p.faces + s for p, s in zip(parts, starts, strict=False)])
+    none = np.zeros(len(vertices), np.float32)
+    mesh = BodyMesh(
+        vertices, faces, np.zeros_like(vertices), none.astype(np.uint8), none, faces[:, 0] < 0
+    )
+    return " | ".join(f"{grade}: {said}" for grade, said in odd_proportions(mesh))
+
+
+def box(size: tuple[float, float, float], middle: tuple[float, float, float]) -> Truth:
+    made = o3d.geometry.TriangleMesh.create_box(*size)
+    vertices = np.asarray(made.vertices) - 0.5 * np.array(size) + middle
+    return Truth(vertices, np.asarray(made.triangles).astype(np.int64))
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_people_of_any_size_are_asked_nothing(body: Truth, size: str) -> None:
+    assert asked(Truth(body.vertices * SIZES[size], body.faces)) == ""
+
+
+@pytest.mark.parametrize(
+    ("size", "middle"),
+    [
+        ((160.0, 300.0, 420.0), (-200.0, 0.0, 0.72)),
+        ((300.0, 100.0, 300.0), (0.0, 450.0, 0.43)),
+    ],
+    ids=["backpack", "bag in a hand"],
+)
+def test_what_is_carried_is_asked_about(
+    body: Truth, size: tuple[float, float, float], middle: tuple[float, float, float]
+) -> None:
+    height = middle[2] * float(body.vertices[:, 2].max())
+    said = asked(body, box(size, (*middle[:2], height)))
+    assert said.startswith("repeat: the body's section changes by")
+    assert "carried" in said
+
+
+def test_a_chest_that_is_deeper_than_wide_is_asked_about(body: Truth) -> None:
+    """A round bag on the back, of which no section shows where it begins."""
+    top = float(body.vertices[:, 2].max())
+    share = body.vertices[:, 2] / top
+    trunk = np.abs(body.vertices[:, 1]) < 0.12 * top
+    deeper = 1.0 + 0.8 * np.exp(-(((share - 0.7) / 0.08) ** 2)) * trunk
+    vertices = body.vertices * np.stack([deeper, np.ones_like(deeper), np.ones_like(deeper)], 1)
+    assert "times as deep as wide" in asked(Truth(vertices, body.faces))
+
+
+def test_who_lies_is_asked(body: Truth) -> None:
+    x, y, z = body.vertices.T
+    lying = np.stack([z, y, x - x.min()], axis=1)
+    assert "does the person lie" in asked(Truth(lying, body.faces[:, ::-1]))
