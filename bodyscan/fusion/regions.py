@@ -124,16 +124,7 @@ def label_regions(
 
     large = np.bincount(patch, darks) >= SMALLEST * len(grey)
     on_head = np.isin(patch, patch[head & covered])
-    kind = np.where(
-        head,
-        np.where(smooth, DARK_CLOTH, HAIR),
-        np.where(
-            on_head,
-            np.where(rough, HAIR, np.where(smooth, DARK_CLOTH, UNSURE)),
-            np.where(rough, UNSURE, DARK_CLOTH),
-        ),
-    )
-    kind[~large[patch]] = UNSURE
+    kind = np.where(large[patch], _coverings(head, on_head, rough, smooth), UNSURE)
     # Fair hair is as bright as skin.
     bare = head & (darks == 0)
     shaggy = bare & cells.mostly(texture.rough, texture.known & bare)
@@ -141,6 +132,14 @@ def label_regions(
     dim = np.where(covered, kind, UNSURE)
     found = np.where(dark, kind[cell], np.where(grey < DIM * usual, dim[cell], bright[cell]))
     return found.astype(np.uint8)
+
+
+def _coverings(head: Mask, on_head: Mask, rough: Mask, smooth: Mask) -> Indices:
+    """(count,) what dark cells are: of the head, of what is one patch with it, and of all else."""
+    hanging = np.where(rough, HAIR, np.where(smooth, DARK_CLOTH, UNSURE))
+    elsewhere = np.where(rough, UNSURE, DARK_CLOTH)
+    worn = np.where(smooth, DARK_CLOTH, HAIR)
+    return np.where(head, worn, np.where(on_head, hanging, elsewhere))
 
 
 def _head(points: Array, places: Array) -> Mask:

@@ -11,6 +11,7 @@ from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.comparison import Comparison
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.decimation import decimate
+from bodyscan.mesh.regions import NAMES, covered_shares
 from bodyscan.progress import THREADS
 from bodyscan.report.canvas import blue_white_red, turbo
 from bodyscan.report.model import Layer, Shape, css, ramp_legend
@@ -20,6 +21,8 @@ FACES = (50_000, 44_000, 38_000)
 """Tried in turn: reduced to one number of faces a mesh may fold, and not to another."""
 UNKNOWN = (150, 150, 150)
 SKIN = (214, 210, 205)
+REGIONS = (UNKNOWN, SKIN, (120, 70, 30), (40, 70, 130))
+"""As `mesh.regions.NAMES`: unsure (what was filled too), skin, hair, dark cloth."""
 PAIRS = (
     (70, 50, 125),
     (60, 100, 170),
@@ -48,7 +51,8 @@ def layers(
     comparison: Comparison | None,
     limit_mm: float,
 ) -> list[Layer]:
-    """By photo, plain, number of pairs, sigma, filled and, if compared, deviation."""
+    """By photo, plain, number of pairs, sigma, filled; where some of it is covered by regions, and if
+    compared by deviation."""
     made_up = np.zeros(len(small.vertices), bool)
     made_up[small.faces[small.filled]] = True
     top = _round_up(float(np.nanpercentile(cloud.sigma_mm, 98)))
@@ -73,6 +77,10 @@ def layers(
             "swatches": [(css(SKIN), "measured"), (css(tint), "filled to close the mesh")],
         }),
     ]  # fmt: skip
+    if covered_shares(small.regions) and small.regions is not None:
+        own = np.array(REGIONS, np.uint8)
+        swatches = [(css(colour), name) for colour, name in zip(REGIONS, NAMES, strict=True)]
+        found.append(Layer("regions", own[small.regions], {"swatches": swatches}))
     if comparison is not None:
         found.append(_deviation(small, mesh, comparison, made_up, limit_mm))
     return found

@@ -22,7 +22,10 @@ from bodyscan.errors import BadInput, ResultError
 from bodyscan.evaluation.comparison import compare_surfaces
 from bodyscan.files.atomic import write_json
 from bodyscan.jobs.forgetting import find_subject
+from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.holes import holes
+from bodyscan.mesh.regions import HAIR, SKIN
+from bodyscan.report.body_model import layers
 from bodyscan.report.model import Layer, Shape, pack
 from bodyscan.report.page import Number, render
 from bodyscan.report.result_page import build_page
@@ -111,6 +114,15 @@ def test_the_body_is_packed_to_a_fraction_of_a_millimetre(html: str, scan: MadeS
     orange = np.frombuffer(base64.b64decode(model["layers"][4]["colours"]), np.uint8).reshape(-1, 3)
     made_up = np.unique(scan.mesh.faces[scan.mesh.filled])
     assert np.array_equal(np.flatnonzero(orange[:, 0] == 255), made_up)
+
+
+def test_what_covers_the_skin_is_a_layer_of_its_own() -> None:
+    mesh = egg(20)
+    hair = np.where(mesh.vertices[:, 2] > 1500.0, HAIR, SKIN).astype(np.uint8)
+    cloud = BodyCloud(mesh.vertices, mesh.normals, mesh.sigma_mm, mesh.colours, mesh.colours[:, 0])
+    *_, last = layers(replace(mesh, regions=hair), mesh, cloud, None, 1.0)
+    assert last.name == "regions"
+    assert len(np.unique(last.colours, axis=0)) == 2
 
 
 def test_a_mesh_too_large_for_its_indices_is_refused() -> None:
