@@ -33,7 +33,9 @@ from bodyscan.settings import AlignmentSettings
 
 REFRACTION = 1.4
 """Index of skin (Tuchin, Tissue Optics, 2015: 1.36 to 1.45)."""
-STRIPES = 32
+STRIPES, FEWEST_SHEETS = 32, 3
+PARALLEL = 1e-3
+"""Radians between sheets: then light comes from a kilometre away, and its way is not known so well."""
 WINDOW_MM = 7.0
 """Over which normals are averaged: those of five pixels are as noisy as the effect is large."""
 MOST_LIFT = 4.0
@@ -58,10 +60,15 @@ class LightLine:
     along: Array
 
     @staticmethod
-    def of(sheets: LightSheets) -> LightLine:
+    def of(sheets: LightSheets) -> LightLine | None:
+        """None where sheets are too few, or parallel: they meet nowhere."""
         planes = sheets.tangent_planes(np.linspace(0.0, sheets.stripes, STRIPES + 2)[1:-1])
         planes = planes[np.isfinite(planes).all(axis=1)]
+        if len(planes) < FEWEST_SHEETS:
+            return None
         left, sizes, right = np.linalg.svd(planes[:, :3], full_matrices=False)
+        if sizes[1] < PARALLEL * sizes[0]:
+            return None
         two = left[:, :2].T @ -planes[:, 3] / sizes[:2]
         return LightLine(two @ right[:2], right[2])
 
@@ -155,7 +162,7 @@ def find_oblique_light(
     """One length for all overlaps, with the pairs' motions: what these explain as well counts for none.
 
     rig_from_camera: aligned, so that what is left is small.  lines: of every image's projector. None
-    where fewer than four images overlap.
+    where fewer than four images overlap, or all that say something do so with one and the same.
     """
     names = [image.pair for image in images]
     placed = [rig_from_camera[name] for name in names]
@@ -182,6 +189,8 @@ def find_oblique_light(
         return None
     held = np.asarray(np.linalg.inv(SwayPrior.of(settings).covariance(names, prior)), np.float64)
     without = np.array([_reach(overlaps, held, one) for one in seen])
+    if not np.isfinite(without).all():
+        return None
     # Jackknife (Tukey 1958): images err each by itself, points of one image alike.
     sigma = np.sqrt((len(seen) - 1) / len(seen) * np.sum((without - without.mean()) ** 2))
     return ObliqueLight(_reach(overlaps, held), float(sigma))
@@ -250,8 +259,8 @@ def _shared(
 def _reach(
     overlaps: Mapping[tuple[int, int], _Shared], held: Array, without: int | None = None
 ) -> float:
-    """The length that explains the overlaps best, of all images or without one; held: (6P, 6P) inverse
-    covariance of the pairs' motions."""
+    """The length that explains the overlaps best, of all images or without one, NaN if none is left;
+    held: (6P, 6P) inverse covariance of the pairs' motions."""
     size = len(held)
     normal, right = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
     normal[:size, :size] = held
@@ -263,4 +272,4 @@ def _reach(
         at = np.concatenate([6 * a + np.arange(6), 6 * b + np.arange(6), [size]])
         normal[np.ix_(at, at)] += signed.T @ one.information @ signed
         right[at] += signed.T @ one.gradient
-    return float(solve_scaled(normal, right)[-1])
+    return float(solve_scaled(normal, right)[-1]) if normal[-1, -1] > 0.0 else float("nan")

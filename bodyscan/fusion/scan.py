@@ -174,7 +174,8 @@ def _light_lines(
     directions, which oblique light moves each their own way."""
     pairs = [calibration.pairs.get(image.pair) for image in seen]
     sheets = {pair.name: pair.sheets for pair in pairs if pair is not None}
-    lines = {name: LightLine.of(one) for name, one in sheets.items() if one is not None}
+    found = {name: LightLine.of(one) for name, one in sheets.items() if one is not None}
+    lines = {name: line for name, line in found.items() if line is not None}
     return None if len(lines) < len(seen) or any(one.agreement for one in seen) else lines
 
 

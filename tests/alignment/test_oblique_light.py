@@ -142,6 +142,11 @@ def test_few_pairs_do_not_tell(seen: Seen) -> None:
     assert find_oblique_light(images, placed, seen.lines, seen.prior, SETTINGS) is None
 
 
+def test_sheets_that_are_parallel_meet_nowhere() -> None:
+    planes = np.column_stack([np.tile([0.0, 0.8, 0.6], (40, 1)), 900.0 + 10.0 * np.arange(40)])
+    assert LightLine.of(LightPlanes(planes, np.zeros((40, 4, 4)), "horizontal")) is None
+
+
 def test_what_is_not_known_is_in_sigmas(seen: Seen) -> None:
     image = seen.through_skin(0.0)[1]
     line, valid = seen.lines[image.pair], image.valid
@@ -169,5 +174,6 @@ def test_light_comes_from_where_its_sheets_meet(along: list[float]) -> None:
     planes[7] = np.nan  # a stripe that no board showed
     planes *= np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
     line = LightLine.of(LightPlanes(planes, np.zeros((40, 4, 4)), "horizontal"))
+    assert line is not None
     np.testing.assert_allclose(line.origin, origin, atol=1e-6)
     assert abs(line.along @ way) == pytest.approx(1.0)
