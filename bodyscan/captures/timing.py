@@ -7,12 +7,11 @@ since the first pair began with that shot.
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
-from pydantic import Field, PositiveFloat
+from pydantic import Field
 
 from bodyscan.errors import CaptureError
 from bodyscan.files.model import Model, Name, Problem, did_you_mean, duplicates
@@ -28,7 +27,13 @@ Sequences: TypeAlias = Mapping[tuple[str, str], tuple[str, ...]]
 FrameTimes: TypeAlias = Mapping[tuple[str, str], Mapping[str, float]]
 """By shot and pair, then by frame: ms."""
 
-Milliseconds = Annotated[float, Field(ge=0.0)]
+LATEST_MS = 1e13
+"""Since 1970 it is 2e12: who gives that is understood."""
+QUICKEST_MS, SLOWEST_MS = 0.01, 6e5
+"""Of a frame: a tenth of what the quickest projectors take, so that seconds are not taken for ms;
+ten minutes."""
+Milliseconds = Annotated[float, Field(ge=0.0, le=LATEST_MS)]
+FrameMilliseconds = Annotated[float, Field(ge=QUICKEST_MS, le=SLOWEST_MS)]
 Start = Literal["one-after-another", "together", "poles"] | dict[Name, Milliseconds]
 
 COLUMNS = ("shot", "pair", "frame", "ms")
@@ -47,7 +52,7 @@ class Timing(Model):
     times: a CSV file, relative to the capture folder.
     """
 
-    frame_ms: PositiveFloat | None = None
+    frame_ms: FrameMilliseconds | None = None
     order: tuple[str, ...] | None = None
     start: Start | None = None
     times: str | None = None
@@ -216,4 +221,4 @@ def _is_time(text: str) -> bool:
         value = float(text)
     except ValueError:
         return False
-    return math.isfinite(value) and value >= 0.0
+    return 0.0 <= value <= LATEST_MS

@@ -15,7 +15,8 @@ MOST_BYTES = 100_000_000  # a calibration of sixteen pairs and two hundred shots
 def read_json_object(path: Path) -> dict[str, Any]:
     """The one mapping that a JSON file holds, every number in it finite.
 
-    Raises ValueError for anything else (a key given twice, NaN, 1e999, too long, nested too deep),
+    Raises ValueError for anything else (a key given twice, NaN, 1e999, halves of characters, too long,
+    nested too deep),
     BadInput for what is no regular file, OSError when it cannot be read.
     """
     data = read_regular(path, MOST_BYTES)
@@ -30,6 +31,9 @@ def read_json_object(path: Path) -> dict[str, Any]:
         )
     except RecursionError:
         raise ValueError("is nested too deep") from None
+    if b"\\ud" in data.lower():
+        # Half of a character: it could be read, but never printed or written again.
+        json.dumps(content, ensure_ascii=False).encode("utf-8")
     if not isinstance(content, dict):
         raise ValueError("does not hold a mapping")
     return content

@@ -101,6 +101,7 @@ def test_a_file_of_times(tmp_path: Path) -> None:
         ({"bit00": "b1,p1,lit,6"}, "4:1: gives frame lit of pair p1 a second time"),
         ({"bit00": "b1,p1,bit00,soon"}, "4:1: ms must be a number, 0 or more (got 'soon')"),
         ({"bit00": "b1,p1,bit00,nan"}, "4:1: ms must be a number"),
+        ({"bit00": "b1,p1,bit00,1e300"}, "4:1: ms must be a number"),
         ({"lit": "b1,p1,lit,-1"}, "2:1: ms must be a number, 0 or more"),
         ({"bit00": "b1,p1,6"}, "4:1: has 3 columns, not 4"),
         ({"bit00": ""}, "has no time of bit00 (pair p1, shot b1)"),
@@ -115,7 +116,10 @@ def test_mistakes_in_a_file_of_times(tmp_path: Path, change: dict[str, str], mes
 @pytest.mark.parametrize(
     ("timing", "message"),
     [
-        ("  frame_ms: 0\n  start: together", "4:13: timing.frame_ms: must be greater than 0 (got 0)"),
+        ("  frame_ms: 0\n  start: together", "4:13: timing.frame_ms: must be 0.01 or more (got 0)"),
+        ("  frame_ms: 0.008\n  start: together", "timing.frame_ms: must be 0.01 or more (got 0.008)"),
+        ("  frame_ms: 1.0e+300\n  start: together", "timing.frame_ms: must be 600000 or less"),
+        ("  frame_ms: 10\n  start: {p1: 0, p2: 1.0e+308, cam: 3}", "timing.start.p2: must be"),
         ("  start: together", "timing.frame_ms: is missing (or `times`"),
         ("  frame_ms: 10", "timing.start: is missing: one-after-another, together, poles, or"),
         ("  frame_ms: 10\n  start: later", "5:10: timing.start: must be 'one-after-another',"

@@ -68,6 +68,10 @@ MISTAKES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "a scaled rotation": lambda c: pose(c, lambda m: m @ np.diag([1.01, 1.01, 1.01, 1.0])),
     "a sheared rotation": lambda c: pose(c, lambda m: m + np.eye(4, k=1) * 0.01),
     "a matrix turned over": lambda c: pose(c, np.transpose),
+    "two cameras at one place": lambda c: set_(
+        c, "pairs", "p1-2", "rig_from_camera", to=c["pairs"]["p2-3"]["rig_from_camera"]
+    ),
+    "a note that is no text": lambda c: set_(c, "notes", to=["\ud800"]),
     "a matrix of three rows": lambda c: pose(c, lambda m: m[:3]),
     "a pose that is empty": lambda c: set_(c, "pairs", "p1-2", "rig_from_camera", to=[]),
     "a pose beyond the horizon": lambda c: set_(
@@ -134,6 +138,11 @@ def test_what_no_calibration_can_be_like_is_refused_without_any_hash(
 
 ARRAYS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "NaN in it": lambda a: set_(a, "placing_covariance", to=np.full((24, 24), np.nan)),
+    "numbers of two bytes": lambda a: set_(
+        a,
+        "placing_covariance",
+        to=(np.eye(24) + 2.0 * (np.eye(24, k=1) + np.eye(24, k=-1))).astype(np.float16),
+    ),
     "the wrong shape": lambda a: set_(a, "placing_covariance", to=np.eye(6)),
     "a negative variance": lambda a: set_(a, "p1-2/camera_covariance", to=-np.eye(7)),
     "no symmetry": lambda a: set_(a, "p1-2/camera_covariance", to=np.eye(7) + np.eye(7, k=1)),
