@@ -33,6 +33,7 @@ from benchmarks import (
     rig,
     seconds,
     sigmas,
+    skin,
 )
 from bodyscan.files.atomic import write_text
 
@@ -42,6 +43,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "three-pole": full_size.three_pole,
     "four-pole": full_size.four_pole,
     "living": full_size.living,
+    "skin": skin.report,
     "sigmas": sigmas.report,
     "sigmas-rigs": sigmas.rigs,
     "one-solve": one_solve.report,
