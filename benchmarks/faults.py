@@ -39,6 +39,7 @@ KINDS = {
     "ideal": ["--subject-preset", "mannequin", "--preset", "ideal"],
 }
 """How a subject is rendered: workshop devices, but for ideal ones."""
+CRASHED = "crashed"
 IDEAL, LIVING = "ideal devices", "a living person"
 SWAY_MM, SWAYS = 5.0, 3
 SETTINGS = ScanSettings(
@@ -149,6 +150,7 @@ def _told(found: Sequence[Found], columns: Sequence[tuple[str, str]]) -> str:
             "2",
             sum(one.grade != "good" for one in sound),
         ),
+        ("end in a traceback", "0", sum(one.grade == CRASHED for one in found)),
         (f"faults told ({len(told)}) whose cause is named", "80 %", f"{100.0 * share:.0f} %"),
     ]
     targets = "\n".join(f"| {what} | {target} | {number} |" for what, target, number in goals)
@@ -169,7 +171,7 @@ trunk that is given as measured (- where none is). A star: the verdict does not 
 
 
 def _refused(one: Found) -> bool:
-    return one.grade in ("repeat", "refused")
+    return one.grade in ("repeat", "refused", CRASHED)
 
 
 def _cell(one: Found) -> str:
@@ -214,11 +216,13 @@ def _swaying(seed: int) -> Callable[[Sound], Case]:
 
 
 def _judge(rig: str, subject: str, fault: Fault, sound: Sound) -> Found:
-    calibration, measured = fault.inject(sound)
     try:
+        calibration, measured = fault.inject(sound)
         scan = fuse(calibration, measured, SETTINGS)
     except BodyscanError as error:
         return Found(rig, subject, fault.name, "refused", None, True, str(error))
+    except Exception as error:  # costs its cell, not the hour of the others
+        return Found(rig, subject, fault.name, CRASHED, None, False, repr(error))
     try:
         errors = compare_girths(scan.mesh, sound.girths)
         worst = errors.worst_mm if np.isfinite(errors.worst_mm) else None

@@ -19,6 +19,8 @@ from bodyscan.geometry.transforms import RigidTransform
 AGREEMENT = 0.04
 """Poses that differ by this share of the boards' usual distance agree: graphs place pairs roughly."""
 FEWEST_VOTES = 3
+FEWEST_APART = 3
+"""shots: of so many taken together two agree, whichever end they are numbered from."""
 BOARD_REACH = 0.3
 MOST_CANDIDATES = 12
 
@@ -275,6 +277,14 @@ def _open_tie(first: Group, second: Group, tie: RelativePose) -> RigDisconnected
         "board, or one whose columns and rows differ in parity"
     )
     found = f"shots {_shots(tie.targets)}"
+    if tie.votes == 1 and len(tie.targets) >= FEWEST_APART:
+        return RigDisconnected(
+            f"no two shots agree on the relative pose of {', '.join(sorted(first))} and "
+            f"{', '.join(sorted(second))}, whichever end their board is numbered from ({found})",
+            remedy="look whether their pictures were taken together and bear the names of the same "
+            "shots (one camera's numbers one further on, say); synchronise the cameras, or hold the "
+            f"board still until all have taken their picture. Else {remedy}",
+        )
     if 1 < tie.votes < len(tie.targets):
         # Shots that agree with no other, whichever end they are numbered from, may be wrong.
         found += f"; at best {_shots(tie.agreeing)} agree"
