@@ -15,11 +15,13 @@ from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
 from bodyscan.calibration.camera import CameraCalibration
-from bodyscan.calibration.light_sheets import fit_light_sheets, fit_planes, smooth_models
+from bodyscan.calibration.light_sheets import fit_light_sheets, fit_planes
 from bodyscan.calibration.pinhole_projector import fit_pinhole
+from bodyscan.calibration.sheet_fit import fit_sheets
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import PairFailed
+from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Rig
@@ -80,9 +82,9 @@ def _models(
         [c[2] for c in corners],
         pinhole,
     )
-    smooth = dict(smooth_models(points, stripes, direction))
+    plain = pinhole.sheets(points.points, stripes, direction)
     return {
-        "smooth planes": smooth["smooth planes"],
+        "smooth planes": fit_sheets(BowedSheets.of_pinhole(plain, 0), points).sheets,
         "free planes": fit_planes(points, stripes, direction, 0.0).planes,
         "chosen by held-out boards": fit_light_sheets(points, stripes, direction).sheets,
         "pinhole (2 x 4, stripes)": pinhole.planes(stripes, direction),

@@ -33,9 +33,12 @@ PROJECT = Path(__file__).parents[1]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The slow files first, then those with some slow tests; the quick ones fill the end evenly."""
+    partly = {item.path for item in items if item.get_closest_marker("slow")}
+
     def place(item: pytest.Item) -> int:
         path = item.path.relative_to(Path(__file__).parent).as_posix()
-        return SLOW.index(path) if path in SLOW else len(SLOW)
+        return SLOW.index(path) if path in SLOW else len(SLOW) + (item.path not in partly)
 
     for item in items:
         if place(item) < len(SLOW):
@@ -60,15 +63,26 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
 
 
 @pytest.fixture(scope="session")
-def cleaned(scan: Scan) -> list[RangeImage]:
-    return clean(scan.range_images, scan.rig_from_camera, load_rig().volume)
+def cleaned(scan: Scan, tmp_path_factory: pytest.TempPathFactory) -> list[RangeImage]:
+    def make() -> list[RangeImage]:
+        return clean(scan.range_images, scan.rig_from_camera, load_rig().volume)
+
+    return value_made_once(tmp_path_factory, "cleaned", make)
 
 
 @pytest.fixture(scope="session")
-def cloud(scan: Scan, cleaned: list[RangeImage]) -> BodyCloud:
-    return merge(cleaned, scan.rig_from_camera, FusionSettings(points=250_000)).cloud
+def cloud(
+    scan: Scan, cleaned: list[RangeImage], tmp_path_factory: pytest.TempPathFactory
+) -> BodyCloud:
+    def make() -> BodyCloud:
+        return merge(cleaned, scan.rig_from_camera, FusionSettings(points=250_000)).cloud
+
+    return value_made_once(tmp_path_factory, "cloud", make)
 
 
 @pytest.fixture(scope="session")
-def body(scan: Scan, cloud: BodyCloud) -> BodyMesh:
-    return mesh(cloud, MeshSettings(depth=8), scan.range_images, scan.rig_from_camera)
+def body(scan: Scan, cloud: BodyCloud, tmp_path_factory: pytest.TempPathFactory) -> BodyMesh:
+    def make() -> BodyMesh:
+        return mesh(cloud, MeshSettings(depth=8), scan.range_images, scan.rig_from_camera)
+
+    return value_made_once(tmp_path_factory, "body", make)

@@ -58,4 +58,5 @@ def smooth_part(points: Array, values: Array, degree: int = DEGREE) -> Array:
     rows = legendre.legvander2d(place[:, 0], place[:, 1], [degree, degree])
     total = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)).ravel()
     rows = rows[:, total <= degree]
-    return np.asarray(rows @ np.linalg.lstsq(rows, values, rcond=None)[0], np.float64)
+    # Products of Legendre polynomials are all but orthogonal: their normal equations lose nothing.
+    return np.asarray(rows @ np.linalg.lstsq(rows.T @ rows, rows.T @ values)[0], np.float64)

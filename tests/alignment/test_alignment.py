@@ -166,6 +166,7 @@ def test_a_rig_is_refined_on_a_still_object(
         refine_on_object([i for i in images if i.pair in ("p0", "p2")], start, prior)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("matching", ["projected", "open3d"])
 def test_threads_change_nothing(
     scanned: tuple[list[RangeImage], dict[str, RigidTransform]],

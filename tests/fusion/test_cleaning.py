@@ -19,7 +19,7 @@ NOISE_MM = 0.3
 
 def distances(scan: Scan, images: list[RangeImage]) -> np.ndarray:
     points = [
-        scan.rig_from_camera[i.pair].apply(i.points[i.valid][::5].astype(float)) for i in images
+        scan.rig_from_camera[i.pair].apply(i.points[i.valid][::15].astype(float)) for i in images
     ]
     return np.abs(signed_distances(np.concatenate(points), scan.truth.vertices, scan.truth.faces))
 

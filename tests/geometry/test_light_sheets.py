@@ -85,6 +85,7 @@ def test_depth_and_its_slope(seed: int) -> None:
         assert np.allclose(model.depth_per_stripe(rays, s)[inside], slope[inside], rtol=1e-5)
 
 
+@pytest.mark.slow
 @settings(max_examples=2, deadline=None)
 @given(st.integers(0, 10_000))
 def test_variance_is_that_of_sheets_drawn_from_the_covariance(seed: int) -> None:

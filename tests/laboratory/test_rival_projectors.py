@@ -54,7 +54,7 @@ def worst_offset(found: LightPlanes, true: LightPlanes) -> float:
 @pytest.mark.parametrize("tilt_deg", [0.0, 1.5])
 def test_an_invariable_baseline_is_found(tilt_deg: float) -> None:
     true = baseline_planes(160.0, tilt_deg)
-    points = mirror_points(stripe=stripe_of(true), every_px=16)
+    points = mirror_points(stripe=stripe_of(true), every_px=32)
     found = fit_invariable_baseline(points, STRIPES, "vertical")
     # Points come from an iteration that ends at 1e-7 of a stripe.
     assert worst_offset(found, true) < 1e-4
@@ -65,7 +65,7 @@ def test_an_invariable_baseline_is_found(tilt_deg: float) -> None:
 
 def test_a_variable_baseline_is_found_and_an_invariable_one_misses_it() -> None:
     true = baseline_planes(BASELINES, 1.5)
-    points = mirror_points(stripe=stripe_of(true), every_px=16)
+    points = mirror_points(stripe=stripe_of(true), every_px=32)
     assert worst_offset(fit_variable_baseline(points, STRIPES, "vertical"), true) < 1e-4
     # 15 mm of change in the baseline, half of it within the boards: the best single baseline is
     # off by some 3 of 160 mm at their ends, which angles make up for at one depth only.
@@ -74,7 +74,7 @@ def test_a_variable_baseline_is_found_and_an_invariable_one_misses_it() -> None:
 
 def test_tilted_light_needs_a_tilted_model() -> None:
     true = baseline_planes(160.0, 1.5)
-    points = mirror_points(stripe=stripe_of(true), every_px=16)
+    points = mirror_points(stripe=stripe_of(true), every_px=32)
     straight = fit_invariable_baseline(points, STRIPES, "vertical", fit_tilt=False)
     # tan 1.5 degrees over 20 mm (0.05 of 400) is 0.5 mm across, over tan of some 20 degrees.
     assert worst_offset(straight, true) > 0.5
@@ -82,7 +82,7 @@ def test_tilted_light_needs_a_tilted_model() -> None:
 
 def test_outliers_lose_their_weight() -> None:
     true = baseline_planes(160.0)
-    points = mirror_points(stripe=stripe_of(true), every_px=8, noise_px=0.02)
+    points = mirror_points(stripe=stripe_of(true), every_px=16, noise_px=0.02)
     points.points[::50] += [3.0, 0.0, 0.0]
     found = fit_invariable_baseline(points, STRIPES, "vertical")
     # Unweighted they would move every angle by 3 / 50 = 0.06 mm across, 0.15 mm in depth.
@@ -109,7 +109,7 @@ def test_horizontal_stripes_are_the_same_turned() -> None:
 def test_equal_angles_through_one_line_need_a_new_index() -> None:
     # Stripes at equal angles from one centre: no slide has them evenly, a re-mapped one does.
     true = baseline_planes(160.0)
-    points = mirror_points(stripe=stripe_of(true), every_px=16)
+    points = mirror_points(stripe=stripe_of(true), every_px=32)
     s = points.index.astype(float)
     found = fit_remapped_pinhole(points.points, s, STRIPES, "vertical")
     # tan over 36 degrees: its part of the sixth power in the index is left, below 0.01 mm.

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from small_pair import CAMERA, STRIPES, pair, planes, stripe_map
 
@@ -66,6 +66,7 @@ def some_s(seed: int, rising: bool) -> Floats:
 
 
 @pytest.mark.slow
+@settings(max_examples=40)
 @given(
     st.floats(400.0, 800.0),
     st.floats(-3.0, 3.0),

@@ -54,7 +54,7 @@ def test_sigmas_of_positions_are_honest() -> None:
 @pytest.mark.slow
 def test_wrong_views_are_found_and_named() -> None:
     placings, cameras = ring_of_cameras()
-    views, _ = ring_views(placings, cameras)
+    views, _ = ring_views(placings, cameras, shots=24)
     clean = rms(centre_errors(solve_rig(ring_rig(placings), views, cameras).value, placings))
     number = next(i for i, v in enumerate(views) if v.pair == "p2-2" and len(v.pixels) > 30)
     shuffled = views[number].pixels.copy()

@@ -333,6 +333,7 @@ def test_frame_names() -> None:
     assert names.of_kind(INVERSE, 3) == ("a", "b", "c")
 
 
+@pytest.mark.slow
 @given(
     st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),

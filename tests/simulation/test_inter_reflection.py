@@ -94,6 +94,7 @@ def test_what_stands_between_keeps_the_light_away() -> None:
         assert (found > 0.2).all() if expected is None else (found == expected).all()
 
 
+@pytest.mark.slow
 def test_images_with_light_between_surfaces() -> None:
     """Off, they are as they were to the last bit; on, all light still adds up and some is added."""
     side = grid_surface(

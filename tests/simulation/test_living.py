@@ -186,9 +186,10 @@ def test_what_moves_is_seen_where_it_is_when_each_frame_is_taken() -> None:
     places = {name: 5.0 * k for k, name in enumerate(render(0.0))}
     images = render(0.0, Moving(1, lambda frame: scene(places[frame]), 70.0))
     for frame, place in places.items():
-        expected = render(place)[frame]
+        still = render(place)
+        expected = still[frame]
         # The wall under the square's shadow is lit as where the square was at first.
-        there = render(place)["dark"] > 5.0  # ambient 8 on the square, 1 on the wall
+        there = still["dark"] > 5.0  # ambient 8 on the square, 1 on the wall
         assert there.any()
         np.testing.assert_allclose(images[frame][there], expected[there], atol=1e-4)
         assert np.count_nonzero((images["dark"] > 5.0) != there) > 0 or frame == "dark"

@@ -416,7 +416,7 @@ def test_a_real_scan_lies_on_the_cloud_that_came_with_it(captures: Path, tmp_pat
     assert len(found) > 0.99 * told.sum()
     cloud = o3d.io.read_point_cloud(str(folder / "scan_0020_cloud.ply"))
     theirs = np.asarray(cloud.points) * [1.0, -1.0, -1.0]
-    assert np.median(cKDTree(found).query(theirs)[0]) < 0.11
+    assert np.median(cKDTree(found).query(theirs[::20])[0]) < 0.11
     # Half a projector pixel beside it would be 0.4 mm in depth.
     pixels = np.round(pair.camera.project(theirs)).astype(int)
     depth = points[pixels[:, 1], pixels[:, 0], 2]

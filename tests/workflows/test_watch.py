@@ -55,7 +55,6 @@ def feed(person: Path, scan: Path) -> None:
         shutil.copyfile(path, place)
 
 
-@pytest.mark.slow
 def test_what_arrives_is_fused_as_a_batch_would_and_never_twice(example: Path, day: Path) -> None:
     (day / "inbox").mkdir()
     process = watch(day, "out")
@@ -96,7 +95,6 @@ def _bytes(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): file_hash(path) for path in paths}
 
 
-@pytest.mark.slow
 def test_a_calibration_that_cannot_be_used_is_said_at_once(tmp_path: Path) -> None:
     shutil.copytree(STORED, tmp_path / "calibration")
     (tmp_path / "calibration" / "calibration.npz").write_bytes(b"no arrays")
