@@ -23,6 +23,7 @@ from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.regions import DARK_CLOTH, HAIR, SKIN, UNSURE
+from bodyscan.progress import threaded
 from bodyscan.reconstruction.range_image import RangeImage
 
 DARK, DIM = 1 / 3, 1 / 2
@@ -159,14 +160,17 @@ def _texture(
     window_mm: float,
 ) -> _Texture:
     """Of what is dark, and of the head; elsewhere neither is told."""
-    asked, found = dark | head, []
-    for image in range_images:
+    asked = dark | head
+
+    def looked_at(image: RangeImage) -> Misfits | None:
         valid, at = image.valid, rig_from_camera[image.pair]
         wanted = np.zeros(valid.shape, bool)
         wanted[valid] = asked[cells.find(at.apply(image.points[valid].astype(np.float64)))]
         box = crop_of(wanted)
-        if box is not None:
-            found.append(misfits(image, at, box, window_mm))
+        return None if box is None else misfits(image, at, box, window_mm)
+
+    each = threaded(looked_at, range_images, stage="naming regions")
+    found = [one for one in each if one is not None]
     if not found:
         nowhere = np.zeros(cells.count, bool)
         return _Texture(nowhere, nowhere, nowhere)
