@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
@@ -34,6 +35,11 @@ class BoundaryPoints:
     points: Array
     per_pixel: Array
     sigma_px: Array
+
+    @cached_property
+    def board_errors(self) -> BoardErrors:
+        """From the points themselves, which lie on their boards."""
+        return _board_errors(self)
 
 
 def points_on_board(
@@ -124,8 +130,7 @@ class BoardErrors:
     facing: Array
 
 
-def board_errors(data: BoundaryPoints) -> BoardErrors:
-    """From the points themselves, which lie on their boards."""
+def _board_errors(data: BoundaryPoints) -> BoardErrors:
     _, board = np.unique(data.board, return_inverse=True)
     count = np.bincount(board)[:, None]
     centred = data.points - (_by_board(data.points, board) / count)[board]

@@ -9,7 +9,6 @@ import numpy as np
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
-    board_errors,
     boundary_points,
     concatenate,
     points_on_board,
@@ -140,7 +139,7 @@ def _covariance(
 
 def _board_pull(planes: Array, data: BoundaryPoints, weights: Array) -> Array:
     """(S + 1, boards, 4, 3): the pull of 1 mm of each board error at each plane."""
-    errors = board_errors(data)
+    errors = data.board_errors
     off = np.sum(planes[data.index, :3] * errors.along_ray, axis=1)
     effects = np.nan_to_num(off * weights)[:, None] * errors.effects
     homogeneous = np.column_stack([data.points, np.ones(len(data.points))])

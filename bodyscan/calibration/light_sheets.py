@@ -12,9 +12,9 @@ from bodyscan.calibration.light_planes import PlaneFit, fit_light_planes
 from bodyscan.calibration.model_selection import (
     Candidate,
     HeldOutModel,
-    folds,
     hold_out,
     select_model,
+    split,
 )
 from bodyscan.calibration.pinhole_projector import fit_pinhole
 from bodyscan.calibration.sheet_fit import SheetFit, fit_sheets
@@ -79,10 +79,10 @@ def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> She
     starts = smooth_models(few, stripes, direction)
     candidates = [_smooth_candidate(name, start) for name, start in starts]
     candidates.append(_planes_candidate(stripes, direction))
-    fold = folds(few)
-    tried = [hold_out(candidate, few, fold) for candidate in candidates]
+    folds = split(few)
+    tried = [hold_out(candidate, few, folds) for candidate in candidates]
     chosen, figures = select_model(candidates, tried, few)
-    error = tried[chosen].board_error_mm(few)
+    error = tried[chosen].board_error_mm(few, folds)
     fit: SheetFit[SmoothSheets] | PlaneFit
     sheets: LightSheets
     if chosen < len(starts):

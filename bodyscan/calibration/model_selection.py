@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array, Indices, Mask
-from bodyscan.calibration.boundary_points import BoundaryPoints, board_errors, select
+from bodyscan.calibration.boundary_points import BoundaryPoints, select
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, spread
@@ -61,22 +61,41 @@ class HeldOutModel:
 
 
 @dataclass(frozen=True, eq=False)
+class Fold:
+    """left_out: (N,) the points that are measured.  rest: the others, which models are fitted to."""
+
+    left_out: Mask
+    rest: BoundaryPoints
+
+
+@dataclass(frozen=True, eq=False)
 class HeldOutErrors:
     """distances: (N,) mm of the measured points from their boards, NaN where not measured.
 
-    unit_variance: (N,) mm^2, what they would be if boards were known to 1 mm (see `BoardErrors`).
+    sheets: fitted without each fold.
     """
 
     distances: Array
-    unit_variance: Array
+    sheets: tuple[LightSheets, ...]
 
-    def board_error_mm(self, data: BoundaryPoints) -> float:
+    def unit_variance(self, data: BoundaryPoints, folds: Sequence[Fold]) -> Array:
+        """(N,) mm^2, what the distances would be if boards were known to 1 mm (see `BoardErrors`)."""
+        errors = data.board_errors
+        variance = np.sum(errors.effects**2, axis=1)
+        for fold, sheets in zip(folds, self.sheets, strict=True):
+            rays, s, _ = _measured(data, fold)
+            own = sheets.variance_mm2(rays, s, sheets.depth(rays, s))
+            variance[fold.left_out] += own * errors.facing[fold.left_out] ** 2
+        return variance
+
+    def board_error_mm(self, data: BoundaryPoints, folds: Sequence[Fold]) -> float:
         """How far out of place boards must be, for distances as large as these are.
 
         data: the points that were held out. Their own noise, seen in how neighbours on a boundary
         differ, is taken off.
         """
-        known = np.isfinite(self.distances) & np.isfinite(self.unit_variance)
+        unit_variance = self.unit_variance(data, folds)
+        known = np.isfinite(self.distances) & np.isfinite(unit_variance)
         squared = self.distances[known] ** 2
         if not squared.size:
             return 0.0
@@ -87,34 +106,36 @@ class HeldOutErrors:
         steps = steps[np.isfinite(steps)]
         noise = 0.5 * spread(steps) ** 2 if steps.size else 0.0
         left = max(total - noise, LEAST_SHARE * total)
-        return float(np.sqrt(left / self.unit_variance[known].mean()))
+        return float(np.sqrt(left / unit_variance[known].mean()))
 
 
-def folds(data: BoundaryPoints) -> Indices:
-    """(N,) number of the group in which each point is held out: its board, or one of MOST_FOLDS
-    groups of boards; with only two boards, a half of one."""
+def split(data: BoundaryPoints) -> list[Fold]:
+    """The points, each left out once: by boards, in MOST_FOLDS groups at most; with only two boards, by
+    halves of one."""
     boards, number = np.unique(data.board, return_inverse=True)
     if len(boards) > 2:
-        return number % MOST_FOLDS
-    half = board_errors(data).effects[:, 2] > 0.0
-    return 2 * number + half
+        group = number % MOST_FOLDS
+    else:
+        group = 2 * number + (data.board_errors.effects[:, 2] > 0.0)
+    return [Fold(group == k, select(data, group != k)) for k in np.unique(group)]
 
 
-def hold_out(candidate: Candidate, data: BoundaryPoints, fold: Indices) -> HeldOutErrors:
+def hold_out(candidate: Candidate, data: BoundaryPoints, folds: Sequence[Fold]) -> HeldOutErrors:
     """Fit without each fold in turn, and measure what was left out."""
-    distances, variance = np.full((2, len(fold)), np.nan)
-    errors = board_errors(data)
-    own = np.sum(errors.effects**2, axis=1)
-    for number in np.unique(fold):
-        left_out = fold == number
-        sheets = candidate.fit(select(data, ~left_out))
-        points, s = data.points[left_out], data.index[left_out].astype(float)
-        rays, facing = points / points[:, 2:], errors.facing[left_out]
-        depth = sheets.depth(rays, s)
-        distances[left_out] = (depth - points[:, 2]) * facing
-        sheets_own = sheets.variance_mm2(rays, s, depth) * facing**2
-        variance[left_out] = own[left_out] + sheets_own
-    return HeldOutErrors(distances, variance)
+    distances, fitted = np.full(len(data.index), np.nan), []
+    for fold in folds:
+        sheets = candidate.fit(fold.rest)
+        rays, s, depth = _measured(data, fold)
+        facing = data.board_errors.facing[fold.left_out]
+        distances[fold.left_out] = (sheets.depth(rays, s) - depth) * facing
+        fitted.append(sheets)
+    return HeldOutErrors(distances, tuple(fitted))
+
+
+def _measured(data: BoundaryPoints, fold: Fold) -> tuple[Array, Array, Array]:
+    """Of the points left out: rays (n, 3) with z = 1, s (n,), and their own depth (n,) mm."""
+    points, s = data.points[fold.left_out], data.index[fold.left_out].astype(float)
+    return points / points[:, 2:], s, points[:, 2]
 
 
 def select_model(
@@ -130,7 +151,7 @@ def select_model(
     """
     medians = [_median(np.abs(errors.distances)) for errors in tried]
     cap = CAP * min(medians)
-    part, effects, board = parts_of_boards(data), board_errors(data).effects, data.board
+    part, effects, board = parts_of_boards(data), data.board_errors.effects, data.board
     seen = [
         np.isfinite(errors.distances) | candidate.everywhere
         for candidate, errors in zip(candidates, tried, strict=True)
@@ -166,7 +187,7 @@ def select_model(
 
 def parts_of_boards(data: BoundaryPoints) -> Indices:
     """(N,) number of the ninth of its board in which each point lies."""
-    across, down = (np.digitize(place, THIRDS) for place in board_errors(data).effects[:, 1:].T)
+    across, down = (np.digitize(place, THIRDS) for place in data.board_errors.effects[:, 1:].T)
     _, board = np.unique(data.board, return_inverse=True)
     return np.asarray(9 * board + 3 * across + down, np.int64)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.board_form import BoardForm
-from bodyscan.calibration.boundary_points import BoundaryPoints, board_errors, concatenate
+from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
 from bodyscan.calibration.camera import CameraCalibration, fit_camera, locate_board
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain, shared_weights
 from bodyscan.calibration.joint_refinement import (
@@ -177,7 +177,7 @@ def _hold_out(
             for k in held:
                 off, corners[way][k] = _off_board(one, boards[k], fit)
                 stripes[way][data.board == k] = off
-    effects = board_errors(data).effects
+    effects = data.board_errors.effects
     cap = CAP * min(float(np.nanmedian(np.abs(values))) for values in stripes)
     capped = (np.clip(np.nan_to_num(values, nan=cap), -cap, cap) for values in stripes)
     still = [without_motion(values, effects, data.board)[:, None] for values in capped]

@@ -8,9 +8,9 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.boundary_points import BoundaryPoints, board_errors
+from bodyscan.calibration.boundary_points import BoundaryPoints
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
-from bodyscan.geometry.smooth_sheets import Offset, SmoothSheets
+from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 Sheets = TypeVar("Sheets", bound=SmoothSheets)
 
@@ -65,7 +65,7 @@ def fit_sheets(
         damping=1e-6,
     )
     sheets, points = solution.state, solution.blocks[0]
-    by_point = _offset(sheets, data).by_point
+    by_point = sheets.offset(data.points, sheets.at(data.index.astype(float))).by_point
     covariance = solution.covariance
     if board_error_mm > 0.0:
         covariance = covariance + _of_boards(solution, data, by_point, board_error_mm)
@@ -80,7 +80,8 @@ def fit_sheets(
 def _blocks(sheets: SmoothSheets, data: BoundaryPoints) -> tuple[Block, Block]:
     """The points' offsets over what their pixels' error is worth there, and the model's prior."""
     with np.errstate(all="ignore"):
-        offset = _offset(sheets, data)
+        at = sheets.at(data.index.astype(float))
+        offset = sheets.offset(data.points, at, parameters=True)
     by_parameter = offset.by_parameter
     assert by_parameter is not None
     leverage = np.abs(np.einsum("ni,ni->n", offset.by_point, data.per_pixel))
@@ -95,16 +96,12 @@ def _blocks(sheets: SmoothSheets, data: BoundaryPoints) -> tuple[Block, Block]:
     )
 
 
-def _offset(sheets: SmoothSheets, data: BoundaryPoints) -> Offset:
-    return sheets.offset(data.points, sheets.at(data.index.astype(float)), parameters=True)
-
-
 def _of_boards(
     solution: Solution[Sheets], data: BoundaryPoints, by_point: Array, board_error_mm: float
 ) -> Array:
     """What each board's error on its own adds to the covariance (a sandwich, boards as clusters)."""
     points, noise = solution.blocks[0], solution.covariance
-    errors = board_errors(data)
+    errors = data.board_errors
     off = np.einsum("ni,ni->n", by_point, errors.along_ray)
     weights = solution.weights[0] / (points.sigma * solution.spreads[0]) ** 2
     effects = errors.effects * (off * weights)[:, None]

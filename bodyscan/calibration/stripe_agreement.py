@@ -10,7 +10,6 @@ import numpy as np
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
-    board_errors,
     select,
     subsample,
 )
@@ -88,7 +87,7 @@ def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
     stripes: median along its normal, positive away from the camera."""
     rays = data.points / data.points[:, 2:]
     depth = intersect_rays(sheets, rays, data.index.astype(float)).depth
-    off = (depth - data.points[:, 2]) * board_errors(data).facing
+    off = (depth - data.points[:, 2]) * data.board_errors.facing
     known = np.isfinite(off)
     off, board = off[known], data.board[known]
     return np.array([np.median(off[board == k]) for k in np.unique(board)], np.float64)

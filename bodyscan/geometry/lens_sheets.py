@@ -141,6 +141,8 @@ def _frame_and_scale(above: Array, below: Array, x: float) -> tuple[RigidTransfo
     down = above[:3] - centre * axis
     focal = float(np.linalg.norm(down))
     down = down / focal
-    rotation = np.stack([np.cross(down, axis), down, axis])
+    (a, b, c), (p, q, r) = down, axis
+    along = [b * r - c * q, c * p - a * r, a * q - b * p]  # a product of two: np.cross is slow
+    rotation = np.array([along, down, axis])
     translation = np.array([x, (above[3] - centre * below[3]) / focal, below[3]])
     return RigidTransform(rotation, translation), np.array([focal, centre])
