@@ -27,7 +27,7 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.progress import threaded
 
-PART_MM = 350.0  # how far what moves as one reaches: an arm, a thigh, a shoulder girdle
+PART_MM = 250.0  # how far what moves as one reaches: a forearm, half a thigh, a shoulder
 LEAST_PART = 0.02
 ARM_MM = 400.0  # at which a part's turn displaces as much as its shift
 FIRST_MM = 1.0
@@ -40,6 +40,9 @@ explain most of a breath too, so that evidence alone makes it too small: there i
 PARTS_MM = 0.5
 """By so much parts above the legs may have moved where nothing was seen of it, a third of a breath:
 evidence sizes the parts of the whole body at once, and legs that stood still say nothing of a hip."""
+APART_MM = 0.07
+"""By so much two pairs' surfaces lie apart in a cell for no motion of the body: calibrations bend by
+0.05 mm each, which no number of matches averages out."""
 ANY = 0.1
 """Of what is usual; a statue that sways shows a thirtieth, calibrations bend by less."""
 
@@ -106,8 +109,8 @@ class BodyMotion:
         stance, pairs = Courses.of(of_stance, seconds), len(seconds)
         by_freedom = np.arange(6 * pairs).reshape(pairs, 6).T.ravel()
         known = invert_scaled(boards)[np.ix_(by_freedom, by_freedom)]
-        part = rigid_fields(cells, cells.centres.mean(axis=0), ARM_MM)
-        any_part = modulated(part, cells, cells.alike(PART_MM, LEAST_PART))
+        shifts = rigid_fields(cells, np.zeros(3), ARM_MM)[:, :, 3:]
+        any_part = modulated(shifts, cells, cells.alike(PART_MM, LEAST_PART))
         breath = breath_fields(cells)
         kinds = (
             Kind("pose", rigid_fields(cells, np.zeros(3), 1.0), Courses.steady(pairs), 1.0, known),
@@ -173,7 +176,7 @@ class BodyMotion:
 
         def asked_of(overlap: tuple[tuple[int, int], CellEvidence]) -> tuple[Array, Array]:
             (a, b), seen = overlap
-            return self._asked(seen, now[a] - now[b])
+            return self._asked(seen.doubted(APART_MM), now[a] - now[b])
 
         asked = threaded(asked_of, evidence.items(), stage="aligning")
         asked += threaded(lambda told: told.asked(fields), speeds.values(), stage="aligning")

@@ -46,6 +46,18 @@ class CellEvidence:
         """The same with first and second exchanged."""
         return CellEvidence(self.cells, self.information, -self.gradient)
 
+    def doubted(self, misfit_mm: float) -> CellEvidence:
+        """Believed less, as no motion of the body explains more of a cell than up to this."""
+        share = 1.0 / (1.0 + misfit_mm**2 * self._weight)
+        return CellEvidence(
+            self.cells, self.information * share[:, None, None], self.gradient * share[:, None]
+        )
+
+    @property
+    def _weight(self) -> Array:
+        """(c,) 1/variance of a shift along the surface's normals."""
+        return np.asarray(np.trace(self.information[:, :3, :3], axis1=1, axis2=2))
+
     @staticmethod
     def total(parts: Sequence[CellEvidence]) -> CellEvidence:
         cells = np.unique(np.concatenate([part.cells for part in parts]))
