@@ -19,6 +19,7 @@ from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.pair import Pair
+from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.workflows.evaluate import load_truth
 
@@ -33,9 +34,21 @@ PLANES_MM = 0.03
 def calibration_from_truth(workspace: Path, seed: int = 0) -> RigCalibration:
     """workspace: what `simulate` wrote with projectors of kind `mirror` without smile.  The same
     seed gives the same errors; all workspaces of a rig have the same truth."""
+    rig, truth = load_rig(workspace / "rig.yaml"), load_truth(workspace / "truth")
+    return calibration_from_facts(rig, truth.facts["pairs"], seed)
+
+
+def calibration_from_facts(
+    rig: Rig,
+    truth: Mapping[str, Any],
+    seed: int,
+    *,
+    shift_mm: float = SHIFT_MM,
+    turn_deg: float = TURN_DEG,
+) -> RigCalibration:
+    """truth: `pairs` of truth.json.  shift_mm, turn_deg: of each place, for each axis."""
     rng = np.random.default_rng(seed)
-    rig, truth = load_rig(workspace / "rig.yaml"), load_truth(workspace / "truth").facts["pairs"]
-    sigmas = np.repeat([np.radians(TURN_DEG), SHIFT_MM], 3)
+    sigmas = np.repeat([np.radians(turn_deg), shift_mm], 3)
     pairs, placed, covariances = {}, {}, []
     to_rig = adjoint(MIDDLE)
     for pair in rig.pairs:

@@ -1,0 +1,147 @@
+"""People cast by rays: how exact scans of people who move are, and how well they repeat."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.cast_people import SCALE, STANCE_DEG, STANCE_MM, cast_person
+from bodyscan.arrays import Array
+from bodyscan.evaluation.body import WHOLE, true_girths
+from bodyscan.evaluation.comparison import fit_to_surface
+from bodyscan.evaluation.surface import normalized_errors, signed_distances
+from bodyscan.fusion.scan import fuse
+from bodyscan.geometry.robust import rms
+from bodyscan.measurement.measurements import Measurements, measure
+from bodyscan.outcome import Outcome
+from bodyscan.progress import THREADS
+from bodyscan.settings import ScanSettings
+
+WOMAN, MAN = "woman_average", "man_average"
+THREE, FOUR = "three-pole-12", "four-pole-16"
+PEOPLE = ((THREE, WOMAN, 21), (THREE, MAN, 22), (FOUR, WOMAN, 23), (FOUR, MAN, 24))
+PRESETS = ("standing", "restless")
+SCANS = range(31, 41)
+ARMPITS = 0.75
+"""Of the stature: above, what counts as trunk depends on where the arms hang."""
+Job = tuple[str, str, str, int]
+"""Rig, subject, preset, seed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """errors_mm, over_sigmas: (N,) of the cloud, laid onto the body of the scan's moment.  girths_mm:
+    by the number of its height, as a tape runs, at mean breath; true_mm: of the body then.  grade: the
+    verdict."""
+
+    errors_mm: Array
+    over_sigmas: Array
+    girths_mm: dict[int, float]
+    true_mm: dict[int, float]
+    grade: str
+
+    @property
+    def girth_errors_mm(self) -> Array:
+        return np.array([ours - self.true_mm[at] for at, ours in self.girths_mm.items()])
+
+
+def report() -> str:
+    """The section of docs/results.md: minutes."""
+    people = [[(rig, who, preset, seed) for rig, who, seed in PEOPLE] for preset in PRESETS]
+    repeated = [[(THREE, who, "standing", seed) for seed in SCANS] for who in (WOMAN, MAN)]
+    asked = [job for jobs in (*people, *repeated) for job in jobs]
+    with ProcessPoolExecutor(THREADS, multiprocessing.get_context("spawn")) as pool:
+        found = dict(zip(asked, pool.map(scan_person, asked), strict=True))
+    rows = [_row(job, found[job]) for jobs in people for job in jobs]
+    totals = [
+        _total(p, [found[job] for job in jobs]) for p, jobs in zip(PRESETS, people, strict=True)
+    ]
+    spreads = [_spread(jobs[0][1], [found[job] for job in jobs]) for jobs in repeated]
+    return f"""## People cast by rays: exactness and repeatability (synthetic)
+
+No images: depths of the simulator's people are cast at {SCALE:g} of full size as each pair finds them,
+pair after pair; noise, speeds and calibration are off by what those of rendered scans are
+(`benchmarks/cast_people.py`). Cleaning, alignment, following, cloud, mesh and measurement are the
+real ones. The cloud against the body at the scan's moment, laid rigidly onto it; tape girths of the
+trunk below the armpits, every 20 mm, against mean breath.
+
+| person | bias, RMS, 95 % mm | error over sigma | beyond three | girths RMS, worst mm | verdict |
+|---|---|---|---|---|---|
+{chr(10).join([*rows, *totals])}
+
+{len(SCANS)} scans of one person on three poles, `standing`, each with a new stance (by some
+{STANCE_DEG:g} degrees and {STANCE_MM:g} mm), a new breath and a rig built and calibrated
+anew. Of girths: standard deviation over the scans, RMS and worst of all heights; errors, RMS, worst.
+
+| person | girths' spread mm | errors mm | cloud RMS mm | error over sigma | beyond three | good |
+|---|---|---|---|---|---|---|
+{chr(10).join(spreads)}
+"""
+
+
+def scan_person(job: Job) -> Found:
+    """Cast, fused, measured."""
+    cast = cast_person(*job)
+    scan = fuse(cast.calibration, Outcome(cast.images), ScanSettings())
+    vertices, faces = cast.vertices(), cast.faces
+    points = fit_to_surface(scan.cloud.points, vertices, faces).apply(scan.cloud.points)
+    errors = signed_distances(points, vertices, faces)
+    true = true_girths(cast.vertices(breathing=False), faces)
+    ours = measure(scan.mesh, [one.height_mm for one in true.slices])
+    over = errors / scan.cloud.sigma_mm
+    return Found(errors, over, _tapes(ours), _tapes(true), scan.verdict.grade)
+
+
+def _tapes(measured: Measurements) -> dict[int, float]:
+    """Around the trunk below the armpits, where it was measured."""
+    below = [one for one in measured.slices if one.height_mm < ARMPITS * measured.stature_mm]
+    trunks = {number: one.of("trunk") for number, one in enumerate(below)}
+    return {
+        number: trunk.tape_mm
+        for number, trunk in trunks.items()
+        if trunk is not None and trunk.measured > WHOLE
+    }
+
+
+def _row(job: Job, found: Found) -> str:
+    rig, who, preset, seed = job
+    return f"| {preset}, {who}, {rig}, seed {seed} | {_figures([found])} | {found.grade} |"
+
+
+def _total(preset: str, found: Sequence[Found]) -> str:
+    good = sum(one.grade == "good" for one in found)
+    return f"| **{preset}, all** | {_figures(found)} | {good} of {len(found)} good |"
+
+
+def _figures(found: Sequence[Found]) -> str:
+    errors = np.concatenate([one.errors_mm for one in found])
+    girths = np.concatenate([one.girth_errors_mm for one in found])
+    return (
+        f"{errors.mean():+.3f}, {rms(errors):.3f}, {np.percentile(np.abs(errors), 95.0):.3f} | "
+        f"{_over_sigmas(found)} | {rms(girths):.2f}, {np.abs(girths).max():.2f}"
+    )
+
+
+def _over_sigmas(found: Sequence[Found]) -> str:
+    """As `evaluate` has them."""
+    spread, beyond = normalized_errors(
+        np.concatenate([one.over_sigmas for one in found]), np.ones(())
+    )
+    return f"{spread:.2f} | {100.0 * beyond:.1f} %"
+
+
+def _spread(who: str, found: Sequence[Found]) -> str:
+    shared = set.intersection(*(set(one.girths_mm) for one in found))
+    girths = np.array([[one.girths_mm[at] for at in sorted(shared)] for one in found])
+    spread = girths.std(axis=0, ddof=1)
+    errors = np.concatenate([one.girth_errors_mm for one in found])
+    cloud = rms(np.concatenate([one.errors_mm for one in found]))
+    good = sum(one.grade == "good" for one in found)
+    return (
+        f"| {who} | {rms(spread):.2f}, {spread.max():.2f} | {rms(errors):.2f}, "
+        f"{np.abs(errors).max():.2f} | {cloud:.3f} | {_over_sigmas(found)} | {good} of {len(found)} |"
+    )
