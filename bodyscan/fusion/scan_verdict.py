@@ -231,7 +231,8 @@ def _shifted(steps: Sequence[PoleStep]) -> Iterator[Finding]:
             "repeat" if len(step.pairs) == 1 or len(steps) > 1 else "usable",
             f"{step.name} stands {step.shift_mm:.1f} mm from where the calibration has it, turned by "
             f"{step.turn_deg:.2f} degrees, by itself and at once, as no person moves: it was moved "
-            "since, and brought to the others here; calibrate again",
+            "since, and brought to the others here; calibrate again, unless `timing` of captures.yaml "
+            "is wrong",
         )
 
 

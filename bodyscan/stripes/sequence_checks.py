@@ -178,7 +178,8 @@ def check_codes(
         "the patterns do not make a stripe code: " + "; ".join(found or ["no order in them"]),
         remedy="it would fit if " + ", or if ".join(causes)
         if causes
-        else "see whether frames are in their order",
+        else "see whether frames are in their order, whether the first bit is missing among them, and "
+        "whether `stripes` and `first_code` are right",
     )
 
 

@@ -85,6 +85,18 @@ def test_a_frame_taken_twice_or_missing_is_named(good: Sequence, bit: int) -> No
             read(with_frame(good, "inverses", bit, good.patterns[bit + 1]))
 
 
+def test_half_of_the_stripes_without_their_first_bit_is_no_wrong_order(good: Sequence) -> None:
+    """Codes of the other half read as stripes beyond the last, or count back."""
+    half = replace(good, patterns=good.patterns[1:], inverses=good.inverses[1:])
+    with pytest.raises(DecodingFailed) as refused:
+        decode_gray(
+            half.lit, half.dark, half.patterns, half.inverses,
+            stripes=STRIPES // 2, direction="horizontal",
+        )  # fmt: skip
+    assert refused.value.remedy is not None
+    assert re.search("first bit is missing|bit 0 is missing", refused.value.remedy)
+
+
 def test_a_bit_in_place_of_another_is_noticed(good: Sequence) -> None:
     order = [0, 1, 2, 4, 4, 5, 6]
     with pytest.raises(DecodingFailed, match="do not make a stripe code"):
