@@ -8,6 +8,7 @@ from ray_cast_scan import Scan, scene_of
 from scipy.spatial import cKDTree
 from surface_coverage import coverage
 
+from bodyscan.arrays import Array
 from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.surface import deviation, sample_surface, signed_distances
 from bodyscan.fusion.merging import merge
@@ -19,9 +20,15 @@ from bodyscan.settings import FusionSettings
 SETTINGS = FusionSettings(points=250_000)
 
 
-def test_the_cloud_lies_on_the_body(scan: Scan, cloud: BodyCloud) -> None:
+@pytest.fixture(scope="module")
+def off(scan: Scan, cloud: BodyCloud) -> Array:
+    """How far off the body each point of the cloud is, mm."""
+    return signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
+
+
+def test_the_cloud_lies_on_the_body(off: Array) -> None:
     """The targets for full-size images; here there are four times fewer pixels to average."""
-    found = deviation(signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces))
+    found = deviation(off)
     assert abs(found.bias_mm) < 0.03
     assert found.rms_mm < 0.15
     assert found.p95_mm < 0.30
@@ -66,16 +73,14 @@ def test_what_the_pairs_could_see_is_covered(scan: Scan, cloud: BodyCloud) -> No
     assert found > 0.9
 
 
-def test_sigma_is_honest(scan: Scan, cloud: BodyCloud) -> None:
-    off = signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
+def test_sigma_is_honest(off: Array, cloud: BodyCloud) -> None:
     ratio = np.abs(off) / cloud.sigma_mm
     # 0.8 to 1.25 times 0.67, the median of a standard normal's size.
     assert 0.54 < np.median(ratio) < 0.84
     assert np.median(cloud.sigma_mm) < 0.1
 
 
-def test_more_pairs_are_better(scan: Scan, cloud: BodyCloud) -> None:
-    off = signed_distances(cloud.points, scan.truth.vertices, scan.truth.faces)
+def test_more_pairs_are_better(off: Array, cloud: BodyCloud) -> None:
     assert cloud.pairs_seen.min() >= 1
     assert 3 <= cloud.pairs_seen.max() <= 12
     alone, together = (np.median(np.abs(off[cloud.pairs_seen == n])) for n in (1, 3))

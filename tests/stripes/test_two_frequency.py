@@ -40,7 +40,12 @@ def board(opened: Captures) -> np.ndarray:
 
 
 def off_surface(s: np.ndarray, board: np.ndarray, reach_px: float) -> np.ndarray:
-    """How far s is off a polynomial, and that off its own mean over some pixels around."""
+    """How far s is off a polynomial, and that off its own mean over some pixels around; of the picture
+    the board and what the mean reaches beside it."""
+    v, u = np.nonzero(board)
+    beside = round(4.0 * reach_px)
+    rows, columns = (slice(max(w.min() - beside, 0), w.max() + beside) for w in (v, u))
+    s, board = s[rows, columns], board[rows, columns]
     v, u = np.nonzero(board)
     x, y = (u - u.mean()) / u.std(), (v - v.mean()) / v.std()
     powers = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -44,6 +45,7 @@ def load_rig(name: str = "three-pole-12") -> Rig:
     return Rig.model_validate(yaml.safe_load((ROOT / "rigs" / f"{name}.yaml").read_text()))
 
 
+@cache
 def load_body(path: Path = BODY, subdivisions: int = 2) -> Truth:
     """A subject's file (metres, facing -y), Loop-subdivided, facing x in mm."""
     mesh = o3d.io.read_triangle_mesh(str(path)).subdivide_loop(subdivisions)
