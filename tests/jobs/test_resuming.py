@@ -7,6 +7,7 @@ import random
 import subprocess
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from cheap_batch import batch_command, jobs_of, results, run_cheap
@@ -23,9 +24,12 @@ def test_ten_kills_leave_the_same_bytes_as_none(
     moments = random.Random(1)
     out = tmp_path / "killed"
     there: dict[str, int] = {}
-    for _ in range(10):
+    for number in range(10):
         process = subprocess.Popen(batch_command(scans, out), stdout=subprocess.DEVNULL)
-        time.sleep(moments.uniform(0.3, 0.9))
+        if number % 2:  # once something more is there, however busy the machine is
+            _wait_for(partial(_is_more_there, out, len(there), process))
+        else:
+            time.sleep(moments.uniform(0.2, 0.7))
         process.kill()
         process.wait()
         _wait_for(lambda: not any(_is_held(job.folder / "lock") for job in jobs_of(scans, out)))
@@ -88,6 +92,10 @@ def test_half_made_folders_are_taken_away_and_not_believed(
 def _made(out: Path) -> dict[str, int]:
     """When each stage's results that are in place were made."""
     return {str(path): path.stat().st_mtime_ns for path in out.glob("*/[!.]*/stage.json")}
+
+
+def _is_more_there(out: Path, before: int, process: subprocess.Popen[bytes]) -> bool:
+    return len(_made(out)) > before or process.poll() is not None
 
 
 def _is_held(lock: Path) -> bool:
