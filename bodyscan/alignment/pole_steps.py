@@ -9,7 +9,7 @@ Gaussian processes over time.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -53,12 +53,14 @@ FREE = SwayPrior(30.0, 5.0, 1.0, 1.0)
 @dataclass(frozen=True)
 class PoleStep:
     """A pole, or a pair by itself, that stands off by shift_mm at the body's centre, and turned, from
-    where the others and its calibration put it.  name: `pole p1`."""
+    where the others and its calibration put it.  name: `pole p1`.  all_moved: whether each of the
+    others has a step of its own, so that none is where it was."""
 
     name: str
     pairs: frozenset[str]
     shift_mm: float
     turn_deg: float
+    all_moved: bool = False
 
     @staticmethod
     def of(name: str, pairs: frozenset[str], motions: Mapping[str, Array]) -> PoleStep:
@@ -139,7 +141,10 @@ def find_steps(
         each = _evidence(seen, SWAY_MM, _alike(seen.names, poles), STEPS_MM)[0] - still
         if each > max(gain, SURE):
             gain = each
-            step = max((one for _, one in found), key=lambda one: (len(one.pairs), one.shift_mm))
+            farthest = max(
+                (one for _, one in found), key=lambda one: (len(one.pairs), one.shift_mm)
+            )
+            step = replace(farthest, all_moved=True)
     lever = np.radians(step.turn_deg) * ARM_MM
     moved = gain > SURE and np.hypot(step.shift_mm, lever) > STEP_MM
     return StepSearch(step if moved else None, least, sway_mm, own_mm)

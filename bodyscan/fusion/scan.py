@@ -208,10 +208,13 @@ def _measured_again(steps: Sequence[PoleStep], motions: Mapping[str, Array]) -> 
     """How far each stands off from those that did not move, now that all were free to."""
     off = frozenset[str]().union(*(step.pairs for step in steps))
     return [
-        PoleStep.of(
-            step.name,
-            step.pairs,
-            {name: at for name, at in motions.items() if name not in off - step.pairs},
+        replace(
+            PoleStep.of(
+                step.name,
+                step.pairs,
+                {name: at for name, at in motions.items() if name not in off - step.pairs},
+            ),
+            all_moved=step.all_moved,
         )
         for step in steps
     ]

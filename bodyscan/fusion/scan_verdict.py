@@ -228,7 +228,7 @@ def _shifted(steps: Sequence[PoleStep]) -> Iterator[Finding]:
             )
             continue
         yield (
-            "repeat" if len(step.pairs) == 1 or len(steps) > 1 else "usable",
+            "repeat" if len(step.pairs) == 1 or len(steps) > 1 or step.all_moved else "usable",
             f"{step.name} stands {step.shift_mm:.1f} mm from where the calibration has it, turned by "
             f"{step.turn_deg:.2f} degrees, by itself and at once, as no person moves: it was moved "
             "since, and brought to the others here; calibrate again, unless `timing` of captures.yaml "

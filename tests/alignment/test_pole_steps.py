@@ -61,7 +61,7 @@ def test_a_pole_that_moved_is_named_though_the_person_sways(
     sway_mm: float, step: list[float]
 ) -> None:
     steps = [found(seed, sway_mm, np.array(step, float)) for seed in SEEDS]
-    assert all(one is not None and one.name == "pole p2" for one in steps)
+    assert all(one and one.name == "pole p2" and not one.all_moved for one in steps)
     shifts = [one.shift_mm for one in steps if one]
     # The others' mean sways too.
     assert np.median(shifts) == pytest.approx(np.linalg.norm(step[:3]), abs=0.2 + sway_mm)
@@ -80,6 +80,7 @@ def test_poles_that_all_moved_outwards_are_no_person_who_went_round(
         step = in_one((twists, at))
         assert step is not None
         assert step.name.startswith("pole")
+        assert step.all_moved
 
 
 def test_poles_that_fire_at_one_moment_each_cannot_be_told_from_a_person() -> None:

@@ -164,6 +164,15 @@ def test_two_poles_that_moved_leave_nothing_to_hold_the_size(scan: MadeScan) -> 
     assert all(f"{step.name} stands 3.0 mm" in str(verdict) for step in steps)
 
 
+def test_one_pole_of_those_that_all_moved_leaves_nothing_either(scan: MadeScan) -> None:
+    """All by 3 mm outwards, with a person who sways: one is found, and girths were 11 mm off."""
+    step = PoleStep("pole p1", frozenset({"p1-1", "p1-2"}), 3.0, 0.1, all_moved=True)
+    verdict = grade_scan(
+        scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=[step]
+    )
+    assert verdict.grade == "repeat"
+
+
 def test_who_turns_stays_where_he_is(scan: MadeScan) -> None:
     """As a pole that is turned about its own foot does not."""
     pairs = frozenset({"p1-1", "p1-2"})
