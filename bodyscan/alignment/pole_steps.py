@@ -31,8 +31,10 @@ NOISE_MM = np.geomspace(0.05, 5.0, 9)
 SWAY_MM = np.geomspace(0.05, 20.0, 10)
 STILL_MM = 0.4
 """What a mannequin seems to sway by, as calibrations disagree; a person who stands, by 1 to 5."""
-SHARED = 0.3
-"""Of a sway: what its rigid motion leaves, alike for the pairs of a pole, which see the same side."""
+SHARED, SHARED_MM = 0.8, 1.2
+"""Of a sway, and at most: what its rigid motion leaves, alike for the pairs of a pole, which see one
+side. A side breathes by some 2 mm, and arms go their own ways: of ten sound people who stood half had a
+pole off by 1.5 to 4 mm, more than 0.3 of their sway can be."""
 STEPS_MM = np.geomspace(0.5, 30.0, 8)
 NEARLY = 0.5
 """Correlation of a stance with that of 0.8 s later. A pole that fired when no other did, by
@@ -176,12 +178,14 @@ def motions_between(
 @dataclass(frozen=True, eq=False)
 class _Seen:
     """What N pairs, those of each scan after those of another, saw.  motions: (N, 6) mm, of the body's
-    centre and of what is an arm's length from it.  sway: (N, N) correlations of a person's.  free:
-    (N, N) mm2, of what is not asked: how a scan stands as a whole, and poles known to have moved."""
+    centre and of what is an arm's length from it.  sway: (N, N) correlations of a person's.  sides:
+    (N, N) 1 for those that saw the same side at once.  free: (N, N) mm2, of what is not asked: how a
+    scan stands as a whole, and poles known to have moved."""
 
     names: tuple[str, ...]
     motions: Array
     sway: Array
+    sides: Array
     free: Array
 
     @staticmethod
@@ -190,20 +194,22 @@ class _Seen:
     ) -> _Seen:
         """timed: of pairs whose moment is known alone."""
         names: list[str] = []
-        motions, sways, sizes = [np.empty((0, 6))], [], []
+        motions, sways, sides = [np.empty((0, 6))], [], []
         for moved, moments_ms in scans:
             own = [name for name in moved if not timed or moments_ms[name] is not None]
             twists = np.array([moved[name] for name in own]).reshape(-1, 6)
             motions.append(np.hstack([centre_shifts(twists), ARM_MM * twists[:, :3]]))
-            side = [poles.get(name, name) for name in own]
-            alike = _stances([moments_ms[name] for name in own])
-            sways.append(alike + SHARED**2 * np.equal.outer(side, side))
-            sizes.append(len(own))
+            sways.append(_stances([moments_ms[name] for name in own]))
+            sides.append(_alike(own, poles))
             names += own
         off = np.array([name in freed for name in names], float)
-        free = block_diag(*(np.ones((size, size)) for size in sizes)) + np.outer(off, off)
+        free = block_diag(*(np.ones_like(sway) for sway in sways)) + np.outer(off, off)
         return _Seen(
-            tuple(names), np.concatenate(motions), block_diag(*sways), ANYWHERE_MM**2 * free
+            tuple(names),
+            np.concatenate(motions),
+            block_diag(*sways),
+            block_diag(*sides),
+            ANYWHERE_MM**2 * free,
         )
 
 
@@ -231,6 +237,7 @@ def _evidence(
     covariance = (
         noise2.ravel()[:, None, None] * np.eye(size)
         + sway2.ravel()[:, None, None] * seen.sway
+        + np.minimum(SHARED**2 * sway2, SHARED_MM**2).ravel()[:, None, None] * seen.sides
         + step2.ravel()[:, None, None] * stepped
         + seen.free
     )

@@ -1,8 +1,8 @@
 """What no person who stands by himself is shaped like: who lies, and things that are carried.
 
 A bag or a backpack is measured as exactly as skin, and nothing that cameras see tells it from a body.
-But bodies change slowly with height and are wider than deep at the chest. What is a little beyond that
-is asked about; what is far beyond is to be repeated.
+But bodies change slowly with height and are wider than deep at the chest. What is beyond that is asked
+about, and no more: skirts end at once too, and were meant to be scanned.
 """
 
 from __future__ import annotations
@@ -22,17 +22,19 @@ STEP = 1.0 / 54.0
 """of the height: 30 mm of an adult"""
 LOW, HIGH = 0.28, 0.78
 """of the height: from the knees, above swelling calves, to the armpits, below narrowing shoulders"""
-SOON, SOONEST = 0.21, 0.3
+SOON = 0.21
 """Logarithm of the section's area over that of the next height: under arms and breasts, and along
 thighs, it is 0.09 to 0.17; the top of a bag at the hip is 0.25, that of a box 0.5."""
 CHEST = 0.66, 0.75
-DEEP, DEEPEST = 1.0, 1.15
+DEEP = 1.0
 """Depth over width of a chest between the arms: 0.65 to 0.75 of average people, 0.9 of a barrel."""
 ALIKE = 0.5
 """of the larger leg's section, that of the other"""
 FLAT = 0.8
 """Height over the farthest that it reaches to the side: arms held out make it 1"""
 LIMB_MM2 = 1500.0
+MEASURED = 0.9
+"""of a section's outline: where fillings close it, it may be of any size"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,25 +69,33 @@ def _sections(mesh: BodyMesh, top: float) -> Iterator[_Section]:
     low, high = heights.min(axis=1), heights.max(axis=1)
     for share in np.arange(LOW, HIGH, STEP).tolist():
         level = share * top
-        faces = mesh.faces[(low < level) & (high >= level)]
-        loops = [x for x in loops_at(mesh.vertices, faces, level) if x.area_mm2 > LIMB_MM2]
-        if loops:
+        near = (low < level) & (high >= level)
+        every = loops_at(mesh.vertices, mesh.faces[near], level, mesh.filled[near])
+        loops = [loop for loop in every if loop.area_mm2 > LIMB_MM2]
+        if loops and _measured(loops):
             yield _Section(share, level, loops)
 
 
+def _measured(loops: Sequence[Loop]) -> bool:
+    lengths = [loop.girth_mm for loop in loops]
+    return bool(np.average([loop.measured_share for loop in loops], weights=lengths) > MEASURED)
+
+
 def _changes(sections: Sequence[_Section]) -> Iterator[tuple[Grade, str]]:
-    """Along the legs, and from above where they join, which is a step by itself, to the armpits."""
+    """Along the legs, and from above where they join, which is a step by itself, to the armpits;
+    between neighbours that were measured."""
     crotch = next((k for k, one in enumerate(sections) if not _on_two_legs(one)), len(sections))
     steps = {
         0.5 * (below.height_mm + above.height_mm): abs(np.log(above.area_mm2 / below.area_mm2))
         for part in (sections[:crotch], sections[crotch + 1 :])
         for below, above in pairwise(part)
+        if above.share - below.share < 1.5 * STEP
     }
     sudden = {height: step for height, step in steps.items() if step > SOON}
     if sudden:
         worst = max(sudden, key=lambda height: sudden[height])
         yield (
-            "repeat" if sudden[worst] > SOONEST else "usable",
+            "usable",
             f"the body's section changes by {np.expm1(sudden[worst]):.0%} at once at {worst:.0f} mm: a "
             "bag or something else that is carried, a bent arm or leg, a skirt? Girths hold it",
         )
@@ -106,7 +116,7 @@ def _chest(sections: Sequence[_Section]) -> Iterator[tuple[Grade, str]]:
     deep = float(np.median(ratios)) if ratios else 0.0
     if deep > DEEP:
         yield (
-            "repeat" if deep > DEEPEST else "usable",
+            "usable",
             f"the chest is {deep:.2f} times as deep as wide: a backpack, or a child that is carried? "
             "Girths hold it",
         )
