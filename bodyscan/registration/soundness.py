@@ -7,7 +7,6 @@ against what any camera, pose and covariance must be; a hash says besides whethe
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import combinations
 
 import numpy as np
 
@@ -27,7 +26,6 @@ SYMMETRIC, POSITIVE = 1e-6, -1e-6  # of a correlation, which is 1 at most; solve
 NARROWEST, WIDEST = 0.0175, 7.5  # width over focal length: fields of view of 1 and 150 degrees
 MOST_UNLIKE = 2.0  # focal lengths along columns and rows: cameras that skip every other line
 MOST_SKEW = 0.1  # of the focal length: axes 6 degrees off a right angle; sensors are cut far better
-NEAREST_MM = 5.0  # between two cameras: the smallest are wider
 FARTHEST_MM = 1e5  # 100 m from the rig's centre
 SEES = 0.5  # of a picture that rays can be drawn through: what is less is no lens but a slip
 
@@ -49,7 +47,6 @@ def find_faults(calibration: RigCalibration) -> Iterator[Fault]:
         yield from covariance_faults(pair.camera_covariance, size, f"{name}/camera_covariance")
         yield from pose_faults(calibration.rig_from_camera[name], f"{place}.rig_from_camera")
         yield from _light(pair, known[name])
-    yield from _at_one_place(calibration)
     size = 6 * len(calibration.covariance.names)
     yield from covariance_faults(calibration.covariance.matrix, size, "placing_covariance")
     for (shot, board), pose in calibration.rig_from_board.items():
@@ -117,19 +114,6 @@ def covariance_faults(matrix: Array, size: int, place: str) -> Iterator[Fault]:
             yield place, "is not symmetric"
         elif size and np.linalg.eigvalsh(correlation).min() < POSITIVE * size:
             yield place, "is not a covariance: it is not positive semidefinite"
-
-
-def _at_one_place(calibration: RigCalibration) -> Iterator[Fault]:
-    """Cameras nearer to each other than they are wide: places exchanged, or lengths in metres."""
-    places = {name: at.translation for name, at in calibration.rig_from_camera.items()}
-    for one, other in combinations(places, 2):
-        apart = float(np.linalg.norm(places[one] - places[other]))
-        if apart < NEAREST_MM:
-            yield (
-                f"pairs.{other}.rig_from_camera",
-                f"puts its camera {apart:.2g} mm from that of {one}",
-            )
-            return
 
 
 def _names(calibration: RigCalibration) -> Iterator[Fault]:

@@ -68,9 +68,6 @@ MISTAKES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "a scaled rotation": lambda c: pose(c, lambda m: m @ np.diag([1.01, 1.01, 1.01, 1.0])),
     "a sheared rotation": lambda c: pose(c, lambda m: m + np.eye(4, k=1) * 0.01),
     "a matrix turned over": lambda c: pose(c, np.transpose),
-    "two cameras at one place": lambda c: set_(
-        c, "pairs", "p1-2", "rig_from_camera", to=c["pairs"]["p2-3"]["rig_from_camera"]
-    ),
     "a note that is no text": lambda c: set_(c, "notes", to=["\ud800"]),
     "a matrix of three rows": lambda c: pose(c, lambda m: m[:3]),
     "a pose that is empty": lambda c: set_(c, "pairs", "p1-2", "rig_from_camera", to=[]),
