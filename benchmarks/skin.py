@@ -129,7 +129,7 @@ def _light_row(name: str, case: Case) -> str:
     scan, (vertices, faces) = case.scan, _surface(case.truth)
     off = signed_distances(_laid(case), vertices, faces)
     light, sigmas = scan.oblique_light, spread(off / scan.cloud.sigma_mm)
-    length = "" if light is None else f"{light.reach_mm:.3f} ± {light.sigma_mm:.3f}"
+    length = "" if light is None else f"{light.aside_mm:.3f} ± {light.sigma_mm:.3f}"
     size = f"{off.mean():.3f}, {rms(off):.3f}, {np.percentile(np.abs(off), 95):.3f}"
     return f"| {name} | {length} | {size} | {sigmas:.2f} | {scan.verdict.grade} |"
 

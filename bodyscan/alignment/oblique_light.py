@@ -1,7 +1,7 @@
 """Light that enters skin obliquely and comes out aside: seen as a disagreement of pairs, and undone.
 
 Under the surface light goes on as it was refracted, and what a camera sees entered a little before,
-against the way the light came: by `reach_mm` times the tangent of the refracted angle. A pixel so
+against the way the light came: by `aside_mm` times the tangent of the refracted angle. A pixel so
 shows the stripe of a place beside, and its depth is wrong by where that stripe's sheet lies on the
 pixel's ray: by more where the surface leans over against the sheet, to the other side where the
 projector stands on the other side of the camera. Pairs that see the same skin under different
@@ -39,7 +39,7 @@ PARALLEL = 1e-3
 WINDOW_MM = 7.0
 """Over which normals are averaged: those of five pixels are as noisy as the effect is large."""
 MOST_LIFT = 4.0
-"""Of a point along its ray, times the reach: more it is nowhere but where light grazes."""
+"""Of a point along its ray, times how far aside: more it is nowhere but where light grazes."""
 ROUNDS = 2
 """After the first, each leaves a tenth of what was left."""
 FEWEST_IMAGES = 4
@@ -74,7 +74,7 @@ class LightLine:
 
     def lift(self, points: Array, normals: Array) -> Array:
         """How far points (N, 3) with unit normals (N, 3) towards the camera, camera frame, are seen
-        from where they are: (N,) mm along their rays, away from the camera, for a reach of 1 mm; NaN
+        from where they are: (N,) mm along their rays, away from the camera, for 1 mm aside; NaN
         where light or camera graze the surface or each other."""
         light = points - self.origin
         light /= np.linalg.norm(light, axis=1, keepdims=True)
@@ -93,26 +93,26 @@ class LightLine:
 
 @dataclass(frozen=True)
 class ObliqueLight:
-    """reach_mm: how far aside light comes out, over the tangent of the refracted angle; sigma_mm: of
+    """aside_mm: how far aside light comes out, over the tangent of the refracted angle; sigma_mm: of
     that, from how much every single pair says in it."""
 
-    reach_mm: float
+    aside_mm: float
     sigma_mm: float
 
     @property
     def told(self) -> bool:
         """Whether it is there; light never comes out before where it entered."""
-        return self.reach_mm > max(TOLD_SIGMAS * self.sigma_mm, LEAST_MM)
+        return self.aside_mm > max(TOLD_SIGMAS * self.sigma_mm, LEAST_MM)
 
     @property
     def most_mm(self) -> float:
         """What it may be."""
-        return abs(self.reach_mm) + self.sigma_mm
+        return abs(self.aside_mm) + self.sigma_mm
 
 
 @dataclass(frozen=True, eq=False)
 class _Shared:
-    """What an overlap says: J^T W J (7, 7) and J^T W d (7,), by the source's motion and the reach."""
+    """What an overlap says: J^T W J (7, 7) and J^T W d (7,), by the source's motion and the length."""
 
     information: Array
     gradient: Array
@@ -146,7 +146,7 @@ def take_out(
         rest = find_oblique_light(seen, found.rig_from_camera, lines, prior, settings)
         if rest is None:
             break
-        total = ObliqueLight(total.reach_mm + rest.reach_mm, rest.sigma_mm)
+        total = ObliqueLight(total.aside_mm + rest.aside_mm, rest.sigma_mm)
     return seen, found, total
 
 
@@ -188,12 +188,12 @@ def find_oblique_light(
     if len(seen) < FEWEST_IMAGES:
         return None
     held = np.asarray(np.linalg.inv(SwayPrior.of(settings).covariance(names, prior)), np.float64)
-    without = np.array([_reach(overlaps, held, one) for one in seen])
+    without = np.array([_aside(overlaps, held, one) for one in seen])
     if not np.isfinite(without).all():
         return None
     # Jackknife (Tukey 1958): images err each by itself, points of one image alike.
     sigma = np.sqrt((len(seen) - 1) / len(seen) * np.sum((without - without.mean()) ** 2))
-    return ObliqueLight(_reach(overlaps, held), float(sigma))
+    return ObliqueLight(_aside(overlaps, held), float(sigma))
 
 
 def undo(image: RangeImage, line: LightLine, found: ObliqueLight) -> RangeImage:
@@ -205,7 +205,7 @@ def undo(image: RangeImage, line: LightLine, found: ObliqueLight) -> RangeImage:
     known = np.isfinite(lift)
     unsure = np.where(known, found.sigma_mm * np.abs(lift), MOST_LIFT * found.most_mm)
     length = np.linalg.norm(points, axis=1, keepdims=True)
-    moved = np.where(known, found.reach_mm * lift, 0.0)[:, None] / length
+    moved = np.where(known, found.aside_mm * lift, 0.0)[:, None] / length
     common = np.zeros_like(image.sigma_mm) if image.common_mm is None else image.common_mm.copy()
     placed, sigma_mm = image.points.copy(), image.sigma_mm.copy()
     placed[valid] = points * (1.0 - moved)
@@ -232,7 +232,7 @@ def _apart(
     line: LightLine, rig_from_camera: RigidTransform, points: Array, normals: Array
 ) -> Array:
     """(N,) mm along normals (N, 3) by which a pair sees points (N, 3), rig frame, off their places, for
-    a reach of 1 mm."""
+    1 mm aside."""
     camera_from_rig = rig_from_camera.inverse()
     seen, across = camera_from_rig.apply(points), camera_from_rig.rotate(normals)
     facing = np.sum(seen * across, axis=1) / np.linalg.norm(seen, axis=1)
@@ -247,7 +247,7 @@ def _shared(
     apart: Array,
     correlated: float,
 ) -> _Shared:
-    """As `OverlapEquations`, the reach as the last unknown; matches without `apart` say nothing."""
+    """As `OverlapEquations`, how far aside as the last unknown; matches without `apart` say nothing."""
     rows = np.column_stack([np.cross(points, normals), normals, apart])
     variance = sigma_mm**2 + spread(distances, LEAST_SPREAD_MM) ** 2
     weight = np.isfinite(apart) / (variance + 0.25 * distances**2) / correlated
@@ -256,7 +256,7 @@ def _shared(
     return _Shared(weighted @ rows, weighted @ distances)
 
 
-def _reach(
+def _aside(
     overlaps: Mapping[tuple[int, int], _Shared], held: Array, without: int | None = None
 ) -> float:
     """The length that explains the overlaps best, of all images or without one, NaN if none is left;

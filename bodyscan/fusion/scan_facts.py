@@ -62,7 +62,7 @@ class _Person(_Part):
 
 
 class _ObliqueLight(_Part):
-    reach_mm: float
+    aside_mm: float
     sigma_mm: float
     taken_out: bool
 

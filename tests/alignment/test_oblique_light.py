@@ -38,19 +38,19 @@ class Seen:
     lines: dict[str, LightLine]
     prior: PoseCovariance
 
-    def through_skin(self, reach_mm: float) -> list[RangeImage]:
-        """As seen through skin of that reach, noise and all: each pixel's ray meets the sheet of light
+    def through_skin(self, aside_mm: float) -> list[RangeImage]:
+        """As seen through such skin, noise and all: each pixel's ray meets the sheet of light
         that entered where what it sees came in."""
         rng = np.random.default_rng(4)
-        return [self.seen_through(image, reach_mm, rng) for image in self.scan.range_images]
+        return [self.seen_through(image, aside_mm, rng) for image in self.scan.range_images]
 
     def seen_through(
-        self, image: RangeImage, reach_mm: float, rng: np.random.Generator
+        self, image: RangeImage, aside_mm: float, rng: np.random.Generator
     ) -> RangeImage:
         line, valid = self.lines[image.pair], image.valid
         points = image.points[valid].astype(np.float64)
         normals = image.normals[valid].astype(np.float64)
-        entered = came_in_at(points, line.origin - points, normals, reach_mm)
+        entered = came_in_at(points, line.origin - points, normals, aside_mm)
         sheet = np.cross(line.along, entered - line.origin)
         along = np.sum(sheet * line.origin, axis=1) / np.sum(sheet * points, axis=1)
         along += NOISE_MM * rng.standard_normal(len(along)) / np.linalg.norm(points, axis=1)
@@ -105,7 +105,7 @@ def test_the_effect_of_skin_is_told_and_taken_out(seen: Seen) -> None:
     assert light is not None
     assert light.told
     # The length is known to a few hundredths; facets of 10 mm stand in for a smooth body.
-    assert light.reach_mm == pytest.approx(0.8, abs=0.06)
+    assert light.aside_mm == pytest.approx(0.8, abs=0.06)
     assert 0.003 < light.sigma_mm < 0.06
     before, after = (np.percentile(np.abs(seen.errors(some)), 90) for some in (images, without))
     assert before > 0.7
@@ -133,7 +133,7 @@ def test_sway_is_not_taken_for_it(seen: Seen) -> None:
     assert not light.told
     _, light = taken_out(seen, seen.through_skin(0.8), swayed)
     assert light is not None
-    assert light.reach_mm == pytest.approx(0.8, abs=0.1)
+    assert light.aside_mm == pytest.approx(0.8, abs=0.1)
 
 
 def test_few_pairs_do_not_tell(seen: Seen) -> None:
