@@ -31,7 +31,7 @@ NOISE_MM = np.geomspace(0.05, 5.0, 9)
 SWAY_MM = np.geomspace(0.05, 20.0, 10)
 STILL_MM = 0.4
 """What a mannequin seems to sway by, as calibrations disagree; a person who stands, by 1 to 5."""
-SHARED, SHARED_MM = 0.8, 1.2
+SHARED, SHARED_MM = 0.6, 0.9
 """Of a sway, and at most: what its rigid motion leaves, alike for the pairs of a pole, which see one
 side. A side breathes by some 2 mm, and arms go their own ways: of ten sound people who stood half had a
 pole off by 1.5 to 4 mm, more than 0.3 of their sway can be."""

@@ -33,7 +33,7 @@ ALIKE = 0.5
 FLAT = 0.8
 """Height over the farthest that it reaches to the side: arms held out make it 1"""
 LIMB_MM2 = 1500.0
-MEASURED = 0.9
+MEASURED = 0.6
 """of a section's outline: where fillings close it, it may be of any size"""
 
 
