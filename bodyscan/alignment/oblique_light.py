@@ -156,8 +156,6 @@ def find_oblique_light(
     lines: Mapping[str, LightLine],
     prior: PoseCovariance,
     settings: AlignmentSettings,
-    *,
-    workers: int = THREADS,
 ) -> ObliqueLight | None:
     """One length for all overlaps, with the pairs' motions: what these explain as well counts for none.
 
@@ -170,7 +168,7 @@ def find_oblique_light(
     def points(image: RangeImage) -> OverlapPoints:
         return OverlapPoints.of(replace(image, normals=_steady(image)), settings.spacing_mm)
 
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         clouds = list(pool.map(points, images))
 
         def of_two(i: int, j: int) -> _Shared | None:
@@ -264,11 +262,11 @@ def _aside(
     size = len(held)
     normal, right = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
     normal[:size, :size] = held
+    # The target's motion has the opposite effect; `apart` is of both.
+    signed = np.concatenate([np.eye(7)[:, :6], -np.eye(7)[:, :6], np.eye(7)[:, 6:]], axis=1)
     for (a, b), one in overlaps.items():
         if without in (a, b):
             continue
-        # The target's motion has the opposite effect; `apart` is of both.
-        signed = np.concatenate([np.eye(7)[:, :6], -np.eye(7)[:, :6], np.eye(7)[:, 6:]], axis=1)
         at = np.concatenate([6 * a + np.arange(6), 6 * b + np.arange(6), [size]])
         normal[np.ix_(at, at)] += signed.T @ one.information @ signed
         right[at] += signed.T @ one.gradient

@@ -114,8 +114,8 @@ def find_steps(
     seen = _Seen.of(scans, poles, freed, timed=not several)
     if len(set(seen.names)) < FEWEST:
         return StepSearch(None, np.inf)
-    nothing = np.zeros(len(seen.names))
-    still, believed, sway_mm, own_mm = _evidence(seen, SWAY_MM, np.diag(nothing), np.zeros(1))
+    nothing = np.zeros_like(seen.sway)
+    still, believed, sway_mm, own_mm = _evidence(seen, SWAY_MM, nothing, np.zeros(1))
     found: list[tuple[float, PoleStep]] = []
     least, hidden = STEP_MM, bool(freed)
     for name, pairs in moving_alone(sorted(set(seen.names)), poles).items():

@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Floats
 from bodyscan.fusion.quadratics import close_holes, fit_full_windows, window_basis
-from bodyscan.fusion.smoothing import inverse_depths, window_reach
+from bodyscan.fusion.smoothing import inverse_depths, pixel_size, window_reach
 from bodyscan.geometry.crop import Crop, ends_of
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -37,7 +37,7 @@ def misfits(
     whole = (slice(0, sigma_mm.shape[0]), slice(0, sigma_mm.shape[1]))
     inverse, noise = inverse_depths(points, sigma_mm, common, ends_of(whole))
     valid = inverse > 0
-    reach = window_reach(inverse, image.camera, window_mm)
+    reach = window_reach(pixel_size(inverse, image.camera), window_mm)
     closed, there = close_holes(inverse, valid)
     window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     full = valid & (cv2.erode(there.astype(np.uint8), window, borderValue=0) > 0)

@@ -73,7 +73,7 @@ def smooth(
     common = np.broadcast_to(common, image.sigma_mm.shape)
     inverse, noise = inverse_depths(image.points, image.sigma_mm, common, ends_of(box))
     pixel_mm = pixel_size(inverse, image.camera)
-    reach = window_reach(inverse, image.camera, window_mm)
+    reach = window_reach(pixel_mm, window_mm)
     fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm)
     return _surface(image, common, rig_from_camera, box, fit, fitted, reach)
 
@@ -84,9 +84,9 @@ def pixel_size(inverse: Floats, camera: Camera) -> float:
     return float(np.median(1.0 / some[some > 0])) / camera.alpha
 
 
-def window_reach(inverse: Floats, camera: Camera, window_mm: float) -> int:
+def window_reach(pixel_mm: float, window_mm: float) -> int:
     """Pixels to either side of a window's middle."""
-    return int(np.clip(round(0.5 * window_mm / pixel_size(inverse, camera)), 2, 6))
+    return int(np.clip(round(0.5 * window_mm / pixel_mm), 2, 6))
 
 
 def _surface(

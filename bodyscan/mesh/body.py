@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -67,7 +68,7 @@ class BodyMesh:
     breath: BreathAt | None = None
     regions: Bytes | None = None
 
-    @property
+    @cached_property
     def face_regions(self) -> Bytes | None:
         """(F,) uint8, what two corners at least are; unsure where filled."""
         if self.regions is None:
