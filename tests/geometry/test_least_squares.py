@@ -20,7 +20,7 @@ from bodyscan.geometry.least_squares import (
     minimize,
     minimize_each,
 )
-from bodyscan.geometry.robust import spread
+from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, rms, rms_length, spread
 from bodyscan.geometry.scaled_systems import gram, invert_scaled, solve_scaled
 
 TIME = np.linspace(0.0, 3.0, 60)
@@ -317,3 +317,22 @@ def test_the_spread_is_a_standard_deviation_that_outliers_do_not_sway() -> None:
     values[:2000] = 1e6
     assert spread(values) < 2.5
     assert spread(np.zeros(5), 0.1) == 0.1
+
+
+@pytest.mark.parametrize("group", [1, 2])
+def test_cauchy_weights_are_the_slope_of_the_cost(group: int) -> None:
+    residuals = np.random.default_rng(10).normal(0.0, 5.0, 12)
+    slope = [
+        (cauchy_cost(residuals + h, group, 3.0) - cauchy_cost(residuals - h, group, 3.0)) / 2e-4
+        for h in 1e-4 * np.eye(12)
+    ]
+    # Central differences over 1e-4 of a curve that bends over 3: 1e-9 of its size.
+    assert np.allclose(slope, 2.0 * cauchy_weights(residuals, group, 3.0) * residuals, atol=1e-6)
+    assert cauchy_cost(1e-3 * residuals, group, 3.0) == pytest.approx(
+        1e-6 * residuals @ residuals, 1e-4
+    )
+
+
+def test_root_mean_squares_are_of_values_and_of_lengths() -> None:
+    assert rms(np.array([3.0, -4.0])) == pytest.approx(np.sqrt(12.5))
+    assert rms_length(np.array([[3.0, 4.0], [0.0, 0.0]])) == pytest.approx(np.sqrt(12.5))
