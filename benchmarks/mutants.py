@@ -2,10 +2,10 @@
 
 `make mutants`, or `python -m benchmarks.mutants [--count N] [--seed S] [MODULE ...]`. cosmic-ray makes
 the mutants; a seeded sample of them, the same number of each module, is tried in copies of the
-project: against the tests of those test files that are nearest to the module by what imports what, the
-quick ones first, up to the first that fails. That one has to pass without the mutant. What survives is
-listed, to be read: a mutant that changes nothing anyone could notice (an equivalent one) is put down in
-`equivalent_mutants.txt`, with the reason.
+project: against the test files that are nearest to the module by what imports what, quick tests first,
+up to the first that fails. That one has to pass without the mutant. What survives is listed, to be read:
+a mutant that changes nothing anyone could notice (an equivalent one) is put down in
+`equivalent_mutants.txt`, with the reason; what else survives, in `first_survivors.txt`.
 """
 
 from __future__ import annotations
@@ -28,10 +28,17 @@ from functools import lru_cache
 from pathlib import Path
 from queue import SimpleQueue
 
+from bodyscan.files.atomic import write_text
+
 PROJECT = Path(__file__).parents[1]
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.txt")
+"""Blocks of a path, the lines that differ, and `# why` nobody could notice."""
+SURVIVED_FIRST = Path(__file__).with_name("first_survivors.txt")
+"""Likewise those of the published sample that survived when it was drawn: tests written to find them
+say nothing of the faults that no sample drew, so they count as survivors for good."""
 WORK = PROJECT / "build" / "mutants"
-"""The copies, and what Numba compiled in them, which later runs find again."""
+"""The copies, what Numba compiled in them, and which test found which mutant: later runs try that first."""
+FOUND_BY = WORK / "found_by.json"
 RUNS = 2
 """Mutants tried at a time, each in a copy of its own."""
 ROOMS = (
@@ -70,9 +77,9 @@ OPERATORS = re.compile(
 """Of cosmic-ray's operators those that one might write by mistake; the others end in a TypeError."""
 DECLARATION = re.compile(r"-\s*(@|\*,$)", re.MULTILINE)
 """Lines in which nothing is worked out: decorators, the star before arguments that are named."""
-NEAREST, OWN = 6, 2
-"""Test files whose quick tests are tried, and of these the nearest, whose slow ones are as well: those
-farther away ask for little of the module that nearer ones do not."""
+NEAREST, FIRST = 6, 2
+"""Test files tried, and how many of them alone at first, which is cheap and mostly enough; those farther
+away ask for little of the module that nearer ones do not."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,10 @@ class Mutant:
     path: str
     code: str
     change: str
+
+    @property
+    def key(self) -> str:
+        return f"{self.path}\n{self.change}"
 
 
 @dataclass
@@ -113,42 +124,60 @@ SEED = 1
 def report(count: int = COUNT, seed: int = SEED, modules: Sequence[str] = ()) -> str:
     """The section of docs/results.md."""
     sample = list(_sample(modules or _modules(), count, random.Random(seed)))
-    known = _equivalent()
-    tried = [one for one in sample if one.change not in known.get(one.path, ())]
-    copies: SimpleQueue[Copy] = SimpleQueue()
-    for number in range(RUNS):
-        copies.put(_copy(WORK / str(number)))
-
-    def fate(mutant: Mutant) -> bool:
-        copy = copies.get()
-        try:
-            found_by = _found_by(mutant, copy)
-        finally:
-            copies.put(copy)
-        said = f"killed by {found_by}" if found_by else "survived"
-        print(f"{said}: {mutant.path}\n{mutant.change}\n", file=sys.stderr, flush=True)
-        return bool(found_by)
-
-    with ThreadPoolExecutor(RUNS) as pool:
-        survivors = [
-            one for one, killed in zip(tried, pool.map(fate, tried), strict=True) if not killed
-        ]
-    for _ in range(RUNS):
-        copies.get().runner.communicate()
-    listed = "\n\n".join(f"{own.path}\n{own.change}" for own in survivors)
-    modules_tried = len({one.path for one in sample})
+    equivalent, first = _blocks(EQUIVALENT), _blocks(SURVIVED_FIRST)
+    tried = [one for one in sample if one.key not in equivalent]
+    fates = _fates(tried)
+    left = [one for one in tried if not fates[one.key]]
+    survived = [one for one in tried if one.key in first or not fates[one.key]]
+    listed = "\n\n".join(one.key for one in left)
     return f"""## Deliberate faults
 
-`make mutants`: {len(sample)} one-line faults that cosmic-ray made in the mathematics and the verdicts
-(seed {seed}, in {modules_tried} of {len(_modules())} modules), each against the quick tests of the {NEAREST} test
-files nearest to it, then the slow ones of the nearest {OWN}. {len(sample) - len(tried)} change nothing that anyone
-could notice: `benchmarks/equivalent_mutants.txt` says why. Of the {len(tried)} others
-**{len(survivors)} survived, {len(survivors) / max(len(tried), 1):.0%}.**
+`make mutants` (`--count {count} --seed {seed}`): {
+        len(sample)
+    } one-line faults that cosmic-ray made in {len({one.path for one in sample})} of the {
+        len(_modules())
+    }
+modules of mathematics and verdicts, each against the {NEAREST} test files nearest to it. {
+        len(sample) - len(tried)
+    } change nothing that
+anyone could notice: `benchmarks/equivalent_mutants.txt` says why. Of the {len(tried)} others **{
+        len(survived)
+    } survived when the
+sample was drawn, {len(survived) / max(len(tried), 1):.0%}**; tests written since find {
+        len(survived) - len(left)
+    } of these. Those that still survive:
 
 ```
 {listed or "none"}
 ```
 """
+
+
+def _fates(mutants: Sequence[Mutant]) -> dict[str, str]:
+    """By mutant the test that finds it, or ""."""
+    copies: SimpleQueue[Copy] = SimpleQueue()
+    for number in range(RUNS):
+        copies.put(_copy(WORK / str(number)))
+    found = json.loads(FOUND_BY.read_text("utf-8")) if FOUND_BY.exists() else {}
+
+    def fate(mutant: Mutant) -> str:
+        copy = copies.get()
+        try:
+            test = _found_by(mutant, copy, found.get(mutant.key, ""))
+        finally:
+            copies.put(copy)
+        said = f"found by {test}" if test else "survived"
+        print(f"{said}: {mutant.key}\n", file=sys.stderr, flush=True)
+        return test
+
+    fates: dict[str, str] = {}
+    with ThreadPoolExecutor(RUNS) as pool:
+        for mutant, test in zip(mutants, pool.map(fate, mutants), strict=True):
+            fates[mutant.key] = test
+            write_text(FOUND_BY, json.dumps(found | fates, indent=1))
+    for _ in range(RUNS):
+        copies.get().runner.communicate()
+    return fates
 
 
 def _modules() -> list[str]:
@@ -206,13 +235,13 @@ def _difference(before: str, after: str) -> str:
     return "\n".join(line for line in lines if line[:1] in "+-" and line[:3] not in ("+++", "---"))
 
 
-def _equivalent() -> dict[str, set[str]]:
-    """By path, the changes known to change nothing: blocks of a path, its lines, and `# why`."""
-    known: dict[str, set[str]] = {}
-    for block in EQUIVALENT.read_text("utf-8").split("\n\n") if EQUIVALENT.exists() else []:
-        path, *lines = [line for line in block.splitlines() if not line.startswith("#")] or [""]
-        known.setdefault(path, set()).add("\n".join(lines))
-    return known
+def _blocks(path: Path) -> set[str]:
+    """Keys of the mutants that a file lists; lines that begin with # are for readers."""
+    blocks = path.read_text("utf-8").split("\n\n") if path.exists() else []
+    return {
+        "\n".join(line for line in block.strip().splitlines() if not line.startswith("#"))
+        for block in blocks
+    }
 
 
 def _copy(folder: Path) -> Copy:
@@ -251,16 +280,20 @@ def _environment(project: Path) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(project), "BODYSCAN_CAPTURES": captures, "CI": "true"}
 
 
-def _found_by(mutant: Mutant, copy: Copy) -> str:
-    """The first test that fails with the mutant in place and passes without it; "" where none does."""
+def _found_by(mutant: Mutant, copy: Copy, hint: str) -> str:
+    """The first test that fails with the mutant in place and passes without it; "" where none does.
+
+    hint: the test that found it in an earlier run is tried first, "" where there is none.
+    """
     tests = _tests_of(mutant.path)
     if not tests:
         return ""
     with _in_place(mutant, copy) as cache:
         failed = (
-            _first_failure(tests[:OWN], False, cache, copy)
-            or (tests[OWN:] and _first_failure(tests[OWN:], False, cache, copy))
-            or _first_failure(tests[:OWN], True, cache, copy)
+            (hint and _first_failure([hint], True, cache, copy))
+            or _first_failure(tests[:FIRST], False, cache, copy)
+            or (tests[FIRST:] and _first_failure(tests[FIRST:], False, cache, copy))
+            or _first_failure(tests, True, cache, copy)
         )
     if failed and failed not in copy.sound:
         copy.sound[failed] = not _first_failure([failed], True, copy.cache, copy)
@@ -283,6 +316,7 @@ def _in_place(mutant: Mutant, copy: Copy) -> Iterator[Path]:
     cache = copy.cache
     if callers:
         cache = copy.cache.with_name("compiled-mutant")
+        shutil.rmtree(cache, ignore_errors=True)  # of a run that was broken off
         shutil.copytree(copy.cache, cache, copy_function=os.link)
     try:
         place.write_text(mutant.code, "utf-8")

@@ -65,6 +65,31 @@ def test_at_a_rim_a_surface_counts_for_less_and_so_it_does_in_the_sigma() -> Non
     assert cloud.sigma_mm[both] == pytest.approx(0.1 * np.sqrt(1 + 1 / 16) / 1.25, rel=1e-3)
 
 
+def test_what_one_pair_alone_saw_is_as_certain_as_it_says() -> None:
+    surface = known_to(wall(WALL_MM, 60, RigidTransform.identity()), 0.1)
+    samples = take_samples([surface], 10**6)
+    alone = [compare(samples, surface, 0, 1.5, 6.0)]
+    cloud = average(samples, [surface], alone, as_seen(samples, [surface]), 1)
+    assert cloud.sigma_mm == pytest.approx(0.1, rel=1e-5)
+
+
+def test_where_a_surface_ends_there_is_no_step() -> None:
+    """Its weight rises from near 0 at its rim to that of its sigma over a window."""
+    surfaces = [
+        wall(WALL_MM, 100, RigidTransform.identity()),
+        wall(WALL_MM + 0.5, 100, ASIDE),
+    ]
+    samples = take_samples(surfaces, 10**6)
+    evidence = [compare(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)]
+    cloud = average(samples, surfaces, evidence, as_seen(samples, surfaces), 1)
+    left, right = surfaces[1].points[:, 0].min(), surfaces[0].points[:, 0].max()
+    middle = np.abs(cloud.points[:, 1]) < 20.0
+    x, z = cloud.points[middle, 0], cloud.points[middle, 2]
+    # A pixel of 0.7 mm or two inside, a tenth or two of the weight: less than 0.5 * 0.2 / 1.2 mm.
+    assert abs(z[np.abs(x - left - 0.7) < 0.5].mean() - WALL_MM) < 0.085
+    assert abs(z[np.abs(x - right + 0.7) < 0.5].mean() - WALL_MM - 0.5) < 0.085
+
+
 def test_the_mean_lies_where_the_weights_say() -> None:
     cloud, *_ = fused(0.1, (0.1, 0.2))
     both = cloud.pairs_seen == 2

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from flat_walls import ASIDE, WALL_MM, wall
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bodyscan.fusion.thinning import one_per_voxel, voxel_size_for
+from bodyscan.fusion.thinning import one_per_voxel, take_samples, voxel_size_for
+from bodyscan.geometry.transforms import RigidTransform
 
 
 def sphere(count: int, radius: float = 300.0, seed: int = 0) -> np.ndarray:
@@ -65,3 +67,17 @@ def test_evenly_spread() -> None:
     assert np.bincount(octant, minlength=8).std() < 0.02 * len(thin) / 8
     bands = np.histogram(thin[:, 2], bins=10)[0]
     assert bands.max() / bands.min() < 1.5
+
+
+def test_no_sample_is_of_a_rim_where_another_surface_goes_on() -> None:
+    surfaces = [wall(WALL_MM, 100, placing) for placing in (RigidTransform.identity(), ASIDE)]
+    samples = take_samples(surfaces, 5000)
+    left, right = surfaces[1].points[:, 0].min(), surfaces[0].points[:, 0].max()
+    across, up = samples.points[:, 0], samples.points[:, 1]
+    # The rim's half is five pixels of 0.7 mm; voxels, 2 mm wide, may reach beyond it.
+    for beside in (np.abs(across - left) < 2.0, np.abs(across - right) < 2.0):
+        beside &= np.abs(up) < 20.0
+        inner = 0 if across[beside].mean() < 0.5 * (left + right) else 1
+        own = np.flatnonzero(beside)
+        assert np.all((own >= samples.starts[inner]) & (own < samples.starts[inner + 1]))
+        assert len(own) > 20
