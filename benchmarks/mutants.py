@@ -2,9 +2,9 @@
 
 `make mutants`, or `python -m benchmarks.mutants [--count N] [--seed S] [MODULE ...]`. cosmic-ray makes
 the mutants; a seeded sample of them, the same number of each module, is tried in copies of the
-project: against the test files that are nearest to the module by what imports what, quick tests first,
-up to the first that fails. That one has to pass without the mutant. What survives is listed, to be read:
-a mutant that changes nothing anyone could notice (an equivalent one) is put down in
+project: against the test files that are nearest to the module by what imports what, quick tests
+first, up to the first that fails. That one has to pass without the mutant. What survives is listed, to
+be read: a mutant that changes nothing anyone could notice (an equivalent one) is put down in
 `equivalent_mutants.txt`, with the reason; what else survives, in `first_survivors.txt`.
 """
 
@@ -37,7 +37,8 @@ SURVIVED_FIRST = Path(__file__).with_name("first_survivors.txt")
 """Likewise those of the published sample that survived when it was drawn: tests written to find them
 say nothing of the faults that no sample drew, so they count as survivors for good."""
 WORK = PROJECT / "build" / "mutants"
-"""The copies, what Numba compiled in them, and which test found which mutant: later runs try that first."""
+"""The copies, what Numba compiled in them, and which test found which mutant, which is tried first
+the next time."""
 FOUND_BY = WORK / "found_by.json"
 RUNS = 2
 """Mutants tried at a time, each in a copy of its own."""
@@ -78,8 +79,8 @@ OPERATORS = re.compile(
 DECLARATION = re.compile(r"-\s*(@|\*,$)", re.MULTILINE)
 """Lines in which nothing is worked out: decorators, the star before arguments that are named."""
 NEAREST, FIRST = 6, 2
-"""Test files tried, and how many of them alone at first, which is cheap and mostly enough; those farther
-away ask for little of the module that nearer ones do not."""
+"""Test files tried, and how many of them alone at first, which is cheap and mostly enough; those
+farther away ask for little of the module that nearer ones do not."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ def main() -> None:
     print(report(given.count, given.seed, given.modules))
 
 
-COUNT = 120
+COUNT = 50
 SEED = 1
 """Of the published sample: survivors of other seeds were read and mended before it was drawn."""
 
@@ -130,25 +131,19 @@ def report(count: int = COUNT, seed: int = SEED, modules: Sequence[str] = ()) ->
     left = [one for one in tried if not fates[one.key]]
     survived = [one for one in tried if one.key in first or not fates[one.key]]
     listed = "\n\n".join(one.key for one in left)
+    same, share = len(sample) - len(tried), len(survived) / max(len(tried), 1)
+    places = f"{len({one.path for one in sample})} of the {len(_modules())} modules"
+    since = len(survived) - len(left)
     return f"""## Deliberate faults
 
-`make mutants` (`--count {count} --seed {seed}`): {
-        len(sample)
-    } one-line faults that cosmic-ray made in {len({one.path for one in sample})} of the {
-        len(_modules())
-    }
-modules of mathematics and verdicts, each against the {NEAREST} test files nearest to it. {
-        len(sample) - len(tried)
-    } change nothing that
-anyone could notice: `benchmarks/equivalent_mutants.txt` says why. Of the {len(tried)} others **{
-        len(survived)
-    } survived when the
-sample was drawn, {len(survived) / max(len(tried), 1):.0%}**; tests written since find {
-        len(survived) - len(left)
-    } of these. Those that still survive:
+`make mutants`: {len(sample)} one-line faults that cosmic-ray made, drawn with seed {seed}, in {places}
+of mathematics and verdicts, each against the {NEAREST} test files nearest to it.
+{same} change nothing that anyone could notice, `benchmarks/equivalent_mutants.txt` says why. Of the
+{len(tried)} others **{len(survived)} survived when they were drawn, {share:.0%}.** Tests written since
+find {since} of these; what still survives:
 
 ```
-{listed or "none"}
+{listed or "nothing"}
 ```
 """
 
