@@ -17,6 +17,7 @@ from bodyscan.calibration.boundary_points import (
     boundary_points,
     concatenate,
 )
+from bodyscan.calibration.light_sheets import FIT_BINS
 from bodyscan.compiled import compiled
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.camera import Camera
@@ -26,6 +27,7 @@ from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.quadratic_table import Table, look_up
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
+from bodyscan.rig.pair import CameraSpec
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_map import StripeMap
 
@@ -36,6 +38,8 @@ BIN_PX = 16
 """Along a boundary, which is straight over so short a piece: its sagitta is below a thousandth of a
 pixel. Ten times fewer points are left."""
 
+FEWEST_BANDS = 4
+"""Across a board, of those bins: sheets of light bow across their width."""
 AROUND_PX = 16.0
 """Decoding a boundary looks at pixels up to 7 px beside it (`indirect_light`, `albedo_edges`), and at
 boundaries of its run up to 6 px away, which look so far in turn."""
@@ -119,6 +123,21 @@ def box_of_print(camera: Camera, board: Board, view: LocatedView) -> Box:
         np.maximum(low, shown.min(axis=0) - AROUND_PX),
         np.minimum(high, shown.max(axis=0) + AROUND_PX),
     )
+
+
+def bands_apart(code: StripeCode, boxes: Sequence[Box]) -> int:
+    """One in how many bands of BIN_PX along the stripes gives a fit as many bins as it takes, though of
+    all stripes half may fall beside the boards."""
+    along = 0 if code.direction == "horizontal" else 1
+    pieces = sum(float(high[along] - low[along]) / BIN_PX for low, high in boxes)
+    return max(int(0.5 * code.stripes * pieces / FIT_BINS), 1)
+
+
+def most_apart(boxes: Sequence[Box], camera: CameraSpec) -> int:
+    """One in how many bands leaves FEWEST_BANDS across what the picture shows of every board."""
+    size = np.array([camera.width, camera.height])
+    shown = [np.minimum(high, size) - np.maximum(low, 0.0) for low, high in boxes]
+    return max(int(np.min(shown) / (FEWEST_BANDS * BIN_PX)), 1)
 
 
 def boundaries_on_boards(

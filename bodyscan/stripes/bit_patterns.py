@@ -16,12 +16,13 @@ from bodyscan.stripes.boundaries import find_boundaries
 from bodyscan.stripes.boundary_scatter import scatter
 from bodyscan.stripes.code_lines import fill_from_codes
 from bodyscan.stripes.grey_noise import noise_variance
+from bodyscan.stripes.line_bands import LineBands
 from bodyscan.stripes.one_moment import Moments, carry_to_moment
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.sequence_checks import check_codes, check_exposure
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
 from bodyscan.stripes.stripe_limits import StripeLimits
-from bodyscan.stripes.stripe_map import StripeMap, stripe_map
+from bodyscan.stripes.stripe_map import StripeMap, boundary_map, stripe_map
 from bodyscan.stripes.usable_pixels import MIN_CONTRAST, shown_pixels
 
 SAMPLES = 20_000
@@ -54,6 +55,8 @@ def decode_bits(
         usable, beyond = limits.split(codes, usable, turned=images.turned)
         shown, _ = limits.split(codes, shown, turned=images.turned)
     brightness = Brightness.of(images, variance, usable)
+    if images.bands is not None:
+        usable = usable & images.bands.wanted[:, None]
     boundaries = find_boundaries(
         images, brightness, codes, usable, variance, code.finest_run, code.first
     )
@@ -65,6 +68,8 @@ def decode_bits(
             boundaries, bit, moments, turned=images.turned
         )
     boundaries = replace(boundaries, sigma_px=scatter(boundaries) * boundaries.sigma_px)
+    if images.bands is not None:
+        return boundary_map(images, lit, boundaries, stripes)
     s, sigma = interpolate_stripes(boundaries, codes, usable, carried)
     if code.single:  # of others, codes at boundaries are misread by any number
         fill_from_codes(s, sigma, codes, shown)
@@ -74,14 +79,28 @@ def decode_bits(
 
 
 def bit_lines(
-    lit: Greys, dark: Greys | None, patterns: Greys, inverses: Greys | None, direction: str
+    lit: Greys,
+    dark: Greys | None,
+    patterns: Greys,
+    inverses: Greys | None,
+    direction: str,
+    bands: LineBands | None = None,
 ) -> ScanLines:
-    """The patterns (bits, H, W), and their inverses if there are any, as scan lines.
+    """The patterns (bits, H, W), and their inverses if there are any, as scan lines; those near
+    `bands` alone, if any.
 
     Without a dark frame it is taken from the patterns and their inverses: every stripe is dark in
     one of each two; and both lit and dark, if they were exposed otherwise. Raises DecodingFailed if
     there are no inverses either.
     """
+    turned, chosen = direction == "horizontal", None
+    if bands is not None:
+        chosen = bands.lines(lit.shape[1 if turned else 0], turned=turned)
+        lit, patterns = (chosen.cut(images, turned=turned) for images in (lit, patterns))
+        dark, inverses = (
+            None if images is None else chosen.cut(images, turned=turned)
+            for images in (dark, inverses)
+        )
     if dark is None:
         if inverses is None:
             raise DecodingFailed(
@@ -92,7 +111,8 @@ def bit_lines(
     if inverses is not None and not _exposed_alike(lit, dark, patterns, inverses):
         lit = np.maximum(patterns, inverses).max(axis=0)
         dark = np.minimum(patterns, inverses).min(axis=0)
-    return ScanLines.along_lines(lit, dark, patterns, inverses, direction)
+    lines = ScanLines.along_lines(lit, dark, patterns, inverses, direction)
+    return replace(lines, bands=chosen)
 
 
 def _exposed_alike(lit: Greys, dark: Greys, patterns: Greys, inverses: Greys) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Greys
 from bodyscan.errors import DecodingFailed, WrongDirection
+from bodyscan.stripes.line_bands import LineBands
 from bodyscan.stripes.one_moment import Moments
 from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
@@ -23,6 +24,7 @@ def decode_stripes(
     *,
     limits: StripeLimits | None = None,
     moments: Sequence[Moments] = (),
+    bands: LineBands | None = None,
     where: str = "",
 ) -> StripeMap:
     """The stripe coordinate of every pixel, from one pair's images of one shot.
@@ -33,6 +35,7 @@ def decode_stripes(
     limits: the stripes that matter; others get no s.
     moments: of the code's images, then of those of the stripes that cross, if what moved meanwhile
     is to be told and taken out.
+    bands: where boundaries are wanted, and no s.
 
     Raises DecodingFailed, naming the image where it can be told, if they do not add up. Where only
     those of the stripes that cross do not, the map is that of the others and says why.
@@ -40,13 +43,13 @@ def decode_stripes(
     try:
         own, *others = images_by_kind(code, coded)
         seen, across = (*moments, None, None)[:2]
-        found = _decode(code, lit, dark, own, limits, seen)
+        found = _decode(code, lit, dark, own, limits, seen, bands)
         if code.crossing is None:
             return found
     except DecodingFailed as error:
         raise DecodingFailed(error.what, where=where, remedy=error.remedy) from error
     try:
-        crossing = _decode(code.crossing, lit, dark, others[0], None, across)
+        crossing = _decode(code.crossing, lit, dark, others[0], None, across, bands)
         return replace(found, crossing=crossing)
     except DecodingFailed as error:
         remedy = error.remedy
@@ -62,6 +65,7 @@ def _decode(
     coded: Mapping[ImageKind, Greys],
     limits: StripeLimits | None,
     moments: Moments | None,
+    bands: LineBands | None,
 ) -> StripeMap:
     """The map of stripes that run one way."""
     shape = next(iter(coded.values())).shape[1:]
@@ -71,7 +75,7 @@ def _decode(
         raise DecodingFailed(f"images of {shape} px, lit frame of {lit.shape} px")
     if dark is not None and dark.shape != shape:
         raise DecodingFailed(f"dark frame of {dark.shape} px, lit frame of {lit.shape} px")
-    found = way.decode(SequenceImages(lit, dark, coded, moments), limits)
+    found = way.decode(SequenceImages(lit, dark, coded, moments, bands), limits)
     if limits is None or found.beyond is not None:
         return found
     return restrict(found, limits)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Bytes, Floats, Greys, Indices, Mask
 from bodyscan.compiled import compiled
+from bodyscan.stripes.line_bands import BandLines
 
 Words = NDArray[np.uint16]
 
@@ -24,6 +25,7 @@ class ScanLines:
     lit, dark: (L, P).  patterns: (F, L, P), the images of the code.
     inverses: (F, L, P), None where none are projected.  All of one type, see `Greys`.
     turned: the lines are the camera image's columns (its stripes are horizontal).
+    bands: which of its lines they are, where not all.
     """
 
     lit: Greys
@@ -31,6 +33,7 @@ class ScanLines:
     patterns: Greys
     inverses: Greys | None
     turned: bool
+    bands: BandLines | None = None
 
     @staticmethod
     def along_lines(

@@ -23,6 +23,7 @@ from bodyscan.files.model import Model, Problem
 
 if TYPE_CHECKING:
     from bodyscan.arrays import Array, Greys
+    from bodyscan.stripes.line_bands import LineBands
     from bodyscan.stripes.one_moment import Moments
     from bodyscan.stripes.stripe_limits import StripeLimits
     from bodyscan.stripes.stripe_map import StripeMap
@@ -51,13 +52,15 @@ class SequenceImages:
 
     lit, dark: (H, W); no dark where none was taken.  coded: (n, H, W) of each kind.  All of one type:
     uint8, or float32 where parts of grey levels are known.  moments: when they were taken, if what
-    moved meanwhile is to be told and taken out by codes that can.
+    moved meanwhile is to be told and taken out by codes that can.  bands: where boundaries alone are
+    wanted; codes that can look there only, and give no s.
     """
 
     lit: Greys
     dark: Greys | None
     coded: Mapping[ImageKind, Greys]
     moments: Moments | None = None
+    bands: LineBands | None = None
 
 
 class StripeCode(Model):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -36,7 +36,8 @@ class ResponseShare:
 class StripeMap:
     """The stripe coordinate of every lit pixel, and the stripe boundaries between them.
 
-    s: (height, width) float32, in [0, S]; NaN where there is none.
+    s: (height, width) float32, in [0, S]; NaN where there is none; (0, 0) where boundaries alone were
+    wanted.
     sigma: (height, width) float32, standard deviation of s, in stripes; NaN likewise.
     lit: (height, width) uint8, the fully lit image (grey).
     boundary_index: (N,) int64: boundary i lies between stripes i - 1 and i, that is s = i.
@@ -75,18 +76,26 @@ def stripe_map(
     beyond: Mask | None = None,
 ) -> StripeMap:
     """What was read along scan lines, back in the camera's own layout."""
-    pixels = np.stack([boundaries.position, boundaries.line_position], axis=-1)
     if images.turned:
         s, sigma = cv2.transpose(s), cv2.transpose(sigma)
-        pixels = pixels[:, ::-1]
         beyond = None if beyond is None else beyond.T
+    found = boundary_map(images, lit, boundaries, stripes)
+    return replace(found, s=s, sigma=sigma, beyond=beyond)
+
+
+def boundary_map(images: ScanLines, lit: Greys, boundaries: Boundaries, stripes: int) -> StripeMap:
+    """The boundaries alone, in the camera's own layout."""
+    across, kept = boundaries.line_position, np.ones(len(boundaries.line), bool)
+    if images.bands is not None:
+        across, kept = images.bands.places(boundaries.line, across)
+    places = (across, boundaries.position) if images.turned else (boundaries.position, across)
+    nothing = np.empty((0, 0), np.float32)
     return StripeMap(
-        s=s,
-        sigma=sigma,
+        s=nothing,
+        sigma=nothing,
         lit=whole_grey(lit),
-        boundary_index=boundaries.index,
-        boundary_pixels=np.ascontiguousarray(pixels, float),
-        boundary_sigma_px=boundaries.sigma_px.astype(np.float32),
+        boundary_index=boundaries.index[kept],
+        boundary_pixels=np.stack(places, axis=-1)[kept],
+        boundary_sigma_px=boundaries.sigma_px[kept].astype(np.float32),
         stripes=stripes,
-        beyond=beyond,
     )

@@ -15,6 +15,7 @@ from bodyscan.calibration.striped_view import (
     BoardBoundaries,
     Box,
     StripedView,
+    bands_apart,
     box_of_print,
     on_print,
 )
@@ -200,7 +201,12 @@ def _decode(
         return on_print(camera, code, shot.board, shot.camera_from_face, seen)
 
     wanted = [view for view in views if view.key in used]
-    return decode_on_boards(rig, captures, wanted, progress, box=box, keep=printed)
+    every = {
+        pair.name: bands_apart(pair.projector, [box(v) for v in wanted if v.pair == pair.name])
+        for pair in rig.pairs
+        if pair.projector is not None
+    }
+    return decode_on_boards(rig, captures, wanted, progress, box=box, keep=printed, every=every)
 
 
 def _fit_sheets(

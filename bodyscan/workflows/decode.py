@@ -7,14 +7,17 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
+from types import MappingProxyType
 
 from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.calibration.striped_view import (
+    BIN_PX,
     BoardBoundaries,
     Box,
     boundaries_near,
     box_around,
     crop_around,
+    most_apart,
 )
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_sequence
@@ -26,6 +29,7 @@ from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import fill
 from bodyscan.stripes.decoding import decode_stripes
+from bodyscan.stripes.line_bands import LineBands
 from bodyscan.stripes.one_moment import Moments
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
@@ -47,9 +51,10 @@ def decode_sequence(
     limits: StripeLimits | None = None,
     moments: Sequence[Moments] = (),
     crop: Crop = WHOLE,
+    bands: LineBands | None = None,
     workers: int = 1,
 ) -> StripeMap:
-    """Read and decode what `pair` took in one shot; limits, moments: see `decode_stripes`.
+    """Read and decode what `pair` took in one shot; limits, moments, bands: see `decode_stripes`.
 
     crop: rows and columns of the images to decode; the map is of these alone.
 
@@ -70,6 +75,7 @@ def decode_sequence(
             images.coded,
             limits=limits,
             moments=moments,
+            bands=bands,
             where=where,
         )
 
@@ -97,17 +103,20 @@ def decode_on_boards(
     *,
     box: Callable[[BoardView], Box] = box_around,
     keep: Keep = _all,
+    every: Mapping[str, int] = MappingProxyType({}),
 ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
     """Stripe boundaries near each of these views; sequences that are bad are noted.
 
     box: where the board of a view shows stripes that are wanted.  keep: what is kept of a view's, of
-    which a rig has tens of millions.  A pair of which none can be decoded is a failure.
+    which a rig has tens of millions.  every: by pair, of how many bands of BIN_PX along the stripes one
+    is enough; shots take turns.  A pair of which none can be decoded is a failure.
     """
     wanted: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
     for view in views:
         wanted[view.pair, view.shot].append(view)
     sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
 
+    turn = {s: captures.of_pair(s.pair).index(s) for s in sequences}
     responses: dict[str, list[ResponseShare]] = defaultdict(list)
     one_way: dict[ImageSequence, str] = {}
 
@@ -115,7 +124,11 @@ def decode_on_boards(
         own = wanted[sequence.pair, sequence.shot]
         boxes = [box(view) for view in own]
         crop = crop_around(boxes)
-        stripes = decode_sequence(sequence, rig.pair(sequence.pair), crop=crop)
+        pair = rig.pair(sequence.pair)
+        apart = min(every.get(pair.name, 1), most_apart(boxes, pair.camera))
+        corner = crop[0].start, crop[1].start
+        bands = LineBands(BIN_PX, apart, turn[sequence], corner)
+        stripes = decode_sequence(sequence, pair, crop=crop, bands=bands)
         responses[sequence.pair] += responses_in(stripes)
         one_way[sequence] = stripes.crossing_fault
         return {

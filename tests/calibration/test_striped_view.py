@@ -17,14 +17,17 @@ from bodyscan.calibration.striped_view import (
     RIM_SQUARES,
     BoardBoundaries,
     StripedView,
+    bands_apart,
     boundaries_on_boards,
     box_around,
     box_of_print,
+    most_apart,
     on_board,
 )
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.registration.board_shape import BoardShape
 from bodyscan.rig.board import Board
+from bodyscan.rig.pair import CameraSpec
 from bodyscan.stripes.codes.gray import Gray
 
 SCENE = chapter_scene()
@@ -127,3 +130,19 @@ def test_boundaries_are_averaged_in_pieces_on_the_print_alone() -> None:
     np.testing.assert_allclose(np.sum(1.0 / found.sigma_px**2), inside.sum() / 0.2**2)
     # Over 16 px a boundary bends by less than a hundredth of a stripe.
     assert np.abs(SCENE.projector.stripe(found.points) - found.index).max() < 0.01
+
+
+def test_more_boards_need_fewer_bands_of_each() -> None:
+    code = Gray(stripes=640, direction="horizontal")
+    box = np.array([100.0, 300.0]), np.array([580.0, 700.0])
+    # 30 bins along each of 320 boundaries, and a fit takes 25,000.
+    assert [bands_apart(code, [box] * boards) for boards in (3, 10, 20)] == [1, 3, 7]
+
+
+def test_small_boards_and_those_half_outside_are_not_missed_between_bands() -> None:
+    camera = CameraSpec(width=1280, height=1024)
+    large = np.array([100.0, 300.0]), np.array([900.0, 900.0])
+    small = np.array([1000.0, 0.0]), np.array([1140.0, 135.0])
+    cut = np.array([1130.0, 0.0]), np.array([2000.0, 900.0])
+    assert [most_apart(boxes, camera) for boxes in ([large], [large, small], [cut])] == [9, 2, 2]
+    assert most_apart([(np.zeros(2), np.full(2, 50.0))], camera) == 1

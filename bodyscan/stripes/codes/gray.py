@@ -101,7 +101,8 @@ class _NumberedStripes(StripeCode):
         from bodyscan.stripes.bit_patterns import bit_lines, decode_bits
 
         patterns, inverses = images.coded[PATTERN], images.coded.get(INVERSE)
-        lines = bit_lines(images.lit, images.dark, patterns, inverses, self.direction)
+        frames = images.lit, images.dark, patterns, inverses
+        lines = bit_lines(*frames, self.direction, images.bands)
         code, lit = self.word_code, images.lit
         return decode_bits(code, lines, lit, self.stripes, limits, images.moments)
 

@@ -1,0 +1,63 @@
+"""Boundaries of some scan lines alone: a board shows more of them than any fit takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.arrays import Array, Greys, Indices, Mask
+
+ASIDE, MARGIN = 2, 8
+"""Lines beside a band from which boundaries are pulled into it by edges of brightness, and those that
+tell what pixels of these show: brightness looks 3 lines aside (`albedo_edges`), at pixels that 2 more
+decide of (`usable_pixels`)."""
+
+
+@dataclass(frozen=True)
+class LineBands:
+    """Of bands of `width` neighbouring lines one in `every`; `turn` says which.
+
+    corner: row and column of the camera's image at which the images begin: bands are counted from its
+    first line, so that they are the same however it is cut.
+    """
+
+    width: int
+    every: int
+    turn: int
+    corner: tuple[int, int]
+
+    def lines(self, count: int, *, turned: bool) -> BandLines:
+        """Of so many lines, which are columns if turned."""
+        band = (self.corner[turned] + np.arange(count)) // self.width
+        inside = band % self.every == self.turn % self.every
+        near, wanted = (_widened(inside, by) for by in (MARGIN, ASIDE))
+        return BandLines(np.flatnonzero(near), wanted[near], inside)
+
+
+def _widened(lines: Mask, by: int) -> Mask:
+    return np.asarray(np.convolve(lines, np.ones(2 * by + 1), "same") > 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class BandLines:
+    """number: (L,) of lines to look at.  wanted: (L,) those whose boundaries may lie in a band.
+    inside: (count,) of all lines, those in a band."""
+
+    number: Indices
+    wanted: Mask
+    inside: Mask
+
+    def places(self, line: Indices, place: Array) -> tuple[Array, Mask]:
+        """Of boundaries on lines (N,) of these, at places (N,) across them: where they lie across all
+        lines (N,) px, and which of them (N,) in a band."""
+        place = place + (self.number - np.arange(len(self.number)))[line]
+        nearest = np.clip(np.floor(place).astype(np.int64), 0, len(self.inside) - 1)
+        return place, self.inside[nearest]
+
+    def cut(self, images: Greys, *, turned: bool) -> Greys:
+        """Of images (..., H, W) these rows, or columns if turned, alone."""
+        ends = np.flatnonzero(np.diff(self.number) > 1) + 1
+        runs = [slice(run[0], run[-1] + 1) for run in np.split(self.number, ends)]
+        parts = [images[..., run] if turned else images[..., run, :] for run in runs]
+        return np.concatenate(parts, axis=-1 if turned else -2)
