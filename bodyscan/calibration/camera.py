@@ -221,15 +221,17 @@ def locate_board(
     camera: Camera, view: PlanarView, start: RigidTransform | None = None
 ) -> tuple[RigidTransform, Array]:
     """`camera_from_board` of one view for a known camera, and its residuals (N, 2) px."""
-    if start is None:
-        # Where the lens folds, the pixel without its lens has to do for a start.
-        seen = camera.rays(view.pixels)[:, :2]
-        normalized = np.where(np.isfinite(seen), seen, camera.normalized_from_pixels(view.pixels))
-        start = camera_from_plane(
-            homography(view.points[:, :2], normalized), float(view.points[0, 2])
-        )
-    (pose,), (residuals,) = locate_boards(camera, [view], [start])
+    begun = roughly_located(camera, view) if start is None else start
+    (pose,), (residuals,) = locate_boards(camera, [view], [begun])
     return pose, residuals
+
+
+def roughly_located(camera: Camera, view: PlanarView) -> RigidTransform:
+    """`camera_from_board` of one view by its homography: where `locate_boards` may start."""
+    # Where the lens folds, the pixel without its lens has to do.
+    seen = camera.rays(view.pixels)[:, :2]
+    normalized = np.where(np.isfinite(seen), seen, camera.normalized_from_pixels(view.pixels))
+    return camera_from_plane(homography(view.points[:, :2], normalized), float(view.points[0, 2]))
 
 
 def locate_boards(

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.detection import find_boards
 from bodyscan.boards.numbered_corners import number_corners
 from bodyscan.boards.unfound import describe_unfound
-from bodyscan.boards.view import BoardView
+from bodyscan.boards.view import BoardView, ViewKey
 from bodyscan.calibration.board_views import (
     LocatedView,
     board_symmetries,
@@ -25,7 +26,8 @@ from bodyscan.calibration.camera import (
     CameraCalibration,
     calibrate_camera,
     calibrate_known_camera,
-    locate_board,
+    locate_boards,
+    roughly_located,
 )
 from bodyscan.calibration.known_pair import read_known_camera
 from bodyscan.calibration.lens_choice import calibrate_with_lenses
@@ -34,6 +36,8 @@ from bodyscan.captures.images import read_board_image
 from bodyscan.errors import BadInput, BodyscanError, DegeneratePoses
 from bodyscan.files.corners_vnl import Corners, write_corners
 from bodyscan.geometry.lenses import FAMILY, LENSES
+from bodyscan.geometry.robust import rms_length
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, threaded
 from bodyscan.registration.board_appearance import appearance_notes, without_odd_mirrored
@@ -239,13 +243,23 @@ def locate_views(
     rig: Rig, views: Sequence[BoardView], cameras: Mapping[str, CameraCalibration]
 ) -> Outcome[list[LocatedView]]:
     """The pose of each board in the camera that saw it; views that fit no pose are dropped."""
+    usable = [
+        view
+        for view in views
+        if view.pair in cameras and has_enough_corners(view, rig.board(view.board))
+    ]
+    fitted: dict[ViewKey, tuple[RigidTransform, Array]] = {}
+    for name, found in cameras.items():
+        # All at once: a solve of one board's pose takes as many calls as one of thirty.
+        own = [view for view in usable if view.pair == name]
+        planar = [planar_view(view, rig.board(view.board)) for view in own]
+        starts = [roughly_located(found.camera, view) for view in planar]
+        poses = zip(*locate_boards(found.camera, planar, starts), strict=True) if own else ()
+        fitted |= zip((view.key for view in own), poses, strict=True)
     located, notes = [], []
-    for view in views:
-        board = rig.board(view.board)
-        if view.pair not in cameras or not has_enough_corners(view, board):
-            continue
-        pose, residuals = locate_board(cameras[view.pair].camera, planar_view(view, board))
-        rms = float((residuals**2).sum(axis=1).mean() ** 0.5)
+    for view in usable:
+        board, (pose, residuals) = rig.board(view.board), fitted[view.key]
+        rms = rms_length(residuals)
         if rms > max(NO_POSE_PX, NO_POSE_TIMES * cameras[view.pair].rms_px):
             notes.append(
                 f"{view.pair}: board {board.name} in shot {view.shot} fits no pose ({rms:.2f} px); "
