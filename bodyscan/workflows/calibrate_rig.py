@@ -186,7 +186,8 @@ def _decode(
     progress: Progress,
 ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
     """Stripes on the boards that took part in placing the rig: of tens of millions of boundaries means
-    on the print alone."""
+    on the print alone, of as many as light sheets are fitted to. A pair by itself, whose stripes place
+    the boards too, has all of them."""
     used = {view.key: view for view in placed.views}
 
     def box(view: BoardView) -> Box:
@@ -204,7 +205,7 @@ def _decode(
     every = {
         pair.name: bands_apart(pair.projector, [box(v) for v in wanted if v.pair == pair.name])
         for pair in rig.pairs
-        if pair.projector is not None
+        if pair.projector is not None and len(placed.cameras) > 1
     }
     return decode_on_boards(rig, captures, wanted, progress, box=box, keep=printed, every=every)
 
