@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -60,4 +61,4 @@ class BandLines:
         ends = np.flatnonzero(np.diff(self.number) > 1) + 1
         runs = [slice(run[0], run[-1] + 1) for run in np.split(self.number, ends)]
         parts = [images[..., run] if turned else images[..., run, :] for run in runs]
-        return np.concatenate(parts, axis=-1 if turned else -2)
+        return cast(Greys, np.concatenate(parts, axis=-1 if turned else -2))

@@ -53,7 +53,7 @@ def test_boundaries_in_bands_are_those_of_the_whole_picture(
     # One at a band's very end may fall in or out.
     assert abs(len(some.boundary_index) - np.count_nonzero(band % 3 == turn % 3)) <= 3
     places = [np.column_stack([APART * m.boundary_index, m.boundary_pixels]) for m in (every, some)]
-    off, nearest = cKDTree(places[0]).query(places[1])
+    off, nearest = map(np.asarray, cKDTree(places[0]).query(places[1]))
     # Blur is told from fewer edges: where brightness changes it moves boundaries, by far less than they
     # may be off.
     assert off.max() < 0.03
