@@ -355,14 +355,17 @@ def _imports() -> dict[str, frozenset[str]]:
                 wanted |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
                 wanted |= {node.module, *(f"{node.module}.{one.name}" for one in node.names)}
+        if "bodyscan.files.registry" in wanted:  # takes what lies beside it
+            folder = str(Path(path).parent)
+            wanted |= {one for one, place in named.items() if str(Path(place).parent) == folder}
         found[path] = frozenset(named[one] for one in wanted if one in named) - {path}
     return found
 
 
 @lru_cache
 def _tests_of(path: str) -> tuple[str, ...]:
-    """The test files nearest to a module by imports; of equally near ones first those that are called
-    like it, then those of its room, then those that import least besides."""
+    """The test files nearest to a module by imports, those of other rooms a step farther; of equally
+    near ones first those that are called like it, then those that import least besides."""
     imports = _imports()
     distance, step, reached = {path: 0}, 0, {path}
     while reached:
@@ -374,7 +377,8 @@ def _tests_of(path: str) -> tuple[str, ...]:
 
     def place(test: Path) -> tuple[object, ...]:
         own = test.as_posix()
-        return distance[own], name not in test.stem, test.parts[1] != room, len(imports[own]), own
+        steps = distance[own] + (test.parts[1] != room)
+        return steps, name not in test.stem, len(imports[own]), own
 
     return tuple(one.as_posix() for one in sorted(tests, key=place)[:NEAREST])
 

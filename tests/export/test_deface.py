@@ -10,7 +10,7 @@ import open3d as o3d
 import pytest
 
 from bodyscan.errors import FailedWork
-from bodyscan.export.defacing import GREY, deface
+from bodyscan.export.defacing import GREY, RINGS, deface
 from bodyscan.export.neck import Neck, find_neck
 from bodyscan.export.scan import export_scan
 from bodyscan.fusion.storage import StoredScan
@@ -97,6 +97,15 @@ def test_the_head_is_smooth_and_faces_outwards(body: BodyMesh, neck: Neck) -> No
     middles = corners[head].mean(axis=1)
     outwards = middles - [*middles[:, :2].mean(axis=0), neck.height_mm + 100.0]
     assert np.all(np.einsum("fc,fc->f", normals, outwards) > 0)
+    # Nor does the head begin as the rim of the cut, which zigzags from face to face: the lowest ring
+    # turns little from step to step, as a round line of so many does.
+    low = neck.height_mm - 30.0
+    added = shared.vertices[np.isnan(shared.sigma_mm) & (shared.vertices[:, 2] > low)]
+    ring = added[: len(added) // RINGS]
+    step = np.roll(ring, -1, axis=0) - ring
+    turn = np.linalg.norm(step - np.roll(step, 1, axis=0), axis=1)
+    # 46 points: 2 pi / 46 of a step, 0.14; along the rim's zigzag nearly all of it.
+    assert turn.mean() < 0.25 * np.linalg.norm(step, axis=1).mean()
 
 
 def test_raised_hands_stay(body: BodyMesh, neck: Neck) -> None:
