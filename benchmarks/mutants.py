@@ -20,7 +20,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -125,9 +125,16 @@ SEED = 1
 def report(count: int = COUNT, seed: int = SEED, modules: Sequence[str] = ()) -> str:
     """The section of docs/results.md."""
     sample = list(_sample(modules or _modules(), count, random.Random(seed)))
-    equivalent, first = _blocks(EQUIVALENT), _blocks(SURVIVED_FIRST)
+    equivalent = _blocks(EQUIVALENT)
     tried = [one for one in sample if one.key not in equivalent]
-    fates = _fates(tried)
+    return _section(seed, sample, tried, _fates(tried))
+
+
+def _section(
+    seed: int, sample: Sequence[Mutant], tried: Sequence[Mutant], fates: Mapping[str, str]
+) -> str:
+    """Of a sample, those of it that are not equivalent, and which test found each of these."""
+    first = _blocks(SURVIVED_FIRST)
     left = [one for one in tried if not fates[one.key]]
     survived = [one for one in tried if one.key in first or not fates[one.key]]
     listed = "\n\n".join(one.key for one in left)
@@ -355,9 +362,9 @@ def _imports() -> dict[str, frozenset[str]]:
                 wanted |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
                 wanted |= {node.module, *(f"{node.module}.{one.name}" for one in node.names)}
-        if "bodyscan.files.registry" in wanted:  # takes what lies beside it
-            folder = str(Path(path).parent)
-            wanted |= {one for one, place in named.items() if str(Path(place).parent) == folder}
+        if "pkgutil" in wanted and path.endswith("__init__.py"):  # takes what lies beside it
+            folder = Path(path).parent
+            wanted |= {one for one, place in named.items() if Path(place).parent == folder}
         found[path] = frozenset(named[one] for one in wanted if one in named) - {path}
     return found
 

@@ -54,8 +54,9 @@ def test_a_pair_that_wants_too_far_stays_where_it_was() -> None:
 
 def test_a_pair_that_nothing_ties_is_known_as_the_boards_and_a_sway_say() -> None:
     """1 mm of sway at the body's centre, besides the boards' 0.1 mm."""
-    known = PoseCovariance(("p1", "p2"), 0.1**2 * np.eye(12))
+    known = PoseCovariance(("p1", "p2", "p3"), 0.1**2 * np.eye(18))
     loose = SwayPrior(1.0, 0.0, 0.3, 4.0).loosen(known, ["p2"])
-    assert np.array_equal(loose.of("p1"), known.of("p1"))
+    for tied in ("p1", "p3"):
+        assert np.array_equal(loose.of(tied), known.of(tied))
     added = loose.of("p2") - known.of("p2")
     assert np.sqrt(np.diag(added))[3:] == pytest.approx([1.0, 1.0, 1.0], rel=1e-3)

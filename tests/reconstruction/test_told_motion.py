@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,8 +12,11 @@ import pytest
 from moving_ball import BITS, CAMERA, CENTRE, bit_of, seen_boundaries, sheets
 
 from bodyscan.arrays import Array
+from bodyscan.reconstruction.sequence_moments import sequence_moments
 from bodyscan.reconstruction.told_motion import tell_motion
+from bodyscan.rig.frame_names import FrameNames
 from bodyscan.stripes.boundaries import Boundaries
+from bodyscan.stripes.codes.gray import Gray
 from bodyscan.stripes.comb import Comb
 from bodyscan.stripes.one_moment import Moments, StripeMotion, carry_to_moment
 
@@ -147,3 +152,13 @@ def test_teeth_that_no_smooth_motion_explains_go_into_the_sigmas() -> None:
     assert np.median(grid[0]) > 5.0 * np.median(grid[1])
     late = (bit_of(carried.index) < BITS - 2) & (carried.line < 40)
     assert np.median(carried.sigma_px[late] / seen.sigma_px[late]) > 1.5
+
+
+@pytest.mark.parametrize(("lasts_ms", "most_mm"), [(10.0, 2.0), (3000.0, 120.0)])
+def test_nobody_moves_farther_than_there_is_time_for(lasts_ms: float, most_mm: float) -> None:
+    """At 40 mm a second, and by no leap that is too short to be named."""
+    code, names = Gray(stripes=64, direction="vertical"), FrameNames()
+    frame_ms = dict(zip(names.of_code(code), np.linspace(500.0, 500.0 + lasts_ms, 12), strict=True))
+    pair: Any = SimpleNamespace(camera=CAMERA, sheets=sheets(), crossing=None)
+    (moments,) = sequence_moments(pair, code, names, frame_ms)
+    assert moments.most_mm == pytest.approx(most_mm)

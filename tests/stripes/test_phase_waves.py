@@ -297,6 +297,11 @@ def test_waves_that_begin_otherwise_than_said_are_named(projected: Keys, said: s
     assert said in str(refused.value)
 
 
+def test_a_list_of_one_wave_is_that_wave() -> None:
+    for one, listed in (({"period": 16}, {"period": [16]}), ({"periods": 15}, {"periods": [15]})):
+        assert described({**listed, "steps": [4]}).waves == described({**one, "steps": 4}).waves
+
+
 def test_other_periods_than_said_are_noticed() -> None:
     lit, coded, _ = captured(HIERARCHICAL)
     with pytest.raises(DecodingFailed, match="go together at"):
