@@ -196,16 +196,18 @@ def _day(rig: Path) -> tuple[float, float, float, float]:
 def main(rig: Path, scans: int = DAY) -> None:
     """A day of the resident process that `watch` keeps; prints seconds and MiB of each scan."""
     from bodyscan.settings import ScanSettings
-    from bodyscan.workflows.resident import Resident
+    from bodyscan.workflows.preparation import Preparation
     from bodyscan.workflows.scan_folder import scan_folder
 
-    resident = Resident(rig / "calibration")
-    names = [pair.name for pair in resident.calibration.rig.pairs]
+    preparation = Preparation(rig / "calibration")
+    names = [pair.name for pair in preparation.calibration.rig.pairs]
     person, seconds, held = rig / "captures" / "person", [], []
     for _ in range(scans):
         started = time.perf_counter()
-        resident.prepare(person, names)
-        scan_folder(person, rig / "calibration", rig / "out", ScanSettings(), resident=resident)
+        preparation.prepare(person, names)
+        scan_folder(
+            person, rig / "calibration", rig / "out", ScanSettings(), preparation=preparation
+        )
         seconds.append(time.perf_counter() - started)
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         held.append(pages * os.sysconf("SC_PAGE_SIZE") / 2**20)

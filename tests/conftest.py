@@ -8,20 +8,21 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
 from made_once import value_made_once
-from ray_cast_scan import Scan, cast_scan, load_body, load_rig
 from required import IN_CI, missing
 from slow_files import SLOW
 
-from bodyscan.fusion.cleaning import clean
-from bodyscan.fusion.merging import merge
-from bodyscan.fusion.meshing import mesh
-from bodyscan.mesh.body import BodyCloud, BodyMesh
-from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.settings import FusionSettings, MeshSettings
+# What is heavy is imported where it is used: the process that hands tests out reads this file as well,
+# before any worker begins.
+if TYPE_CHECKING:
+    from ray_cast_scan import Scan
+
+    from bodyscan.mesh.body import BodyCloud, BodyMesh
+    from bodyscan.reconstruction.range_image import RangeImage
 
 # What is compiled is compiled at its first call, and machines may be loaded. In CI the same examples
 # are tried every time, so that a change is judged by itself; elsewhere new ones are looked for.
@@ -57,6 +58,8 @@ def captures() -> Path:
 
 @pytest.fixture(scope="session")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    from ray_cast_scan import cast_scan, load_body, load_rig
+
     return value_made_once(
         tmp_path_factory, "scan", lambda: cast_scan(load_body(), load_rig(), scale=0.5)
     )
@@ -64,6 +67,10 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
 
 @pytest.fixture(scope="session")
 def cleaned(scan: Scan, tmp_path_factory: pytest.TempPathFactory) -> list[RangeImage]:
+    from ray_cast_scan import load_rig
+
+    from bodyscan.fusion.cleaning import clean
+
     def make() -> list[RangeImage]:
         return clean(scan.range_images, scan.rig_from_camera, load_rig().volume)
 
@@ -74,6 +81,9 @@ def cleaned(scan: Scan, tmp_path_factory: pytest.TempPathFactory) -> list[RangeI
 def cloud(
     scan: Scan, cleaned: list[RangeImage], tmp_path_factory: pytest.TempPathFactory
 ) -> BodyCloud:
+    from bodyscan.fusion.merging import merge
+    from bodyscan.settings import FusionSettings
+
     def make() -> BodyCloud:
         return merge(cleaned, scan.rig_from_camera, FusionSettings(points=250_000)).cloud
 
@@ -82,6 +92,9 @@ def cloud(
 
 @pytest.fixture(scope="session")
 def body(scan: Scan, cloud: BodyCloud, tmp_path_factory: pytest.TempPathFactory) -> BodyMesh:
+    from bodyscan.fusion.meshing import mesh
+    from bodyscan.settings import MeshSettings
+
     def make() -> BodyMesh:
         return mesh(cloud, MeshSettings(depth=8), scan.range_images, scan.rig_from_camera)
 

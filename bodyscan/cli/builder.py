@@ -117,12 +117,17 @@ def import_(
 
 
 def _calibration_folder(rig_file: Path, out: Path | None, overwrite: bool) -> Path:
+    folder = out or rig_file.parent / "calibration"
+    _require_place(folder, overwrite)
+    return folder
+
+
+def _require_place(folder: Path, overwrite: bool) -> None:
+    """That a calibration can be written there: now, not after minutes of work."""
     from bodyscan.registration.storage import refuse_existing
 
-    folder = out or rig_file.parent / "calibration"
     require_writable(folder)
     refuse_existing(folder, overwrite)
-    return folder
 
 
 def _say_calibration(output: Output, found: RigCalibration, saved: Path) -> None:
@@ -151,17 +156,11 @@ def check_calibration(
     overwrite: OverwriteCalibration = False,
 ) -> None:
     """Say whether anything in the rig has moved, and if so which pair or pole, and how far."""
-    from bodyscan.registration.storage import (
-        keep_former,
-        load_calibration,
-        refuse_existing,
-        save_calibration,
-    )
+    from bodyscan.registration.storage import keep_former, load_calibration, save_calibration
     from bodyscan.workflows.check_rig import check_rig
 
     if repair is not None:
-        require_writable(repair)
-        refuse_existing(repair, overwrite)
+        _require_place(repair, overwrite)
     rig = load_calibration(calibration)
     with output.stages() as progress:
         found = check_rig(rig, folders, progress, follow_links=follow_links)
@@ -192,16 +191,10 @@ def refine_rig(
 ) -> None:
     """Bring the pairs closer together on an object they scanned, within what the boards allow."""
     from bodyscan.captures.folder import open_scan
-    from bodyscan.registration.storage import (
-        keep_former,
-        load_calibration,
-        refuse_existing,
-        save_calibration,
-    )
+    from bodyscan.registration.storage import keep_former, load_calibration, save_calibration
     from bodyscan.workflows.refine_rig import refine_rig as refine
 
-    require_writable(out)
-    refuse_existing(out, overwrite)
+    _require_place(out, overwrite)
     rig = load_calibration(calibration)
     with output.stages() as progress:
         found = refine(rig, open_scan(rig.rig, folder), folder.name, progress)

@@ -15,7 +15,7 @@ from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.errors import FailedWork
 from bodyscan.export.neck import REACH_MM, Neck
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.regions import UNSURE
+from bodyscan.mesh.regions import regions_at
 from bodyscan.mesh.topology import (
     directed_edges,
     drop_unused_vertices,
@@ -75,9 +75,7 @@ def _attach_attributes(
         np.concatenate([mesh.colours[used], np.full((added, 3), GREY, np.uint8)]),
         np.concatenate([mesh.sigma_mm[used], np.full(added, np.nan, np.float32)]),
         np.concatenate([filled, np.ones(len(faces) - len(filled), bool)]),
-        regions=None
-        if mesh.regions is None
-        else np.concatenate([mesh.regions[used], np.full(added, UNSURE, np.uint8)]),
+        regions=regions_at(mesh.regions, np.concatenate([used, np.full(added, -1)])),
     )
 
 

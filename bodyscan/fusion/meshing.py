@@ -14,7 +14,7 @@ from bodyscan.fusion.support import fit_to_points, support
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.bricks import SIDE, Bricks
-from bodyscan.mesh.regions import UNSURE
+from bodyscan.mesh.regions import regions_at
 from bodyscan.mesh.repair import largest_piece
 from bodyscan.mesh.surface_nets import surface_nets
 from bodyscan.mesh.topology import topology, vertex_normals
@@ -103,7 +103,5 @@ def attach_attributes(
         cloud.colours[around.nearest],
         sigma_mm,
         np.any(np.isnan(sigma_mm)[faces], axis=1),
-        regions=None
-        if cloud.regions is None
-        else np.where(around.measured, cloud.regions[around.nearest], np.uint8(UNSURE)),
+        regions=regions_at(cloud.regions, np.where(around.measured, around.nearest, -1)),
     )

@@ -4,7 +4,7 @@ starts it, nobody needs to type it."""
 import sys
 
 if sys.argv[1] == "--resident":
-    from bodyscan.jobs.resident import main
+    from bodyscan.jobs.resident_worker import main
 else:
     from bodyscan.jobs.worker import main
 

@@ -20,7 +20,7 @@ from bodyscan.rig.rig_file import load_rig
 from bodyscan.verdict import Announce
 
 if TYPE_CHECKING:
-    from bodyscan.workflows.resident import Resident
+    from bodyscan.workflows.preparation import Preparation
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,15 @@ def scan_inputs(job: Job) -> dict[str, Path]:
 
 
 def run_scan(
-    job: Job, out: Path, progress: Progress, announce: Announce, resident: Resident | None = None
+    job: Job,
+    out: Path,
+    progress: Progress,
+    announce: Announce,
+    preparation: Preparation | None = None,
 ) -> None:
     """As `bodyscan scan` does: cloud, mesh, what they are, pictures.
 
-    resident: what a process that stays has loaded and decoded before.
+    preparation: what a process that stays has loaded and decoded before.
     """
     from bodyscan.workflows.scan_folder import scan_folder
 
@@ -84,7 +88,7 @@ def run_scan(
         out,
         settings,
         progress,
-        resident=resident,
+        preparation=preparation,
         announce=announce,
     )
     for note in pictures.notes:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
-from bodyscan.mesh.regions import UNSURE, of_faces
+from bodyscan.mesh.regions import UNSURE, of_faces, regions_at
 from bodyscan.mesh.topology import drop_unused_vertices, face_areas
 
 
@@ -102,5 +102,5 @@ class BodyMesh:
             self.colours[used],
             self.sigma_mm[used],
             filled,
-            regions=None if self.regions is None else self.regions[used],
+            regions=regions_at(self.regions, used),
         )

@@ -5,7 +5,7 @@ strays.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -73,16 +73,10 @@ def _decimated(content: _Content, faces: int, within_mm: float) -> BodyMesh:
         )
     vertices, corners = refine_to_tolerance(vertices, corners, mesh.vertices, mesh.faces, within_mm)
     nearest = np.asarray(cKDTree(mesh.vertices).query(vertices, workers=THREADS)[1])
-    sigma_mm = mesh.sigma_mm[nearest]
-    return BodyMesh(
-        vertices,
-        corners,
-        vertex_normals(vertices, corners),
-        mesh.colours[nearest],
-        sigma_mm,
-        np.any(np.isnan(sigma_mm)[corners], axis=1),
-        regions=None if mesh.regions is None else mesh.regions[nearest],
+    small = mesh.part(
+        vertices, corners, nearest, np.isnan(mesh.sigma_mm)[nearest[corners]].any(axis=1)
     )
+    return replace(small, normals=vertex_normals(vertices, corners))
 
 
 class NearestSurface:

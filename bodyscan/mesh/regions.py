@@ -21,6 +21,14 @@ def shares(regions: Bytes, sizes: Array | None = None) -> dict[str, float]:
     return dict(zip(NAMES, (counts / max(counts.sum(), 1e-12)).tolist(), strict=True))
 
 
+def regions_at(regions: Bytes | None, places: Indices) -> Bytes | None:
+    """(M,) of regions (N,) those at places (M,), unsure where a place is -1, as what is new has none;
+    None where nothing is known of regions."""
+    if regions is None:
+        return None
+    return np.where(places >= 0, regions[places], np.uint8(UNSURE))
+
+
 def of_faces(regions: Bytes, faces: Indices) -> Bytes:
     """(F,) of faces (F, 3): what two corners at least are, of vertices' regions (V,); else unsure."""
     a, b, c = regions[faces].T

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from bodyscan.arrays import Array, Bytes, Indices, Mask
-from bodyscan.mesh.regions import UNSURE, shares
+from bodyscan.mesh.regions import regions_at, shares
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,8 @@ def runs_of(loop: Loop, shortest_gap_mm: float) -> tuple[Run, ...]:
     label = _stretches(ends, loop.measured, len(nodes))
     lengths = np.bincount(label, loop.lengths)
     measured = loop.measured | (lengths[label] < shortest_gap_mm)
-    label = _stretches(ends, measured, len(nodes))
+    if (measured != loop.measured).any():
+        label = _stretches(ends, measured, len(nodes))
     runs = [_run(ends, np.flatnonzero(label == k), measured) for k in range(label.max() + 1)]
     begins = {int(ends[run.first, 0]): k for k, run in enumerate(runs)}
     order = [0]
@@ -119,9 +120,7 @@ def joined(loop: Loop, runs: Sequence[Run]) -> Loop:
         np.concatenate([loop.segments[own], across]),
         np.concatenate([loop.measured[own], np.zeros(len(across), bool)]),
         np.concatenate([loop.ends[own], numbers]),
-        None
-        if loop.regions is None
-        else np.concatenate([loop.regions[own], np.full(len(across), UNSURE, np.uint8)]),
+        regions_at(loop.regions, np.concatenate([own, np.full(len(across), -1)])),
     )
 
 
@@ -136,16 +135,10 @@ def _run(ends: Indices, own: Indices, measured: Mask) -> Run:
 
 def _stretches(ends: Indices, measured: Mask, count: int) -> Indices:
     """(N,) numbers from 0 of the stretches of segments (N, 2) that were measured, or were not."""
-    label = np.empty(len(ends), np.int64)
-    taken = 0
-    for state in (True, False):
-        own = np.flatnonzero(measured == state)
-        graph = coo_array((np.ones(len(own), np.int8), tuple(ends[own].T)), shape=(count, count))
-        nodes = connected_components(graph, directed=False)[1]
-        _, label[own] = np.unique(nodes[ends[own, 0]], return_inverse=True)
-        label[own] += taken
-        taken = int(label[own].max(initial=taken - 1)) + 1
-    return label
+    own = ends + count * ~measured[:, None]  # what was not measured hangs on nodes of its own
+    graph = coo_array((np.ones(len(own), np.int8), tuple(own.T)), shape=(2 * count, 2 * count))
+    nodes = connected_components(graph, directed=False)[1]
+    return np.unique(nodes[own[:, 0]], return_inverse=True)[1]
 
 
 def loops_at(
@@ -177,9 +170,8 @@ def loops_at(
     measured = np.ones(crossed.size, bool) if filled is None else ~filled[crossed]
     order = np.argsort(labels, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
-    kinds = None if regions is None else regions[crossed]
     loops = [
-        Loop(segments[part], measured[part], ends[part], None if kinds is None else kinds[part])
+        Loop(segments[part], measured[part], ends[part], regions_at(regions, crossed[part]))
         for part in parts
     ]
     return tuple(sorted(loops, key=lambda loop: -loop.area_mm2))

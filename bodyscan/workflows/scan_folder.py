@@ -16,7 +16,7 @@ from bodyscan.registration.storage import calibration_id, load_calibration
 from bodyscan.report.pictures import Pictures, cloud_pictures, mesh_pictures, write_pictures
 from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Announce, say_nothing
-from bodyscan.workflows.resident import Resident
+from bodyscan.workflows.preparation import Preparation
 from bodyscan.workflows.scan_person import scan_person
 
 
@@ -29,24 +29,24 @@ def scan_folder(
     *,
     empty: Path | None = None,
     follow_links: bool = False,
-    resident: Resident | None = None,
+    preparation: Preparation | None = None,
     announce: Announce = say_nothing,
 ) -> tuple[Scan, Path, Outcome[list[Path]]]:
     """The scan, its scan.json in `out`, and the pictures beside it, written once the result is kept.
     A result that lay there goes. The cloud is drawn while it is meshed, where a core is free.
 
     empty: captures of the rig with nobody in it. follow_links: though the calibration's rig file does
-    not say so. resident: what was loaded and decoded before. announce: told the verdict as the points
-    alone have it, and once the result is kept the final one. Raises ScanFailed after saying so in
-    scan.json.
+    not say so. preparation: what was loaded and decoded before. announce: told the verdict as the
+    points alone have it, and once the result is kept the final one. Raises ScanFailed after saying so
+    in scan.json.
     """
-    rig = resident.calibration if resident else load_calibration(calibration)
+    rig = preparation.calibration if preparation else load_calibration(calibration)
     described = rig.rig
     if follow_links:
         described = described.model_copy(update={"follow_links": True})
     captures = open_scan(described, folder)
     nobody = open_scan(described, empty) if empty else None
-    made = resident.made_of(captures) if resident else {}
+    made = preparation.made_of(captures) if preparation else {}
     origin = calibration_id(calibration)
     subject, when, simulated = captures.subject, captures.when, captures.simulated
     drawn: list[Future[Pictures]] = []

@@ -1,4 +1,4 @@
-"""What a process that stays between scans keeps: the calibration, and range images made early.
+"""What is made ready before a scan is whole: its calibration loaded, range images of what came.
 
 A pair's images are decoded as soon as they are there, while other pairs still take theirs; what is
 left after the last image is its own pair and what joins them all.
@@ -29,7 +29,7 @@ class _Made:
     stamps: tuple[Stamp, ...]
 
 
-class Resident:
+class Preparation:
     """One calibration, loaded once, and the range images of scans that are still arriving."""
 
     def __init__(self, calibration: Path) -> None:

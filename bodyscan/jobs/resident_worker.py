@@ -24,7 +24,7 @@ from bodyscan.jobs.job import LOG
 from bodyscan.jobs.stages import KINDS, Kinds, run_scan
 from bodyscan.jobs.supervision import open_log
 from bodyscan.jobs.worker import attempt, become_worker
-from bodyscan.workflows.resident import Resident
+from bodyscan.workflows.preparation import Preparation
 
 
 def main() -> int:
@@ -32,11 +32,11 @@ def main() -> int:
     tell = become_worker()
     requests = _requests()
     try:
-        resident = Resident(Path(sys.argv[2]))
+        preparation = Preparation(Path(sys.argv[2]))
     except BodyscanError as error:
         tell(unusable=str(error))
         return error.exit_code
-    kinds = _kinds(resident)
+    kinds = _kinds(preparation)
     # Now, not while the first verdict is waited for.
     import_module("bodyscan.workflows.scan_folder")
     tell(ready=True)
@@ -44,17 +44,17 @@ def main() -> int:
         request = requests.get()
         folder = Path(request["folder"])
         if "pairs" in request:
-            resident.prepare(folder, request["pairs"])
+            preparation.prepare(folder, request["pairs"])
             continue
         with _log_of(folder):
             failure = attempt(folder, kinds, tell)
         tell(ended=request["folder"], failed=failure.reason if failure else "")
 
 
-def _kinds(resident: Resident) -> Kinds:
-    """Stages as ever, but for the scan, which takes what is resident."""
+def _kinds(preparation: Preparation) -> Kinds:
+    """Stages as ever, but for the scan, which takes what was prepared."""
     scan, *others = KINDS["fuse"]
-    return {"fuse": (replace(scan, run=partial(run_scan, resident=resident)), *others)}
+    return {"fuse": (replace(scan, run=partial(run_scan, preparation=preparation)), *others)}
 
 
 def _requests() -> SimpleQueue[dict[str, Any]]:
