@@ -23,6 +23,7 @@ def compiled(function: Function) -> Function:
     Division by zero gives infinity or NaN, as in numpy. What was kept on disk is good as long as the
     function's file and those that it imports compiled functions from are unchanged. int() of a
     uint8 is unsigned there, and differences of such wrap round: write float(), or np.int64().
+    Copy arrays in a loop: `a[i] = b` compiles the words of its error as well, two seconds a process.
     """
     options = {"nogil": True, "error_model": "numpy"}
     try:

@@ -55,11 +55,17 @@ def _unfilter(rows: Bytes, image: Bytes) -> bool:
         elif kind == PAETH:
             _add_paeth(row, above, image[v])
         elif kind == 0:
-            image[v] = row
+            _copy(row, image[v])
         else:
             return False
         above = image[v]
     return True
+
+
+@compiled
+def _copy(row: Bytes, image: Bytes) -> None:
+    for u in range(row.size):
+        image[u] = row[u]
 
 
 @compiled

@@ -151,10 +151,11 @@ def _solve(moments: Array, prior: Array, solution: Array, variance: Array) -> No
     """
     normal, factor = np.empty((6, 6, LANES)), np.empty(LANES)
     for i in range(6):
-        solution[i] = moments[RIGHT[i]]
+        _copy(moments[RIGHT[i]], solution[i])
         for j in range(i, 6):
-            normal[i, j] = moments[LEFT[i, j]]
-        normal[i, i] += prior if i >= 3 else np.full_like(prior, 1e-6)
+            _copy(moments[LEFT[i, j]], normal[i, j])
+        for b in range(LANES):
+            normal[i, i, b] += prior[b] if i >= 3 else 1e-6
     for k in range(5, 0, -1):
         for i in range(k):
             _divide(normal[i, k], normal[k, k], factor)
@@ -165,7 +166,8 @@ def _solve(moments: Array, prior: Array, solution: Array, variance: Array) -> No
         for k in range(i):
             _subtract(solution[i], normal[k, i], solution[k])
         _divide(solution[i], normal[i, i], solution[i])
-    _divide(np.ones_like(prior), normal[0, 0], variance)
+    for b in range(LANES):
+        variance[b] = 1.0 / normal[0, 0, b]
 
 
 @compiled
@@ -195,6 +197,12 @@ def _weigh(
     for b in range(len(sample)):
         off = sample[b] - (constant[b] + du * (slope[b] + du * curvature[b]))
         weight[b] = ONE if abs(off) < width else ZERO
+
+
+@compiled
+def _copy(one: Array, other: Array) -> None:
+    for b in range(len(other)):
+        other[b] = one[b]
 
 
 @compiled

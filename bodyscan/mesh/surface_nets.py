@@ -174,7 +174,7 @@ def _place_vertices(
                         low[0], low[1], low[2] = i, j, k
                         low[(axis + 1) % 3] += edge & 1
                         low[(axis + 2) % 3] += edge >> 1 & 1
-                        high[:] = low
+                        high[0], high[1], high[2] = low[0], low[1], low[2]
                         high[axis] += 1
                         a, b = block[low[0], low[1], low[2]], block[high[0], high[1], high[2]]
                         vertex = first[brick, i, j, k] + part

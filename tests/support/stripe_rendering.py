@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -131,10 +132,8 @@ def render(
     """
     n = SUPERSAMPLING
     height, width = shape
-    u, v = np.meshgrid(
-        (np.arange(width * n) + 0.5) / n - 0.5, (np.arange(height * n) + 0.5) / n - 0.5
-    )
-    s, brightness = s_at(u, v), albedo(u, v)
+    s, truth = _fine_and_at_pixels(s_at, shape)
+    brightness = albedo(*_fine_places(shape))
     on = np.isfinite(s) & (s >= 0) & (s < stripes)
     rng = np.random.default_rng(seed)
     background = (np.where(np.isfinite(s), ambient, 0.0) * brightness).astype(np.float32)
@@ -143,19 +142,35 @@ def render(
 
     def frame(values: np.ndarray) -> np.ndarray:
         table = smeared(values.astype(float), light_blur_stripes, len(values) // stripes)
-        fine = background + lit_share * table.astype(np.float32)[place]
+        fine = table.astype(np.float32).take(place)
+        fine *= lit_share
+        fine += background
         blurred = cv2.GaussianBlur(fine, (0, 0), lens_blur_px * n)
         image = cv2.resize(blurred, (width, height), interpolation=cv2.INTER_AREA)
         image = image + rng.normal(0.0, noise, image.shape)
         return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
-    uc, vc = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
-    truth = s_at(uc, vc)
     return (
         frame(np.ones(stripes)),
         frame(np.zeros(stripes)),
         np.stack([frame(values) for values in lights]),
         np.where((truth >= 0) & (truth < stripes), truth, np.nan),
+    )
+
+
+@lru_cache(2)
+def _fine_and_at_pixels(s_at: Field, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """s at the samples of a picture (H, W), and at its pixels' centres; kept for the next picture."""
+    height, width = shape
+    centres = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    return s_at(*_fine_places(shape)), s_at(*centres)
+
+
+def _fine_places(shape: tuple[int, int]) -> list[np.ndarray]:
+    """u and v of the samples of a picture (H, W)."""
+    n, (height, width) = SUPERSAMPLING, shape
+    return np.meshgrid(
+        (np.arange(width * n) + 0.5) / n - 0.5, (np.arange(height * n) + 0.5) / n - 0.5
     )
 
 
@@ -179,5 +194,5 @@ def smeared(values: np.ndarray, blur: float, parts: int = 1) -> np.ndarray:
 def places_in_table(s: np.ndarray, stripes: int) -> np.ndarray:
     """Where values of s stand in the table that `smeared` makes of so many stripes."""
     last = (stripes + 2 * TABLE_AHEAD) * TABLE_PER_STRIPE - 1
-    place = ((s + TABLE_AHEAD) * TABLE_PER_STRIPE).astype(np.int32)
+    place = ((s + TABLE_AHEAD) * TABLE_PER_STRIPE).astype(np.intp)  # as numpy looks things up
     return np.asarray(np.clip(place, 0, last))
