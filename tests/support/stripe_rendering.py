@@ -166,7 +166,7 @@ def _fine_and_at_pixels(s_at: Field, shape: tuple[int, int]) -> tuple[np.ndarray
     return s_at(*_fine_places(shape)), s_at(*centres)
 
 
-def _fine_places(shape: tuple[int, int]) -> list[np.ndarray]:
+def _fine_places(shape: tuple[int, int]) -> tuple[np.ndarray, ...]:
     """u and v of the samples of a picture (H, W)."""
     n, (height, width) = SUPERSAMPLING, shape
     return np.meshgrid(
