@@ -74,7 +74,7 @@ def _decimated(content: _Content, faces: int, within_mm: float) -> BodyMesh:
     vertices, corners = refine_to_tolerance(vertices, corners, mesh.vertices, mesh.faces, within_mm)
     nearest = np.asarray(cKDTree(mesh.vertices).query(vertices, workers=THREADS)[1])
     small = mesh.part(
-        vertices, corners, nearest, np.isnan(mesh.sigma_mm)[nearest[corners]].any(axis=1)
+        vertices, corners, nearest, np.any(np.isnan(mesh.sigma_mm)[nearest[corners]], axis=1)
     )
     return replace(small, normals=vertex_normals(vertices, corners))
 
