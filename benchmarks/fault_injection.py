@@ -115,7 +115,7 @@ def _all_out(mm: float) -> Fault:
         }
         return replace(sound.calibration, rig_from_camera=moved), Outcome(sound.images)
 
-    return Fault(f"all poles: out {mm:g} mm", ("pole p",), inject)
+    return Fault(f"all poles: out {mm:g} mm", ("pole p", "all poles"), inject)
 
 
 def _moved(what: str, how: str, mm: float, way: int, degrees: float) -> Fault:

@@ -89,14 +89,15 @@ class Kind:
 class BodyMotion:
     """amplitudes: (n,) of all kinds' fields and courses.  usual: (6,) the sway that its unit is.
 
-    normal: (n, n), what was seen of them, without any prior.  inverse, units: of their covariance, in
-    units (n,).  Of both matrices the lower triangle counts.
+    normal: (n, n), what was seen of them, without any prior; pull: (n,) its right-hand side.  inverse,
+    units: of their covariance, in units (n,).  Of both matrices the lower triangle counts.
     """
 
     kinds: tuple[Kind, ...]
     usual: Array
     amplitudes: Array
     normal: Array
+    pull: Array
     inverse: Array
     units: Array
 
@@ -120,8 +121,8 @@ class BodyMotion:
             Kind("breath", breath, Courses.of(of_breath, seconds), BREATH_MM, usual=BREATH_MM),
         )
         count = sum(kind.count for kind in kinds)
-        nothing = np.zeros((count, count))
-        return BodyMotion(kinds, sway, np.zeros(count), nothing, nothing, np.ones(count))
+        nothing, none = np.zeros((count, count)), np.zeros(count)
+        return BodyMotion(kinds, sway, none, nothing, none, nothing, np.ones(count))
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -192,18 +193,18 @@ class BodyMotion:
             for k in self.kinds
         ]
         count = len(self.amplitudes)
-        normal, right = np.zeros((count, count), order="F"), np.zeros(count)
+        normal, total = np.zeros((count, count), order="F"), np.zeros(count)
         for g, kind in enumerate(self.kinds):
             own, rows = slice(ends[g], ends[g + 1]), self.slices[g]
-            right[rows] = (pull[:, own].T @ apart[g]).ravel()
+            total[rows] = (pull[:, own].T @ apart[g]).ravel()
             for h, other in enumerate(self.kinds[: g + 1]):
                 block = square[:, own, ends[h] : ends[h + 1]]
                 normal[rows, self.slices[h]] = _products(block, apart[g], apart[h]).reshape(
                     kind.count, other.count
                 )
-        motion = replace(self, normal=normal)._settled(right)
+        motion = replace(self, normal=normal, pull=total)._settled()
         for _ in range(SIZINGS):
-            motion = motion._resized()._settled(right)
+            motion = motion._resized()._settled()
         return motion
 
     def doubted(self) -> Array:
@@ -212,7 +213,19 @@ class BodyMotion:
             replace(kind, size=max(kind.size, PARTS_MM)) if kind.name == "parts" else kind
             for kind in self.kinds
         )
-        return replace(self, kinds=tuple(kinds))._settled(self.amplitudes).covariance
+        return replace(self, kinds=tuple(kinds))._settled().covariance
+
+    def asked_of_poses(self) -> tuple[Array, Array]:
+        """(6P, 6P) and (6P,): normal equations of motions (6,), pair after pair, by which poses are off
+        beside what boards left open and whatever the person may have done meanwhile."""
+        pose = self.slices[0]
+        # The first kind: its columns of the lower triangle are whole but for its own block.
+        seen = self.normal[:, pose].copy()
+        seen[pose] = np.tril(seen[pose]) + np.tril(seen[pose], -1).T
+        information = seen[pose] - seen.T @ self.covariance @ seen
+        pull = self.pull[pose] - seen.T @ self.amplitudes
+        by_pair = np.arange(len(pull)).reshape(6, -1).T.ravel()
+        return information[np.ix_(by_pair, by_pair)], pull[by_pair]
 
     def _asked(self, seen: CellEvidence, apart: Array) -> tuple[Array, Array]:
         """What an overlap asks of the fields, (M, M) and (M,); apart: (C, 12) of its two pairs now."""
@@ -221,7 +234,7 @@ class BodyMotion:
         wanted = np.einsum("cij,cj->ci", seen.information, apart[seen.cells]) - seen.gradient
         return basis.T @ (seen.information @ fields).reshape(basis.shape), basis.T @ wanted.ravel()
 
-    def _settled(self, right: Array) -> BodyMotion:
+    def _settled(self) -> BodyMotion:
         """With the solution of the normal equations and the prior.
 
         They grow with the pairs: their matrix lies as LAPACK wants it, which works in its place.
@@ -233,7 +246,7 @@ class BodyMotion:
         normal *= units[:, None]
         normal *= units
         factor = cho_factor(normal, lower=True, overwrite_a=True, check_finite=False)
-        amplitudes = units * cho_solve(factor, units * right, check_finite=False)
+        amplitudes = units * cho_solve(factor, units * self.pull, check_finite=False)
         inverse, _ = dpotri(factor[0], lower=True, overwrite_c=True)
         return replace(self, amplitudes=amplitudes, inverse=inverse, units=units)
 

@@ -24,6 +24,7 @@ from bodyscan.alignment.limbs import LIMBS
 from bodyscan.alignment.matching import AlignmentPoints, Matches
 from bodyscan.alignment.overlaps import COARSE, OverlapPoints, each_overlap, match_overlap
 from bodyscan.alignment.part_names import LEGS, PARTS, name_parts
+from bodyscan.alignment.place_evidence import PlaceEvidence
 from bodyscan.alignment.sway import BODY_CENTRE, SwayPrior, centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.pose_covariance import PoseCovariance
@@ -117,14 +118,15 @@ def follow(
     settings: AlignmentSettings,
     *,
     workers: int = THREADS,
-) -> tuple[Alignment, Followed | None]:
+) -> tuple[Alignment, Followed | None, PlaceEvidence | None]:
     """The alignment with a moving person's sway along time, and what else moved; None, and the
-    alignment as it was, for who stood still or if too little overlaps to tell.
+    alignment as it was, for who stood still or if too little overlaps to tell. Then what all that says
+    of the pairs' places, if anything.
 
     images, rig_from_camera, prior, settings: what `align` got; aligned: what it made of them.
     """
     if not aligned.overlaps or not settings.sway_mm or aligned.refused:
-        return aligned, None
+        return aligned, None, None
     names = [image.pair for image in images]
     seconds = [None if image.time_ms is None else 1e-3 * image.time_ms for image in images]
     with ThreadPoolExecutor(workers) as pool:
@@ -158,7 +160,7 @@ def follow(
             taken = coarse if left > 1 else views
             said = _each_overlap(asks, pool, taken, (motion, cells), reach, settings)
             if not said:
-                return aligned, None
+                return aligned, None, None
             motion = motion.solved(_both_ways(said), speeds)
             reach = max(reach / 2.0, settings.least_reach_mm)
             if (
@@ -166,11 +168,11 @@ def follow(
                 and _is_unbent(motion, seen)
                 and _is_unswayed(motion, seen, settings)
             ):
-                return aligned, None
+                return aligned, None, PlaceEvidence.of(names, motion)
         gaps = _each_overlap(_gap, pool, coarse, (motion, cells), reach, settings)
-    placed = _placed(aligned, names, views, motion, gaps)
+    placed, places = _placed(aligned, names, views, motion, gaps), PlaceEvidence.of(names, motion)
     if placed.rms_after_mm > NEARER * aligned.rms_after_mm and _is_unswayed(motion, seen, settings):
-        return aligned, None
+        return aligned, None, places
     followed = Followed(
         cells,
         dict(zip(names, motion.displacements(BENDING, from_middle=True), strict=True)),
@@ -180,7 +182,7 @@ def follow(
         _middle_ms(images),
         _mean_breath(motion, cells) if _middle_ms(images) is not None else None,
     )
-    return placed, followed
+    return placed, followed, places
 
 
 def _middle_ms(images: Sequence[RangeImage]) -> float | None:

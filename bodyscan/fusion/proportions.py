@@ -8,7 +8,7 @@ about, and no more: skirts end at once too, and were meant to be scanned.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -33,6 +33,8 @@ ALIKE = 0.5
 FLAT = 0.8
 """Height over the farthest that it reaches to the side: arms held out make it 1"""
 LIMB_MM2 = 1500.0
+NECK = 0.86
+"""of the height: a backpack ends below"""
 MEASURED = 0.6
 """of a section's outline: where fillings close it, it may be of any size"""
 
@@ -48,10 +50,17 @@ class _Section:
         return sum(loop.area_mm2 for loop in self.loops)
 
 
+@dataclass(frozen=True)
+class Load:
+    """Heights over the floor between which the trunk's outline holds more than a body, mm."""
+
+    low_mm: float
+    high_mm: float
+
+
 def odd_proportions(mesh: BodyMesh) -> Iterator[tuple[Grade, str]]:
     """A question for each thing that no standing person by himself is shaped like."""
-    top = float(mesh.vertices[:, 2].max())
-    across = float(np.ptp(mesh.vertices[:, :2], axis=0).max())
+    top, across = _extents(mesh)
     if top < FLAT * across:
         yield (
             "usable",
@@ -62,6 +71,42 @@ def odd_proportions(mesh: BodyMesh) -> Iterator[tuple[Grade, str]]:
     sections = list(_sections(mesh, top))
     yield from _changes(sections)
     yield from _chest(sections)
+
+
+def find_loads(mesh: BodyMesh) -> tuple[Load, ...]:
+    """Where a standing person's trunk goes on at once in something larger, up to where that ends, or to
+    the neck; and what is deep around a chest that is deeper than wide."""
+    top, across = _extents(mesh)
+    if top < FLAT * across:
+        return ()
+    sections = list(_sections(mesh, top))
+    trunk = sections[_crotch(sections) + 1 :]
+    found: list[Load] = []
+    begins: float | None = None
+    for below, above in pairwise(trunk):
+        own = _change(_trunk_of(below), _trunk_of(above))
+        # Arms that join the trunk change its outline alone, and a bag in a hand changes all but it.
+        if begins is None and min(own, _change(below, above)) > SOON:
+            begins = below.height_mm
+        elif own < -SOON and (begins is not None or _change(below, above) < -SOON):
+            found.append(Load(trunk[0].height_mm if begins is None else begins, above.height_mm))
+            begins = None
+    if begins is not None:
+        found.append(Load(begins, NECK * top))
+    deep = [one for one in _deep_chest(trunk) if _is_deep(one)]
+    if deep:
+        flat = [one.height_mm for one in trunk if len(one.loops) == 3 and not _is_deep(one)]
+        lower = [height for height in flat if height < deep[0].height_mm]
+        higher = [height for height in flat if height > deep[-1].height_mm]
+        ends = max(lower, default=trunk[0].height_mm), min(higher, default=NECK * top)
+        found.append(Load(*ends))
+    return tuple(found)
+
+
+def _extents(mesh: BodyMesh) -> tuple[float, float]:
+    """mm: up, and farthest to the side."""
+    across = float(np.ptp(mesh.vertices[:, :2], axis=0).max())
+    return float(mesh.vertices[:, 2].max()), across
 
 
 def _sections(mesh: BodyMesh, top: float) -> Iterator[_Section]:
@@ -82,14 +127,12 @@ def _measured(loops: Sequence[Loop]) -> bool:
 
 
 def _changes(sections: Sequence[_Section]) -> Iterator[tuple[Grade, str]]:
-    """Along the legs, and from above where they join, which is a step by itself, to the armpits;
-    between neighbours that were measured."""
-    crotch = next((k for k, one in enumerate(sections) if not _on_two_legs(one)), len(sections))
+    """Along the legs, and from above where they join, which is a step by itself, to the armpits."""
+    crotch = _crotch(sections)
     steps = {
-        0.5 * (below.height_mm + above.height_mm): abs(np.log(above.area_mm2 / below.area_mm2))
+        0.5 * (below.height_mm + above.height_mm): abs(_change(below, above))
         for part in (sections[:crotch], sections[crotch + 1 :])
         for below, above in pairwise(part)
-        if above.share - below.share < 1.5 * STEP
     }
     sudden = {height: step for height, step in steps.items() if step > SOON}
     if sudden:
@@ -97,8 +140,25 @@ def _changes(sections: Sequence[_Section]) -> Iterator[tuple[Grade, str]]:
         yield (
             "usable",
             f"the body's section changes by {np.expm1(sudden[worst]):.0%} at once at {worst:.0f} mm: a "
-            "bag or something else that is carried, a bent arm or leg, a skirt? Girths hold it",
+            "bag or something else that is carried, a bent arm or leg, a skirt? Girths of a trunk that "
+            "hold it are those of `trunk and load`",
         )
+
+
+def _crotch(sections: Sequence[_Section]) -> int:
+    """Number of the lowest section that is not on two legs."""
+    return next((k for k, one in enumerate(sections) if not _on_two_legs(one)), len(sections))
+
+
+def _trunk_of(section: _Section) -> _Section:
+    return replace(section, loops=section.loops[:1])
+
+
+def _change(below: _Section, above: _Section) -> float:
+    """Logarithm of how many times larger the upper one is, for each height between neighbours: some of
+    those may not have been measured."""
+    heights = max(round((above.share - below.share) / STEP), 1)
+    return float(np.log(above.area_mm2 / below.area_mm2)) / heights
 
 
 def _on_two_legs(section: _Section) -> bool:
@@ -107,19 +167,25 @@ def _on_two_legs(section: _Section) -> bool:
 
 
 def _chest(sections: Sequence[_Section]) -> Iterator[tuple[Grade, str]]:
-    """Between two arms, which say which way is sideways."""
-    ratios = [
-        _depth_over_width(one.loops)
-        for one in sections
-        if CHEST[0] <= one.share <= CHEST[1] and len(one.loops) == 3
-    ]
-    deep = float(np.median(ratios)) if ratios else 0.0
-    if deep > DEEP:
+    deep = _deep_chest(sections)
+    if deep:
+        ratio = float(np.median([_depth_over_width(one.loops) for one in deep]))
         yield (
             "usable",
-            f"the chest is {deep:.2f} times as deep as wide: a backpack, or a child that is carried? "
-            "Girths hold it",
+            f"the chest is {ratio:.2f} times as deep as wide: a backpack, or a child that is carried? "
+            "Girths that hold it are those of `trunk and load`",
         )
+
+
+def _deep_chest(sections: Sequence[_Section]) -> list[_Section]:
+    """Of a chest that is deeper than wide, between two arms, which say which way is sideways."""
+    chest = [one for one in sections if CHEST[0] <= one.share <= CHEST[1] and len(one.loops) == 3]
+    ratios = [_depth_over_width(one.loops) for one in chest]
+    return chest if ratios and float(np.median(ratios)) > DEEP else []
+
+
+def _is_deep(section: _Section) -> bool:
+    return _depth_over_width(section.loops) > DEEP
 
 
 def _depth_over_width(loops: Sequence[Loop]) -> float:

@@ -10,18 +10,11 @@ import numpy as np
 
 from bodyscan.alignment.bending import at_once
 from bodyscan.alignment.body_parts import PersonMotion
-from bodyscan.alignment.following import Followed, follow
+from bodyscan.alignment.following import Followed
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.oblique_light import LightLine, ObliqueLight, take_out
-from bodyscan.alignment.pole_steps import (
-    PoleStep,
-    StepSearch,
-    find_steps,
-    loosened,
-    motions_between,
-)
 from bodyscan.alignment.sway import SwayPrior, centre_sigmas
-from bodyscan.arrays import Array
+from bodyscan.alignment.together import Together, bring_together
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import mesh
@@ -93,8 +86,7 @@ def fuse(
         seen = require_subject(cleaned)
     placing = dict(calibration.rig_from_camera)
     alignment, followed, known = None, None, calibration.covariance
-    shifted: list[PoleStep] = []
-    search: StepSearch | None = None
+    together: Together | None = None
     oblique: ObliqueLight | None = None
     if settings.alignment.matching != "none" and len(seen) > 1:
         with step(progress, "aligning"):
@@ -104,13 +96,10 @@ def fuse(
                 seen, found, oblique = take_out(
                     seen, placing, found, lines, known, settings.alignment
                 )
-            believed = known
-            while moved := (search := _moved(seen, placing, found, calibration, shifted)).step:
-                shifted.append(moved)
-                believed = loosened(believed, moved.pairs)
-                found = align(seen, placing, believed, settings.alignment)
-            alignment, followed = follow(seen, placing, found, believed, settings.alignment)
-            shifted = _measured_again(shifted, _tied_motions(placing, alignment))
+            together = bring_together(
+                seen, placing, found, known, calibration.rig.poles, settings.alignment
+            )
+            alignment, followed = together.alignment, together.followed
             placing |= alignment.rig_from_camera
             seen = at_once(seen, placing, followed)
             untied = {image.pair for image in seen} - alignment.motion_mm.keys()
@@ -140,8 +129,9 @@ def fuse(
             cameras=np.array([at.translation for at in calibration.rig_from_camera.values()]),
             agreements={image.pair: image.agreement for image in images if image.agreement},
             person=person,
-            shifted=shifted,
-            search=search,
+            shifted=together.shifted if together else (),
+            size=together.size if together else None,
+            search=together.search if together else None,
             boards_mm=centre_sigmas(calibration.covariance),
             silent=_silent(
                 calibration.rig.poles, [*points, *failed], [image.pair for image in seen]
@@ -186,43 +176,6 @@ def _silent(
     count = Counter(poles[name] for name in asked if name in poles)
     seen = {poles.get(name) for name in seeing}
     return tuple(pole for pole, pairs in count.items() if pairs > 1 and pole not in seen)
-
-
-def _moved(
-    seen: Sequence[RangeImage],
-    placing: Mapping[str, RigidTransform],
-    found: Alignment,
-    calibration: RigCalibration,
-    known: Sequence[PoleStep],
-) -> StepSearch:
-    """What moved by itself besides what is known to; one pole stays, or all would have moved."""
-    freed = frozenset[str]().union(*(step.pairs for step in known))
-    poles = calibration.rig.poles
-    if len({poles.get(image.pair, image.pair) for image in seen if image.pair not in freed}) < 2:
-        return StepSearch(None, np.inf)
-    moments = {image.pair: image.time_ms for image in seen}
-    return find_steps([(_tied_motions(placing, found), moments)], poles, freed)
-
-
-def _measured_again(steps: Sequence[PoleStep], motions: Mapping[str, Array]) -> list[PoleStep]:
-    """How far each stands off from those that did not move, now that all were free to."""
-    off = frozenset[str]().union(*(step.pairs for step in steps))
-    return [
-        replace(
-            PoleStep.of(
-                step.name,
-                step.pairs,
-                {name: at for name, at in motions.items() if name not in off - step.pairs},
-            ),
-            all_moved=step.all_moved,
-        )
-        for step in steps
-    ]
-
-
-def _tied_motions(placing: Mapping[str, RigidTransform], found: Alignment) -> dict[str, Array]:
-    """Of the pairs that overlaps tie."""
-    return motions_between(placing, {name: found.rig_from_camera[name] for name in found.motion_mm})
 
 
 def _breathing(surface: BodyMesh, followed: Followed | None) -> BodyMesh:

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.icp import Alignment
+from bodyscan.alignment.place_evidence import SizeStep
 from bodyscan.alignment.pole_steps import STILL_MM, PoleStep, StepSearch
 from bodyscan.arrays import Array
 from bodyscan.fusion.contradictions import Contradictions
@@ -96,6 +97,7 @@ def grade_scan(
     agreements: Mapping[str, Agreement] | None = None,
     person: PersonMotion | None = None,
     shifted: Sequence[PoleStep] = (),
+    size: SizeStep | None = None,
     search: StepSearch | None = None,
     boards_mm: Mapping[str, float] | None = None,
     silent: Sequence[str] = (),
@@ -109,7 +111,8 @@ def grade_scan(
     see is no reason to repeat.
 
     agreements: of pairs that project stripes of two directions.  person: how a body that moved did.
-    shifted: poles that moved since the calibration.  search: what the pairs' motions are besides.
+    shifted: poles that moved since the calibration.  size: all of them did, outwards or inwards.
+    search: what the pairs' motions are besides.
     boards_mm: how exactly each pair's place is known, see `centre_sigmas`.
     silent: poles of which no pair saw anybody.
 
@@ -125,9 +128,12 @@ def grade_scan(
         "directions": lambda: _directions(agreements or {}),
         "seams": lambda: _seams(seams, use),
         "poles": lambda: _shifted(shifted),
+        "size": lambda: _size(size, use),
         "places": lambda: _own_places(search, use, boards_mm or {}),
         "disagreement": lambda: _disagreement(alignment),
-        "motion": lambda: _motion(None if shifted else alignment, person, use, boards_mm or {}),
+        "motion": lambda: _motion(
+            None if shifted or size else alignment, person, use, boards_mm or {}
+        ),
         "contradictions": lambda: _contradictions(contradictions, seams),
         "pieces": lambda: _company(cloud),
         "limbs": lambda: _limbs(shape) if shape else (),
@@ -234,6 +240,20 @@ def _shifted(steps: Sequence[PoleStep]) -> Iterator[Finding]:
             "since, and brought to the others here; calibrate again, unless `timing` of captures.yaml "
             "is wrong",
         )
+
+
+def _size(size: SizeStep | None, use: UseLimits) -> Iterator[Finding]:
+    """Taken out as well; but where a calibration is wrong everywhere, overlaps alone hold the size."""
+    if size is None:
+        return
+    costs = abs(size.out_mm) * GIRTH_PER_MM
+    where, wrong = ("farther from", "small") if size.out_mm > 0.0 else ("nearer to", "large")
+    yield (
+        "repeat" if costs > use.usable_girth_mm else "usable",
+        f"all poles stand {abs(size.out_mm):.1f} mm (known to {size.sigma_mm:.1f}) {where} the body "
+        f"than the calibration has them, as no person moves: girths would be {costs:.0f} mm too "
+        f"{wrong}, and now nothing but overlaps holds the body's size; calibrate again",
+    )
 
 
 def _own_places(

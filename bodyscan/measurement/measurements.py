@@ -9,6 +9,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Mask
 from bodyscan.errors import BadInput
+from bodyscan.fusion.proportions import Load, find_loads
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
 from bodyscan.measurement.head import HeadTop, estimate_head_top
@@ -34,7 +35,8 @@ class Girth:
     """One part of the body in a horizontal slice.
 
     part: trunk (neck and head too), left leg, right leg, left arm, right arm; "trunk and left arm"
-    where a hand touches the trunk and the outline goes round both.  girth_mm: along the surface.
+    where a hand touches the trunk and the outline goes round both, "trunk and load" where it goes round
+    what no body is shaped like.  girth_mm: along the surface.
     tape_mm: as a tape runs (convex hull).  width_mm, depth_mm: extent to the side and forward.
     centre_mm: (x, y), body frame.  measured: share of girth_mm that was measured, not filled.
     girth_range_mm, tape_range_mm: what they may be, given what was not: see `Outline`.
@@ -112,14 +114,14 @@ def measure(
     stature = float(mesh.vertices[:, 2].max())
     frame = rig_from_body(mesh.vertices)
     vertices = frame.inverse().apply(mesh.vertices)
-    contacts = _contacts(vertices, mesh)
+    contacts, loads = _contacts(vertices, mesh), find_loads(mesh)
     if heights_mm is None:
         # Of a body seen in part, what there is of it.
         every = np.arange(STEP_MM, stature, STEP_MM).tolist()
-        slices = [_slice(vertices, mesh, height, contacts) for height in every]
+        slices = [_slice(vertices, mesh, height, contacts, loads) for height in every]
     else:
         every = [float(height) for height in heights_mm]
-        slices = [_slice(vertices, mesh, height, contacts) for height in every]
+        slices = [_slice(vertices, mesh, height, contacts, loads) for height in every]
         for height, found in zip(heights_mm, slices, strict=True):
             if found is None:
                 low, high = vertices[:, 2].min(), vertices[:, 2].max()
@@ -130,7 +132,7 @@ def measure(
     if fuller is not None:
         more = frame.inverse().apply(fuller.vertices)
         slices = [
-            found and _doubted(found, _slice(more, mesh, height, contacts))
+            found and _doubted(found, _slice(more, mesh, height, contacts, loads))
             for found, height in zip(slices, every, strict=True)
         ]
     areas = face_areas(mesh.vertices, mesh.faces)
@@ -234,16 +236,22 @@ def _loops(vertices: Array, mesh: BodyMesh, height_mm: float) -> tuple[Loop, ...
 
 
 def _slice(
-    vertices: Array, mesh: BodyMesh, height_mm: float, contacts: Sequence[_Contact]
+    vertices: Array,
+    mesh: BodyMesh,
+    height_mm: float,
+    contacts: Sequence[_Contact],
+    loads: Sequence[Load],
 ) -> Slice | None:
     """None where there is no body."""
     loops = _loops(vertices, mesh, height_mm)
     if not loops:
         return None
     girths = []
+    loaded = any(load.low_mm < height_mm < load.high_mm for load in loads)
     for part, loop in zip(name_parts(loops), loops, strict=True):
         arms = [one.side for one in contacts if part == "trunk" and one.joins(loop, height_mm)]
         joined = "".join(f" and {side} arm" for side in dict.fromkeys(arms))
+        joined += " and load" if part == "trunk" and loaded and not arms else ""
         girths.append(_girth(part + joined, loop))
     return Slice(height_mm, tuple(sorted(girths, key=lambda girth: (girth.part, -girth.area_mm2))))
 

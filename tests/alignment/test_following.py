@@ -46,7 +46,7 @@ def together(
 ) -> tuple[Alignment, Alignment, Followed | None]:
     images, settings = images_of(scan, timed=timed), AlignmentSettings()
     aligned = align(images, scan.rig_from_camera, boards(scan), settings)
-    return aligned, *follow(images, scan.rig_from_camera, aligned, boards(scan), settings)
+    return aligned, *follow(images, scan.rig_from_camera, aligned, boards(scan), settings)[:2]
 
 
 def surface(scan: LivingScan, alignment: Alignment, followed: Followed | None) -> Array:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import open3d as o3d
 import pytest
 from ray_cast_scan import ROOT, Truth, load_body
 
-from bodyscan.fusion.proportions import odd_proportions
+from bodyscan.fusion.proportions import find_loads, odd_proportions
 from bodyscan.mesh.body import BodyMesh
 
 SUBJECTS = ("woman_average", "man_average")
@@ -21,11 +23,16 @@ def body(request: pytest.FixtureRequest) -> Truth:
 
 
 def asked(*parts: Truth, filled_above: float = np.inf) -> str:
+    found = odd_proportions(meshed(*parts, filled_above=filled_above))
+    return " | ".join(f"{grade}: {said}" for grade, said in found)
+
+
+def meshed(*parts: Truth, filled_above: float = np.inf) -> BodyMesh:
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([p.faces + s for p, s in zip(parts, starts, strict=False)])
     none = np.zeros(len(vertices), np.float32)
-    mesh = BodyMesh(
+    return BodyMesh(
         vertices,
         faces,
         np.zeros_like(vertices),
@@ -33,7 +40,6 @@ def asked(*parts: Truth, filled_above: float = np.inf) -> str:
         none,
         vertices[faces, 2].min(axis=1) > filled_above,
     )
-    return " | ".join(f"{grade}: {said}" for grade, said in odd_proportions(mesh))
 
 
 def box(size: tuple[float, float, float], middle: tuple[float, float, float]) -> Truth:
@@ -44,7 +50,9 @@ def box(size: tuple[float, float, float], middle: tuple[float, float, float]) ->
 
 @pytest.mark.parametrize("size", SIZES)
 def test_people_of_any_size_are_asked_nothing(body: Truth, size: str) -> None:
-    assert asked(Truth(body.vertices * SIZES[size], body.faces)) == ""
+    sized = Truth(body.vertices * SIZES[size], body.faces)
+    assert asked(sized) == ""
+    assert find_loads(meshed(sized)) == ()
 
 
 @pytest.mark.parametrize(
@@ -72,6 +80,38 @@ def test_a_chest_that_is_deeper_than_wide_is_asked_about(body: Truth) -> None:
     deeper = 1.0 + 0.8 * np.exp(-(((share - 0.7) / 0.08) ** 2)) * trunk
     vertices = body.vertices * np.stack([deeper, np.ones_like(deeper), np.ones_like(deeper)], 1)
     assert "times as deep as wide" in asked(Truth(vertices, body.faces))
+
+
+def with_backpack(body: Truth, low: float, high: float) -> Truth:
+    """On the back, between two heights, 150 mm deep, in one surface with it."""
+    x, y, z = body.vertices.T
+    top = float(z.max())
+    back = (x < 0.0) & (np.abs(y) < 0.1 * top) & (low * top < z) & (z < high * top)
+    return Truth(body.vertices - np.outer(back, [150.0, 0.0, 0.0]), body.faces)
+
+
+def test_a_trunk_holds_a_backpack_from_where_it_begins_to_where_it_ends(body: Truth) -> None:
+    top = float(body.vertices[:, 2].max())
+    loads = find_loads(meshed(with_backpack(body, 0.58, 0.68)))
+    assert min(load.low_mm for load in loads) == pytest.approx(0.58 * top, abs=0.03 * top)
+    assert max(load.high_mm for load in loads) == pytest.approx(0.68 * top, abs=0.03 * top)
+    loads = find_loads(meshed(with_backpack(body, 0.6, 0.85)))
+    # Shoulders narrow by themselves: up to the neck nobody can tell where it ends.
+    assert max(load.high_mm for load in loads) == pytest.approx(0.86 * top)
+
+
+def test_a_bag_in_a_hand_is_no_load_of_the_trunk(body: Truth) -> None:
+    height = 0.5 * float(body.vertices[:, 2].max())
+    assert find_loads(meshed(body, box((300.0, 100.0, 300.0), (0.0, 450.0, height)))) == ()
+
+
+def test_a_section_that_was_not_measured_hides_no_jump(body: Truth) -> None:
+    """Where a backpack begins its underside was seen by nobody, as in a scan by three poles."""
+    top = float(body.vertices[:, 2].max())
+    mesh = meshed(with_backpack(body, 0.6, 0.85))
+    centre = mesh.vertices[mesh.faces, 2].mean(axis=1) / top
+    hidden = replace(mesh, filled=np.abs(centre - 0.6) < 0.015)
+    assert min(load.low_mm for load in find_loads(hidden)) < 0.6 * top
 
 
 def test_who_lies_is_asked(body: Truth) -> None:

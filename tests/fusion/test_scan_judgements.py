@@ -9,6 +9,7 @@ import pytest
 from made_scan import MadeScan, make_scan
 
 from bodyscan.alignment.icp import Alignment, Overlap
+from bodyscan.alignment.place_evidence import SizeStep
 from bodyscan.alignment.pole_steps import PoleStep, StepSearch
 from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.scan_verdict import grade_scan
@@ -171,6 +172,24 @@ def test_one_pole_of_those_that_all_moved_leaves_nothing_either(scan: MadeScan) 
         scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=[step]
     )
     assert verdict.grade == "repeat"
+
+
+@pytest.mark.parametrize(
+    ("out_mm", "grade", "words"),
+    [
+        (0.5, "usable", "farther from the body than the calibration has them"),
+        (-0.5, "usable", "nearer to the body than the calibration has them"),
+        (-3.0, "repeat", "girths would be 19 mm too large"),
+    ],
+)
+def test_poles_that_all_stand_farther_out_leave_overlaps_to_hold_the_size(
+    scan: MadeScan, out_mm: float, grade: str, words: str
+) -> None:
+    size = SizeStep(out_mm, 0.1)
+    verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), size=size)
+    assert verdict.grade == grade
+    assert "all poles stand" in str(verdict)
+    assert words in str(verdict)
 
 
 def test_who_turns_stays_where_he_is(scan: MadeScan) -> None:

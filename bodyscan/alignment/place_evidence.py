@@ -1,0 +1,161 @@
+"""Poles that stand off, and a size that is off, told from all that one scan shows of a person's motion.
+
+Pairs' motions alone (`pole_steps`) hardly tell poles that all moved outwards from a person who went
+round them in turn. But feet stay where they are while a body sways, breath lifts no leg, and stripes
+tell how fast each place went: a person who was followed leaves little that only poles explain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyscan.alignment.body_motion import ARM_MM, BodyMotion
+from bodyscan.alignment.pole_steps import STEP_MM, STEPS_MM, SURE, PoleStep
+from bodyscan.alignment.sway import BODY_CENTRE
+from bodyscan.arrays import Array
+from bodyscan.geometry.transforms import RigidTransform
+
+LEAST_OUT_MM = 0.3
+"""2 mm of a girth; less is what calibrations of poles disagree by: 0.1 mm of ten sound people."""
+
+
+@dataclass(frozen=True)
+class SizeStep:
+    """All poles stand `out_mm` farther from the body than their calibration has them, or as much nearer
+    where it is negative: by that every radius of the body was too small.  sigma_mm: of that."""
+
+    out_mm: float
+    sigma_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceEvidence:
+    """What a scan says of P pairs' places, whatever the person may have done meanwhile.
+
+    information (6P, 6P), pull (6P,): normal equations of motions, pair after pair, by which the pairs
+    stand off beside what their calibration left open.
+    """
+
+    names: tuple[str, ...]
+    information: Array
+    pull: Array
+
+    @staticmethod
+    def of(names: Collection[str], motion: BodyMotion) -> PlaceEvidence:
+        return PlaceEvidence(tuple(names), *motion.asked_of_poses())
+
+    def of_steps(self, ways: Array) -> _Told:
+        """What is said of motions along `ways` (6P, k), at the size in mm that explains it best."""
+        square, pull = ways.T @ self.information @ ways, ways.T @ self.pull
+        own = np.eye(len(pull))
+        found = []
+        for size_mm in STEPS_MM:
+            covariance = np.linalg.inv(square + own / size_mm**2)
+            volume = np.linalg.slogdet(own + size_mm**2 * square)[1]
+            gain = float(0.5 * pull @ covariance @ pull - 0.5 * volume)
+            found.append(_Told(gain, covariance @ pull, covariance))
+        return max(found, key=lambda told: told.gain)
+
+
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """gain: logarithm of how many times as well steps explain what was seen; steps (k,) mm, with their
+    covariance (k, k)."""
+
+    gain: float
+    steps: Array
+    covariance: Array
+
+
+def find_off(
+    seen: PlaceEvidence,
+    rig_from_camera: Mapping[str, RigidTransform],
+    poles: Mapping[str, str],
+    freed: Collection[str] = (),
+) -> PoleStep | SizeStep | None:
+    """What explains a scan better than any motion of the person: one pole that stands off, each of them
+    by itself (`all_moved`), or all of them farther out or nearer.
+
+    rig_from_camera: as calibrated.  poles: of each pair that stands on one.  freed: pairs of poles
+    that are known to have moved.
+    """
+    sides = [poles.get(name, name) for name in seen.names]
+    if len(set(sides)) < 2 or not set(seen.names) - set(freed):
+        return None
+    ways = {side: _ways(np.equal(sides, side)) for side in dict.fromkeys(sides)}
+    told = {side: seen.of_steps(own) for side, own in ways.items()}
+    moved = max(
+        (
+            side
+            for side, pairs in _members(seen.names, sides).items()
+            if len(pairs) > 1 and pairs.isdisjoint(freed)
+        ),
+        key=lambda side: told[side].gain,
+        default=None,
+    )
+    found: list[tuple[float, PoleStep | SizeStep]] = []
+    if moved is not None:
+        found.append((told[moved].gain, _step(moved, seen, sides, told[moved].steps)))
+    if not freed:
+        each = seen.of_steps(np.hstack(list(ways.values())))
+        apart = each.steps.reshape(-1, 6) - each.steps.reshape(-1, 6).mean(axis=0)
+        farthest = int(np.argmax(np.linalg.norm(apart, axis=1)))
+        side = list(ways)[farthest]
+        step = _step(side, seen, sides, apart[farthest], all_moved=True)
+        found.append((each.gain, step))
+        size = seen.of_steps(_outward(seen.names, sides, rig_from_camera).reshape(-1, 1))
+        sigma_mm = float(np.sqrt(size.covariance[0, 0]))
+        found.append((size.gain, SizeStep(float(size.steps[0]), sigma_mm)))
+    gain, best = max(found, key=lambda one: one[0], default=(0.0, None))
+    return best if best and gain > SURE and _does_harm(best) else None
+
+
+def _does_harm(found: PoleStep | SizeStep) -> bool:
+    if isinstance(found, SizeStep):
+        return abs(found.out_mm) > LEAST_OUT_MM
+    return float(np.hypot(found.shift_mm, ARM_MM * np.radians(found.turn_deg))) > STEP_MM
+
+
+def _members(names: Collection[str], sides: list[str]) -> dict[str, frozenset[str]]:
+    return {
+        side: frozenset(name for name, own in zip(names, sides, strict=True) if own == side)
+        for side in dict.fromkeys(sides)
+    }
+
+
+def _step(
+    side: str, seen: PlaceEvidence, sides: list[str], steps: Array, *, all_moved: bool = False
+) -> PoleStep:
+    """steps: (6,) mm, as in `_ways`."""
+    pairs = _members(seen.names, sides)[side]
+    shift, turn = np.linalg.norm(steps.reshape(2, 3), axis=1)
+    return PoleStep(
+        f"pole {side}", pairs, float(shift), float(np.degrees(turn / ARM_MM)), all_moved
+    )
+
+
+def _ways(own: Array) -> Array:
+    """(6P, 6) for the pairs (P,) that move as one: shifts of the body's centre by 1 mm, then turns
+    about it that move what is an arm's length away by as much."""
+    rigid = np.zeros((6, 6))
+    rigid[3:, :3] = np.eye(3)
+    rigid[:3, 3:] = np.eye(3) / ARM_MM
+    rigid[3:, 3:] = -np.cross(np.eye(3) / ARM_MM, BODY_CENTRE).T
+    return np.asarray(np.kron(own.astype(float)[:, None], rigid))
+
+
+def _outward(
+    names: Collection[str], sides: list[str], rig_from_camera: Mapping[str, RigidTransform]
+) -> Array:
+    """(P, 6): each pair carried level by 1 mm away from the body, its pole's pairs alike."""
+    away = np.array([rig_from_camera[name].translation - BODY_CENTRE for name in names])
+    away[:, 2] = 0.0
+    out = np.zeros((len(away), 6))
+    for side in dict.fromkeys(sides):
+        own = np.equal(sides, side)
+        middle = away[own].mean(axis=0)
+        out[own, 3:] = middle / np.linalg.norm(middle)
+    return out
