@@ -121,7 +121,7 @@ def follow(
 ) -> tuple[Alignment, Followed | None, PlaceEvidence | None]:
     """The alignment with a moving person's sway along time, and what else moved; None, and the
     alignment as it was, for who stood still or if too little overlaps to tell. Then what all that says
-    of the pairs' places, if anything.
+    of the pairs' places; None where a pair's moment is not known, to which any sway would be one.
 
     images, rig_from_camera, prior, settings: what `align` got; aligned: what it made of them.
     """
@@ -168,9 +168,9 @@ def follow(
                 and _is_unbent(motion, seen)
                 and _is_unswayed(motion, seen, settings)
             ):
-                return aligned, None, PlaceEvidence.of(names, motion)
+                return aligned, None, _places(names, motion, seconds)
         gaps = _each_overlap(_gap, pool, coarse, (motion, cells), reach, settings)
-    placed, places = _placed(aligned, names, views, motion, gaps), PlaceEvidence.of(names, motion)
+    placed, places = _placed(aligned, names, views, motion, gaps), _places(names, motion, seconds)
     if placed.rms_after_mm > NEARER * aligned.rms_after_mm and _is_unswayed(motion, seen, settings):
         return aligned, None, places
     followed = Followed(
@@ -183,6 +183,12 @@ def follow(
         _mean_breath(motion, cells) if _middle_ms(images) is not None else None,
     )
     return placed, followed, places
+
+
+def _places(
+    names: Sequence[str], motion: BodyMotion, seconds: Sequence[float | None]
+) -> PlaceEvidence | None:
+    return None if None in seconds else PlaceEvidence.of(names, motion)
 
 
 def _middle_ms(images: Sequence[RangeImage]) -> float | None:
