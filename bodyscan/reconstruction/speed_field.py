@@ -16,7 +16,7 @@ KNOT_MM, REACH_MM = 80.0, 150.0
 SIZES = np.geomspace(0.02, 50.0, 40)
 """Standard deviations of the field that are tried, mm per unit of time; before them, none."""
 SIGMAS = 3.0
-"""Evidence counts where noise alone gives it once in some hundred times."""
+"""What is left over counts where noise alone gives it once in some hundred times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,16 +78,17 @@ class FieldFit:
         return np.asarray(np.sum((jacobian @ self.covariance) * jacobian, axis=1), np.float64)
 
 
-def fit_field(cells: CellSpeeds, knots: Knots, twist_sigmas: Array) -> FieldFit:
+def fit_field(cells: CellSpeeds, knots: Knots, twist_sigmas: Array, *, bent: float) -> FieldFit:
     """Twist and field together; the field is 0 where there is no evidence of one.
 
     twist_sigmas: (6,) of the twist's prior. The field's size is the one under which what was seen is
-    likeliest (its other unknowns integrated out).
+    likeliest (its other unknowns integrated out).  bent: there is one where that is likelier than none
+    by more, twice the logarithm.
     """
     problem = _Problem.of(cells, knots, twist_sigmas)
     gains = problem.gains(SIZES)
     best = int(np.argmax(gains))
-    is_bent = bool(2.0 * gains[best] > SIGMAS**2)
+    is_bent = bool(2.0 * gains[best] > bent)
     normal, used = problem.normal, slice(0, None if is_bent else 6)
     if is_bent:
         normal = normal.copy()

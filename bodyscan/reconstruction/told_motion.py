@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
+from scipy.special import chdtri, fdtri
 
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.camera import Camera
@@ -39,9 +40,14 @@ body that is round. Renderings with cells of 14 and 28 mm: off by 3 and 6 % of t
 SETTLED = 1e-3
 """Variances: a thirtieth of a sigma."""
 FEWEST_BANDS = 5
+NEIGHBOURS = 2.0 / 3.0
+"""Squares of differences between neighbours tell a variance as well as so many independent errors each
+(von Neumann 1941): every value stands in two of them."""
 TEETH_NOISE = Noise("teeth", cauchy=3.0)
 SIGMAS = 3.0
-"""A chi-square counts where it exceeds what noise alone does by so many of its own deviations."""
+"""A speed counts beyond so many of what all windows may have in common."""
+CHANCE = 0.005
+"""Of either alarm though nothing moved, in a whole scan: one mannequin in a hundred."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,19 +70,25 @@ class _Teeth:
     common: float
 
 
-def tell_motion(camera: Camera, sheets: LightSheets, comb: Comb) -> StripeMotion | None:
-    """None where too little was seen. Units of time are those of the comb."""
+def tell_motion(
+    camera: Camera, sheets: LightSheets, comb: Comb, *, chance: float = CHANCE
+) -> StripeMotion | None:
+    """None where too little was seen. Units of time are those of the comb.
+
+    chance: with which what stands still may be told to have moved rigidly, and to have bent.
+    """
     if len(comb.speed) < FEWEST:
         return None
     cells = _cells(camera, comb)
     teeth = _teeth(camera, sheets, comb, cells)
     if len(teeth.speed) < FEWEST:
         return None
-    speeds = _by_cell(cells, teeth, _weights(teeth))
+    weights, independent = _weights(teeth)
+    speeds = _by_cell(cells, teeth, weights)
     known = speeds.weight > 0.0
     mm_per_px = float(teeth.middle[2]) / camera.alpha
     knots = Knots.over(cells, known, mm_per_px)
-    fit = fit_field(speeds, knots, TWIST_SIGMAS)
+    fit = fit_field(speeds, knots, TWIST_SIGMAS, bent=_limit(1, independent, 2.0 * chance))
     speed = fit.speed(speeds, knots)
     lost = unexplained(speeds, knots, speeds.speed - speed)
     doubt = np.sqrt(fit.variance(speeds, knots) + lost)
@@ -95,8 +107,15 @@ def tell_motion(camera: Camera, sheets: LightSheets, comb: Comb) -> StripeMotion
         doubt_mm=rms(np.sqrt(lost[known])),
         explained=fit.explained,
         is_significant=rms(speed[known]) > SIGMAS * teeth.common
-        and (fit.is_bent or fit.explained > 6.0 + SIGMAS * np.sqrt(12.0)),
+        and (fit.is_bent or fit.explained > _limit(6, independent, chance)),
     )
+
+
+def _limit(freedoms: int, independent: float, chance: float) -> float:
+    """Of a chi-square whose variance is known from so many independent errors."""
+    if not np.isfinite(independent):
+        return float(chdtri(freedoms, chance))
+    return float(freedoms * fdtri(freedoms, independent, 1.0 - chance))
 
 
 def _cells(camera: Camera, comb: Comb) -> Cells:
@@ -133,8 +152,9 @@ def _teeth(camera: Camera, sheets: LightSheets, comb: Comb, cells: Cells) -> _Te
     )
 
 
-def _weights(teeth: _Teeth) -> Array:
-    """(N,) 1/variance of the windows' speeds, less for those that are far off a rigid motion."""
+def _weights(teeth: _Teeth) -> tuple[Array, float]:
+    """(N,) 1/variance of the windows' speeds, less for those that are far off a rigid motion; and by
+    how many independent errors it is known."""
     by_twist = teeth.by_twist[teeth.cell]
 
     def blocks(twist: Array) -> tuple[Block, ...]:
@@ -147,12 +167,14 @@ def _weights(teeth: _Teeth) -> Array:
 
     found = minimize(np.zeros(6), blocks, np.add, unknowns=6, settled=SETTLED)
     weights = found.weights[0] / (teeth.sigma * found.spreads[0]) ** 2
-    return weights * _band_share(teeth.band, teeth.speed - by_twist @ found.state, weights)
+    share, independent = _band_share(teeth.band, teeth.speed - by_twist @ found.state, weights)
+    return weights * share, independent
 
 
-def _band_share(band: Indices, left: Array, weights: Array) -> Array:
+def _band_share(band: Indices, left: Array, weights: Array) -> tuple[Array, float]:
     """(N,) to what share of their weights windows count, because those of the same stripes err alike:
-    a projector that strays moves a boundary all along its stripe.
+    a projector that strays moves a boundary all along its stripe. And of how many independent errors
+    that is known, which is what a test has to allow for.
 
     left: (N,) speeds that no rigid motion explains. From one band of stripes to the next a body's
     speed hardly changes, so that what their means are apart beyond noise is the stripes' own.
@@ -161,11 +183,16 @@ def _band_share(band: Indices, left: Array, weights: Array) -> Array:
     weight, mean = np.bincount(band, weights, count), _mean_by(band, left, weights, count)
     both = (weight[1:] > 0.0) & (weight[:-1] > 0.0)
     if np.count_nonzero(both) < FEWEST_BANDS:
-        return np.ones(len(band))
+        return np.ones(len(band)), np.inf
     noise = (1.0 / weight[1:][both] + 1.0 / weight[:-1][both]) / 2.0
-    excess = np.diff(mean)[both] ** 2 / 2.0 - noise / SIGMAS_PER_MEDIAN**2
-    shared = max(float(np.median(excess)) * SIGMAS_PER_MEDIAN**2, 0.0)
-    return np.asarray(1.0 / (1.0 + shared * weight[band]), np.float64)
+    square = np.diff(mean)[both] ** 2 / 2.0
+    usual = max(float(np.median(SIGMAS_PER_MEDIAN**2 * square - noise)), 0.0)
+    # The median's own error is that of a third as many bands: from it follow the weights of a mean.
+    trust = (noise + usual) ** -2.0
+    shared = max(float(np.average(square - noise, weights=trust)), 0.0)
+    said = trust * (noise + shared)
+    independent = NEIGHBOURS * np.sum(said) ** 2 / np.sum(said**2)
+    return np.asarray(1.0 / (1.0 + shared * weight[band]), np.float64), float(independent)
 
 
 def _by_cell(cells: Cells, teeth: _Teeth, weights: Array) -> CellSpeeds:

@@ -74,14 +74,19 @@ def find_comb(boundaries: Boundaries, times: Array, *, turned: bool) -> Comb:
 
 
 def _window_starts(boundaries: Boundaries) -> Indices:
-    """First boundaries of windows that lie end to end along every unbroken run that counts one way."""
+    """First boundaries of windows in unbroken runs that count one way.
+
+    Every scan line is cut between the same stripes: what strays with its stripe is then in one window
+    of each line, and not in half of two, where it would look like what neighbours have in common. In the
+    middle of a window is the boundary of its coarsest pattern: at an end the cubic would hide it.
+    """
     count = len(boundaries.line)
     begins = np.flatnonzero(np.append(True, ~boundaries.joined)) if count else np.empty(0, np.int64)
     lengths = np.diff(np.append(begins, count))
-    place = np.arange(count) - np.repeat(begins, lengths)
-    first = np.flatnonzero((place % TEETH == 0) & (place + TEETH <= np.repeat(lengths, lengths)))
-    climb = boundaries.index[first + TEETH - 1] - boundaries.index[first]
-    first = first[np.abs(climb) == TEETH - 1]
+    ends = np.repeat(begins + lengths, lengths)
+    first = np.flatnonzero(np.arange(count) + TEETH <= ends)
+    one, other = boundaries.index[first], boundaries.index[first + TEETH - 1]
+    first = first[(np.abs(other - one) == TEETH - 1) & (np.minimum(one, other) % TEETH == TEETH // 2)]
     return np.asarray(first[:: 1 + len(first) // ENOUGH], np.int64)
 
 

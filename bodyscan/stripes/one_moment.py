@@ -82,7 +82,8 @@ def carry_to_moment(
     """The boundaries as they would have been seen at the moment, what moved them, and the farthest
     that s had to be carried, stripes.  bit: (N,) in whose images each boundary was seen.
 
-    What noise explains leaves them untouched. Of two orders the one that explains more is believed.
+    What noise explains leaves them untouched. Of two orders the one that explains more is believed: in
+    the wrong one teeth may look like stripes that stray.
     Raises DecodingFailed for a sequence whose images show the body in two places.
     """
 
@@ -90,12 +91,12 @@ def carry_to_moment(
         return seen.told(find_comb(boundaries, seen.of_bits[bit], turned=turned))
 
     motion = told(moments)
-    if motion is None or not motion.is_significant:
-        return boundaries, motion, 0.0
-    if moments.instead is not None:
+    if motion is not None and moments.instead is not None:
         other = told(moments.instead)
         if other is not None and other.explained > motion.explained:
             moments, motion = moments.instead, other
+    if motion is None or not motion.is_significant:
+        return boundaries, motion, 0.0
     _check_whole(boundaries, bit, (moments, motion), turned=turned)
     late = moments.of_bits[bit] - moments.moment
     place = [boundaries.line_position, boundaries.position]

@@ -46,7 +46,8 @@ def reconstruct_sequence(
     moments: tuple[Moments, ...] = ()
     frame_ms = captures.frame_ms(sequence.shot, sequence.pair)
     if spec.projector is not None:
-        moments = sequence_moments(pair, spec.projector, calibration.rig.frames, frame_ms)
+        frames, pairs = calibration.rig.frames, len(calibration.pairs)
+        moments = sequence_moments(pair, spec.projector, frames, frame_ms, pairs)
     stripes = decode_sequence(sequence, spec, limits=limits, moments=moments)
     image, motion = reconstruct_range_image(pair, stripes), stripes.motion
     if motion is not None and motion.is_significant and image.agreement is not None:

@@ -73,7 +73,7 @@ def test_what_a_ball_does_about_its_own_middle_is_not_seen_and_not_claimed() -> 
     assert motion is not None
     turn = np.sqrt(np.diagonal(motion.velocity.covariance)[:3])
     assert np.all(
-        turn > 0.015
+        turn > 0.011
     )  # of the prior's 0.05 rad/s; a velocity of 8 mm/s would be 0.009 off
 
 
@@ -126,6 +126,18 @@ def test_stripes_that_stray_by_themselves_are_not_taken_for_motion() -> None:
     # Counted as if each column told them anew, these teeth are 9 sigmas.
     assert not motion.is_significant
     assert carried is seen
+
+
+@pytest.mark.parametrize("seed", [6, 13, 25])
+def test_nor_are_they_where_runs_begin_at_any_stripe(seed: int) -> None:
+    """Windows cut anywhere had stripes in common with their neighbours, which hid how far these stray:
+    of thirty such balls five, these among them, were told to move by 1.4 to 2.6 mm/s."""
+    stray = 0.03 * np.random.default_rng(1000 + seed).standard_normal(200)
+    seen = seen_boundaries(STILL, TIMES, seed=2000 + seed)
+    seen = replace(seen, position=seen.position + stray[seen.index])
+    _, motion, _ = carry(seen)
+    assert motion is not None
+    assert not motion.is_significant
 
 
 def test_of_two_orders_the_one_that_explains_the_teeth_is_believed() -> None:
