@@ -43,6 +43,11 @@ RING_MM = 20.0  # heights of one girth: less than a cell's
 STILL_MM = 0.1
 """RMS of what no rigid motion explains; less does no harm, and calibrations bend by half of it."""
 
+UNSEEN = 0.7
+"""Of how far breath carried a place since a pair saw it: so much is not known long after. A pole's
+pairs tell place, speed and how that changes, so that soon after next to nothing is missing; a second
+later a quarter is (people cast by rays: 0.1 to 0.45 of a belly that nobody saw at its fullest)."""
+
 NEARER = 0.95
 """Overlaps that bending brings no nearer than this are apart by the pairs' own calibrations, which bend
 with the place and not with time."""
@@ -178,7 +183,7 @@ def follow(
         dict(zip(names, motion.displacements(BENDING, from_middle=True), strict=True)),
         motion.displacements(MOVING, from_middle=True)[..., :3],
         seen,
-        _cell_sigmas(motion, cells, seen),
+        cell_sigmas(motion, cells, seen),
         _middle_ms(images),
         _mean_breath(motion, cells) if _middle_ms(images) is not None else None,
     )
@@ -304,7 +309,7 @@ def _placed(
     )
 
 
-def _cell_sigmas(motion: BodyMotion, cells: BodyCells, seen: Mask) -> Array:
+def cell_sigmas(motion: BodyMotion, cells: BodyCells, seen: Mask) -> Array:
     """(C,) mm along the normals, of what is not known of the shape: a motion of the whole does not
     count.  Looked at in the landmarks, from which it changes slowly."""
     pair, mark = np.nonzero(seen[:, cells.landmarks])
@@ -325,8 +330,21 @@ def _cell_sigmas(motion: BodyMotion, cells: BodyCells, seen: Mask) -> Array:
     variance[~stands] = np.sum((others @ motion.doubted()) * others, axis=1)
     size = len(cells.landmarks)
     mean = np.bincount(mark, variance, size) / np.maximum(np.bincount(mark, minlength=size), 1)
+    mean += (UNSEEN * _breath_unseen(motion, cells, seen)[cells.landmarks]) ** 2
     near = (
         np.exp(-0.5 * (cells.away / BLEND_MM) ** 2)
         * (np.bincount(mark, minlength=size) > 0)[:, None]
     )
     return np.sqrt(mean @ near / np.maximum(near.sum(axis=0), 1e-12))
+
+
+def _breath_unseen(motion: BodyMotion, cells: BodyCells, seen: Mask) -> Array:
+    """(C,) mm along the normals: how far breath carried each cell to the middle from when it was seen,
+    by how little that moment tells of the middle; of several moments the one that tells most."""
+    moments = motion.kind("sway").courses
+    ways = motion.displacements(("breath",), from_middle=True)[..., :3]
+    apart = 1.0 - moments.values @ moments.middle
+    far = np.abs(np.einsum("pci,ci->pc", ways, cells.normals)) * apart[:, None] ** 2
+    least = np.min(far, axis=0, where=seen, initial=np.inf)
+    told = np.isfinite(least) & moments.middle.any()
+    return np.where(told, least, 0.0)

@@ -34,7 +34,9 @@ def sequence_moments(
     """Of the stripes, and of those that cross them, which are wanted at the same moment.
 
     pairs: of the rig. Each is asked whether the subject moved: noise that says so of one in a hundred
-    would say it of every sixth mannequin before sixteen.  frame_ms: when each image was taken, by its name; times are in seconds then. Where it is not known,
+    would say it of every sixth mannequin before sixteen.
+
+    frame_ms: when each image was taken, by its name; times are in seconds then. Where it is not known,
     images are taken to have come one after the other in the code's order or in that in which they are
     best shown, and times are counted in images: motion can be taken out by that as well, only its speed
     is not known.

@@ -86,7 +86,9 @@ def _window_starts(boundaries: Boundaries) -> Indices:
     ends = np.repeat(begins + lengths, lengths)
     first = np.flatnonzero(np.arange(count) + TEETH <= ends)
     one, other = boundaries.index[first], boundaries.index[first + TEETH - 1]
-    first = first[(np.abs(other - one) == TEETH - 1) & (np.minimum(one, other) % TEETH == TEETH // 2)]
+    first = first[
+        (np.abs(other - one) == TEETH - 1) & (np.minimum(one, other) % TEETH == TEETH // 2)
+    ]
     return np.asarray(first[:: 1 + len(first) // ENOUGH], np.int64)
 
 

@@ -10,13 +10,14 @@ from living_body import STANDING, STILL, LivingScan, Motion, cast_living, errors
 from ray_cast_scan import load_rig
 from scipy.spatial import cKDTree
 
+from bodyscan.alignment import body_motion
 from bodyscan.alignment.bending import at_once
 from bodyscan.alignment.body_motion import PARTS_MM, BodyMotion
 from bodyscan.alignment.body_parts import PartMotion, PersonMotion
 from bodyscan.alignment.breath import breathing
-from bodyscan.alignment.following import Followed, follow, sigmas_around
+from bodyscan.alignment.following import UNSEEN, Followed, cell_sigmas, follow, sigmas_around
 from bodyscan.alignment.icp import Alignment, align
-from bodyscan.alignment.part_names import PARTS, name_parts
+from bodyscan.alignment.part_names import LEGS, PARTS, name_parts
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.reconstruction.range_image import RangeImage
@@ -252,3 +253,35 @@ def test_what_stood_still_does_not_vouch_for_a_hip(
     known = np.sqrt(np.diag(motion.doubted()))
     np.testing.assert_allclose(known[parts], PARTS_MM)
     np.testing.assert_allclose(np.delete(known[12:], np.arange(len(known))[parts] - 12), 0.01)
+
+
+def test_a_breath_that_nobody_saw_is_known_to_a_share(
+    found: tuple[Alignment, Alignment, Followed | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a belly that two pairs saw, both breathed out, smoothness does not tell how full it
+    was between them; of one that was seen there, and of legs, it has nothing to tell."""
+    _, _, followed = found
+    assert followed is not None
+    cells = followed.cells
+    motion = BodyMotion.start(cells, [0.0, 2.0, 4.0], 1e-8 * np.eye(18), np.full(6, 1e-3))
+    breath = motion.slices[[kind.name for kind in motion.kinds].index("breath")]
+    amplitudes = np.zeros(len(motion.amplitudes))
+    amplitudes[breath] = np.random.default_rng(5).standard_normal(breath.stop - breath.start)
+    # Nothing else is unknown.
+    sure = tuple(replace(kind, size=1e-3) if kind.moves else kind for kind in motion.kinds)
+    motion = replace(motion, kinds=sure, amplitudes=amplitudes)
+    monkeypatch.setattr(body_motion, "PARTS_MM", 0.0)
+    moved = motion.displacements(("breath",), from_middle=True)[..., :3]
+    way = np.abs(np.einsum("pci,ci->pc", moved, cells.normals))
+    every = np.ones((3, len(cells.centres)), bool)
+    by_two = every.copy()
+    by_two[1] = False
+    fully, partly = (cell_sigmas(motion, cells, seen) for seen in (every, by_two))
+    belly = breathing(cells) > 0.9
+    nearest = np.minimum(way[0], way[2])[belly]
+    assert rms(nearest) > 0.3
+    # Two seconds are long, and a stance of then tells a twentieth of now.
+    assert rms(partly[belly]) == pytest.approx(UNSEEN * rms(nearest), rel=0.25)
+    assert rms(fully[belly]) < 0.4 * rms(partly[belly])
+    legs = np.isin(name_parts(cells), [PARTS.index(leg) for leg in LEGS])
+    assert rms(partly[legs]) < 0.1 * rms(partly[belly])
