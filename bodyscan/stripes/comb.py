@@ -77,8 +77,8 @@ def _window_starts(boundaries: Boundaries) -> Indices:
     """First boundaries of windows in unbroken runs that count one way.
 
     Every scan line is cut between the same stripes: what strays with its stripe is then in one window
-    of each line, and not in half of two, where it would look like what neighbours have in common. In the
-    middle of a window is the boundary of its coarsest pattern: at an end the cubic would hide it.
+    of each line, and not in half of two, where it would look like what neighbours have in common. In
+    the middle of a window is the boundary of its coarsest pattern: at an end the cubic would hide it.
     """
     count = len(boundaries.line)
     begins = np.flatnonzero(np.append(True, ~boundaries.joined)) if count else np.empty(0, np.int64)

@@ -9,7 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from moving_ball import BITS, CAMERA, CENTRE, bit_of, seen_boundaries, sheets
+from moving_ball import BITS, CAMERA, CENTRE, STRIPES, bit_of, seen_boundaries, sheets
+from ray_cast_scan import load_rig
 
 from bodyscan.arrays import Array
 from bodyscan.reconstruction.sequence_moments import sequence_moments
@@ -17,7 +18,7 @@ from bodyscan.reconstruction.told_motion import tell_motion
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.codes.gray import Gray
-from bodyscan.stripes.comb import Comb
+from bodyscan.stripes.comb import Comb, find_comb
 from bodyscan.stripes.one_moment import Moments, StripeMotion, carry_to_moment
 
 TIMES = np.linspace(1.0 - BITS, 0.0, BITS) / 60.0
@@ -138,6 +139,21 @@ def test_nor_are_they_where_runs_begin_at_any_stripe(seed: int) -> None:
     _, motion, _ = carry(seen)
     assert motion is not None
     assert not motion.is_significant
+
+
+def test_the_more_pairs_are_asked_the_clearer_each_has_to_be() -> None:
+    code = Gray(stripes=STRIPES, direction="horizontal", inverses=True)
+    frames = load_rig().frames
+    frame_ms = {name: 8.0 * place for place, name in enumerate(frames.of_code(code))}
+    pair: Any = SimpleNamespace(camera=CAMERA, sheets=sheets(), crossing=None)
+    seen = seen_boundaries(np.array([0.0, 0.0, 1.0]), TIMES)
+    comb = find_comb(seen, TIMES[bit_of(seen.index)], turned=True)
+    told = []
+    for pairs in (1, 64):
+        motion = sequence_moments(pair, code, frames, frame_ms, pairs)[0].told(comb)
+        assert motion is not None
+        told.append(motion.is_significant)
+    assert told == [True, False]
 
 
 def test_of_two_orders_the_one_that_explains_the_teeth_is_believed() -> None:
