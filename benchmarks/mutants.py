@@ -124,7 +124,7 @@ SEED = 1
 
 def report(count: int = COUNT, seed: int = SEED, modules: Sequence[str] = ()) -> str:
     """The section of docs/results.md."""
-    sample = list(_sample(modules or _modules(), count, random.Random(seed)))
+    sample = list(_sample(modules or _modules(), count, seed))
     equivalent = _blocks(EQUIVALENT)
     tried = [one for one in sample if one.key not in equivalent]
     return _section(seed, sample, tried, _fates(tried))
@@ -188,11 +188,11 @@ def _modules() -> list[str]:
     return [*found, *BESIDE]
 
 
-def _sample(modules: Sequence[str], count: int, rng: random.Random) -> Iterator[Mutant]:
-    """As many of each module, in an order that does not depend on the others."""
-    order = list(modules)
-    rng.shuffle(order)
-    waiting = {path: _mutants(path, random.Random(f"{rng.random()}")) for path in order}
+def _sample(modules: Sequence[str], count: int, seed: int) -> Iterator[Mutant]:
+    """As many of each module; what is drawn of one does not depend on which others there are."""
+    draws = {path: random.Random(f"{seed} {path}") for path in modules}
+    order = sorted(modules, key=lambda path: draws[path].random())
+    waiting = {path: _mutants(path, draws[path]) for path in order}
     left = count
     while left and waiting:
         for path in list(waiting):
