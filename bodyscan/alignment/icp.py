@@ -14,12 +14,17 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
-import networkx as nx
 import numpy as np
 
 from bodyscan.alignment.matching import Matches
 from bodyscan.alignment.overlap_equations import OverlapEquations, solve_motions
-from bodyscan.alignment.overlaps import COARSE, OverlapPoints, each_overlap, match_overlap
+from bodyscan.alignment.overlaps import (
+    COARSE,
+    OverlapPoints,
+    each_overlap,
+    match_overlap,
+    tied_groups,
+)
 from bodyscan.alignment.sway import SwayPrior, bound_motions, centre_shifts
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
@@ -165,7 +170,8 @@ def _each_overlap(
 
 def _largest_group(overlaps: Iterable[tuple[int, int]]) -> set[int]:
     """Of the images that overlaps tie together; those that nothing ties are none."""
-    groups = sorted(nx.connected_components(nx.Graph(list(overlaps))), key=min)
+    ties = list(overlaps)
+    groups = tied_groups(sorted({image for both in ties for image in both}), ties)
     return max(groups, key=len, default=set())
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import permutations
@@ -20,6 +20,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 
 Result = TypeVar("Result")
+Name = TypeVar("Name", int, str)
 
 COARSE = slice(None, None, 4)
 """Of the points; all of them take part only in the last rounds."""
@@ -75,3 +76,17 @@ def each_overlap(
     every_two = list(permutations(range(count), 2))
     found = zip(every_two, pool.map(lambda both: of_two(*both), every_two), strict=True)
     return {both: said for both, said in found if said is not None}
+
+
+def tied_groups(names: Iterable[Name], ties: Iterable[tuple[Name, Name]]) -> list[set[Name]]:
+    """Those of the names that ties join, directly or by way of others; one that none joins is a group
+    of its own. In the order of each group's first name."""
+    group = {name: {name} for name in names}
+    for one, other in ties:
+        joined = group[one] | group[other]
+        group |= dict.fromkeys(joined, joined)
+    groups: list[set[Name]] = []
+    for own in group.values():
+        if own not in groups:
+            groups.append(own)
+    return groups

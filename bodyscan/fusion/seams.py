@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations
 
-import networkx as nx
 import numpy as np
 
 from bodyscan.alignment.matching import (
@@ -23,6 +22,7 @@ from bodyscan.alignment.matching import (
     alignment_points,
     match_projected,
 )
+from bodyscan.alignment.overlaps import tied_groups
 from bodyscan.alignment.pole_steps import moving_alone
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
@@ -134,9 +134,8 @@ def find_misfits(
 
 
 def _untied(names: Sequence[str], seams: Sequence[Seam]) -> tuple[tuple[str, ...], ...]:
-    shared = nx.Graph([seam.pairs for seam in seams if set(seam.pairs) <= set(names)])
-    shared.add_nodes_from(names)
-    groups = sorted(nx.connected_components(shared), key=lambda group: (-len(group), min(group)))
+    shared = [seam.pairs for seam in seams if set(seam.pairs) <= set(names)]
+    groups = sorted(tied_groups(names, shared), key=lambda group: (-len(group), min(group)))
     return tuple(tuple(sorted(group)) for group in groups[1:])
 
 

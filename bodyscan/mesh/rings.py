@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import networkx as nx
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -45,15 +44,24 @@ def rings(vertices: Array, faces: Indices, *, smallest_mm: float = 80.0) -> list
     height = np.zeros(count)
     height[piece] = layer_mm * (layer + 0.5)
     y = np.bincount(piece, vertices[:, 1], count) / np.bincount(piece, minlength=count)
-    pieces = nx.Graph(np.unique(piece[edges[~within]], axis=0).tolist())
+    joined = _without_branches(np.unique(piece[edges[~within]], axis=0))
+    if not len(joined):
+        return []
+    import networkx as nx  # loads for a fifth of a second; few bodies have a ring
+
     found = []
-    for cycle in nx.minimum_cycle_basis(_prune_branches(pieces)):
+    for cycle in nx.minimum_cycle_basis(nx.Graph(joined.tolist())):
         heights = height[cycle]
         if np.ptp(heights) >= smallest_mm:
             found.append(Ring(float(heights.min()), float(heights.max()), float(y[cycle].mean())))
     return sorted(found, key=lambda ring: (ring.low_mm, ring.y_mm))
 
 
-def _prune_branches(graph: nx.Graph) -> nx.Graph:
-    """Without the branches that are in no ring."""
-    return nx.k_core(graph, 2)
+def _without_branches(joined: Indices) -> Indices:
+    """Of what is joined, (N, 2), what is in a ring or between two."""
+    joined = np.unique(np.sort(joined, axis=1), axis=0)
+    while True:
+        inside = (np.bincount(joined.ravel())[joined] > 1).all(axis=1)
+        if inside.all():
+            return joined
+        joined = joined[inside]

@@ -9,10 +9,10 @@ open which sheets meet there: of such two the one nearer to the surface is put o
 
 from __future__ import annotations
 
+from collections import defaultdict
 from functools import cache
 from itertools import product
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,12 +50,20 @@ def sheets_of_cases() -> tuple[NDArray[np.int8], NDArray[np.int8]]:
     """
     parts, counts = np.full((256, 12), -1, np.int8), np.zeros(256, np.int8)
     for case in range(256):
-        links = nx.Graph()
+        beside = defaultdict[int, list[int]](list)
         for axis, side in product(range(3), range(2)):
-            links.add_edges_from(_links(case, axis, side))
-        for number, sheet in enumerate(sorted(nx.connected_components(links), key=min)):
-            parts[case, list(sheet)] = number
-            counts[case] = number + 1
+            for one, other in _links(case, axis, side):
+                beside[one].append(other)
+                beside[other].append(one)
+        for first in sorted(beside):
+            if parts[case, first] >= 0:
+                continue
+            around = [first]
+            while around:
+                edge = around.pop()
+                parts[case, edge] = counts[case]
+                around += [other for other in beside[edge] if parts[case, other] < 0]
+            counts[case] += 1
     return parts, counts
 
 
