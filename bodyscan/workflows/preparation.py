@@ -7,13 +7,14 @@ left after the last image is its own pair and what joins them all.
 from __future__ import annotations
 
 from collections.abc import Collection
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from bodyscan.captures.captures_file import FILE_NAME
 from bodyscan.captures.folder import Captures, ImageSequence, open_scan
 from bodyscan.errors import BodyscanError
-from bodyscan.progress import attempt_each
+from bodyscan.progress import THREADS
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
 from bodyscan.workflows.range_images import Reconstructed, reconstruct_sequence
@@ -35,10 +36,12 @@ class Preparation:
     def __init__(self, calibration: Path) -> None:
         """Raises CalibrationFileError as `load_calibration` does."""
         self.calibration: RigCalibration = load_calibration(calibration)
-        self._made: dict[Path, dict[ImageSequence, _Made]] = {}
+        self._pool = ThreadPoolExecutor(THREADS)
+        self._made: dict[Path, dict[ImageSequence, Future[_Made | None]]] = {}
 
     def prepare(self, folder: Path, pairs: Collection[str]) -> None:
-        """Decode what these pairs took, if all of it is there.
+        """Begin to decode what these pairs took, if all of it is there: as many at a time as there are
+        threads, however few each call names.
 
         What is amiss is left to the scan, which tries again and says so; nothing is raised for it.
         """
@@ -48,24 +51,28 @@ class Preparation:
             return
         wanted = [s for s in captures.sequences if s.pair in pairs and self._can(s)]
 
-        def make(sequence: ImageSequence) -> _Made:
+        def make(sequence: ImageSequence) -> _Made | None:
             stamps = _stamps(captures, sequence)
-            made = reconstruct_sequence(self.calibration, captures, sequence, volume_only=True)
+            try:
+                made = reconstruct_sequence(self.calibration, captures, sequence, volume_only=True)
+            except BodyscanError:
+                return None
             return _Made(made, stamps)
 
-        made, _ = attempt_each(make, wanted, BodyscanError, stage="range images")
-        self._made.setdefault(folder, {}).update(made)
+        own = self._made.setdefault(folder, {})
+        own |= {sequence: self._pool.submit(make, sequence) for sequence in wanted}
 
     def made_of(self, captures: Captures) -> dict[ImageSequence, Reconstructed]:
-        """The range images made of these captures whose files have stayed as they were; they are
-        given away, so that none is kept twice."""
-        made: dict[ImageSequence, _Made] = {}
+        """The range images made of these captures whose files have stayed as they were; those that
+        are being made are waited for. They are given away, so that none is kept twice."""
+        made: dict[ImageSequence, Future[_Made | None]] = {}
         for folder in captures.folders:
             made |= self._made.pop(folder, {})
+        found = {sequence: one.result() for sequence, one in made.items()}
         return {
             sequence: own.range_image
-            for sequence, own in made.items()
-            if _stamps(captures, sequence) == own.stamps
+            for sequence, own in found.items()
+            if own is not None and _stamps(captures, sequence) == own.stamps
         }
 
     def _can(self, sequence: ImageSequence) -> bool:

@@ -7,13 +7,17 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 from small_workspace import run
 
+from bodyscan.captures.folder import ImageSequence, open_scan
+from bodyscan.errors import ImageError
 from bodyscan.files.hashing import file_hash, files_below
+from bodyscan.workflows.resident import Resident
 
 SMALL = ("--set", "fusion.points=20000", "--set", "mesh.depth=6", "--set", "export.formats=glb")
 STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0" / "calibration"
@@ -93,6 +97,27 @@ def test_what_arrives_is_fused_as_a_batch_would_and_never_twice(example: Path, d
 def _bytes(folder: Path) -> dict[str, str]:
     paths = [path for path in files_below(folder) if path.name not in OWN | {"job.json"}]
     return {str(path.relative_to(folder)): file_hash(path) for path in paths}
+
+
+def test_pairs_that_come_one_by_one_are_decoded_side_by_side(
+    example: Path, day: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    resident = Resident(day / "calibration")
+    person = example / "pole" / "captures" / "person"
+    captures = open_scan(resident.calibration.rig, person)
+    both, met = threading.Barrier(2, timeout=60.0), list[str]()
+
+    def decode(_: object, __: object, sequence: ImageSequence, **___: object) -> None:
+        both.wait()
+        met.append(sequence.pair)
+        raise ImageError("is left to the scan")
+
+    monkeypatch.setattr("bodyscan.workflows.resident.reconstruct_sequence", decode)
+    pairs = sorted({sequence.pair for sequence in captures.sequences})[:2]
+    for pair in pairs:
+        resident.prepare(person, [pair])
+    assert resident.made_of(captures) == {}
+    assert sorted(met) == pairs
 
 
 def test_a_calibration_that_cannot_be_used_is_said_at_once(tmp_path: Path) -> None:
