@@ -13,8 +13,8 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.linalg.lapack import dpotri
+from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpotrf, dpotri, dtrtri
 
 from bodyscan.alignment.body_cells import BodyCells, modulated, rigid_fields
 from bodyscan.alignment.breath import breath_fields
@@ -89,8 +89,8 @@ class Kind:
 class BodyMotion:
     """amplitudes: (n,) of all kinds' fields and courses.  usual: (6,) the sway that its unit is.
 
-    normal: (n, n), what was seen of them, without any prior; pull: (n,) its right-hand side.  inverse,
-    units: of their covariance, in units (n,).  Of both matrices the lower triangle counts.
+    normal: (n, n), what was seen of them, without any prior, its lower triangle; pull: (n,) its
+    right-hand side.  factor: (n, n) Cholesky's, lower, of the inverse of their covariance in units (n,).
     """
 
     kinds: tuple[Kind, ...]
@@ -98,7 +98,7 @@ class BodyMotion:
     amplitudes: Array
     normal: Array
     pull: Array
-    inverse: Array
+    factor: Array
     units: Array
 
     @staticmethod
@@ -133,13 +133,14 @@ class BodyMotion:
     @cached_property
     def covariance(self) -> Array:
         """(n, n) of the amplitudes."""
-        lower = np.tril(self.inverse)
+        lower = np.tril(dpotri(self.factor, lower=True)[0])
         return (lower + np.tril(lower, -1).T) * self.units[:, None] * self.units
 
     @property
     def variances(self) -> Array:
-        """(n,) of the amplitudes: all that a round needs of the covariance."""
-        return np.diag(self.inverse) * self.units * self.units
+        """(n,) of the amplitudes: all that a round needs of the covariance, at half its price."""
+        root = dtrtri(self.factor, lower=True)[0]
+        return np.asarray(np.einsum("ij,ij->j", root, root) * self.units**2, np.float64)
 
     @cached_property
     def fields(self) -> Array:
@@ -245,10 +246,9 @@ class BodyMotion:
         units = 1.0 / np.sqrt(np.diag(normal))
         normal *= units[:, None]
         normal *= units
-        factor = cho_factor(normal, lower=True, overwrite_a=True, check_finite=False)
-        amplitudes = units * cho_solve(factor, units * self.pull, check_finite=False)
-        inverse, _ = dpotri(factor[0], lower=True, overwrite_c=True)
-        return replace(self, amplitudes=amplitudes, inverse=inverse, units=units)
+        factor, _ = dpotrf(normal, lower=True, overwrite_a=True)
+        amplitudes = units * cho_solve((factor, True), units * self.pull, check_finite=False)
+        return replace(self, amplitudes=amplitudes, factor=factor, units=units)
 
     def _resized(self) -> BodyMotion:
         """Each kind as large as the evidence says (MacKay 1992): what it does not ask for shrinks."""
