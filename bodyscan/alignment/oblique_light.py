@@ -19,9 +19,10 @@ import numpy as np
 
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.overlap_equations import LEAST_SPREAD_MM
-from bodyscan.alignment.overlaps import OverlapPoints, each_overlap, match_overlap
+from bodyscan.alignment.overlaps import COARSE, OverlapPoints, each_overlap, match_overlap
 from bodyscan.alignment.sway import SwayPrior
 from bodyscan.arrays import Array, Floats
+from bodyscan.compiled import compiled
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.robust import spread
@@ -47,6 +48,8 @@ FEWEST_IMAGES = 4
 TOLD_SIGMAS, LEAST_MM = 4.0, 0.05
 """From which on it is believed: a surface that leans by 20 degrees then stands off by as much, which
 makes 0.3 mm of a girth."""
+SHORTEST = np.float32(1e-3)
+"""Of a mean of unit normals."""
 FLATTEST = 0.1
 """Cosine, of light, ray and sheet: flatter than that the effect has no size, nothing is measured."""
 
@@ -165,8 +168,12 @@ def find_oblique_light(
     names = [image.pair for image in images]
     placed = [rig_from_camera[name] for name in names]
 
+    # Each image says its own, whatever the number of its points: a part of them tells as much.
+    correlated = max(settings.correlated / COARSE.step, 1.0)
+
     def points(image: RangeImage) -> OverlapPoints:
-        return OverlapPoints.of(replace(image, normals=_steady(image)), settings.spacing_mm)
+        seen = OverlapPoints.of(replace(image, normals=_steady(image)), settings.spacing_mm)
+        return seen.some(COARSE)
 
     with ThreadPoolExecutor(THREADS) as pool:
         clouds = list(pool.map(points, images))
@@ -179,7 +186,7 @@ def find_oblique_light(
             places = found.points, found.normals
             apart = _apart(lines[names[i]], placed[i], *places)
             apart -= _apart(lines[names[j]], placed[j], *places)
-            return _shared(*places, found.distances, found.sigma_mm, apart, settings.correlated)
+            return _shared(*places, found.distances, found.sigma_mm, apart, correlated)
 
         overlaps = each_overlap(pool, len(names), of_two)
     seen = sorted({k for both in overlaps for k in both})
@@ -221,9 +228,18 @@ def _steady(image: RangeImage) -> Floats:
     pixel_mm = float(np.median(image.points[known][:, 2])) / image.camera.alpha
     side = 2 * max(1, round(0.5 * WINDOW_MM / pixel_mm)) + 1
     total = cv2.blur(np.where(known[..., None], image.normals, np.float32(0.0)), (side, side))
-    length = np.linalg.norm(total, axis=-1, keepdims=True)
-    with np.errstate(invalid="ignore"):
-        return np.where(length > 1e-3, total / length, np.float32(np.nan)).astype(np.float32)
+    to_unit_length(total.reshape(-1, 3))
+    return total
+
+
+@compiled
+def to_unit_length(normals: Floats) -> None:
+    """Of normals (N, 3); NaN where next to nothing is left of them."""
+    for n in range(len(normals)):
+        x, y, z = normals[n, 0], normals[n, 1], normals[n, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        for k in range(3):
+            normals[n, k] = normals[n, k] / length if length > SHORTEST else np.float32(np.nan)
 
 
 def _apart(

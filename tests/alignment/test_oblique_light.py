@@ -15,6 +15,7 @@ from bodyscan.alignment.oblique_light import (
     ObliqueLight,
     find_oblique_light,
     take_out,
+    to_unit_length,
     undo,
 )
 from bodyscan.arrays import Array
@@ -177,3 +178,12 @@ def test_light_comes_from_where_its_sheets_meet(along: list[float]) -> None:
     assert line is not None
     np.testing.assert_allclose(line.origin, origin, atol=1e-6)
     assert abs(line.along @ way) == pytest.approx(1.0)
+
+
+def test_means_of_normals_are_brought_to_unit_length() -> None:
+    normals = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
+    normals[::7] *= np.float32(1e-5)  # next to nothing is left where they look all ways
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    expected = np.where(length > 1e-3, normals / length, np.float32(np.nan))
+    to_unit_length(normals)
+    np.testing.assert_allclose(normals, expected, rtol=1e-6)
