@@ -44,7 +44,7 @@ def rings(vertices: Array, faces: Indices, *, smallest_mm: float = 80.0) -> list
     height = np.zeros(count)
     height[piece] = layer_mm * (layer + 0.5)
     y = np.bincount(piece, vertices[:, 1], count) / np.bincount(piece, minlength=count)
-    joined = _without_branches(np.unique(piece[edges[~within]], axis=0))
+    joined = without_branches(np.unique(piece[edges[~within]], axis=0))
     if not len(joined):
         return []
     import networkx as nx  # loads for a fifth of a second; few bodies have a ring
@@ -57,7 +57,7 @@ def rings(vertices: Array, faces: Indices, *, smallest_mm: float = 80.0) -> list
     return sorted(found, key=lambda ring: (ring.low_mm, ring.y_mm))
 
 
-def _without_branches(joined: Indices) -> Indices:
+def without_branches(joined: Indices) -> Indices:
     """Of what is joined, (N, 2), what is in a ring or between two."""
     joined = np.unique(np.sort(joined, axis=1), axis=0)
     while True:
