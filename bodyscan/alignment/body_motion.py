@@ -246,7 +246,9 @@ class BodyMotion:
         units = 1.0 / np.sqrt(np.diag(normal))
         normal *= units[:, None]
         normal *= units
-        factor, _ = dpotrf(normal, lower=True, overwrite_a=True)
+        factor, failed = dpotrf(normal, lower=True, overwrite_a=True)
+        if failed:
+            raise np.linalg.LinAlgError("what was seen of a motion leaves its amplitudes open")
         amplitudes = units * cho_solve((factor, True), units * self.pull, check_finite=False)
         return replace(self, amplitudes=amplitudes, factor=factor, units=units)
 

@@ -42,6 +42,19 @@ def mesh(
     through are not webbed over. A vertex farther than `settings.reach_mm` from every point was
     measured by nobody. Raises ScanFailed if no closed surface comes out.
     """
+    shape = closed_surface(cloud, settings, range_images, rig_from_camera, workers=workers)
+    return attach_attributes(*shape, cloud, settings.reach_mm)
+
+
+def closed_surface(
+    cloud: BodyCloud,
+    settings: MeshSettings,
+    range_images: Sequence[RangeImage] = (),
+    rig_from_camera: dict[str, RigidTransform] | None = None,
+    *,
+    workers: int = THREADS,
+) -> tuple[Array, Indices]:
+    """Vertices (V, 3) mm and faces (F, 3) of the mesh, as exact as a grid's; otherwise as `mesh`."""
     if len(cloud.points) < FEWEST_POINTS:
         raise ScanFailed(
             f"a cloud of {len(cloud.points)} points is too small for a mesh",
@@ -58,7 +71,7 @@ def mesh(
     found = topology(vertices, faces)
     if not found.manifold:
         raise ScanFailed(f"no closed surface came out of the cloud ({found})")
-    return attach_attributes(vertices, faces, cloud, settings.reach_mm)
+    return vertices, faces
 
 
 def signed_distances(

@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from bodyscan.alignment.part_names import NECK
 from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
+from bodyscan.compiled import compiled
 from bodyscan.fusion.brightness import DARKEST
 from bodyscan.fusion.roughness import Misfits, misfits
 from bodyscan.geometry.crop import crop_of
@@ -163,9 +164,9 @@ def _texture(
     asked = dark | head
 
     def looked_at(image: RangeImage) -> Misfits | None:
-        valid, at = image.valid, rig_from_camera[image.pair]
-        wanted = np.zeros(valid.shape, bool)
-        wanted[valid] = asked[cells.find(at.apply(image.points[valid].astype(np.float64)))]
+        at, wanted = rig_from_camera[image.pair], np.zeros(image.sigma_mm.shape, np.bool_)
+        matrix, grid = at.matrix[:3], asked.reshape(cells.shape)
+        lies_in(image.points, image.sigma_mm, matrix, cells.origin, grid, wanted)
         box = crop_of(wanted)
         return None if box is None else misfits(image, at, box, window_mm)
 
@@ -175,6 +176,34 @@ def _texture(
         nowhere = np.zeros(cells.count, bool)
         return _Texture(nowhere, nowhere, nowhere)
     return _told(cells, found)
+
+
+@compiled
+def lies_in(
+    points: Floats,
+    sigma_mm: Floats,
+    rig_from_camera: Array,
+    origin: Array,
+    asked: Mask,
+    wanted: Mask,
+) -> None:
+    """wanted (H, W): which points (H, W, 3) that have a sigma lie in cells that are asked about.
+
+    rig_from_camera: (3, 4).  origin: (3,) mm, of the cells (a, b, c); beyond them the nearest counts.
+    """
+    m, low = rig_from_camera, origin
+    for v in range(wanted.shape[0]):
+        for u in range(wanted.shape[1]):
+            if not np.isfinite(sigma_mm[v, u]):
+                continue
+            x, y, z = points[v, u, 0], points[v, u, 1], points[v, u, 2]
+            a = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] - low[0]) / CELL_MM
+            b = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] - low[1]) / CELL_MM
+            c = (m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] - low[2]) / CELL_MM
+            i = min(max(int(np.floor(a)), 0), asked.shape[0] - 1)
+            j = min(max(int(np.floor(b)), 0), asked.shape[1] - 1)
+            k = min(max(int(np.floor(c)), 0), asked.shape[2] - 1)
+            wanted[v, u] = asked[i, j, k]
 
 
 def _told(cells: _Cells, found: Sequence[Misfits]) -> _Texture:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from bodyscan.alignment.sway import SwayPrior, centre_sigmas
 from bodyscan.alignment.together import Together, bring_together
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.merging import merge
-from bodyscan.fusion.meshing import mesh
+from bodyscan.fusion.meshing import attach_attributes, closed_surface
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
 from bodyscan.fusion.regions import label_regions
 from bodyscan.fusion.scan_verdict import grade_scan
@@ -32,12 +33,12 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Announce, Verdict, say_nothing
 
-Merged = Callable[[BodyCloud], None]
-"""Takes a scan's cloud as soon as it is there, before it is meshed."""
+Made = Callable[[BodyCloud | BodyMesh], None]
+"""Takes a scan's cloud, and then its mesh, as soon as each is there; from any thread."""
 
 
-def no_use(cloud: BodyCloud) -> None:
-    """Where nobody waits for the cloud."""
+def no_use(body: BodyCloud | BodyMesh) -> None:
+    """Where nobody waits for them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,12 +72,13 @@ def fuse(
     *,
     empty: Sequence[RangeImage] = (),
     announce: Announce = say_nothing,
-    merged: Merged = no_use,
+    made: Made = no_use,
 ) -> Scan:
     """Range images of one person, background and all, to body model and mesh.
 
     measured: with the pairs that gave none as failures. empty: as in `clean`. announce: told what the
-    points alone say of the scan, before the mesh is made. merged: given the cloud then.
+    points alone say of the scan, before the mesh is made. made: given the cloud while that is made, and
+    the mesh while it is judged.
 
     Raises ScanFailed if they show no body.
     """
@@ -141,12 +143,21 @@ def fuse(
     with step(progress, "judging"):
         seams = judge_seams(seen, there, calibration.rig.poles)
         announce(graded(None, None), final=False)
-    with step(progress, "naming regions"):
+
+    def named() -> BodyCloud:
         regions = label_regions(cloud, seen, there, settings.fusion.window_mm)
-        cloud = replace(cloud, regions=regions)
-    merged(cloud)
-    with step(progress, "meshing"):
-        surface = _breathing(mesh(cloud, settings.mesh, images, placing), followed)
+        known = replace(cloud, regions=regions)
+        made(known)
+        return known
+
+    with step(progress, "meshing"), ThreadPoolExecutor(1) as beside:
+        # Of a mesh most is made on one core: what it is not made of is found out on the other.
+        naming = beside.submit(named)
+        shape = closed_surface(cloud, settings.mesh, images, placing)
+        cloud = naming.result()
+        surface = attach_attributes(*shape, cloud, settings.mesh.reach_mm)
+        surface = _breathing(surface, followed)
+        made(surface)
         carried = {image.pair: image for image in seen}
         at_once_or_empty = [carried.get(image.pair, image) for image in cleaned]
         held = check_surface(surface, at_once_or_empty, placing)

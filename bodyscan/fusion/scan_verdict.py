@@ -343,13 +343,15 @@ def _contradictions(found: Contradictions | None, seams: SeamReport | None) -> I
 
 def _company(cloud: BodyCloud) -> Iterator[Finding]:
     """Bodies that stand beside each other, and pieces that nothing joins."""
-    cells = np.floor((cloud.points - cloud.points.min(axis=0)) / CELL_MM).astype(np.int64)
-    taken = np.zeros(cells.max(axis=0) + 1, bool)
-    taken[tuple(cells.T)] = True
-    label = ndimage.label(taken, np.ones((3, 3, 3)))[0][tuple(cells.T)]
-    share = np.bincount(label)[1:] / len(label)
-    if len(share) == 1:
+    low = cloud.points.min(axis=0)
+    cells = tuple(((cloud.points[:, k] - low[k]) / CELL_MM).astype(np.int64) for k in range(3))
+    taken = np.zeros([int(place.max()) + 1 for place in cells], bool)
+    taken[cells] = True
+    labels, count = ndimage.label(taken, np.ones((3, 3, 3)))
+    if count == 1:
         return
+    label = labels[cells]
+    share = np.bincount(label)[1:] / len(label)
     order = np.argsort(-share)
     extents = [np.percentile(cloud.points[label == k + 1, 2], [1, 99]) for k in order[:4]]
     low, high = extents[0]

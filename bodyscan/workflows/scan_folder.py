@@ -9,7 +9,7 @@ from bodyscan.captures.folder import open_scan
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.scan import Scan
 from bodyscan.fusion.storage import clear, save_failure, save_scan
-from bodyscan.mesh.body import BodyCloud
+from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, step
 from bodyscan.registration.storage import calibration_id, load_calibration
@@ -33,7 +33,8 @@ def scan_folder(
     announce: Announce = say_nothing,
 ) -> tuple[Scan, Path, Outcome[list[Path]]]:
     """The scan, its scan.json in `out`, and the pictures beside it, written once the result is kept.
-    A result that lay there goes. The cloud is drawn while it is meshed, where a core is free.
+    A result that lay there goes. Pictures are drawn while a core is free: the cloud's while it is
+    meshed, the mesh's while it is judged.
 
     empty: captures of the rig with nobody in it. follow_links: though the calibration's rig file does
     not say so. preparation: what was loaded and decoded before. announce: told the verdict as the
@@ -46,14 +47,17 @@ def scan_folder(
         described = described.model_copy(update={"follow_links": True})
     captures = open_scan(described, folder)
     nobody = open_scan(described, empty) if empty else None
-    made = preparation.made_of(captures) if preparation else {}
+    reconstructed = preparation.made_of(captures) if preparation else {}
     origin = calibration_id(calibration)
     subject, when, simulated = captures.subject, captures.when, captures.simulated
     drawn: list[Future[Pictures]] = []
     with ThreadPoolExecutor(1) as beside:
 
-        def draw(cloud: BodyCloud) -> None:
-            drawn.append(beside.submit(cloud_pictures, cloud))
+        def draw(body: BodyCloud | BodyMesh) -> None:
+            if isinstance(body, BodyCloud):
+                drawn.append(beside.submit(cloud_pictures, body))
+            else:
+                drawn.append(beside.submit(mesh_pictures, body))
 
         try:
             scan = scan_person(
@@ -62,9 +66,9 @@ def scan_folder(
                 settings,
                 progress,
                 empty=nobody,
-                made=made,
+                reconstructed=reconstructed,
                 announce=announce,
-                merged=draw,
+                made=draw,
             )
         except ScanFailed as error:
             clear(out)
@@ -73,7 +77,6 @@ def scan_folder(
             )
             raise
         with step(progress, "writing"):
-            drawn.append(beside.submit(mesh_pictures, scan.mesh))
             clear(out)
             saved = save_scan(
                 scan, out, calibration_id=origin, subject=subject, when=when, simulated=simulated

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.fusion.scan import Merged, Scan, fuse, no_use
+from bodyscan.fusion.scan import Made, Scan, fuse, no_use
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
@@ -21,17 +21,19 @@ def scan_person(
     progress: Progress = silent,
     *,
     empty: Captures | None = None,
-    made: Mapping[ImageSequence, Reconstructed] = MappingProxyType({}),
+    reconstructed: Mapping[ImageSequence, Reconstructed] = MappingProxyType({}),
     announce: Announce = say_nothing,
-    merged: Merged = no_use,
+    made: Made = no_use,
 ) -> Scan:
     """Person images in, body model and mesh out.
 
     empty: captures of the rig without anybody in it, whose surfaces are no part of the subject.
-    made: see `reconstruct_range_images`.  announce, merged: see `fuse`.
+    reconstructed: see `reconstruct_range_images`.  announce, made: see `fuse`.
     Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left.
     """
-    images = reconstruct_range_images(calibration, captures, progress, made=made, volume_only=True)
+    images = reconstruct_range_images(
+        calibration, captures, progress, made=reconstructed, volume_only=True
+    )
     nobody = empty and reconstruct_range_images(calibration, empty, progress, volume_only=True)
     background = nobody.value if nobody else ()
     return fuse(
@@ -41,5 +43,5 @@ def scan_person(
         progress,
         empty=background,
         announce=announce,
-        merged=merged,
+        made=made,
     )

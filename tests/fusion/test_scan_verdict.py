@@ -11,13 +11,13 @@ import open3d as o3d
 import pytest
 from ray_cast_scan import Truth, cast_scan, load_body, load_rig, nominal_placings, without
 
+from bodyscan.arrays import Array, Indices
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.cleaning import apply_mask
-from bodyscan.fusion.meshing import mesh
+from bodyscan.fusion.meshing import closed_surface
 from bodyscan.fusion.scan import Scan, fuse
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.body import BodyMesh
 from bodyscan.outcome import Outcome
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -135,11 +135,11 @@ def test_two_people_are_told_before_there_is_a_mesh(
         assert not final
         told.append(verdict)
 
-    def meshed(*about: Any) -> BodyMesh:
+    def meshed(*about: Any) -> tuple[Array, Indices]:
         assert [verdict.grade for verdict in told] == ["repeat"]
-        return mesh(*about)
+        return closed_surface(*about)
 
-    monkeypatch.setattr("bodyscan.fusion.scan.mesh", meshed)
+    monkeypatch.setattr("bodyscan.fusion.scan.closed_surface", meshed)
     scan = fused(photographed(both), announce=listen)
     assert scan.verdict.grade == "repeat"
     assert "two bodies" in said(scan)

@@ -17,7 +17,7 @@ from small_workspace import run
 from bodyscan.captures.folder import ImageSequence, open_scan
 from bodyscan.errors import ImageError
 from bodyscan.files.hashing import file_hash, files_below
-from bodyscan.workflows.resident import Resident
+from bodyscan.workflows.preparation import Preparation
 
 SMALL = ("--set", "fusion.points=20000", "--set", "mesh.depth=6", "--set", "export.formats=glb")
 STORED = Path(__file__).parents[1] / "data" / "stored-0.1.0" / "calibration"
@@ -102,9 +102,9 @@ def _bytes(folder: Path) -> dict[str, str]:
 def test_pairs_that_come_one_by_one_are_decoded_side_by_side(
     example: Path, day: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    resident = Resident(day / "calibration")
+    preparation = Preparation(day / "calibration")
     person = example / "pole" / "captures" / "person"
-    captures = open_scan(resident.calibration.rig, person)
+    captures = open_scan(preparation.calibration.rig, person)
     both, met = threading.Barrier(2, timeout=60.0), list[str]()
 
     def decode(_: object, __: object, sequence: ImageSequence, **___: object) -> None:
@@ -112,11 +112,11 @@ def test_pairs_that_come_one_by_one_are_decoded_side_by_side(
         met.append(sequence.pair)
         raise ImageError("is left to the scan")
 
-    monkeypatch.setattr("bodyscan.workflows.resident.reconstruct_sequence", decode)
+    monkeypatch.setattr("bodyscan.workflows.preparation.reconstruct_sequence", decode)
     pairs = sorted({sequence.pair for sequence in captures.sequences})[:2]
     for pair in pairs:
-        resident.prepare(person, [pair])
-    assert resident.made_of(captures) == {}
+        preparation.prepare(person, [pair])
+    assert preparation.made_of(captures) == {}
     assert sorted(met) == pairs
 
 
