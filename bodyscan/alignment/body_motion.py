@@ -90,7 +90,7 @@ class BodyMotion:
     """amplitudes: (n,) of all kinds' fields and courses.  usual: (6,) the sway that its unit is.
 
     normal: (n, n), what was seen of them, without any prior, its lower triangle; pull: (n,) its
-    right-hand side.  factor: (n, n) Cholesky's, lower, of the inverse of their covariance in units (n,).
+    right-hand side.  factor: (n, n) Cholesky's, lower, of their covariance's inverse in units (n,).
     """
 
     kinds: tuple[Kind, ...]
