@@ -64,7 +64,7 @@ def test_a_pair_that_nothing_ties_is_known_as_the_boards_and_a_sway_say() -> Non
 
 def test_what_all_pairs_share_is_not_between_two() -> None:
     shared, own = 4.0 * np.eye(6), 0.01 * np.eye(6)
-    known = PoseCovariance(("p1", "p2", "p3"), np.kron(np.ones((3, 3)), shared))
+    known = PoseCovariance(("p1", "p2", "p3"), np.kron(np.ones((3, 3)), shared).astype(float))
     known.matrix[12:, 12:] += own
     assert np.allclose(known.between("p1", "p2"), 0.0)
     assert np.allclose(known.between("p2", "p3"), own)
