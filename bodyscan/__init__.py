@@ -15,9 +15,11 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str) -> Any:
-        if name.startswith("_") and name != "__all__":
-            raise AttributeError(f"module 'bodyscan' has no attribute {name!r}")
-        return getattr(import_module("bodyscan.api"), name)
+        if not name.startswith("_") or name == "__all__":
+            api = import_module("bodyscan.api")
+            if name == "__all__" or name in api.__all__:
+                return getattr(api, name)
+        raise AttributeError(f"module 'bodyscan' has no attribute {name!r}")
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *import_module("bodyscan.api").__all__})
+        return sorted([*import_module("bodyscan.api").__all__, "__version__"])

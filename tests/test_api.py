@@ -52,10 +52,14 @@ def test_the_list_is_sorted_and_short() -> None:
     assert len(api.__all__) < 32
 
 
-def test_a_word_that_is_no_name_is_refused() -> None:
-    word = "scann"
+@pytest.mark.parametrize("word", ["scann", "Path", "silent"])
+def test_a_word_that_is_no_name_is_refused(word: str) -> None:
     with pytest.raises(AttributeError, match=word):
         getattr(bodyscan, word)
+
+
+def test_the_list_is_all_that_shows() -> None:
+    assert dir(bodyscan) == sorted([*api.__all__, "__version__"])
 
 
 def test_star_gives_the_list() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
@@ -11,6 +12,7 @@ PROJECT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*PROJECT.glob("*.md"), *PROJECT.glob("docs/**/*.md")])
 LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)#\s]+)")
 SOURCE = re.compile(r"`((?:[\w.]+/)*\w+\.py)`")
+ROOMS = sorted(path.parent for path in (PROJECT / "bodyscan").glob("*/__init__.py"))
 ELSEWHERE = re.compile(r"(?<![\w/.])/(?:work|home|root|tmp|Users)/\w+")
 
 
@@ -38,3 +40,13 @@ def test_source_files_named_are_there(document: Path) -> None:
 @pytest.mark.parametrize("document", DOCUMENTS, ids=by_name)
 def test_no_folder_of_the_machine_that_wrote_a_document_is_named(document: Path) -> None:
     assert ELSEWHERE.findall(document.read_text("utf-8")) == []
+
+
+@pytest.mark.parametrize("room", ROOMS, ids=lambda room: str(room.name))
+def test_a_room_says_where_each_of_its_files_belongs(room: Path) -> None:
+    guide = ast.get_docstring(ast.parse((room / "__init__.py").read_text("utf-8"))) or ""
+    named = set(re.findall(r"\w+", guide))
+    files = {path.stem for path in room.glob("*.py") if not path.stem.startswith("__")}
+    folders = {path.name for path in room.iterdir() if path.is_dir()}
+    assert files - named == set()
+    assert {name for name in named if "_" in name} - files - folders == set()

@@ -22,7 +22,7 @@ from bodyscan.alignment.cell_evidence import CellEvidence
 from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.limbs import limb_fields
 from bodyscan.alignment.moments import Courses, of_breath, of_stance
-from bodyscan.alignment.sway import BODY_CENTRE
+from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.progress import threaded

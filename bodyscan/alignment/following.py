@@ -25,7 +25,7 @@ from bodyscan.alignment.matching import AlignmentPoints, Matches
 from bodyscan.alignment.overlaps import COARSE, OverlapPoints, each_overlap, match_overlap
 from bodyscan.alignment.part_names import LEGS, PARTS, name_parts
 from bodyscan.alignment.place_evidence import PlaceEvidence
-from bodyscan.alignment.sway import BODY_CENTRE, SwayPrior, centre_shifts
+from bodyscan.alignment.sway_prior import BODY_CENTRE, SwayPrior, centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform

@@ -25,7 +25,7 @@ from bodyscan.alignment.overlaps import (
     match_overlap,
     tied_groups,
 )
-from bodyscan.alignment.sway import SwayPrior, bound_motions, centre_shifts
+from bodyscan.alignment.sway_prior import SwayPrior, bound_motions, centre_shifts
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform

@@ -20,7 +20,7 @@ import numpy as np
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.overlap_equations import LEAST_SPREAD_MM
 from bodyscan.alignment.overlaps import COARSE, OverlapPoints, each_overlap, match_overlap
-from bodyscan.alignment.sway import SwayPrior
+from bodyscan.alignment.sway_prior import SwayPrior
 from bodyscan.arrays import Array, Floats
 from bodyscan.compiled import compiled
 from bodyscan.geometry.light_planes import LightSheets

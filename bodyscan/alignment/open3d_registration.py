@@ -18,7 +18,7 @@ import open3d as o3d
 from bodyscan.alignment.matching import FACING, AlignmentPoints, Matches
 from bodyscan.alignment.overlap_equations import OverlapEquations
 from bodyscan.alignment.overlaps import COARSE
-from bodyscan.alignment.sway import SwayPrior
+from bodyscan.alignment.sway_prior import SwayPrior
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.scaled_systems import solve_scaled

@@ -14,7 +14,7 @@ import numpy as np
 
 from bodyscan.alignment.body_motion import ARM_MM, BodyMotion
 from bodyscan.alignment.pole_steps import STEP_MM, STEPS_MM, PoleStep
-from bodyscan.alignment.sway import BODY_CENTRE
+from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
 

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from bodyscan.alignment.body_motion import ARM_MM
 from bodyscan.alignment.moments import of_stance
-from bodyscan.alignment.sway import SwayPrior, centre_shifts
+from bodyscan.alignment.sway_prior import SwayPrior, centre_shifts
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform

@@ -14,7 +14,7 @@ from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.following import Followed
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.oblique_light import LightLine, ObliqueLight, take_out
-from bodyscan.alignment.sway import SwayPrior, centre_sigmas
+from bodyscan.alignment.sway_prior import SwayPrior, centre_sigmas
 from bodyscan.alignment.together import Together, bring_together
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.merging import merge

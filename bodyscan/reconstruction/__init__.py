@@ -1,3 +1,5 @@
 """A pair's stripe map to a range image: range_image (what it is), scan_volume (which stripes are
-looked for), triangulation (rays meet light sheets).
+looked for), triangulation (rays meet light sheets), two_ways (stripes of both directions).
+
+What moved meanwhile: sequence_moments (who saw what when), told_motion, speed_field, surface_cells.
 """

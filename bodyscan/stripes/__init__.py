@@ -9,6 +9,8 @@ their kind, laid out by scan_lines; phase_waves those of waves of several period
 sequence_checks and stripe_order say whether images add up, and which is wrong; usable_pixels, with
 grey_noise and indirect_light, which pixels count; stripe_limits, which stripes are worth it. boundaries
 finds where stripes end, albedo_edges puts that right at edges of the surface's brightness,
-stripe_coordinates interpolates between them; pixel_stripes does all that for codes that tell s at each
-pixel.
+stripe_coordinates interpolates between them, code_lines where there are none; pixel_stripes does all
+that for codes that tell s at each pixel. line_bands: boundaries of some lines alone. bit_clarity,
+clear_changes and boundary_scatter hold what was decoded against its noise. comb and one_moment: what
+moved while the images were taken.
 """

@@ -11,7 +11,7 @@ import numpy as np
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.pair_drift import LEAST_MM, PairDrift, mean_drift
 from bodyscan.alignment.pole_steps import StepSearch, find_steps, motions_between
-from bodyscan.alignment.sway import BODY_CENTRE
+from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.captures.folder import Captures
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.geometry.transforms import RigidTransform

@@ -7,7 +7,7 @@ import pytest
 
 from bodyscan.alignment.place_evidence import PlaceEvidence, SizeStep, find_off
 from bodyscan.alignment.pole_steps import PoleStep
-from bodyscan.alignment.sway import BODY_CENTRE
+from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
 

@@ -10,7 +10,7 @@ import pytest
 from bodyscan.alignment.body_motion import ARM_MM
 from bodyscan.alignment.moments import of_stance
 from bodyscan.alignment.pole_steps import PoleStep, Scan, find_steps, motions_between
-from bodyscan.alignment.sway import BODY_CENTRE, centre_shifts
+from bodyscan.alignment.sway_prior import BODY_CENTRE, centre_shifts
 from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
 

@@ -13,7 +13,7 @@ from made_scan import MadeScan, egg, make_scan
 from bodyscan.alignment.body_parts import PartMotion, PersonMotion
 from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.pole_steps import StepSearch
-from bodyscan.alignment.sway import centre_sigmas
+from bodyscan.alignment.sway_prior import centre_sigmas
 from bodyscan.arrays import Array
 from bodyscan.fusion import scan_verdict
 from bodyscan.fusion.contradictions import Contradictions

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.alignment.sway import SwayPrior, bound_motions, centre_shifts
+from bodyscan.alignment.sway_prior import SwayPrior, bound_motions, centre_shifts
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.settings import BODY_CENTRE_MM
