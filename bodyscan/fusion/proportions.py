@@ -33,6 +33,8 @@ ALIKE = 0.5
 FLAT = 0.8
 """Height over the farthest that it reaches to the side: arms held out make it 1"""
 LIMB_MM2 = 1500.0
+HAND_MM2 = 6000.0
+"""A fist and its thumb. Hands that hang begin at once, between two heights; no bag is as small."""
 NECK = 0.86
 """of the height: a backpack ends below"""
 MEASURED = 0.6
@@ -130,7 +132,7 @@ def _changes(sections: Sequence[_Section]) -> Iterator[tuple[Grade, str]]:
     """Along the legs, and from above where they join, which is a step by itself, to the armpits."""
     crotch = _crotch(sections)
     steps = {
-        0.5 * (below.height_mm + above.height_mm): abs(_change(below, above))
+        0.5 * (below.height_mm + above.height_mm): abs(_change(below, _without_hands(above, below)))
         for part in (sections[:crotch], sections[crotch + 1 :])
         for below, above in pairwise(part)
     }
@@ -159,6 +161,13 @@ def _change(below: _Section, above: _Section) -> float:
     those may not have been measured."""
     heights = max(round((above.share - below.share) / STEP), 1)
     return float(np.log(above.area_mm2 / below.area_mm2)) / heights
+
+
+def _without_hands(above: _Section, below: _Section) -> _Section:
+    """Without what is as small as hands and was not there below."""
+    there = len(below.loops)
+    more = [loop for loop in above.loops[there:] if loop.area_mm2 > HAND_MM2]
+    return replace(above, loops=(*above.loops[:there], *more))
 
 
 def _on_two_legs(section: _Section) -> bool:
