@@ -42,6 +42,22 @@ def test_small_distances_keep_their_sign() -> None:
     assert np.mean(np.abs(found - step) < 1e-4) > 0.98
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_a_point_beyond_a_corner_is_outside_however_obtuse_the_faces(seed: int) -> None:
+    """Of a flattened tetrahedron: a corner's normal is that of its faces, each by its angle there."""
+    rng = np.random.default_rng(seed)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    corners = 100.0 * rng.normal(size=(4, 3)) * [1.0, 1.0, 0.05]
+    if np.linalg.det(corners[1:] - corners[0]) < 0.0:
+        corners = corners[[0, 2, 1, 3]]
+    sides = corners[faces[:, 1:]] - corners[faces[:, :1]]
+    normals = np.cross(sides[:, 0], sides[:, 1])
+    points = rng.uniform(corners.min(axis=0) - 30.0, corners.max(axis=0) + 30.0, (1000, 3))
+    outside = np.einsum("pfk,fk->pf", points[:, None] - corners[faces[:, 0]], normals) > 0.0
+    found = signed_distances(points, corners, faces)
+    assert np.array_equal(found > 0.0, outside.any(axis=1))
+
+
 def test_statistics() -> None:
     found = deviation(np.array([0.0, 1.0, -1.0, 2.0]))
     assert found.count == 4
