@@ -134,7 +134,9 @@ def grade_scan(
         "motion": lambda: _motion(
             None if shifted or size else alignment, person, use, boards_mm or {}
         ),
-        "contradictions": lambda: _contradictions(contradictions, seams),
+        "contradictions": lambda: _contradictions(
+            contradictions, seams, explained=bool(shifted or size)
+        ),
         "pieces": lambda: _company(cloud),
         "limbs": lambda: _limbs(shape) if shape else (),
         "proportions": lambda: odd_proportions(shape) if shape else (),
@@ -322,9 +324,21 @@ def _motion(
         )
 
 
-def _contradictions(found: Contradictions | None, seams: SeamReport | None) -> Iterator[Finding]:
-    """Pairs that see through each other's surfaces, which points near each other do not tell."""
+def _contradictions(
+    found: Contradictions | None, seams: SeamReport | None, *, explained: bool
+) -> Iterator[Finding]:
+    """Pairs that see through each other's surfaces, which points near each other do not tell.
+    explained: poles were said to have moved, and brought to the others, which should have ended that.
+    """
     if found is None or found.beyond_noise <= SOME_CONTRADICTED:
+        return
+    if explained:
+        yield (
+            "repeat",
+            f"the pairs contradict each other, {found.share:.1%} of what they say of one another's "
+            "points, though poles were brought to the others: it is something else that is wrong, a "
+            "pair's own camera or light; has a lens been touched, was the calibration edited?",
+        )
         return
     blamed = found.blamed(seams.groups) if seams else ""
     yield (

@@ -112,6 +112,28 @@ def test_pairs_that_see_through_each_other(scan: MadeScan, share: float, grade: 
     assert ("the pairs contradict each other" in str(verdict)) == (grade != "good")
 
 
+def test_poles_that_moved_explain_nothing_if_pairs_still_contradict_each_other(
+    scan: MadeScan,
+) -> None:
+    """A focal length wrong by 1 %, taken for a pole that moved, left 16.6 mm of a girth, usable."""
+    found = against({("a", "b"): 0.009, ("b", "c"): 0.009, ("a", "c"): 0.009})
+    step = PoleStep("pole p1", frozenset({"p1-1", "p1-2"}), 2.6, 0.15)
+    grades = [
+        grade_scan(
+            scan.cloud,
+            scan.mesh,
+            aligned(),
+            {},
+            Volume(),
+            UseLimits(),
+            contradictions=contradictions,
+            shifted=[step],
+        ).grade
+        for contradictions in (None, found)
+    ]
+    assert grades == ["usable", "repeat"]
+
+
 def against(shares: dict[tuple[str, str], float]) -> Contradictions:
     """Of 1000 words that every two pairs have for each other's points."""
     names = sorted({name for both in shares for name in both})
