@@ -29,6 +29,7 @@ from bodyscan.mesh.body import BodyCloud, BodyMesh, BreathAt
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, step
 from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.registration.board_checks import size_ratio
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Announce, Verdict, say_nothing
@@ -127,6 +128,7 @@ def fuse(
             seams,
             held,
             fused.contradictions,
+            size_ratio=size_ratio(calibration.rig, calibration.rig_from_camera),
             unjudged=[name for name, pair in calibration.pairs.items() if pair.quality.unjudged],
             cameras=np.array([at.translation for at in calibration.rig_from_camera.values()]),
             agreements={image.pair: image.agreement for image in images if image.agreement},

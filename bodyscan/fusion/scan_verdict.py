@@ -22,6 +22,7 @@ from bodyscan.mesh.rings import rings
 from bodyscan.mesh.slices import loops_at
 from bodyscan.optional import optional
 from bodyscan.reconstruction.two_ways import Agreement
+from bodyscan.registration.board_checks import OTHER_SIZE, REFUSED_SIZE
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
 from bodyscan.verdict import Grade, Verdict
@@ -93,6 +94,7 @@ def grade_scan(
     surface: SurfaceCheck | None = None,
     contradictions: Contradictions | None = None,
     unjudged: Sequence[str] = (),
+    size_ratio: float | None = None,
     cameras: Array | None = None,
     agreements: Mapping[str, Agreement] | None = None,
     person: PersonMotion | None = None,
@@ -107,6 +109,7 @@ def grade_scan(
     `judge_seams`. surface: see `check_surface`. contradictions: see `merge`.
 
     unjudged: pairs whose calibration was imported and says nothing of how exact it is.
+    size_ratio: how many times as far apart as their nominal places the cameras stand, if known.
     cameras: (N, 3) where those of the whole rig stand; None for all round.  What none of them could
     see is no reason to repeat.
 
@@ -125,6 +128,7 @@ def grade_scan(
         "pairs": lambda: _pairs(failed, alignment),
         "presence": lambda: _silent(silent),
         "calibration": lambda: _calibration(unjudged),
+        "nominal places": lambda: _rig_size(size_ratio),
         "directions": lambda: _directions(agreements or {}),
         "seams": lambda: _seams(seams, use),
         "poles": lambda: _shifted(shifted),
@@ -190,6 +194,18 @@ def _calibration(unjudged: Sequence[str]) -> Iterator[Finding]:
             f"the calibration of {', '.join(unjudged)} was made elsewhere and does not say how exact "
             "it is: sigmas hold the decoding alone",
         )
+
+
+def _rig_size(ratio: float | None) -> Iterator[Finding]:
+    """Whoever scans need not have read what was said when the rig was calibrated."""
+    if ratio is None or abs(ratio - 1.0) <= OTHER_SIZE:
+        return
+    yield (
+        "repeat" if abs(ratio - 1.0) > REFUSED_SIZE else "usable",
+        f"the calibration has the cameras {ratio:.3f} times as far apart as their nominal poses: is "
+        "square_mm of its boards right? Every girth is wrong by as much if it is not; correct it and "
+        "calibrate again, or correct `nominal`",
+    )
 
 
 def _directions(agreements: Mapping[str, Agreement]) -> Iterator[Finding]:

@@ -180,6 +180,21 @@ def test_a_pole_that_moved_is_mended_and_a_pair_may_measure_wrongly(
     assert "pole p stands 5.0 mm from where the calibration has it" in str(verdict)
 
 
+@pytest.mark.parametrize(
+    ("ratio", "grade"),
+    [(None, "good"), (0.98, "good"), (0.96, "usable"), (1.04, "usable"), (1.11, "repeat")],
+)
+def test_cameras_that_do_not_stand_where_they_should_make_the_size_doubtful(
+    scan: MadeScan, ratio: float | None, grade: str
+) -> None:
+    """A print at 97 % was said when the rig was calibrated, and every scan after it was good."""
+    verdict = grade_scan(
+        scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), size_ratio=ratio
+    )
+    assert verdict.grade == grade
+    assert ("times as far apart" in str(verdict)) == (grade != "good")
+
+
 def test_two_poles_that_moved_leave_nothing_to_hold_the_size(scan: MadeScan) -> None:
     steps = [PoleStep(f"pole p{k}", frozenset({f"p{k}-1", f"p{k}-2"}), 3.0, 0.1) for k in (1, 2)]
     verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=steps)
