@@ -103,8 +103,8 @@ class Breath:
 class LivingBody:
     """A person who stands as people do.
 
-    rest: at mean breath, upright.  limbs: arms and head, against the trunk.  swells: (N, 3, 2) where
-    chest and belly go, for each mm of breath.  ankles: the whole body's sway.
+    rest: at mean breath, upright.  limbs: both arms, then the head, against the trunk.  swells:
+    (N, 3, 2) where chest and belly go, for each mm of breath.  ankles: the whole body's sway.
     """
 
     rest: Surface
@@ -112,6 +112,12 @@ class LivingBody:
     swells: Array
     breath: Breath
     ankles: Joint
+
+    @property
+    def arms_share(self) -> Array:
+        """(N,) how far each vertex goes with an arm: 1 beyond the shoulders, 0 on the trunk."""
+        left, right = (limb.weights for limb in self.limbs[:2])
+        return np.maximum(left, right)
 
     def vertices(self, ms: float, *, breathing: bool = True) -> Array:
         """(N, 3) mm, rig frame, at a moment since the scan began; without breathing, at mean breath."""
