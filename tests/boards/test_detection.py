@@ -103,6 +103,29 @@ def test_a_part_of_a_larger_board_is_not_taken_for_the_board() -> None:
     assert len(found(picture, larger)[0].corner_ids) == 88
 
 
+@pytest.mark.parametrize("first", ["black", "white"])
+@pytest.mark.parametrize(("left", "above", "right", "below"), np.eye(4, dtype=int).tolist())
+def test_one_line_of_squares_too_many_on_any_side_is_seen(
+    monkeypatch: pytest.MonkeyPatch, left: int, above: int, right: int, below: int, first: str
+) -> None:
+    """Straight on, squares of 20 px; a detector offers the corners of all squares but one line."""
+    board = Board(name="even", columns=8, rows=6, square_mm=30, margin_mm=20)
+
+    def offered(left: int, above: int, right: int, below: int) -> int:
+        column, row = np.meshgrid(np.arange(-left, 8 + right), np.arange(-above, 6 + below))
+        print_ = 200 * ((column + row) % 2 == (first == "black")).astype(np.uint8)
+        squares = np.pad(np.kron(print_, np.ones((20, 20), np.uint8)), 60, constant_values=200)
+        x, y = np.meshgrid(np.arange(1, 8) + left, np.arange(1, 6) + above)
+        corners = 59.5 + 20.0 * np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
+        monkeypatch.setattr(checkerboard, "_classic", lambda image, size: (True, corners))
+        monkeypatch.setattr(checkerboard, "_adaptive", lambda image, size: (False, None))
+        seen = checkerboard.find_quickly(cv2.GaussianBlur(squares, (0, 0), 0.9), board)
+        return 0 if seen is None else len(seen.ids)
+
+    assert offered(0, 0, 0, 0) == 35
+    assert offered(left, above, right, below) == 0
+
+
 def test_before_tiles_of_another_size_a_board_is_found() -> None:
     place = view_of(PLAIN, 20, 60, 20, fill=0.5)
     picture = render([(PLAIN, place)], background=0.0, black=40)

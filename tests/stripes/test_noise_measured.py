@@ -1,0 +1,186 @@
+"""How noisy grey levels are and how far boundaries scatter, measured from what should be the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.stripes.boundaries import Boundaries
+from bodyscan.stripes.boundary_scatter import scatter
+from bodyscan.stripes.grey_noise import fitted_variance, noise_variance
+from bodyscan.stripes.scan_lines import ScanLines
+from bodyscan.stripes.wave import Wave
+from bodyscan.stripes.wave_noise import wave_variance
+from bodyscan.stripes.waves import see_wave
+
+U8 = np.dtype(np.uint8)
+F32 = np.dtype(np.float32)
+
+
+def line(of: np.dtype, grey: list[float], variance: list[float], count: list[float]) -> np.ndarray:
+    return fitted_variance(np.array(grey), np.array(variance), np.array(count), of)
+
+
+def test_noise_that_rises_with_the_light_is_a_line() -> None:
+    found = line(U8, [8.0, 100.0, 200.0], [2.16, 4.0, 6.0], [600, 600, 600])
+    np.testing.assert_allclose(found, 2.0 + 0.02 * np.arange(256), rtol=1e-5)
+
+
+def test_noise_that_falls_or_of_two_bands_only_is_their_mean_by_count() -> None:
+    found = line(U8, [8.0, 100.0, 200.0], [6.0, 4.0, 3.0], [300, 100, 100])
+    np.testing.assert_allclose(found, 5.0)
+    np.testing.assert_allclose(line(U8, [8.0, 100.0], [2.0, 6.0], [300, 100]), 3.0)
+
+
+def test_bands_count_by_how_well_their_variance_is_known() -> None:
+    # Three bands lie on a line; a fourth of a hundredth of the pixels does not.
+    grey, variance = [50.0, 100.0, 150.0, 200.0], [2.0, 3.0, 4.0, 9.0]
+    found = line(U8, grey, variance, [1e6, 1e6, 1e6, 1e4])
+    np.testing.assert_allclose(found[50:200], 1.0 + 0.02 * np.arange(50, 200), rtol=0.02)
+    # A variance of 20 is known ten times less well than one of 2: relative to itself as well.
+    grey, variance = [10.0, 20.0, 30.0, 200.0], [2.0, 2.2, 2.4, 20.0]
+    found = line(U8, grey, variance, [1e4] * 4)
+    assert found[20] == pytest.approx(2.2, rel=0.15)
+
+
+def test_no_noise_is_less_than_rounding() -> None:
+    np.testing.assert_allclose(line(U8, [8.0, 100.0], [0.0, 0.01], [600, 600]), 0.15)
+    np.testing.assert_allclose(line(F32, [8.0, 100.0], [0.0, 0.0], [600, 600]), 0.15 / 256)
+    # Where a rising line would be below it.
+    found = line(U8, [50.0, 150.0, 250.0], [0.2, 10.0, 20.0], [600, 600, 600])
+    assert found[0] == np.float32(0.15)
+    # Nothing known: one grey level.
+    np.testing.assert_allclose(line(U8, [], [], []), 1.0)
+
+
+def frames(
+    sigma: float, *, inverses: bool, ramp: float = 0.0, seed: int = 0, of: type = np.float32
+) -> ScanLines:
+    """Half of a picture under the coarsest pattern; lit from 60 to 220, dark 20, noise in each frame
+    with a variance that rises by `ramp` for each grey level."""
+    rng = np.random.default_rng(seed)
+    lit = np.tile(np.linspace(60.0, 220.0, 320), (160, 1))
+    dark = np.full_like(lit, 20.0)
+    on = np.arange(320) % 40 < 20
+    shown = [lit, dark, np.where(on, lit, dark), np.where(on, dark, lit)]
+    noisy = [
+        one + np.sqrt(sigma**2 + ramp * one) * rng.normal(size=lit.shape) for one in shown
+    ]  # fmt: skip
+    lit, dark, pattern, inverse = (
+        (np.rint(one) if of is np.uint8 else one).astype(of) for one in noisy
+    )
+    return ScanLines(lit, dark, pattern[None], inverse[None] if inverses else None, False)
+
+
+@pytest.mark.parametrize("inverses", [True, False])
+@pytest.mark.parametrize("sigma", [0.5, 2.0])
+def test_noise_is_measured_from_frames_that_show_the_same(sigma: float, inverses: bool) -> None:
+    found = noise_variance(frames(sigma, inverses=inverses))
+    # Of 12,800 pixels or more, seen twice; the brighter of two noisy ones is brighter by nothing here.
+    np.testing.assert_allclose(found[20:220], sigma**2, rtol=0.1)
+
+
+def test_noise_of_whole_grey_levels_has_their_rounding_in_it() -> None:
+    found = noise_variance(frames(2.0, inverses=True, of=np.uint8))
+    np.testing.assert_allclose(found[20:220], 4.0 + 1.0 / 12.0, rtol=0.1)
+
+
+def test_noise_of_light_itself_rises_with_it() -> None:
+    found = noise_variance(frames(1.0, inverses=True, ramp=0.02))
+    np.testing.assert_allclose(found[20:220], 1.0 + 0.02 * np.arange(20, 220), rtol=0.1)
+
+
+def test_what_moved_and_what_is_saturated_is_no_noise() -> None:
+    clean = frames(1.0, inverses=True)
+    pattern = clean.patterns.copy()
+    pattern[0, :30] += 24.0 + 8.0  # something passed: more than noise ever makes
+    lit = clean.lit.copy()
+    assert clean.inverses is not None
+    inverse = clean.inverses.copy()
+    lit[:, 300:], pattern[0, :, 300:] = 255.0, 240.0  # burnt out, and not quite
+    found = noise_variance(ScanLines(lit, clean.dark, pattern, inverse, False))
+    np.testing.assert_allclose(found[20:220], 1.0, rtol=0.15)
+
+
+def waves(
+    sigma: float, several: tuple[Wave, ...], *, gamma: float = 1.0, seed: int = 0
+) -> np.ndarray:
+    """(256,) as measured on 200 x 300 pixels of which s is known."""
+    rng = np.random.default_rng(seed)
+    s = np.tile(np.linspace(0.0, 90.0, 300), (200, 1)) + np.linspace(0.0, 7.0, 200)[:, None]
+    bright = np.tile(np.linspace(40.0, 90.0, 200)[:, None], (1, 300))
+    seen, images = [], []
+    for wave in several:
+        turn = s / wave.period - np.arange(wave.steps)[:, None, None] / wave.steps
+        light = (0.5 + 0.5 * np.cos(2.0 * np.pi * turn)) ** gamma
+        stack = (20.0 + 2.0 * bright * light + sigma * rng.normal(size=turn.shape)).astype(
+            np.float32
+        )
+        stack[:, :3] += 30.0 * rng.normal(size=(wave.steps, 3, 300)).astype(np.float32)  # moved
+        seen.append(see_wave(stack, wave))
+        images.append(stack)
+    return wave_variance(seen, images, np.ones(s.shape, bool))
+
+
+@pytest.mark.parametrize(
+    "several",
+    [
+        (Wave(10.0, 3), Wave(100.0, 3)),
+        (Wave(10.0, 3), Wave(30.0, 5)),
+        (Wave(10.0, 4),),
+        (Wave(12.0, 8),),
+    ],
+)
+def test_noise_is_what_waves_do_not_agree_on(several: tuple[Wave, ...]) -> None:
+    # 60,000 pixels; what moved, one in seventy, is left out but for its middle.
+    np.testing.assert_allclose(waves(1.5, several)[60:180], 1.5**2, rtol=0.08)
+
+
+def test_a_bent_response_is_no_noise() -> None:
+    # Of a gamma of 2 the second harmonic is a quarter of the wave, 15 levels: 400 times the noise.
+    # What harmonics do to the wave itself leaves a sixth too much.
+    np.testing.assert_allclose(waves(0.5, (Wave(12.0, 6),), gamma=2.0)[60:180], 0.25, rtol=0.25)
+
+
+def test_one_wave_of_three_steps_says_nothing_of_noise() -> None:
+    np.testing.assert_allclose(waves(1.5, (Wave(10.0, 3),)), 1.0)
+
+
+def boundaries(scattered: float, *, lines: int = 100, joined: bool = True) -> Boundaries:
+    """Thirty on each line, bent, off by `scattered` px and claimed to be known to 0.1 px."""
+    rng = np.random.default_rng(0)
+    count = 30
+    place = 2.0 * np.arange(count) + 0.01 * np.arange(count) ** 2
+    position = (place + scattered * rng.normal(size=(lines, count))).ravel()
+    line = np.repeat(np.arange(lines), count)
+    ends = np.diff(line) == 0
+    return Boundaries(
+        line=line,
+        before=np.floor(position).astype(np.int64),
+        position=position,
+        line_position=line.astype(float),
+        sigma_px=np.full(len(line), 0.1),
+        index=np.tile(np.arange(count), lines),
+        joined=ends & joined,
+        blur2=0.0,
+    )
+
+
+def test_boundaries_that_scatter_more_than_their_sigmas_claim_are_found_out() -> None:
+    # 2,600 runs of five: their median is known to 3 %.
+    assert scatter(boundaries(0.3)) == pytest.approx(3.0, rel=0.1)
+    assert scatter(boundaries(0.15)) == pytest.approx(1.5, rel=0.1)
+
+
+def test_boundaries_that_scatter_as_claimed_or_hardly_more_are_left() -> None:
+    assert scatter(boundaries(0.1)) == 1.0
+    assert scatter(boundaries(0.11)) == 1.0
+    assert scatter(boundaries(0.01)) == 1.0
+
+
+def test_few_boundaries_or_such_as_do_not_join_say_nothing() -> None:
+    assert scatter(boundaries(0.3, lines=38)) == 1.0  # 988 runs
+    assert scatter(boundaries(0.3, lines=39)) > 2.5  # 1,014
+    assert scatter(boundaries(0.3, joined=False)) == 1.0
+    empty = boundaries(0.3, lines=0)
+    assert scatter(empty) == 1.0
