@@ -1,0 +1,121 @@
+"""Parts of a picture, what lies in it, how well its rays are known, and how what it shows moves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.crop import crop_of, ends_of, widened
+from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.pose_covariance import PoseCovariance, point_covariance, position_sigma
+from bodyscan.geometry.ray_uncertainty import COLUMNS, ROWS, RayUncertainty, nodes
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.velocity import SurfaceSpeeds, Velocity
+from bodyscan.geometry.visibility import in_image
+
+PLAIN = Camera(500.0, 510.0, 0.0, 159.5, 119.5, Radial(0.0, 0.0), 320, 240)
+BARREL = Camera(300.0, 300.0, 0.0, 159.5, 119.5, Radial(-0.3, 0.0), 320, 240)
+
+
+def test_a_point_moves_as_the_rigid_motion_it_is_part_of() -> None:
+    twist = np.array([0.02, -0.05, 0.03, 4.0, -2.0, 7.0])
+    none = np.empty((0, 3))
+    unseen = SurfaceSpeeds(none, none, none[:, 0], none[:, 0], none[:, :1])
+    points = np.array([[100.0, -50.0, 900.0], [-30.0, 80.0, 1100.0]])
+    for_a_while = 1e-4
+    moved = RigidTransform.identity().moved(for_a_while * twist).apply(points) - points
+    velocity = Velocity(twist, np.eye(6), unseen).at(points)
+    np.testing.assert_allclose(velocity, moved / for_a_while, atol=1e-3)  # turns of 5e-6: 0.3 %
+
+
+def test_a_crop_is_the_smallest_box_and_grows_no_farther_than_the_first_row() -> None:
+    shown = np.zeros((9, 12), bool)
+    shown[3, 5] = shown[6, 2] = True
+    crop = crop_of(shown)
+    assert crop == (slice(3, 7), slice(2, 6))
+    assert ends_of(crop) == (3, 7, 2, 6)
+    assert widened(crop, 1) == (slice(2, 8), slice(1, 7))
+    assert widened(crop, 5) == (slice(0, 12), slice(0, 11))
+    assert crop_of(np.zeros((4, 4), bool)) is None
+
+
+def at(camera: Camera, *pixels: tuple[float, float], depth: float = 800.0) -> np.ndarray:
+    return depth * camera.rays(np.array(pixels))
+
+
+def test_what_is_seen_lies_ahead_between_the_first_pixel_and_the_last() -> None:
+    just_in = at(PLAIN, (0.001, 0.001), (318.999, 238.999), (160.0, 0.001), (0.001, 120.0))
+    just_out = at(PLAIN, (-0.001, 5), (5, -0.001), (319.001, 5), (5, 239.001))
+    assert in_image(PLAIN, just_in).all()
+    assert not in_image(PLAIN, just_out).any()
+    assert not in_image(PLAIN, -just_in).any()
+    assert not in_image(PLAIN, np.array([[0.0, 0.0, 0.0]])).any()
+    assert in_image(PLAIN, just_in.reshape(2, 2, 3)).shape == (2, 2)
+
+
+def test_a_margin_is_kept_on_all_four_sides() -> None:
+    kept = at(PLAIN, (10.001, 10.001), (308.999, 228.999))
+    left_out = at(PLAIN, (9.999, 120), (160, 9.999), (309.001, 120), (160, 229.001))
+    assert in_image(PLAIN, kept, 10.0).all()
+    assert not in_image(PLAIN, left_out, 10.0).any()
+    assert in_image(PLAIN, left_out, 9.99).all()
+
+
+def test_where_a_lens_folds_back_into_the_picture_nothing_is_seen() -> None:
+    fold = BARREL.lens.fold_radius
+    beyond = np.array([[1.6 * fold, 0.0, 1.0], [0.0, 1.65 * fold, 1.0], [-1.6 * fold, 0.1, 1.0]])
+    u, v = BARREL.project(beyond).T
+    assert np.all((u > 0) & (u < 319) & (v > 0) & (v < 239)), "they fall into the picture"
+    assert not in_image(BARREL, beyond).any()
+    assert in_image(BARREL, at(BARREL, (1.0, 1.0), (318.0, 238.0))).all()
+
+
+def test_rays_are_known_between_nodes_as_linearly_as_at_them() -> None:
+    places = nodes(320, 240)
+    assert places.shape == (ROWS, COLUMNS, 2)
+    assert places[0, 0].tolist() == [0.0, 0.0]
+    assert places[-1, -1].tolist() == [319.0, 239.0]
+    assert places[0, -1].tolist() == [319.0, 0.0]
+    rising = 0.3 + 1e-3 * places[..., 0] + 2e-3 * places[..., 1]
+    known = RayUncertainty(0.6 * rising, 0.8 * rising)
+    np.testing.assert_allclose(known.sigma_px, rising)
+    image = known.image(320, 240)
+    v, u = np.indices((240, 320))
+    # OpenCV interpolates in 1/32 of a node's distance, 16 px: 0.25 px on either side.
+    np.testing.assert_allclose(image, 0.3 + 1e-3 * u + 2e-3 * v, atol=1e-3)
+    excess = known.with_excess(4.0)
+    np.testing.assert_allclose(excess.noise_px, 1.2 * rising)
+    np.testing.assert_allclose(excess.lens_px, 0.8 * rising)
+
+
+def test_covariances_of_pairs_are_those_of_motions_drawn_from_them() -> None:
+    rng = np.random.default_rng(0)
+    mixed = rng.normal(size=(18, 18)) * np.tile([1e-3] * 3 + [1.0] * 3, 3)[:, None]
+    names = ("a", "b", "c")
+    covariance = PoseCovariance(names, mixed @ mixed.T)
+    drawn = (rng.normal(size=(20000, 18)) @ mixed.T).reshape(-1, 3, 6)
+    point = np.array([300.0, -200.0, 1000.0])
+    moved = np.cross(drawn[..., :3], point) + drawn[..., 3:]
+
+    def close(found: np.ndarray, samples: np.ndarray) -> None:
+        expected = np.cov(samples.T)
+        size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        # 20,000 draws: correlations are known to 0.007 or better, variances to 1 %.
+        assert np.abs((found - expected) / size).max() < 0.05
+
+    close(covariance.of("b"), drawn[:, 1])
+    close(covariance.among(["c", "a"]), drawn[:, [2, 0]].reshape(-1, 12))
+    close(covariance.between("c", "a"), drawn[:, 0] - drawn[:, 2])
+    close(covariance.between("a", "b"), drawn[:, 1] - drawn[:, 0])
+    close(point_covariance(covariance.of("c"), point), moved[:, 2])
+    np.testing.assert_allclose(
+        position_sigma(covariance, "b", point), moved[:, 1].std(axis=0), rtol=0.03
+    )
+
+
+@pytest.mark.parametrize("name", ["a", "b", "c"])
+def test_a_pair_does_not_move_against_itself(name: str) -> None:
+    mixed = np.random.default_rng(1).normal(size=(18, 18))
+    covariance = PoseCovariance(("a", "b", "c"), mixed @ mixed.T)
+    np.testing.assert_allclose(covariance.between(name, name), 0.0, atol=1e-12)
