@@ -48,7 +48,7 @@ def test_a_nominal_pose_looks_where_it_says_and_stands_upright(
     pose = nominal_pose(NominalPose(position_mm=position, look_at_mm=look_at))
     away = np.array(look_at) - position
     seen = pose.inverse().apply(np.array([look_at]))[0]
-    np.testing.assert_allclose(seen, [0.0, 0.0, np.linalg.norm(away)], atol=1e-9)
+    np.testing.assert_allclose(seen, [0.0, 0.0, float(np.linalg.norm(away))], atol=1e-9)
     np.testing.assert_allclose(pose.translation, position)
     np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(pose.rotation) == pytest.approx(1.0)

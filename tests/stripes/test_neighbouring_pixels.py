@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bodyscan.arrays import Greys
 from bodyscan.errors import DecodingFailed, WrongDirection
 from bodyscan.stripes.pixel_stripes import whole_numbers
 from bodyscan.stripes.scan_lines import ScanLines
@@ -59,8 +60,9 @@ def test_a_pixel_at_the_rim_that_is_much_darker_than_its_neighbour_is_half_cover
 
 def seen(lit: float, dark: float, of: type, *, code: int = 3, variance: float = 1.0) -> bool:
     """Whether a pixel is shown, one of a picture of such pixels under a single coarse pattern."""
-    frames = [np.full((9, 9), level, of) for level in (lit, dark)]
-    images = ScanLines(*frames, frames[0][None], frames[1][None], False)
+    light: Greys = np.full((9, 9), lit).astype(of)
+    black: Greys = np.full((9, 9), dark).astype(of)
+    images = ScanLines(light, black, light[None], black[None], False)
     codes = np.full((9, 9), code, np.int32)
     levels = np.full(256, variance, np.float32)
     return bool(shown_pixels(images, codes, levels, 8, 0)[1][4, 4])

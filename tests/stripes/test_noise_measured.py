@@ -62,13 +62,9 @@ def frames(
     lit = np.tile(np.linspace(60.0, 220.0, 320), (160, 1))
     dark = np.full_like(lit, 20.0)
     on = np.arange(320) % 40 < 20
-    shown = [lit, dark, np.where(on, lit, dark), np.where(on, dark, lit)]
-    noisy = [
-        one + np.sqrt(sigma**2 + ramp * one) * rng.normal(size=lit.shape) for one in shown
-    ]  # fmt: skip
-    lit, dark, pattern, inverse = (
-        (np.rint(one) if of is np.uint8 else one).astype(of) for one in noisy
-    )
+    shown = np.stack([lit, dark, np.where(on, lit, dark), np.where(on, dark, lit)])
+    shown += np.sqrt(sigma**2 + ramp * shown) * rng.normal(size=shown.shape)
+    lit, dark, pattern, inverse = (np.rint(shown) if of is np.uint8 else shown).astype(of)
     return ScanLines(lit, dark, pattern[None], inverse[None] if inverses else None, False)
 
 

@@ -15,7 +15,7 @@ def shown(wave: Wave, bright: float = 80.0, dark: float = 15.0) -> np.ndarray:
     """Images as `Wave` describes them."""
     k = np.arange(wave.steps)[:, None, None]
     angle = 2.0 * np.pi * ((S - wave.origin) / wave.period - wave.sign * k / wave.steps)
-    return np.float32(dark + bright * (0.5 + 0.5 * np.cos(angle + wave.start)))
+    return np.asarray(dark + bright * (0.5 + 0.5 * np.cos(angle + wave.start)), np.float32)
 
 
 @pytest.mark.parametrize(
@@ -38,12 +38,19 @@ def test_a_waves_turn_is_s_over_its_period_whatever_its_start(wave: Wave) -> Non
     np.testing.assert_allclose(seen.mean, 55.0, rtol=1e-5)
 
 
+def test_a_wave_that_says_no_more_is_brightest_at_zero_first_and_moves_forward() -> None:
+    k = np.arange(4)[:, None, None]
+    images = 50.0 + 40.0 * np.cos(2.0 * np.pi * (S / 12.0 - k / 4.0))
+    off = see_wave(images.astype(np.float32), Wave(12.0, 4)).turn - S / 12.0
+    np.testing.assert_allclose(off - np.rint(off), 0.0, atol=1e-5)
+
+
 @pytest.mark.parametrize(("wave", "noise"), [(Wave(12.0, 3), 2.0), (Wave(12.0, 8), 2.0)])
 def test_sigma_is_how_far_noise_turns_a_wave(wave: Wave, noise: float) -> None:
     clean, rng = shown(wave), np.random.default_rng(0)
     off = []
     for _ in range(60):
-        noisy = np.float32(clean + noise * rng.normal(size=clean.shape))
+        noisy = (clean + noise * rng.normal(size=clean.shape)).astype(np.float32)
         turned = see_wave(noisy, wave).turn - S / wave.period
         off.append(turned - np.rint(turned))
     sigma = see_wave(clean, wave).sigma(np.full(S.shape, noise, np.float32))

@@ -1,0 +1,104 @@
+"""s from the codes of the pixels around, where stripes are too narrow for boundaries."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.stripes.code_lines import fill_from_codes
+
+PLACES = np.arange(60)
+
+
+def filled(
+    codes: np.ndarray, shown: np.ndarray | None = None, s: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """s and sigma (60,) of one line."""
+    found = np.full((1, len(codes)), np.nan, np.float32) if s is None else s[None].copy()
+    sigma = np.full_like(found, np.nan)
+    every = np.ones(len(codes), bool) if shown is None else shown
+    fill_from_codes(found, sigma, codes[None].astype(np.int32), every[None])
+    return found[0], sigma[0]
+
+
+@pytest.mark.parametrize("slope", [1.3, -1.7, 2.6])
+def test_s_between_leaping_codes_lies_on_the_line_through_them(slope: float) -> None:
+    s = 170.3 + slope * PLACES
+    found, sigma = filled(np.floor(s))
+    known = np.isfinite(found)
+    assert known[4:-4].mean() > 0.9
+    # Nine codes, each known to 1/sqrt(12) of a stripe: a third of that.
+    off = (found - s)[known]
+    assert np.sqrt(np.mean(off**2)) < 12.0**-0.5 / 3.0 * 1.2
+    assert sigma[10:50][known[10:50]].min() == pytest.approx(12.0**-0.5 / 3.0, rel=0.05)
+    assert np.abs(off / sigma[known]).max() < 3.0
+
+
+def test_beside_a_rim_two_pixels_on_either_side_must_show_a_code() -> None:
+    s = 20.3 + 1.7 * PLACES
+    shown = (PLACES >= 10) & (PLACES <= 40)
+    found, sigma = filled(np.floor(s), shown)
+    assert np.flatnonzero(np.isfinite(found)).tolist() == list(range(12, 39))
+    # With nine, eight and seven in the window, which is lopsided then.
+    assert sigma[14] < sigma[13] < sigma[12]
+    x = np.arange(-2, 5)
+    doubt = np.sqrt((1.0 / 7.0 + np.mean(x) ** 2 / np.sum((x - np.mean(x)) ** 2)) / 12.0)
+    assert sigma[12] == pytest.approx(doubt, rel=0.1)
+
+
+def test_fewer_than_six_codes_tell_no_line() -> None:
+    s = 20.3 + 1.7 * PLACES
+    for width, known in ((6, 2), (5, 0)):
+        shown = (PLACES >= 20) & (width > PLACES - 20)
+        assert np.isfinite(filled(np.floor(s), shown)[0]).sum() == known
+
+
+def test_what_is_not_shown_or_known_already_is_left() -> None:
+    s = 20.3 + 1.7 * PLACES
+    shown = PLACES != 30
+    known = np.full(60, np.nan, np.float32)
+    known[35] = 7.0
+    found, sigma = filled(np.floor(s), shown, known)
+    assert np.isnan(found[30])
+    assert found[35] == 7.0
+    assert np.isnan(sigma[35])
+    assert np.isfinite(found[[29, 31, 34, 36]]).all()
+
+
+def test_without_a_leap_boundaries_tell_s_better() -> None:
+    assert np.isnan(filled(np.floor(20.3 + 0.9 * PLACES))[0]).all()
+    assert np.isnan(filled(np.full(60, 7))[0]).all()
+
+
+def test_a_code_a_stripe_off_the_line_of_its_neighbours_is_misread() -> None:
+    codes = np.floor(20.3 + 1.7 * PLACES)
+    codes[30] += 2
+    found, _ = filled(codes)
+    assert np.isnan(found[30])
+    assert np.isfinite(found[[28, 29, 31, 32]]).all()
+
+
+def test_scattered_codes_and_those_of_two_surfaces_tell_nothing() -> None:
+    rng = np.random.default_rng(0)
+    assert np.isnan(filled(np.floor(20.3 + 1.7 * PLACES) + rng.integers(-4, 5, 60))[0]).mean() > 0.9
+    # One in front of the other, pixel by pixel, 2.4 stripes apart: half lie beside the line.
+    two = np.floor(40.3 + 0.6 * PLACES) + np.where(PLACES % 4 < 2, 0.0, 2.4)
+    assert np.isnan(filled(np.floor(two))[0]).mean() > 0.8
+    # Leaps, but no slope: a line says nothing.
+    level = np.where(PLACES % 3 == 0, 22, 20)
+    assert np.isnan(filled(level)[0]).all()
+
+
+def test_sigma_follows_how_codes_scatter_where_that_is_more_than_rounding() -> None:
+    codes = np.floor(20.3 + 1.7 * PLACES)
+    codes[26::9] += 1
+    found, sigma = filled(codes)
+    near = np.flatnonzero(np.isfinite(found) & (PLACES > 30) & (PLACES < 50))
+    assert len(near) > 10
+    x = np.arange(-4, 5)
+    for place in near:
+        around = codes[place - 4 : place + 5]
+        line = np.polyfit(x, around, 1)
+        rms = np.sqrt(np.sum((around - np.polyval(line, x)) ** 2) / 7.0)
+        assert sigma[place] == pytest.approx(max(rms, 12.0**-0.5) / 3.0, rel=1e-5)
+        assert found[place] == pytest.approx(line[1] + 0.5, abs=1e-4)
