@@ -46,7 +46,9 @@ MOST_APART = 0.06
 """Of the finest period, between waves on the whole; the least wrong start, of 30 degrees, makes
 0.083 of it for any whole ratio of their periods but one of 12 k + 1."""
 
-LINES_TRIED = 40
+LINES_TRIED = 20
+"""Thousands of pixels, of which each of some sixty mistakes is judged by most."""
+
 AS_GOOD = 1.3
 MOST_CAUSES = 2
 WHOLE = 1e-6

@@ -141,7 +141,7 @@ def test_two_people_are_told_before_there_is_a_mesh(
         return closed_surface(*about)
 
     monkeypatch.setattr("bodyscan.fusion.scan.closed_surface", meshed)
-    scan = fused(photographed(both), announce=listen)
+    scan = fused(photographed(both), settings=NOT_FOLLOWED, announce=listen)
     assert scan.verdict.grade == "repeat"
     assert "two bodies" in said(scan)
     assert "two bodies" in told[0].reasons[0]
@@ -152,7 +152,7 @@ def test_two_people_hand_in_hand(person: Truth) -> None:
     """In one piece: the scan volume's cells and the cloud's pieces do not tell them apart."""
     apart = 0.5 * float(np.ptp(person.vertices[:, 1])) - 15.0
     both = joined(moved(person, [0.0, -apart, 0.0]), moved(person, [0.0, apart, 0.0]))
-    scan = fused(photographed(both))
+    scan = fused(photographed(both), settings=NOT_FOLLOWED)
     assert scan.verdict.grade == "repeat"
     assert "more than one person" in said(scan)
 
@@ -216,7 +216,7 @@ def test_who_left_is_missed(images: list[RangeImage]) -> None:
         raise Enough
 
     with pytest.raises(Enough):
-        fused(seen, announce=hear)
+        fused(seen, settings=NOT_FOLLOWED, announce=hear)
     assert heard[0].grade != "good"
     assert "pole p3 saw nobody" in str(heard[0])
     alone = [
@@ -224,7 +224,7 @@ def test_who_left_is_missed(images: list[RangeImage]) -> None:
         for image in images
     ]
     with pytest.raises(Enough):
-        fused(alone, announce=hear)
+        fused(alone, settings=NOT_FOLLOWED, announce=hear)
     assert "saw nobody" not in str(heard[1])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -33,10 +34,19 @@ def s_at(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 def captured(
     keys: Keys, *, gamma: float = 1.0, **scene: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lit and coded images, and the true s."""
-    lights = code_light("phase-shift", STRIPES, **keys) ** gamma
-    scene = {"shape": (160, 200), "ambient": 10.0, **scene}
-    lit, _, coded, s = render(s_at, lights, stripes=STRIPES, **scene)
+    """Lit and coded images, and the true s; what several tests look at is rendered once."""
+    return _captured(tuple(keys.items()), gamma, tuple(scene.items()))
+
+
+@lru_cache(16)
+def _captured(
+    keys: tuple[tuple[str, Any], ...], gamma: float, scene: tuple[tuple[str, Any], ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    lights = code_light("phase-shift", STRIPES, **dict(keys)) ** gamma
+    whole = {"shape": (160, 200), "ambient": 10.0, **dict(scene)}
+    lit, _, coded, s = render(s_at, lights, stripes=STRIPES, **whole)
+    for images in (lit, coded, s):
+        images.flags.writeable = False
     return lit, coded, s
 
 
