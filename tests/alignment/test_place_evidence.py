@@ -47,6 +47,10 @@ def of_pole(pole: str, shift: list[float]) -> Array:
     return np.array([shift if POLES[name] == pole else [0.0] * 3 for name in NAMES])
 
 
+def of_pair(pair: str, shift: list[float]) -> Array:
+    return np.array([shift if name == pair else [0.0] * 3 for name in NAMES])
+
+
 def test_noise_is_nothing() -> None:
     assert not any(off(0.0 * OUT, seed) for seed in range(50))
 
@@ -67,6 +71,34 @@ def test_one_pole_that_moved_is_named(pole: str) -> None:
         assert (found.name, found.all_moved) == (f"pole {pole}", False)
         assert found.shift_mm == pytest.approx(np.sqrt(14.0), abs=1.0)
         assert found.turn_deg < 0.2
+
+
+@pytest.mark.parametrize("pair", ["p1-1", "p2-3", "p3-4"])
+def test_one_pair_that_moved_is_named_and_not_its_pole(pair: str) -> None:
+    """5 mm of it were taken for 1 mm of its pole, and the scan for usable."""
+    for seed in range(5):
+        found = off(of_pair(pair, [5.0, 0.0, 0.0]), seed)
+        assert isinstance(found, PoleStep)
+        assert (found.name, found.pairs) == (f"pair {pair}", {pair})
+        assert found.shift_mm == pytest.approx(5.0, abs=1.0)  # three of its sigmas
+
+
+def test_another_pair_than_those_that_are_free() -> None:
+    shifts = of_pair("p1-1", [5.0, 0.0, 0.0]) + of_pair("p3-2", [0.0, 4.0, 0.0])
+    found = off(shifts, freed=("p1-1",))
+    assert isinstance(found, PoleStep)
+    assert found.name == "pair p3-2"
+
+
+def test_of_three_pairs_any_may_have_moved() -> None:
+    few = [NAMES.index(name) for name in ("p1-1", "p2-1", "p3-1")]
+    places = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in few])
+    whole = evidence(of_pair("p1-1", [5.0, 0.0, 0.0]))
+    cut = PlaceEvidence(
+        tuple(NAMES[k] for k in few), whole.information[np.ix_(places, places)], whole.pull[places]
+    )
+    found = find_off(cut, PLACED, POLES)
+    assert not isinstance(found, PoleStep) or found.all_moved
 
 
 def test_poles_that_moved_each_its_own_way_leave_none_to_go_by() -> None:
