@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from scipy import sparse
 
 from bodyscan.alignment.body_cells import BodyCells
+from bodyscan.alignment.breath import breathing
 from bodyscan.alignment.limbs import LIMBS, limb_fields
+from bodyscan.alignment.part_names import PARTS, leftward, name_parts
 
 
 def person() -> BodyCells:
@@ -44,3 +49,78 @@ def test_what_the_body_does_not_show_moves_nothing() -> None:
     legs[0, 2] = 1000.0
     low = BodyCells(legs, cells.normals, cells.links, cells.landmarks, cells.away)
     assert np.abs(limb_fields(low, 400.0)["left arm"][1:]).max() < 1.0 + 1e-9
+
+
+def at(cells: BodyCells, y: float, z: float) -> int:
+    return int(np.argmin(np.hypot(cells.centres[:, 1] - y, cells.centres[:, 2] - z)))
+
+
+def named(cells: BodyCells, y: float, z: float) -> str:
+    return PARTS[name_parts(cells)[at(cells, y, z)]]
+
+
+def test_parts_are_told_by_height_and_by_how_far_they_are_through_the_body() -> None:
+    """Stature 1.695 m: the neck at 1.458, the crotch at 0.797; from a fingertip 644 mm of arm."""
+    cells = person()
+    assert [named(cells, 0.0, z) for z in (1665.0, 1485.0, 1425.0, 825.0)] == [
+        "head", "head", "trunk", "trunk",
+    ]  # fmt: skip
+    for side, name in ((1.0, "left arm"), (-1.0, "right arm")):
+        assert [named(cells, side * y, 1365.0) for y in (780.0, 150.0, 120.0)] == [
+            name, name, "trunk",
+        ]  # fmt: skip
+    split = cells.centres.copy()
+    below = split[:, 2] < 800.0
+    split[below, 1] = np.where(np.arange(below.sum()) % 2, 5.0, -5.0)
+    legs = replace(cells, centres=split)
+    assert [named(legs, *cell) for cell in ((5.0, 405.0), (-5.0, 375.0))] == [
+        "left leg",
+        "right leg",
+    ]
+
+
+def test_an_arm_too_short_to_be_one_is_trunk() -> None:
+    cells = person()
+    for reach, name in ((300.0, "left arm"), (210.0, "trunk")):
+        # From the navel 360 mm up and so far out; to a fingertip it is 593 mm at least.
+        kept = (cells.centres[:, 1] <= reach) & (cells.centres[:, 1] > -50.0)
+        links = cells.links[kept][:, kept]
+        short = BodyCells(cells.centres[kept], cells.normals[kept], links, np.arange(3), cells.away)
+        assert named(short, reach, 1365.0) == name
+
+
+@pytest.mark.parametrize("degrees", [0.0, 50.0, 180.0, -120.0])
+def test_toes_tell_which_side_is_left(degrees: float) -> None:
+    cells = person()
+    feet = np.array([[x, 0.0, 20.0] for x in np.arange(0.0, 121.0, 30.0)])
+    centres = np.vstack([cells.centres, feet])
+    turn = np.radians(degrees)
+    spin = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    centres[:, :2] = centres[:, :2] @ spin.T
+    standing = replace(cells, centres=centres)
+    np.testing.assert_allclose(leftward(standing), spin @ [0.0, 1.0], atol=1e-9)
+
+
+def test_who_shows_no_toes_faces_the_rigs_x() -> None:
+    np.testing.assert_allclose(leftward(person()), [0.0, 1.0])
+    cells = person()
+    legless = cells.centres[:, 2] > 300.0
+    np.testing.assert_allclose(leftward(replace(cells, centres=cells.centres[legless])), [0.0, 1.0])
+
+
+def test_breath_shows_on_the_trunk_in_front_more_than_behind() -> None:
+    """Hips 0.797, waist 0.915, collarbones 1.339 m, and the neck."""
+    cells = person()
+    found = breathing(cells)
+    assert found[at(cells, 0.0, 1125.0)] == pytest.approx(1.0)
+    assert found[at(cells, 0.0, 945.0)] == pytest.approx(1.0)
+    half = found[at(cells, 0.0, 855.0)]  # 0.5044 of the stature, 0.4917 of the way to the waist
+    t = (855.0 / 1695.0 - 0.47) / 0.07
+    assert half == pytest.approx(t * t * (3.0 - 2.0 * t))
+    t = (1395.0 / 1695.0 - 0.79) / 0.07
+    assert found[at(cells, 0.0, 1395.0)] == pytest.approx(1.0 - t * t * (3.0 - 2.0 * t))
+    assert not found[[at(cells, 0.0, z) for z in (1665.0, 765.0, 100.0)]].any()
+    assert found[at(cells, 780.0, 1365.0)] == 0.0
+    for normal, front in (([-1.0, 0.0, 0.0], 0.25), ([0.0, 1.0, 0.0], 0.25 + 0.75 * 7.0 / 27.0)):
+        turned = replace(cells, normals=np.tile(normal, (len(cells.centres), 1)))
+        assert breathing(turned)[at(cells, 0.0, 1125.0)] == pytest.approx(front)

@@ -146,3 +146,29 @@ def test_no_face_folds_over() -> None:
     assert cosines(vertices + shifts[:, None] * normals).min() < 0.3
     assert cosines(moved).min() > 0.3
     assert np.mean(np.abs(moved - vertices - shifts[:, None] * normals).max(axis=1) < 1e-12) > 0.8
+
+
+def test_a_points_weight_falls_off_as_a_gaussian_and_as_it_turns_away() -> None:
+    for off in (0.0, 1.0, 2.0, 3.0):
+        found = asked(cloud_of(np.array([[off, 0.0, 0.0]]), UP), [[0.0, 0.0, 0.0]])
+        # Half of the reach is one standard deviation.
+        assert found.weight[0] == pytest.approx(np.exp(-0.5 * (off / 2.0) ** 2))
+    for degrees in (0, 30, 60, 80):
+        turned = np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
+        found = asked(cloud_of(np.zeros((1, 3)), turned), [[0.0, 0.0, 0.0]])
+        assert found.weight[0] == pytest.approx(turned[2] ** 2, rel=1e-5)
+
+
+def test_shift_and_spread_are_weighted_means_of_the_planes_around() -> None:
+    points = np.array([[0.5, 0.0, 0.2], [0.0, 2.0, -0.1], [-1.0, 1.0, 0.4]])
+    normals = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.28, 0.96]])
+    found = asked(cloud_of(points, normals), [[0.0, 0.0, 0.0]])
+    near = np.exp(-0.5 * np.sum(points**2, axis=1) / 2.0**2)
+    plane = np.sum(points * normals, axis=1)
+    facing = near * normals[:, 2] ** 2
+    shift = np.sum(facing * plane) / np.sum(facing)
+    assert found.weight[0] == pytest.approx(np.sum(facing), rel=1e-5)
+    assert found.shift_mm[0] == pytest.approx(shift, rel=1e-5)
+    spread = np.sqrt(np.sum(near * (plane - shift) ** 2) / np.sum(near))
+    assert found.spread_mm[0] == pytest.approx(spread, rel=1e-5)
+    assert found.nearest[0] == 0

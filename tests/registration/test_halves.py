@@ -1,6 +1,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -139,3 +141,20 @@ def test_no_two_pairs_that_both_halves_tie_together_are_refused() -> None:
     lonely = tuple(v for v in views if v.pair != "p3-1" or v.shot == only)
     with pytest.raises(FailedWork, match="halved"):
         compare_halves(rig, replace(placed, views=lonely))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_of_many_draws_those_halves_are_taken_that_tie_most_pairs(seed: int) -> None:
+    """A pair that took six of twelve shots: no more than two draws of five give either half three."""
+    seen = [
+        SimpleNamespace(pair=pair, shot=f"s{k:02d}", target=(f"s{k:02d}", "b"))
+        for pair, shots in (("a", range(12)), ("b", range(12)), ("c", range(6)))
+        for k in shots
+    ]
+    tied, first, second = split_shots(cast(Any, seen), ("a", "b", "c"), seed=seed)
+    assert tied == ("a", "b", "c")
+    assert (len(first), len(second)) == (6, 6)
+    assert all(sum(shot < "s06" for shot in half) == 3 for half in (first, second))
+    # Where no draw ties all three, the two that most draws tie.
+    few = [view for view in seen if view.pair != "c" or view.shot < "s05"]
+    assert split_shots(cast(Any, few), ("a", "b", "c"), seed=seed)[0] == ("a", "b")

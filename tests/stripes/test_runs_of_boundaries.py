@@ -1,0 +1,268 @@
+"""s between and beside the boundaries of a run, and what edges of brightness do to either."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.arrays import Greys, Mask
+from bodyscan.stripes.albedo_edges import (
+    Brightness,
+    BrightnessEdges,
+    gentle_gradient,
+    without_edges_across,
+)
+from bodyscan.stripes.boundaries import Boundaries
+from bodyscan.stripes.scan_lines import ScanLines
+from bodyscan.stripes.stripe_coordinates import end_slopes, interpolate_stripes, smooth_runs
+
+WIDTH = 100
+
+
+def run(
+    position: np.ndarray, index: np.ndarray, sigma: float = 0.02, blur2: float = 0.0
+) -> Boundaries:
+    """On line 1 of two, all joined."""
+    line = np.ones(len(position), np.int64)
+    return Boundaries(
+        line=line,
+        before=np.floor(position).astype(np.int64),
+        position=position,
+        line_position=line.astype(float),
+        sigma_px=np.full(len(position), sigma),
+        index=index,
+        joined=np.ones(len(position) - 1, bool),
+        blur2=blur2,
+    )
+
+
+def bent(x: np.ndarray) -> np.ndarray:
+    """Stripes of 5 px and, at the end, 2.5: too wide for five of them to be smoothed."""
+    return np.asarray(0.2 * x + 0.001 * x**2)
+
+
+X = np.arange(WIDTH)
+INDEX = np.arange(3, 26)
+POSITION = -100.0 + np.sqrt(100.0**2 + INDEX / 0.001)
+
+
+def interpolated(
+    boundaries: Boundaries, carried: float = 0.0, off: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """s and sigma of line 1; off: what codes are wrong by."""
+    codes = np.tile(np.floor(bent(X)).astype(np.int32) + off, (2, 1))
+    s, sigma = interpolate_stripes(boundaries, codes, np.ones(codes.shape, bool), carried)
+    assert np.isnan(s[0]).all(), "there is no boundary on line 0"
+    return s[1], sigma[1]
+
+
+def test_between_boundaries_of_a_bent_surface_s_is_exact() -> None:
+    s, sigma = interpolated(run(POSITION, INDEX))
+    within = (POSITION[1] < X) & (POSITION[-2] > X)
+    np.testing.assert_allclose(s[within], bent(X)[within], atol=1e-5)
+    # Two boundaries tell a place between them as well as either does.
+    width = np.diff(POSITION)[np.searchsorted(POSITION, X[within]) - 1]
+    wide = width > 4.0
+    np.testing.assert_allclose(sigma[within][wide], 0.02 / width[wide], rtol=1e-5)
+
+
+def test_beside_the_last_boundary_s_goes_on_for_four_tenths_of_a_stripe() -> None:
+    s, sigma = interpolated(run(POSITION, INDEX))
+    true = bent(X)
+    for beside in ((true > 25.0) & (true < 25.4), (true > 2.6) & (true < 3.0)):
+        assert beside.any()
+        np.testing.assert_allclose(s[beside], true[beside], atol=2e-3)
+        assert np.all(sigma[beside] > 2.9 * sigma[(true > 3.0) & (true < 25.0)].min())
+    assert np.isnan(s[(true > 25.41) | (true < 2.59)]).all()
+    assert np.isnan(sigma[np.isnan(s)]).all()
+
+
+def test_s_that_contradicts_the_pixels_code_is_none() -> None:
+    s, _ = interpolated(run(POSITION, INDEX), off=1)
+    # A code is a sixth of a stripe off at most: what is left lies so near to the next stripe.
+    known = np.isfinite(s)
+    near = bent(X) % 1.0
+    assert known.sum() < 0.3 * WIDTH
+    assert np.all(near[known] > 0.85 - 1e-3)
+    carried, _ = interpolated(run(POSITION, INDEX), carried=0.3, off=1)
+    assert np.isfinite(carried).sum() > known.sum() + 10
+
+
+def test_blur_lifts_s_where_it_bends() -> None:
+    s, _ = interpolated(run(POSITION, INDEX))
+    blurred, _ = interpolated(run(POSITION, INDEX, blur2=2.0))
+    within = (POSITION[1] < X) & (POSITION[-2] > X)
+    # blur^2 / 2 times the second derivative, 0.002.
+    np.testing.assert_allclose((s - blurred)[within], 0.002, rtol=0.02)
+    most, _ = interpolated(run(POSITION, INDEX, blur2=1000.0))
+    np.testing.assert_allclose((s - most)[within & np.isfinite(most)], 0.05, atol=1e-5)
+
+
+def test_slopes_are_those_of_parabolas_through_neighbours() -> None:
+    x = np.array([0.0, 2.0, 5.0, 6.0])
+    y = 1.0 + 3.0 * x + 0.5 * x**2
+    secant, width = np.diff(y) / np.diff(x), np.diff(x)
+    slope_in, slope_out = end_slopes(secant, width)
+    np.testing.assert_allclose(slope_in, 3.0 + x[:-1])
+    np.testing.assert_allclose(slope_out, 3.0 + x[1:])
+    # Where s runs the other way, and where there is nothing, a segment is alone.
+    nan = np.nan
+    slope_in, slope_out = end_slopes(np.array([2.0, -3.0, nan, 5.0]), np.array([1.0, 2, nan, 1.0]))
+    np.testing.assert_array_equal(slope_in, [2.0, -3.0, nan, 5.0])
+    np.testing.assert_array_equal(slope_out, [2.0, -3.0, nan, 5.0])
+
+
+def test_narrow_stripes_are_smoothed_along_their_run() -> None:
+    rng = np.random.default_rng(0)
+    count, noise = 4000, 0.05
+    true = 1.5 * np.arange(count) + 0.3 * np.sin(np.arange(count) / 40.0)
+    seen = true + noise * rng.normal(size=count)
+    position, sigma = smooth_runs(run(seen, np.arange(count), noise), np.ones(count - 1, bool))
+    # Seven points: 0.577 of the noise is left; at a run's ends five: 0.697, and one alone: all.
+    share = np.sqrt(147.0) / 21.0
+    assert np.std((position - true)[3:-3]) == pytest.approx(share * noise, rel=0.03)
+    np.testing.assert_allclose(sigma[3:-3], share * noise)
+    five = np.sqrt(9 + 144 + 289 + 144 + 9) / 35.0
+    np.testing.assert_allclose(sigma[[2, -3]], five * noise)
+    np.testing.assert_allclose(sigma[[0, 1, -2, -1]], noise)
+    np.testing.assert_array_equal(position[[0, 1, -2, -1]], seen[[0, 1, -2, -1]])
+
+
+def test_smoothing_stops_at_the_ends_of_a_run_and_at_what_noise_does_not_explain() -> None:
+    place = 1.5 * np.arange(40)
+    joined = np.ones(39, bool)
+    joined[19] = False
+    step = place + np.where(np.arange(40) > 19, 0.9, 0.0)
+    position, sigma = smooth_runs(run(step, np.arange(40), 0.02), joined)
+    np.testing.assert_allclose(position, step, atol=1e-12)
+    np.testing.assert_allclose(sigma[[18, 19, 20, 21]], 0.02)
+    stray = place.copy()
+    stray[10] += 0.3  # the fit would move it by 0.2, ten sigmas
+    position, sigma = smooth_runs(run(stray, np.arange(40), 0.02), np.ones(39, bool))
+    assert position[10] == stray[10]
+    assert sigma[10] == 0.02
+    # Five boundaries over 12 px and more are not smoothed at all.
+    wide = 3.0 * np.arange(40)
+    assert np.all(smooth_runs(run(wide, np.arange(40)), np.ones(39, bool))[1] == 0.02)
+    nearly = 2.99 * np.arange(40)
+    assert np.all(smooth_runs(run(nearly, np.arange(40)), np.ones(39, bool))[1][2:-2] < 0.02)
+
+
+def test_a_gentle_gradient_is_that_of_the_plane_through_what_is_usable() -> None:
+    rng = np.random.default_rng(0)
+    v, u = np.indices((40, 50))
+    image = (2.0 + 0.03 * u - 0.05 * v).astype(np.float32)
+    usable: Mask = np.asarray(rng.random(image.shape) < 0.7)
+    image[~usable] = 99.0
+    along, across = gentle_gradient(image, usable)
+    assert not along[~usable].any()
+    assert not across[~usable].any()
+    usable[[0, 1, -2, -1]] = usable[:, [0, 1, -2, -1]] = False  # there may be too few
+    np.testing.assert_allclose(along[usable], 0.03, atol=2e-5)
+    np.testing.assert_allclose(across[usable], -0.05, atol=2e-5)
+    assert not gentle_gradient(image, np.zeros_like(usable))[0].any()
+
+
+def test_twelve_pixels_that_spread_tell_a_gradient_and_fewer_or_a_line_do_not() -> None:
+    v, u = np.indices((20, 30))
+    image = (0.03 * u - 0.05 * v).astype(np.float32)
+    for columns, known in ((4, True), (3, False)):
+        usable = (np.abs(v - 9) <= 1) & (u >= 10) & (u < 10 + columns)
+        along, across = gentle_gradient(image, usable)
+        np.testing.assert_allclose(along[9, 11], 0.03 * known, atol=1e-5)
+        np.testing.assert_allclose(across[9, 11], -0.05 * known, atol=1e-5)
+    line = (v == 9) & (u > 5)
+    assert not gentle_gradient(image, line)[0].any()
+
+
+def flat_brightness(across: float) -> Brightness:
+    shape = (6, 8)
+    none = np.zeros(shape, np.float32)
+    return Brightness(none, none, np.full(shape, across, np.float32), none)
+
+
+def test_an_edge_along_the_lines_pulls_s_by_blur_times_slope() -> None:
+    v, u = np.indices((6, 8))
+    s = (3.0 + 0.5 * u + 0.4 * v).astype(np.float32)
+    s[3, 5] = np.nan  # its neighbours know one side alone
+    sigma = np.full(s.shape, 0.03, np.float32)
+    freed, doubt = without_edges_across(s, sigma, flat_brightness(0.5), 0.6)
+    shift = 0.6 * 0.5 * 0.4
+    np.testing.assert_allclose(s - freed, np.where(np.isnan(s), np.nan, shift), atol=1e-6)
+    np.testing.assert_allclose(doubt[~np.isnan(s)], np.hypot(0.03, 2.0 * 0.3 * shift), rtol=1e-5)
+    assert np.isnan(freed[3, 5])
+    # By six tenths of a pixel at most, either way.
+    freed, _ = without_edges_across(s, sigma, flat_brightness(5.0), 0.6)
+    np.testing.assert_allclose((s - freed)[:2], 0.6 * 0.4, atol=1e-6)
+    freed, _ = without_edges_across(s, sigma, flat_brightness(-5.0), 0.6)
+    np.testing.assert_allclose((s - freed)[:2], -0.6 * 0.4, atol=1e-6)
+    # What leaps from line to line is no one surface.
+    freed, doubt = without_edges_across(3.0 * s, sigma, flat_brightness(0.5), 0.6)
+    np.testing.assert_array_equal(freed, 3.0 * s)
+    np.testing.assert_allclose(doubt[0], 0.03, rtol=1e-6)
+
+
+def edges(along: np.ndarray, sigma: float = 0.01) -> BrightnessEdges:
+    ones = np.ones(len(along))
+    return BrightnessEdges(ones, ones, along, 0.0 * ones, sigma * ones)
+
+
+def beside_edges(count: int, blur2: float, steep: float = 0.8) -> tuple[float, np.ndarray]:
+    """Every fourth boundary on an edge, which pulls it: blur2 as it is found, and the edges."""
+    along = np.zeros(4 * count + 1)
+    along[2::4] = steep * np.where(np.arange(count) % 2, 1.0, -1.0)
+    position = 3.0 * np.arange(len(along)) - blur2 * along
+    return edges(along).blur2(position, np.ones(len(along) - 1, bool)), along
+
+
+def test_blur_is_told_from_boundaries_on_edges_where_there_are_enough() -> None:
+    assert beside_edges(100, 0.7)[0] == pytest.approx(0.7)
+    assert beside_edges(99, 0.7)[0] == 0.45
+    assert beside_edges(100, 2.5)[0] == 2.0
+    assert beside_edges(100, -0.3)[0] == 0.0
+    # Gentle ones and such as noise may make are no edges.
+    assert beside_edges(100, 0.7, steep=0.49)[0] == 0.45
+    assert beside_edges(100, 0.7, steep=0.51)[0] == pytest.approx(0.7)
+    along = beside_edges(100, 0.7)[1]
+    position = 3.0 * np.arange(len(along)) - 0.7 * along
+    joined = np.ones(len(along) - 1, bool)
+    assert edges(along, 0.17).blur2(position, joined) == 0.45  # five sigmas are 0.85
+    assert edges(along, 0.15).blur2(position, joined) == pytest.approx(0.7)
+    joined[1::4] = False
+    assert edges(along).blur2(position, joined) == 0.45
+
+
+def test_a_shift_is_doubted_by_three_tenths_and_by_noise_no_larger_than_itself() -> None:
+    along, across = np.array([0.4, 0.4, 0.01]), np.array([0.3, 0.3, 0.0])
+    ones = np.ones(3)
+    found = BrightnessEdges(ones, ones, along, across, np.array([0.0, 0.2, 0.2])).doubt(0.5)
+    np.testing.assert_allclose(
+        found, 0.5 * np.sqrt([0.15**2, 0.15**2 + 0.04, 0.003**2 + 0.0001]), rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize("of", [np.uint8, np.float32])
+def test_brightness_beside_a_boundary_is_lit_less_dark_on_either_side(of: type) -> None:
+    lit: Greys = np.full((8, 20), 120).astype(of)
+    lit[:, 10:] = 60
+    dark: Greys = np.full((8, 20), 20).astype(of)
+    images = ScanLines(lit, dark, lit[None], None, False)
+    sharp = Brightness.of(images, np.full(256, 1e-6, np.float32), np.ones(lit.shape, bool))
+    found = sharp.at(np.array([3 * 20 + 4, 3 * 20 + 9]))
+    np.testing.assert_allclose(found.before, [100.0, 100.0], rtol=1e-3)
+    np.testing.assert_allclose(found.behind, [100.0, 40.0], rtol=1e-3)
+    np.testing.assert_allclose(found.along, [0.0, np.log(0.4)], atol=1e-3)
+    np.testing.assert_allclose(found.across, 0.0, atol=1e-6)
+    np.testing.assert_allclose(found.sigma[0], np.sqrt(2.0 * 2e-6) / 100.0, rtol=1e-3)
+    # Noise that may explain the step takes it for shading.
+    noisy = Brightness.of(images, np.full(256, 4e4, np.float32), np.ones(lit.shape, bool))
+    assert abs(noisy.at(np.array([69])).along[0] - sharp.shading.ravel()[69]) < 0.05
+
+
+def test_an_edge_from_line_to_line_is_seen_where_noise_does_not_explain_it() -> None:
+    lit = np.full((20, 8), 120, np.uint8)
+    lit[10:] = 60
+    images = ScanLines(lit, np.full_like(lit, 20), lit[None], None, False)
+    sharp = Brightness.of(images, np.full(256, 1e-6, np.float32), np.ones(lit.shape, bool))
+    np.testing.assert_allclose(sharp.across[[9, 10], 4], np.log(0.4) / 2.0, rtol=1e-3)
+    np.testing.assert_allclose(sharp.across[[4, 15], 4], 0.0, atol=1e-4)
