@@ -1,0 +1,134 @@
+"""Which period of the finest wave a pixel shows, how sure that is, and how waves lie to each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.stripes.phase_order import PhaseOrder, phase_order
+from bodyscan.stripes.wave import Wave
+from bodyscan.stripes.waves import WaveSeen
+
+STRIPES = 240
+SHAPE = (60, 200)
+RNG = np.random.default_rng(0)
+S = np.linspace(5.0, 235.0, SHAPE[1]) + RNG.uniform(-3.0, 3.0, SHAPE)
+
+
+def order_of(
+    periods: tuple[float, ...],
+    sigma: float = 0.005,
+    claimed: float | None = None,
+    *,
+    apart: tuple[float, ...] | None = None,
+    usable: np.ndarray | None = None,
+    s: np.ndarray = S,
+) -> PhaseOrder:
+    """Of waves whose turns err by `sigma` and claim to; apart: turns that each is off besides."""
+    rng = np.random.default_rng(1)
+    waves, sigmas = [], []
+    for period, off in zip(periods, apart or (0.0,) * len(periods), strict=True):
+        turn = (s / period + off + sigma * rng.normal(size=s.shape)) % 1.0
+        grey = np.full(s.shape, 50.0, np.float32)
+        waves.append(WaveSeen(Wave(period, 4), turn.astype(np.float32), grey, grey))
+        sigmas.append(np.full(s.shape, claimed or sigma, np.float32))
+    every = np.ones(s.shape, bool) if usable is None else usable
+    return phase_order(waves, sigmas, every, STRIPES)
+
+
+@pytest.mark.parametrize("periods", [(20.0, 240.0), (12.0, 60.0, 240.0), (18.0, 20.0, 23.0)])
+def test_s_is_told_by_all_waves_together(periods: tuple[float, ...]) -> None:
+    found = order_of(periods)
+    assert found.certain.mean() > 0.99
+    off = (found.s - S)[found.certain]
+    # Waves of about the finest's period share the noise, longer ones only tell its order.
+    akin = np.array([period for period in periods if period <= 2.0 * periods[0]])
+    sigma = 0.005 / np.sqrt(np.sum(akin**-2.0))
+    np.testing.assert_allclose(found.sigma[found.certain], sigma, rtol=1e-4)
+    assert np.std(off) == pytest.approx(sigma, rel=0.05)
+    assert np.abs(off).max() < 1.0  # never a whole period
+    assert found.agreed > 0.99
+    assert found.misfit == pytest.approx(1.0, abs=0.05)
+    np.testing.assert_allclose(found.apart, 0.0, atol=2e-3)
+
+
+def test_a_pixel_that_is_not_asked_for_gets_nothing() -> None:
+    usable = np.zeros(SHAPE, bool)
+    usable[10:30, 20:150] = True
+    found = order_of((20.0, 240.0), usable=usable)
+    assert np.isnan(found.s[~usable]).all()
+    assert np.isnan(found.sigma[~usable]).all()
+    assert not found.certain[~usable].any()
+    assert found.certain[usable].mean() > 0.99
+
+
+def test_a_wave_that_lies_off_on_the_whole_is_told_in_turns_of_the_finest() -> None:
+    found = order_of((18.0, 20.0, 23.0), apart=(0.0, 0.02, -0.03))
+    np.testing.assert_allclose(found.apart, [0.02 * 20.0 / 18.0, -0.03 * 23.0 / 18.0], atol=3e-3)
+    # 0.02 turns where noise makes 0.005 sqrt(1 + (18 / 20)^2), and 0.03 likewise.
+    worst = 0.03 / (0.005 * np.hypot(1.0, 18.0 / 23.0))
+    assert found.misfit == pytest.approx(worst / 0.6745, rel=0.1)
+    assert np.mean(np.abs(found.s - S)[found.certain] < 2.0) > 0.99
+
+
+def test_sigmas_that_promise_too_much_grow_to_what_is_seen() -> None:
+    found = order_of((20.0, 240.0), sigma=0.006, claimed=0.002)
+    # Only the longer wave's can: it is held against the finest, whose own noise is a twelfth there.
+    assert found.misfit == pytest.approx(3.0, rel=0.05)
+    honest = order_of((20.0, 240.0), sigma=0.006, claimed=0.012)
+    assert honest.misfit == 1.0
+
+
+def test_where_waves_hardly_tell_the_order_none_is_guessed() -> None:
+    # One turn of the finest is a twelfth of the long wave's: 0.0833. Between two orders chi squared
+    # differs by 2 ln 10^4 = 18.4 where that is 4.3 sigmas and more.
+    clear, doubtful = order_of((20.0, 240.0), sigma=0.01), order_of((20.0, 240.0), sigma=0.03)
+    assert clear.certain.mean() > 0.9
+    assert doubtful.certain.mean() < 0.05
+    wrong = clear.certain & (np.abs(clear.s - S) > 5.0)
+    assert wrong.mean() < 1e-3
+    # Of pixels that noise lets tell (EASY), there are none: all are judged.
+    assert doubtful.agreed < 0.05
+
+
+def test_what_sees_two_surfaces_agrees_with_none() -> None:
+    rng = np.random.default_rng(3)
+    mixed = np.zeros(SHAPE, bool)
+    mixed[:, ::5] = True
+    periods = (18.0, 20.0, 23.0)
+    waves, sigmas = [], []
+    for period in periods:
+        turn = S / period + 0.004 * rng.normal(size=SHAPE)
+        turn[mixed] = rng.random(mixed.sum())
+        grey = np.full(SHAPE, 50.0, np.float32)
+        waves.append(WaveSeen(Wave(period, 4), (turn % 1.0).astype(np.float32), grey, grey))
+        sigmas.append(np.full(SHAPE, 0.004, np.float32))
+    found = phase_order(waves, sigmas, np.ones(SHAPE, bool), STRIPES)
+    assert found.certain[~mixed].mean() > 0.98
+    # 13 orders, of which one may agree with two waves by chance: within 4.5 sigmas of either.
+    assert found.certain[mixed].mean() < 0.05
+    assert found.agreed == pytest.approx(0.8, abs=0.03)
+
+
+def test_s_so_near_to_either_end_that_noise_may_take_it_beyond_is_uncertain() -> None:
+    s = np.full(SHAPE, 100.0)
+    sigma = 20.0 * 0.005
+    s[:, 0], s[:, 1], s[:, 2], s[:, 3] = (
+        2.0 * sigma,
+        9.0 * sigma,
+        240 - 9.0 * sigma,
+        240 - 2.0 * sigma,
+    )
+    found = order_of((20.0, 240.0), s=s)
+    assert found.certain[:, :4].mean(axis=0).tolist() == [
+        pytest.approx(0.0, abs=0.1), 1.0, 1.0, pytest.approx(0.0, abs=0.1),
+    ]  # fmt: skip
+
+
+def test_one_wave_alone_tells_s_within_its_period() -> None:
+    found = order_of((240.0,))
+    assert found.certain.mean() > 0.9
+    assert np.std((found.s - S)[found.certain]) == pytest.approx(240.0 * 0.005, rel=0.05)
+    assert found.apart == ()
+    assert found.misfit == 1.0
+    assert order_of((240.0,), usable=np.zeros(SHAPE, bool)).agreed == 0.0
