@@ -1,0 +1,146 @@
+"""Wrong views out and back in, round after round, and how the wrong ones are told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence, Set
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bodyscan.boards.view import ViewKey
+from bodyscan.calibration.board_views import LocatedView
+from bodyscan.calibration.camera import LensTrial
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration import consistent_solve
+from bodyscan.registration.consistent_solve import ConsistentSolve, solve_consistently
+from bodyscan.registration.inconsistent_views import _wrong_squares, error_limit
+from bodyscan.registration.joint_solve import JointSolution
+from bodyscan.registration.rig_lenses import lens_notes
+
+BEFORE = RigidTransform.from_rotation_vector([0.0, 0.1, 0.0], [10.0, 0.0, 900.0])
+
+
+def view(number: int) -> LocatedView:
+    points = np.zeros((4, 3))
+    shift = RigidTransform(np.eye(3), np.array([float(number), 0.0, 0.0]))
+    return LocatedView("p", f"s{number}", "b", points, points[:, :2], shift)
+
+
+VIEWS = [view(number) for number in range(8)]
+START = JointSolution({"p": BEFORE}, {("s0", "b"): BEFORE, ("gone", "b"): BEFORE}, {})
+
+
+def solve(
+    monkeypatch: pytest.MonkeyPatch, judged: Sequence[set[int]], wrong: Set[int] = frozenset()
+) -> tuple[ConsistentSolve, list[set[int]]]:
+    """With what each round finds wrong; and which views each solve was given."""
+    given: list[set[int]] = []
+    rounds: Iterator[set[int]] = iter(judged)
+
+    def fully(views: Sequence[LocatedView], start: JointSolution, **keys: Any) -> JointSolution:
+        given.append({int(one.shot[1:]) for one in views})
+        assert keys == {"root": "p", "refine_cameras": True}
+        # Each board that is seen starts where it was, or where its own view has it; no other does.
+        assert start.root_from_board.keys() == {one.target for one in views}
+        for one in views:
+            expected = BEFORE if one.shot == "s0" else BEFORE @ one.camera_from_board
+            assert np.array_equal(start.root_from_board[one.target].matrix, expected.matrix)
+        return START
+
+    def judge(views: Sequence[LocatedView], solution: JointSolution, limit_px: float) -> Any:
+        assert list(views) == VIEWS, "those that are out are judged as well"
+        assert limit_px == 0.7
+        out = next(rounds)
+        return SimpleNamespace(wrong=[VIEWS[k] for k in sorted(out)], notes=(f"{sorted(out)}",))
+
+    monkeypatch.setattr(consistent_solve, "solve_fully", fully)
+    monkeypatch.setattr(consistent_solve, "find_inconsistent_views", judge)
+    found = solve_consistently(
+        VIEWS, START, root="p", refine_cameras=True, limit_px=0.7, wrong=keys_of(wrong)
+    )
+    return found, given
+
+
+def keys_of(numbers: Set[int]) -> set[ViewKey]:
+    return {VIEWS[k].key for k in numbers}
+
+
+ALL = set(range(8))
+
+
+def test_a_solve_that_finds_nothing_wrong_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, given = solve(monkeypatch, [set()])
+    assert given == [ALL]
+    assert found.wrong == frozenset()
+    assert found.kept(VIEWS) == VIEWS
+
+
+def test_a_wrong_view_is_left_out_of_the_next_solve(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, given = solve(monkeypatch, [{3}, {3}])
+    assert given == [ALL, ALL - {3}]
+    assert found.wrong == keys_of({3})
+    assert found.notes == ("[3]",)
+    assert found.kept(VIEWS) == [one for one in VIEWS if one.shot != "s3"]
+
+
+def test_a_view_comes_back_in_where_it_fits_after_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, given = solve(monkeypatch, [{3, 5}, {3}, {3}])
+    assert given == [ALL, ALL - {3, 5}, ALL - {3}]
+    assert found.wrong == keys_of({3})
+    found, given = solve(monkeypatch, [set(), set()], wrong={2})
+    assert given == [ALL - {2}, ALL]
+    assert found.wrong == frozenset()
+
+
+def test_what_comes_and_goes_is_out_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, given = solve(monkeypatch, [{3}, {5}, {3}, {5}])
+    # From the third round on none comes back.
+    assert given == [ALL, ALL - {3}, ALL - {5}, ALL - {3, 5}]
+    assert found.wrong == keys_of({3, 5})
+
+
+def test_where_most_views_are_wrong_no_further_solve_is_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found, given = solve(monkeypatch, [{0, 1, 2, 3, 4}], wrong={7})
+    assert given == [ALL - {7}]
+    assert found.wrong == keys_of({0, 1, 2, 3, 4, 7})
+    half, given = solve(monkeypatch, [{0, 1, 2, 3}, {0, 1, 2, 3}])
+    assert len(given) == 2
+    assert half.wrong == keys_of({0, 1, 2, 3})
+
+
+def test_a_view_is_wrong_from_six_times_the_usual_error_and_a_fifth_of_a_pixel_on() -> None:
+    assert error_limit(np.array([0.05, 0.1, 3.0])) == pytest.approx(0.6)
+    assert error_limit(np.array([0.02, 0.03, 0.03])) == 0.2
+
+
+def test_a_board_of_the_same_other_size_in_three_shots_has_other_squares() -> None:
+    same = [("b", 1.021), ("b", 1.020), ("b", 1.024), ("c", 0.9), ("c", 0.9)]
+    (said,) = _wrong_squares(same)
+    assert said.startswith("board b has squares 1.021 times as large as the rig file says")
+    assert "in 3 shots" in said
+    assert list(_wrong_squares([("b", 1.02), ("b", 1.03), ("b", 1.01), ("b", 1.04)])) == []
+    # Most of them must agree to half a percent.
+    (said,) = _wrong_squares([("b", 1.020), ("b", 1.022), ("b", 1.018), ("b", 1.06)])
+    assert "1.021 times" in said
+
+
+def test_lenses_other_than_the_chapters_are_told_with_what_speaks_for_them() -> None:
+    brown = LensTrial("brown", 0.051, 8.4, True)
+    trials = {
+        "p": (LensTrial("radial", 0.082), brown, LensTrial("rational", 0.051, 0.3)),
+        "q": (LensTrial("radial", 0.060, None, True), LensTrial("brown", 0.060, 1.0)),
+        "r": (LensTrial("radial", 0.061), LensTrial("brown", 0.060, 2.9, True)),
+        "s": (LensTrial("radial", 0.061), LensTrial("brown", 0.060, 3.0, True)),
+    }
+    assert lens_notes(trials) == [
+        "p: lens brown, by 8 standard errors: boards held out fit to 0.051 px with it, 0.082 with "
+        "radial",
+        "r: lens brown, by 3 standard errors, as cameras of its make: boards held out fit to 0.060 "
+        "px with it, 0.061 with radial",
+        "s: lens brown, by 3 standard errors: boards held out fit to 0.060 px with it, 0.061 with "
+        "radial",
+    ]
