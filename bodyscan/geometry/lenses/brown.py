@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar, Self
 
 import numpy as np
@@ -43,8 +43,7 @@ class Brown(Lens):
         return np.array([*[1e-5] * 4, 1e-4])
 
     def distort(self, ideal: Array) -> Array:
-        r2 = squared_radius(ideal)[..., None]
-        factor = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        factor = self._above(squared_radius(ideal)[..., None])
         return ideal * factor + decentring(ideal) @ np.array([self.p1, self.p2])
 
     def by_coefficients(self, ideal: Array) -> Array:
@@ -54,9 +53,7 @@ class Brown(Lens):
         return np.concatenate(parts, axis=-1)
 
     def by_point(self, ideal: Array) -> Array:
-        r2 = squared_radius(ideal)
-        factor = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        slope = self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3)
+        factor, slope = self._factor(squared_radius(ideal))
         return scaled_by_point(ideal, factor, slope) + decentring_by_point(ideal, self.p1, self.p2)
 
     def opencv(self) -> Array:
@@ -64,4 +61,14 @@ class Brown(Lens):
 
     @classmethod
     def from_opencv(cls, coefficients: Array) -> Self | None:
-        return None if np.any(coefficients[5:]) else cls(*coefficients[:5].tolist())
+        count = len(fields(cls))
+        given = np.append(coefficients, np.zeros(count))
+        return None if np.any(given[count:]) else cls(*given[:count].tolist())
+
+    def _above(self, r2: Array) -> Array:
+        """The radial polynomial at squared radii."""
+        return 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+
+    def _factor(self, r2: Array) -> tuple[Array, Array]:
+        """The radial factor at squared radii, and its derivative by them."""
+        return self._above(r2), self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3)
