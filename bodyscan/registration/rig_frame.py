@@ -10,7 +10,7 @@ from bodyscan.calibration.board_views import board_symmetries
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.view_graph import Target
-from bodyscan.rig.pair import NominalPose
+from bodyscan.rig.pair import NominalPose, Pair
 from bodyscan.rig.rig import Rig
 
 
@@ -88,11 +88,37 @@ def rig_from_root(
         rig_from_board = RigidTransform(axes, np.array(frame.origin_mm))
         return rig_from_board @ root_from_board[target].inverse()
     assert pair is not None
-    if pair.name not in root_from_camera:
+    return _at_its_nominal_pose(rig, pair, root_from_camera)
+
+
+def rig_from_world(
+    rig: Rig, world_from_camera: Mapping[str, RigidTransform]
+) -> RigidTransform | None:
+    """Carries the frame of cameras that another program placed into the rig frame; None where the rig
+    file does not say where the pair stands that holds it.
+
+    Raises BadInput if that pair is not among them.
+    """
+    pair = rig.frame_pair
+    if pair is None or (rig.rig_frame.pair is None and pair.nominal is None):
+        return None
+    return _at_its_nominal_pose(rig, pair, world_from_camera, "imported", "its `known`")
+
+
+def _at_its_nominal_pose(
+    rig: Rig,
+    pair: Pair,
+    from_camera: Mapping[str, RigidTransform],
+    done: str = "calibrated",
+    source: str = "that pair's captures",
+) -> RigidTransform:
+    """Carries the frame of `from_camera` to where the pair stands as it should.  done, source: how it
+    was to be known, and from what."""
+    if pair.name not in from_camera:
         raise BadInput(
-            f"the rig frame is fixed by pair {pair.name}, which could not be calibrated",
+            f"the rig frame is fixed by pair {pair.name}, which could not be {done}",
             where=f"rig {rig.name}",
-            remedy="correct that pair's captures, or name another pair in rig_frame",
+            remedy=f"correct {source}, or name another pair in rig_frame",
         )
     placed = nominal_pose(pair.nominal) if pair.nominal else RigidTransform.identity()
-    return placed @ root_from_camera[pair.name].inverse()
+    return placed @ from_camera[pair.name].inverse()

@@ -15,7 +15,7 @@ from bodyscan.files.relative_text import relative_text
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.registration.rig_frame import nominal_pose
+from bodyscan.registration.rig_frame import rig_from_world
 from bodyscan.registration.storage import keep_former, save_calibration
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
@@ -117,18 +117,10 @@ def _placed(rig: Rig, known: dict[str, KnownPair]) -> dict[str, RigidTransform]:
         name: (own.camera_from_world or RigidTransform.identity()).inverse()
         for name, own in known.items()
     }
-    fixed = rig.frame_pair
-    if fixed is None or (rig.rig_frame.pair is None and fixed.nominal is None):
+    carried = rig_from_world(rig, world_from_camera)
+    if carried is None:
         return world_from_camera
-    if fixed.name not in known:
-        raise BadInput(
-            f"the rig frame is fixed by pair {fixed.name}, which could not be imported",
-            where=f"rig {rig.name}",
-            remedy="correct its `known`, or name another pair in rig_frame",
-        )
-    placed = nominal_pose(fixed.nominal) if fixed.nominal else RigidTransform.identity()
-    rig_from_world = placed @ world_from_camera[fixed.name].inverse()
-    return {name: rig_from_world @ pose for name, pose in world_from_camera.items()}
+    return {name: carried @ pose for name, pose in world_from_camera.items()}
 
 
 def _calibrated(pair: Pair, known: KnownPair) -> PairCalibration:
