@@ -87,13 +87,15 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class BodyMotion:
-    """amplitudes: (n,) of all kinds' fields and courses.  usual: (6,) the sway that its unit is.
+    """fields: (C, 12, M) of all kinds.  amplitudes: (n,) of their fields and courses.  usual: (6,) the
+    sway that its unit is.
 
     normal: (n, n), what was seen of them, without any prior, its lower triangle; pull: (n,) its
     right-hand side.  factor: (n, n) Cholesky's, lower, of their covariance's inverse in units (n,).
     """
 
     kinds: tuple[Kind, ...]
+    fields: Array
     usual: Array
     amplitudes: Array
     normal: Array
@@ -122,7 +124,8 @@ class BodyMotion:
         )
         count = sum(kind.count for kind in kinds)
         nothing, none = np.zeros((count, count)), np.zeros(count)
-        return BodyMotion(kinds, sway, none, nothing, none, nothing, np.ones(count))
+        fields = np.concatenate([kind.fields for kind in kinds], axis=2)
+        return BodyMotion(kinds, fields, sway, none, nothing, none, nothing, np.ones(count))
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -141,10 +144,6 @@ class BodyMotion:
         """(n,) of the amplitudes: all that a round needs of the covariance, at half its price."""
         root = dtrtri(self.factor, lower=True)[0]
         return np.asarray(np.einsum("ij,ij->j", root, root) * self.units**2, np.float64)
-
-    @cached_property
-    def fields(self) -> Array:
-        return np.concatenate([kind.fields for kind in self.kinds], axis=2)
 
     def kind(self, name: str) -> Kind:
         return next(kind for kind in self.kinds if kind.name == name)
@@ -174,14 +173,13 @@ class BodyMotion:
         anew. evidence: by pairs (a, b).  speeds: by pair, as its own stripes tell them."""
         names, speeds = [kind.name for kind in self.kinds], speeds or {}
         now = self.displacements(names)
-        fields = self.fields  # made once, not by every thread
 
         def asked_of(overlap: tuple[tuple[int, int], CellEvidence]) -> tuple[Array, Array]:
             (a, b), seen = overlap
             return self._asked(seen.doubted(APART_MM), now[a] - now[b])
 
         asked = threaded(asked_of, evidence.items(), stage="aligning")
-        asked += threaded(lambda told: told.asked(fields), speeds.values(), stage="aligning")
+        asked += threaded(lambda told: told.asked(self.fields), speeds.values(), stage="aligning")
         squares, pulls = zip(*asked, strict=True)
         square, pull = np.array(squares), np.array(pulls)
         first, second = np.array(list(evidence)).T
