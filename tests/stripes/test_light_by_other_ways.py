@@ -1,0 +1,130 @@
+"""How much of a pixel's light came straight from the projector, and where a boundary lies under it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.arrays import Floats
+from bodyscan.stripes.indirect_light import imbalance, mostly_direct
+from bodyscan.stripes.scan_lines import ScanLines
+
+QUIET = np.full(256, 1e-6, np.float32)
+SHAPE = (20, 60)
+BITS = 5
+
+
+def lit_by(direct: np.ndarray, *, bits: dict[int, float] | None = None) -> ScanLines:
+    """120 grey levels of light, of which the projector's part is `direct` (L, P); bits: what share of
+    it a pattern shows."""
+    dark: Floats = np.full(SHAPE, 20.0, np.float32)
+    lit = dark + np.float32(120.0)
+    shown = np.array([(bits or {}).get(k, 1.0) for k in range(BITS)])[:, None, None]
+    step = np.float32(60.0) * (shown * direct).astype(np.float32)
+    return ScanLines(lit, dark, np.float32(80.0) + step, np.float32(80.0) - step, False)
+
+
+def direct_light() -> np.ndarray:
+    """A clear top, and below it on the left more and on the right less than half."""
+    direct = np.ones(SHAPE)
+    direct[8:, :30], direct[8:, 30:] = 0.55, 0.45
+    return direct
+
+
+EVERY = np.ones(SHAPE, bool)
+
+
+def test_a_pixel_that_other_surfaces_light_more_than_the_projector_is_uncertain() -> None:
+    direct = direct_light()
+    assert np.array_equal(mostly_direct(lit_by(direct), EVERY, 4, QUIET), direct > 0.5)
+    # A dark pattern tells as much as a bright one.
+    assert np.array_equal(mostly_direct(lit_by(-direct), EVERY, 4, QUIET), direct > 0.5)
+
+
+def test_a_bit_that_lens_or_projector_blur_is_passed_over_for_a_coarser_one() -> None:
+    direct = direct_light()
+    for blurred in ({4: 0.7}, {4: 0.7, 3: 0.7}):
+        found = mostly_direct(lit_by(direct, bits=blurred), EVERY, 4, QUIET)
+        assert np.array_equal(found, direct > 0.5)
+    # After three none tells anything.
+    images = lit_by(direct, bits={4: 0.7, 3: 0.7, 2: 0.7})
+    assert mostly_direct(images, EVERY, 4, QUIET).all()
+    assert mostly_direct(lit_by(direct, bits={0: 0.7}), EVERY, 0, QUIET).all()
+
+
+def test_a_bit_is_sharp_if_a_tenth_of_the_pixels_show_it_so() -> None:
+    direct = np.full(SHAPE, 0.4)
+    direct[:2] = 0.81
+    assert not mostly_direct(lit_by(direct), EVERY, 4, QUIET)[2:].any()
+    direct[1, -10:] = 0.4
+    assert mostly_direct(lit_by(direct), EVERY, 4, QUIET).all()
+    usable = EVERY.copy()
+    usable[-2:] = False  # of those that are looked at
+    assert not mostly_direct(lit_by(direct), usable, 4, QUIET)[2:].any()
+
+
+def test_dips_where_a_bit_flips_are_filled_and_wider_ones_are_shadows() -> None:
+    direct = np.ones(SHAPE)
+    direct[:, 20:26] = 0.1
+    direct[:, 40:47] = 0.1
+    found = mostly_direct(lit_by(direct), EVERY, 4, QUIET)
+    assert found[:, :40].all()
+    assert not found[:, 40:47].any()
+
+
+def at_boundary(
+    indirect: float, unshared: float, *, noise: float = 1e-6, reach: int = 8, second: int = 60
+) -> tuple[float, float]:
+    """J and its doubt of a boundary between pixels 29 and 30 at stripe 15; a pixel gets D + I, its
+    pattern less its inverse +-D + J.  second: where the bit flips again."""
+    total = 100.0
+    u = np.arange(SHAPE[1])
+    sign = np.where((u >= 30) & (u < second), 1.0, -1.0)
+    difference = np.tile(total * ((1.0 - indirect) * sign + unshared), (SHAPE[0], 1))
+    dark: Floats = np.full(SHAPE, 20.0, np.float32)
+    patterns = (80.0 + difference / 2.0).astype(np.float32)[None]
+    inverses = (80.0 - difference / 2.0).astype(np.float32)[None]
+    images = ScanLines(dark + np.float32(total), dark, patterns, inverses, False)
+    codes = np.tile(u // 2, (SHAPE[0], 1)).astype(np.int32)
+    one = np.array([0])
+    levels = np.full(256, noise, np.float32)
+    mean, doubt = imbalance(
+        images,
+        codes,
+        EVERY,
+        levels,
+        one,
+        np.array([15]),
+        np.array([5 * 60 + 29]),
+        np.array([reach]),
+    )
+    return float(mean[0]), float(doubt[0])
+
+
+@pytest.mark.parametrize("unshared", [0.1, -0.2])
+def test_what_pattern_and_inverse_do_not_share_is_the_middle_of_both_sides(unshared: float) -> None:
+    mean, doubt = at_boundary(0.3, unshared)
+    assert mean == pytest.approx(unshared, rel=1e-3)
+    assert doubt == pytest.approx(0.3 * abs(unshared), rel=1e-2)
+
+
+def test_it_is_never_more_than_all_the_indirect_light() -> None:
+    # Sides of 0.9 and 0.7: on the average 0.8 is direct, so that 0.1 is half of the rest.
+    assert at_boundary(0.2, 0.1)[0] == pytest.approx(0.1, rel=1e-3)
+    # Without indirect light there is none to share.
+    assert at_boundary(0.0, 0.1)[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_finest_bit_has_no_room_and_noise_explains_a_little() -> None:
+    assert at_boundary(0.3, 0.1, reach=1) == (0.0, 0.0)
+    assert at_boundary(0.3, 0.1, reach=2)[0] == pytest.approx(0.1, rel=0.01)
+    # Of eight pixels with sigmas of sqrt(2 v) / 100 each: 0.1 is 4 sigmas, half is believed.
+    noise = (0.1 / 4.0 * 100.0) ** 2 * 8.0 / 2.0
+    mean, doubt = at_boundary(0.3, 0.1, noise=noise)
+    assert mean == pytest.approx(0.05, rel=0.01)
+    assert doubt == pytest.approx(np.hypot(0.025, 0.3 * 0.05), rel=0.01)
+
+
+def test_pixels_where_the_bit_has_flipped_again_are_not_asked() -> None:
+    # Four stripes on: 4, 5 and 6 px away from the boundary's pixels it is the other value.
+    assert at_boundary(0.3, 0.1, reach=2, second=34)[0] == pytest.approx(0.1, rel=0.01)

@@ -1,0 +1,52 @@
+"""A line of light swept over a surface: s from when it comes and goes, with the noise it has."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from bodyscan.stripes.line_sweep import decode_sweep
+from bodyscan.stripes.stripe_map import StripeMap
+
+STRIPES = 40
+SHAPE = (60, 240)
+S = np.linspace(2.5, 37.0, SHAPE[1]) + 0.8 * np.sin(np.arange(SHAPE[0]) / 9.0)[:, None]
+
+
+def swept(
+    blur: float, noise: float = 0.0, *, ramp: float = 0.0, bright: float = 160.0
+) -> StripeMap:
+    """A stripe at a time, its edges blurred by so many stripes."""
+    edges = np.arange(STRIPES + 1)[:, None, None]
+    past = 0.5 * (1.0 + erf((S - edges) / (np.sqrt(2.0) * blur)))
+    light = bright * (past[:-1] - past[1:])
+    rng = np.random.default_rng(0)
+    sigma = np.sqrt(noise**2 + ramp * light)
+    frames = np.clip(20.0 + light + sigma * rng.normal(size=light.shape), 0.0, 255.0)
+    lit = np.full(SHAPE, 20.0 + bright) + noise * rng.normal(size=SHAPE)
+    return decode_sweep(np.rint(lit).astype(np.uint8), np.rint(frames).astype(np.uint8), "vertical")
+
+
+def off(found: StripeMap) -> np.ndarray:
+    return np.asarray(found.s - S)[3:-3, 12:-12]
+
+
+@pytest.mark.parametrize("blur", [0.5, 0.8])
+def test_s_is_exact_whatever_the_blur(blur: float) -> None:
+    found = swept(blur)
+    known = np.isfinite(off(found))
+    assert known.mean() > 0.98
+    # Whole grey levels: of 160, a fifth of a percent; a line three stripes wide is not seen whole.
+    assert np.sqrt(np.mean(off(found)[known] ** 2)) < 0.01
+
+
+@pytest.mark.parametrize(("noise", "ramp"), [(1.5, 0.0), (0.7, 0.03)])
+def test_its_sigma_is_how_far_noise_puts_it_off(noise: float, ramp: float) -> None:
+    found = swept(0.6, noise, ramp=ramp)
+    known = np.isfinite(off(found))
+    assert known.mean() > 0.9
+    sigma = found.sigma[3:-3, 12:-12][known]
+    # The median of what is off over its sigma, for which outliers do not count.
+    ratio = np.median(np.abs(off(found)[known]) / sigma) / 0.6745
+    assert ratio == pytest.approx(1.0, abs=0.25)
