@@ -27,7 +27,8 @@ class CellEvidence:
     @staticmethod
     def of(matches: Matches, cell: Indices, centres: Array, correlated: float) -> CellEvidence:
         """cell: (M,) of each match.  Weights as in `OverlapEquations`."""
-        cells, number = np.unique(cell, return_inverse=True)
+        seen = np.bincount(cell, minlength=len(centres)) > 0
+        cells, number = np.flatnonzero(seen), (np.cumsum(seen) - 1)[cell]
         information = np.zeros((len(cells), 12, 12))
         gradient = np.zeros((len(cells), 12))
         distances = matches.distances

@@ -76,9 +76,14 @@ class Matches:
 def alignment_points(image: RangeImage, spacing_mm: float, rim_px: int = RIM_PX) -> AlignmentPoints:
     """Points of every so many rows and columns, about `spacing_mm` apart where a surface faces the
     camera; what is seen edge-on takes no part."""
-    window = np.ones((2 * rim_px + 1, 2 * rim_px + 1), np.uint8)
+    return points_within_rims(image, spacing_mm, rim_px)[0]
+
+
+def points_within_rims(
+    image: RangeImage, spacing_mm: float, *rims_px: int
+) -> tuple[AlignmentPoints, ...]:
+    """`alignment_points` for each of several widths of the rim: the same points, in the same arrays."""
     valid = image.valid
-    inner = cv2.erode(valid.view(np.uint8), window) > 0
     few = image.every(8)
     depth = image.points[few][..., 2][valid[few]]
     pixel_mm = float(np.median(depth)) / image.camera.alpha if len(depth) else spacing_mm
@@ -88,13 +93,13 @@ def alignment_points(image: RangeImage, spacing_mm: float, rim_px: int = RIM_PX)
     points, normals = (a[some][seen].astype(np.float64) for a in (image.points, image.normals))
     facing = -np.einsum("nc,nc->n", points, normals) / np.linalg.norm(points, axis=-1)
     chosen = facing > EDGE_ON  # a normal of NaN is not more
-    return AlignmentPoints(
-        image,
-        inner,
-        points[chosen],
-        normals[chosen],
-        (image.sigma_mm[some][seen] * facing)[chosen],
-        ~inner[some][seen][chosen],
+    points, normals = points[chosen], normals[chosen]
+    sigma_mm = (image.sigma_mm[some][seen] * facing)[chosen]
+    windows = (np.ones((2 * rim + 1, 2 * rim + 1), np.uint8) for rim in rims_px)
+    inner = [cv2.erode(valid.view(np.uint8), window) > 0 for window in windows]
+    return tuple(
+        AlignmentPoints(image, own, points, normals, sigma_mm, ~own[some][seen][chosen])
+        for own in inner
     )
 
 

@@ -9,11 +9,12 @@ from itertools import permutations
 from typing import TypeVar
 
 from bodyscan.alignment.matching import (
+    RIM_PX,
     SEAM_RIM_PX,
     AlignmentPoints,
     Matches,
-    alignment_points,
     match_projected,
+    points_within_rims,
 )
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.transforms import RigidTransform
@@ -36,9 +37,7 @@ class OverlapPoints:
 
     @staticmethod
     def of(image: RangeImage, spacing_mm: float) -> OverlapPoints:
-        return OverlapPoints(
-            alignment_points(image, spacing_mm), alignment_points(image, spacing_mm, SEAM_RIM_PX)
-        )
+        return OverlapPoints(*points_within_rims(image, spacing_mm, RIM_PX, SEAM_RIM_PX))
 
     def some(self, chosen: Mask | slice) -> OverlapPoints:
         return OverlapPoints(self.inner.some(chosen), self.whole.some(chosen))

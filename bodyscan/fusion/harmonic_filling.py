@@ -41,10 +41,12 @@ def fill_harmonically(values: Floats, fixed: Mask, least: Floats, sure: float) -
 def _halved(values: Floats, fixed: Mask, least: Floats) -> tuple[Floats, Mask, Floats]:
     """Each node for eight: fixed at the mean of those that are; the mean of the bounds if all have
     one."""
-    a, b, c = (size // 2 for size in values.shape)
 
     def total(part: Floats) -> Floats:
-        return np.asarray(np.add.reduce(part.reshape(a, 2, b, 2, c, 2), axis=(1, 3, 5)), np.float32)
+        # An axis at a time: numpy's reduction over three of them takes several times as long.
+        part = part[::2] + part[1::2]
+        part = part[:, ::2] + part[:, 1::2]
+        return part[:, :, ::2] + part[:, :, 1::2]
 
     count = total(fixed.astype(np.float32))
     known = total(np.where(fixed, values, np.float32(0.0))) / np.maximum(count, np.float32(1.0))

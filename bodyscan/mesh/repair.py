@@ -9,7 +9,12 @@ from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.mesh.half_edges import RIM, UNSOUND, corner_fans, twins
-from bodyscan.mesh.topology import drop_unused_vertices, face_components, signed_volume
+from bodyscan.mesh.topology import (
+    drop_unused_vertices,
+    face_components,
+    signed_volume,
+    used_vertices,
+)
 
 
 def close_mesh(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
@@ -63,7 +68,7 @@ def largest_piece(
     if points is not None and labels.any():
         of_vertex = np.empty(len(vertices), labels.dtype)
         of_vertex[faces] = labels[:, None]
-        used = np.unique(faces)
+        used = used_vertices(faces, len(vertices))
         nearest = cKDTree(vertices[used]).query(points)[1]
         counted = of_vertex[used[nearest]]
     vertices, faces, _ = drop_unused_vertices(

@@ -63,8 +63,10 @@ def face_components(faces: Indices, vertex_count: int) -> NDArray[np.int32]:
         (np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])),
         shape=(vertex_count, vertex_count),
     )
-    _, labels = connected_components(graph, directed=False)
-    return np.unique(labels[faces[:, 0]], return_inverse=True)[1].astype(np.int32)
+    count, labels = connected_components(graph, directed=False)
+    own = labels[faces[:, 0]]
+    number = np.cumsum(np.bincount(own, minlength=count) > 0, dtype=np.int32) - 1
+    return number[own]
 
 
 def signed_volume(vertices: Array, faces: Indices) -> float:
