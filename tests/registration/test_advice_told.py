@@ -1,0 +1,104 @@
+"""What advice says of links and further shots, and by which links a rig holds together best."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.advice import Advice, Link, MoreShots, best_chain
+from bodyscan.registration.more_shots import BoardPlace, SigmaReduction
+
+
+def more(**changes: Any) -> MoreShots:
+    views = tuple(
+        tuple(cast(Any, type("Seen", (), {"pair": name})()) for name in names)
+        for names in (("a", "b", "c"), ("c", "b", "a", "d"))
+    )
+    place = BoardPlace(
+        "knee", np.array([10.0, -20.0, 499.6]), 91.0, (RigidTransform.identity(),), views
+    )
+    keys = {"pair": "a", "shots": 3, "between": ("a", "b"), "place": place, "before_mm": 0.5,
+            "after_mm": 0.24, "halves": True}  # fmt: skip
+    return MoreShots(**cast(Any, keys | changes))
+
+
+def advice(
+    *bridges: Link, weak: tuple[Link, ...] = (), shots: MoreShots | None = None
+) -> list[str]:
+    crucial = (("s1", "b"), ("s4", "b")) if bridges else ()
+    return Advice((), (), bridges, weak, crucial, "d", 0.3123, shots).lines
+
+
+def test_what_alone_ties_a_rig_together_is_told_first() -> None:
+    assert advice(
+        Link("a", "b", 1, 0.2), Link("a", "c", 4, 0.1), weak=(Link("c", "d", 2, 0.9),)
+    ) == [
+        "1 shot in common is all that ties a to b, and with them the parts of the rig on either side",
+        "4 shots in common is all that ties a to c, and with them the parts of the rig on either side",
+        "without any one of these shots the rig would fall apart: s1 (b), s4 (b)",
+        "weak link: d is known to 0.900 mm from c (2 shots in common), and no other link ties their "
+        "sides better",
+        "d is known least in the rig frame: sigma 0.312 mm",
+    ]
+    assert len(advice()) == 1
+
+
+def said(**changes: Any) -> str:
+    return advice(shots=more(**changes))[-1]
+
+
+def test_further_shots_are_told_with_where_to_hold_the_board() -> None:
+    assert said() == (
+        "3 more shots seen by both a and b (also by c), board at knee height (middle at 10, -20, 500 "
+        "mm, facing the subject's left, tilted in turn in all directions), would halve the sigma of "
+        "a: 0.500 to 0.240 mm"
+    )
+    assert "would improve a, though not by half: 0.500 to 0.300" in said(after_mm=0.3, halves=False)
+    assert said(shots=1).startswith("1 more shot seen")
+    assert said(after_mm=0.4).startswith("3 more shots seen")  # four fifths is worth it
+    assert said(after_mm=0.401) == (
+        "further shots of this board would not help a much: 3 more bring its sigma from 0.500 to "
+        "0.401 mm"
+    )
+
+
+@pytest.mark.parametrize(
+    ("degrees", "way"),
+    [
+        (0.0, "front"), (22.0, "front"), (23.0, "front left"), (112.0, "left"), (135.0, "back left"),
+        (180.0, "back"), (225.0, "back right"), (-90.0, "right"), (-45.0, "front right"),
+        (338.0, "front"),
+    ],
+)  # fmt: skip
+def test_ways_are_told_as_the_subject_has_them(degrees: float, way: str) -> None:
+    place = more().place
+    turned = BoardPlace(place.height, place.centre_mm, degrees, place.rig_from_board, place.views)
+    assert f"facing the subject's {way}," in said(place=turned)
+
+
+def test_a_place_is_seen_by_those_who_see_every_tilt() -> None:
+    place = more().place
+    assert place.seen_by == ("a", "b", "c")
+    two = place.seen_only_by(("a", "d"))
+    assert two.seen_by == ("a",)
+    assert [len(tilt) for tilt in two.views] == [1, 2]
+
+
+def test_the_best_chain_leaves_out_what_others_do_better() -> None:
+    links = [
+        Link("a", "b", 3, 0.1), Link("b", "c", 3, 0.3), Link("a", "c", 9, 0.4), Link("c", "d", 1, 2.0),
+    ]  # fmt: skip
+    assert best_chain(links) == (links[3], links[1], links[0])
+    assert best_chain([]) == ()
+
+
+def test_a_sigma_is_halved_where_its_variance_is_a_quarter() -> None:
+    def to_halve(*after: float) -> int | None:
+        return SigmaReduction(1.0, np.array(after)).shots_to_halve
+
+    assert to_halve(0.6, 0.26, 0.25, 0.1) == 3
+    assert to_halve(0.2, 0.1) == 1
+    assert to_halve(0.6, 0.251) is None
