@@ -59,7 +59,7 @@ def white_and_black(waves: Sequence[WaveSeen]) -> tuple[Floats, Floats]:
     """What the pixels would show under all of the projector's light, and under none of it."""
     white = np.mean([wave.mean + wave.amplitude for wave in waves], axis=0)
     black = np.mean([wave.mean - wave.amplitude for wave in waves], axis=0)
-    return np.clip(white, 0.0, 255.0), np.clip(black, 0.0, 255.0)
+    return np.minimum(white, 255.0), np.maximum(black, 0.0)
 
 
 def white_image(images: Greys, waves: tuple[Wave, ...]) -> Greys:

@@ -30,7 +30,7 @@ def test_form_is_the_range_without_three_in_a_thousand_and_size_the_diameters_er
     assert found.form_mm == pytest.approx(0.4, abs=0.02)  # those left out pull a little
     assert found.shell_mm == pytest.approx(0.36, abs=0.01)  # nine tenths of an even spread
     assert found.size_mm == pytest.approx(0.1, abs=0.01)
-    np.testing.assert_allclose(found.fitted.centre, CENTRE, atol=0.01)
+    np.testing.assert_allclose(found.fitted.centre, CENTRE, atol=0.02)  # 0.12 / sqrt(1000 / 3)
     off[700] = 1.5  # a fourth is one too many
     points = CENTRE + (RADIUS + 0.05 + off)[:, None] * out
     assert read_sphere(points, out, Sphere(CENTRE, RADIUS), RADIUS).form_mm > 1.5
