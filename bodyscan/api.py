@@ -237,11 +237,11 @@ def save_scan(
     calibration: where the one that it was made with is stored, which scan.json refers to by hash.
     subject: a pseudonym, by which `bodyscan forget` finds all that was made of a person.
     """
+    from bodyscan.fusion.storage import Origin
     from bodyscan.fusion.storage import save_scan as save
     from bodyscan.registration.storage import calibration_id
 
-    origin = calibration_id(Path(calibration))
-    save(scan, Path(folder), calibration_id=origin, subject=subject, when=when)
+    save(scan, Path(folder), Origin(calibration_id(Path(calibration)), subject, when))
     return load_scan(folder)
 
 

@@ -37,6 +37,30 @@ DERIVED = (
 )
 
 
+@dataclass(frozen=True)
+class Origin:
+    """Whose scan it is (a pseudonym), when it was taken, and the calibration it was made with."""
+
+    calibration_id: str
+    subject: str | None
+    when: datetime | None
+    simulated: bool = False
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """As scan.json begins."""
+        return {
+            "schema": SCHEMA,
+            "version": VERSION,
+            "software": f"bodyscan {__version__}",
+            "units": "mm",
+            "axes": "origin on the floor at the rig's centre, x forward, y to the left, z up",
+            "subject": self.subject,
+            "when": self.when.isoformat() if self.when else None,
+            "calibration_id": self.calibration_id,
+        } | ({"simulated": True} if self.simulated else {})
+
+
 @dataclass(frozen=True, eq=False)
 class StoredScan:
     """facts: the content of scan.json."""
@@ -71,15 +95,7 @@ def clear(folder: Path) -> None:
                 path.unlink()
 
 
-def save_scan(
-    scan: Scan,
-    folder: Path,
-    *,
-    calibration_id: str,
-    subject: str | None,
-    when: datetime | None,
-    simulated: bool = False,
-) -> Path:
+def save_scan(scan: Scan, folder: Path, origin: Origin) -> Path:
     """Write the body model and what it is into `folder`; returns the path of scan.json."""
     (folder / FILE_NAME).unlink(missing_ok=True)
 
@@ -91,7 +107,7 @@ def save_scan(
     digests = threaded(write, names, stage="writing")
     write_json(
         folder / FILE_NAME,
-        _origin(calibration_id, subject, when, simulated)
+        origin.facts
         | {
             "sha256": dict(zip(names, digests, strict=True)),
             "counts": {
@@ -114,40 +130,16 @@ def save_scan(
     return folder / FILE_NAME
 
 
-def save_failure(
-    error: ScanFailed,
-    folder: Path,
-    *,
-    calibration_id: str,
-    subject: str | None,
-    when: datetime | None,
-    simulated: bool = False,
-) -> Path:
+def save_failure(error: ScanFailed, folder: Path, origin: Origin) -> Path:
     """Write a scan.json that says why there is no model; one of an earlier try goes."""
     for name in (FILE_NAME, CLOUD_NAME, MESH_NAME):
         (folder / name).unlink(missing_ok=True)
     reasons = tuple(line.strip() for line in str(error).splitlines())
     write_json(
         folder / FILE_NAME,
-        _origin(calibration_id, subject, when, simulated)
-        | {"verdict": asdict(Verdict("repeat", reasons))},
+        origin.facts | {"verdict": asdict(Verdict("repeat", reasons))},
     )
     return folder / FILE_NAME
-
-
-def _origin(
-    calibration_id: str, subject: str | None, when: datetime | None, simulated: bool
-) -> dict[str, Any]:
-    return {
-        "schema": SCHEMA,
-        "version": VERSION,
-        "software": f"bodyscan {__version__}",
-        "units": "mm",
-        "axes": "origin on the floor at the rig's centre, x forward, y to the left, z up",
-        "subject": subject,
-        "when": when.isoformat() if when else None,
-        "calibration_id": calibration_id,
-    } | ({"simulated": True} if simulated else {})
 
 
 def load_scan(folder: Path) -> StoredScan:

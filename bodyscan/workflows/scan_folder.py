@@ -8,7 +8,7 @@ from pathlib import Path
 from bodyscan.captures.folder import open_scan
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.scan import Scan
-from bodyscan.fusion.storage import clear, save_failure, save_scan
+from bodyscan.fusion.storage import Origin, clear, save_failure, save_scan
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, step
@@ -48,8 +48,9 @@ def scan_folder(
     captures = open_scan(described, folder)
     nobody = open_scan(described, empty) if empty else None
     reconstructed = preparation.made_of(captures) if preparation else {}
-    origin = calibration_id(calibration)
-    subject, when, simulated = captures.subject, captures.when, captures.simulated
+    origin = Origin(
+        calibration_id(calibration), captures.subject, captures.when, captures.simulated
+    )
     drawn: list[Future[Pictures]] = []
     with ThreadPoolExecutor(1) as beside:
 
@@ -72,15 +73,11 @@ def scan_folder(
             )
         except ScanFailed as error:
             clear(out)
-            save_failure(
-                error, out, calibration_id=origin, subject=subject, when=when, simulated=simulated
-            )
+            save_failure(error, out, origin)
             raise
         with step(progress, "writing"):
             clear(out)
-            saved = save_scan(
-                scan, out, calibration_id=origin, subject=subject, when=when, simulated=simulated
-            )
+            saved = save_scan(scan, out, origin)
             announce(scan.verdict, final=True)
             pictures = write_pictures((each.result() for each in drawn), out)
     return scan, saved, pictures
