@@ -17,7 +17,7 @@ LEAST_TURN_DEG = 3.0
 
 
 def homography(plane: Array, pixels: Array) -> Array:
-    """(3, 3) with pixels ~ H (x, y, 1), from plane points (N, 2) and pixels (N, 2), N >= 4.
+    """(3, 3) with pixels ~ H (x, y, 1), from plane points (N, 2) and pixels (N, 2), N > 4.
 
     Normalised direct linear transformation (Hartley 1997).
     """

@@ -1,0 +1,152 @@
+"""What least squares start from: closed forms, by themselves, exact where there is no noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.calibration.pinhole_projector import fit_pinhole
+from bodyscan.calibration.zhang import (
+    camera_from_plane,
+    homogeneous,
+    homography,
+    matrix_from_homographies,
+    refuse_parallel,
+)
+from bodyscan.errors import DegeneratePoses
+from bodyscan.geometry.transforms import RigidTransform
+
+WIDTH, HEIGHT = 1280, 1024
+GRID = np.stack(np.meshgrid(30.0 * np.arange(9), 30.0 * np.arange(6)), axis=-1).reshape(-1, 2)
+
+
+def posed(*turn: float, z: float = 700.0) -> RigidTransform:
+    pose = RigidTransform.from_rotation_vector(turn, [0.0, 0.0, 0.0])
+    middle = np.array([120.0, 75.0, 0.0])
+    return RigidTransform(pose.rotation, [20.0, -10.0, z] - pose.rotation @ middle)
+
+
+POSES = [
+    posed(0.4, 0.1, 0.2),
+    posed(-0.3, 0.35, -0.5),
+    posed(0.1, -0.45, 1.0),
+    posed(-0.4, -0.2, 0),
+]
+
+
+def seen(matrix: np.ndarray, pose: RigidTransform, noise: float = 0.0) -> np.ndarray:
+    ahead = pose.apply(np.column_stack([GRID, np.zeros(len(GRID))])) @ matrix.T
+    pixels = ahead[:, :2] / ahead[:, 2:]
+    return np.asarray(pixels + noise * np.random.default_rng(0).normal(size=pixels.shape))
+
+
+def matrix(alpha: float, beta: float, gamma: float, u0: float, v0: float) -> np.ndarray:
+    return np.array([[alpha, gamma, u0], [0.0, beta, v0], [0.0, 0.0, 1.0]])
+
+
+USUAL = matrix(1500.0, 1480.0, 4.0, 655.0, 500.0)
+
+
+def test_a_homography_of_exact_points_is_exact() -> None:
+    true = np.array([[1.2, -0.3, 40.0], [0.25, 1.1, 30.0], [4e-4, -3e-4, 1.0]])
+    there = homogeneous(GRID) @ true.T
+    for some in (slice(None), [0, 8, 22, 45, 53]):
+        found = homography(GRID[some], (there[:, :2] / there[:, 2:])[some])
+        np.testing.assert_allclose(found, true, rtol=1e-6, atol=1e-9)
+    np.testing.assert_array_equal(homogeneous(np.array([[2.0, 3.0]])), [[2.0, 3.0, 1.0]])
+
+
+def test_a_homography_is_normalised_before_noise_is_shared_out() -> None:
+    """Far from the origin, as pixels are, plain least squares of it would be off by pixels."""
+    pixels = seen(USUAL, POSES[0], noise=0.1)
+    there = homogeneous(GRID) @ homography(GRID, pixels).T
+    off = there[:, :2] / there[:, 2:] - seen(USUAL, POSES[0])
+    assert np.sqrt(np.mean(off**2)) < 0.1 * np.sqrt(8.0 / 108.0) * 1.5
+
+
+@pytest.mark.parametrize(
+    "true",
+    [
+        USUAL,
+        matrix(900.0, 1200.0, 0.0, 640.0, 512.0),
+        matrix(1200.0, 880.0, -80.0, 360.0, 800.0),
+    ],
+)
+def test_the_full_matrix_follows_from_three_planes_or_more(true: np.ndarray) -> None:
+    for count in (3, 4):
+        planes = [homography(GRID, seen(true, pose)) for pose in POSES[:count]]
+        np.testing.assert_allclose(
+            matrix_from_homographies(planes, WIDTH, HEIGHT), true, rtol=1e-6, atol=1e-4
+        )
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        matrix(1500.0, 1020.0, 0.0, 640.0, 512.0),  # rows half as long again as columns
+        matrix(1000.0, 1480.0, 0.0, 640.0, 512.0),
+        matrix(1500.0, 1500.0, 160.0, 640.0, 512.0),  # skew of a tenth
+        matrix(1500.0, 1500.0, 0.0, 1270.0, 512.0),  # a quarter of the width off the middle
+    ],
+)
+def test_what_no_camera_is_like_becomes_a_plain_one_about_the_middle(odd: np.ndarray) -> None:
+    planes = [homography(GRID, seen(odd, pose)) for pose in POSES]
+    found = matrix_from_homographies(planes, WIDTH, HEIGHT)
+    assert found[0, 0] == pytest.approx(found[1, 1])
+    np.testing.assert_allclose(found[:2, 2], [640.0, 512.0])
+    assert found[0, 1] == 0.0
+    assert 700.0 < found[0, 0] < 4000.0
+
+
+def test_a_plain_camera_about_the_middle_is_exact_if_that_is_what_there_is() -> None:
+    """Two planes leave the full form open; with noise that spoils it, the plain one is taken."""
+    true = matrix(1400.0, 1400.0, 0.0, 640.0, 512.0)
+    gentle = [posed(0.2, 0.0, 0.1), posed(0.2, 0.02, 0.4), posed(0.18, 0.0, 0.8)]
+    planes = [homography(GRID, seen(true, pose, noise=0.4)) for pose in gentle]
+    found = matrix_from_homographies(planes, WIDTH, HEIGHT)
+    assert np.all(np.isfinite(found))
+    assert found[2, 2] == pytest.approx(1.0)
+
+
+def test_planes_that_turn_by_less_than_three_degrees_are_one_plane() -> None:
+    for degrees, refused in ((2.5, True), (3.6, False)):
+        turned = [posed(0.3, 0.1, 0.0), posed(0.3 + np.radians(degrees), 0.1, 0.0, z=800.0)]
+        planes = [homography(GRID, seen(matrix(1536, 1536, 0, 640, 512), pose)) for pose in turned]
+        if refused:
+            with pytest.raises(DegeneratePoses, match="the 2 board poses differ by a translation"):
+                refuse_parallel(planes, WIDTH, HEIGHT)
+        else:
+            refuse_parallel(planes, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("pose", POSES)
+@pytest.mark.parametrize("plane_z", [0.0, 6.0])
+def test_a_planes_pose_follows_from_its_homography(pose: RigidTransform, plane_z: float) -> None:
+    on_face = RigidTransform(pose.rotation, pose.translation + plane_z * pose.rotation[:, 2])
+    plane = np.linalg.inv(USUAL) @ homography(GRID, seen(USUAL, on_face))
+    for scale in (1.0, -3.0):
+        found = camera_from_plane(scale * plane, plane_z)
+        np.testing.assert_allclose(found.matrix, pose.matrix, atol=1e-5)
+
+
+def test_a_projector_without_lens_is_found_from_its_stripes() -> None:
+    true = np.array([[3.0, 0.2, 0.9, 120.0], [0.1, -0.05, 1.0, 60.0]])
+    true /= np.linalg.norm(true[1, :3])
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-200, -200, 700], [200, 200, 1100], (400, 3))
+    above, below = (points @ true[:, :3].T + true[:, 3]).T
+    s = above / below
+    found = fit_pinhole(points, s)
+    np.testing.assert_allclose(found.matrix, true, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(found.stripe(points), s, rtol=1e-9)
+    assert below.min() > 0.0, "it shines forward"
+    # One in ten is off by 0.7: plainly they would pull the others by 0.07 in the mean.
+    wrong = s + np.where(np.arange(400) % 10 == 0, 0.7, 0.0) + 1e-4 * rng.normal(size=400)
+    assert np.mean(np.abs(fit_pinhole(points, wrong).stripe(points) - s)) < 0.035
+    planes = found.planes(4, "vertical")
+    normals = planes.coefficients[:, :3]
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    assert np.all(planes.coefficients[:, 3] >= 0.0)
+    on = found.matrix[0] - 2.0 * found.matrix[1]
+    cosine = np.abs(planes.coefficients[2] @ on) / np.linalg.norm(planes.coefficients[2])
+    assert cosine == pytest.approx(np.linalg.norm(on))
