@@ -147,3 +147,25 @@ def test_a_board_that_stands_elsewhere_is_measured_there() -> None:
     off = board_offsets(replace(data, points=nearer), fit.sheets)
     assert 0.25 < off[2] < 0.55
     assert np.abs(np.delete(off, 2)).max() < 0.05
+
+
+def test_disagreement_is_told_in_pixels_whatever_the_unit_of_length() -> None:
+    scene = chapter_scene()
+    parts = []
+    for number, pose in enumerate(CHAPTER_POSES):
+        data = scene.boundaries([scene.looking_at(*pose)], seed=number)
+        parts.append(replace(data, board=np.full_like(data.board, number)))
+    parts[1] = replace(parts[1], index=parts[1].index + 3)
+    data = concatenate(parts)
+
+    def told(data: BoundaryPoints) -> ProjectorMotion:
+        found = find_projector_motion(data, scene.projector.stripes, scene.direction)
+        assert found is not None
+        return found
+
+    usual = told(data)
+    metres = told(replace(data, points=1e-3 * data.points, per_pixel=1e-3 * data.per_pixel))
+    assert metres.together_px == pytest.approx(usual.together_px, rel=0.02)
+    # A camera of pixels half as large is off by twice as many.
+    fine = told(replace(data, per_pixel=0.5 * data.per_pixel))
+    assert fine.together_px == pytest.approx(2.0 * usual.together_px, rel=0.02)
