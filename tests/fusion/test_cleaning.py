@@ -9,8 +9,9 @@ import pytest
 from ray_cast_scan import Scan, load_rig
 
 from bodyscan.evaluation.surface import signed_distances
-from bodyscan.fusion.cleaning import clean, cut_to_volume, drop_flying_pixels, inside
+from bodyscan.fusion.cleaning import _inside, clean, cut_to_volume, drop_flying_pixels, inside
 from bodyscan.fusion.surface_check import check_surface
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.reconstruction.range_image import RangeImage
 
@@ -57,6 +58,20 @@ def test_inside_is_what_lies_in_the_cylinder(scan: Scan) -> None:
         found = inside(image, placing, volume)
         assert 0.05 < found.mean() < 0.95
         assert np.count_nonzero(found != expected) <= 2  # rounding, right at the boundary
+
+
+def test_however_a_camera_stands_the_cylinder_stands_upright() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-900, -900, 300], [900, 900, 2500], (60, 80, 3)).astype(np.float32)
+    sigma = np.where(rng.random((60, 80)) < 0.1, np.inf, 0.3).astype(np.float32)
+    place = RigidTransform.from_rotation_vector([1.4, 0.7, -0.6], [-700.0, 500.0, 1300.0])
+    within = np.zeros((60, 80), bool)
+    _inside(points, sigma, place.matrix[:3], (600.0, 200.0, 1700.0), within)
+    there = place.apply(points.astype(float))
+    true = (np.hypot(there[..., 0], there[..., 1]) < 600.0) & np.isfinite(sigma)
+    true &= (there[..., 2] > 200.0) & (there[..., 2] < 1700.0)
+    assert 0.02 < true.mean() < 0.5
+    np.testing.assert_array_equal(within, true)
 
 
 def test_pixels_stay_that_neighbours_agree_with() -> None:

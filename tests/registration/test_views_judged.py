@@ -17,7 +17,8 @@ from bodyscan.registration import consistent_solve
 from bodyscan.registration.consistent_solve import ConsistentSolve, solve_consistently
 from bodyscan.registration.inconsistent_views import _wrong_squares, error_limit
 from bodyscan.registration.joint_solve import JointSolution
-from bodyscan.registration.rig_lenses import lens_notes
+from bodyscan.registration.rig_lenses import _with_what_followed, lens_notes
+from bodyscan.registration.seen_corners import seen_corners
 
 BEFORE = RigidTransform.from_rotation_vector([0.0, 0.1, 0.0], [10.0, 0.0, 900.0])
 
@@ -144,3 +145,50 @@ def test_lenses_other_than_the_chapters_are_told_with_what_speaks_for_them() -> 
         "s: lens brown, by 3 standard errors: boards held out fit to 0.060 px with it, 0.061 with "
         "radial",
     ]
+
+
+def test_a_lens_taken_after_all_is_told_with_what_was_tried_after_it() -> None:
+    trials = (LensTrial("radial", 0.061, None, True), LensTrial("brown", 0.060, 2.9))
+    after = (
+        LensTrial("brown", 0.060, None), LensTrial("rational", 0.05, 7.0, True),
+        LensTrial("spline", 0.05, 1.0),
+    )  # fmt: skip
+
+    def told(kind: str, *tried: LensTrial) -> tuple[LensTrial, ...]:
+        fit = SimpleNamespace(camera=SimpleNamespace(lens=SimpleNamespace(kind=kind)))
+        again: Any = SimpleNamespace(fit=fit, trials=tried)
+        return _with_what_followed(trials, again)
+
+    first, second = LensTrial("radial", 0.061), LensTrial("brown", 0.060, 2.9)
+    assert told("rational", *after) == (first, second, after[1], after[2])
+    assert told("brown") == (first, LensTrial("brown", 0.060, 2.9, True))
+
+
+class PinholeOfOne:
+    """Focal length 1 px, origin in the middle."""
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        return np.asarray(points[:, :2] / points[:, 2:])
+
+
+def test_what_a_camera_saw_is_told_corner_by_corner_with_its_targets_number() -> None:
+    boards = {("s1", "b"): BEFORE, ("s0", "b"): BEFORE, ("s0", "a"): BEFORE}
+    one = RigidTransform.identity()
+    points = np.array([[0.0, 0.0, 0.0], [90.0, 0.0, 0.0], [0.0, 90.0, 0.0]])
+    there = PinholeOfOne().project(BEFORE.apply(points))
+    views = [
+        LocatedView("q", "s1", "b", points, there + 0.5, one),
+        LocatedView("p", "s0", "b", points[:2], there[:2] + [0.25, -0.5], one),
+        LocatedView("q", "s0", "a", points[:1], there[:1], one),
+    ]
+    placed: Any = SimpleNamespace(
+        rig_from_board=boards, views=views, cameras={"p": PinholeOfOne(), "q": PinholeOfOne()},
+        rig_from_camera={"p": one, "q": one, "r": one},
+    )  # fmt: skip
+    found = seen_corners(placed, ["q", "p", "r", "unplaced"])
+    assert list(found) == ["p", "q"], "r saw nothing"
+    assert found["p"].target.tolist() == [1, 1]  # of (s0, a), (s0, b), (s1, b)
+    assert found["q"].target.tolist() == [2, 2, 2, 0]
+    np.testing.assert_allclose(found["p"].residuals_px, [[-0.25, 0.5]] * 2, atol=1e-6)
+    np.testing.assert_allclose(found["q"].pixels[:3], there + 0.5, rtol=1e-6)
+    np.testing.assert_allclose(found["q"].residuals_px[3], 0.0, atol=1e-6)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
 from bodyscan.errors import FailedWork
-from bodyscan.workflows.check_rig import Findings, _of_boards
+from bodyscan.workflows.check_rig import Findings, _named_apart, _of_boards
 
 CALIBRATION: Any = SimpleNamespace(
     pairs={
@@ -72,3 +73,28 @@ def test_what_was_not_checked_is_named() -> None:
         "not checked, for nobody shares their board: t",
         "note: dim",
     )
+
+
+@dataclass(frozen=True)
+class Sequence:
+    shot: str
+
+
+@dataclass(frozen=True)
+class Folder:
+    shots: tuple[str, ...]
+    sequences: tuple[Sequence, ...]
+
+
+def test_shots_of_several_folders_are_told_apart_by_their_folders_number() -> None:
+    one = Folder(("a", "b"), (Sequence("a"), Sequence("b"), Sequence("b")))
+    other = Folder(("a",), (Sequence("a"),))
+
+    def named(*folders: Folder) -> list[Any]:
+        return list(_named_apart(cast(Any, folders)))
+
+    assert named(one) == [one]
+    assert named(one, other) == [
+        Folder(("1/a", "1/b"), (Sequence("1/a"), Sequence("1/b"), Sequence("1/b"))),
+        Folder(("2/a",), (Sequence("2/a"),)),
+    ]
