@@ -17,7 +17,7 @@ from bodyscan.mesh.bricks import SIDE, Bricks
 from bodyscan.mesh.regions import regions_at
 from bodyscan.mesh.repair import largest_piece
 from bodyscan.mesh.surface_nets import surface_nets
-from bodyscan.mesh.topology import topology, vertex_normals
+from bodyscan.mesh.topology import closed_and_manifold, topology, vertex_normals
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import MeshSettings
@@ -68,8 +68,8 @@ def closed_surface(
         raise ScanFailed("no surface came out of the cloud: its points contradict each other")
     some = cloud.points[:: -(-len(cloud.points) // TELLING)]
     vertices, faces = largest_piece(vertices, faces, some)
-    found = topology(vertices, faces)
-    if not found.manifold:
+    if not closed_and_manifold(faces, len(vertices))[1]:
+        found = topology(vertices, faces)
         raise ScanFailed(f"no closed surface came out of the cloud ({found})")
     return vertices, faces
 

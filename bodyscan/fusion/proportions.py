@@ -15,7 +15,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.slices import Loop, loops_at
+from bodyscan.mesh.slices import Loop, height_ranges, loops_at
 from bodyscan.verdict import Grade
 
 STEP = 1.0 / 54.0
@@ -112,8 +112,7 @@ def _extents(mesh: BodyMesh) -> tuple[float, float]:
 
 
 def _sections(mesh: BodyMesh, top: float) -> Iterator[_Section]:
-    heights = mesh.vertices[mesh.faces, 2]
-    low, high = heights.min(axis=1), heights.max(axis=1)
+    low, high = height_ranges(mesh.vertices, mesh.faces)
     for share in np.arange(LOW, HIGH, STEP).tolist():
         level = share * top
         near = (low < level) & (high >= level)

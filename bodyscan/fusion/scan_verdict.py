@@ -19,7 +19,7 @@ from bodyscan.fusion.seams import SeamReport, find_misfits
 from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.rings import rings
-from bodyscan.mesh.slices import loops_at
+from bodyscan.mesh.slices import height_ranges, loops_at
 from bodyscan.optional import optional
 from bodyscan.reconstruction.two_ways import Agreement
 from bodyscan.registration.board_checks import OTHER_SIZE, REFUSED_SIZE
@@ -401,8 +401,7 @@ def _limbs(mesh: BodyMesh) -> Iterator[Finding]:
     """More trunks, legs or arms side by side than one person has, whatever touches, and what stands
     beside the legs of one who stands."""
     top = float(mesh.vertices[:, 2].max())
-    heights = mesh.vertices[mesh.faces, 2]
-    low, high = heights.min(axis=1), heights.max(axis=1)
+    low, high = height_ranges(mesh.vertices, mesh.faces)
     doubled, many, beside = [], [], []
     for share in LEVELS:
         level = share * top

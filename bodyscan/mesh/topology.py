@@ -32,17 +32,23 @@ def topology(vertices: Array, faces: Indices) -> Topology:
     """Of a mesh with vertices (V, 3) and faces (F, 3); unused vertices do not count."""
     used = used_vertices(faces, len(vertices))
     count = len(vertices)
-    twin = twins(faces, count)
-    closed = bool(faces.size) and bool((twin >= 0).all())
+    closed, manifold = closed_and_manifold(faces, count)
     edge_count = 3 * len(faces) // 2 if closed else len(np.unique(_edge_keys(faces, count)))
     labels = face_components(faces, count)
     return Topology(
         closed,
-        closed and corner_fans(twin)[1] == used.size,
+        manifold,
         int(labels.max() + 1) if labels.size else 0,
         int(used.size - edge_count + len(faces)),
         signed_volume(vertices, faces),
     )
+
+
+def closed_and_manifold(faces: Indices, vertex_count: int) -> tuple[bool, bool]:
+    """What `Topology` says of faces (F, 3), without the rest of it."""
+    twin = twins(faces, vertex_count)
+    closed = bool(faces.size) and bool((twin >= 0).all())
+    return closed, closed and corner_fans(twin)[1] == used_vertices(faces, vertex_count).size
 
 
 def _edge_keys(faces: Indices, vertex_count: int) -> Indices:

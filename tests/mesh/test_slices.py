@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from made_bodies import arrays, cylinder, ellipsoid, together
 from scipy.special import ellipe
 
-from bodyscan.mesh.slices import loops_at
+from bodyscan.mesh.slices import height_ranges, loops_at
 
 
 @pytest.mark.parametrize("height", [55.0, 100.0, 123.4])  # 100 lies on a ring of vertices
@@ -73,3 +73,11 @@ def test_what_is_made_up_is_told() -> None:
 def test_a_plane_beside_the_body_cuts_nothing() -> None:
     assert loops_at(*ELLIPSOID, 251.0) == ()
     assert loops_at(*ELLIPSOID, -251.0) == ()
+
+
+def test_ranges_of_heights_are_those_of_each_faces_corners() -> None:
+    rng = np.random.default_rng(5)
+    vertices, faces = rng.normal(size=(40, 3)), rng.integers(0, 40, (90, 3))
+    low, high = height_ranges(vertices, faces)
+    assert low.tolist() == [min(vertices[face, 2]) for face in faces]
+    assert high.tolist() == [max(vertices[face, 2]) for face in faces]
