@@ -17,6 +17,7 @@ from bodyscan.registration.rig_frame import (
     rig_from_root,
 )
 from bodyscan.registration.view_graph import RelativePose
+from bodyscan.rig.board import Board
 from bodyscan.rig.pair import NominalPose
 from bodyscan.rig.rig import Rig
 
@@ -138,6 +139,21 @@ def test_of_all_readings_of_a_plain_board_the_one_that_puts_cameras_where_they_s
             assert found_at[2] == pytest.approx(place[2], abs=5.1)
 
 
+def test_a_plain_board_reads_alike_from_its_ends_and_faces_where_its_print_does() -> None:
+    def readings(columns: int, faces: int) -> list[np.ndarray]:
+        keys = {**PLAIN, "columns": columns, "faces": faces, "thickness_mm": 5.0 * (faces - 1)}
+        places = np.array([[40.0, 80.0, 0.0], [0.0, 0.0, 0.0]])
+        return [turn.apply(places) for turn in board_symmetries(Board.model_validate(keys))]
+
+    itself = np.array([[40.0, 80.0, 0.0], [0.0, 0.0, 0.0]])
+    turned = np.array([[280.0, 160.0, 0.0], [320.0, 240.0, 0.0]])
+    np.testing.assert_allclose(readings(8, 1), [itself, turned])
+    np.testing.assert_allclose(readings(7, 1), [itself])
+    over = np.array([[240.0, 80.0, 5.0], [280.0, 0.0, 5.0]])
+    np.testing.assert_allclose(readings(7, 2), [itself, over])
+    assert len(readings(8, 2)) == 4
+
+
 def test_a_board_that_tells_its_ends_is_left_as_it_was_read() -> None:
     marked = {**PLAIN, "kind": "charuco", "marker_mm": 30}
     found = frame_board_turn(rig({"shot": "s1"}, marked), {}, {("s1", "b"): SOMEWHERE})
@@ -173,6 +189,12 @@ def test_most_boards_or_three_that_no_two_contradict_decide(
 
 
 def test_decided_ties_come_first_then_clear_ones_then_those_with_most_corners() -> None:
-    order = [tie(1, 1, 1, 99), tie(1, 0, 1, 99), tie(3, 1, 3, 40), tie(5, 0, 5, 41)]
-    shuffled = [order[k] for k in (2, 0, 3, 1)]
+    order = [
+        tie(1, 1, 1, 99),
+        tie(2, 1, 3, 90),
+        tie(1, 0, 1, 99),
+        tie(3, 1, 3, 40),
+        tie(5, 0, 5, 41),
+    ]
+    shuffled = [order[k] for k in (2, 4, 0, 3, 1)]
     assert sorted(shuffled, key=lambda one: one.strength) == order

@@ -41,7 +41,7 @@ def test_s_is_exact_whatever_the_blur(blur: float) -> None:
     assert np.sqrt(np.mean(off(found)[known] ** 2)) < 0.01
 
 
-@pytest.mark.parametrize(("noise", "ramp"), [(1.5, 0.0), (0.7, 0.03)])
+@pytest.mark.parametrize(("noise", "ramp"), [(1.5, 0.0), (3.5, 0.0), (0.7, 0.03)])
 def test_its_sigma_is_how_far_noise_puts_it_off(noise: float, ramp: float) -> None:
     found = swept(0.6, noise, ramp=ramp)
     known = np.isfinite(off(found))

@@ -162,6 +162,8 @@ def test_a_missing_image_is_named() -> None:
     # Seen by one in ten of those that see its neighbours, it is there: they lie at a rim.
     few = np.vstack([without[:27, :44], shown_in_order()[:4, :44]])
     check(few)
+    # Seen by one in twenty it is there as well.
+    check(np.vstack([np.tile(without[0], (40, 1)), shown_in_order(lines=1)[:, :44]]))
     # In fewer than 20 lines nothing is said.
     check(without[:19])
 
