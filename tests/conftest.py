@@ -19,6 +19,8 @@ from processor_seconds import ProcessorSeconds
 from required import IN_CI, missing
 from slow_files import SLOW
 
+from bodyscan.memory import keep_freed_memory
+
 # What is heavy is imported where it is used: the process that hands tests out reads this file as well,
 # before any worker begins.
 if TYPE_CHECKING:
@@ -50,7 +52,9 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
     """What is imported and collected stays: looking through it for garbage is a third of the start,
-    in every worker, and goes on in every test."""
+    in every worker, and goes on in every test. Freed memory stays as well, as in commands: fetching it
+    again is a twentieth of what tests with images take."""
+    keep_freed_memory()
     gc.disable()
     try:
         return (yield)
