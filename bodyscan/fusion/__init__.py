@@ -4,5 +4,6 @@ Read in this order: scan (all of it), cleaning (what is not the subject goes), m
 with quadratics and robust_windows; thinning; evidence; brightness; averaging), pose_variance (what
 the rig adds to each point's sigma), regions and roughness (skin, hair, cloth), meshing
 (signed_distances, hole_filling with harmonic_filling and free_space, support with point_columns;
-surface_check), scan_verdict (is it good: contradictions, seams, proportions), storage, scan_facts.
+surface_check), scan_verdict (is it good: contradictions, seams, proportions, floor), storage,
+scan_facts.
 """

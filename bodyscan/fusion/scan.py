@@ -17,6 +17,7 @@ from bodyscan.alignment.oblique_light import LightLine, ObliqueLight, take_out
 from bodyscan.alignment.sway_prior import SwayPrior, centre_sigmas
 from bodyscan.alignment.together import Together, bring_together
 from bodyscan.fusion.cleaning import clean, require_subject
+from bodyscan.fusion.floor import find_floor
 from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import attach_attributes, closed_surface
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
@@ -137,12 +138,19 @@ def fuse(
             size=together.size if together else None,
             search=together.search if together else None,
             boards_mm=centre_sigmas(calibration.covariance),
+            floor_mm=floor,
             silent=_silent(
                 calibration.rig.poles, [*points, *failed], [image.pair for image in seen]
             ),
         )
 
     with step(progress, "judging"):
+        moved = {name for one in together.shifted for name in one.pairs} if together else set()
+        floor = find_floor(
+            [image for image in images if image.pair not in moved],
+            calibration.rig_from_camera,
+            calibration.rig.volume,
+        )
         seams = judge_seams(seen, there, calibration.rig.poles)
         announce(graded(None, None), final=False)
 

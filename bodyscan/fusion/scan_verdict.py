@@ -47,6 +47,8 @@ CAMERA_MM, TURNED_DEG, STAYED = 1000.0, 5.0, 0.25
 """A pole that is bumped turns about its foot, and its view of the body goes along: where the body's
 middle stays within a quarter of that, and the turn is no bump's, it was the body that turned. Few
 cameras stand nearer to it than this."""
+FLOOR_MM = 4.0
+"""What ISO 20685-1 allows a stature, for all errors together; floors are flat to 2 mm over a metre."""
 CELL_MM = 50.0
 SIDE_BY_SIDE = 0.4  # of the taller one's height
 SMALL_PIECE = 0.01
@@ -103,6 +105,7 @@ def grade_scan(
     search: StepSearch | None = None,
     boards_mm: Mapping[str, float] | None = None,
     silent: Sequence[str] = (),
+    floor_mm: float | None = None,
 ) -> Verdict:
     """The worst of all findings decides; the reasons come worst first. mesh: None while there is none
     yet: what it alone would show is left out. use: how wrong a girth may be. seams: see
@@ -118,6 +121,7 @@ def grade_scan(
     search: what the pairs' motions are besides.
     boards_mm: how exactly each pair's place is known, see `centre_sigmas`.
     silent: poles of which no pair saw anybody.
+    floor_mm: at which height the floor is seen, see `find_floor`.
 
     A check that fails by itself leaves the scan usable at best, and says so.
     """
@@ -133,6 +137,7 @@ def grade_scan(
         "seams": lambda: _seams(seams, use),
         "poles": lambda: _shifted(shifted),
         "size": lambda: _size(size, use),
+        "floor": lambda: _floor(floor_mm, moved=bool(shifted)),
         "places": lambda: _own_places(search, use, boards_mm or {}),
         "disagreement": lambda: _disagreement(alignment),
         "motion": lambda: _motion(
@@ -271,6 +276,18 @@ def _size(size: SizeStep | None, use: UseLimits) -> Iterator[Finding]:
         f"all poles stand {abs(size.out_mm):.1f} mm (known to {size.sigma_mm:.1f}) {where} the body "
         f"than the calibration has them, as no person moves: girths would be {costs:.0f} mm too "
         f"{wrong}, and now nothing but overlaps holds the body's size; calibrate again",
+    )
+
+
+def _floor(height_mm: float | None, *, moved: bool) -> Iterator[Finding]:
+    """moved: whether poles were brought to the others: then it may be the others that moved."""
+    if height_mm is None or abs(height_mm) <= FLOOR_MM:
+        return
+    yield (
+        "repeat" if moved else "usable",
+        f"the floor is seen at {height_mm:.0f} mm, heights are counted from 0: a stature is wrong by "
+        "as much, and a girth is another height's; were poles lifted or lowered since the calibration, "
+        "is `rig_frame` that of this floor, does the person stand on something?",
     )
 
 

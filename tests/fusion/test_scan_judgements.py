@@ -195,6 +195,35 @@ def test_cameras_that_do_not_stand_where_they_should_make_the_size_doubtful(
     assert ("times as far apart" in str(verdict)) == (grade != "good")
 
 
+@pytest.mark.parametrize(
+    ("floor_mm", "moved", "grade"),
+    [
+        (3.9, False, "good"),
+        (-3.9, False, "good"),
+        (4.1, False, "usable"),
+        (-4.1, False, "usable"),
+        (3.9, True, "usable"),
+        (4.1, True, "repeat"),
+    ],
+)
+def test_heights_are_counted_from_the_floor(
+    scan: MadeScan, floor_mm: float, moved: bool, grade: str
+) -> None:
+    """Two poles lifted and one lowered by 16 mm: it was brought to the others, and all was as high."""
+    step = PoleStep("pole p1", frozenset({"p1-1", "p1-2"}), 3.0, 0.1)
+    verdict = grade_scan(
+        scan.cloud,
+        scan.mesh,
+        aligned(),
+        {},
+        Volume(),
+        UseLimits(),
+        shifted=[step] if moved else [],
+        floor_mm=floor_mm,
+    )
+    assert verdict.grade == grade
+
+
 def test_two_poles_that_moved_leave_nothing_to_hold_the_size(scan: MadeScan) -> None:
     steps = [PoleStep(f"pole p{k}", frozenset({f"p{k}-1", f"p{k}-2"}), 3.0, 0.1) for k in (1, 2)]
     verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=steps)

@@ -14,6 +14,7 @@ from ray_cast_scan import Truth, cast_scan, load_body, load_rig, nominal_placing
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import ScanFailed
 from bodyscan.fusion.cleaning import apply_mask
+from bodyscan.fusion.floor import find_floor
 from bodyscan.fusion.meshing import closed_surface
 from bodyscan.fusion.scan import Scan, fuse
 from bodyscan.geometry.pose_covariance import PoseCovariance
@@ -182,13 +183,40 @@ def spaced(factor: float) -> Rig:
     return RIG.model_copy(update={"pairs": tuple(pairs)})
 
 
-def test_a_failed_pair_is_named_and_so_is_a_doubtful_size(images: list[RangeImage]) -> None:
+def lifted(z_mm: float) -> dict[str, RigidTransform]:
+    """All cameras, and with them whatever they see."""
+    return {
+        n: RigidTransform(at.rotation, at.translation + [0, 0, z_mm])
+        for n, at in placings().items()
+    }
+
+
+@pytest.mark.parametrize("z_mm", [-20.0, 0.0, 30.0])
+def test_the_floor_is_found_where_it_is(images: list[RangeImage], z_mm: float) -> None:
+    found = find_floor(images, lifted(z_mm), RIG.volume)
+    assert found == pytest.approx(z_mm, abs=0.02)  # medians of thousands of points, 0.1 mm each
+
+
+def test_who_sees_no_floor_says_so(images: list[RangeImage]) -> None:
+    high = [image for image in images if not image.pair.endswith("-1")]
+    assert find_floor(high, placings(), RIG.volume) is None
+    one = [image for image in images if image.pair in ("p1-1", "p1-2")]
+    assert find_floor(one, placings(), RIG.volume) is None
+    assert find_floor(images, lifted(200.0), RIG.volume) is None  # something to stand on
+
+
+def test_a_failed_pair_is_named_and_so_are_a_doubtful_size_and_floor(
+    images: list[RangeImage],
+) -> None:
     without_one = [image for image in images if image.pair != "p2-3"]
     failed = {"p2-3": "bit03.png is missing"}
-    scan = fused(without_one, failed=failed, rig=spaced(0.96), settings=NOT_FOLLOWED)
+    scan = fused(
+        without_one, failed=failed, placed=lifted(-8.0), rig=spaced(0.96), settings=NOT_FOLLOWED
+    )
     assert scan.verdict.grade == "usable"
     assert "p2-3: bit03.png is missing" in said(scan)
     assert "1.042 times as far apart as their nominal poses" in said(scan)
+    assert "the floor is seen at -8 mm" in said(scan)
 
 
 def test_half_the_pairs_give_half_a_body(images: list[RangeImage]) -> None:
