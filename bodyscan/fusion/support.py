@@ -14,6 +14,7 @@ from bodyscan.arrays import Array, Floats, Indices, Mask
 from bodyscan.compiled import compiled
 from bodyscan.fusion.point_columns import PointColumns
 from bodyscan.mesh.body import BodyCloud
+from bodyscan.mesh.topology import face_normals
 
 NEIGHBOURS = 8
 # Shares of the reach: 2, 1 and 0.5 mm of 4.
@@ -85,7 +86,8 @@ def fit_to_points(vertices: Array, faces: Indices, normals: Floats, around: Supp
     concerned = np.arange(len(faces))
     for share in (0.5, 0.5, 0.0):
         some = faces[concerned]
-        before, after = _normals(vertices, some), _normals(vertices + move[:, None] * normals, some)
+        moved = vertices + move[:, None] * normals
+        before, after = face_normals(vertices, some), face_normals(moved, some)
         cosine = np.einsum("fc,fc->f", before, after)
         lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
         folded = np.unique(some[cosine < STEEPEST_TURN * lengths])
@@ -94,12 +96,6 @@ def fit_to_points(vertices: Array, faces: Indices, normals: Floats, around: Supp
         touched[folded] = True
         concerned = np.flatnonzero(touched[faces].any(axis=1))
     return vertices + move[:, None] * normals
-
-
-def _normals(vertices: Array, faces: Indices) -> Array:
-    """(F, 3) normals of faces, as long as twice their areas."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return np.cross(b - a, c - a)
 
 
 @compiled

@@ -14,6 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from bodyscan.arrays import Array, Floats, Indices
+from bodyscan.compiled import compiled
 from bodyscan.mesh.half_edges import corner_fans, twins
 
 
@@ -83,14 +84,29 @@ def signed_volume(vertices: Array, faces: Indices) -> float:
 
 def face_areas(vertices: Array, faces: Indices) -> Array:
     """(F,) mm2."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return 0.5 * np.linalg.norm(face_normals(vertices, faces), axis=1)
+
+
+def face_normals(vertices: Array, faces: Indices) -> Array:
+    """(F, 3) normals of faces (F, 3), as long as twice their areas."""
+    found = np.empty((len(faces), 3))
+    _cross(np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int64), found)
+    return found
+
+
+@compiled
+def _cross(vertices: Array, faces: Indices, found: Array) -> None:
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            found[f, k] = (vertices[b, i] - vertices[a, i]) * (vertices[c, j] - vertices[a, j])
+            found[f, k] -= (vertices[b, j] - vertices[a, j]) * (vertices[c, i] - vertices[a, i])
 
 
 def vertex_normals(vertices: Array, faces: Indices) -> Floats:
     """(V, 3) unit normals, the mean of the faces around weighted by area."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
+    cross = face_normals(vertices, faces)
     total = np.stack(
         [
             np.bincount(faces.ravel(), np.repeat(cross[:, k], 3), minlength=len(vertices))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from bodyscan.mesh.topology import (
     drop_unused_vertices,
     face_components,
+    face_normals,
     signed_volume,
     topology,
     vertex_normals,
@@ -102,6 +103,13 @@ def test_normals_of_a_sphere_point_outward() -> None:
     vertices, faces = arrays(o3d.geometry.TriangleMesh.create_sphere(10.0, resolution=40))
     cosine = np.sum(vertex_normals(vertices, faces) * vertices, axis=1) / 10.0
     assert cosine.min() > 0.998  # facets of 4.5 degrees
+
+
+def test_normals_of_faces_are_the_cross_products_of_their_edges() -> None:
+    rng = np.random.default_rng(4)
+    vertices, faces = rng.normal(size=(30, 3)), rng.integers(0, 30, (80, 3))
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    np.testing.assert_array_equal(face_normals(vertices, faces), np.cross(b - a, c - a))
 
 
 def test_unused_vertices_are_dropped() -> None:
