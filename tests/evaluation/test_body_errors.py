@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_fields import to_fields
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.mesh.topology import vertex_normals
 
 CAMERA = Camera(300.0, 300.0, 0.0, 160.0, 128.0, Radial(), 320, 256)
@@ -33,6 +34,16 @@ def test_a_body_half_a_millimetre_too_thick() -> None:
     assert found.rms_mm == pytest.approx(2 * np.pi * 0.5, rel=1e-2)
     assert found.worst_mm == pytest.approx(found.rms_mm, rel=1e-3)
     assert found.stature_mm == pytest.approx(1.0)
+
+
+def test_breath_stays_in_unless_the_truth_is_at_mean_breath() -> None:
+    vertices, faces = column(150.0)
+    body = mesh_of(vertices, faces)
+    inside = np.full(len(vertices), 0.5, np.float32)
+    breathing = replace(body, breath=BreathAt(inside, np.full_like(inside, 0.1)))
+    assert girth_errors(breathing, vertices, faces).rms_mm < 0.01
+    at_mean = girth_errors(breathing, vertices, faces, mean_breath=True)
+    assert at_mean.rms_mm == pytest.approx(2 * np.pi * 0.5, rel=2e-2)
 
 
 def test_what_was_filled_is_not_judged() -> None:
