@@ -67,11 +67,6 @@ def rms(values: Array) -> float:
 
 
 @pytest.fixture(scope="module")
-def standing() -> LivingScan:
-    return cast_living(load_rig("four-pole-16"), STANDING, seed=2, scale=SCALE)
-
-
-@pytest.fixture(scope="module")
 def found(standing: LivingScan) -> tuple[Alignment, Alignment, Followed | None]:
     return together(standing)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from living_body import STANDING, LivingScan, cast_living
+from living_body import LivingScan
 from ray_cast_scan import load_rig
 
 from bodyscan.alignment.icp import align
@@ -18,12 +18,6 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.settings import AlignmentSettings
 
 RIG = load_rig("four-pole-16")
-SCALE = 0.25  # pixels of 4 mm
-
-
-@pytest.fixture(scope="module")
-def standing() -> LivingScan:
-    return cast_living(RIG, STANDING, seed=2, scale=SCALE)
 
 
 @pytest.fixture(scope="module")
