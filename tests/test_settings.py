@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import doctest
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -30,13 +31,19 @@ def test_the_examples_run() -> None:
     assert doctest.testmod(settings).failed == 0
 
 
+@lru_cache
+def trees() -> dict[Path, ast.Module]:
+    """The package's files as they are parsed."""
+    return {path: ast.parse(path.read_text("utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
+
+
 def test_no_default_is_stated_twice() -> None:
     """A parameter or field that has a setting's name takes its value from there."""
     found = [
         f"{path}:{line}: {name} = {value!r}"
-        for path in sorted(PACKAGE.rglob("*.py"))
+        for path, tree in trees().items()
         if path.relative_to(PACKAGE).parts[0] in ROOMS
-        for line, name, value in defaults(ast.parse(path.read_text("utf-8")))
+        for line, name, value in defaults(tree)
         if name in NAMES and value not in NEUTRAL
     ]
     assert not found, "\n".join(found)
@@ -54,8 +61,8 @@ def test_beside_every_value_stand_its_unit_and_its_meaning(name: str) -> None:
 def test_how_many_threads_is_said_once() -> None:
     found = [
         f"{path}:{line}"
-        for path in sorted(PACKAGE.rglob("*.py"))
-        for line, name, value in defaults(ast.parse(path.read_text("utf-8")))
+        for path, tree in trees().items()
+        for line, name, value in defaults(tree)
         if name == "workers" and value == THREADS
     ]
     assert not found
