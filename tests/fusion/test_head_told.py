@@ -10,8 +10,9 @@ from bodyscan.fusion.regions import HEAD_WIDE, _head
 
 def test_a_head_is_above_the_neck_and_near_the_middle_of_the_upper_body() -> None:
     z = np.linspace(0.0, 1700.0, 1701)
-    # Feet far ahead, which say nothing of where the upper body is.
     points = np.column_stack([np.where(z < 840.0, 600.0, 50.0), np.full(1701, -30.0), z])
+    # Most of what is seen are legs far ahead, which say nothing of where the upper body is.
+    points = np.vstack([points, points[:840], points[:840]])
     wide, neck = HEAD_WIDE * 1700.0, NECK * 1700.0
     places = np.array(
         [
