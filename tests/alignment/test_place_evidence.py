@@ -79,7 +79,7 @@ def test_one_pair_that_moved_is_named_and_not_its_pole(pair: str) -> None:
     for seed in range(5):
         found = off(of_pair(pair, [5.0, 0.0, 0.0]), seed)
         assert isinstance(found, PoleStep)
-        assert (found.name, found.pairs) == (f"pair {pair}", {pair})
+        assert (found.name, found.pairs) == (f"pair {pair}", frozenset({pair}))
         assert found.shift_mm == pytest.approx(5.0, abs=1.0)  # three of its sigmas
 
 
