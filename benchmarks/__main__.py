@@ -115,7 +115,8 @@ def _aged(section: str) -> str:
     elif since in ("", "0"):
         parts = [title, rest]
     else:
-        said = f"**Older than the code**: {since} commits have changed it since."
+        commits = "1 commit has" if since == "1" else f"{since} commits have"
+        said = f"**Older than the code**: {commits} changed it since."
         parts = [title, origin[0], said, rest.replace(origin[0], "", 1)]
     return "\n\n".join(part.strip() for part in parts)
 

@@ -11,6 +11,15 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
+
+from benchmarks.people import of_arms
+from bodyscan.evaluation.comparison import fit_to_surface
+from bodyscan.evaluation.surface import signed_distances
+from bodyscan.fusion.storage import load_scan
+from bodyscan.geometry.robust import rms
+from bodyscan.simulation.living import body_of
+
 PROJECT = Path(__file__).parents[1]
 WORKSPACE = PROJECT / "bench" / "three-pole-12"
 
@@ -43,12 +52,25 @@ scan stands for.
 
 ```
 {_against_truth(outputs)}
+{_by_parts(workspace)}
 ```
 
 ```
 {outputs["scan"].strip()}
 ```
 """
+
+
+def _by_parts(workspace: Path) -> str:
+    stored, body = load_scan(workspace / "scan"), body_of(workspace / "truth")
+    assert body
+    surface = body.vertices(stored.facts["person"]["moment_ms"]), np.asarray(body.rest.triangles)
+    points = fit_to_surface(stored.cloud.points, *surface).apply(stored.cloud.points)
+    errors, arms = signed_distances(points, *surface), of_arms(points, surface[0], body)
+    return (
+        f"  of the cloud            arms RMS {rms(errors[arms]):.3f}, trunk, legs and head "
+        f"{rms(errors[~arms]):.3f} mm"
+    )
 
 
 def _report(title: str, rig: str, subject: str) -> str:

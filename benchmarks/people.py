@@ -21,6 +21,7 @@ from bodyscan.measurement.measurements import Measurements, measure
 from bodyscan.outcome import Outcome
 from bodyscan.progress import THREADS
 from bodyscan.settings import ScanSettings
+from bodyscan.simulation.living import LivingBody
 
 WOMAN, MAN = "woman_average", "man_average"
 THREE, FOUR = "three-pole-12", "four-pole-16"
@@ -101,9 +102,13 @@ def scan_person(job: Job) -> Found:
     true = true_girths(cast.vertices(breathing=False), faces)
     ours = measure(scan.mesh, [one.height_mm for one in true.slices])
     over = errors / scan.cloud.sigma_mm
-    nearest = cKDTree(vertices).query(points)[1]
-    arms = (cast.body.arms_share > MOSTLY)[nearest]
+    arms = of_arms(points, vertices, cast.body)
     return Found(errors, over, arms, _tapes(ours), _tapes(true), scan.verdict.grade)
+
+
+def of_arms(points: Array, vertices: Array, body: LivingBody) -> Mask:
+    """(N,) whether points (N, 3) lie on an arm.  vertices: the body's, where it was then."""
+    return np.asarray((body.arms_share > MOSTLY)[cKDTree(vertices).query(points)[1]])
 
 
 def _tapes(measured: Measurements) -> dict[int, float]:
