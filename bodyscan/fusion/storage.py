@@ -117,6 +117,7 @@ def save_scan(scan: Scan, folder: Path, origin: Origin) -> Path:
                 "filled_faces": int(np.count_nonzero(scan.mesh.filled)),
                 "filled_share": scan.mesh.filled_share,
             },
+            "stature_mm": _number(float(scan.mesh.vertices[:, 2].max())),
             "median_sigma_mm": _number(float(np.nanmedian(scan.cloud.sigma_mm))),
             "regions": None if scan.cloud.regions is None else shares(scan.cloud.regions),
             "verdict": asdict(scan.verdict),

@@ -119,6 +119,7 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
     """
     from bodyscan.jobs.summary import (
         drifted,
+        odd_stature,
         to_repeat,
         write_out_manifest,
         write_summary,
@@ -144,5 +145,6 @@ def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dic
         "set_aside": aside,
         "repeat": to_repeat(done),
         "drifted": {one.pair: round(one.shift_mm, 2) for one in drifted(done)},
+        "odd_stature_mm": odd_stature(done),
         "table": str(table),
     }

@@ -96,6 +96,7 @@ class _Screen:
         said += f", {aside} set aside" if aside else ""
         said += f"\nto be scanned again: {', '.join(event['repeat'])}" if event["repeat"] else ""
         said += _drift_text(event["drifted"])
+        said += _stature_text(event["odd_stature_mm"])
         self._bars.console.print(Text(f"{said}\ntable: {event['table']}"), soft_wrap=True)
 
     def _progress(self, event: dict[str, Any]) -> None:
@@ -151,6 +152,15 @@ def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _stature_text(median_mm: float | None) -> str:
+    if median_mm is None:
+        return ""
+    return (
+        f"\nthe median person of these scans is {median_mm:.0f} mm tall, as no nation's grown-ups are: "
+        "unless they are children, is square_mm right in the rig file, is the floor where z = 0 is?"
+    )
 
 
 def _drift_text(drifted: dict[str, float]) -> str:

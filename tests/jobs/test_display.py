@@ -24,7 +24,8 @@ EVENTS: list[dict[str, Any]] = [
     {"event": "job", "job": "[red]a", "state": "set aside", "attempts": 2, "stages": ["scan"],
      "seconds": 9.0, "reason": "[/bold] broken"},
     {"event": "summary", "jobs": 2, "done": 1, "ran": 0, "set_aside": ["[red]a"], "repeat": ["b"],
-     "drifted": {"p1-4": 1.31, "p2-1": 0.9}, "table": "out/summary.csv"},
+     "drifted": {"p1-4": 1.31, "p2-1": 0.9},
+     "odd_stature_mm": 1410.2, "table": "out/summary.csv"},
 ]  # fmt: skip
 
 
@@ -38,6 +39,7 @@ def test_people_are_told_what_happened(capsys: pytest.CaptureFixture[str]) -> No
     assert "1 of 2 jobs done (0 of them now), 1 set aside" in said
     assert "to be scanned again: b" in said
     assert "out/summary.csv" in said
+    assert "the median person of these scans is 1410 mm tall" in said
     assert "every scan moves pair p1-4 by 1.3 mm the same way, 1 more likewise" in said
 
 
