@@ -89,13 +89,13 @@ def find_off(
     sides = [poles.get(name, name) for name in seen.names]
     if len(set(sides)) < 2 or not set(seen.names) - set(freed):
         return None
-    ways = {side: _ways(np.equal(sides, side)) for side in dict.fromkeys(sides)}
     found: list[tuple[float, PoleStep | SizeStep]] = []
     for name, pairs in _moving_alone(seen.names, poles).items():
         if pairs.isdisjoint(freed):
             told = seen.of_steps(_ways(np.isin(seen.names, list(pairs))))
             found.append((told.gain, _step(name, pairs, told.steps)))
     if not freed:
+        ways = {side: _ways(np.equal(sides, side)) for side in dict.fromkeys(sides)}
         each = seen.of_steps(np.hstack(list(ways.values())))
         apart = each.steps.reshape(-1, 6) - each.steps.reshape(-1, 6).mean(axis=0)
         farthest = int(np.argmax(np.linalg.norm(apart, axis=1)))

@@ -36,7 +36,7 @@ def find_floor(
 
 def _level(image: RangeImage, at: RigidTransform, volume: Volume) -> Array:
     """(N,) heights of what faces upwards near z = 0."""
-    some = (slice(None, None, EVERY_PX), slice(None, None, EVERY_PX))
+    some = image.every(EVERY_PX)
     kept = image.valid[some]
     points = at.apply(image.points[some][kept].astype(np.float64))
     up = image.normals[some][kept].astype(np.float64) @ at.rotation[2]
