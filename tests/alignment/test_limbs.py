@@ -9,9 +9,12 @@ import pytest
 from scipy import sparse
 
 from bodyscan.alignment.body_cells import BodyCells
-from bodyscan.alignment.breath import breathing
+from bodyscan.alignment.body_parts import tell_breath, tell_fullness
+from bodyscan.alignment.breath import breath_fields, breathing
+from bodyscan.alignment.following import Followed, MeanBreath
 from bodyscan.alignment.limbs import LIMBS, limb_fields
 from bodyscan.alignment.part_names import PARTS, leftward, name_parts
+from bodyscan.arrays import Array
 
 
 def person() -> BodyCells:
@@ -124,3 +127,63 @@ def test_breath_shows_on_the_trunk_in_front_more_than_behind() -> None:
     for normal, front in (([-1.0, 0.0, 0.0], 0.25), ([0.0, 1.0, 0.0], 0.25 + 0.75 * 7.0 / 27.0)):
         turned = replace(cells, normals=np.tile(normal, (len(cells.centres), 1)))
         assert breathing(turned)[at(cells, 0.0, 1125.0)] == pytest.approx(front)
+
+
+def test_a_breath_lifts_the_front_of_the_trunk_alike_over_a_hand() -> None:
+    """Products of the fields sum to how alike two cells rise: by 110 mm, times how far each may."""
+    cells = person()
+    lifts, apart = breathing(cells), cells.away
+    fields = breath_fields(cells)
+    assert np.abs(fields[:, 1:3]).max() == 0.0, "outwards, which is along x here"
+    likeness = np.outer(lifts, lifts) * np.exp(-0.5 * (apart / 110.0) ** 2)
+    # Functions of less than a 25th of the largest are left out, some of them beside each other.
+    assert np.abs(fields[:, 0] @ fields[:, 0].T - likeness).max() < 0.2
+
+
+def followed(cells: BodyCells, rise: Array, amounts: Array, sigma_mm: float = 0.5) -> Followed:
+    """The trunk's cells displaced along their normals by `rise` times each pair's amount."""
+    trunk = name_parts(cells) == PARTS.index("trunk")
+    bends = {}
+    for number, amount in enumerate(amounts):
+        bends[f"p{number}"] = np.zeros((len(cells.centres), 12))
+        bends[f"p{number}"][trunk, 0] = 2.0 + amount * rise
+    count = len(cells.centres)
+    return Followed(
+        cells,
+        bends,
+        np.zeros((len(amounts), count, 3)),
+        np.ones((len(amounts), count), bool),
+        np.full(count, sigma_mm),
+        0.0,
+    )
+
+
+def test_a_breath_is_told_by_how_far_the_trunk_rose() -> None:
+    cells = person()
+    trunk = int(np.count_nonzero(name_parts(cells) == PARTS.index("trunk")))
+    amounts = np.array([-3.0, 0.0, 1.0, 4.0])
+    even = np.ones(trunk)
+    assert tell_breath(followed(cells, even, amounts)) == pytest.approx(7.0)
+    # Where it rose most, but for one in twenty.
+    high = np.where(np.arange(trunk) < 1, 9.0, np.where(np.arange(trunk) < 8, 2.0, 1.0))
+    assert tell_breath(followed(cells, high, amounts)) == pytest.approx(14.0)
+    # By more than four sigmas.
+    assert tell_breath(followed(cells, even, amounts, 1.7)) == pytest.approx(7.0)
+    assert tell_breath(followed(cells, even, amounts, 1.8)) is None
+    # Most of it outwards together: 80 % against 20 %, and 79 against 21, leave 0.6 and 0.58.
+    for share, told in ((0.18, True), (0.22, False)):
+        some = np.where(np.arange(trunk) < share * trunk, -1.0, 1.0)
+        assert (tell_breath(followed(cells, some, amounts)) is not None) == told
+
+
+def test_fullness_is_that_of_the_front_of_the_trunk() -> None:
+    cells = person()
+    body = followed(cells, np.ones(1), np.zeros(1))
+    assert tell_fullness(body) is None
+    field = np.zeros((len(cells.centres), 12))
+    rises = breathing(cells) > 0.5
+    field[rises, 0] = np.where(np.arange(rises.sum()) % 2, -1.0, -2.0)
+    field[~rises, 0] = 50.0
+    sigma = np.where(rises, 0.3, 9.0)
+    told = tell_fullness(replace(body, breath=MeanBreath(field, sigma)))
+    assert told == pytest.approx((1.5, 0.3), abs=0.05)

@@ -10,9 +10,10 @@ import pytest
 from ray_cast_scan import BODY, cast_scan, load_body, load_rig, nominal_placings
 
 from bodyscan.alignment.icp import Alignment, align
+from bodyscan.alignment.matching import Matches
 from bodyscan.arrays import Array
 from bodyscan.fusion.cleaning import clean
-from bodyscan.fusion.seams import Seam, SeamReport, find_misfits, judge_seams
+from bodyscan.fusion.seams import Seam, SeamReport, _patches, find_misfits, judge_seams
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -164,3 +165,34 @@ def test_noise_makes_no_step() -> None:
     for sigma, steps in ((0.6, 0), (0.2, 1)):
         seams = [Seam(("a1", "b1"), apart, np.full(400, sigma))]
         assert len(find_misfits(seams, POLES, LIMIT_MM)) == steps
+
+
+def test_sigmas_of_patches_say_how_far_their_medians_scatter() -> None:
+    """Of five neighbours each errs as one: 400 patches of 80 matches."""
+    rng = np.random.default_rng(0)
+    patch = np.repeat(np.arange(400), 80)
+    apart = np.repeat(rng.standard_normal(400 * 16), 5) + 0.3
+    points = np.column_stack([40.0 * (patch % 20) + 1.0, 40.0 * (patch // 20) + 39.0, 0.0 * patch])
+    points[::2, :2] += [38.0, -38.0]
+    found, sigma = _patches(Matches(points, points, apart, apart, patch))
+    assert len(found) == 400, "all 40 mm of a patch go together"
+    # Medians of 16 scatter by 1.25 / 4; the robust sigma of so few is 5 % low.
+    assert sigma.mean() == pytest.approx(1.2533 / 4.0, rel=0.1)
+    assert np.mean(found) == pytest.approx(0.37, abs=0.03)  # of |0.3 +- 0.31|
+    assert np.median(np.abs(found)) < 0.5
+
+
+def test_a_patch_of_eight_matches_counts() -> None:
+    points = np.zeros((15, 3))
+    points[8:, 0] = 400.0
+    matches = Matches(points, points, np.full(15, -2.0), np.ones(15), np.arange(15))
+    found, sigma = _patches(matches)
+    assert found.tolist() == [2.0]
+    assert sigma.tolist() == [0.0]
+
+
+def test_a_step_is_what_three_of_four_patches_keep_to() -> None:
+    apart = np.array([0.0, 1.0, 2.0, 3.0, 50.0])
+    assert Seam(("a", "b"), apart, np.zeros(5)).step_mm == pytest.approx(3.0)
+    assert Seam(("a", "b"), apart, np.full(5, 2.0)).step_mm == pytest.approx(np.sqrt(5.0))
+    assert Seam(("a", "b"), apart, np.full(5, 4.0)).step_mm == 0.0

@@ -11,7 +11,9 @@ from seen_boards import seen_boards
 
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.errors import FailedWork
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration import halves
 from bodyscan.registration.halves import compare_halves, split_shots
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
@@ -158,3 +160,30 @@ def test_of_many_draws_those_halves_are_taken_that_tie_most_pairs(seed: int) -> 
     # Where no draw ties all three, the two that most draws tie.
     few = [view for view in seen if view.pair != "c" or view.shot < "s05"]
     assert split_shots(cast(Any, few), ("a", "b", "c"), seed=seed)[0] == ("a", "b")
+
+
+@pytest.mark.parametrize(("times", "told"), [(4.9, True), (5.1, False)])
+def test_halves_that_know_the_rig_five_times_worse_say_nothing_of_the_whole(
+    monkeypatch: pytest.MonkeyPatch, times: float, told: bool
+) -> None:
+    placings, _ = ring_of_cameras()
+    names = tuple(sorted(placings))
+    known = np.diag(np.tile([1e-10] * 3 + [1e-4] * 3, len(names)))
+    half = PoseCovariance(names, 0.5 * times**2 * known)
+    monkeypatch.setattr(halves, "_placed_by", lambda *of: (dict(placings), half))
+    seen = [
+        SimpleNamespace(pair=p, shot=f"s{k}", target=(f"s{k}", "b"))
+        for p in names
+        for k in range(8)
+    ]
+    placed: Any = SimpleNamespace(
+        rig_from_camera=placings, views=seen, covariance=PoseCovariance(names, known)
+    )
+    if told:
+        found = compare_halves(ring_rig(placings), placed)
+        assert found.over_expected == pytest.approx(0.0, abs=1e-6)
+        # Of the common motion, six of 72 unknowns, they are free.
+        assert found.sigmas_mm == pytest.approx(times * 0.01, rel=0.2)
+        return
+    with pytest.raises(FailedWork, match=r"halves of the shots should differ by 0\.0"):
+        compare_halves(ring_rig(placings), placed)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence, Set
+from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,12 +13,19 @@ import pytest
 from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.camera import LensTrial
+from bodyscan.calibration.lens_choice import ChosenLens
+from bodyscan.geometry.lenses import family_up_to
+from bodyscan.geometry.lenses.rational import Rational
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration import consistent_solve
 from bodyscan.registration.consistent_solve import ConsistentSolve, solve_consistently
 from bodyscan.registration.inconsistent_views import _wrong_squares, error_limit
 from bodyscan.registration.joint_solve import JointSolution
-from bodyscan.registration.rig_lenses import _with_what_followed, lens_notes
+from bodyscan.registration.rig_lenses import (
+    _choose_together,
+    _with_what_followed,
+    lens_notes,
+)
 from bodyscan.registration.seen_corners import seen_corners
 
 BEFORE = RigidTransform.from_rotation_vector([0.0, 0.1, 0.0], [10.0, 0.0, 900.0])
@@ -192,3 +200,43 @@ def test_what_a_camera_saw_is_told_corner_by_corner_with_its_targets_number() ->
     np.testing.assert_allclose(found["p"].residuals_px, [[-0.25, 0.5]] * 2, atol=1e-6)
     np.testing.assert_allclose(found["q"].pixels[:3], there + 0.5, rtol=1e-6)
     np.testing.assert_allclose(found["q"].residuals_px[3], 0.0, atol=1e-6)
+
+
+def lens(kind: str, *trials: LensTrial) -> ChosenLens:
+    fit: Any = SimpleNamespace(camera=SimpleNamespace(lens=SimpleNamespace(kind=kind)))
+    rays: Any = None
+    return ChosenLens(fit, trials, rays)
+
+
+@pytest.mark.parametrize(
+    ("gains", "changed"),
+    [
+        ((1.4, 1.4, 1.4, 1.4), ""),  # three standard errors of a sum of four are six
+        ((1.6, 1.6, 1.6, 1.6), "abcd"),
+        ((1.6, 1.6, 1.6, 1.6, None), "abcd"),  # whose lens the rig file names
+        ((2.0, 2.0, 2.9, -0.5), "abc"),  # its own boards speak against it
+        ((9.0, 2.0, 1.0, 0.5), "bcd"),  # one camera counts as its boards prove it, no more
+        ((9.0, 1.0, 1.0, 0.5), ""),
+        ((2.9,), ""),
+    ],
+)
+def test_cameras_of_one_make_get_the_lens_they_call_for_together(
+    gains: tuple[float | None, ...], changed: str
+) -> None:
+    first = LensTrial("radial", 0.06)
+    chosen, looked = {}, {}
+    for name, gain in zip("abcde", gains, strict=False):
+        tried = () if gain is None else (LensTrial("brown", 0.05, gain),)
+        chosen[name] = lens("radial", first, *tried)
+
+        def again(kinds: Sequence[Any]) -> ChosenLens:
+            assert [kind.kind for kind in kinds] == ["brown", "rational"]
+            return lens("brown", LensTrial("brown", 0.05, None, True))
+
+        looked[name] = SimpleNamespace(choose=again)
+    kinds: Any = {name: family_up_to(Rational) for name in chosen}
+    found = _choose_together(chosen, cast(Any, looked), kinds)
+    brown = "".join(name for name, own in found.items() if own.fit.camera.lens.kind == "brown")
+    assert brown == changed
+    for name in changed:
+        assert found[name].trials[1:] == (replace(chosen[name].trials[1], chosen=True),)
