@@ -168,3 +168,14 @@ def test_what_is_cut_to_the_volume_is_cleaned_and_checked_alike(
     ]
     assert shown[0] == shown[1]
     assert shown[0] > 0
+
+
+def test_a_rim_keeps_its_pixels_and_what_juts_out_of_it_goes() -> None:
+    """A straight rim leaves 14 of 24 neighbours; 13 are enough."""
+    depth = np.full((40, 40), 1000.0, np.float32)
+    depth[:10] = np.nan
+    assert np.isfinite(drop_flying_pixels(depth, 2.0)[10, 6:-6]).all()
+    depth[12, 22] = np.nan
+    assert np.isfinite(drop_flying_pixels(depth, 2.0)[10, 20])
+    depth[12, 21] = np.nan
+    assert np.isnan(drop_flying_pixels(depth, 2.0)[10, 20])

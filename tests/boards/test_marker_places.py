@@ -1,0 +1,94 @@
+"""Which markers agree on where a board is, and which corners lie beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.arrays import Array, Mask
+from bodyscan.boards.board_layout import marker_corners
+from bodyscan.boards.charuco import (
+    Markers,
+    PlacedMarkers,
+    _corners_beside,
+    fit_markers,
+    place_markers,
+)
+from bodyscan.rig.board import Board
+
+BOARD = Board(name="b", kind="charuco", columns=9, rows=8, square_mm=50, marker_mm=40)
+
+
+def printed() -> Array:
+    return np.asarray(marker_corners(BOARD)[1])[..., :2]
+
+
+def image_of(points: Array, scale: float) -> Array:
+    """A board that leans back a little."""
+    x, y = points[..., 0], points[..., 1]
+    away = 1.0 + 2e-4 * x + 1e-4 * y
+    return np.asarray(np.stack([300.0 + scale * x, 200.0 + scale * y], axis=-1) / away[..., None])
+
+
+def agreeing(off_px: float, *, scale: float, marker: int = 17) -> Mask:
+    """With one marker of the middle moved aside."""
+    pixels = image_of(printed(), scale)
+    pixels[marker, :, 0] += off_px
+    fit = fit_markers(printed(), pixels, BOARD)
+    assert fit is not None
+    return fit[1]
+
+
+@pytest.mark.parametrize(("scale", "most_px"), [(1.2, 8.5), (0.2, 2.0)])
+def test_a_marker_off_by_a_seventh_of_a_square_or_two_pixels_does_not_agree(
+    scale: float, most_px: float
+) -> None:
+    """Of squares that appear 57 px wide 15 % are 8.5; the fit goes along with one of 36 by less than
+    a tenth."""
+    assert agreeing(0.88 * most_px, scale=scale).all()
+    one = agreeing(1.12 * most_px, scale=scale)
+    assert not one[17]
+    assert one.sum() == 35
+
+
+def test_two_markers_have_to_agree() -> None:
+    points = printed()
+    pixels = image_of(points, 1.0)
+    assert fit_markers(points[:2], pixels[:2], BOARD) is not None
+    apart = pixels[:2].copy()
+    apart[1] = apart[1, ::-1]  # mirrored: no board shows both so
+    assert fit_markers(points[:2], apart, BOARD) is None
+
+
+def test_where_a_board_lies_is_where_its_markers_say() -> None:
+    ids, points = marker_corners(BOARD)
+    pixels = image_of(points[..., :2], 1.0)
+    some = np.arange(3, 36, 4)
+    placed = place_markers(BOARD, Markers(np.asarray(ids)[some], pixels[some]))
+    assert placed is not None
+    assert (placed.agreeing, placed.seen, placed.face, placed.believed) == (9, 9, 0, True)
+    corner = np.array([[200.0, 150.0]])
+    np.testing.assert_allclose(placed.board_map.apply(corner), image_of(corner, 1.0), atol=0.01)
+    one = Markers(np.asarray(ids)[:1], pixels[:1])
+    assert place_markers(BOARD, one) is None
+
+
+def test_six_of_ten_markers_have_to_agree() -> None:
+    ids, points = marker_corners(BOARD)
+    placed = place_markers(BOARD, Markers(np.asarray(ids), image_of(points[..., :2], 1.0)))
+    assert placed is not None
+
+    def of_ten(agreeing: int) -> PlacedMarkers:
+        return PlacedMarkers(placed.board, 0, placed.board_map, placed.printed[:agreeing], 10)
+
+    assert [of_ten(count).believed for count in (5, 6, 7)] == [False, False, True]
+
+
+def test_corners_beside_a_square_are_those_of_its_four_that_the_board_has() -> None:
+    """Of 8 x 7 inner corners; the square in column 2, row 1 touches corners 1 and 2 of rows 0, 1."""
+    assert _corners_beside(BOARD, np.array([[125.0, 75.0]])).tolist() == [1, 2, 9, 10]
+    assert _corners_beside(BOARD, np.array([[25.0, 25.0]])).tolist() == [0]
+    last = np.array([[8.5 * 50.0, 7.5 * 50.0]])
+    assert _corners_beside(BOARD, last).tolist() == [55]
+    right = np.array([[8.5 * 50.0, 2.5 * 50.0], [7.5 * 50.0, 1.5 * 50.0]])
+    assert _corners_beside(BOARD, right).tolist() == [6, 7, 14, 15, 23]

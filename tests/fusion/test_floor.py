@@ -1,0 +1,79 @@
+"""Level ground near z = 0, told by pixels whose heights and slopes are known."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bodyscan.arrays import Array
+from bodyscan.fusion.floor import find_floor
+from bodyscan.geometry.transforms import RigidTransform
+
+WITHIN: Any = SimpleNamespace(radius_mm=700.0)
+STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
+
+
+def seen(pair: str, points: Array, normal: Array = STRAIGHT_UP) -> Any:
+    """A range image one pixel high; only every fourth pixel is what `points` (N, 3) say."""
+    spread = np.repeat(points, 4, axis=0)[None]
+    return SimpleNamespace(
+        pair=pair,
+        every=lambda step: np.s_[::step, ::step],
+        valid=np.ones(spread.shape[:2], bool),
+        points=spread,
+        normals=np.broadcast_to(normal, spread.shape),
+    )
+
+
+def ground(z_mm: float, count: int = 300, *, out_mm: float = 0.0, along: int = 1) -> Array:
+    """Points on a ring of no more than 500 mm, or moved out by so much along an axis."""
+    angle = np.linspace(0.0, 2.0 * np.pi, count)
+    points = np.stack([200.0 * np.cos(angle), 200.0 * np.sin(angle), np.full(count, z_mm)], axis=1)
+    points[:, along] += out_mm
+    return points
+
+
+def floor(*images: Any) -> float | None:
+    here = RigidTransform.identity()
+    return find_floor(images, {image.pair: here for image in images}, WITHIN)
+
+
+def test_the_floor_is_the_median_of_pairs_which_are_each_a_median() -> None:
+    high = np.concatenate([ground(3.0, 200), ground(50.0, 190)])
+    assert floor(seen("a", high), seen("b", ground(5.0)), seen("c", ground(-8.0))) == 3.0
+    assert floor(seen("a", high)) is None, "one pair may be wrong by itself"
+    assert floor(seen("a", high), seen("b", ground(5.0, 299))) is None
+    assert floor(seen("a", high), seen("b", ground(5.0, 300))) == 4.0
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_what_lies_6_cm_off_is_an_instep_or_a_step(side: float) -> None:
+    for z_mm, told in ((59.0, side * 59.0), (61.0, None)):
+        assert floor(*(seen(name, ground(side * z_mm)) for name in "ab")) == told
+
+
+def test_what_leans_by_10_degrees_is_no_floor() -> None:
+    for lean_deg, told in ((9.5, 7.0), (10.5, None)):
+        lean = np.radians(lean_deg)
+        normal = np.array([np.sin(lean), 0.0, np.cos(lean)])
+        assert floor(*(seen(name, ground(7.0), normal) for name in "ab")) == told
+        assert floor(*(seen(name, ground(7.0), -normal) for name in "ab")) is None
+
+
+@pytest.mark.parametrize("along", [0, 1])
+def test_ground_outside_of_the_volume_is_not_asked(along: int) -> None:
+    for out_mm, told in ((480.0, 7.0), (920.0, None)):
+        ring = ground(7.0, out_mm=out_mm, along=along)
+        assert floor(*(seen(name, ring) for name in "ab")) == told
+
+
+def test_heights_are_those_of_the_rig_wherever_the_camera_stands() -> None:
+    at = RigidTransform.from_rotation_vector([2.0, 0.3, -0.4], [900.0, 300.0, 1500.0])
+    there = at.inverse()
+    images = [
+        seen(name, there.apply(ground(12.0)), there.rotate(STRAIGHT_UP[None])[0]) for name in "ab"
+    ]
+    assert find_floor(images, dict.fromkeys("ab", at), WITHIN) == pytest.approx(12.0)

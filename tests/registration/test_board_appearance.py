@@ -1,0 +1,70 @@
+"""What is said of boards that look otherwise than the rig file describes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bodyscan.boards.appearance import Appearance
+from bodyscan.boards.board_layout import corner_grid
+from bodyscan.boards.view import BoardView
+from bodyscan.registration.board_appearance import appearance_notes
+from bodyscan.rig.board import Board
+from bodyscan.rig.rig import Rig
+
+MARKED = Board(name="m", kind="charuco", columns=9, rows=8, square_mm=50, marker_mm=40)
+RIG = Rig.model_validate(
+    {
+        "name": "r",
+        "boards": (MARKED,),
+        "pairs": [{"name": "p", "camera": {"width": 9, "height": 9}}],
+    }
+)
+COLUMNS, ROWS = corner_grid(MARKED)
+
+
+def view(columns: int, rows: int, appearance: Appearance | None = None) -> BoardView:
+    """The first corners of the board."""
+    ids = (np.arange(rows)[:, None] * COLUMNS + np.arange(columns)).ravel()
+    of = () if appearance is None else (False, appearance)
+    return BoardView("p", "s", "m", ids, np.zeros((len(ids), 2)), *of)
+
+
+def said(*views: BoardView) -> Sequence[str]:
+    return appearance_notes(RIG, views)
+
+
+def test_a_last_line_that_three_views_lack_is_not_there() -> None:
+    short = view(COLUMNS, ROWS - 1)
+    (note,) = said(short, short, short)
+    assert note.startswith("board m: the last line of corners along its rows was never found")
+    assert note.endswith("was in 3 views: it seems to have fewer than 8 rows")
+    assert not said(short, short)
+    assert not said(short, short, short, view(COLUMNS, ROWS))
+    narrow = view(COLUMNS - 2, ROWS)
+    (note,) = said(narrow, narrow, narrow)
+    assert "the last 2 lines of corners along its columns" in note
+    assert note.endswith("fewer than 9 columns")
+
+
+def test_a_line_beside_it_that_was_mostly_hidden_says_nothing() -> None:
+    """The median of its corners counts."""
+    part = view(COLUMNS // 2 - 1, ROWS - 1)
+    rest = view(COLUMNS, ROWS - 2)
+    assert not any("rows" in note for note in said(part, part, part, rest, rest, rest)[:1])
+
+
+def test_every_other_look_is_told_with_how_many_views_had_it() -> None:
+    looks = {
+        "white on black in 2 views (p)": Appearance(inverted=True),
+        "mirrored in 2 views (p)": Appearance(mirrored=True),
+        "legacy_layout: true) in 2 views (p)": Appearance(other_layout=True),
+        "markers below its last row in 2 views (p)": Appearance(goes_on=True),
+    }
+    for words, look in looks.items():
+        plain, other = view(COLUMNS, ROWS), view(COLUMNS, ROWS, look)
+        (note,) = said(plain, other, other)
+        assert words in note
+        assert "Other cameras" not in note  # the same camera saw it both ways
+    assert not said(view(COLUMNS, ROWS))
