@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.arrays import Bytes, Floats, Indices
+from bodyscan.arrays import Array, Bytes, Indices
 from bodyscan.stripes.clear_changes import clear_changes
 from bodyscan.stripes.scan_lines import ScanLines
 
@@ -25,7 +25,7 @@ def frames(words: Indices, lit: Bytes | None = None, step: Indices | int = 100) 
 
 
 def changes(
-    words: Indices, lit: Bytes | None = None, step: Indices | int = 100, good: Floats | None = None
+    words: Indices, lit: Bytes | None = None, step: Indices | int = 100, good: Array | None = None
 ) -> list[tuple[int, int, int]]:
     """Word, next word and mask of what is left out, of each change taken."""
     found = clear_changes(
@@ -34,7 +34,7 @@ def changes(
         np.ones(words.shape, bool) if good is None else good > 0,
         np.full(256, VARIANCE, np.float32),
     )
-    return [tuple(int(part) for part in one) for one in zip(*found, strict=True)]
+    return [(int(a), int(b), int(left_out)) for a, b, left_out in zip(*found, strict=True)]
 
 
 def flip(at: int, place: int = 9, width: int = 20) -> Indices:
