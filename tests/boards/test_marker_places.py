@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array, Mask
+from bodyscan.boards.aprilgrid import _clear_of_edges, place_tags
 from bodyscan.boards.board_layout import marker_corners
 from bodyscan.boards.charuco import (
     Markers,
@@ -92,3 +93,48 @@ def test_corners_beside_a_square_are_those_of_its_four_that_the_board_has() -> N
     assert _corners_beside(BOARD, last).tolist() == [55]
     right = np.array([[8.5 * 50.0, 2.5 * 50.0], [7.5 * 50.0, 1.5 * 50.0]])
     assert _corners_beside(BOARD, right).tolist() == [6, 7, 14, 15, 23]
+
+
+TAGS = Board(name="t", kind="aprilgrid", columns=6, rows=5, square_mm=120, marker_mm=90)
+
+
+def tags(turn: int = 0, *, from_top: bool = False, wrong: int = 0, seen: int = 30) -> Markers:
+    """As a grid's first tags appear, each turned in its place; the wrong ones lie elsewhere."""
+    ids, points = marker_corners(TAGS)
+    order = points.reshape(5, 6, 4, 2)
+    order = order[::-1] if from_top else order
+    pixels = image_of(np.roll(order.reshape(-1, 4, 2), turn, axis=1), 0.5)
+    pixels[:wrong] += np.random.default_rng(1).uniform(60.0, 200.0, (wrong, 1, 2))
+    return Markers(np.asarray(ids)[:seen], pixels[:seen])
+
+
+@pytest.mark.parametrize("turn", range(4))
+@pytest.mark.parametrize("from_top", [False, True])
+def test_a_grid_is_placed_however_its_tags_are_turned_and_counted(
+    turn: int, from_top: bool
+) -> None:
+    placed = place_tags(TAGS, tags(turn, from_top=from_top))
+    assert placed is not None
+    assert placed.agreeing == 30
+    corner = np.array([[200.0, 150.0]])
+    np.testing.assert_allclose(placed.board_map.apply(corner), image_of(corner, 0.5), atol=0.01)
+
+
+def test_three_tags_and_six_of_ten_have_to_agree() -> None:
+    assert place_tags(TAGS, tags(seen=2)) is None
+    placed = place_tags(TAGS, tags(seen=3))
+    assert placed is not None
+    assert placed.agreeing == 3
+    placed = place_tags(TAGS, tags(wrong=11))
+    assert placed is not None
+    assert placed.agreeing == 19
+    assert place_tags(TAGS, tags(wrong=13)) is None
+
+
+def test_around_a_corner_only_rim_gap_and_small_squares_are_clear() -> None:
+    """A tag of six bits and a rim of two on either side: the rim is 18 mm, the gap 30; of a rim one
+    wide 11.25. A window fills 85 % of it."""
+    assert _clear_of_edges(TAGS, 2) == pytest.approx(0.85 * 18.0)
+    assert _clear_of_edges(TAGS, 1) == pytest.approx(0.85 * 11.25)
+    tight = TAGS.model_copy(update={"marker_mm": 110.0})
+    assert _clear_of_edges(tight, 2) == pytest.approx(0.85 * 10.0)

@@ -100,7 +100,7 @@ def test_a_surface_behind_takes_no_part_however_large(beside: int, sigmas: float
     """From two pixels beside the middle on it is no slope (ten sigmas a pixel are 45 degrees); from
     three on the closest neighbours tell."""
     off = bent(0.1)
-    behind = DU >= beside
+    behind = beside <= DU
     off[behind] -= sigmas
     same(fitted(off), by_numpy(off, ~behind))
 
