@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from bodyscan.captures.unlisted_images import describe_unlisted_images
 from bodyscan.errors import BadInput, BodyscanError, FailedWork, listed, plainly
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, attempt_each, silent, step
+from bodyscan.progress import THREADS, Progress, attempt_each, silent, step
 from bodyscan.registration.board_checks import check_board_size, describe_findings
 from bodyscan.registration.references import find_size, resized, solving_views
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -35,7 +36,7 @@ from bodyscan.registration.soundness import find_faults
 from bodyscan.registration.storage import keep_former, save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
-from bodyscan.workflows.decode import decode_on_boards
+from bodyscan.workflows.decode import Through, decode_on_boards
 from bodyscan.workflows.find_boards import (
     HERE,
     FoundBoards,
@@ -117,9 +118,8 @@ def join_rig(
             joined = _join_pairs(rig, located.value, cameras)
     placed = joined.value
     sized = [*size.notes, *check_board_size(rig, placed.rig_from_camera)]
-    decoded = _decode(rig, captures, placed, boards.value, progress)
+    decoded, fitted = _decode_and_fit(rig, captures, placed, cameras.value, boards.value, progress)
     lost = {**cameras.failures, **joined.failures, **decoded.failures}
-    fitted = _fit_sheets(rig, placed, cameras.value, decoded, progress)
     failed = lost | dict(fitted.failures)
     pairs = fitted.value
     if not pairs:
@@ -178,11 +178,49 @@ def _join_pairs(
         raise BadInput(error.what, where=error.where, remedy=remedy) from error
 
 
+def _decode_and_fit(
+    rig: Rig,
+    captures: Captures,
+    placed: RigSolution,
+    cameras: Mapping[str, CameraCalibration],
+    views: list[BoardView],
+    progress: Progress,
+) -> tuple[Outcome[dict[ViewKey, BoardBoundaries]], Outcome[dict[str, PairCalibration]]]:
+    """Stripes on the boards, and light sheets of every pair that was placed and decoded. A pair's
+    sheets are fitted while others' images are read: fitting holds the interpreter's lock, of which
+    reading has no need."""
+    with ThreadPoolExecutor(THREADS) as beside:
+        fits: dict[str, Future[Outcome[PairCalibration]]] = {}
+
+        def fit(name: str, boundaries: Mapping[ViewKey, BoardBoundaries]) -> None:
+            pair = _placed_pair(rig, placed, name, cameras[name], boundaries)
+            fits[name] = beside.submit(calibrate_pair, pair)
+
+        decoded = _decode(rig, captures, placed, views, fit, progress)
+        names = sorted(set(placed.rig_from_camera) - set(decoded.failures))
+        for name in names:
+            if name not in fits:  # nothing of it was to be decoded
+                fit(name, decoded.value)
+        fitted, errors = attempt_each(
+            lambda name: fits[name].result(),
+            names,
+            BodyscanError,
+            stage="fitting light sheets",
+            progress=progress,
+        )
+    return decoded, Outcome(
+        {name: found.value for name, found in fitted.items()},
+        tuple(note for found in fitted.values() for note in found.notes),
+        {name: plainly(error) for name, error in errors.items()},
+    )
+
+
 def _decode(
     rig: Rig,
     captures: Captures,
     placed: RigSolution,
     views: list[BoardView],
+    through: Through,
     progress: Progress,
 ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
     """Stripes on the boards that took part in placing the rig: of tens of millions of boundaries means
@@ -207,29 +245,8 @@ def _decode(
         for pair in rig.pairs
         if pair.projector is not None and len(placed.cameras) > 1
     }
-    return decode_on_boards(rig, captures, wanted, progress, box=box, keep=printed, every=every)
-
-
-def _fit_sheets(
-    rig: Rig,
-    placed: RigSolution,
-    cameras: Mapping[str, CameraCalibration],
-    decoded: Outcome[dict[ViewKey, BoardBoundaries]],
-    progress: Progress,
-) -> Outcome[dict[str, PairCalibration]]:
-    """Light sheets of every pair that was placed and decoded."""
-    names = sorted(set(placed.rig_from_camera) - set(decoded.failures))
-
-    def fit(name: str) -> Outcome[PairCalibration]:
-        return calibrate_pair(_placed_pair(rig, placed, name, cameras[name], decoded.value))
-
-    fitted, errors = attempt_each(
-        fit, names, BodyscanError, stage="fitting light sheets", progress=progress
-    )
-    return Outcome(
-        {name: found.value for name, found in fitted.items()},
-        tuple(note for found in fitted.values() for note in found.notes),
-        {name: plainly(error) for name, error in errors.items()},
+    return decode_on_boards(
+        rig, captures, wanted, progress, box=box, keep=printed, every=every, through=through
     )
 
 

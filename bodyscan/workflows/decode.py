@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
+from threading import Lock
 from types import MappingProxyType
 
 from bodyscan.boards.view import BoardView, ViewKey
@@ -42,6 +43,8 @@ FEW = 2
 
 Failure = tuple[ImageSequence, BodyscanError]
 Keep = Callable[[BoardView, BoardBoundaries], BoardBoundaries]
+Through = Callable[[str, Mapping[ViewKey, BoardBoundaries]], None]
+"""Takes a pair's name and what all of its shots gave."""
 
 
 def decode_sequence(
@@ -95,6 +98,10 @@ def _all(view: BoardView, boundaries: BoardBoundaries) -> BoardBoundaries:
     return boundaries
 
 
+def _no_use(_pair: str, _found: Mapping[ViewKey, BoardBoundaries]) -> None:
+    """Where nobody waits for single pairs."""
+
+
 def decode_on_boards(
     rig: Rig,
     captures: Captures,
@@ -104,12 +111,14 @@ def decode_on_boards(
     box: Callable[[BoardView], Box] = box_around,
     keep: Keep = _all,
     every: Mapping[str, int] = MappingProxyType({}),
+    through: Through = _no_use,
 ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
     """Stripe boundaries near each of these views; sequences that are bad are noted.
 
     box: where the board of a view shows stripes that are wanted.  keep: what is kept of a view's, of
     which a rig has tens of millions.  every: by pair, of how many bands of BIN_PX along the stripes one
-    is enough; shots take turns.  A pair of which none can be decoded is a failure.
+    is enough; shots take turns.  through: told of each pair as soon as its last sequence is done, from
+    any thread.  A pair of which none can be decoded is a failure.
     """
     wanted: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
     for view in views:
@@ -119,8 +128,23 @@ def decode_on_boards(
     turn = {s: captures.of_pair(s.pair).index(s) for s in sequences}
     responses: dict[str, list[ResponseShare]] = defaultdict(list)
     one_way: dict[ImageSequence, str] = {}
+    by_pair: dict[str, dict[ViewKey, BoardBoundaries]] = defaultdict(dict)
+    left, counting = Counter(sequence.pair for sequence in sequences), Lock()
 
     def decode(sequence: ImageSequence) -> dict[ViewKey, BoardBoundaries]:
+        found: dict[ViewKey, BoardBoundaries] = {}
+        try:
+            found = found_in(sequence)
+        finally:
+            with counting:
+                by_pair[sequence.pair] |= found
+                left[sequence.pair] -= 1
+                last = not left[sequence.pair]
+            if last:
+                through(sequence.pair, by_pair.pop(sequence.pair))
+        return found
+
+    def found_in(sequence: ImageSequence) -> dict[ViewKey, BoardBoundaries]:
         own = wanted[sequence.pair, sequence.shot]
         boxes = [box(view) for view in own]
         crop = crop_around(boxes)
@@ -136,15 +160,20 @@ def decode_on_boards(
             for view, near in zip(own, boxes, strict=True)
         }
 
+    one_after_another = sorted(sequences, key=lambda sequence: sequence.pair)
     decoded, errors = attempt_each(
-        decode, sequences, BodyscanError, stage="decoding stripes", progress=progress
+        decode, one_after_another, BodyscanError, stage="decoding stripes", progress=progress
     )
-    boundaries = {key: near for found in decoded.values() for key, near in found.items()}
-    failures = list(errors.items())
+    boundaries = {key: near for s in sequences if s in decoded for key, near in decoded[s].items()}
+    failures = [(sequence, errors[sequence]) for sequence in sequences if sequence in errors]
     failed = failed_pairs(failures, {pair for pair, _, _ in boundaries})
     failed |= _without_stripes(rig, wanted, {sequence.pair for sequence in sequences})
     kept = [failure for failure in failures if failure[0].pair not in failed]
-    notes = (*failure_notes(kept), *one_way_notes(one_way), *response_notes(responses))
+    notes = (
+        *failure_notes(kept),
+        *one_way_notes({s: one_way[s] for s in decoded}),
+        *response_notes(responses),
+    )
     return Outcome(boundaries, notes, failed)
 
 

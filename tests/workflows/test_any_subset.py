@@ -150,6 +150,7 @@ def test_any_subset_of_images_with_stripes_does_too(
         box: object,
         keep: Keep,
         every: object,
+        through: object,
     ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
         keys = {view.key: view for view in wanted}
         return Outcome({key: keep(keys[key], striped[key]) for key in keys if key in striped})
