@@ -41,3 +41,14 @@ def test_the_evidence_of_a_cell_is_that_of_its_matches_by_its_displacement_field
             found.gradient[k], own.T @ (weight * distances[cell == k]), atol=1e-6
         )
     assert found.cells.tolist() == [0, 1]
+
+
+def test_cells_that_no_match_lies_in_say_nothing() -> None:
+    points = np.array([[0.0, 0.0, 5.0], [90.0, 0.0, -5.0]])
+    ones = np.ones(2)
+    matches = Matches(points, np.tile([0.0, 0.0, 1.0], (2, 1)), ones, ones, np.arange(2))
+    centres = np.array([[0.0, 0, 0], [40.0, 0, 0], [90.0, 0, 0], [130.0, 0, 0]])
+    found = CellEvidence.of(matches, np.array([0, 2]), centres, correlated=1.0)
+    assert found.cells.tolist() == [0, 2]
+    assert found.information.shape == (2, 12, 12)
+    assert (found.information[:, 2, 2] > 0.0).all()

@@ -13,6 +13,7 @@ from bodyscan.alignment.oblique_light import (
     LEAST_MM,
     LightLine,
     ObliqueLight,
+    _shared,
     find_oblique_light,
     take_out,
     to_unit_length,
@@ -187,3 +188,21 @@ def test_means_of_normals_are_brought_to_unit_length() -> None:
     expected = np.where(length > 1e-3, normals / length, np.float32(np.nan))
     to_unit_length(normals)
     np.testing.assert_allclose(normals, expected, rtol=1e-6)
+
+
+def test_a_match_twice_its_spread_away_says_half_as_much() -> None:
+    """And one where light grazes says nothing."""
+    rng = np.random.default_rng(3)
+    points, normals = rng.standard_normal((41, 3)), np.tile([0.0, 0.0, 1.0], (41, 1))
+    distances = np.where(np.arange(41) % 2, 0.3, -0.3)
+    sigma, lifted = np.full(41, 0.2), np.ones(41)
+    lifted[3] = np.nan
+    spread2 = 0.2**2 + (1.4826 * 0.3) ** 2
+    distances[7] = 2.0 * np.sqrt(spread2)
+    found = _shared(points, normals, distances, sigma, lifted, 5.0)
+    weight = 1.0 / (spread2 + 0.25 * 0.3**2) / 5.0
+    far = 0.5 / spread2 / 5.0
+    assert found.information[6, 6] == pytest.approx(39 * weight + far, rel=1e-3)
+    assert found.information[5, 6] == pytest.approx(39 * weight + far, rel=1e-3)
+    even = weight * (-0.3 * 21 + 0.3 * 18) + far * distances[7]
+    assert found.gradient[6] == pytest.approx(even, rel=1e-3)

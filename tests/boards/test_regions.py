@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bodyscan.boards.checkerboard import find_checkerboard
-from bodyscan.boards.regions import shows_lattice
+from bodyscan.boards.regions import _strongest_saddles, board_regions, shows_lattice
 from bodyscan.rig.board import Board
 
 BOARD = Board(name="b", kind="checkerboard", columns=10, rows=7, square_mm=30.0)
@@ -61,3 +61,48 @@ def test_no_slow_detector_is_asked_without_one(
 
 def test_a_board_of_few_corners_is_always_looked_for() -> None:
     assert shows_lattice(np.zeros((48, 64), np.uint8), (3, 4))
+
+
+@pytest.mark.parametrize("rises_deg", [0.0, 25.0, 70.0, 110.0, 160.0])
+def test_a_saddle_is_found_with_the_direction_in_which_it_rises(rises_deg: float) -> None:
+    v, u = np.mgrid[:61, :61] - 30.0
+    along = np.radians(rises_deg)
+    x, y = u * np.cos(along) + v * np.sin(along), v * np.cos(along) - u * np.sin(along)
+    image = 128.0 + 50.0 * np.exp(-(u**2 + v**2) / 200.0) * (x**2 - y**2) / 40.0
+    points, angles = _strongest_saddles(np.rint(image).astype(np.uint8), 1)
+    assert points.tolist() == [[30, 30]]
+    off = (np.degrees(angles[0]) - rises_deg + 90.0) % 180.0 - 90.0
+    assert abs(off) < 2.0  # of whole grey levels
+
+
+def test_no_more_saddles_are_given_than_asked_for_and_the_clearest_first() -> None:
+    image = grey(board_picture(45.0), noise=0.0)
+    few, many = _strongest_saddles(image, 10)[0], _strongest_saddles(image, 40)[0]
+    assert (len(few), len(many)) == (10, 40)
+    np.testing.assert_array_equal(few, many[:10])
+
+
+def flat_board(left: int, top: int, columns: int, rows: int, square: int) -> tuple[slice, slice]:
+    return slice(top, top + rows * square), slice(left, left + columns * square)
+
+
+def test_regions_hold_boards_with_a_margin_the_larger_first() -> None:
+    """Two boards far apart; corners of the first lie from 220 to 360 px and from 120 to 210 px,
+    its own outermost among them."""
+    image = np.full((480, 640), 150, np.uint8)
+    for left, top, columns, rows in ((220, 120, 14, 9), (500, 350, 8, 6)):
+        even = np.add.outer(np.arange(rows), np.arange(columns)) % 2
+        part = np.kron(even, np.ones((10, 10))) * 150 + 40
+        image[flat_board(left, top, columns, rows, 10)] = part
+    found = board_regions(image, 13 * 8)
+    # 104 corners are asked for; seven tenths of that would be more than the second board has.
+    assert len(found) == 1
+    (one,) = found
+    expected = (220 - 21 - 20, 120 - 13 - 20, 360 + 21 + 20, 210 + 13 + 20)
+    assert np.abs(np.array([one.left, one.top, one.right, one.bottom]) - expected).max() <= 3
+    assert one.area == (one.right - one.left) * (one.bottom - one.top)
+    np.testing.assert_array_equal(one.cut(image), image[one.top : one.bottom, one.left : one.right])
+    both = board_regions(image, 45)
+    assert len(both) == 2
+    assert both[0] == one
+    assert abs(both[1].left - (500 - 12 - 20)) <= 3

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from bodyscan.evaluation.acceptance_readings import (
@@ -11,6 +13,7 @@ from bodyscan.evaluation.acceptance_readings import (
     Readings,
     SpacingRow,
     SphereRow,
+    acceptance_document,
     figures,
     grade_acceptance,
 )
@@ -102,3 +105,18 @@ def test_readings_of_several_places_are_those_of_all() -> None:
     assert total.spacings == READ.spacings
     assert total.plates == READ.plates
     assert total.problems == ("one",)
+
+
+def test_the_file_says_what_it_is_and_holds_every_figure_and_reading() -> None:
+    class Described(File):
+        def model_dump(self, mode: str) -> dict[str, str]:
+            return {"mode": mode}
+
+    file: Any = Described()
+    found = acceptance_document(READ, figures(READ, file), file, synthetic=True)
+    assert (found["schema"], found["version"]) == ("bodyscan-acceptance", 1)  # docs/formats.md
+    assert found["synthetic"]
+    assert found["artefacts"] == {"mode": "json"}
+    assert found["figures"]["sphere_spacing_mm"]["value"] == 0.15
+    assert not found["figures"]["sphere_spacing_mm"]["exceeded"]
+    assert [len(found[rows]) for rows in ("spheres", "spacings", "plates")] == [3, 5, 3]

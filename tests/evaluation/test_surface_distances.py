@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import open3d as o3d
 import pytest
@@ -9,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from surface_coverage import coverage
 
+from bodyscan.errors import BadInput
+from bodyscan.evaluation.comparison import _surface
 from bodyscan.evaluation.surface import deviation, sample_surface, signed_distances
 
 BOX = o3d.geometry.TriangleMesh.create_box(100.0, 200.0, 300.0)
@@ -81,3 +85,15 @@ def test_coverage_needs_points_near_along_the_normal() -> None:
     lifted = points + 1.5 * normals
     assert coverage(lifted, VERTICES, FACES, samples=5000, spacing_mm=4.0) < 0.05
     assert coverage(lifted, VERTICES, FACES, samples=5000, within_mm=2.0, spacing_mm=4.0) > 0.99
+
+
+def test_surfaces_are_read_from_files_that_have_faces(tmp_path: Path) -> None:
+    o3d.io.write_triangle_mesh(str(tmp_path / "box.ply"), BOX)
+    vertices, faces = _surface(tmp_path / "box.ply")
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), [100.0, 200.0, 300.0])
+    assert faces.shape == (12, 3)
+    cloud = o3d.geometry.PointCloud(BOX.vertices)
+    o3d.io.write_point_cloud(str(tmp_path / "points.ply"), cloud)
+    for name in ("points.ply", "missing.ply"):
+        with pytest.raises(BadInput, match="no surface can be read here"):
+            _surface(tmp_path / name)

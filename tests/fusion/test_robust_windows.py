@@ -12,7 +12,7 @@ REACH = 3
 SIDE = 2 * REACH + 1
 DV, DU = np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1].astype(float)
 OWN, UNIT = 1e-3, 1e-7  # a metre away, known to a tenth of a millimetre
-PIXEL_MM = 1.0
+PIXEL_MM = 0.8
 TERMS = np.stack([np.ones_like(DU), DU, DV, DU**2, DU * DV, DV**2], axis=-1).reshape(-1, 6)
 # A surface of 6 mm radius curves by one sigma of what is expected: half its curvature, in noise.
 SHARPEST = PIXEL_MM**2 * OWN**2 / UNIT / (2.0 * 6.0)

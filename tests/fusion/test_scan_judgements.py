@@ -12,6 +12,7 @@ from bodyscan.alignment.icp import Alignment, Overlap
 from bodyscan.alignment.place_evidence import SizeStep
 from bodyscan.alignment.pole_steps import PoleStep, StepSearch
 from bodyscan.fusion.contradictions import Contradictions
+from bodyscan.fusion.scan import _silent
 from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.seams import Seam, SeamReport
 from bodyscan.fusion.surface_check import SurfaceCheck
@@ -319,3 +320,11 @@ def test_pairs_that_stand_off_each_by_itself(
     verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), limits, search=search)
     assert verdict.grade == grade
     assert ("did head or arms move" in str(verdict)) == (sway_mm > 1.0)
+
+
+def test_a_pole_of_which_nobody_saw_the_person_is_named() -> None:
+    poles = {"a1": "a", "a2": "a", "b1": "b", "b2": "b", "c1": "c"}
+    asked = ["a1", "a2", "b1", "b2", "c1", "alone"]
+    assert _silent(poles, asked, ["a1"]) == ("b",)  # one pair may look over a child's head
+    assert _silent(poles, asked, ["a1", "b2"]) == ()
+    assert _silent(poles, asked, []) == ("a", "b")

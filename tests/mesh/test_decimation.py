@@ -90,3 +90,18 @@ def test_the_same_mesh_read_twice_is_decimated_once() -> None:
     assert decimate(replace(some, vertices=vertices.copy()), faces=1000, within_mm=2.0) is small
     darker = replace(some, colours=np.ones(shape, np.uint8))
     assert decimate(darker, faces=1000, within_mm=2.0).colours.min() == 1
+
+
+def test_what_falls_apart_is_its_largest_piece() -> None:
+    """Two balls, one of them small; each closed by itself."""
+    large, small = ball(40), ball(12)
+    vertices = np.concatenate([large[0], 0.2 * small[0]])
+    faces = np.concatenate([large[1], small[1] + len(large[0])])
+    blank = np.zeros((len(vertices), 3), np.uint8)
+    mesh = BodyMesh(
+        vertices, faces, vertex_normals(vertices, faces), blank,
+        np.full(len(vertices), 0.1, np.float32), np.zeros(len(faces), bool),
+    )  # fmt: skip
+    found = decimate(mesh, faces=2000, within_mm=2.0)
+    shape = topology(found.vertices, found.faces)
+    assert (shape.manifold, shape.components) == (True, 1)

@@ -13,8 +13,9 @@ from moving_ball import BITS, CAMERA, CENTRE, STRIPES, bit_of, seen_boundaries, 
 from ray_cast_scan import load_rig
 
 from bodyscan.arrays import Array
+from bodyscan.reconstruction import sequence_moments as sequence_moments_file
 from bodyscan.reconstruction.sequence_moments import sequence_moments
-from bodyscan.reconstruction.told_motion import tell_motion
+from bodyscan.reconstruction.told_motion import CHANCE, _velocity, tell_motion
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.codes.gray import Gray
@@ -190,3 +191,44 @@ def test_nobody_moves_farther_than_there_is_time_for(lasts_ms: float, most_mm: f
     pair: Any = SimpleNamespace(camera=CAMERA, sheets=sheets(), crossing=None)
     (moments,) = sequence_moments(pair, code, names, frame_ms)
     assert moments.most_mm == pytest.approx(most_mm)
+
+
+def test_what_all_windows_share_is_not_known_of_a_velocity_along_the_view() -> None:
+    middle = np.array([30.0, -60.0, 900.0])
+    fit: Any = SimpleNamespace(
+        twist=np.array([0.1, 0, 0, 3.0, 0, 4.0]), covariance=np.zeros((9, 9))
+    )
+    teeth: Any = SimpleNamespace(common=0.4, middle=middle)
+    seen: Any = None
+    found = _velocity(fit, teeth, seen, 0.0)
+    along = 0.4 * middle / 900.0
+    np.testing.assert_allclose(found.covariance[3:, 3:], np.outer(along, along), atol=1e-12)
+    np.testing.assert_allclose(found.covariance[:3], 0.0, atol=1e-12)
+    # About the middle it turns by (0.1, 0, 0) and moves by (3, 0, 4).
+    moved = np.cross(found.twist[:3], middle) + found.twist[3:]
+    np.testing.assert_allclose(moved, [3.0, 0.0, 4.0], atol=1e-12)
+    # A speed that may be off by a twentieth: of a turn of 0.1 and a shift of 5.
+    off = _velocity(
+        fit, SimpleNamespace(common=0.0, middle=0.0 * middle + [0, 0, 1e-9]), seen, 0.05
+    )  # type: ignore[arg-type]
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(off.covariance)), [0.005] * 3 + [0.25] * 3, rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("crossing", [1, 2])
+def test_noise_says_of_one_rig_in_a_hundred_that_somebody_moved(
+    crossing: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many pairs are asked, and stripes of one direction or both."""
+    asked: list[float] = []
+
+    def look(pair: Any, code: Any, frames: Any, chance: float, when: Any) -> tuple[Moments, ...]:
+        asked.append(chance)
+        return (Moments({}, 0.0, None),)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(sequence_moments_file, "_moments", look)
+    code: Any = SimpleNamespace(directions=("vertical", "horizontal")[:crossing])
+    nothing: Any = None
+    sequence_moments(nothing, code, nothing, {"a": 0.0, "b": 100.0}, pairs=16)
+    assert 1.0 - (1.0 - asked[0]) ** (16 * crossing) == pytest.approx(CHANCE)

@@ -214,3 +214,12 @@ def test_too_few_images_are_refused(section: Read) -> None:
 
     with pytest.raises(DecodingFailed, match="59 images of the code, but it has 60"):
         section(fewer)
+
+
+def test_one_pixel_in_a_hundred_may_have_a_number_beyond_the_last() -> None:
+    v, u = np.mgrid[:130, :130]
+    image = index_image(1.2 + (v + 0.1 * u) / 2.3)
+    some = np.arange(image.size).reshape(image.shape) % 1000
+    read_index(np.where(some < 8, STRIPES + 1, image))
+    with pytest.raises(DecodingFailed, match="1% of the pixels have a stripe number above 60"):
+        read_index(np.where(some < 14, STRIPES + 1, image))

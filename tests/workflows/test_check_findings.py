@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 
 from bodyscan.errors import FailedWork
-from bodyscan.workflows.check_rig import Findings, _named_apart, _of_boards
+from bodyscan.workflows.check_rig import Findings, _named_apart, _of_boards, _of_scans
 
 CALIBRATION: Any = SimpleNamespace(
     pairs={
@@ -98,3 +98,15 @@ def test_shots_of_several_folders_are_told_apart_by_their_folders_number() -> No
         Folder(("1/a", "1/b"), (Sequence("1/a"), Sequence("1/b"), Sequence("1/b"))),
         Folder(("2/a",), (Sequence("2/a"),)),
     ]
+
+
+@pytest.mark.parametrize(("scans", "asked"), [(2, "3 scans or more"), (3, "more scans")])
+def test_an_undecided_check_asks_for_more_scans(scans: int, asked: str) -> None:
+    still = SimpleNamespace(pair="p", moved=False, shift_mm=0.1, sigma_mm=0.1)
+    check = SimpleNamespace(
+        search=SimpleNamespace(step=None), poles=(), pairs=(still,), valid=True, apart=(),
+        decided=False, quiet=False, unseen_mm=1.84, before_mm=(0.4,) * scans, after_mm=(0.2,) * scans,
+    )  # fmt: skip
+    first = _of_scans(cast(Any, check)).lines[0]
+    assert first.startswith(f"undecided: from {scans} scans a pair that moved by less than 1.8 mm")
+    assert f"give {asked}, or a shot of the board" in first
