@@ -26,6 +26,10 @@ def test_the_share_of_the_picture_is_that_of_the_hull(
     )
 
 
+def test_a_board_from_rim_to_rim_covers_all() -> None:
+    assert covered_share([corners(0, 0, 639, 479)], 640, 480) == 1.0
+
+
 def test_views_in_the_same_place_cover_no_more() -> None:
     one, beside = corners(0, 0, 320, 240), corners(320, 240, 319, 239)
     assert covered_share([one, one], 640, 480) == covered_share([one], 640, 480)

@@ -8,7 +8,7 @@ import numpy as np
 import open3d as o3d
 from ray_cast_scan import looking, nominal_camera
 
-from bodyscan.fusion.free_space import Guess, sees_through
+from bodyscan.fusion.free_space import Guess, _within, sees_through
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.pair import NominalPose
 
@@ -43,3 +43,12 @@ def test_a_wall_and_something_beyond_the_volume_are_seen_through_alike() -> None
     # Without a word of what is behind, only what lies between measured parts can be open.
     blind = sees_through(points, guess, replace(far, beyond=None), POSE, 10.0)
     assert blind.sum() < through.sum()
+
+
+def test_what_lies_to_the_left_is_looked_for_in_its_own_row_and_no_farther() -> None:
+    mask = np.zeros((3, 12), bool)
+    mask[0, 2], mask[1, [0, 6]] = True, True
+    found = _within(mask, 3)
+    assert np.flatnonzero(found[0]).tolist() == [2, 3, 4, 5]
+    assert np.flatnonzero(found[1]).tolist() == [0, 1, 2, 3, 6, 7, 8, 9]
+    assert not found[2].any()

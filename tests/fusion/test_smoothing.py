@@ -9,7 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bodyscan.fusion.quadratics import fit_quadratics
+from bodyscan.fusion.quadratics import (
+    _square_misfits,
+    close_holes,
+    fit_full_windows,
+    fit_quadratics,
+)
 from bodyscan.fusion.smoothing import SmoothSurface, _distance_to_rim, smooth
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
@@ -240,3 +245,57 @@ def test_rims_are_where_nothing_lies_beside_or_something_behind(turns: int) -> N
     depth[12:] = 1000.0 * (1.0 + np.float32(0.009))
     flat = np.rot90(_distance_to_rim(np.ascontiguousarray(np.rot90(depth, turns)), 0.01), -turns)
     assert flat[11, 9] > 5.0
+
+
+def test_holes_of_a_few_pixels_are_closed_as_a_plane_goes_on() -> None:
+    """By opposite neighbours, of which four pairs have to be there."""
+    v, u = np.mgrid[:20, :24].astype(np.float32)
+    plane = (1.0 + 0.01 * u - 0.02 * v).astype(np.float32)
+    valid = np.ones(plane.shape, bool)
+    valid[8, 9] = valid[12, 5] = valid[12, 6] = valid[0, 3] = False
+    closed, whole = close_holes(plane * valid, valid)
+    assert whole[valid].all()
+    assert whole[8, 9]
+    assert whole[12, 5:7].all()
+    assert not whole[0, 3]  # at the picture's rim two pairs, in its own row
+    np.testing.assert_allclose(closed[whole], plane[whole], rtol=1e-6)
+    # A column of two pixels to one side and none to the other has no opposite pairs at all.
+    half = np.zeros(plane.shape, bool)
+    half[:, :10] = True
+    assert not close_holes(plane * half, half)[1][:, 10:].any()
+    for pairs, told in ((3, False), (4, True)):
+        few = np.zeros(plane.shape, bool)
+        for step in ((0, 1), (1, 0), (1, 1), (2, 2))[:pairs]:
+            few[8 + step[0], 9 + step[1]] = few[8 - step[0], 9 - step[1]] = True
+        few[6, 9] = few[6, 10] = True  # without their opposites
+        closed, whole = close_holes(plane * few, few)
+        assert whole[8, 9] == told
+    assert closed[8, 9] == pytest.approx(plane[8, 9], rel=1e-6)
+
+
+def test_full_windows_are_fitted_as_least_squares_would() -> None:
+    rng = np.random.default_rng(5)
+    image = (1.0 + 0.1 * rng.standard_normal((15, 17))).astype(np.float32)
+    noise = np.full(image.shape, 0.1, np.float32)
+    fit = fit_full_windows(image, noise, 3)
+    dv, du = np.mgrid[-3:4, -3:4].astype(float)
+    terms = np.stack([np.ones(49), *(t.ravel() for t in (du, dv, du**2, du * dv, dv**2))], axis=1)
+    inverse = np.linalg.inv(terms.T @ terms)
+    truth = inverse @ terms.T @ image[4:11, 5:12].ravel().astype(float)
+    assert fit.value[7, 8] == pytest.approx(truth[0], abs=1e-5)
+    assert fit.slope_u[7, 8] == pytest.approx(truth[1], abs=1e-5)
+    assert fit.slope_v[7, 8] == pytest.approx(truth[2], abs=1e-5)
+    assert fit.sigma[7, 8] == pytest.approx(0.1 * np.sqrt(inverse[0, 0]), rel=1e-5)
+
+
+def test_misfits_count_where_something_was_measured_and_outliers_are_not_calm() -> None:
+    inverse = np.array([[1.0, 1.02, 1.5, 0.0]], np.float32)
+    noise = np.full((1, 4), 0.01, np.float32)
+    squares, calm = np.full((1, 4), 9.0, np.float32), np.full((1, 4), 9, np.uint8)
+    fitted = np.array([[True, True, True, False]])
+    _square_misfits(inverse, noise, np.ones((1, 4), np.float32), fitted, squares, calm)
+    np.testing.assert_allclose(squares, [[0.0, 4.0, 2500.0, 0.0]], rtol=1e-4)
+    assert calm.tolist() == [[1, 1, 0, 1]]
+    fitted[0, 0] = False
+    _square_misfits(inverse, noise, np.ones((1, 4), np.float32), fitted, squares, calm)
+    assert calm.tolist() == [[0, 1, 0, 1]]

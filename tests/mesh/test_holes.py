@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,3 +62,17 @@ def test_the_largest_comes_first_and_patches_that_touch_are_one() -> None:
     assert one.faces == "left"
     np.testing.assert_allclose(one.middle, [100.0, 90.0, 240.0])  # by area
     assert holes(mesh()) == []
+
+
+@pytest.mark.parametrize("way", list(WAYS))
+def test_a_patch_that_leans_by_40_degrees_still_faces_its_way(way: str) -> None:
+    whole = mesh(way)
+    normal = np.array(WAYS[way])
+    for other in np.eye(3):
+        if normal @ other:
+            continue
+        for side in (1.0, -1.0):
+            # Sheared so that the face's normal leans towards another side.
+            lean = np.eye(3) - np.tan(np.radians(40.0)) * side * np.outer(normal, other)
+            (hole,) = holes(replace(whole, vertices=whole.vertices @ lean.T))
+            assert hole.faces == way

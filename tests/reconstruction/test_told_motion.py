@@ -208,9 +208,8 @@ def test_what_all_windows_share_is_not_known_of_a_velocity_along_the_view() -> N
     moved = np.cross(found.twist[:3], middle) + found.twist[3:]
     np.testing.assert_allclose(moved, [3.0, 0.0, 4.0], atol=1e-12)
     # A speed that may be off by a twentieth: of a turn of 0.1 and a shift of 5.
-    off = _velocity(
-        fit, SimpleNamespace(common=0.0, middle=0.0 * middle + [0, 0, 1e-9]), seen, 0.05
-    )  # type: ignore[arg-type]
+    here: Any = SimpleNamespace(common=0.0, middle=np.array([0.0, 0.0, 1e-9]))
+    off = _velocity(fit, here, seen, 0.05)
     np.testing.assert_allclose(
         np.sqrt(np.diag(off.covariance)), [0.005] * 3 + [0.25] * 3, rtol=1e-6
     )
