@@ -76,10 +76,10 @@ OPERATORS = re.compile(
     r"|ReplaceTrueWithFalse|ReplaceFalseWithTrue|ZeroIterationForLoop)"
 )
 """Of cosmic-ray's operators those that one might write by mistake; the others end in a TypeError."""
-DECLARATION = re.compile(r"-\s*(@|\*,$)", re.MULTILINE)
-"""Lines in which nothing is worked out: decorators, the star before arguments that are named."""
-GUARD = re.compile(r"strict=\s*(True|False)")
-"""Of zip: what it refuses, the callers cannot give."""
+DECLARATION = re.compile(r"-\s*@", re.MULTILINE)
+"""Lines in which nothing is worked out: decorators."""
+GUARD = re.compile(r"strict=\s*(True|False)|[*/],")
+"""Of zip what it refuses, which callers cannot give; and the star before arguments that are named."""
 NEAREST, FIRST = 9, 2
 """Test files tried, and how many of them alone at first, which is cheap and mostly enough; those
 farther away ask for little of the module that nearer ones do not. With six, tests of parts beside it

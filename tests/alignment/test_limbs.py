@@ -187,3 +187,15 @@ def test_fullness_is_that_of_the_front_of_the_trunk() -> None:
     sigma = np.where(rises, 0.3, 9.0)
     told = tell_fullness(replace(body, breath=MeanBreath(field, sigma)))
     assert told == pytest.approx((1.5, 0.3), abs=0.05)
+
+
+def test_over_a_border_what_moves_passes_into_what_does_not_as_a_bell_curve_sums() -> None:
+    """An arm of 21 cells: 105 mm within it, 96 % of a cell are the arm's."""
+    cells = person()
+    arm = limb_fields(cells, 400.0)["left arm"][:, 0, 3]
+    part = name_parts(cells) == PARTS.index("left arm")
+    along = cells.centres[:, 1]
+    border = along[part].min() - 15.0
+    for away_mm, share in ((15.0, 0.599), (75.0, 0.894), (105.0, 0.960)):
+        here = at(cells, border + away_mm, 1365.0)
+        assert arm[here] == pytest.approx(share, abs=0.02)

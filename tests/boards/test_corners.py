@@ -12,7 +12,7 @@ from scipy.special import erf
 
 from bodyscan.arrays import Array, Bytes
 from bodyscan.boards.board_map import fit_board_map
-from bodyscan.boards.corners import refine_corners, sum_equations
+from bodyscan.boards.corners import _patches, refine_corners, sum_equations
 from bodyscan.geometry.least_squares import StackedEquations
 from bodyscan.rig.board import Board
 
@@ -124,3 +124,44 @@ def test_compiled_equations_are_those_of_the_corner_s_image() -> None:
         # central differences of 1e-5 px are good to 1e-9 of the greatest entry
         scale = np.abs(expected).max()
         assert getattr(found, name) == pytest.approx(expected, abs=1e-7 * scale), name
+
+
+def window(marker_gap: float | None, radius_px: float = 9.0) -> Array:
+    """Weights of the pixels around the corner at (40, 30) of squares of 20 x 30 px."""
+    image = np.zeros((61, 81), np.uint8)
+    along = np.array([[[20.0, 0.0], [0.0, 30.0]]])
+    start, bright = np.array([[40.0, 30.0]]), np.array([True])
+    found = _patches(image, start, along, bright, marker_gap, radius_px)
+    side = 2 * int(radius_px) + 1
+    return np.asarray(found.weight.reshape(side, side))
+
+
+def test_a_window_holds_what_is_sure_to_be_of_the_four_squares() -> None:
+    """Within its radius, and within 0.42 of a square: 8.4 and 12.6 px."""
+    v, u = np.mgrid[-9:10, -9:10]
+    np.testing.assert_array_equal(window(None), (np.abs(u) <= 8) & (u**2 + v**2 <= 81))
+    v, u = np.mgrid[-14:15, -14:15]
+    inside = (np.abs(u) <= 8) & (np.abs(v) <= 12) & (u**2 + v**2 <= 196)
+    np.testing.assert_array_equal(window(None, 14.0), inside)
+
+
+def test_of_white_squares_a_window_holds_what_lies_before_their_markers() -> None:
+    """A gap of 0.2 is 4 px across and 6 down; 1.4 px less for blur. The white ones lie where u and v
+    have one sign. Of a narrow gap 1.5 px are left."""
+    v, u = np.mgrid[-9:10, -9:10]
+    inside = (np.abs(u) <= 8) & (u**2 + v**2 <= 81)
+    white = u * v > 0
+    before = (np.abs(u) < 2.6) | (np.abs(v) < 4.6)
+    np.testing.assert_array_equal(window(0.2), inside & (before | ~white))
+    narrow = (np.abs(u) < 1.5) | (np.abs(v) < 1.5)
+    np.testing.assert_array_equal(window(0.05), inside & (narrow | ~white))
+
+
+def test_what_lies_beside_the_picture_has_no_weight() -> None:
+    along, bright = np.array([[[20.0, 0.0], [0.0, 20.0]]]), np.array([True])
+    picture = np.zeros((61, 81), np.uint8)
+    found = _patches(picture, np.array([[3.0, 58.0]]), along, bright, None, 6.0)
+    weight = found.weight.reshape(13, 13)
+    assert not weight[:, :3].any()
+    assert not weight[9:].any()
+    assert weight[6, 3] == weight[8, 6] == 1.0
