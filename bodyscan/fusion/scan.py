@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.following import Followed
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.oblique_light import LightLine, ObliqueLight, take_out
-from bodyscan.alignment.sway_prior import SwayPrior, centre_sigmas
+from bodyscan.alignment.sway_prior import SwayPrior
 from bodyscan.alignment.together import Together, bring_together
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.floor import find_floor
@@ -22,15 +23,14 @@ from bodyscan.fusion.merging import merge
 from bodyscan.fusion.meshing import attach_attributes, closed_surface
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
 from bodyscan.fusion.regions import label_regions
-from bodyscan.fusion.scan_verdict import grade_scan
+from bodyscan.fusion.scan_verdict import ImageEvidence, RigEvidence, grade_scan
 from bodyscan.fusion.seams import judge_seams
-from bodyscan.fusion.surface_check import SurfaceCheck, check_surface
+from bodyscan.fusion.surface_check import check_surface
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh, BreathAt
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent, step
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.registration.board_checks import size_ratio
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Announce, Verdict, say_nothing
@@ -118,32 +118,6 @@ def fuse(
     points = {image.pair: int(image.valid.sum()) for image in cleaned}
     failed = dict(measured.failures)
 
-    def graded(surface: BodyMesh | None, held: SurfaceCheck | None) -> Verdict:
-        return grade_scan(
-            cloud,
-            surface,
-            alignment,
-            failed,
-            calibration.rig.volume,
-            settings.use,
-            seams,
-            held,
-            fused.contradictions,
-            size_ratio=size_ratio(calibration.rig, calibration.rig_from_camera),
-            unjudged=[name for name, pair in calibration.pairs.items() if pair.quality.unjudged],
-            cameras=np.array([at.translation for at in calibration.rig_from_camera.values()]),
-            agreements={image.pair: image.agreement for image in images if image.agreement},
-            person=person,
-            shifted=together.shifted if together else (),
-            size=together.size if together else None,
-            search=together.search if together else None,
-            boards_mm=centre_sigmas(calibration.covariance),
-            floor_mm=floor,
-            silent=_silent(
-                calibration.rig.poles, [*points, *failed], [image.pair for image in seen]
-            ),
-        )
-
     with step(progress, "judging"):
         moved = {name for one in together.shifted for name in one.pairs} if together else set()
         floor = find_floor(
@@ -151,8 +125,23 @@ def fuse(
             calibration.rig_from_camera,
             calibration.rig.volume,
         )
-        seams = judge_seams(seen, there, calibration.rig.poles)
-        announce(graded(None, None), final=False)
+        judged = partial(
+            grade_scan,
+            cloud,
+            RigEvidence.of(calibration),
+            ImageEvidence(
+                failed,
+                _silent(calibration.rig.poles, [*points, *failed], [image.pair for image in seen]),
+                {image.pair: image.agreement for image in images if image.agreement},
+                judge_seams(seen, there, calibration.rig.poles),
+                fused.contradictions,
+                floor,
+            ),
+            settings.use,
+            together=together,
+            person=person,
+        )
+        announce(judged(), final=False)
 
     def named() -> BodyCloud:
         regions = label_regions(cloud, seen, there, settings.fusion.window_mm)
@@ -171,7 +160,7 @@ def fuse(
         carried = {image.pair: image for image in seen}
         at_once_or_empty = [carried.get(image.pair, image) for image in cleaned]
         held = check_surface(surface, at_once_or_empty, placing)
-        verdict = graded(surface, held)
+        verdict = judged(mesh=surface, surface=held)
     images, notes = tuple(seen), measured.notes
     return Scan(
         cloud, surface, alignment, points, failed, verdict, images, placing, person, notes, oblique

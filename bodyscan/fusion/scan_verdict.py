@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import ndimage
@@ -12,6 +13,8 @@ from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.place_evidence import SizeStep
 from bodyscan.alignment.pole_steps import STILL_MM, PoleStep, StepSearch
+from bodyscan.alignment.sway_prior import centre_sigmas
+from bodyscan.alignment.together import Together
 from bodyscan.arrays import Array
 from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.proportions import odd_proportions
@@ -22,7 +25,8 @@ from bodyscan.mesh.rings import rings
 from bodyscan.mesh.slices import height_ranges, loops_at
 from bodyscan.optional import optional
 from bodyscan.reconstruction.two_ways import Agreement
-from bodyscan.registration.board_checks import OTHER_SIZE, REFUSED_SIZE
+from bodyscan.registration.nominal_size import NominalSize, nominal_size
+from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
 from bodyscan.verdict import Grade, Verdict
@@ -85,63 +89,92 @@ LEAST_YIELD = 0.6
 """of the skin: shadows of arms and chin leave 0.85 and more"""
 
 
-def grade_scan(
-    cloud: BodyCloud,
-    mesh: BodyMesh | None,
-    alignment: Alignment | None,
-    failed: Mapping[str, str],
-    volume: Volume,
-    use: UseLimits,
-    seams: SeamReport | None = None,
-    surface: SurfaceCheck | None = None,
-    contradictions: Contradictions | None = None,
-    unjudged: Sequence[str] = (),
-    size_ratio: float | None = None,
-    cameras: Array | None = None,
-    agreements: Mapping[str, Agreement] | None = None,
-    person: PersonMotion | None = None,
-    shifted: Sequence[PoleStep] = (),
-    size: SizeStep | None = None,
-    search: StepSearch | None = None,
-    boards_mm: Mapping[str, float] | None = None,
-    silent: Sequence[str] = (),
-    floor_mm: float | None = None,
-) -> Verdict:
-    """The worst of all findings decides; the reasons come worst first. mesh: None while there is none
-    yet: what it alone would show is left out. use: how wrong a girth may be. seams: see
-    `judge_seams`. surface: see `check_surface`. contradictions: see `merge`.
+@dataclass(frozen=True, eq=False)
+class RigEvidence:
+    """What a verdict goes by of the rig and its calibration.
 
     unjudged: pairs whose calibration was imported and says nothing of how exact it is.
-    size_ratio: how many times as far apart as their nominal places the cameras stand, if known.
-    cameras: (N, 3) where those of the whole rig stand; None for all round.  What none of them could
-    see is no reason to repeat.
-
-    agreements: of pairs that project stripes of two directions.  person: how a body that moved did.
-    shifted: poles that moved since the calibration.  size: all of them did, outwards or inwards.
-    search: what the pairs' motions are besides.
+    nominal: how the distances between cameras compare with those of their nominal places, if known.
+    cameras: (N, 3) where those of the whole rig stand; None for all round. What none of them could see
+    is no reason to repeat.
     boards_mm: how exactly each pair's place is known, see `centre_sigmas`.
-    silent: poles of which no pair saw anybody.
-    floor_mm: at which height the floor is seen, see `find_floor`.
+    """
+
+    volume: Volume
+    unjudged: tuple[str, ...] = ()
+    nominal: NominalSize | None = None
+    cameras: Array | None = None
+    boards_mm: Mapping[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def of(calibration: RigCalibration) -> RigEvidence:
+        pairs, placed = calibration.pairs, calibration.rig_from_camera
+        return RigEvidence(
+            calibration.rig.volume,
+            tuple(name for name, pair in pairs.items() if pair.quality.unjudged),
+            nominal_size(calibration.rig, placed),
+            np.array([at.translation for at in placed.values()]),
+            centre_sigmas(calibration.covariance),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ImageEvidence:
+    """What a verdict goes by of the range images.
+
+    failed: pairs that gave none, with the reason. silent: poles of which no pair saw anybody.
+    agreements: of pairs that project stripes of two directions. seams: see `judge_seams`.
+    contradictions: see `merge`. floor_mm: at which height the floor is seen, see `find_floor`.
+    """
+
+    failed: Mapping[str, str] = field(default_factory=dict)
+    silent: tuple[str, ...] = ()
+    agreements: Mapping[str, Agreement] = field(default_factory=dict)
+    seams: SeamReport | None = None
+    contradictions: Contradictions | None = None
+    floor_mm: float | None = None
+
+
+def grade_scan(
+    cloud: BodyCloud,
+    rig: RigEvidence,
+    images: ImageEvidence,
+    use: UseLimits,
+    *,
+    together: Together | None = None,
+    person: PersonMotion | None = None,
+    mesh: BodyMesh | None = None,
+    surface: SurfaceCheck | None = None,
+) -> Verdict:
+    """The worst of all findings decides; the reasons come worst first.
+
+    use: how wrong a girth may be. together: what alignment made of the images; None where it took no
+    part. person: how a body that moved did. mesh: None while there is none yet: what it alone would
+    show is left out. surface: see `check_surface`.
 
     A check that fails by itself leaves the scan usable at best, and says so.
     """
+    alignment = together.alignment if together else None
+    shifted = together.shifted if together else ()
+    size = together.size if together else None
+    seams, contradictions = images.seams, images.contradictions
     # What is filled touches anything, and has any shape.
     filled = surface.filled_share if surface else mesh.filled_share if mesh else 1.0
     shape = mesh if filled <= MOST_FILLED else None
     checks: dict[str, Callable[[], Iterable[Finding]]] = {
-        "pairs": lambda: _pairs(failed, alignment),
-        "presence": lambda: _silent(silent),
-        "calibration": lambda: _calibration(unjudged),
-        "nominal places": lambda: _rig_size(size_ratio),
-        "directions": lambda: _directions(agreements or {}),
+        "pairs": lambda: _pairs(images.failed, alignment),
+        "presence": lambda: _silent(images.silent),
+        "calibration": lambda: _calibration(rig.unjudged),
+        "nominal places": lambda: _rig_size(rig.nominal),
+        "directions": lambda: _directions(images.agreements),
         "seams": lambda: _seams(seams, use),
         "poles": lambda: _shifted(shifted),
         "size": lambda: _size(size, use),
-        "floor": lambda: _floor(floor_mm, moved=bool(shifted)),
-        "places": lambda: _own_places(search, use, boards_mm or {}),
+        "floor": lambda: _floor(images.floor_mm, moved=bool(shifted)),
+        "places": lambda: _own_places(together.search, use, rig.boards_mm) if together else (),
         "disagreement": lambda: _disagreement(alignment),
         "motion": lambda: _motion(
-            None if shifted or size else alignment, person, use, boards_mm or {}
+            None if shifted or size else alignment, person, use, rig.boards_mm
         ),
         "contradictions": lambda: _contradictions(
             contradictions, seams, explained=bool(shifted or size)
@@ -149,12 +182,14 @@ def grade_scan(
         "pieces": lambda: _company(cloud),
         "limbs": lambda: _limbs(shape) if shape else (),
         "proportions": lambda: odd_proportions(shape) if shape else (),
-        "cuts": lambda: _cuts(cloud, volume),
+        "cuts": lambda: _cuts(cloud, rig.volume),
         "omissions": lambda: _omissions(cloud, mesh) if mesh else (),
         "contacts": lambda: _contacts(shape) if shape else (),
         "yields": lambda: _yields(surface),
         "gaps": lambda: (
-            _other_side(mesh) if mesh and _see_one_side(cloud, cameras) else _gaps(cloud, surface)
+            _other_side(mesh)
+            if mesh and _see_one_side(cloud, rig.cameras)
+            else _gaps(cloud, surface)
         ),
     }
     findings: list[Finding] = []
@@ -201,15 +236,13 @@ def _calibration(unjudged: Sequence[str]) -> Iterator[Finding]:
         )
 
 
-def _rig_size(ratio: float | None) -> Iterator[Finding]:
+def _rig_size(size: NominalSize | None) -> Iterator[Finding]:
     """Whoever scans need not have read what was said when the rig was calibrated."""
-    if ratio is None or abs(ratio - 1.0) <= OTHER_SIZE:
+    if size is None or size.mark == "good":
         return
     yield (
-        "repeat" if abs(ratio - 1.0) > REFUSED_SIZE else "usable",
-        f"the calibration has the cameras {ratio:.3f} times as far apart as their nominal poses: is "
-        "square_mm of its boards right? Every girth is wrong by as much if it is not; correct it and "
-        "calibrate again, or correct `nominal`",
+        "repeat" if size.mark == "bad" else "usable",
+        f"{size.words}, and every girth may be wrong by as much: {size.remedy}",
     )
 
 

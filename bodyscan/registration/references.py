@@ -18,7 +18,7 @@ from bodyscan.boards.view import BoardView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.transforms import rigid_fit
 from bodyscan.outcome import Outcome
-from bodyscan.registration.board_checks import OTHER_SIZE, REFUSED_SIZE
+from bodyscan.registration.nominal_size import OTHER_SIZE, REFUSED_SIZE
 from bodyscan.registration.rig_solve import RigSolution
 from bodyscan.rig.board import Board
 from bodyscan.rig.reference import Reference

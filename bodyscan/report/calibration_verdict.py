@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.calibration.coverage import covered_share
-from bodyscan.errors import FailedWork
 from bodyscan.geometry.pose_covariance import position_sigma
-from bodyscan.registration.board_checks import check_board_size
+from bodyscan.registration.nominal_size import nominal_size
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.verdict import Grade, Verdict
 
@@ -81,7 +80,9 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
         for times, words in pair.beyond():
             far = times > FAR_BEYOND
             findings.append((times, f"{'recalibrate: ' if far else ''}pair {pair.name}: {words}"))
-    findings += [(1.0, line) for line in _size(calibration)]
+    size = nominal_size(calibration.rig, calibration.rig_from_camera)
+    if size and size.mark != "good":  # one in use is told; a new one that is far off is not made
+        findings.append((1.0, f"{size.words}: {size.remedy}"))
     findings.sort(key=lambda finding: -finding[0])
     worst = findings[0][0] if findings else 0.0
     unjudged = [
@@ -94,14 +95,6 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
     if unjudged and grade != "recalibrate":
         grade = "not judged"
     return Verdict(grade, (*(words for _, words in findings), *unjudged))
-
-
-def _size(calibration: RigCalibration) -> list[str]:
-    """A calibration in use is told of its size; a new one that is far off is not made."""
-    try:
-        return check_board_size(calibration.rig, calibration.rig_from_camera)
-    except FailedWork as error:
-        return [str(error)]
 
 
 def _figures(calibration: RigCalibration, name: str) -> PairFigures:

@@ -26,7 +26,8 @@ from bodyscan.errors import BadInput, BodyscanError, FailedWork, listed, plainly
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 from bodyscan.progress import THREADS, Progress, attempt_each, silent, step
-from bodyscan.registration.board_checks import check_board_size, describe_findings
+from bodyscan.registration.board_checks import describe_findings
+from bodyscan.registration.nominal_size import check_nominal_size
 from bodyscan.registration.references import find_size, resized, solving_views
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.rig_frame import frame_target
@@ -117,7 +118,7 @@ def join_rig(
             located = locate_views(rig, views, cameras.value)
             joined = _join_pairs(rig, located.value, cameras)
     placed = joined.value
-    sized = [*size.notes, *check_board_size(rig, placed.rig_from_camera)]
+    sized = [*size.notes, *check_nominal_size(rig, placed.rig_from_camera)]
     decoded, fitted = _decode_and_fit(rig, captures, placed, cameras.value, boards.value, progress)
     lost = {**cameras.failures, **joined.failures, **decoded.failures}
     failed = lost | dict(fitted.failures)

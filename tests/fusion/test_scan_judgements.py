@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import pytest
 from made_scan import MadeScan, make_scan
+from verdict_given import verdict_given
 
 from bodyscan.alignment.icp import Alignment, Overlap
 from bodyscan.alignment.place_evidence import SizeStep
 from bodyscan.alignment.pole_steps import PoleStep, StepSearch
 from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.scan import _silent
-from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.seams import Seam, SeamReport
 from bodyscan.fusion.surface_check import SurfaceCheck
-from bodyscan.rig.rig import Volume
+from bodyscan.registration.nominal_size import NominalSize
 from bodyscan.settings import UseLimits
 from bodyscan.verdict import Verdict
 
@@ -34,20 +35,13 @@ def aligned(motion_mm: float = 0.1, rms_mm: float = 0.1, expected_mm: float = 0.
     return Alignment({}, {"p1": motion_mm, "p2": 0.0}, {}, (overlap,))
 
 
-def graded(
-    scan: MadeScan,
-    alignment: Alignment | None = None,
-    step_mm: float | None = None,
-    untied: tuple[tuple[str, ...], ...] = (),
-    use: UseLimits = UseLimits(),  # noqa: B008  (frozen)
-    contradictions: Contradictions | None = None,
-) -> Verdict:
-    seams = (Seam(("p1", "p2"), np.full(9, step_mm), np.zeros(9)),) if step_mm else ()
-    report = SeamReport(seams, GROUPS, untied)
-    volume = Volume()
-    return grade_scan(
-        scan.cloud, scan.mesh, alignment, {}, volume, use, report, contradictions=contradictions
-    )
+def graded(scan: MadeScan, alignment: Alignment | None = None, **given: Any) -> Verdict:
+    return verdict_given(scan.cloud, scan.mesh, alignment=alignment or aligned(), **given)
+
+
+def met(step_mm: float) -> SeamReport:
+    """Two pairs whose surfaces stand so far apart where they meet."""
+    return SeamReport((Seam(("p1", "p2"), np.full(9, step_mm), np.zeros(9)),), GROUPS, ())
 
 
 def test_this_scan_is_good(scan: MadeScan) -> None:
@@ -75,11 +69,11 @@ def test_nothing_is_said_of_motion_that_nobody_saw(scan: MadeScan) -> None:
 )
 def test_a_step_counts_by_the_girth_it_costs(scan: MadeScan, step_mm: float, grade: str) -> None:
     """2 and 4 mm of girth, over 2 pi."""
-    assert graded(scan, aligned(), step_mm).grade == grade
+    assert graded(scan, aligned(), seams=met(step_mm)).grade == grade
 
 
 def test_the_operator_says_what_is_good_enough(scan: MadeScan) -> None:
-    assert graded(scan, aligned(), 5.0, use=NO_LIMITS).grade == "good"
+    assert graded(scan, aligned(), seams=met(5.0), use=NO_LIMITS).grade == "good"
 
 
 def test_noise_that_sigmas_hold_is_no_reason_to_repeat(scan: MadeScan) -> None:
@@ -98,7 +92,7 @@ def test_disagreement_beyond_sigmas_is_told(
 
 
 def test_pairs_that_nothing_ties_are_named(scan: MadeScan) -> None:
-    verdict = graded(scan, aligned(), untied=(("p3-1", "p3-2"),))
+    verdict = graded(scan, aligned(), seams=SeamReport((), GROUPS, (("p3-1", "p3-2"),)))
     assert verdict.grade == "usable"
     assert "nothing ties p3-1, p3-2 to the others" in str(verdict)
 
@@ -120,13 +114,9 @@ def test_poles_that_moved_explain_nothing_if_pairs_still_contradict_each_other(
     found = against({("a", "b"): 0.009, ("b", "c"): 0.009, ("a", "c"): 0.009})
     step = PoleStep("pole p1", frozenset({"p1-1", "p1-2"}), 2.6, 0.15)
     grades = [
-        grade_scan(
-            scan.cloud,
-            scan.mesh,
+        graded(
+            scan,
             aligned(),
-            {},
-            Volume(),
-            UseLimits(),
             contradictions=contradictions,
             shifted=[step],
         ).grade
@@ -174,9 +164,7 @@ def test_a_pole_that_moved_is_mended_and_a_pair_may_measure_wrongly(
     scan: MadeScan, pairs: set[str], grade: str
 ) -> None:
     step = PoleStep("pole p", frozenset(pairs), 5.0, 0.1)
-    verdict = grade_scan(
-        scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=[step]
-    )
+    verdict = graded(scan, aligned(), shifted=[step])
     assert verdict.grade == grade
     assert "pole p stands 5.0 mm from where the calibration has it" in str(verdict)
 
@@ -189,9 +177,7 @@ def test_cameras_that_do_not_stand_where_they_should_make_the_size_doubtful(
     scan: MadeScan, ratio: float | None, grade: str
 ) -> None:
     """A print at 97 % was said when the rig was calibrated, and every scan after it was good."""
-    verdict = grade_scan(
-        scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), size_ratio=ratio
-    )
+    verdict = graded(scan, aligned(), nominal=NominalSize(ratio) if ratio else None)
     assert verdict.grade == grade
     assert ("times as far apart" in str(verdict)) == (grade != "good")
 
@@ -212,13 +198,9 @@ def test_heights_are_counted_from_the_floor(
 ) -> None:
     """Two poles lifted and one lowered by 16 mm: it was brought to the others, and all was as high."""
     step = PoleStep("pole p1", frozenset({"p1-1", "p1-2"}), 3.0, 0.1)
-    verdict = grade_scan(
-        scan.cloud,
-        scan.mesh,
+    verdict = graded(
+        scan,
         aligned(),
-        {},
-        Volume(),
-        UseLimits(),
         shifted=[step] if moved else [],
         floor_mm=floor_mm,
     )
@@ -227,7 +209,7 @@ def test_heights_are_counted_from_the_floor(
 
 def test_two_poles_that_moved_leave_nothing_to_hold_the_size(scan: MadeScan) -> None:
     steps = [PoleStep(f"pole p{k}", frozenset({f"p{k}-1", f"p{k}-2"}), 3.0, 0.1) for k in (1, 2)]
-    verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=steps)
+    verdict = graded(scan, aligned(), shifted=steps)
     assert verdict.grade == "repeat"
     assert all(f"{step.name} stands 3.0 mm" in str(verdict) for step in steps)
 
@@ -235,9 +217,7 @@ def test_two_poles_that_moved_leave_nothing_to_hold_the_size(scan: MadeScan) -> 
 def test_one_pole_of_those_that_all_moved_leaves_nothing_either(scan: MadeScan) -> None:
     """All by 3 mm outwards, with a person who sways: one is found, and girths were 11 mm off."""
     step = PoleStep("pole p1", frozenset({"p1-1", "p1-2"}), 3.0, 0.1, all_moved=True)
-    verdict = grade_scan(
-        scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=[step]
-    )
+    verdict = graded(scan, aligned(), shifted=[step])
     assert verdict.grade == "repeat"
 
 
@@ -253,7 +233,7 @@ def test_poles_that_all_stand_farther_out_leave_overlaps_to_hold_the_size(
     scan: MadeScan, out_mm: float, grade: str, words: str
 ) -> None:
     size = SizeStep(out_mm, 0.1)
-    verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), size=size)
+    verdict = graded(scan, aligned(), size=size)
     assert verdict.grade == grade
     assert "all poles stand" in str(verdict)
     assert words in str(verdict)
@@ -263,17 +243,14 @@ def test_who_turns_stays_where_he_is(scan: MadeScan) -> None:
     """As a pole that is turned about its own foot does not."""
     pairs = frozenset({"p1-1", "p1-2"})
     person, pole = PoleStep("pole p1", pairs, 5.0, 14.0), PoleStep("pole p1", pairs, 200.0, 14.0)
-    said = [
-        grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), shifted=[step])
-        for step in (person, pole)
-    ]
+    said = [graded(scan, aligned(), shifted=[step]) for step in (person, pole)]
     assert "the person turned by 14 degrees" in str(said[0])
     assert said[0].grade == "repeat"
     assert "pole p1 stands 200.0 mm from where" in str(said[1])
 
 
 def test_a_pole_that_saw_nobody_is_named(scan: MadeScan) -> None:
-    verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), UseLimits(), silent=["p3"])
+    verdict = graded(scan, aligned(), silent=["p3"])
     assert verdict.grade == "usable"
     assert "pole p3 saw nobody" in str(verdict)
     assert "did the person leave" in str(verdict)
@@ -289,7 +266,7 @@ def test_a_pair_that_does_not_fit_is_to_be_repeated(scan: MadeScan) -> None:
 def test_pairs_that_failed_alike_share_a_line_and_its_remedy(scan: MadeScan) -> None:
     missing = "s01/{}/lit.png: is missing\n  Copy it here."
     failed = {name: missing.format(name) for name in ("p1-1", "p1-2")} | {"p2-1": "too dark"}
-    verdict = grade_scan(scan.cloud, scan.mesh, None, failed, Volume(), NO_LIMITS)
+    verdict = graded(scan, failed=failed, use=NO_LIMITS)
     assert verdict.reasons == (
         "left out: p1-1, p1-2: s01/p1-1/lit.png: is missing\n  Copy it here.",
         "left out: p2-1: too dark",
@@ -302,7 +279,7 @@ def test_a_head_that_ends_in_a_cut_has_no_stature(scan: MadeScan, filled: bool) 
     heights = np.append(np.linspace(0.0, 1500.0, 1000), np.full(20, 1503.0))
     areas = np.full(len(heights), 1600.0)
     check = SurfaceCheck(heights, areas, (heights > 1500.0) & filled, {}, {})
-    verdict = grade_scan(scan.cloud, scan.mesh, None, {}, Volume(), NO_LIMITS, surface=check)
+    verdict = graded(scan, use=NO_LIMITS, surface=check)
     assert verdict.grade == ("usable" if filled else "good")
     assert ("above 1503 mm" in str(verdict)) == filled
 
@@ -317,7 +294,7 @@ def test_pairs_that_stand_off_each_by_itself(
     """2 mm of a girth are 0.32 of a radius, 4 are 0.64."""
     search = StepSearch(None, 1.0, sway_mm, own_mm)
     limits = UseLimits(good_girth_mm=2.0, usable_girth_mm=4.0)
-    verdict = grade_scan(scan.cloud, scan.mesh, aligned(), {}, Volume(), limits, search=search)
+    verdict = graded(scan, aligned(), use=limits, search=search)
     assert verdict.grade == grade
     assert ("did head or arms move" in str(verdict)) == (sway_mm > 1.0)
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from made_scan import MadeScan, egg, make_scan
+from verdict_given import verdict_given
 
 from bodyscan.alignment.body_parts import PartMotion, PersonMotion
 from bodyscan.alignment.icp import Alignment
@@ -17,7 +18,6 @@ from bodyscan.alignment.sway_prior import centre_sigmas
 from bodyscan.arrays import Array
 from bodyscan.fusion import scan_verdict
 from bodyscan.fusion.contradictions import Contradictions
-from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -38,14 +38,7 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> MadeScan:
 
 def told(cloud: BodyCloud, mesh: BodyMesh | None = None, **given: Any) -> tuple[str, str]:
     """Grade, and the reasons as one text."""
-    facts: dict[str, Any] = {
-        "alignment": None,
-        "failed": {},
-        "volume": Volume(),
-        "use": UseLimits(),
-        **given,
-    }
-    verdict = grade_scan(cloud, mesh, **facts)
+    verdict = verdict_given(cloud, mesh, **given)
     return verdict.grade, " | ".join(verdict.reasons)
 
 

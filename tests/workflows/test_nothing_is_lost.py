@@ -8,15 +8,13 @@ from typing import NoReturn
 import pytest
 from made_scan import make_scan
 from seen_boards import SeenBoards, seen_boards
+from verdict_given import verdict_given
 
 from bodyscan.files.hashing import file_hash
-from bodyscan.fusion.scan_verdict import grade_scan
 from bodyscan.fusion.storage import load_scan
 from bodyscan.registration.storage import load_calibration
 from bodyscan.report import calibration_page, pictures
 from bodyscan.report.page import render
-from bodyscan.rig.rig import Volume
-from bodyscan.settings import UseLimits
 from bodyscan.workflows import calibrate_rig, rig_remarks
 from bodyscan.workflows.write_report import write_report
 
@@ -103,9 +101,9 @@ def test_a_verdict_that_misses_a_check_is_not_good(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scan = make_scan(tmp_path / "scan")
-    whole = grade_scan(scan.cloud, scan.mesh, None, {}, Volume(), UseLimits())
+    whole = verdict_given(scan.cloud, scan.mesh)
     monkeypatch.setattr("bodyscan.fusion.scan_verdict.rings", broken)
-    missed = grade_scan(scan.cloud, scan.mesh, None, {}, Volume(), UseLimits())
+    missed = verdict_given(scan.cloud, scan.mesh)
     said = set(missed.reasons) - set(whole.reasons)
     assert len(said) == 1
     assert "verdict on contacts" in said.pop()

@@ -1,0 +1,68 @@
+"""The size that the boards give a rig is held against the nominal places of its cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.errors import FailedWork
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.nominal_size import check_nominal_size, nominal_size
+from bodyscan.rig.board import Board
+from bodyscan.rig.rig import Rig
+
+PLACES = {"a": (1000.0, 0.0, 500.0), "b": (0.0, 1000.0, 500.0), "c": (-1000.0, 0.0, 900.0)}
+RIG = Rig.model_validate(
+    {
+        "name": "three",
+        "boards": (
+            Board(name="seen", columns=9, rows=7, square_mm=50),
+            Board(name="unseen", columns=10, rows=7, square_mm=20),
+        ),
+        "pairs": tuple(
+            {
+                "name": name,
+                "camera": {"width": 640, "height": 480},
+                "nominal": {"position_mm": place, "look_at_mm": (0, 0, 500)},
+            }
+            for name, place in PLACES.items()
+        ),
+    }
+)
+
+
+def placed(factor: float) -> dict[str, RigidTransform]:
+    return {n: RigidTransform(np.eye(3), factor * np.array(p)) for n, p in PLACES.items()}
+
+
+def test_squares_of_another_size_show_in_the_size_of_the_rig() -> None:
+    (note,) = check_nominal_size(RIG, placed(1.04))
+    assert "1.040 times" in note
+    assert "48.08 would fit" in note
+    assert not check_nominal_size(RIG, placed(1.02))
+    (note,) = check_nominal_size(RIG, placed(0.96))
+    assert "0.960 times" in note
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.89, 1.11, 10.0])
+def test_a_size_that_no_tape_measure_errs_by_is_refused(factor: float) -> None:
+    """Centimetres for millimetres; a print scaled to another paper."""
+    with pytest.raises(FailedWork, match=f"{factor:.3f} times as far apart") as refused:
+        check_nominal_size(RIG, placed(factor))
+    assert "square_mm may be wrong" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("factor", "mark"), [(0.89, "bad"), (0.91, "usable"), (0.98, "good"), (1.09, "usable")]
+)
+def test_a_calibration_in_use_is_marked(factor: float, mark: str) -> None:
+    size = nominal_size(RIG, placed(factor))
+    assert size is not None
+    assert size.mark == mark
+
+
+def test_a_rig_without_boards_is_told_as_well() -> None:
+    """What another program calibrated: only `nominal` can be mended here."""
+    (note,) = check_nominal_size(RIG.model_copy(update={"boards": ()}), placed(1.05))
+    assert "1.050 times" in note
+    assert "correct `nominal`" in note

@@ -1,0 +1,58 @@
+"""A scan's verdict from a few facts by name, all others being sound."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, TypeVar
+
+import numpy as np
+
+from bodyscan.alignment.body_parts import PersonMotion
+from bodyscan.alignment.icp import Alignment
+from bodyscan.alignment.pole_steps import StepSearch
+from bodyscan.alignment.together import Together
+from bodyscan.fusion.scan_verdict import ImageEvidence, RigEvidence, grade_scan
+from bodyscan.fusion.surface_check import SurfaceCheck
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.rig.rig import Volume
+from bodyscan.settings import UseLimits
+from bodyscan.verdict import Verdict
+
+Evidence = TypeVar("Evidence", RigEvidence, ImageEvidence, Together)
+SOUND: dict[type, dict[str, Any]] = {
+    RigEvidence: {"volume": Volume()},
+    ImageEvidence: {},
+    Together: {
+        "alignment": Alignment({}, {}, {}, ()),
+        "followed": None,
+        "shifted": (),
+        "size": None,
+        "search": StepSearch(None, np.inf),
+    },
+}
+
+
+def verdict_given(
+    cloud: BodyCloud,
+    mesh: BodyMesh | None = None,
+    *,
+    use: UseLimits = UseLimits(),  # noqa: B008  (frozen)
+    person: PersonMotion | None = None,
+    surface: SurfaceCheck | None = None,
+    **given: Any,
+) -> Verdict:
+    """given: fields of RigEvidence, of ImageEvidence and of Together."""
+    rig, images = _evidence(RigEvidence, given), _evidence(ImageEvidence, given)
+    together = _evidence(Together, given)
+    assert not given, f"no evidence has {', '.join(given)}"
+    return grade_scan(
+        cloud, rig, images, use, together=together, person=person, mesh=mesh, surface=surface
+    )
+
+
+def _evidence(kind: type[Evidence], given: dict[str, Any]) -> Evidence:
+    own: Mapping[str, Any] = {
+        field.name: given.pop(field.name) for field in fields(kind) if field.name in given
+    }
+    return kind(**{**SOUND[kind], **own})
