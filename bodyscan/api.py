@@ -116,8 +116,13 @@ def load_rig(path: AnyPath) -> Rig:
     return load(Path(path))
 
 
-def calibrate_rig(rig_file: AnyPath, *, progress: Progress = silent) -> RigCalibration:
+def calibrate_rig(
+    rig_file: AnyPath | Rig, *, folder: AnyPath | None = None, progress: Progress = silent
+) -> RigCalibration:
     """Every pair of a rig calibrated and placed, from the board images that its file names.
+
+    rig_file: or what `load_rig` made of it, changed or not.  folder: where a `Rig`'s paths start, which
+    is beside its file; without it the current one.
 
     `notes` and `failed` of what is returned say what was left out and why. Raises RigFileError,
     CaptureError; FailedWork if no pair can be calibrated or the pairs do not hang together.
@@ -125,9 +130,11 @@ def calibrate_rig(rig_file: AnyPath, *, progress: Progress = silent) -> RigCalib
     from bodyscan.captures.folder import open_captures
     from bodyscan.workflows.calibrate_rig import calibrate_rig as calibrate
 
-    rig = load_rig(rig_file)
-    captures = open_captures(rig, Path(rig_file))
-    return calibrate(rig, captures, progress, folder=Path(rig_file).parent)
+    if isinstance(rig_file, str | PathLike):
+        rig, path = load_rig(rig_file), Path(rig_file)
+    else:
+        rig, path = rig_file, Path(folder or "") / "rig.yaml"
+    return calibrate(rig, open_captures(rig, path), progress, folder=path.parent)
 
 
 def import_calibration(rig_file: AnyPath, *, sigma_px: float | None = None) -> RigCalibration:

@@ -17,7 +17,6 @@ from bodyscan.captures.folder import open_captures
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.rig.capture_folder import CaptureFolder
 from bodyscan.simulation import simulate
-from bodyscan.workflows.calibrate_rig import calibrate_rig
 from bodyscan.workflows.decode import decode_sequence
 
 RIGS = Path(__file__).parents[1] / "rigs"
@@ -33,7 +32,7 @@ else:
 captures = open_captures(rig, rig_file)
 
 # %% Calibrated: the camera, and the light of every stripe
-calibration = calibrate_rig(rig, captures)
+calibration = bodyscan.calibrate_rig(rig, folder=rig_file.parent)
 ((name, pair),) = calibration.pairs.items()
 print(f"corners {pair.quality.corners_rms_px:.3f} px RMS, light: {pair.quality.light_model}")
 

@@ -55,17 +55,12 @@ def _unfilter(rows: Bytes, image: Bytes) -> bool:
         elif kind == PAETH:
             _add_paeth(row, above, image[v])
         elif kind == 0:
-            _copy(row, image[v])
+            for u in range(row.size):
+                image[v, u] = row[u]
         else:
             return False
         above = image[v]
     return True
-
-
-@compiled
-def _copy(row: Bytes, image: Bytes) -> None:
-    for u in range(row.size):
-        image[u] = row[u]
 
 
 @compiled
