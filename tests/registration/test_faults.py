@@ -17,6 +17,8 @@ from bodyscan.registration.rig_solve import RigSolution, solve_rig
 
 PLACINGS, CAMERAS = ring_of_cameras()
 SHOTS = 24
+Seen = tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float]
+"""Views, where each shot's board stood, and by how much the places that they give are off."""
 
 
 def place(views: list[LocatedView]) -> Outcome[RigSolution]:
@@ -32,7 +34,7 @@ def rms(placed: Outcome[RigSolution]) -> float:
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float]:
+def seen() -> Seen:
     views, truth = ring_views(PLACINGS, CAMERAS, shots=SHOTS)
     return views, truth, rms(place(views))
 
@@ -56,9 +58,7 @@ def busiest(views: list[LocatedView]) -> tuple[str, list[str]]:
     return shot, sorted(view.pair for view in views if view.shot == shot)
 
 
-def test_a_camera_with_half_its_shots_missing(
-    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float],
-) -> None:
+def test_a_camera_with_half_its_shots_missing(seen: Seen) -> None:
     views, _, clean = seen
     own = [view for view in views if view.pair == "p2-3"]
     missing = {view.shot for view in own[::2]}
@@ -72,9 +72,7 @@ def test_a_camera_with_half_its_shots_missing(
     assert np.sqrt(np.mean(np.square(others))) < 1.2 * clean
 
 
-def test_a_pair_entirely_absent(
-    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float],
-) -> None:
+def test_a_pair_entirely_absent(seen: Seen) -> None:
     views, _, clean = seen
     cameras = {name: camera for name, camera in CAMERAS.items() if name != "p3-2"}
     rig = ring_rig(PLACINGS)
@@ -83,9 +81,7 @@ def test_a_pair_entirely_absent(
     assert rms(placed) < 1.2 * clean
 
 
-def test_shuffled_corners(
-    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float],
-) -> None:
+def test_shuffled_corners(seen: Seen) -> None:
     views, _, clean = seen
     number = next(k for k, v in enumerate(views) if v.pair == "p2-2" and len(v.pixels) > 30)
     order = np.random.default_rng(1).permutation(len(views[number].pixels))
@@ -94,16 +90,14 @@ def test_shuffled_corners(
     placed = place(
         [*views[:number], replace(shuffled, camera_from_board=pose), *views[number + 1 :]]
     )
-    assert len(placed.notes) == 1
-    assert "p2-2" in placed.notes[0]
-    assert views[number].shot in placed.notes[0]
+    (note,) = placed.notes
+    assert "p2-2" in note
+    assert views[number].shot in note
     assert rms(placed) < 1.2 * clean
 
 
 @pytest.mark.parametrize("slip_mm", [1.5, 60.0])
-def test_a_board_that_slipped_between_exposures(
-    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float], slip_mm: float
-) -> None:
+def test_a_board_that_slipped_between_exposures(seen: Seen, slip_mm: float) -> None:
     views, truth, clean = seen
     shot, pairs = busiest(views)
     late = pairs[-2:]
@@ -112,17 +106,15 @@ def test_a_board_that_slipped_between_exposures(
     moved = slip @ truth[shot, CHARUCO.name]
     changed = [seen_anew(v, moved, rng) if v.shot == shot and v.pair in late else v for v in views]
     placed = place(changed)
-    assert len(placed.notes) == 1
-    assert f"shot {shot}" in placed.notes[0]
-    assert all(name in placed.notes[0] for name in late)
-    assert not any(name in placed.notes[0] for name in pairs[:-2])
+    (note,) = placed.notes
+    assert f"shot {shot}" in note
+    assert all(name in note for name in late)
+    assert not any(name in note for name in pairs[:-2])
     assert rms(placed) < 1.2 * clean
 
 
 @pytest.mark.parametrize("size", [0.8, 1.02])
-def test_a_different_board_in_one_shot(
-    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float], size: float
-) -> None:
+def test_a_different_board_in_one_shot(seen: Seen, size: float) -> None:
     views, truth, clean = seen
     shot, pairs = busiest(views)
     rng = np.random.default_rng(3)
@@ -130,17 +122,15 @@ def test_a_different_board_in_one_shot(
         seen_anew(v, truth[shot, CHARUCO.name], rng, size) if v.shot == shot else v for v in views
     ]
     placed = place(changed)
-    assert len(placed.notes) == 1
-    assert f"shot {shot}" in placed.notes[0]
-    assert f"{size:.3f} times" in placed.notes[0]
-    assert all(name in placed.notes[0] for name in pairs)
+    (note,) = placed.notes
+    assert f"shot {shot}" in note
+    assert f"{size:.3f} times" in note
+    assert all(name in note for name in pairs)
     assert rms(placed) < 1.2 * clean
 
 
 @pytest.mark.parametrize("step_mm", [10.0, 400.0])
-def test_a_camera_that_took_its_pictures_at_other_times(
-    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float], step_mm: float
-) -> None:
+def test_a_camera_that_took_its_pictures_at_other_times(seen: Seen, step_mm: float) -> None:
     views, truth, clean = seen
     rng = np.random.default_rng(4)
     changed = [
@@ -155,9 +145,7 @@ def test_a_camera_that_took_its_pictures_at_other_times(
 
 
 @pytest.mark.parametrize("step_mm", [10.0, 400.0])
-def test_pictures_none_of_which_were_taken_together_are_refused(
-    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float], step_mm: float
-) -> None:
+def test_pictures_none_of_which_were_taken_together_are_refused(seen: Seen, step_mm: float) -> None:
     views, truth, _ = seen
     rng = np.random.default_rng(5)
     changed = [seen_anew(v, drifted(truth[v.target], step_mm, rng), rng) for v in views]
@@ -179,9 +167,7 @@ def drifted(
     return to_middle @ turn @ to_middle.inverse() @ rig_from_board
 
 
-def test_one_of_two_boards_with_other_squares_than_the_rig_file_says(
-    seen: tuple[list[LocatedView], dict[tuple[str, str], RigidTransform], float],
-) -> None:
+def test_one_of_two_boards_with_other_squares_than_the_rig_file_says(seen: Seen) -> None:
     views, truth, clean = seen
     rng = np.random.default_rng(6)
     second = {f"s{number:02d}" for number in range(0, SHOTS, 4)}
