@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ring import looking_at
 
-from bodyscan.alignment.bending import bend
+from bodyscan.alignment.bending import _one_in_each_block, bend
 from bodyscan.alignment.body_cells import BodyCells, modulated, normal_field, rigid_fields
 from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.matching import alignment_points, match_projected
@@ -145,3 +145,18 @@ def test_what_is_cut_away_changes_nothing(ball: tuple[RangeImage, BodyCells]) ->
             "colours",
         ):
             assert np.array_equal(getattr(one, name, 0), getattr(other, name, 0)), name
+
+
+def test_of_each_block_the_measured_pixel_nearest_to_its_middle_is_taken() -> None:
+    """Blocks of five, counted from the picture's own corner."""
+    sigma = np.full((12, 13), 0.1, np.float32)
+    sigma[4, 5] = np.nan  # the middle of one
+    found = _one_in_each_block(sigma, (3, 2), 5)
+    assert found.shape == (3, 3)
+    # The block of rows 5 to 9 and columns 5 to 9 of the picture has its middle at (7, 7).
+    assert found[1, 2] == 13 * (12 - 3 - 5) + (12 - 2)
+    assert found[1, 1] == 13 * 3 + 5  # beside the one that is missing, the first of four
+    assert found[2, 1] == 13 * (12 - 3) + (7 - 2)
+    assert found[0, 0] == 13 * 0 + 0
+    sigma[2:7, 3:8] = np.nan
+    assert _one_in_each_block(sigma, (3, 2), 5)[1, 1] == -1

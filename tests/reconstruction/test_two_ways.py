@@ -184,3 +184,22 @@ def test_sheets_of_an_import_that_meet_nowhere_are_refused() -> None:
     known = PairQuality(None, 0, imported="its file")
     with pytest.raises(BadInput, match=r"does not fit these stripes.*meet at 0\n.*inverse"):
         reconstruct_range_image(replace(pair(), crossing=rows, quality=known), stripes())
+
+
+def test_a_way_off_by_five_sigmas_is_dropped_where_most_agree_better_than_they_claim() -> None:
+    """Of most the sigmas claim too much, by ten; what those hold is no reason to drop a point."""
+    rays = np.tile([0.0, 0.0, 1.0], (10, 20, 1)).astype(np.float32)
+    sigma = np.full((10, 20), 1.0, np.float32)
+    noise = 0.1 * np.random.default_rng(0).standard_normal((10, 20, 1)).astype(np.float32)
+    crossing = rays * (700.0 + noise)
+    crossing[3, 4] = rays[3, 4] * (700.0 + 4.9 * np.sqrt(2.0))
+    crossing[5, 6] = rays[5, 6] * (700.0 - 5.1 * np.sqrt(2.0))
+    nowhere = np.zeros((10, 20), bool)
+    _, sigma_mm, agreement = combine(rays * 700.0, sigma, crossing, sigma, alone=nowhere)
+    assert agreement is not None
+    assert agreement.dropped == 1
+    assert np.isnan(sigma_mm[5, 6])
+    np.testing.assert_allclose(sigma_mm[np.isfinite(sigma_mm)], np.sqrt(0.5), rtol=1e-6)
+    assert (agreement.pixels, agreement.apart_sigmas < 0.2) == (200, True)
+    few = np.where(np.arange(200).reshape(10, 20) < 99, sigma, np.float32(np.nan))
+    assert combine(rays * 700.0, few, crossing, sigma, alone=nowhere)[2] is None

@@ -33,5 +33,9 @@ def test_a_board_never_found_is_named_with_what_the_rig_file_says() -> None:
 
 
 def test_a_board_of_which_little_is_found_is_doubted() -> None:
-    assert "may not be those" in describe_findings(RIG, [view(10)], 30)
+    said = describe_findings(RIG, [view(10), view(12), view(48)], 30)
+    assert "found in 3 of 30 images, with 25 % of its corners in the usual one" in said
+    assert "may not be those" in said
+    assert "may not be those" in describe_findings(RIG, [view(23)], 30)
+    assert "may not be those" not in describe_findings(RIG, [view(24)], 30)
     assert "may not be those" not in describe_findings(RIG, [view(45)], 30)

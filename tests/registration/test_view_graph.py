@@ -1,0 +1,98 @@
+"""Where pairs stand by the boards they share, and which views and pairs do not go along."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bodyscan.calibration.board_views import LocatedView, greatest_displacement
+from bodyscan.errors import RigDisconnected
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.view_graph import _gaps, initial_poses, place_boards, view_graph
+
+PLACED = {
+    "a": RigidTransform.identity(),
+    "b": RigidTransform.from_rotation_vector([0.0, 0.4, 0.0], [-500.0, 0.0, 80.0]),
+    "c": RigidTransform.from_rotation_vector([0.0, -0.5, 0.1], [480.0, 30.0, 60.0]),
+}
+AWAY_MM = 1000.0
+POINTS = np.array([[40.0 * (k % 4), 40.0 * (k // 4), 0.0] for k in range(12)])
+
+
+def board(shot: int) -> RigidTransform:
+    rng = np.random.default_rng(shot)
+    turn, shift = rng.uniform(-0.4, 0.4, 3), rng.uniform(-100.0, 100.0, 3)
+    return RigidTransform.from_rotation_vector(turn, shift + [0.0, 0.0, AWAY_MM])
+
+
+def view(pair: str, shot: int, aside_mm: float = 0.0, corners: int = 12) -> LocatedView:
+    """aside_mm: how far from where it stood the board is seen."""
+    moved = RigidTransform(np.eye(3), np.array([0.6, 0.8, 0.0]) * aside_mm)
+    seen = PLACED[pair].inverse() @ moved @ board(shot)
+    points = POINTS[:corners]
+    return LocatedView(pair, f"s{shot}", "board", points, points[:, :2], seen)
+
+
+def test_pairs_are_tied_by_the_boards_they_saw_at_one_moment() -> None:
+    graph = view_graph(
+        [view("a", 1), view("b", 1), view("b", 2), view("c", 2), view("a", 3)], "abcd"
+    )
+    assert sorted(map(sorted, graph.edges)) == [["a", "b"], ["b", "c"]]
+    assert graph.edges["a", "b"]["targets"] == [("s1", "board")]
+    assert set(graph.nodes) == set("abcd")
+
+
+def test_displacements_of_many_are_those_of_each() -> None:
+    rng = np.random.default_rng(2)
+    several = [
+        RigidTransform.from_rotation_vector(rng.uniform(-1.5, 1.5, 3), rng.uniform(-90, 90, 3))
+        for _ in range(9)
+    ]
+    found = _gaps(several[0], several, 700.0)
+    truth = [greatest_displacement(several[0], other, 700.0) for other in several]
+    np.testing.assert_allclose(found, truth, atol=0.1)
+    assert found.max() > 900.0
+
+
+def test_poses_follow_along_a_chain_of_shared_boards() -> None:
+    views = [view(pair, shot) for shot in (1, 2) for pair in "ab"]
+    views += [view(pair, shot) for shot in (3, 4) for pair in "bc"]
+    found, left_out = initial_poses(views, "abc")
+    assert not left_out
+    for one, other in (("a", "b"), ("a", "c")):
+        np.testing.assert_allclose(
+            (found[one].inverse() @ found[other]).matrix,
+            (PLACED[one].inverse() @ PLACED[other]).matrix,
+            atol=1e-6,
+        )
+
+
+def test_a_pair_whose_pictures_were_taken_at_other_moments_is_left_out() -> None:
+    views = [view(pair, shot) for shot in range(1, 6) for pair in "ab"]
+    views += [view("c", shot, 150.0 * shot) for shot in range(1, 6)]
+    found, left_out = initial_poses(views, "abc")
+    assert set(found) == {"a", "b"}
+    assert "c" in left_out["c"]
+    with pytest.raises(RigDisconnected, match="differs from shot to shot"):
+        initial_poses([v for v in views if v.pair != "b"], "ac")
+
+
+def test_pairs_that_share_nothing_are_named() -> None:
+    with pytest.raises(RigDisconnected, match="no shared board view ties c to a, b"):
+        initial_poses([view("a", 1), view("b", 1), view("c", 2)], "abc")
+
+
+def test_a_board_stands_where_most_corners_say_and_a_view_far_off_is_doubtful() -> None:
+    """A twelfth of the distance, 80 mm, is doubtful; a twenty-fifth agrees."""
+    for aside_mm, doubted in ((70.0, False), (90.0, True)):
+        views = [view("a", 1), view("b", 1), view("c", 1, aside_mm), view("a", 2)]
+        kept, boards, doubtful = place_boards(views, PLACED)
+        assert len(kept) == 4
+        np.testing.assert_allclose(boards["s1", "board"].matrix, board(1).matrix, atol=1e-6)
+        assert doubtful == ({("s1", "board")} if doubted else set())
+    few = [view("a", 1, 100.0, corners=8), view("b", 1), view("c", 1, 100.0, corners=3)]
+    _, boards, _ = place_boards(few, PLACED)
+    assert np.linalg.norm(boards["s1", "board"].translation - board(1).translation) < 1e-6
+    more = [view("a", 1, 100.0, corners=8), view("b", 1), view("c", 1, 130.0, corners=6)]
+    _, boards, _ = place_boards(more, PLACED)
+    assert np.linalg.norm(boards["s1", "board"].translation - board(1).translation) > 90.0
