@@ -74,7 +74,8 @@ def test_a_board_with_other_squares_is_another_board(size: float) -> None:
     assert len(found.wrong) == 4
     assert f"has squares {size:.3f} times as large: another board?" in found.notes[0]
     ((name, seen),) = found.sizes
-    assert (name, seen) == ("board", pytest.approx(size, abs=1e-3))
+    assert name == "board"
+    assert seen == pytest.approx(size, abs=1e-3)
 
 
 def test_squares_off_by_less_than_half_a_percent_are_of_no_other_board() -> None:
