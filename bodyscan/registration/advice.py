@@ -167,7 +167,7 @@ def more_shots(rig: Rig, placed: RigSolution, pair: str) -> MoreShots | None:
         placed.rig_from_board,
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
         fixed_target=frame_target(rig),
-        cameras_free=len(placed.rig_from_camera) > 1,
+        cameras_free=True,
     )
     knowledge = RigInformation(equations, placed.cameras, placed.rig_from_camera)
     tried = [(place, knowledge.after(knowledge.information(place), pair)) for place in places]

@@ -1,0 +1,103 @@
+"""What is said of markers that were found where their board was not, without any picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bodyscan.arrays import Array
+from bodyscan.boards import unfound
+from bodyscan.boards.appearance import AS_PRINTED, Appearance
+from bodyscan.boards.board_layout import marker_corners
+from bodyscan.boards.charuco import Markers
+from bodyscan.boards.unfound import _marker_side, describe_unfound
+from bodyscan.rig.board import Board
+
+BOARD = Board(name="b", kind="charuco", columns=9, rows=8, square_mm=50, marker_mm=40)
+NOTHING = np.zeros((4, 4), np.uint8)
+
+
+def image_of(points: Array) -> Array:
+    x, y = points[..., 0], points[..., 1]
+    away = 1.0 + 2e-4 * x + 1e-4 * y
+    return np.asarray(np.stack([300.0 + x, 200.0 + y], axis=-1) / away[..., None])
+
+
+def shown(board: Board, count: int | None = None, wrong: int = 0) -> Markers:
+    """The first markers of a board as printed; the wrong ones lie elsewhere."""
+    ids, points = marker_corners(board)
+    pixels = image_of(points[..., :2])
+    pixels[:wrong] += np.random.default_rng(3).uniform(80.0, 300.0, (wrong, 1, 2))
+    return Markers(np.asarray(ids)[:count], pixels[:count])
+
+
+def changed(**keys: Any) -> Board:
+    return BOARD.model_copy(update=keys)
+
+
+def said(markers: Markers, monkeypatch: pytest.MonkeyPatch, seen: Appearance = AS_PRINTED) -> str:
+    """Of markers that show in one appearance alone."""
+    none = Markers(np.zeros(0, np.int64), np.zeros((0, 4, 2)))
+    monkeypatch.setattr(
+        unfound, "_markers", lambda image, board, how: markers if how == seen else none
+    )
+    monkeypatch.setattr(unfound, "_other_dictionaries", lambda image, board: ", but others")
+    return describe_unfound(NOTHING, BOARD)
+
+
+def test_how_large_markers_are_is_told_by_their_middles() -> None:
+    for side in (30.0, 40.0, 46.0):
+        found = _marker_side(BOARD, shown(changed(marker_mm=side)))
+        assert found == pytest.approx(side, abs=0.1)
+    other = _marker_side(BOARD, shown(changed(legacy_layout=not BOARD.legacy_layout)))
+    assert other == pytest.approx(40.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("count", "wrong", "told"), [(7, 0, False), (8, 0, True), (36, 6, True), (36, 8, False)]
+)
+def test_eight_markers_and_four_of_five_have_to_agree_on_it(
+    count: int, wrong: int, told: bool
+) -> None:
+    assert (_marker_side(BOARD, shown(BOARD, count, wrong)) is not None) == told
+
+
+def test_three_markers_may_be_chance(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert said(shown(BOARD, 3), monkeypatch) == "3 markers of DICT_4X4_1000, but others"
+    assert "others" not in said(shown(BOARD, 4), monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("side", "told"), [(33.0, False), (31.0, True), (47.0, False), (49.0, True)]
+)
+def test_markers_a_fifth_larger_or_smaller_than_said_are_of_another_size(
+    side: float, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(unfound, "_agreeing", lambda board, markers: 1)
+    words = said(shown(changed(marker_mm=side)), monkeypatch)
+    assert (f"`marker_mm` is about {side:.2g} if `square_mm` is 50, not 40" in words) == told
+    assert (f"whose sides are about {side / 50.0:.2f} of a square's" in words) == told
+
+
+def test_a_board_of_other_columns_or_rows_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unfound, "OTHER_SIZES", (1,))  # each that does not fit takes a while
+    words = said(shown(changed(columns=10)), monkeypatch)
+    assert "as on a board of 10 columns x" in words
+    assert words.endswith("not 9 x 8")
+    words = said(shown(changed(columns=8, rows=9)), monkeypatch)
+    assert "fit with columns and rows exchanged: 8 columns x 9 rows" in words
+    words = said(shown(changed(columns=7)), monkeypatch)
+    assert words.endswith("which do not lie as on 9 columns x 8 rows")
+
+
+def test_markers_where_they_should_be_lack_corners(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = said(shown(BOARD), monkeypatch)
+    assert words == (
+        "36 markers of DICT_4X4_1000, with too few corners beside them that can be seen sharply"
+    )
+    how = Appearance(inverted=True, mirrored=True)
+    assert "36 markers of DICT_4X4_1000, white on black, mirrored" in said(
+        shown(BOARD), monkeypatch, how
+    )
