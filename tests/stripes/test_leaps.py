@@ -27,7 +27,8 @@ def leaps(
     seen_mm: float = 3.0,
     most_mm: float = 4.0,
 ) -> str:
-    """What is said of a leap, "" if nothing, of motion_mm while the patterns were taken; no subject moves by most_mm.
+    """What is said of a leap, "" if nothing, where a subject went motion_mm while the patterns were
+    taken, and none goes farther than most_mm.
 
     A leap between two patterns explains so much, and puts what is before and behind it apart_mm apart;
     windows show seen_mm of it in the mean.
