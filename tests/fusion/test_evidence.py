@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from flat_walls import ASIDE, WALL_MM, wall
@@ -71,3 +73,18 @@ def test_means_by_weight() -> None:
     assert (cloud.pairs_seen[~inner] == 1).all()
     # 0.8 mm apart with sigmas of 0.025: everything is that much less certain.
     assert np.median(cloud.sigma_mm) > 0.2
+
+
+def test_a_surface_that_was_bent_is_asked_where_its_points_went() -> None:
+    """Carried 3 mm aside, which are four pixels: as of a camera that stood so, but for its rim."""
+    samples, surfaces, still = seen_beside(0.8)
+    aside = np.array([3.0, 0.0, 0.0], np.float32)
+    moved = replace(surfaces[1], points=surfaces[1].points + aside, bent=True)
+    found = compare(samples, moved, 1, 1.5, 6.0)
+    assert len(found.index) > 0.95 * len(still.index)
+    np.testing.assert_allclose(found.shift_mm, -0.8, atol=2e-3)
+    apart = moved.points[found.at] - samples.points[found.index]
+    assert np.abs(apart[:, :2]).max() < 0.4 + 0.4 * 0.8 + 0.75
+    asked = compare(samples, replace(moved, bent=False), 1, 1.5, 6.0)
+    off = moved.points[asked.at] - samples.points[asked.index]
+    assert np.median(off[:, 0]) > 2.0, "looked up where they were"
