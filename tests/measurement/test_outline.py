@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array, Mask
-from bodyscan.measurement.outline import Outline, outline
+from bodyscan.measurement.outline import Outline, holds_middle, outline
 from bodyscan.mesh.slices import Loop, loops_at
 
 TRUNK_MM, ARM_MM, ARM_AT_MM = 150.0, 45.0, 230.0
@@ -100,3 +100,36 @@ def test_a_limb_that_is_seen_in_part_lies_between_chord_and_fill() -> None:
     found = outline(wall(points, (degrees > 200) & (degrees < 280)))
     chord = 60.0 * (2.0 * np.pi - np.radians(79.0)) + 120.0 * np.sin(np.radians(39.5))
     assert found.girth_range_mm == pytest.approx((chord, 2.0 * np.pi * 60.0), rel=2e-3)
+
+
+def test_a_strip_that_is_itself_seen_in_two_parts_is_no_limb_either() -> None:
+    """From the first part's beginning to the last one's end it is as straight as the whole strip."""
+    points = arc(TRUNK_MM, 0.0, 0.0, 359.0)
+    degrees = np.arange(len(points))
+    gaps = ((40, 60), (85, 95), (120, 140))
+    filled = np.any([(degrees > low) & (degrees < high) for low, high in gaps], axis=0)
+    found = outline(wall(points, filled))
+    assert found.loop.girth_mm == pytest.approx(2.0 * np.pi * TRUNK_MM, rel=1e-3)
+
+
+@pytest.mark.parametrize(("half_deg", "limb"), [(85.0, False), (95.0, True)])
+def test_a_limb_goes_round_by_more_than_half(half_deg: float, limb: bool) -> None:
+    """A round piece beside the trunk, of which so much on either side of its outermost was seen."""
+    turned = np.radians(half_deg)
+    arm = arc(ARM_MM, ARM_AT_MM, 90.0 - half_deg, 90.0 + half_deg)
+    points = np.concatenate(
+        [arc(TRUNK_MM, 0.0, -70.0, 70.0), arm, arc(TRUNK_MM, 0.0, 110.0, 290.0)]
+    )
+    filled = np.zeros(len(points), bool)
+    ends = np.cumsum([141, len(arm)]) - 1
+    filled[ends] = True
+    found = outline(wall(points, filled))
+    assert (found.loop.segments[..., 1].max() < ARM_AT_MM) == limb
+    assert np.sin(turned) / turned < 0.68  # chord over arc, 0.64 of half a circle
+
+
+@pytest.mark.parametrize(("across", "both"), [(0.14, False), (0.16, True)])
+def test_a_trunk_holds_the_middle_by_a_seventh_of_its_width(across: float, both: bool) -> None:
+    y = np.array([-300.0 * across, 300.0 * (1.0 - across)])
+    assert holds_middle(y) == both
+    assert holds_middle(-y) == both

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,7 @@ from bodyscan.evaluation.artefacts import (
 from bodyscan.evaluation.spheres import Sphere
 from bodyscan.laboratory.simulated_acceptance import plates_at, spheres_at
 from bodyscan.rig.rig import Volume
+from bodyscan.workflows import accept_rig
 
 RADIUS = 60.0
 CENTRES = np.array([[0.0, 0.0, 0.0], [400.0, 0.0, 0.0], [0.0, 250.0, 150.0]])
@@ -216,3 +219,35 @@ def test_what_cannot_be_measured_is_bad_input(
     result = CliRunner().invoke(app, ["accept", *arguments])
     assert result.exception is not None
     assert getattr(result.exception, "exit_code", None) == 2
+
+
+def test_a_test_is_written_down_and_the_page_of_an_earlier_one_does_not_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(accept_rig, "calibration_id", lambda stored: "0123")
+    calibration: Any = SimpleNamespace(rig=SimpleNamespace(name="r"))
+    readings = Readings((sphere_row(),), (), ())
+    file = load_acceptance(None, {"probing_size_mm": 0.4})
+
+    def judge() -> accept_rig.Acceptance:
+        return accept_rig.judge_readings(
+            readings, file, calibration, tmp_path, tmp_path, synthetic=True
+        )
+
+    found = judge()
+    assert found.verdict.grade == "accepted"
+    assert found.page is not None
+    assert "0123" in found.page.read_text("utf-8")
+    content = json.loads(found.file.read_text("utf-8"))
+    assert content["calibration_id"] == "0123"
+    assert content["synthetic"]
+    assert not found.notes
+
+    def broken(*_: object) -> None:
+        raise OSError("no fonts")
+
+    monkeypatch.setattr(accept_rig, "acceptance_page", broken)
+    again = judge()
+    assert again.page is None
+    assert not found.page.exists()
+    assert len(again.notes) == 1
