@@ -11,11 +11,13 @@ from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import boundary_points, concatenate
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
 from bodyscan.calibration.joint_refinement import (
+    JointFit,
     StripedBoard,
     _offsets,
     _rays,
     _State,
     _stripe_jacobian,
+    allowing_for,
     refine_jointly,
     striped_board,
 )
@@ -126,3 +128,20 @@ def test_derivatives_are_those_of_the_offsets(bow: float, within: float) -> None
         # and, by sheets and heights, that sigmas change: residuals times a share of them.
         most = within if unknown < state.first_sheet else 2e-2
         np.testing.assert_allclose(found[:, column], slope, rtol=most, atol=most * abs(slope).max())
+
+
+def test_what_another_fit_finds_otherwise_is_in_the_covariances() -> None:
+    camera, sheets, boards = calibrated(0)
+    count = len(camera.camera.parameters)
+    known = np.diag(np.linspace(1.0, 2.0, count))
+    fit = JointFit(camera.camera, {}, sheets, known, 0.1, {})
+    same = allowing_for(fit, fit, boards)
+    np.testing.assert_allclose(same.camera_covariance, known)
+    np.testing.assert_allclose(same.sheets.covariance, sheets.covariance, atol=1e-12)
+    step = 0.3 * np.eye(count)[0]  # its focal length
+    other = JointFit(camera.camera.moved(step), {}, sheets, known, 0.1, {})
+    allowed = allowing_for(fit, other, boards)
+    np.testing.assert_allclose(allowed.camera_covariance - known, np.outer(step, step), atol=1e-9)
+    added = np.linalg.eigvalsh(allowed.sheets.covariance - sheets.covariance)
+    assert added[-1] > 0.0
+    assert added[0] > -1e-9 * added[-1]

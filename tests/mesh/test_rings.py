@@ -5,6 +5,7 @@ from __future__ import annotations
 import networkx as nx
 import numpy as np
 import open3d as o3d
+import pytest
 
 from bodyscan.arrays import Indices
 from bodyscan.mesh.rings import rings, without_branches
@@ -27,6 +28,27 @@ def test_a_ring_is_found_and_a_ball_has_none() -> None:
     assert found[0].high_mm - found[0].low_mm > 200.0
     ball = o3d.geometry.TriangleMesh.create_sphere(150.0, 40)
     assert not rings(np.asarray(ball.vertices), np.asarray(ball.triangles, np.int64))
+
+
+def upright_ring(radius_mm: float, at: tuple[float, float, float]) -> tuple[np.ndarray, Indices]:
+    torus = o3d.geometry.TriangleMesh.create_torus(radius_mm, 0.25 * radius_mm, 60, 30)
+    torus.rotate(torus.get_rotation_matrix_from_xyz((np.pi / 2.0, 0.0, 0.0)), (0.0, 0.0, 0.0))
+    return np.asarray(torus.vertices) + at, np.asarray(torus.triangles, np.int64)
+
+
+def test_a_ring_is_told_where_it_is() -> None:
+    """From the lowest layer to the highest that its hole parts, and those that close it."""
+    (one,) = rings(*upright_ring(120.0, (30.0, -70.0, 1000.0)))
+    assert one.y_mm == pytest.approx(-70.0, abs=5.0)
+    assert 0.5 * (one.low_mm + one.high_mm) == pytest.approx(1000.0, abs=10.0)
+    # The hole is 180 mm high: of layers of 20 mm nine, and one on either side.
+    assert one.high_mm - one.low_mm == pytest.approx(200.0, abs=20.0)
+
+
+def test_rings_less_than_eight_centimetres_high_are_folds() -> None:
+    small = upright_ring(40.0, (0.0, 0.0, 500.0))
+    assert not rings(*small)
+    assert len(rings(*small, smallest_mm=50.0)) == 1
 
 
 def _edges(joined: Indices) -> set[frozenset[int]]:
