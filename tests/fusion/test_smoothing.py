@@ -15,7 +15,13 @@ from bodyscan.fusion.quadratics import (
     fit_full_windows,
     fit_quadratics,
 )
-from bodyscan.fusion.smoothing import SmoothSurface, _distance_to_rim, smooth
+from bodyscan.fusion.smoothing import (
+    SmoothSurface,
+    _distance_to_rim,
+    pixel_size,
+    smooth,
+    window_reach,
+)
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -299,3 +305,21 @@ def test_misfits_count_where_something_was_measured_and_outliers_are_not_calm() 
     fitted[0, 0] = False
     _square_misfits(inverse, noise, np.ones((1, 4), np.float32), fitted, squares, calm)
     assert calm.tolist() == [[0, 1, 0, 1]]
+
+
+def test_windows_are_as_wide_as_asked_within_two_to_six_pixels() -> None:
+    assert [window_reach(pixel, 7.0) for pixel in (0.4, 0.6, 0.75, 1.0, 1.6, 3.0)] == [
+        6,
+        6,
+        5,
+        4,
+        2,
+        2,
+    ]
+
+
+def test_a_pixel_is_as_wide_as_it_appears_half_way_deep() -> None:
+    depth = np.full((40, 40), 500.0)
+    depth[:, :10] = 5000.0
+    inverse = np.where(np.arange(40) > 35, 0.0, 1.0 / depth).astype(np.float32)
+    assert pixel_size(inverse, CAMERA) == pytest.approx(500.0 / CAMERA.alpha, rel=1e-6)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from made_bodies import arrays, cylinder, ellipsoid, together
 from scipy.special import ellipe
 
-from bodyscan.mesh.slices import height_ranges, loops_at
+from bodyscan.mesh.slices import Loop, height_ranges, hull_mm, joined, loops_at, runs_of
 
 
 @pytest.mark.parametrize("height", [55.0, 100.0, 123.4])  # 100 lies on a ring of vertices
@@ -81,3 +81,66 @@ def test_ranges_of_heights_are_those_of_each_faces_corners() -> None:
     low, high = height_ranges(vertices, faces)
     assert low.tolist() == [min(vertices[face, 2]) for face in faces]
     assert high.tolist() == [max(vertices[face, 2]) for face in faces]
+
+
+def square(*measured: bool, regions: list[int] | None = None) -> Loop:
+    """A square of 40 mm, anticlockwise in pieces of 10, each measured or not; their order is mixed."""
+    corners = np.array([[0, 0], [40, 0], [40, 40], [0, 40], [0, 0]], float)
+    points = np.concatenate([np.linspace(corners[k], corners[k + 1], 5)[:4] for k in range(4)])
+    segments = np.stack([points, np.roll(points, -1, axis=0)], axis=1)
+    ends = np.stack([np.arange(16), np.roll(np.arange(16), -1)], axis=1) + 100
+    seen = np.array(measured or (True,) * 16)
+    order = np.random.default_rng(1).permutation(16)
+    known = None if regions is None else np.array(regions, np.uint8)[order]
+    return Loop(segments[order], seen[order], ends[order], known)
+
+
+def test_a_loop_is_cut_where_it_was_not_measured_for_long_enough() -> None:
+    seen = np.ones(16, bool)
+    seen[[2, 3, 9]] = False
+    loop = square(*seen.tolist())
+    runs = runs_of(loop, 15.0)  # the 10 mm of number 9 count as measured
+    assert sorted(len(run.segments) for run in runs) == [2, 14]
+    (gap,) = (run for run in runs if not run.measured)
+    assert loop.segments[gap.first, 0].tolist() == [20.0, 0.0]
+    assert loop.segments[gap.last, 1].tolist() == [40.0, 0.0]
+    (rest,) = (run for run in runs if run.measured)
+    assert loop.segments[rest.first, 0].tolist() == [40.0, 0.0]
+    assert loop.segments[rest.last, 1].tolist() == [20.0, 0.0]
+    assert len(runs_of(loop, 9.0)) == 4
+    assert len(runs_of(loop, 25.0)) == 1
+    one_after_another = runs_of(loop, 9.0)
+    for run, following in zip(
+        one_after_another, (*one_after_another[1:], one_after_another[0]), strict=True
+    ):
+        assert loop.ends[run.last, 1] == loop.ends[following.first, 0]
+
+
+def test_stretches_are_joined_straight_and_what_is_new_was_not_measured() -> None:
+    seen = np.ones(16, bool)
+    seen[3:6] = False  # round one corner
+    loop = square(*seen.tolist(), regions=[1] * 8 + [2] * 8)
+    (kept,) = (run for run in runs_of(loop, 5.0) if run.measured)
+    found = joined(loop, [kept])
+    assert found.girth_mm == pytest.approx(130.0 + np.hypot(10.0, 20.0))
+    assert found.area_mm2 == pytest.approx(1600.0 - 0.5 * 10.0 * 20.0)
+    assert found.measured_share == pytest.approx(130.0 / found.girth_mm)
+    shares = found.region_shares
+    assert shares is not None
+    assert list(shares.values()) == pytest.approx(
+        [np.hypot(10.0, 20.0) / found.girth_mm, 50.0 / found.girth_mm, 80.0 / found.girth_mm]
+        + [0.0] * (len(shares) - 3)
+    )
+    whole = joined(loop, runs_of(loop, 5.0))
+    assert whole.girth_mm == pytest.approx(160.0)
+    assert len(whole.segments) == 16
+
+
+def test_of_a_square_all_figures_are_known() -> None:
+    loop = square()
+    assert (loop.girth_mm, loop.tape_mm) == pytest.approx((160.0, 160.0))
+    assert loop.area_mm2 == pytest.approx(1600.0)
+    np.testing.assert_allclose(loop.centre, [20.0, 20.0])
+    assert (loop.measured_share, loop.region_shares) == (1.0, None)
+    # A speck in one line has a hull as well: there and back.
+    assert hull_mm(np.array([[0.0, 0.0], [3.0, 4.0], [1.5, 2.0]])) == pytest.approx(10.0)
