@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bodyscan.boards.view import BoardView, ViewKey
@@ -108,27 +108,36 @@ def join_rig(
     cameras = replace(cameras, failures=boards.blamed_on_images(failures, captures))
     if not cameras.value:
         raise _nothing_calibrated(rig, cameras.failures, _seen_instead(rig, boards, searched))
-    with step(progress, "joining the pairs"):
-        views = solving_views(rig, boards.value)
-        located = locate_views(rig, views, cameras.value)
-        joined = _join_pairs(rig, located.value, cameras)
-        size = find_size(rig, joined.value, boards.value)
-        if size.value.factor != 1.0:
-            rig = resized(rig, size.value.factor)
-            located = locate_views(rig, views, cameras.value)
-            joined = _join_pairs(rig, located.value, cameras)
-    placed = joined.value
-    sized = [*size.notes, *check_nominal_size(rig, placed.rig_from_camera)]
-    decoded, fitted = _decode_and_fit(rig, captures, placed, cameras.value, boards.value, progress)
-    lost = {**cameras.failures, **joined.failures, **decoded.failures}
+    located = locate_views(rig, solving_views(rig, boards.value), cameras.value)
+    # Reading images takes one core and none of the interpreter's lock; solving and fitting the other.
+    with ThreadPoolExecutor(1 + THREADS) as beside:
+        solving = beside.submit(_solve, rig, boards.value, located, cameras)
+        fits: dict[str, Future[Outcome[PairCalibration]]] = {}
+
+        def fit(name: str, boundaries: Mapping[ViewKey, BoardBoundaries]) -> None:
+            fits[name] = beside.submit(_fit_sheets, solving, cameras.value, name, boundaries)
+
+        decoded = _decode(
+            rig, captures, boards.value, cameras.value, solving, located.value, fit, progress
+        )
+        with step(progress, "joining the pairs"):
+            solved = solving.result()
+        rig, placed = solved.rig, solved.joined.value
+        for name in placed.rig_from_camera:
+            if name not in fits:  # nothing of it was to be decoded
+                fit(name, decoded.value)
+        fitted = _fitted(
+            fits, sorted(set(placed.rig_from_camera) - set(decoded.failures)), progress
+        )
+    lost = {**cameras.failures, **decoded.failures, **solved.joined.failures}
     failed = lost | dict(fitted.failures)
     pairs = fitted.value
     if not pairs:
         raise _nothing_calibrated(rig, failed)
     for pair in pairs.values():
         placed = update_poses(rig, placed, pair)
-    stages = (boards, cameras, located, decoded, fitted, joined)
-    notes = [*sized, *(note for stage in stages for note in stage.notes)]
+    stages = (boards, cameras, solved.located, decoded, fitted, solved.joined)
+    notes = [*solved.sized, *(note for stage in stages for note in stage.notes)]
     calibration = RigCalibration(
         rig,
         pairs,
@@ -179,75 +188,100 @@ def _join_pairs(
         raise BadInput(error.what, where=error.where, remedy=remedy) from error
 
 
-def _decode_and_fit(
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """rig: with boards of the size that references give them, and what is said of that, sized.
+    located: each board by itself.  joined: the joint solve."""
+
+    rig: Rig
+    sized: tuple[str, ...]
+    located: Outcome[list[LocatedView]]
+    joined: Outcome[RigSolution]
+
+
+def _solve(
     rig: Rig,
-    captures: Captures,
-    placed: RigSolution,
-    cameras: Mapping[str, CameraCalibration],
-    views: list[BoardView],
-    progress: Progress,
-) -> tuple[Outcome[dict[ViewKey, BoardBoundaries]], Outcome[dict[str, PairCalibration]]]:
-    """Stripes on the boards, and light sheets of every pair that was placed and decoded. A pair's
-    sheets are fitted while others' images are read: fitting holds the interpreter's lock, of which
-    reading has no need."""
-    with ThreadPoolExecutor(THREADS) as beside:
-        fits: dict[str, Future[Outcome[PairCalibration]]] = {}
-
-        def fit(name: str, boundaries: Mapping[ViewKey, BoardBoundaries]) -> None:
-            pair = _placed_pair(rig, placed, name, cameras[name], boundaries)
-            fits[name] = beside.submit(calibrate_pair, pair)
-
-        decoded = _decode(rig, captures, placed, views, fit, progress)
-        names = sorted(set(placed.rig_from_camera) - set(decoded.failures))
-        for name in names:
-            if name not in fits:  # nothing of it was to be decoded
-                fit(name, decoded.value)
-        fitted, errors = attempt_each(
-            lambda name: fits[name].result(),
-            names,
-            BodyscanError,
-            stage="fitting light sheets",
-            progress=progress,
-        )
-    return decoded, Outcome(
-        {name: found.value for name, found in fitted.items()},
-        tuple(note for found in fitted.values() for note in found.notes),
-        {name: plainly(error) for name, error in errors.items()},
-    )
+    boards: list[BoardView],
+    located: Outcome[list[LocatedView]],
+    cameras: Outcome[dict[str, CameraCalibration]],
+) -> _Solved:
+    joined = _join_pairs(rig, located.value, cameras)
+    size = find_size(rig, joined.value, boards)
+    if size.value.factor != 1.0:
+        rig = resized(rig, size.value.factor)
+        located = locate_views(rig, solving_views(rig, boards), cameras.value)
+        joined = _join_pairs(rig, located.value, cameras)
+    sized = (*size.notes, *check_nominal_size(rig, joined.value.rig_from_camera))
+    return _Solved(rig, sized, located, joined)
 
 
 def _decode(
     rig: Rig,
     captures: Captures,
-    placed: RigSolution,
-    views: list[BoardView],
+    boards: list[BoardView],
+    cameras: Mapping[str, CameraCalibration],
+    solving: Future[_Solved],
+    located: list[LocatedView],
     through: Through,
     progress: Progress,
 ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
-    """Stripes on the boards that took part in placing the rig: of tens of millions of boundaries means
-    on the print alone, of as many as light sheets are fitted to. A pair by itself, whose stripes place
-    the boards too, has all of them."""
-    used = {view.key: view for view in placed.views}
+    """Stripes on the boards, where each camera by itself sees them: of tens of millions of boundaries
+    means on the print alone, of as many as light sheets are fitted to. A pair by itself, whose stripes
+    place the boards too, has all of them."""
+    known = {view.key: view for view in located}
+    wanted = [view for view in boards if view.key in known]
+
+    def print_of(view: BoardView) -> Box:
+        return box_of_print(cameras[view.pair].camera, rig.board(view.board), known[view.key])
 
     def box(view: BoardView) -> Box:
-        located = _as_solved(placed, used[view.key])
-        return box_of_print(placed.cameras[view.pair], rig.board(view.board), located)
+        if solving.done():
+            solving.result()  # Of pairs that nothing joins no more is decoded.
+        return print_of(view)
 
     def printed(view: BoardView, seen: BoardBoundaries) -> BoardBoundaries:
-        shot = striped(rig, placed, used[view.key], seen)
+        shot = StripedView(known[view.key], rig.board(view.board), seen)
         code = rig.pair(view.pair).projector
         assert code is not None
-        camera = placed.cameras[view.pair]
-        return on_print(camera, code, shot.board, shot.camera_from_face, seen)
+        return on_print(cameras[view.pair].camera, code, shot.board, shot.camera_from_face, seen)
 
-    wanted = [view for view in views if view.key in used]
     every = {
-        pair.name: bands_apart(pair.projector, [box(v) for v in wanted if v.pair == pair.name])
+        pair.name: bands_apart(pair.projector, [print_of(v) for v in wanted if v.pair == pair.name])
         for pair in rig.pairs
-        if pair.projector is not None and len(placed.cameras) > 1
+        if pair.projector is not None and len(cameras) > 1
     }
     return decode_on_boards(
         rig, captures, wanted, progress, box=box, keep=printed, every=every, through=through
+    )
+
+
+def _fit_sheets(
+    solving: Future[_Solved],
+    cameras: Mapping[str, CameraCalibration],
+    name: str,
+    boundaries: Mapping[ViewKey, BoardBoundaries],
+) -> Outcome[PairCalibration]:
+    """Light sheets of a pair, once it is placed."""
+    solved = solving.result()
+    return calibrate_pair(
+        _placed_pair(solved.rig, solved.joined.value, name, cameras[name], boundaries)
+    )
+
+
+def _fitted(
+    fits: Mapping[str, Future[Outcome[PairCalibration]]], names: list[str], progress: Progress
+) -> Outcome[dict[str, PairCalibration]]:
+    fitted, errors = attempt_each(
+        lambda name: fits[name].result(),
+        names,
+        BodyscanError,
+        stage="fitting light sheets",
+        progress=progress,
+    )
+    return Outcome(
+        {name: found.value for name, found in fitted.items()},
+        tuple(note for found in fitted.values() for note in found.notes),
+        {name: plainly(error) for name, error in errors.items()},
     )
 
 

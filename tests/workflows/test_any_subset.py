@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
@@ -239,3 +241,39 @@ def test_too_few_shots_for_halves_are_said_to_be_so(shots: int, said: str | None
     found = calibrated(boards, views)
     assert not [line for line in found.advice if "half" in line and "differ" in line]
     assert any(f"{said} cannot be halved" in note for note in found.notes)
+
+
+def test_pairs_that_nothing_joins_are_decoded_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images take seconds a pair, and the error is known long before."""
+    boards, failed = seen(4), threading.Event()
+    refusal = RigDisconnected("nothing joins them")
+    asked: list[BodyscanError] = []
+
+    def decoded(
+        _rig: Rig,
+        _captures: Captures,
+        wanted: Views,
+        *_: object,
+        box: Callable[[BoardView], object],
+        **__: object,
+    ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
+        box(wanted[0])
+        failed.set()
+        for _again in range(600):
+            try:
+                box(wanted[0])
+            except BodyscanError as error:
+                asked.append(error)
+                break
+            time.sleep(0.1)
+        return Outcome({})
+
+    def join(*_: object) -> None:
+        assert failed.wait(60.0)
+        raise refusal
+
+    monkeypatch.setattr(calibrate_rig, "decode_on_boards", decoded)
+    monkeypatch.setattr(calibrate_rig, "_join_pairs", join)
+    with pytest.raises(RigDisconnected):
+        join_rig(boards.rig, boards.captures(boards.views), boards.found(boards.views))
+    assert asked == [refusal]
