@@ -10,13 +10,21 @@ import numpy as np
 from bodyscan.arrays import Bytes
 from bodyscan.boards.appearance import AS_PRINTED, OTHERWISE, Appearance
 from bodyscan.boards.aprilgrid import find_aprilgrid
-from bodyscan.boards.charuco import Markers, detect_markers, locate_charuco, markers_concerned
+from bodyscan.boards.charuco import (
+    Markers,
+    detect_markers,
+    locate_charuco,
+    markers_concerned,
+    place_markers,
+)
 from bodyscan.boards.checkerboard import find_checkerboard
 from bodyscan.boards.corners import SightedCorners
 from bodyscan.boards.view import BoardView
 from bodyscan.rig.board import Board
 
 MIN_CORNERS = 6
+Seen = dict[tuple[str, Appearance, bool], Markers]
+"""Markers found once a dictionary, at a quick look or a thorough one."""
 
 
 def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) -> list[BoardView]:
@@ -30,7 +38,7 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
     then numbered as if it showed its front). Raises BadInput for a board that cannot be found.
     """
     views = []
-    seen: dict[tuple[str, Appearance], Markers] = {}
+    seen: Seen = {}
     first: dict[str, int] = {}
     for board in boards:
         first[board.dictionary] = max(markers_concerned(board), first.get(board.dictionary, 0))
@@ -52,20 +60,17 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
 def _find_marked(
     image: Bytes,
     board: Board,
-    seen: dict[tuple[str, Appearance], Markers],
+    seen: Seen,
     first: dict[str, int],
 ) -> SightedCorners | None:
-    """The board as printed, or else white on black, or mirrored: markers found once a dictionary, of
-    which only the first so many are printed."""
+    """The board as printed, or else white on black, or mirrored; of a dictionary only the first so many
+    markers are printed."""
     for appearance in (AS_PRINTED, *OTHERWISE):
         picture = appearance.as_printed(image)
-        key = board.dictionary, appearance
         if board.kind == "aprilgrid":
             found = find_aprilgrid(picture, board, thorough=appearance == AS_PRINTED)
         else:
-            if key not in seen:
-                seen[key] = detect_markers(picture, board, first=first[board.dictionary])
-            found = locate_charuco(picture, board, seen[key])
+            found = _find_charuco(picture, board, appearance, seen, first[board.dictionary])
         if found is not None and _determines_plane(found):
             pixels = appearance.in_image(found.pixels, image.shape[1])
             shown = replace(
@@ -73,6 +78,26 @@ def _find_marked(
             )
             return replace(found, pixels=pixels, appearance=shown)
     return None
+
+
+def _find_charuco(
+    picture: Bytes, board: Board, appearance: Appearance, seen: Seen, first: int
+) -> SightedCorners | None:
+    """At a quick look, and where markers are missing at a thorough one."""
+
+    def look(quick: bool) -> Markers:
+        key = board.dictionary, appearance, quick
+        if key not in seen:
+            seen[key] = detect_markers(picture, board, first=first, quick=quick)
+        return seen[key]
+
+    if appearance == AS_PRINTED:  # which nearly all are
+        markers = look(quick=True)
+        placed = place_markers(board, markers)
+        if placed is not None and placed.believed and placed.all_seen(picture.shape):
+            return locate_charuco(picture, board, markers, placed)
+    markers = look(quick=False)
+    return locate_charuco(picture, board, markers, place_markers(board, markers))
 
 
 def _determines_plane(found: SightedCorners) -> bool:
