@@ -168,7 +168,7 @@ def test_halves_that_know_the_rig_five_times_worse_say_nothing_of_the_whole(
 ) -> None:
     placings, _ = ring_of_cameras()
     names = tuple(sorted(placings))
-    known = np.diag(np.tile([1e-10] * 3 + [1e-4] * 3, len(names)))
+    known = np.diag(np.tile([1e-16] * 3 + [1e-4] * 3, len(names)))
     half = PoseCovariance(names, 0.5 * times**2 * known)
     monkeypatch.setattr(halves, "_placed_by", lambda *of: (dict(placings), half))
     seen = [
@@ -182,7 +182,7 @@ def test_halves_that_know_the_rig_five_times_worse_say_nothing_of_the_whole(
     if told:
         found = compare_halves(ring_rig(placings), placed)
         assert found.over_expected == pytest.approx(0.0, abs=1e-6)
-        # Of the common motion, six of 72 unknowns, they are free.
+        # But for what all have in common, a twelfth of the variance and what turns them alike.
         assert found.sigmas_mm == pytest.approx(times * 0.01, rel=0.2)
         return
     with pytest.raises(FailedWork, match=r"halves of the shots should differ by 0\.0"):
