@@ -1,0 +1,141 @@
+"""Kinds of motion on three cells and two pairs, against sums written out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bodyscan.alignment.body_motion import BodyMotion, Kind, observed, outward_errors
+from bodyscan.alignment.moments import Courses
+from bodyscan.arrays import Array
+
+PAIRS, CELLS = 2, 3
+RNG = np.random.default_rng(5)
+NORMALS = np.array([[1.0, 0, 0], [0, 0.6, 0.8], [0, 0, 1.0]])
+COURSES = Courses(RNG.normal(size=(PAIRS, 2)), RNG.normal(size=2), RNG.normal(size=(PAIRS, 2)))
+KNOWN = np.diag(RNG.uniform(1.0, 3.0, 6 * PAIRS))
+POSE = Kind("pose", RNG.normal(size=(CELLS, 12, 6)), Courses.steady(PAIRS), 1.0, KNOWN)
+PARTS = Kind("parts", RNG.normal(size=(CELLS, 12, 3)), COURSES, 0.8)
+COUNT = 6 * PAIRS + 3 * 2
+
+
+def seen(kinds: tuple[Kind, ...] = (POSE, PARTS)) -> tuple[BodyMotion, Array]:
+    """A motion with what was seen of it, solved, and that as a whole matrix."""
+    root = np.random.default_rng(6).normal(size=(COUNT, 30))
+    square, pull = root @ root.T, root @ np.random.default_rng(7).normal(size=30)
+    fields = np.concatenate([kind.fields for kind in kinds], axis=2)
+    nothing: Any = None
+    lower = np.tril(square)
+    start = BodyMotion(kinds, fields, np.ones(6), np.zeros(COUNT), lower, pull, nothing, nothing)
+    return start._settled(), square
+
+
+def prior() -> Array:
+    return np.diag([*np.diag(KNOWN), *[0.8**-2.0] * 6])
+
+
+def test_amplitudes_are_those_of_what_was_seen_and_of_the_prior() -> None:
+    motion, square = seen()
+    truth = np.linalg.inv(square + prior())
+    np.testing.assert_allclose(motion.covariance, truth, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(motion.variances, np.diag(truth), rtol=1e-8)
+    np.testing.assert_allclose(motion.amplitudes, truth @ motion.pull, rtol=1e-8, atol=1e-12)
+
+
+def written_out(motion: BodyMotion, pair: int, *, from_middle: bool) -> Array:
+    """(C, 12) field after field and course after course."""
+    total = np.zeros((CELLS, 12))
+    place = 0
+    for kind in motion.kinds:
+        for field in range(kind.fields.shape[2]):
+            for course in range(kind.courses.count):
+                along = kind.courses.values[pair, course]
+                along -= kind.courses.middle[course] if from_middle else 0.0
+                total += motion.amplitudes[place] * along * kind.fields[:, :, field]
+                place += 1
+    return total
+
+
+@pytest.mark.parametrize("from_middle", [False, True])
+def test_displacements_are_fields_times_courses(from_middle: bool) -> None:
+    motion, _ = seen()
+    found = motion.displacements(["pose", "parts"], from_middle=from_middle)
+    for pair in range(PAIRS):
+        truth = written_out(motion, pair, from_middle=from_middle)
+        np.testing.assert_allclose(found[pair], truth, atol=1e-12)
+    alone = motion.displacements(["parts"], from_middle=from_middle)
+    assert np.abs(alone - found).max() > 0.1
+    # Of each amplitude, as a pair saw the cells.
+    rows = observed(motion, 1, np.array([2, 0]), NORMALS[[2, 0]])
+    told = written_out(motion, 1, from_middle=True)
+    along = np.sum(told[[2, 0], :3] * NORMALS[[2, 0]], axis=1)
+    np.testing.assert_allclose(rows @ motion.amplitudes, along, atol=1e-12)
+
+
+def test_what_is_not_known_of_one_kind_is_that_of_its_amplitudes() -> None:
+    motion, _ = seen()
+    course = COURSES.values[0] - COURSES.middle
+    errors = outward_errors(motion, "parts", course, NORMALS)
+    rows = np.einsum("cim,ci->cm", PARTS.fields[:, :3], NORMALS)[:, :, None] * course
+    rows = rows.reshape(CELLS, -1)
+    own = motion.covariance[12:, 12:]
+    np.testing.assert_allclose(errors @ errors.T, rows @ own @ rows.T, atol=1e-10)
+
+
+def test_a_kind_is_as_large_as_the_evidence_says() -> None:
+    """MacKay's: amplitudes over as many of them as were told."""
+    motion, _ = seen()
+    told = 6.0 - np.sum(motion.variances[12:]) / 0.8**2
+    size = np.sqrt(np.sum(motion.amplitudes[12:] ** 2) / told)
+    pose, parts = motion._resized().kinds
+    assert parts.size == pytest.approx(size)
+    assert pose is POSE, "what boards left open is no motion of the person"
+
+
+def test_a_breath_that_shows_a_tenth_of_what_is_usual_is_as_large_as_usual() -> None:
+    breath = replace(PARTS, usual=1.5)
+    assert breath.resized(2.0).size == 2.0
+    assert breath.resized(0.16).size == 1.5
+    assert breath.resized(0.14).size == 0.14
+    assert PARTS.resized(0.16).size == 0.16
+    assert PARTS.resized(1e-9).size == 1e-3
+
+
+def test_parts_are_doubted_as_if_they_had_moved_as_peoples_do() -> None:
+    small = replace(PARTS, size=0.1)
+    motion, square = seen((POSE, small))
+    bold = np.diag([*np.diag(KNOWN), *[0.5**-2.0] * 6])
+    np.testing.assert_allclose(
+        motion.doubted(), np.linalg.inv(square + bold), rtol=1e-7, atol=1e-12
+    )
+    large, square = seen()
+    np.testing.assert_allclose(
+        large.doubted(), np.linalg.inv(square + prior()), rtol=1e-7, atol=1e-12
+    )
+
+
+def test_what_is_asked_of_poses_is_what_any_motion_leaves() -> None:
+    """The least misfit of all motions, with each pair moved besides: its slope and its bend."""
+    motion, square = seen()
+    information, pull = motion.asked_of_poses()
+    order = np.arange(12).reshape(6, PAIRS).T.ravel()  # of amplitudes, pair after pair
+
+    def misfit(moved: Array) -> float:
+        besides = np.zeros(COUNT)
+        besides[order] = moved
+        right = motion.pull - square @ besides
+        left = np.linalg.solve(square + prior(), right)
+        both = left + besides
+        return float(0.5 * both @ square @ both - motion.pull @ both + 0.5 * left @ prior() @ left)
+
+    step = 1e-3 * np.eye(12)
+    slope = [(misfit(one) - misfit(-one)) / 2e-3 for one in step]
+    np.testing.assert_allclose(slope, -pull, atol=1e-6 * np.abs(pull).max())
+    bend = [(misfit(one) + misfit(-one) - 2.0 * misfit(0.0 * one)) / 1e-6 for one in step]
+    np.testing.assert_allclose(bend, np.diag(information), rtol=1e-3)
+    mixed = (misfit(step[0] + step[7]) - misfit(step[0] - step[7])) / 2.0 / 1e-6
+    mixed -= slope[7] / 1e-3
+    assert mixed == pytest.approx(information[0, 7], rel=1e-2, abs=1e-3)
