@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Sequence
+from functools import cache
 
 import numpy as np
 
@@ -18,6 +20,11 @@ LENS = from_fields(describe_camera(apparatus.CAMERA))
 MIRROR = apparatus.chapter_setup(apparatus.ideal_settings(1)).projector
 TRUE_PLANES = apparatus.true_planes(apparatus.chapter_setup(apparatus.ideal_settings(1)))
 STRIPES = apparatus.PROJECTOR.stripes
+
+
+@cache
+def _seen_of_the_mirror(place: bytes, every_px: int) -> tuple[Indices, Array]:
+    return seen_on(pickle.loads(place), MIRROR.stripe, every_px=every_px)
 
 
 def seen_on(
@@ -61,8 +68,11 @@ def mirror_points(
     rng = np.random.default_rng(0)
     parts = []
     for number, place in enumerate(places or apparatus.board_poses()):
-        index, pixels = seen_on(place, stripe, every_px=every_px)
-        pixels[:, 0] += noise_px * rng.standard_normal(len(pixels))
+        if stripe == MIRROR.stripe:  # asked for again with every draw of noise
+            index, exact = _seen_of_the_mirror(pickle.dumps(place), every_px)
+        else:
+            index, exact = seen_on(place, stripe, every_px=every_px)
+        pixels = exact + noise_px * rng.standard_normal((len(exact), 1)) * [1.0, 0.0]
         sigma = np.full(len(index), max(noise_px, 0.01))
         parts.append(
             boundary_points(LENS, place, index, pixels, sigma, board=number, direction="vertical")
