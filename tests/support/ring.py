@@ -10,7 +10,7 @@ from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.view import BoardView
 from bodyscan.calibration.board_views import LocatedView, PlanarView, board_symmetries
-from bodyscan.calibration.camera import locate_board
+from bodyscan.calibration.camera import locate_boards, roughly_located
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -93,7 +93,8 @@ def ring_views(
     rng = np.random.default_rng(seed)
     points = corner_points(board)
     per_face = len(points) // board.faces
-    views, truth = [], {}
+    seen: list[tuple[str, PlanarView, tuple[RigidTransform, ...]]] = []
+    truth = {}
     for number, rig_from_board in enumerate(board_poses(shots, rng)):
         shot = f"s{number:02d}"
         truth[shot, board.name] = rig_from_board
@@ -109,19 +110,39 @@ def ring_views(
             if inside.sum() < 12:
                 continue
             noisy = pixels[inside] + rng.normal(0.0, noise_px, (inside.sum(), 2))
-            seen = face[inside]
-            view = PlanarView(shot, seen, noisy)
+            corners = face[inside]
+            view = PlanarView(shot, corners, noisy)
             symmetries: tuple[RigidTransform, ...] = (RigidTransform.identity(),)
             if board.kind == "checkerboard":
                 # As a detector would: whichever end, and always as if it were the front.
                 symmetries = board_symmetries(board)
                 label = symmetries[rng.integers(len(symmetries))]
-                if abs(label.inverse().apply(seen)[0, 2]) > 1e-9:
-                    label = next(s for s in symmetries if abs(s.inverse().apply(seen)[0, 2]) < 1e-9)
-                view = PlanarView(shot, label.inverse().apply(seen), noisy)
-            pose, _ = locate_board(camera, view)
-            views.append(LocatedView(name, shot, board.name, view.points, noisy, pose, symmetries))
+                if abs(label.inverse().apply(corners)[0, 2]) > 1e-9:
+                    label = next(
+                        s for s in symmetries if abs(s.inverse().apply(corners)[0, 2]) < 1e-9
+                    )
+                view = PlanarView(shot, label.inverse().apply(corners), noisy)
+            seen.append((name, view, symmetries))
+    poses = _located(cameras, [(name, view) for name, view, _ in seen])
+    views = [
+        LocatedView(name, view.shot, board.name, view.points, view.pixels, pose, symmetries)
+        for (name, view, symmetries), pose in zip(seen, poses, strict=True)
+    ]
     return views, truth
+
+
+def _located(
+    cameras: dict[str, Camera], views: Sequence[tuple[str, PlanarView]]
+) -> list[RigidTransform]:
+    """camera_from_board of each view, all of a camera at once."""
+    poses: dict[int, RigidTransform] = {}
+    for name, camera in cameras.items():
+        own = {number: view for number, (of, view) in enumerate(views) if of == name}
+        starts = [roughly_located(camera, view) for view in own.values()]
+        if own:
+            found, _ = locate_boards(camera, list(own.values()), starts)
+            poses |= dict(zip(own, found, strict=True))
+    return [poses[number] for number in range(len(views))]
 
 
 def as_found(views: Sequence[LocatedView]) -> list[BoardView]:
