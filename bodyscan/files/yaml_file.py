@@ -118,6 +118,7 @@ def read_yaml(path: Path) -> Document:
         raise _error(Place(1, 1), f"is not YAML: {error}".splitlines()[0]) from None
     document = Document()
     if node is not None:
+        _refuse_many(node, {})
         document.data = _Builder(document).build(node, (), 0)
     return document
 
@@ -157,7 +158,7 @@ class _Builder:
         self.nodes += 1
         place = _mark(node.start_mark)
         if self.nodes > MOST_NODES:
-            raise _error(place, f"has more than {MOST_NODES:,} values once aliases are followed")
+            raise _too_many(place)
         if depth > MOST_DEPTH:
             raise _error(place, f"is nested more than {MOST_DEPTH} deep")
         self.document.values[where] = place
@@ -251,6 +252,27 @@ def _refuse_deep(text: str) -> None:
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MOST_DEPTH:
             raise _error(_mark(event.start_mark), f"is nested more than {MOST_DEPTH} deep")
+
+
+def _refuse_many(node: yaml.Node, sizes: dict[int, int]) -> int:
+    """How many values a node stands for once aliases are followed, each counted once: to build what an
+    alias bomb holds until there are too many takes half a second, of every file of a batch."""
+    if id(node) in sizes:
+        return sizes[id(node)]
+    sizes[id(node)] = 1  # one that holds itself is too deep, which is said when it is built
+    parts: list[yaml.Node] = []
+    if isinstance(node, yaml.MappingNode):
+        parts = [value for key, value in node.value if key.value != "<<"]
+    elif isinstance(node, yaml.SequenceNode):
+        parts = node.value
+    sizes[id(node)] += sum(_refuse_many(part, sizes) for part in parts)
+    if sizes[id(node)] > MOST_NODES:
+        raise _too_many(_mark(node.start_mark))
+    return sizes[id(node)]
+
+
+def _too_many(place: Place) -> YamlError:
+    return _error(place, f"has more than {MOST_NODES:,} values once aliases are followed")
 
 
 def _mark(mark: Any) -> Place:

@@ -14,12 +14,7 @@ import time
 from pathlib import Path
 
 from bodyscan.errors import BodyscanError
-from bodyscan.jobs.allocation import Allocation
-from bodyscan.jobs.batch import finish, run_batch, run_locally
-from bodyscan.jobs.discovery import find_jobs
-from bodyscan.jobs.display import json_lines
 from bodyscan.jobs.job import Job
-from bodyscan.jobs.pipeline import load_pipeline
 from bodyscan.jobs.stages import Stage, results_of
 from bodyscan.jobs.worker import main
 from bodyscan.progress import Progress
@@ -78,6 +73,13 @@ def kinds(scan_version: int = 1) -> dict[str, tuple[Stage, ...]]:
 
 
 def batch(scans: Path, out: Path, workers: int) -> int:
+    # As in the package, a job's own process does not load what hands jobs out.
+    from bodyscan.jobs.allocation import Allocation
+    from bodyscan.jobs.batch import finish, run_batch, run_locally
+    from bodyscan.jobs.discovery import find_jobs
+    from bodyscan.jobs.display import json_lines
+    from bodyscan.jobs.pipeline import load_pipeline
+
     pipeline = load_pipeline(PIPELINE)
     jobs = find_jobs(pipeline, scans, out, scans, "export")
     with json_lines() as listen:
