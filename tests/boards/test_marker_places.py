@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array, Mask
+from bodyscan.boards.appearance import AS_PRINTED, OTHERWISE, Appearance
 from bodyscan.boards.aprilgrid import _clear_of_edges, place_tags
 from bodyscan.boards.board_layout import marker_corners
 from bodyscan.boards.charuco import (
@@ -138,3 +139,16 @@ def test_around_a_corner_only_rim_gap_and_small_squares_are_clear() -> None:
     assert _clear_of_edges(TAGS, 1) == pytest.approx(0.85 * 11.25)
     tight = TAGS.model_copy(update={"marker_mm": 110.0})
     assert _clear_of_edges(tight, 2) == pytest.approx(0.85 * 10.0)
+
+
+def test_a_print_seen_in_a_mirror_or_in_white_is_put_right() -> None:
+    image = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    np.testing.assert_array_equal(AS_PRINTED.as_printed(image), image)
+    mirrored = Appearance(mirrored=True)
+    np.testing.assert_array_equal(mirrored.as_printed(image), image[:, ::-1])
+    np.testing.assert_array_equal(Appearance(inverted=True).as_printed(image), 255 - image)
+    pixels = np.array([[0.0, 2.0], [2.5, 0.0]])
+    np.testing.assert_array_equal(mirrored.in_image(pixels, 4), [[3.0, 2.0], [0.5, 0.0]])
+    np.testing.assert_array_equal(AS_PRINTED.in_image(pixels, 4), pixels)
+    assert Appearance(False, False, False, False) == AS_PRINTED
+    assert len({AS_PRINTED, *OTHERWISE}) == 4  # all that a picture may look like

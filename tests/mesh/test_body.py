@@ -9,6 +9,16 @@ import pytest
 from small_bodies import ball
 
 from bodyscan.mesh.body import BodyMesh, BreathAt
+from bodyscan.mesh.regions import (
+    DARK_CLOTH,
+    HAIR,
+    SKIN,
+    UNSURE,
+    covered_shares,
+    of_faces,
+    regions_at,
+    shares,
+)
 
 
 def test_what_is_filled_is_told_by_its_area() -> None:
@@ -52,3 +62,24 @@ def test_at_mean_breath_a_body_is_carried_along_its_normals(
     np.testing.assert_allclose(found.vertices - mesh.vertices, out_mm * mesh.normals, atol=1e-5)
     assert found.breath is None
     assert mesh.at_mean_breath() is mesh
+
+
+def test_shares_of_regions_are_those_of_their_sizes() -> None:
+    regions = np.array([SKIN, SKIN, HAIR, UNSURE, HAIR, SKIN, SKIN, SKIN], np.uint8)
+    assert shares(regions) == {"unsure": 0.125, "skin": 0.625, "hair": 0.25, "dark cloth": 0.0}
+    sizes = np.array([0.0, 0.0, 0.3, 0.1, 0.0, 0.0, 0.0, 0.1])
+    assert list(shares(regions, sizes).values()) == pytest.approx([0.2, 0.2, 0.6, 0.0])
+    assert list(shares(regions, 0.0 * sizes).values()) == [0.0] * 4
+    many = np.repeat(np.array([SKIN, HAIR, UNSURE], np.uint8), [990, 6, 4])
+    assert covered_shares(many) == {"hair": 0.006}
+    assert covered_shares(None) == {}
+
+
+def test_a_face_is_what_two_of_its_corners_are() -> None:
+    regions = np.array([SKIN, SKIN, HAIR, DARK_CLOTH], np.uint8)
+    faces = np.array([[0, 1, 2], [0, 2, 1], [2, 0, 1], [0, 2, 3], [2, 2, 2]])
+    assert of_faces(regions, faces).tolist() == [SKIN, SKIN, SKIN, UNSURE, HAIR]
+    found = regions_at(regions, np.array([3, -1, 0]))
+    assert found is not None
+    assert found.tolist() == [DARK_CLOTH, UNSURE, SKIN]
+    assert regions_at(None, np.array([3])) is None
