@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyscan.files.atomic import atomic_replacement, json_text, write_bytes, write_json, write_npz
-from bodyscan.files.hashing import file_hash
+from bodyscan.files.hashing import content_hash, file_hash, file_hashes, files_below
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
@@ -109,3 +109,26 @@ def test_every_byte_of_a_large_file_is_hashed(tmp_path: Path) -> None:
     content[-1] ^= 1
     path.write_bytes(content)
     assert file_hash(path) != whole
+
+
+def test_plain_data_is_what_it_holds_in_whatever_order() -> None:
+    one = {"a": [1, 2], "b": {"c": None, "d": 0.5}}
+    other = {"b": {"d": 0.5, "c": None}, "a": [1, 2]}
+    assert content_hash(one) == content_hash(other)
+    assert content_hash(one) != content_hash(one | {"a": [2, 1]})
+    assert content_hash({}) == hashlib.sha256(b"{}").hexdigest()
+    assert content_hash({"a": 1}) == hashlib.sha256(b'{"a":1}').hexdigest()
+    with pytest.raises(ValueError, match="Out of range"):
+        content_hash({"a": float("nan")})
+
+
+def test_files_are_what_they_hold_and_listed_in_one_order(tmp_path: Path) -> None:
+    for name in ("b/2", "b/1", "a/3", "c"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name, "utf-8")
+    (tmp_path / "b" / "0").symlink_to(tmp_path / "a", target_is_directory=True)
+    found = [path.relative_to(tmp_path).as_posix() for path in files_below(tmp_path)]
+    assert found == ["c", "a/3", "b/0", "b/1", "b/2"]  # the link is named and not followed
+    hashes = file_hashes({"z": tmp_path / "c", "y": tmp_path / "a" / "3"})
+    assert list(hashes) == ["y", "z"]
+    assert hashes["z"] == hashlib.sha256(b"c").hexdigest()

@@ -9,6 +9,7 @@ from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.honest_covariance import (
     HonestCovariance,
+    _excess,
     board_places,
     honest_covariance,
 )
@@ -143,3 +144,19 @@ def test_boards_that_nearly_stood_where_another_did_are_in_its_place() -> None:
         [("s2", "b"), ("s5", "b")],
         [("s4", "b")],
     ]
+
+
+def test_a_place_has_its_own_excess_as_far_as_it_is_known() -> None:
+    """Five places that say a fifth each of twenty unknowns: of what each saw the solve followed a
+    fifth, so that 16 of 100 are left of each unknown, and twenty degrees of freedom of a place."""
+    information = np.tile(0.2 * np.eye(20), (5, 1, 1))
+    pulls = np.zeros((5, 20))
+    pulls[:, 3] = np.sqrt(3.2 * 0.5)  # variance 0.5
+    pulls[0] *= 3.0
+    found = _excess(information, pulls, np.eye(20), 0.5)
+    assert found.pooled == pytest.approx((9.0 + 4.0) / 5.0)
+    # Twenty degrees of freedom count twice as much as the ten from which a place is known by half.
+    own = (2.0 * 9.0 + found.pooled) / 3.0, (2.0 * 1.0 + found.pooled) / 3.0
+    np.testing.assert_allclose(found.of_place, [own[0], *[own[1]] * 4])
+    # Less than independent corners err promises nothing better.
+    assert _excess(information, 0.1 * pulls, np.eye(20), 0.5).pooled == 1.0
