@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.advice import Advice, Link, MoreShots, best_chain
-from bodyscan.registration.more_shots import BoardPlace, SigmaReduction
+from bodyscan.registration.advice import Advice, Link, MoreShots, _preference, best_chain
+from bodyscan.registration.more_shots import MOST_SHOTS, BoardPlace, SigmaReduction
 
 
 def more(**changes: Any) -> MoreShots:
@@ -102,3 +102,15 @@ def test_a_sigma_is_halved_where_its_variance_is_a_quarter() -> None:
     assert to_halve(0.6, 0.26, 0.25, 0.1) == 3
     assert to_halve(0.2, 0.1) == 1
     assert to_halve(0.6, 0.251) is None
+
+
+def test_fewest_shots_are_preferred_and_then_what_gains_most() -> None:
+    def gained(*after: float) -> SigmaReduction:
+        rest = [after[-1]] * (MOST_SHOTS - len(after))
+        return SigmaReduction(1.0, np.array([*after, *rest]))
+
+    two, three = gained(0.5, 0.2), gained(0.5, 0.3, 0.2)
+    sharper, never, hardly = gained(0.5, 0.1), gained(0.4), gained(0.9)
+    last = SigmaReduction(1.0, np.array([0.9] * (MOST_SHOTS - 1) + [0.2]))
+    order = sorted([hardly, three, last, never, two, sharper], key=_preference)
+    assert order == [sharper, two, three, last, never, hardly]

@@ -13,7 +13,14 @@ from bodyscan.boards.view import BoardView
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.references import board_length, find_size, resized, solving_views
+from bodyscan.registration.references import (
+    Size,
+    _words,
+    board_length,
+    find_size,
+    resized,
+    solving_views,
+)
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.board import Board
 from bodyscan.rig.reference import Reference
@@ -152,3 +159,8 @@ def test_boards_of_references_do_not_place_the_rig() -> None:
     assert solving_views(small_rig(bar()), views) == []
     alone = small_rig(bar()).model_copy(update={"boards": (LEFT, RIGHT)})
     assert solving_views(alone, views) == views
+
+
+def test_a_size_is_told_in_per_cent_with_its_sigma() -> None:
+    assert _words(Size(1.00123, 0.00045)) == "+0.123 % (sigma 0.045 %)"
+    assert _words(Size(0.998, 0.0002)) == "-0.200 % (sigma 0.020 %)"
