@@ -17,7 +17,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import erf
 
 from bodyscan.arrays import Array, Bytes, Indices, Mask
 from bodyscan.boards.appearance import AS_PRINTED, Appearance
@@ -45,6 +44,7 @@ LEAST_OF_SEEN = 0.02
 """Residuals (shares of the contrast) and sigmas of good corners of a clear picture, and of any: where
 all are worse, in noise or blur, a corner may be twice as bad as the usual one of its board."""
 STEPS = 12
+UNSEEN = 1e-9  # share of a diagonal: what a window without pixels leaves open stays as it is
 SETTLED = 1e-2  # a tenth of a corner's own sigma, before a last step that makes it far less
 
 
@@ -221,17 +221,12 @@ def _fit(patches: _Patches, start: Array, along: Array, light: _Light | None = N
 
 
 def _linear(patches: _Patches, state: Array) -> Array:
-    """b, a and g (N, 4) by least squares for given edges."""
-    relative = patches.place - state[:, None, :2]
-    cos, sin = np.cos(state[:, None, 2:4]), np.sin(state[:, None, 2:4])
-    across = relative[..., :1] * cos + relative[..., 1:] * sin
-    edges = erf(across / (np.sqrt(2.0) * state[:, None, 4:5]))
-    design = np.concatenate(
-        [edges.prod(axis=-1)[..., None], np.ones_like(relative[..., :1]), relative], axis=-1
-    )
-    weighted = design * patches.weight[..., None]
-    normal = np.einsum("npi,npj->nij", weighted, design) + 1e-9 * np.eye(4)
-    return solve_scaled(normal, np.einsum("npi,np->ni", weighted, patches.grey))
+    """b, a and g (N, 4) by least squares for given edges: where no square differs yet and no light
+    falls off, the image is linear in them."""
+    even = np.column_stack([state[:, :5], np.tile([0.0, MIN_CONTRAST, 0.0, 0.0], (len(state), 1))])
+    at = _equations(patches, even)
+    step = solve_scaled(at.normal[:, 5:, 5:], at.gradient[:, 5:], np.full(len(state), UNSEEN))
+    return even[:, 5:] - step
 
 
 def _equations(patches: _Patches, state: Array) -> StackedEquations:
