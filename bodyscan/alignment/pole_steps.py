@@ -232,20 +232,22 @@ def _evidence(
     """Logarithm of the likelihood of the motions, at the sizes of sway, step and noise that explain
     them best, the covariance (N, N) that these make, sway and noise.  stepped: (N, N), 1 for two that
     have the same step."""
-    size = len(seen.names)
-    noise2, sway2, step2 = np.meshgrid(NOISE_MM**2, sways_mm**2, steps_mm**2, indexing="ij")
-    covariance = (
-        noise2.ravel()[:, None, None] * np.eye(size)
-        + sway2.ravel()[:, None, None] * seen.sway
-        + np.minimum(SHARED**2 * sway2, SHARED_MM**2).ravel()[:, None, None] * seen.sides
-        + step2.ravel()[:, None, None] * stepped
+    sway2, step2 = (sizes.ravel() for sizes in np.meshgrid(sways_mm**2, steps_mm**2))
+    moved = (
+        sway2[:, None, None] * seen.sway
+        + np.minimum(SHARED**2 * sway2, SHARED_MM**2)[:, None, None] * seen.sides
+        + step2[:, None, None] * stepped
         + seen.free
     )
-    motions = np.broadcast_to(seen.motions, (len(covariance), *seen.motions.shape))
-    pulls = np.linalg.solve(covariance, motions)
-    fit = np.einsum("pi,kpi->k", seen.motions, pulls)
-    volume = seen.motions.shape[1] * np.linalg.slogdet(covariance)[1]
+    # Noise is added to the eigenvalues: one decomposition serves all its sizes.
+    variances, ways = np.linalg.eigh(moved)
+    noise2 = NOISE_MM**2
+    variance = np.maximum(variances, 0.0)[:, None, :] + noise2[:, None]
+    along = np.sum((ways.transpose(0, 2, 1) @ seen.motions) ** 2, axis=2)
+    fit = np.sum(along[:, None, :] / variance, axis=2)
+    volume = seen.motions.shape[1] * np.sum(np.log(variance), axis=2)
     likelihood = -0.5 * fit - 0.5 * volume
-    best = int(np.argmax(likelihood))
-    sway, noise = (float(np.sqrt(sizes.ravel()[best])) for sizes in (sway2, noise2))
-    return float(likelihood[best]), covariance[best], sway, noise
+    size, noise = np.unravel_index(np.argmax(likelihood), likelihood.shape)
+    covariance = moved[size] + noise2[noise] * np.eye(len(seen.names))
+    own = float(np.sqrt(sway2[size])), float(np.sqrt(noise2[noise]))
+    return float(likelihood[size, noise]), covariance, *own
