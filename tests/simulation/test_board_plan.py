@@ -30,19 +30,16 @@ def plan(request: pytest.FixtureRequest) -> tuple[Rig, dict[str, TruePair], list
 
 
 def seen(pair: TruePair, shot: BoardShot, rig: Rig) -> tuple[float, float, bool]:
-    """(angle off the face in degrees, share inside the image, front?) worked out point by point."""
+    """(angle off the face in degrees, share inside the image, front?) worked out anew."""
     board = rig.board(shot.board)
     size = np.array([board.columns, board.rows]) * board.square_mm
-    inside = []
-    for x in np.linspace(0, size[0], 21):
-        for y in np.linspace(0, size[1], 21):
-            point = shot.rig_from_board.apply(np.array([x, y, 0.0]))
-            seen_at = pair.rig_from_camera.inverse().apply(point)
-            if seen_at[2] <= 0:
-                inside.append(False)
-                continue
-            u, v = pair.camera.image(seen_at)
-            inside.append(0 <= u < pair.camera.width and 0 <= v < pair.camera.height)
+    x, y = np.meshgrid(np.linspace(0, size[0], 21), np.linspace(0, size[1], 21))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    seen_at = pair.rig_from_camera.inverse().apply(shot.rig_from_board.apply(points))
+    ahead = seen_at[:, 2] > 0
+    u, v = pair.camera.image(seen_at[ahead]).T
+    inside = np.zeros(len(points))
+    inside[ahead] = (u >= 0) & (u < pair.camera.width) & (v >= 0) & (v < pair.camera.height)
     centre = shot.rig_from_board.apply(np.array([*size / 2, 0.0]))
     way = pair.rig_from_camera.translation - centre
     cosine = shot.rig_from_board.rotation[:, 2] @ way / np.linalg.norm(way)
