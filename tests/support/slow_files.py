@@ -12,6 +12,7 @@ SLOW = (
     "workflows/test_reports.py",
     "laboratory/test_reproduce.py",
     "workflows/test_real_captures.py",
+    "alignment/test_together.py",
     "alignment/test_following.py",
     "fusion/test_seams.py",
     "workflows/test_codes_calibrated.py",
