@@ -8,7 +8,14 @@ import pytest
 from bodyscan.calibration.board_views import LocatedView, greatest_displacement
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.view_graph import _gaps, initial_poses, place_boards, view_graph
+from bodyscan.registration.view_graph import (
+    RelativePose,
+    _gaps,
+    _open_tie,
+    initial_poses,
+    place_boards,
+    view_graph,
+)
 
 PLACED = {
     "a": RigidTransform.identity(),
@@ -96,3 +103,27 @@ def test_a_board_stands_where_most_corners_say_and_a_view_far_off_is_doubtful() 
     more = [view("a", 1, 100.0, corners=8), view("b", 1), view("c", 1, 130.0, corners=6)]
     _, boards, _ = place_boards(more, PLACED)
     assert np.linalg.norm(boards["s1", "board"].translation - board(1).translation) > 90.0
+
+
+def said_of(shots: int, agreeing: int) -> str:
+    """What is said of a tie that boards which may be numbered from either end leave open."""
+    targets = tuple((f"s{k}", "b") for k in range(shots))
+    pose = RigidTransform.identity()
+    tie = RelativePose(pose, targets, targets[:agreeing], agreeing, 40, True)
+    groups = (dict.fromkeys(names, pose) for names in ("ba", "c"))
+    return str(_open_tie(*groups, tie))
+
+
+def test_what_leaves_a_tie_open_is_told() -> None:
+    for shots in (1, 2):
+        words = said_of(shots, 1)
+        assert "the relative pose of a, b and c stays open" in words
+        assert "at best" not in words
+    words = said_of(3, 1)
+    assert "no two shots agree on the relative pose of a, b and c" in words
+    assert "(shots s0, s1, s2)" in words
+    words = said_of(4, 2)
+    assert "stays open" in words
+    assert "(shots s0, s1, s2, s3; at best s0, s1 agree)" in words
+    assert "at best" not in said_of(2, 2)
+    assert "(shots s0, s1, s2, s3, s4, s5; at best s0, s1 agree)" in said_of(9, 2)
