@@ -110,8 +110,7 @@ def said_of(shots: int, agreeing: int) -> str:
     targets = tuple((f"s{k}", "b") for k in range(shots))
     pose = RigidTransform.identity()
     tie = RelativePose(pose, targets, targets[:agreeing], agreeing, 40, True)
-    groups = (dict.fromkeys(names, pose) for names in ("ba", "c"))
-    return str(_open_tie(*groups, tie))
+    return str(_open_tie(dict.fromkeys("ba", pose), {"c": pose}, tie))
 
 
 def test_what_leaves_a_tie_open_is_told() -> None:
