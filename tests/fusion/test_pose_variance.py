@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
@@ -112,9 +113,7 @@ def test_pairs_that_see_a_point_too_flat_have_no_part_in_its_error_bar(azimuth_d
     )  # fmt: skip
     turned = np.diag([1e-8, 4e-8, 0.0, 0.3, 0.7, 2.0])  # about x by 1e-4 at y = -30: 3 um
     shifted = np.diag([0.0] * 5 + [1.0])
-    prior = PoseCovariance(
-        ("a", "b"), np.kron(np.diag([1.0, 0.0]), turned) + np.kron(np.diag([0.0, 1.0]), shifted)
-    )
+    prior = PoseCovariance(("a", "b"), np.asarray(block_diag(turned, shifted), np.float64))
     steep = looking_from(1.0, 0.0)
     for cosine, variance in ((0.21, 1.5), (0.19, 2.0)):
         found = add_pose_variance(one, {"a": steep, "b": looking_from(cosine, azimuth_deg)}, prior)
