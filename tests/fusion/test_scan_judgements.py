@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import combinations
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -329,3 +330,24 @@ def test_whoever_is_to_blame_makes_half_of_it(left: float, blamed: str) -> None:
     found = against(shares)
     assert found.share == pytest.approx(0.05, abs=0.001)
     assert found.blamed({name: group for name, group in POLES.items() if "pair" in name}) == blamed
+
+
+def test_what_pairs_say_of_each_other_is_counted_by_whose_point_it_is() -> None:
+    """Samples 0 to 9 are the first pair's, 10 to 19 the second's."""
+    samples: Any = SimpleNamespace(starts=np.array([0, 10, 20]), sigma_mm=np.full(20, 0.3))
+    surface: Any = SimpleNamespace(sigma_mm=np.full(50, 0.4))
+
+    def said(agreed: list[int], against: list[int]) -> Any:
+        index, other = np.array(agreed, np.int64), np.array(against, np.int64)
+        return SimpleNamespace(index=index, at=index, against_index=other, against_at=other)
+
+    evidence = [said([10, 12, 19], [11]), said([0, 9], [1, 2, 3])]
+    found = Contradictions.of(["a", "b"], evidence, samples, [surface, surface], 1.5)
+    assert found.asked.tolist() == [[0, 4], [5, 0]]
+    assert found.against.tolist() == [[0, 1], [3, 0]]
+    assert found.share == pytest.approx(4.0 / 9.0)
+    # Both points' sigmas are 0.5 mm: beyond three of them noise is once in 370 times.
+    assert found.by_noise == pytest.approx(0.0027, rel=1e-2)
+    assert found.beyond_noise == pytest.approx(4.0 / 9.0 - 0.0027, abs=1e-4)
+    nothing = Contradictions.of(["a", "b"], [said([], [])] * 2, samples, [surface, surface], 1.5)
+    assert (nothing.share, nothing.by_noise) == (0.0, 0.0)
