@@ -1,8 +1,9 @@
 """How a person's surface moved between the pairs' moments, from all overlaps together.
 
-Kinds of motion share what the overlaps ask for: the whole body sways, head and arms turn each as a
-whole, any part shifts and turns, the trunk breathes. Each is a Gaussian process over surface and
-time, as large as the evidence says; beside them stands what the boards left open of the pairs' poses.
+Kinds of motion share what the overlaps ask for: the whole body leans above its ankles or goes any
+other way, head and arms turn about their joints or shift, any part shifts, the trunk breathes. Each is
+a Gaussian process over surface and time, as large as the evidence says; beside them stands what the
+boards left open of the pairs' poses.
 """
 
 from __future__ import annotations
@@ -17,34 +18,32 @@ from scipy.linalg import cho_solve
 from scipy.linalg.lapack import dpotrf, dpotri, dtrtri
 
 from bodyscan.alignment.body_cells import BodyCells, modulated, rigid_fields
-from bodyscan.alignment.breath import breath_fields
+from bodyscan.alignment.breath import breath_fields, likely_breath
 from bodyscan.alignment.cell_evidence import CellEvidence
 from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.limbs import limb_fields
-from bodyscan.alignment.moments import Courses, of_breath, of_stance
+from bodyscan.alignment.moments import Courses, breaths, of_breath, of_stance
+from bodyscan.alignment.part_names import above_feet, ankles
 from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.scaled_systems import invert_scaled
+from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.progress import threaded
 
+LEAN_MM = 1000.0  # above the ankles a body's middle: a unit of lean carries it by 1 mm
 PART_MM = 250.0  # how far what moves as one reaches: a forearm, half a thigh, a shoulder
 LEAST_PART = 0.02
 ARM_MM = 400.0  # at which a part's turn displaces as much as its shift
-FIRST_MM = 1.0
+FIRST_MM, WHOLE_MM = 1.0, 2.0
 SIZINGS = 3
 """Of each round: what the evidence does not ask for shrinks by steps."""
 SMALLEST_MM = 1e-3
-BREATH_MM = 1.5
-"""A chest or belly rises by 2 to 8 mm at rest; 4 are 1.4 of standard deviation. Limbs' motion would
-explain most of a breath too, so that evidence alone makes it too small: there is this or none."""
-PARTS_MM = 0.5
-"""By so much parts above the legs may have moved where nothing was seen of it, a third of a breath:
+PARTS_MM = 0.25
+"""By so much parts above the legs may have moved where nothing was seen of it, a sixth of a breath:
 evidence sizes the parts of the whole body at once, and legs that stood still say nothing of a hip."""
 APART_MM = 0.07
 """By so much two pairs' surfaces lie apart in a cell for no motion of the body: calibrations bend by
 0.05 mm each, which no number of matches averages out."""
-ANY = 0.1
-"""Of what is usual; a statue that sways shows a thirtieth, calibrations bend by less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +51,9 @@ class Kind:
     """One kind of motion: displacement fields (C, 12, M), mm, each along J courses.
 
     size: standard deviation of their amplitudes before anything was seen; precision: (M J, M J), in
-    its place, where it is known.  usual: of size at least, where the evidence asks for any.
+    its place, where it is known; alike: (J, J) covariance of each field's, where courses are not.
+    twists: (6, M) about the rig's origin, if the body goes as a whole; but for its feet: bends
+    (C, 12, M) is what fields are beside twists, which a pair's placing does not see to.
     """
 
     name: str
@@ -60,7 +61,24 @@ class Kind:
     courses: Courses
     size: float = FIRST_MM
     precision: Array | None = None
-    usual: float = SMALLEST_MM
+    alike: Array | None = None
+    twists: Array | None = None
+    bends: Array | None = None
+
+    @staticmethod
+    def whole(name: str, cells: BodyCells, twists: Array, courses: Courses) -> Kind:
+        """Of the whole body."""
+        fields = rigid_fields(cells, np.zeros(3), 1.0) @ twists
+        return Kind(name, fields, courses, WHOLE_MM, twists=twists)
+
+    @staticmethod
+    def lean(cells: BodyCells, courses: Courses) -> Kind:
+        """About the ankles, as an inverted pendulum (Winter 1995), and round: feet stay where they
+        stand. What sways otherwise as a whole is less, and no more than the evidence asks for."""
+        about_ankles = adjoint(RigidTransform(np.eye(3), ankles(cells)))[:, :3] / LEAN_MM
+        whole = rigid_fields(cells, np.zeros(3), 1.0) @ about_ankles
+        fields = modulated(whole, cells, above_feet(cells)[:, None])
+        return Kind("lean", fields, courses, WHOLE_MM, twists=about_ankles, bends=fields - whole)
 
     @property
     def count(self) -> int:
@@ -73,12 +91,11 @@ class Kind:
 
     @property
     def prior(self) -> Array:
-        return np.eye(self.count) / self.size**2 if self.precision is None else self.precision
-
-    def resized(self, size: float) -> Kind:
-        """As large as the evidence says."""
-        least = self.usual if size > ANY * self.usual else SMALLEST_MM
-        return replace(self, size=max(size, least))
+        if self.precision is not None:
+            return self.precision
+        if self.alike is not None:
+            return np.kron(np.eye(self.fields.shape[2]), np.linalg.inv(self.alike))
+        return np.eye(self.count) / self.size**2
 
     def during(self, pair: int) -> Array:
         """(J,) courses from the middle to a pair's moment; of the pairs' own errors at that moment."""
@@ -87,21 +104,21 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class BodyMotion:
-    """fields: (C, 12, M) of all kinds.  amplitudes: (n,) of their fields and courses.  usual: (6,) the
-    sway that its unit is.
+    """fields: (C, 12, M) of all kinds.  amplitudes: (n,) of their fields and courses.
 
     normal: (n, n), what was seen of them, without any prior, its lower triangle; pull: (n,) its
     right-hand side.  factor: (n, n) Cholesky's, lower, of their covariance's inverse in units (n,).
+    breaths: (K, J, J) that there may be (see `moments.breaths`).
     """
 
     kinds: tuple[Kind, ...]
     fields: Array
-    usual: Array
     amplitudes: Array
     normal: Array
     pull: Array
     factor: Array
     units: Array
+    breaths: Array
 
     @staticmethod
     def start(
@@ -112,20 +129,26 @@ class BodyMotion:
         stance, pairs = Courses.of(of_stance, seconds), len(seconds)
         by_freedom = np.arange(6 * pairs).reshape(pairs, 6).T.ravel()
         known = invert_scaled(boards)[np.ix_(by_freedom, by_freedom)]
+        pose = Kind.whole("pose", cells, np.eye(6), Courses.steady(pairs))
+        any_way = adjoint(RigidTransform(np.eye(3), BODY_CENTRE)) * sway
         shifts = rigid_fields(cells, np.zeros(3), ARM_MM)[:, :, 3:]
         any_part = modulated(shifts, cells, cells.alike(PART_MM, LEAST_PART))
-        breath = breath_fields(cells)
+        rising = Courses.of(of_breath, seconds)
         kinds = (
-            Kind("pose", rigid_fields(cells, np.zeros(3), 1.0), Courses.steady(pairs), 1.0, known),
-            Kind("sway", rigid_fields(cells, BODY_CENTRE, 1.0) * sway, stance, 2.0),
+            replace(pose, precision=known),
+            Kind.lean(cells, stance),
+            Kind.whole("sway", cells, any_way, stance),
             *(Kind(name, field, stance) for name, field in limb_fields(cells, ARM_MM).items()),
             Kind("parts", any_part, stance),
-            Kind("breath", breath, Courses.of(of_breath, seconds), BREATH_MM, usual=BREATH_MM),
+            Kind("breath", breath_fields(cells), rising, alike=np.eye(rising.count)),
         )
         count = sum(kind.count for kind in kinds)
         nothing, none = np.zeros((count, count)), np.zeros(count)
         fields = np.concatenate([kind.fields for kind in kinds], axis=2)
-        return BodyMotion(kinds, fields, sway, none, nothing, none, nothing, np.ones(count))
+        known_breaths = breaths(rising, seconds)
+        return BodyMotion(
+            kinds, fields, none, nothing, none, nothing, np.ones(count), known_breaths
+        )
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -148,6 +171,15 @@ class BodyMotion:
     def kind(self, name: str) -> Kind:
         return next(kind for kind in self.kinds if kind.name == name)
 
+    def twist(self, pair: int, *, from_middle: bool = False) -> Array:
+        """(6,) a pair's own error and what moved the person as a whole, about the rig's origin."""
+        total = np.zeros(6)
+        for kind in self.kinds:
+            if kind.twists is not None:
+                course = kind.during(pair) if from_middle else kind.courses.values[pair]
+                total += kind.twists @ self.of(kind.name, course)
+        return total
+
     def of(self, name: str, course: Array) -> Array:
         """(M, ...) amplitudes of one kind's fields along courses (J, ...)."""
         k = self.kinds.index(self.kind(name))
@@ -155,13 +187,19 @@ class BodyMotion:
 
     def displacements(self, names: Sequence[str], *, from_middle: bool = False) -> Array:
         """(P, C, 12) mm: what those kinds come to at each pair's moment."""
-        first = self.kinds[0]
-        total = np.zeros((first.fields.shape[0] * 12, len(first.courses.values)))
-        for kind in self.kinds:
-            if kind.name in names:
-                middle = kind.courses.middle if from_middle else 0.0
-                course = (kind.courses.values - middle).T
-                total += kind.fields.reshape(len(total), -1) @ self.of(kind.name, course)
+        return self._sum({k.name: k.fields for k in self.kinds if k.name in names}, from_middle)
+
+    def bends(self, *, from_middle: bool = False) -> Array:
+        """(P, C, 12) mm: likewise of all kinds, beside `twist`."""
+        beside = {k.name: k.fields if k.twists is None else k.bends for k in self.kinds}
+        return self._sum({n: f for n, f in beside.items() if f is not None}, from_middle)
+
+    def _sum(self, fields: Mapping[str, Array], from_middle: bool) -> Array:
+        total = np.zeros((self.fields.shape[0] * 12, len(self.kinds[0].courses.values)))
+        for name, field in fields.items():
+            courses = self.kind(name).courses
+            course = courses.values - (courses.middle if from_middle else 0.0)
+            total += field.reshape(len(total), -1) @ self.of(name, course.T)
         return total.T.reshape(total.shape[1], -1, 12)
 
     def solved(
@@ -201,7 +239,7 @@ class BodyMotion:
                 normal[rows, self.slices[h]] = _products(block, apart[g], apart[h]).reshape(
                     kind.count, other.count
                 )
-        motion = replace(self, normal=normal, pull=total)._settled()
+        motion = replace(self, normal=normal, pull=total)._settled()._in_breath()._settled()
         for _ in range(SIZINGS):
             motion = motion._resized()._settled()
         return motion
@@ -250,13 +288,25 @@ class BodyMotion:
         amplitudes = units * cho_solve((factor, True), units * self.pull, check_finite=False)
         return replace(self, amplitudes=amplitudes, factor=factor, units=units)
 
+    def _in_breath(self) -> BodyMotion:
+        """Breathing as the evidence says, whatever else moved. Limbs' motion would explain most of a
+        breath too, but none of it comes and goes as that does, on the whole trunk at once."""
+        breath = self.kind("breath")
+        own = self.slices[self.kinds.index(breath)]
+        known = np.linalg.inv(self.covariance[own, own])
+        seen = known - breath.prior
+        alike = likely_breath(seen, known @ self.amplitudes[own], self.breaths)
+        kinds = (replace(k, alike=alike) if k is breath else k for k in self.kinds)
+        return replace(self, kinds=tuple(kinds))
+
     def _resized(self) -> BodyMotion:
         """Each kind as large as the evidence says (MacKay 1992): what it does not ask for shrinks."""
         kinds, variances = [], self.variances
         for kind, some in zip(self.kinds, self.slices, strict=True):
             told = kind.count - np.sum(variances[some]) / kind.size**2
             size = np.sqrt(np.sum(self.amplitudes[some] ** 2) / max(told, 1e-6))
-            kinds.append(kind.resized(float(size)) if kind.moves else kind)
+            sized = kind.precision is None and kind.alike is None
+            kinds.append(replace(kind, size=max(float(size), SMALLEST_MM)) if sized else kind)
         return replace(self, kinds=tuple(kinds))
 
 

@@ -10,17 +10,50 @@ from bodyscan.arrays import Array
 
 LENGTH_MM = 110.0  # over which a trunk rises alike: a chest, a belly, a side
 LEAST = 0.04
+PLACE = 0.35
+"""Of how far the front of a trunk rises as one, how much more or less any place of it does."""
+SIZES_MM = np.array([0.02, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8])
+"""Standard deviations over time of where it rises most; a chest or belly rises by 2 to 8 mm at rest,
+1.4 of 4."""
 # Shares of the stature: breath begins to show above the hips, and no more above the collarbones.
 HIPS, WAIST, COLLAR, NECK = 0.47, 0.54, 0.79, 0.86
+EVIDENCE = 0.1
+"""By so much what was seen of all cells tells one breath from another: neighbouring cells err alike,
+since calibrations bend over a fifth of a picture, of which they are a tenth."""
 BEHIND = 0.25
 """Of the front: ribs rise to the sides too, less than half as far, and a back leans on nothing."""
 
 
 def breath_fields(cells: BodyCells) -> Array:
-    """(C, 12, M) displacement fields outwards, smooth over the trunk, nothing elsewhere."""
-    functions = cells.alike(LENGTH_MM, LEAST) * breathing(cells)[:, None]
+    """(C, 12, M) displacement fields outwards, of the trunk as one and of its places, smooth over it,
+    nothing elsewhere."""
+    as_one = breathing(cells)[:, None]
+    functions = PLACE * cells.alike(LENGTH_MM, LEAST) * as_one
     shown = np.sum(functions**2, axis=0)
-    return modulated(normal_field(cells), cells, functions[:, shown > LEAST * shown.max()])
+    kept = functions[:, shown > LEAST * shown.max()]
+    return modulated(normal_field(cells), cells, np.hstack([as_one, kept]))
+
+
+def likely_breath(information: Array, pull: Array, breaths: Array) -> Array:
+    """(J, J) covariance of courses' amplitudes: the mean of all breaths (K, J, J) in all sizes, each as
+    likely as it explains what was seen.
+
+    information (M J, M J), pull (M J,): normal equations of M fields along J courses, whatever else
+    moved.
+    """
+    courses = breaths.shape[1]
+    roots = np.linalg.cholesky(breaths)
+    blocks = information.reshape(-1, courses, len(information) // courses, courses)
+    gains = np.empty((len(breaths), len(SIZES_MM)))
+    for k, root in enumerate(roots):
+        seen = np.einsum("ai,manb,bj->minj", root, blocks, root, optimize=True)
+        sizes, ways = np.linalg.eigh(seen.reshape(information.shape))
+        along = (pull.reshape(-1, courses) @ root).ravel() @ ways
+        more = np.maximum(sizes, 0.0) + SIZES_MM[:, None] ** -2.0
+        volume = np.log(more * SIZES_MM[:, None] ** 2).sum(axis=1)
+        gains[k] = 0.5 * (along**2 / more).sum(axis=1) - 0.5 * volume
+    weights = np.exp((gains - gains.max()) * EVIDENCE)
+    return np.asarray(np.einsum("kij,ks,s->ij", breaths, weights / weights.sum(), SIZES_MM**2))
 
 
 def breathing(cells: BodyCells) -> Array:

@@ -20,7 +20,7 @@ from bodyscan.alignment.body_motion import BodyMotion, observed, outward_errors
 from bodyscan.alignment.cell_evidence import CellEvidence
 from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.icp import Alignment
-from bodyscan.alignment.limbs import LIMBS
+from bodyscan.alignment.limbs import LIMBS, SHIFTS
 from bodyscan.alignment.matching import AlignmentPoints, Matches
 from bodyscan.alignment.overlaps import COARSE, OverlapPoints, each_overlap, match_overlap
 from bodyscan.alignment.part_names import LEGS, PARTS, name_parts
@@ -35,8 +35,9 @@ from bodyscan.settings import AlignmentSettings
 
 Result = TypeVar("Result")
 
-BENDING = (*LIMBS, "parts", "breath")
-MOVING = ("sway", *BENDING)
+SWAYING = ("lean", "sway")
+BENDING = (*LIMBS, *SHIFTS, "parts", "breath")
+MOVING = (*SWAYING, *BENDING)
 BLEND_MM = 60.0
 ROUNDS = 3  # the last with all points
 RING_MM = 20.0  # heights of one girth: less than a cell's
@@ -180,7 +181,7 @@ def follow(
         return aligned, None, places
     followed = Followed(
         cells,
-        dict(zip(names, motion.displacements(BENDING, from_middle=True), strict=True)),
+        dict(zip(names, motion.bends(from_middle=True), strict=True)),
         motion.displacements(MOVING, from_middle=True)[..., :3],
         seen,
         cell_sigmas(motion, cells, seen),
@@ -218,17 +219,6 @@ def sigmas_around(errors: Array, height: Array) -> Array:
     return own * np.linalg.norm(near @ errors, axis=1) / np.maximum(near @ own, 1e-12)
 
 
-def _rigid(motion: BodyMotion, pair: int, *, from_middle: bool = False) -> Array:
-    """(6,) a pair's own error and the person's sway, as one motion about the rig's origin."""
-    twist = motion.of("pose", motion.kind("pose").during(pair)).copy()
-    sway = motion.kind("sway")
-    course = sway.during(pair) if from_middle else sway.courses.values[pair]
-    turn, shift = (motion.of("sway", course) * motion.usual).reshape(2, 3)
-    twist[:3] += turn
-    twist[3:] += shift - np.cross(turn, BODY_CENTRE)
-    return twist
-
-
 def _each_overlap(
     measure: Callable[[Matches, Indices], Result],
     pool: ThreadPoolExecutor,
@@ -239,8 +229,8 @@ def _each_overlap(
 ) -> dict[tuple[int, int], Result]:
     """What the matches of every two pairs, and their cells, say, the person as followed so far."""
     motion, cells = person
-    placed = [view.start.moved(_rigid(motion, k)) for k, view in enumerate(views)]
-    bends = motion.displacements(BENDING)
+    placed = [view.start.moved(motion.twist(k)) for k, view in enumerate(views)]
+    bends = motion.bends()
 
     def of_two(i: int, j: int) -> Result | None:
         """The source carried to where it was when the target was seen."""
@@ -270,7 +260,7 @@ def _is_unbent(motion: BodyMotion, seen: Mask) -> bool:
 
 
 def _is_unswayed(motion: BodyMotion, seen: Mask, settings: AlignmentSettings) -> bool:
-    return _far(motion, ("sway",), seen) < settings.least_sway * settings.sway_mm
+    return _far(motion, SWAYING, seen) < settings.least_sway * settings.sway_mm
 
 
 def _far(motion: BodyMotion, names: Sequence[str], seen: Mask) -> float:
@@ -290,7 +280,7 @@ def _placed(
     motion: BodyMotion,
     gaps: Mapping[tuple[int, int], float],
 ) -> Alignment:
-    twists = np.array([_rigid(motion, k, from_middle=True) for k in range(len(views))])
+    twists = np.array([motion.twist(k, from_middle=True) for k in range(len(views))])
     shift = np.linalg.norm(centre_shifts(twists), axis=1)
     placed = [view.start.moved(twist) for view, twist in zip(views, twists, strict=True)]
     left = {(names[i], names[j]): rms_mm for (i, j), rms_mm in gaps.items()}

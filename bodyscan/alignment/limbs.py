@@ -1,4 +1,4 @@
-"""Head and arms, which turn and shift each as a whole, against the trunk."""
+"""Head and arms, which turn each as a whole about its joint with the trunk, and hardly shift."""
 
 from __future__ import annotations
 
@@ -9,18 +9,21 @@ from bodyscan.alignment.part_names import PARTS, name_parts
 from bodyscan.arrays import Array
 
 LIMBS = ("head", "left arm", "right arm")
+SHIFTS = tuple(f"{limb} shift" for limb in LIMBS)
 BORDER_MM = 60.0  # over which what moves passes into what does not: a neck, a shoulder
 
 
 def limb_fields(cells: BodyCells, arm_mm: float) -> dict[str, Array]:
-    """By limb, (C, 12, 6) displacement fields: its rigid motion about its own middle (see
-    `rigid_fields`), smooth over its border; nothing of one that the body does not show."""
+    """Of each limb, and of its shift, (C, 12, 3) displacement fields (see `rigid_fields`), smooth over
+    its border, in the middle of which its joint is; nothing of one that the body does not show."""
     part = name_parts(cells)
     near = np.exp(-0.5 * (cells.away / BORDER_MM) ** 2)
     fields = {}
-    for name in LIMBS:
-        own = part == PARTS.index(name)
+    for limb, shift in zip(LIMBS, SHIFTS, strict=True):
+        own = part == PARTS.index(limb)
         share = (own[cells.landmarks] @ near) / np.maximum(near.sum(axis=0), 1e-12)
-        middle = cells.centres[own].mean(axis=0) if own.any() else np.zeros(3)
-        fields[name] = modulated(rigid_fields(cells, middle, arm_mm), cells, share[:, None])
+        border = share * (1.0 - share)
+        joint = border @ cells.centres / max(border.sum(), 1e-12)
+        field = modulated(rigid_fields(cells, joint, arm_mm), cells, share[:, None])
+        fields[limb], fields[shift] = field[..., :3], field[..., 3:]
     return fields

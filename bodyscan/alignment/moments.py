@@ -14,9 +14,17 @@ Correlation = Callable[[Array], Array]
 LEAST = 1e-3  # of the variance of the first course; less is not worth an unknown
 STANCE_S = 0.8
 """After which a stance has little to do with what it was: people sway at 0.1 to 1 Hz."""
-BREATHS_S = np.linspace(2.8, 5.5, 10)
-"""From one breath to the next at rest: 11 to 21 a minute."""
+BREATHS_S = np.geomspace(2.5, 5.8, 12)
+"""From one breath to the next at rest: 10 to 24 a minute."""
 STEADY = 0.05  # of a breath's variance that does not come back with it
+BEGUN = np.arange(8) * np.pi / 8.0
+"""Phases; half a turn later it is the same with the other sign."""
+LAG = 0.35
+"""Tangent of how far belly and chest are from breathing at once: 10 to 30 degrees at rest (Konno and
+Mead 1967)."""
+IRREGULAR = 0.05
+"""Of a breath, what is no sine. What nobody saw is told by the sine alone: nothing in a scan says how
+much this is."""
 STEP_S = 1e-3
 
 
@@ -81,3 +89,21 @@ class Courses:
     def steady(count: int) -> Courses:
         """Of what is another for each pair, and does not move."""
         return Courses(np.eye(count), np.zeros(count), np.zeros((count, count)))
+
+
+def breaths(courses: Courses, seconds: Sequence[float | None]) -> Array:
+    """(K, J, J) covariances of the courses' amplitudes of K breaths, of each length and phase.
+    Where a moment is not known, one: every moment is its own."""
+    at = np.array([second for second in seconds if second is not None])
+    if len(at) < len(seconds):
+        return np.eye(courses.count)[None]
+    knots = np.append(at, 0.5 * (at.min() + at.max()))
+    told = np.linalg.pinv(np.vstack([courses.values, courses.middle]))
+    turns = (2.0 * np.pi * knots / BREATHS_S[:, None, None] + BEGUN[:, None]).reshape(
+        -1, len(knots)
+    )
+    waves = told @ np.stack([np.cos(turns), LAG * np.sin(turns)], axis=2)
+    sines = 2.0 * waves @ np.swapaxes(waves, 1, 2)
+    # What the courses leave out has to leave the sum positive.
+    any_way = told @ of_stance(knots[:, None] - knots) @ told.T + LEAST * np.eye(courses.count)
+    return np.asarray(sines + IRREGULAR**2 * any_way)

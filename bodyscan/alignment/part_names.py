@@ -35,6 +35,20 @@ def name_parts(cells: BodyCells) -> Indices:
     return part
 
 
+def ankles(cells: BodyCells) -> Array:
+    """(3,) mm, between them; where no shin was seen, below the middle of the body."""
+    stature = float(cells.centres[:, 2].max())
+    shins = cells.centres[:, 2] < SHIN * stature
+    low = cells.centres[shins] if shins.any() else cells.centres
+    return np.append(low[:, :2].mean(axis=0), ANKLE * stature)
+
+
+def above_feet(cells: BodyCells) -> Array:
+    """(C,) 0 of the feet, 1 above the ankles."""
+    height = cells.centres[:, 2] / cells.centres[:, 2].max()
+    return np.clip((height - FOOT) / (ANKLE - FOOT), 0.0, 1.0)
+
+
 def leftward(cells: BodyCells) -> Array:
     """(2,) to the subject's left: toes point forward, and who stands on none faces the rig's x."""
     height = cells.centres[:, 2] / cells.centres[:, 2].max()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import truncnorm
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
@@ -105,8 +106,6 @@ def _fit(places: Array, hair_top_mm: float) -> Solution[_Ellipsoid]:
 
 def _between(estimate: float, sigma: float, low: float, high: float) -> HeadTop:
     """What is left of a normal distribution between what skin and hair leave open."""
-    from scipy.stats import truncnorm  # loads for half a second; of most heads nothing is asked
-
     ends = (low - estimate) / sigma, (high - estimate) / sigma
     left = truncnorm(*ends, loc=estimate, scale=sigma)
     return HeadTop(float(left.mean()), float(left.std()))

@@ -7,9 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import sparse
 
+from bodyscan.alignment import body_motion
+from bodyscan.alignment.body_cells import BodyCells
 from bodyscan.alignment.body_motion import BodyMotion, Kind, observed, outward_errors
 from bodyscan.alignment.moments import Courses
+from bodyscan.alignment.part_names import ankles
 from bodyscan.arrays import Array
 
 PAIRS, CELLS = 2, 3
@@ -29,7 +33,7 @@ def seen(kinds: tuple[Kind, ...] = (POSE, PARTS)) -> tuple[BodyMotion, Array]:
     fields = np.concatenate([kind.fields for kind in kinds], axis=2)
     nothing: Any = None
     lower = np.tril(square)
-    start = BodyMotion(kinds, fields, np.ones(6), np.zeros(COUNT), lower, pull, nothing, nothing)
+    start = BodyMotion(kinds, fields, np.zeros(COUNT), lower, pull, nothing, nothing, nothing)
     return start._settled(), square
 
 
@@ -75,6 +79,34 @@ def test_displacements_are_fields_times_courses(from_middle: bool) -> None:
     np.testing.assert_allclose(rows @ motion.amplitudes, along, atol=1e-12)
 
 
+def test_a_pairs_placing_and_bends_make_up_all_displacements() -> None:
+    """Of a body that leans the placing takes all along, and bends leave its feet behind."""
+    heights = np.array([20.0, 60.0, 110.0, 900.0, 1700.0])
+    centres = np.stack([[100.0, -40.0, 30.0, 0.0, 20.0], np.zeros(5), heights], axis=1)
+    links = sparse.csr_array((5, 5))
+    cells = BodyCells(centres, np.tile([1.0, 0, 0], (5, 1)), links, np.arange(5), np.eye(5))
+    lean = Kind.lean(cells, COURSES)
+    pose = replace(Kind.whole("pose", cells, np.eye(6), Courses.steady(PAIRS)), precision=KNOWN)
+    motion, _ = seen((pose, lean))
+    for from_middle in (False, True):
+        every = motion.displacements(("pose", "lean"), from_middle=from_middle)
+        bends = motion.bends(from_middle=from_middle)
+        for pair in range(PAIRS):
+            turn, shift = motion.twist(pair, from_middle=from_middle).reshape(2, 3)
+            placed = np.cross(turn, centres) + shift
+            np.testing.assert_allclose(every[pair, :, :3], placed + bends[pair, :, :3], atol=1e-9)
+    beside, _ = seen((replace(POSE, twists=np.eye(6)), PARTS))
+    np.testing.assert_array_equal(beside.bends(), beside.displacements(("parts",)))
+    # The foot stays; the ankle and what is above go about it, a metre up by a millimetre.
+    np.testing.assert_allclose(lean.fields[0, :3], 0.0, atol=1e-12)
+    ankle = ankles(cells)
+    np.testing.assert_allclose(ankle, [30.0, 0.0, 0.05 * 1700.0])
+    for k, axis in enumerate(np.eye(3)):
+        about = np.cross(axis, centres[2:] - ankle) / 1000.0
+        np.testing.assert_allclose(lean.fields[2:, :3, k], about, atol=1e-12)
+    assert lean.fields[4, 0, 1] == pytest.approx(1.615)
+
+
 def test_what_is_not_known_of_one_kind_is_that_of_its_amplitudes() -> None:
     motion, _ = seen()
     course = COURSES.values[0] - COURSES.middle
@@ -95,19 +127,39 @@ def test_a_kind_is_as_large_as_the_evidence_says() -> None:
     assert pose is POSE, "what boards left open is no motion of the person"
 
 
-def test_a_breath_that_shows_a_tenth_of_what_is_usual_is_as_large_as_usual() -> None:
-    breath = replace(PARTS, usual=1.5)
-    assert breath.resized(2.0).size == 2.0
-    assert breath.resized(0.16).size == 1.5
-    assert breath.resized(0.14).size == 0.14
-    assert PARTS.resized(0.16).size == 0.16
-    assert PARTS.resized(1e-9).size == 1e-3
+def test_a_breath_is_asked_of_what_other_motions_leave() -> None:
+    """And what it is believed to be takes its prior's place."""
+    alike = np.array([[1.3, 0.2], [0.2, 0.6]])
+    breath = Kind("breath", PARTS.fields, COURSES, alike=alike)
+    motion, square = seen((POSE, breath))
+    prior = np.kron(np.eye(3), np.linalg.inv(alike))
+    np.testing.assert_allclose(breath.prior, prior, atol=1e-12)
+    asked = []
+
+    def believe(information: Array, pull: Array, breaths: Array) -> Array:
+        asked.append((information, pull, breaths))
+        return 4.0 * alike
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(body_motion, "likely_breath", believe)
+        found = replace(motion, breaths=np.eye(2)[None])._in_breath()
+    [(information, pull, breaths)] = asked
+    rest = np.linalg.inv(square[:12, :12] + KNOWN)
+    np.testing.assert_allclose(
+        information, square[12:, 12:] - square[12:, :12] @ rest @ square[:12, 12:], atol=1e-7
+    )
+    np.testing.assert_allclose(
+        pull, motion.pull[12:] - square[12:, :12] @ rest @ motion.pull[:12], atol=1e-7
+    )
+    assert breaths.shape == (1, 2, 2)
+    np.testing.assert_allclose(found.kind("breath").prior, prior / 4.0, atol=1e-12)
+    assert found._resized().kind("breath") is found.kind("breath")
 
 
 def test_parts_are_doubted_as_if_they_had_moved_as_peoples_do() -> None:
     small = replace(PARTS, size=0.1)
     motion, square = seen((POSE, small))
-    bold = np.diag([*np.diag(KNOWN), *[0.5**-2.0] * 6])
+    bold = np.diag([*np.diag(KNOWN), *[0.25**-2.0] * 6])
     np.testing.assert_allclose(
         motion.doubted(), np.linalg.inv(square + bold), rtol=1e-7, atol=1e-12
     )

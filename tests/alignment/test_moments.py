@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.alignment.moments import Courses, of_breath, of_stance
+from bodyscan.alignment.moments import BEGUN, BREATHS_S, LAG, Courses, breaths, of_breath, of_stance
 
 
 @pytest.mark.parametrize("correlation", [of_stance, of_breath])
@@ -39,3 +39,29 @@ def test_a_moment_that_is_not_known_is_like_no_other() -> None:
     free = Courses.of(of_stance, [None, None])
     np.testing.assert_array_equal(free.values, np.eye(2))
     np.testing.assert_array_equal(free.middle, np.zeros(2))
+
+
+def test_each_breath_has_its_own_length_and_phase() -> None:
+    """A tide of one of the lengths, at the moments and half way, is what one of them expects."""
+    seconds = np.linspace(0.1, 2.1, 12)
+    courses = Courses.of(of_breath, seconds.tolist())
+    every = breaths(courses, seconds.tolist())
+    assert len(every) == len(BREATHS_S) * len(BEGUN)
+    length, begun = 4, 3
+    turns = 2.0 * np.pi * np.append(seconds, 1.1) / BREATHS_S[length] + BEGUN[begun]
+    amplitudes = np.linalg.pinv(np.vstack([courses.values, courses.middle])) @ np.cos(turns)
+    unlike = [amplitudes @ np.linalg.solve(one, amplitudes) for one in every]
+    assert np.argmin(unlike) == length * len(BEGUN) + begun
+    # Its variance is that of the sine's middle and more: 1/2 of cos squared.
+    assert min(unlike) == pytest.approx(0.5, rel=0.05)
+    # What is half a turn later is the same with the other sign, a quarter comes with LAG alone.
+    quarter = (begun + len(BEGUN) // 2) % len(BEGUN) + length * len(BEGUN)
+    assert unlike[quarter] == pytest.approx(0.5 / LAG**2, rel=0.15)
+    for one in every:
+        np.testing.assert_allclose(one, one.T, atol=1e-12)
+        assert np.linalg.eigvalsh(one).min() > 0.0
+
+
+def test_where_a_moment_is_not_known_any_breath_is() -> None:
+    courses = Courses.of(of_breath, [0.2, None, 0.6])
+    np.testing.assert_array_equal(breaths(courses, [0.2, None, 0.6]), np.eye(courses.count)[None])

@@ -103,7 +103,7 @@ class Living:
         turn = np.radians(m.head_deg) * np.array([_wave(rng, seconds)[0] for _ in range(3)])
         joint = height * np.array([0.0, 0.0, 0.87])
         vertices += self.head[:, None] * np.cross(turn, vertices - joint)
-        # An inverted pendulum about the ankles, and a little turn about the upright axis.
+        # An inverted pendulum about the ankles, and a little turn about the upright axis; feet stand.
         lean = []
         for _ in range(2):
             rms = np.sqrt(
@@ -112,8 +112,10 @@ class Living:
             lean.append(m.sway_mm_s / np.sqrt(2.0) / rms / height * _wave(rng, seconds)[0])
         angle = np.array([lean[0], lean[1], 0.5 * lean[0]])
         ankles = np.array([0.0, 0.0, 0.04 * height])
-        vertices = RigidTransform.from_rotation_vector(angle, np.zeros(3)).apply(vertices - ankles)
-        return replace(self.still, vertices=vertices + ankles)
+        lean_to = RigidTransform.from_rotation_vector(angle, np.zeros(3)).apply(vertices - ankles)
+        above = _step((self.still.vertices[:, 2:] / height - 0.03) / 0.02)
+        vertices = vertices + above * (lean_to + ankles - vertices)
+        return replace(self.still, vertices=vertices)
 
 
 @dataclass(frozen=True, eq=False)
