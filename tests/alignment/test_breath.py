@@ -26,7 +26,7 @@ def seen(period_s: float, deep_mm: float, moments: Indices) -> tuple[Array, Arra
     measured = high[:, None] * wave[moments] + NOISE_MM * rng.standard_normal(
         (FIELDS, len(moments))
     )
-    information: Array = np.kron(np.eye(FIELDS), rows.T @ rows) / NOISE_MM**2
+    information = np.asarray(np.kron(np.eye(FIELDS), rows.T @ rows) / NOISE_MM**2, np.float64)
     return information, (measured @ rows).ravel() / NOISE_MM**2, high * wave[-1]
 
 
