@@ -9,7 +9,7 @@ import pytest
 from scipy import sparse
 
 from bodyscan.alignment.body_cells import BodyCells
-from bodyscan.alignment.body_parts import tell_breath, tell_fullness
+from bodyscan.alignment.body_parts import tell_breath, tell_fullness, tell_parts
 from bodyscan.alignment.breath import breath_fields, breathing
 from bodyscan.alignment.following import Followed, MeanBreath
 from bodyscan.alignment.limbs import LIMBS, SHIFTS, limb_fields
@@ -178,6 +178,17 @@ def test_a_breath_is_told_by_how_far_the_trunk_rose() -> None:
     for share, told in ((0.18, True), (0.22, False)):
         some = np.where(np.arange(trunk) < share * trunk, -1.0, 1.0)
         assert (tell_breath(followed(cells, some, amounts)) is not None) == told
+
+
+def test_what_is_left_of_a_parts_motion_is_its_cells_root_mean_square() -> None:
+    cells = person()
+    body = followed(cells, np.ones(1), np.zeros(1))
+    head = name_parts(cells) == PARTS.index("head")
+    sigma = np.full(len(head), 0.2)
+    sigma[head] = np.where(np.arange(head.sum()) % 2, 0.1, 0.7)  # 0.5 squared in the mean of both
+    left = {part.name: part.left_mm for part in tell_parts(replace(body, sigma_mm=sigma))}
+    assert left["head"] == pytest.approx(0.5)
+    assert left["trunk"] == pytest.approx(0.2)
 
 
 def test_fullness_is_that_of_the_front_of_the_trunk() -> None:

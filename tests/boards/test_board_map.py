@@ -22,9 +22,14 @@ def shown(points: np.ndarray, bend: float = 0.0) -> np.ndarray:
     return np.asarray(pixels + bend * off * np.sum(off**2, axis=1)[:, None])
 
 
-@pytest.mark.parametrize(("size", "degree"), [((8, 5), 3), ((13, 3), 2), ((5, 4), 2), ((19, 1), 0)])
-def test_terms_follow_the_number_of_points(size: tuple[int, int], degree: int) -> None:
-    assert fit_board_map(printed(*size), shown(printed(*size))).degree == degree
+@pytest.mark.parametrize(
+    ("size", "degree", "terms"),
+    [((8, 5), 3, 10), ((13, 3), 2, 6), ((5, 4), 2, 6), ((19, 1), 0, 1)],
+)
+def test_terms_follow_the_number_of_points(size: tuple[int, int], degree: int, terms: int) -> None:
+    found = fit_board_map(printed(*size), shown(printed(*size)))
+    assert found.degree == degree
+    assert found.coefficients.shape == (terms, 2), "those of x and y together up to the degree"
 
 
 def test_without_a_lens_it_is_the_homography_and_its_slopes() -> None:

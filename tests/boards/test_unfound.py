@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -100,4 +101,18 @@ def test_markers_where_they_should_be_lack_corners(monkeypatch: pytest.MonkeyPat
     how = Appearance(inverted=True, mirrored=True)
     assert "36 markers of DICT_4X4_1000, white on black, mirrored" in said(
         shown(BOARD), monkeypatch, how
+    )
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(8, 7), (10, 7), (9, 6), (9, 8), (8, 8), (10, 6)])
+def test_a_checkerboard_of_one_line_more_or_fewer_either_way_is_named(
+    columns: int, rows: int
+) -> None:
+    board = Board(name="b", kind="checkerboard", columns=9, rows=7, square_mm=30)
+    row, column = np.indices((rows, columns))
+    squares = np.kron(((row + column) % 2).astype(np.uint8), np.full((24, 24), 200, np.uint8))
+    picture = cv2.GaussianBlur(np.pad(squares, 40, constant_values=200), (0, 0), 0.9)
+    assert describe_unfound(picture, board) == (
+        f"no grid of 8 x 6 inner corners, but one of {columns - 1} x {rows - 1}: {columns} columns x "
+        f"{rows} rows of squares"
     )

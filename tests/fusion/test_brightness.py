@@ -46,6 +46,11 @@ def test_light_that_the_room_gives_is_not_taken_for_more_than_matt() -> None:
     assert light_power([(3.0 * shade, shade)]) == 1.0
 
 
+def test_one_grey_under_light_that_falls_alike_tells_no_power() -> None:
+    ratio, shade = np.full((2, 500), 0.3, np.float32)
+    assert light_power([(ratio, shade)]) == 0.0
+
+
 def test_no_seams_between_exposures(scan: Scan, cleaned: list[RangeImage]) -> None:
     """A grey body whose pairs were exposed 0.6 to 1.4 times as long: one grey all over."""
     factors = np.linspace(0.6, 1.4, len(cleaned))

@@ -119,6 +119,18 @@ def test_without_a_clock_the_order_is_enough() -> None:
     assert motion.velocity.at(CENTRE)[2] == pytest.approx(8.0 / 60.0, rel=0.1)
 
 
+def test_how_far_windows_err_is_told_by_them_and_not_by_what_they_say_of_it() -> None:
+    seen = seen_boundaries(np.array([0.0, 0.0, 8.0]), TIMES)
+    comb = find_comb(seen, TIMES[bit_of(seen.index)], turned=True)
+    honest, boasting = (
+        tell_motion(CAMERA, sheets(), replace(comb, sigma=factor * comb.sigma))
+        for factor in (1.0, 0.25)
+    )
+    assert honest is not None
+    assert boasting is not None
+    np.testing.assert_allclose(boasting.velocity.seen.sigma, honest.velocity.seen.sigma, rtol=1e-3)
+
+
 def test_stripes_that_stray_by_themselves_are_not_taken_for_motion() -> None:
     stray = 0.02 * np.random.default_rng(53).standard_normal(200)  # px, along the whole of a stripe
     seen = seen_boundaries(STILL, TIMES)

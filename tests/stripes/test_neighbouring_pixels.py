@@ -180,6 +180,13 @@ def test_images_in_any_order_are_refused_and_rims_are_not() -> None:
         check(np.tile([2, 2, 9, 9], (20, 1)))
 
 
+def test_three_of_five_changes_in_step_are_enough() -> None:
+    line = np.array([0, 1, 2, 5, 6, 9])
+    check(np.tile(np.repeat(line, 4), (30, 1)))
+    with pytest.raises(DecodingFailed, match="in 50% of the cases only"):
+        check(np.tile(np.repeat(line[1:], 4), (30, 1)))
+
+
 def test_what_is_not_good_does_not_count() -> None:
     numbers, good = shown_in_order(), np.ones((30, 48), bool)
     numbers[:, 21], good[:, 21] = 11, False
