@@ -108,7 +108,7 @@ class BodyMotion:
 
     normal: (n, n), what was seen of them, without any prior, its lower triangle; pull: (n,) its
     right-hand side.  factor: (n, n) Cholesky's, lower, of their covariance's inverse in units (n,).
-    breaths: (K, J, J) that there may be (see `moments.breaths`).
+    breaths: (K, J, J) that there may be and (K,) how likely each is (see `moments.breaths`).
     """
 
     kinds: tuple[Kind, ...]
@@ -118,7 +118,7 @@ class BodyMotion:
     pull: Array
     factor: Array
     units: Array
-    breaths: Array
+    breaths: tuple[Array, Array]
 
     @staticmethod
     def start(
@@ -295,7 +295,7 @@ class BodyMotion:
         own = self.slices[self.kinds.index(breath)]
         known = np.linalg.inv(self.covariance[own, own])
         seen = known - breath.prior
-        alike = likely_breath(seen, known @ self.amplitudes[own], self.breaths)
+        alike = likely_breath(seen, known @ self.amplitudes[own], *self.breaths)
         kinds = (replace(k, alike=alike) if k is breath else k for k in self.kinds)
         return replace(self, kinds=tuple(kinds))
 

@@ -17,9 +17,9 @@ SIZES_MM = np.array([0.02, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8])
 1.4 of 4."""
 # Shares of the stature: breath begins to show above the hips, and no more above the collarbones.
 HIPS, WAIST, COLLAR, NECK = 0.47, 0.54, 0.79, 0.86
-EVIDENCE = 0.1
-"""By so much what was seen of all cells tells one breath from another: neighbouring cells err alike,
-since calibrations bend over a fifth of a picture, of which they are a tenth."""
+EVIDENCE = 0.3
+"""By so much what was seen of all cells tells one breath from another: neighbouring cells err alike, by
+how calibrations bend, so that three count as one."""
 BEHIND = 0.25
 """Of the front: ribs rise to the sides too, less than half as far, and a back leans on nothing."""
 
@@ -34,9 +34,9 @@ def breath_fields(cells: BodyCells) -> Array:
     return modulated(normal_field(cells), cells, np.hstack([as_one, kept]))
 
 
-def likely_breath(information: Array, pull: Array, breaths: Array) -> Array:
+def likely_breath(information: Array, pull: Array, breaths: Array, likely: Array) -> Array:
     """(J, J) covariance of courses' amplitudes: the mean of all breaths (K, J, J) in all sizes, each as
-    likely as it explains what was seen.
+    likely (K,) as it was before, times how well it explains what was seen.
 
     information (M J, M J), pull (M J,): normal equations of M fields along J courses, whatever else
     moved.
@@ -52,7 +52,7 @@ def likely_breath(information: Array, pull: Array, breaths: Array) -> Array:
         more = np.maximum(sizes, 0.0) + SIZES_MM[:, None] ** -2.0
         volume = np.log(more * SIZES_MM[:, None] ** 2).sum(axis=1)
         gains[k] = 0.5 * (along**2 / more).sum(axis=1) - 0.5 * volume
-    weights = np.exp((gains - gains.max()) * EVIDENCE)
+    weights = likely[:, None] * np.exp((gains - gains.max()) * EVIDENCE)
     return np.asarray(np.einsum("kij,ks,s->ij", breaths, weights / weights.sum(), SIZES_MM**2))
 
 

@@ -16,6 +16,9 @@ STANCE_S = 0.8
 """After which a stance has little to do with what it was: people sway at 0.1 to 1 Hz."""
 BREATHS_S = np.geomspace(2.5, 5.8, 12)
 """From one breath to the next at rest: 10 to 24 a minute."""
+USUAL_S, USUAL_SHARE = 3.75, 0.2
+"""16 a minute, give or take a fifth: adults at rest breathe 12 to 20 times. Half a breath alone looks
+much like a third of a deeper and slower one."""
 STEADY = 0.05  # of a breath's variance that does not come back with it
 BEGUN = np.arange(8) * np.pi / 8.0
 """Phases; half a turn later it is the same with the other sign."""
@@ -91,12 +94,13 @@ class Courses:
         return Courses(np.eye(count), np.zeros(count), np.zeros((count, count)))
 
 
-def breaths(courses: Courses, seconds: Sequence[float | None]) -> Array:
-    """(K, J, J) covariances of the courses' amplitudes of K breaths, of each length and phase.
-    Where a moment is not known, one: every moment is its own."""
+def breaths(courses: Courses, seconds: Sequence[float | None]) -> tuple[Array, Array]:
+    """(K, J, J) covariances of the courses' amplitudes of K breaths, of each length and phase, and how
+    likely each is before anything was seen (K,). Where a moment is not known, one: every moment is its
+    own."""
     at = np.array([second for second in seconds if second is not None])
     if len(at) < len(seconds):
-        return np.eye(courses.count)[None]
+        return np.eye(courses.count)[None], np.ones(1)
     knots = np.append(at, 0.5 * (at.min() + at.max()))
     told = np.linalg.pinv(np.vstack([courses.values, courses.middle]))
     turns = (2.0 * np.pi * knots / BREATHS_S[:, None, None] + BEGUN[:, None]).reshape(
@@ -106,4 +110,6 @@ def breaths(courses: Courses, seconds: Sequence[float | None]) -> Array:
     sines = 2.0 * waves @ np.swapaxes(waves, 1, 2)
     # What the courses leave out has to leave the sum positive.
     any_way = told @ of_stance(knots[:, None] - knots) @ told.T + LEAST * np.eye(courses.count)
-    return np.asarray(sines + IRREGULAR**2 * any_way)
+    usual = np.exp(-0.5 * (np.log(BREATHS_S / USUAL_S) / USUAL_SHARE) ** 2)
+    likely = np.repeat(usual / (usual.sum() * len(BEGUN)), len(BEGUN))
+    return sines + IRREGULAR**2 * any_way, likely

@@ -136,13 +136,13 @@ def test_a_breath_is_asked_of_what_other_motions_leave() -> None:
     np.testing.assert_allclose(breath.prior, prior, atol=1e-12)
     asked = []
 
-    def believe(information: Array, pull: Array, breaths: Array) -> Array:
+    def believe(information: Array, pull: Array, breaths: Array, likely: Array) -> Array:
         asked.append((information, pull, breaths))
         return 4.0 * alike
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(body_motion, "likely_breath", believe)
-        found = replace(motion, breaths=np.eye(2)[None])._in_breath()
+        found = replace(motion, breaths=(np.eye(2)[None], np.ones(1)))._in_breath()
     [(information, pull, breaths)] = asked
     rest = np.linalg.inv(square[:12, :12] + KNOWN)
     np.testing.assert_allclose(

@@ -13,7 +13,7 @@ SECONDS = np.linspace(0.1, 2.9, 16)
 FIELDS = 20
 NOISE_MM = 0.05
 COURSES = Courses.of(of_breath, SECONDS.tolist())
-EVERY = breaths(COURSES, SECONDS.tolist())
+EVERY, LIKELY = breaths(COURSES, SECONDS.tolist())
 
 
 def seen(period_s: float, deep_mm: float, moments: Indices) -> tuple[Array, Array, Array]:
@@ -37,7 +37,10 @@ def test_a_breath_is_told_that_began_before_and_ended_after_the_scan() -> None:
     for period_s in (3.0, 4.5):
         information, pull, truth = seen(period_s, 1.4, moments)
         errors = []
-        for alike in (likely_breath(information, pull, EVERY), 1.4**2 * np.eye(COURSES.count)):
+        for alike in (
+            likely_breath(information, pull, EVERY, LIKELY),
+            1.4**2 * np.eye(COURSES.count),
+        ):
             prior = np.kron(np.eye(FIELDS), np.linalg.inv(alike))
             found = np.linalg.solve(information + prior, pull).reshape(FIELDS, -1) @ COURSES.middle
             errors.append(np.sqrt(np.mean((found - truth) ** 2)))
@@ -49,7 +52,7 @@ def test_a_breath_is_told_that_began_before_and_ended_after_the_scan() -> None:
 @pytest.mark.parametrize("deep_mm", [0.5, 1.4, 2.8])
 def test_a_breath_is_as_deep_as_it_shows(deep_mm: float) -> None:
     information, pull, _ = seen(3.6, deep_mm, np.arange(16))
-    alike = likely_breath(information, pull, EVERY)
+    alike = likely_breath(information, pull, EVERY, LIKELY)
     # Sizes are tried in steps of 1.4; 20 places tell it to a sixth.
     mean = COURSES.values @ alike @ COURSES.values.T
     assert np.sqrt(np.mean(np.diag(mean))) == pytest.approx(deep_mm, rel=0.4)
@@ -57,12 +60,14 @@ def test_a_breath_is_as_deep_as_it_shows(deep_mm: float) -> None:
 
 def test_who_does_not_breathe_is_left_alone() -> None:
     information, pull, _ = seen(3.6, 0.0, np.arange(16))
-    alike = likely_breath(information, pull, EVERY)
+    alike = likely_breath(information, pull, EVERY, LIKELY)
     assert np.trace(alike) < 1.01 * SIZES_MM[0] ** 2 * np.trace(EVERY.mean(axis=0)) * 2.0
 
 
 def test_of_nothing_seen_every_breath_is_as_likely() -> None:
     nothing = np.zeros((COURSES.count, COURSES.count))
-    alike = likely_breath(nothing, np.zeros(COURSES.count), EVERY)
-    np.testing.assert_allclose(alike, np.mean(SIZES_MM**2) * EVERY.mean(axis=0), atol=1e-12)
+    alike = likely_breath(nothing, np.zeros(COURSES.count), EVERY, LIKELY)
+    np.testing.assert_allclose(
+        alike, np.mean(SIZES_MM**2) * np.einsum("kij,k->ij", EVERY, LIKELY), atol=1e-12
+    )
     assert len(EVERY) == len(BREATHS_S) * len(BEGUN)

@@ -45,7 +45,7 @@ def test_each_breath_has_its_own_length_and_phase() -> None:
     """A tide of one of the lengths, at the moments and half way, is what one of them expects."""
     seconds = np.linspace(0.1, 2.1, 12)
     courses = Courses.of(of_breath, seconds.tolist())
-    every = breaths(courses, seconds.tolist())
+    every, likely = breaths(courses, seconds.tolist())
     assert len(every) == len(BREATHS_S) * len(BEGUN)
     length, begun = 4, 3
     turns = 2.0 * np.pi * np.append(seconds, 1.1) / BREATHS_S[length] + BEGUN[begun]
@@ -54,6 +54,11 @@ def test_each_breath_has_its_own_length_and_phase() -> None:
     assert np.argmin(unlike) == length * len(BEGUN) + begun
     # Its variance is that of the sine's middle and more: 1/2 of cos squared.
     assert min(unlike) == pytest.approx(0.5, rel=0.05)
+    # Sixteen a minute are likeliest, ten and twenty-four are not.
+    by_length = likely.reshape(len(BREATHS_S), -1)
+    assert likely.sum() == pytest.approx(1.0)
+    assert BREATHS_S[by_length[:, 0].argmax()] == pytest.approx(3.75, rel=0.05)
+    assert by_length[[0, -1]].max() < 0.15 * by_length.max()
     # What is half a turn later is the same with the other sign, a quarter comes with LAG alone.
     quarter = (begun + len(BEGUN) // 2) % len(BEGUN) + length * len(BEGUN)
     assert unlike[quarter] == pytest.approx(0.5 / LAG**2, rel=0.15)
@@ -64,4 +69,6 @@ def test_each_breath_has_its_own_length_and_phase() -> None:
 
 def test_where_a_moment_is_not_known_any_breath_is() -> None:
     courses = Courses.of(of_breath, [0.2, None, 0.6])
-    np.testing.assert_array_equal(breaths(courses, [0.2, None, 0.6]), np.eye(courses.count)[None])
+    every, likely = breaths(courses, [0.2, None, 0.6])
+    np.testing.assert_array_equal(every, np.eye(courses.count)[None])
+    assert likely == 1.0
