@@ -20,6 +20,8 @@ HIPS, WAIST, COLLAR, NECK = 0.47, 0.54, 0.79, 0.86
 EVIDENCE = 0.3
 """By so much what was seen of all cells tells one breath from another: neighbouring cells err alike, by
 how calibrations bend, so that three count as one."""
+SMALL = 0.005
+"""Of a breath's variance: what is less than that tells no breath from another, and costs most."""
 BEHIND = 0.25
 """Of the front: ribs rise to the sides too, less than half as far, and a back leans on nothing."""
 
@@ -42,12 +44,15 @@ def likely_breath(information: Array, pull: Array, breaths: Array, likely: Array
     moved.
     """
     courses = breaths.shape[1]
-    roots = np.linalg.cholesky(breaths)
+    sizes, ways = np.linalg.eigh(breaths)
+    main = (sizes > SMALL * sizes[:, -1:]).any(axis=0)
+    roots = ways[:, :, main] * np.sqrt(sizes[:, None, main])
     blocks = information.reshape(-1, courses, len(information) // courses, courses)
     gains = np.empty((len(breaths), len(SIZES_MM)))
     for k, root in enumerate(roots):
         seen = np.einsum("ai,manb,bj->minj", root, blocks, root, optimize=True)
-        sizes, ways = np.linalg.eigh(seen.reshape(information.shape))
+        count = len(pull) // courses * root.shape[1]
+        sizes, ways = np.linalg.eigh(seen.reshape(count, count))
         along = (pull.reshape(-1, courses) @ root).ravel() @ ways
         more = np.maximum(sizes, 0.0) + SIZES_MM[:, None] ** -2.0
         volume = np.log(more * SIZES_MM[:, None] ** 2).sum(axis=1)
