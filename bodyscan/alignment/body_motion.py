@@ -76,9 +76,9 @@ class Kind:
         """About the ankles, as an inverted pendulum (Winter 1995), and round: feet stay where they
         stand. What sways otherwise as a whole is less, and no more than the evidence asks for."""
         about_ankles = adjoint(RigidTransform(np.eye(3), ankles(cells)))[:, :3] / LEAN_MM
-        whole = rigid_fields(cells, np.zeros(3), 1.0) @ about_ankles
-        fields = modulated(whole, cells, above_feet(cells)[:, None])
-        return Kind("lean", fields, courses, WHOLE_MM, twists=about_ankles, bends=fields - whole)
+        whole = Kind.whole("lean", cells, about_ankles, courses)
+        fields = modulated(whole.fields, cells, above_feet(cells)[:, None])
+        return replace(whole, fields=fields, bends=fields - whole.fields)
 
     @property
     def count(self) -> int:
@@ -303,10 +303,11 @@ class BodyMotion:
         """Each kind as large as the evidence says (MacKay 1992): what it does not ask for shrinks."""
         kinds, variances = [], self.variances
         for kind, some in zip(self.kinds, self.slices, strict=True):
-            told = kind.count - np.sum(variances[some]) / kind.size**2
-            size = np.sqrt(np.sum(self.amplitudes[some] ** 2) / max(told, 1e-6))
-            sized = kind.precision is None and kind.alike is None
-            kinds.append(replace(kind, size=max(float(size), SMALLEST_MM)) if sized else kind)
+            if kind.precision is None and kind.alike is None:
+                told = kind.count - np.sum(variances[some]) / kind.size**2
+                size = np.sqrt(np.sum(self.amplitudes[some] ** 2) / max(told, 1e-6))
+                kind = replace(kind, size=max(float(size), SMALLEST_MM))
+            kinds.append(kind)
         return replace(self, kinds=tuple(kinds))
 
 
