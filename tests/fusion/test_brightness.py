@@ -76,6 +76,5 @@ def test_no_seams_where_one_pair_looks_squarely_and_another_along(
         images.append(replace(image, colours=np.clip(np.rint(lit), 0, 255).astype(np.uint8)))
     cloud = merge(images, scan.rig_from_camera, FusionSettings(points=100_000)).cloud
     grey = cloud.colours[:, 0].astype(float)
-    low, high = np.percentile(grey, [5, 95])
-    # As the cameras give it, the brightest is 2.5 times the darkest.
-    assert high / low < 1.1
+    # Normals that are off at 8 bits of grey leave 0.04; as the cameras give it, 0.39 would be left.
+    assert grey.std() / grey.mean() < 0.06
