@@ -92,9 +92,18 @@ def _origin(load: float) -> str:
     changed = (
         " with changes that are not committed" if _git("status", "--porcelain", "bodyscan") else ""
     )
-    machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
+    machine = f"{os.cpu_count()} cores, {_processor()}, Python {platform.python_version()}"
     today = datetime.now(UTC).date().isoformat()
     return f"*Commit {commit}{changed}, {today}; {machine}; load average at its end {load:.1f}.*"
+
+
+def _processor() -> str:
+    """Its name and generation, or the instruction set where the system names neither."""
+    try:
+        told = dict(re.findall(r"(.+?)\s*: (.+)", Path("/proc/cpuinfo").read_text("utf-8")))
+        return f"{told['model name']} (family {told['cpu family']})"
+    except (OSError, KeyError):
+        return platform.machine()
 
 
 MEASURED = ("bodyscan", "benchmarks")
