@@ -7,6 +7,7 @@ import numpy as np
 from bodyscan.alignment.body_cells import BodyCells, modulated, normal_field
 from bodyscan.alignment.part_names import PARTS, leftward, name_parts
 from bodyscan.arrays import Array
+from bodyscan.progress import threaded
 
 LENGTH_MM = 110.0  # over which a trunk rises alike: a chest, a belly, a side
 LEAST = 0.04
@@ -48,15 +49,18 @@ def likely_breath(information: Array, pull: Array, breaths: Array, likely: Array
     main = (sizes > SMALL * sizes[:, -1:]).any(axis=0)
     roots = ways[:, :, main] * np.sqrt(sizes[:, None, main])
     blocks = information.reshape(-1, courses, len(information) // courses, courses)
-    gains = np.empty((len(breaths), len(SIZES_MM)))
-    for k, root in enumerate(roots):
+    count = len(pull) // courses
+
+    def gain(root: Array) -> Array:
+        """(S,) of one breath in all sizes: the logarithm of how well it explains what was seen."""
         seen = np.einsum("ai,manb,bj->minj", root, blocks, root, optimize=True)
-        count = len(pull) // courses * root.shape[1]
-        sizes, ways = np.linalg.eigh(seen.reshape(count, count))
+        sizes, ways = np.linalg.eigh(seen.reshape(2 * (count * root.shape[1],)))
         along = (pull.reshape(-1, courses) @ root).ravel() @ ways
         more = np.maximum(sizes, 0.0) + SIZES_MM[:, None] ** -2.0
         volume = np.log(more * SIZES_MM[:, None] ** 2).sum(axis=1)
-        gains[k] = 0.5 * (along**2 / more).sum(axis=1) - 0.5 * volume
+        return np.asarray(0.5 * (along**2 / more).sum(axis=1) - 0.5 * volume)
+
+    gains = np.array(threaded(gain, roots, stage="aligning"))
     weights = likely[:, None] * np.exp((gains - gains.max()) * EVIDENCE)
     return np.asarray(np.einsum("kij,ks,s->ij", breaths, weights / weights.sum(), SIZES_MM**2))
 
