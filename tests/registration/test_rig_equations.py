@@ -81,6 +81,15 @@ def jacobian(seen: list[LocatedView], free: bool) -> Array:
     return np.stack(columns, axis=1)
 
 
+@pytest.mark.parametrize("number", range(3))
+def test_a_board_that_holds_the_frame_is_held_whichever_it_is(number: int) -> None:
+    target = tuple(BOARDS)[number]
+    found = normal_equations(
+        views(), CAMERAS, PLACED, BOARDS, fixed_pair=None, fixed_target=target, cameras_free=False
+    )
+    assert found.held.tolist() == found.parts[number].columns[-6:].tolist()
+
+
 @pytest.mark.parametrize("free", [False, True])
 def test_they_are_those_of_all_errors_by_all_unknowns(free: bool) -> None:
     """With noise so even that every corner counts alike."""
