@@ -281,6 +281,8 @@ def _mark(mark: Any) -> Place:
 
 def _words(error: yaml.MarkedYAMLError) -> str:
     said = ", ".join(part for part in (error.context, error.problem) if part)
+    if "nesting depth" in said:  # PyYAML 6.0.4 has a limit of its own, and reaches it first
+        return f"is nested more than {MOST_DEPTH} deep"
     tab = "\\t" in said or "cannot start any token" in said
     advice = " (indent with spaces, never with tabs)" if tab else ""
     return f"is not YAML: {said}{advice}"
