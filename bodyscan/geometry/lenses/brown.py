@@ -11,6 +11,7 @@ from bodyscan.arrays import Array
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.polynomials import (
     DECENTRED,
+    decentred,
     decentring,
     decentring_by_point,
     scaled_by_point,
@@ -44,7 +45,7 @@ class Brown(Lens):
 
     def distort(self, ideal: Array) -> Array:
         factor = self._above(squared_radius(ideal)[..., None])
-        return ideal * factor + decentring(ideal) @ np.array([self.p1, self.p2])
+        return ideal * factor + decentred(ideal, self.p1, self.p2)
 
     def by_coefficients(self, ideal: Array) -> Array:
         r2 = squared_radius(ideal)[..., None, None]

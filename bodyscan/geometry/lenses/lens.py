@@ -15,7 +15,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
-from bodyscan.geometry.lenses.polynomials import squared_radius
+from bodyscan.geometry.lenses.polynomials import apart, squared_radius
 
 NEWTON_STEPS = 20
 """Five or six reach rounding; it takes more close to where a lens folds."""
@@ -99,13 +99,15 @@ class Lens(ABC):
 
         Good to rounding within `fold_radius`; NaN where no ideal point within it belongs to a real one.
         """
-        start = np.array(real, np.float64)
+        real = apart(real)
         with np.errstate(all="ignore"):
-            ideal = _at_most(start, 0.9 * self.fold_radius)
+            ideal = _at_most(real, 0.9 * self.fold_radius)
             for _ in range(NEWTON_STEPS):
                 (a, b), (c, d) = np.moveaxis(self.by_point(ideal), (-2, -1), (0, 1))
-                x, y = np.moveaxis(self.distort(ideal) - real, -1, 0)
-                step = np.stack([d * x - b * y, a * y - c * x], -1) / (a * d - b * c)[..., None]
+                off = self.distort(ideal) - real
+                x, y, scale = off[..., 0], off[..., 1], a * d - b * c
+                step = np.empty_like(ideal)
+                step[..., 0], step[..., 1] = (d * x - b * y) / scale, (a * y - c * x) / scale
                 ideal = _at_most(
                     ideal - step, 0.5 * (self.fold_radius + np.sqrt(squared_radius(ideal)))
                 )
@@ -138,7 +140,10 @@ class Lens(ABC):
 def _at_most(points: Array, radius: Array | float) -> Array:
     """Points (..., 2), those farther than `radius` (...) from the axis brought there."""
     own = np.sqrt(squared_radius(points))
-    return points * np.where(own > radius, radius / own, 1.0)[..., None]
+    beyond = own > radius
+    if not beyond.any():
+        return points
+    return points * np.where(beyond, radius / own, 1.0)[..., None]
 
 
 def settled(step: Array) -> bool:

@@ -18,33 +18,55 @@ def squared_radius(ideal: Array) -> Array:
     return np.asarray(x * x + y * y, np.float64)
 
 
+def apart(points: Array) -> Array:
+    """A copy of points (..., 2) whose x lie side by side in memory, and so do their y: arithmetic on
+    one coordinate is then several times faster."""
+    return np.moveaxis(np.array([points[..., 0], points[..., 1]], np.float64), 0, -1)
+
+
+def _matrices(shape: tuple[int, ...]) -> Array:
+    """Space for matrices (*shape, 2, 2), each of their entries side by side in memory."""
+    return np.moveaxis(np.empty((2, 2, *shape)), (0, 1), (-2, -1))
+
+
 def scaled_by_point(ideal: Array, factor: Array, slope: Array) -> Array:
     """Derivatives (..., 2, 2) of `ideal` times a factor of r^2, by the ideal points (..., 2).
 
     factor: (...), at each.  slope: (...), its derivative by r^2.
     """
     x, y = ideal[..., 0], ideal[..., 1]
-    derivatives = np.empty((*x.shape, 2, 2))
-    derivatives[..., 0, 0] = factor + 2.0 * slope * x * x
-    derivatives[..., 1, 1] = factor + 2.0 * slope * y * y
-    derivatives[..., 0, 1] = derivatives[..., 1, 0] = 2.0 * slope * x * y
+    derivatives = _matrices(x.shape)
+    along_x, along_y = 2.0 * slope * x, 2.0 * slope * y
+    derivatives[..., 0, 0] = factor + along_x * x
+    derivatives[..., 1, 1] = factor + along_y * y
+    derivatives[..., 0, 1] = derivatives[..., 1, 0] = along_x * y
     return derivatives
 
 
 def decentring(ideal: Array) -> Array:
     """(..., 2, 2): where p1 and p2 move the points (..., 2), per unit of each (OpenCV's signs)."""
     x, y = ideal[..., 0], ideal[..., 1]
-    derivatives = np.empty((*x.shape, 2, 2))
+    derivatives = _matrices(x.shape)
     derivatives[..., 0, 0] = derivatives[..., 1, 1] = 2.0 * x * y
     derivatives[..., 0, 1] = 3.0 * x * x + y * y
     derivatives[..., 1, 0] = x * x + 3.0 * y * y
     return derivatives
 
 
+def decentred(ideal: Array, p1: float, p2: float) -> Array:
+    """(..., 2): where p1 and p2 move the points (..., 2), `decentring(ideal) @ (p1, p2)`."""
+    x, y = ideal[..., 0], ideal[..., 1]
+    xx, xy, yy = x * x, 2.0 * x * y, y * y
+    moved = np.empty_like(ideal)
+    moved[..., 0] = p1 * xy + p2 * (3.0 * xx + yy)
+    moved[..., 1] = p1 * (xx + 3.0 * yy) + p2 * xy
+    return moved
+
+
 def decentring_by_point(ideal: Array, p1: float, p2: float) -> Array:
     """Derivatives (..., 2, 2) of `decentring(ideal) @ (p1, p2)` by the points (..., 2)."""
     x, y = ideal[..., 0], ideal[..., 1]
-    derivatives = np.empty((*x.shape, 2, 2))
+    derivatives = _matrices(x.shape)
     derivatives[..., 0, 0] = 2.0 * p1 * y + 6.0 * p2 * x
     derivatives[..., 0, 1] = derivatives[..., 1, 0] = 2.0 * p1 * x + 2.0 * p2 * y
     derivatives[..., 1, 1] = 6.0 * p1 * y + 2.0 * p2 * x
