@@ -1,4 +1,4 @@
-"""The builder's commands: a rig described, calibrated, looked at, kept right."""
+"""The builder's commands: describe a rig, calibrate it, look at it, keep it right."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def register(app: typer.Typer) -> None:
 
 
 def check(output: Output, rig_file: RigFile) -> None:
-    """Validate a rig file and its capture folders, and list what is missing."""
+    """Check a rig file and its capture folders, and list what is missing or wrong."""
     from bodyscan.captures.check import check as look_over
     from bodyscan.captures.check import report_lines
     from bodyscan.rig.rig_file import load_rig
@@ -70,7 +70,7 @@ def patterns(
         int, typer.Option(min=1, max=32767, help="Height of the projector's image, px.")
     ] = 1080,
 ) -> None:
-    """Write the images that a rig's projectors are to show, as PNG, with their order."""
+    """Write the images that a rig's projectors must show, as PNG, with their order."""
     from bodyscan.captures.pattern_files import uneven_stripes, write_patterns
     from bodyscan.rig.rig_file import load_rig
 
@@ -104,12 +104,12 @@ def import_(
         float | None,
         typer.Option(
             min=1e-6,
-            help="By how many pixels it may be off, 1 sigma. Default: as the rig file says.",
+            help="Accuracy of the calibration in pixels, 1 sigma. Default: as in the rig file.",
         ),
     ] = None,
     overwrite: OverwriteCalibration = False,
 ) -> None:
-    """Take over calibrations made elsewhere, from the files that the rig file names as `known`."""
+    """Import calibrations from other programs: the files that the rig file names as `known`."""
     from bodyscan.workflows.import_rig import import_folder
 
     out = _calibration_folder(rig_file, out, overwrite)
@@ -145,17 +145,18 @@ def _say_calibration(output: Output, found: RigCalibration, saved: Path) -> None
 def check_calibration(
     output: Output,
     folders: Annotated[
-        list[Path], typer.Argument(metavar="FOLDER...", help="A board's shots, or scans of people.")
+        list[Path],
+        typer.Argument(metavar="FOLDER...", help="Shots of a board, or scans of people."),
     ],
     calibration: Calibration,
     repair: Annotated[
         Path | None,
-        typer.Option(help="Write a calibration with the moves corrected into this folder."),
+        typer.Option(help="Folder for a calibration in which the moves are corrected."),
     ] = None,
     follow_links: FollowLinks = False,
     overwrite: OverwriteCalibration = False,
 ) -> None:
-    """Say whether anything in the rig has moved, and if so which pair or pole, and how far."""
+    """Find out whether anything in the rig has moved: which pair or pole, and how far."""
     from bodyscan.registration.storage import keep_former, load_calibration, save_calibration
     from bodyscan.workflows.check_rig import check_rig
 
@@ -174,7 +175,7 @@ def check_calibration(
 
 
 def accept_changed(output: Output, calibration: CalibrationArgument) -> None:
-    """Store a calibration that was edited by hand as one that holds, with a note that says so."""
+    """Accept a calibration that was edited by hand, and add a note that says so."""
     from bodyscan.registration.storage import accept_calibration
 
     output.made("calibration", accept_calibration(calibration))
@@ -183,13 +184,13 @@ def accept_changed(output: Output, calibration: CalibrationArgument) -> None:
 def refine_rig(
     output: Output,
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="A scan of a rigid object that stood still.")
+        Path, typer.Argument(metavar="FOLDER", help="Scan of a rigid object that stood still.")
     ],
     calibration: Calibration,
     out: Annotated[Path, typer.Option(help="Folder for the refined calibration.")],
     overwrite: OverwriteCalibration = False,
 ) -> None:
-    """Bring the pairs closer together on an object they scanned, within what the boards allow."""
+    """Refine the poses of the pairs on a rigid object, within what the boards allow."""
     from bodyscan.captures.folder import open_scan
     from bodyscan.registration.storage import keep_former, load_calibration, save_calibration
     from bodyscan.workflows.refine_rig import refine_rig as refine
@@ -212,7 +213,7 @@ def sigma_map(
         Path | None, typer.Option(help="Default: `sigma-map.png` beside the calibration.")
     ] = None,
 ) -> None:
-    """Draw how well each place of the scan volume is known by the poses of the pairs."""
+    """Draw how well the poses of the pairs determine each place of the scan volume."""
     from bodyscan.workflows.draw_sigma_map import draw_sigma_map
 
     output.made("picture", draw_sigma_map(calibration, out))
@@ -222,11 +223,11 @@ def export_rig(
     output: Output,
     calibration: CalibrationArgument,
     out: OutFolder,
-    formats: Annotated[str, typer.Option("--format", help="Comma-separated.")] = ",".join(
-        RigExportSettings().formats
-    ),
+    formats: Annotated[
+        str, typer.Option("--format", help="Formats, separated by commas.")
+    ] = ",".join(RigExportSettings().formats),
 ) -> None:
-    """Write a calibrated rig as colmap, opencv, kalibr, mrcal, caliscope or aniposelib read it.
+    """Export a calibrated rig for colmap, opencv, kalibr, mrcal, caliscope or aniposelib.
 
     Projectors that have a centre and a lens are written as further cameras.
     """

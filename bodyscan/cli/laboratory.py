@@ -1,4 +1,4 @@
-"""The laboratory's commands: what is simulated, measured against truth, accepted."""
+"""The laboratory's commands: simulate, measure against truth, accept."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def simulate(
     rig_file: RigFile,
     out: OutFolder,
     subject: Annotated[
-        Path | None, typer.Option(help="A body surface (PLY, metres, z up, facing -y).")
+        Path | None, typer.Option(help="Surface of a body (PLY, metres, z up, facing -y).")
     ] = None,
     scale: Annotated[
         float, typer.Option(min=0.1, max=4.0, help="Factor on image size and number of stripes.")
@@ -35,7 +35,7 @@ def simulate(
     seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 0,
     projector: Annotated[
         Literal["mirror", "pinhole"],
-        typer.Option(help="A laser and a rotating mirror, or a projector with a lens."),
+        typer.Option(help="A laser with a rotating mirror, or a projector with a lens."),
     ] = "mirror",
     preset: Annotated[
         Literal["ideal", "workshop"],
@@ -47,12 +47,12 @@ def simulate(
     ] = "standing",
     look: Annotated[
         Literal["matt", "skin", "dressed"],
-        typer.Option(help="Matt all over, like skin, or with dark hair and shorts too."),
+        typer.Option(help="Matt all over, like skin, or skin with dark hair and shorts."),
     ] = "matt",
     sway_mm: Annotated[
         float,
         typer.Option(
-            min=0.0, help="How far a mannequin moves, rigid, between the pairs' captures."
+            min=0.0, help="How far a mannequin moves, as a rigid body, between the pairs' captures."
         ),
     ] = 0.0,
     changes: Annotated[
@@ -60,7 +60,7 @@ def simulate(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Change a number, such as person.breath_mm=5; repeatable. truth/truth.json shows all.",
+            help="Change a number, such as person.breath_mm=5; repeatable. truth/truth.json lists all.",
         ),
     ] = None,
     board_shots: Annotated[
@@ -106,7 +106,9 @@ def evaluate(
     output: Output,
     workspace: Annotated[
         Path,
-        typer.Argument(metavar="WORKSPACE", help="What simulate wrote, calibrated and scanned."),
+        typer.Argument(
+            metavar="WORKSPACE", help="Folder that simulate wrote, calibrated and scanned."
+        ),
     ],
 ) -> None:
     """Compare the calibration and scan of a simulated workspace with the truth beside it."""
@@ -123,29 +125,29 @@ def accept(
     output: Output,
     artefact: Annotated[
         Path | None,
-        typer.Argument(metavar="ARTEFACT.YAML", help="Artefacts as calibrated, and limits."),
+        typer.Argument(metavar="ARTEFACT.YAML", help="The calibrated artefacts, and limits."),
     ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option(
-            help="What calibrate-rig wrote; with --simulate, by default the one beside the rig."
+            help="What calibrate-rig wrote. Default with --simulate: the one beside the rig."
         ),
     ] = None,
     spheres: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FOLDER", help="A scan of the spheres at one place; repeatable."),
+        typer.Option(metavar="FOLDER", help="Scan of the spheres at one place; repeatable."),
     ] = None,
     plate: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FOLDER", help="A scan of the plate at one place; repeatable."),
+        typer.Option(metavar="FOLDER", help="Scan of the plate at one place; repeatable."),
     ] = None,
     simulate: Annotated[
         Path | None,
         typer.Option(metavar="WORKSPACE", help="Simulate the artefacts in this simulated rig."),
     ] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="Simulated shots of each place.")] = 2,
+    repeats: Annotated[int, typer.Option(min=1, help="Simulated shots at each place.")] = 2,
     places: Annotated[
-        int | None, typer.Option(min=1, help="Simulate this many of the places only.")
+        int | None, typer.Option(min=1, help="Simulate only this many of the places.")
     ] = None,
     limit: Annotated[
         list[str] | None,
@@ -155,7 +157,7 @@ def accept(
         Path | None, typer.Option(help="Default: `acceptance` beside the calibration.")
     ] = None,
 ) -> None:
-    """Measure spheres and a plate of known size at several places and judge the figures."""
+    """Measure spheres and a plate of known size at several places, and judge the figures."""
     from bodyscan.evaluation.acceptance_file import limit_from, load_acceptance
     from bodyscan.laboratory.simulated_acceptance import simulate_readings
     from bodyscan.registration.storage import load_calibration
@@ -200,7 +202,10 @@ def reproduce(
     seed: Annotated[int, typer.Option(help="Seed of all noise.")] = 0,
     real_light: Annotated[
         bool,
-        typer.Option("--real-light", help="Add a bowed board, speckle, jitter, a smile, defocus."),
+        typer.Option(
+            "--real-light",
+            help="Add a bowed board, speckle, jitter, the laser line's smile, defocus.",
+        ),
     ] = False,
     quick: Annotated[
         bool, typer.Option("--quick", help="Render coarsely, with fewer shots.")
@@ -209,7 +214,7 @@ def reproduce(
         int, typer.Option(min=3, max=10, help="Poses of the board; the chapter has three.")
     ] = 3,
 ) -> None:
-    """Simulate the chapter's own set-up: its Tables 1 and 2, its Fig. 6 and 7, and all rivals."""
+    """Simulate the chapter's own set-up: Tables 1 and 2, Fig. 6 and 7, and all rival models."""
     from bodyscan.laboratory.chapter.text import figure_names, text_name
     from bodyscan.laboratory.reproduce import reproduce as run
 

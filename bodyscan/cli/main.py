@@ -25,7 +25,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     epilog="Exit codes: 0 done; 1 the work failed, or its result must not be used as it is (repeat, "
-    "not valid, not accepted); 2 the input is wrong. docs/commands.md has every command.",
+    "not valid, not accepted); 2 the input is wrong. docs/commands.md describes every command.",
 )
 for _group in (builder, operator, laboratory):
     _group.register(app)
@@ -79,7 +79,7 @@ def _show_version(wanted: bool) -> None:
 @app.callback()
 def _options(
     debug: Annotated[
-        bool, typer.Option("--debug", help="Show tracebacks (may stand anywhere).")
+        bool, typer.Option("--debug", help="Show tracebacks; allowed anywhere on the command line.")
     ] = False,
     version: Annotated[
         bool,

@@ -1,4 +1,4 @@
-"""The operator's commands: people scanned, fused in batches, looked at, handed on, forgotten."""
+"""The operator's commands: scan people, fuse in batches, look at scans, export them, forget them."""
 
 from __future__ import annotations
 
@@ -59,13 +59,14 @@ def scan(
     ] = AlignmentSettings().matching,
     empty: Annotated[
         Path | None,
-        typer.Option(help="Captures of the empty rig: what they show is cut away."),
+        typer.Option(help="Captures of the empty rig; whatever they show is removed."),
     ] = None,
     changes: Changes = None,
     follow_links: FollowLinks = False,
     overwrite: Overwrite = False,
     e57: Annotated[
-        bool, typer.Option("--e57", help="Write each pair's raw cloud too: `raw.e57` (pye57).")
+        bool,
+        typer.Option("--e57", help="Also write each pair's raw cloud, `raw.e57` (needs pye57)."),
     ] = False,
 ) -> None:
     """Fuse one person's captures into a body cloud and a closed mesh."""
@@ -114,7 +115,7 @@ def scan(
 def report(
     output: Output,
     result: Annotated[
-        Path, typer.Argument(metavar="RESULT", help="What calibrate-rig or scan wrote.")
+        Path, typer.Argument(metavar="RESULT", help="Result of calibrate-rig or scan.")
     ],
     out: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Default: report.html in the result.")
@@ -124,7 +125,7 @@ def report(
         typer.Option(metavar="OTHER", help="Another scan, or a known surface (PLY, mm)."),
     ] = None,
 ) -> None:
-    """Write a report on a calibration or a scan: one HTML file that opens anywhere, and prints."""
+    """Write a report on a calibration or a scan: one HTML file that opens anywhere and prints."""
     from bodyscan.workflows.write_report import write_report
 
     path, verdict = write_report(result, out, compare)
@@ -138,7 +139,7 @@ def measure(
     heights: Annotated[
         str | None,
         typer.Option(
-            help="Heights of slices above the floor, mm, such as 800,1050. Default: every 100."
+            help="Heights of slices above the floor in mm, such as 800,1050. Default: every 100."
         ),
     ] = None,
     out: Annotated[
@@ -170,21 +171,21 @@ def export(
     output: Output,
     result: Result,
     out: Annotated[Path | None, typer.Option(help="Default: `export` inside the result.")] = None,
-    formats: Annotated[str, typer.Option("--format", help="Comma-separated.")] = ",".join(
-        ExportSettings().formats
-    ),
+    formats: Annotated[
+        str, typer.Option("--format", help="Formats, separated by commas.")
+    ] = ",".join(ExportSettings().formats),
     deface: Annotated[
         bool,
         typer.Option(
-            "--deface", help="Replace the head by a plain one, for sharing; written into `shared`."
+            "--deface", help="Replace the head by a plain one, for sharing; writes into `shared`."
         ),
     ] = False,
     frame: Annotated[
-        str, typer.Option(help="rig, or body: origin under the body, x the way it faces.")
+        str, typer.Option(help="rig, or body (origin under the body, x the way it faces).")
     ] = "rig",
     anyway: Anyway = False,
 ) -> None:
-    """Write a scan's mesh as PLY, OBJ, STL and GLB for other programs."""
+    """Export a scan's mesh as PLY, OBJ, STL and GLB for other programs."""
     from bodyscan.export.scan import export_scan
     from bodyscan.fusion.storage import load_scan, refuse_repeat
 
@@ -204,17 +205,21 @@ def batch(
     pipeline: Annotated[
         Path, typer.Argument(metavar="PIPELINE.YAML", help="The pipeline file; see pipelines/.")
     ],
-    scans: Annotated[str, typer.Option(help="Folder (or URL) that holds scan folders, or rigs.")],
-    out: Annotated[str, typer.Option(help="Folder (or URL) to write a job folder for each into.")],
+    scans: Annotated[str, typer.Option(help="Folder (or URL) of scan folders, or of rigs.")],
+    out: Annotated[
+        str, typer.Option(help="Folder (or URL) to write one job folder for each into.")
+    ],
     calibration: Annotated[
         str | None,
-        typer.Option(help="Default: `calibration` in the folder of scans, beside or above it."),
+        typer.Option(help="Default: `calibration` in the folder of scans, beside it or above it."),
     ] = None,
     changes: Changes = None,
     until: Annotated[
         str | None, typer.Option(metavar="STAGE", help="The last stage to run.")
     ] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Jobs at the same time.")] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Number of jobs at the same time.")
+    ] = None,
     cluster: Annotated[
         str | None,
         typer.Option(
@@ -222,12 +227,12 @@ def batch(
         ),
     ] = None,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Say why each stage would run; do nothing.")
+        bool, typer.Option("--explain", help="Say why each stage would run, and run nothing.")
     ] = False,
 ) -> None:
-    """Fuse every scan of a day (or calibrate every rig), each in a process of its own.
+    """Fuse every scan of a day (or calibrate every rig), each in its own process.
 
-    With --json each event is a line of JSON as it happens; the last one is the summary.
+    With --json each event is printed as a line of JSON when it happens; the last one is the summary.
     """
     from bodyscan.jobs.discovery import find_jobs
     from bodyscan.jobs.object_storage import Store, find_stored_jobs, is_url
@@ -321,27 +326,29 @@ def _run(
 def watch(
     output: Output,
     inbox: Annotated[
-        Path, typer.Argument(metavar="INBOX", help="Folder in which a folder a scan appears.")
+        Path, typer.Argument(metavar="INBOX", help="Folder in which each scan appears as a folder.")
     ],
     calibration: Calibration,
     out: OutFolder,
     pipeline: Annotated[
-        Path | None, typer.Option(metavar="PIPELINE.YAML", help="Settings, as `batch` takes them.")
+        Path | None, typer.Option(metavar="PIPELINE.YAML", help="Settings, as for `batch`.")
     ] = None,
     changes: Changes = None,
     quiet_s: Annotated[
         float,
         typer.Option(
-            "--quiet-s", min=1.0, help="A scan is taken as it is when nothing came for so long."
+            "--quiet-s",
+            min=1.0,
+            help="Take a scan as complete when nothing has come for this many seconds.",
         ),
     ] = 30.0,
     once: Annotated[
-        bool, typer.Option("--once", help="End when all that lies in INBOX is done.")
+        bool, typer.Option("--once", help="End when everything in INBOX is done.")
     ] = False,
 ) -> None:
-    """Fuse scans while their images arrive; the verdict comes seconds after the last one.
+    """Fuse scans while their images arrive; the verdict comes seconds after the last image.
 
-    Stopped at any moment and started again, it goes on where it was. docs/inbox.md is the protocol.
+    You can stop it at any moment; started again, it continues. docs/inbox.md describes the protocol.
     """
     from bodyscan.files.model_file import apply_settings
     from bodyscan.jobs import display
@@ -371,10 +378,13 @@ def watch(
 def verify(
     output: Output,
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="What batch wrote, or one job's folder in it.")
+        Path,
+        typer.Argument(
+            metavar="FOLDER", help="Folder that batch wrote, or one job's folder in it."
+        ),
     ],
 ) -> None:
-    """Compare images, calibration and results with the manifest; find any byte that changed."""
+    """Compare images, calibration and results with the manifest, and find any byte that changed."""
     from bodyscan.jobs.job import printable
     from bodyscan.jobs.verification import verify as look
 
@@ -395,7 +405,7 @@ def forget(
     subject: Annotated[str, typer.Argument(metavar="SUBJECT", help="The subject's pseudonym.")],
     workspace: Annotated[Path, typer.Option(help="Folder to search.")] = Path(),
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would be removed; remove nothing.")
+        bool, typer.Option("--dry-run", help="Say what would be removed, and remove nothing.")
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask first.")] = False,
 ) -> None:
