@@ -1,6 +1,6 @@
 """Calibrate a rig of projector-camera pairs and fuse its scans of a person into a body model.
 
-What a Python program needs is here by name, see `bodyscan.api`; it is imported when it is asked for.
+The names that a Python program needs are listed in `bodyscan.api`; each is imported on first use.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Where the command line begins: Ctrl-C is heard while modules are still being imported."""
+"""Entry point of the command line: handles Ctrl-C even while modules are still being imported."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def start() -> None:
         main()
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr, flush=True)
-        os._exit(130)  # as shells have it: 128 + SIGINT
+        os._exit(130)  # the shells' convention: 128 + SIGINT
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The front door: a rig calibrated, people scanned, measured and handed on, from Python.
+"""The public Python interface: calibrate a rig, scan people, measure and export the results.
 
     import bodyscan
 
@@ -12,16 +12,17 @@
     kept = bodyscan.save_scan(person, "person-model", calibration="calibration")
     bodyscan.export_scan(kept, "person-export")
 
-Lengths are millimetres; a point is in the rig frame (origin on the floor, x the way the subject faces,
-y to its left, z up) unless its name says otherwise. What goes wrong is a `BodyscanError`: `BadInput`
-where the caller can mend something, `FailedWork` where good input gave no result; both say what, where
-and what to do. `progress` is any function of a stage's name, what is done of it and what there is.
+Lengths are millimetres. Points are in the rig frame (origin on the floor, x the way the subject
+faces, y to the subject's left, z up) unless a name says otherwise. Every error is a
+`BodyscanError`: `BadInput` where the caller can mend something, `FailedWork` where good input gave
+no result; both say what went wrong, where, and what to do. `progress` is any function of a stage's
+name, the number of steps done and their total.
 
-**What is stable.** The names of `bodyscan.__all__`, their arguments, the fields of what they return
-and the files that they write. From one minor version to the next they grow; a name is warned of
-(DeprecationWarning) for one minor version before it goes. Files stay readable, or are refused with a
-message that says what to do. Figures may get better from version to version: CHANGELOG.md says when.
-Any other module may be imported as well (`bodyscan.geometry`, say) and may change at any time.
+**What is stable.** The names in `bodyscan.__all__`, their arguments, the fields of what they return
+and the files they write. Minor versions only add to them; a name to be removed raises a
+DeprecationWarning for one minor version first. Files stay readable, or are refused with a message
+that says what to do. Numerical results may improve from version to version: CHANGELOG.md says when.
+Any other module (`bodyscan.geometry`, say) may be imported too, but may change at any time.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ _HOMES = {
     "Scan": "bodyscan.fusion.scan",
     "StoredScan": "bodyscan.fusion.storage",
 }
-"""Types that only cost time where nobody asks for them."""
+"""Where each type lives: it is imported on first use, since importing it takes time."""
 
 __all__ = [
     "AlignmentSettings",
@@ -105,7 +106,7 @@ __all__ = [
 
 
 def load_rig(path: AnyPath) -> Rig:
-    """A rig's description. Raises RigFileError with every problem, by line and column.
+    """Read a rig file. Raises RigFileError with every problem, by line and column.
 
     >>> rig = load_rig("rigs/three-pole-12.yaml")
     >>> len(rig.pairs), rig.pairs[0].name, rig.volume.radius_mm
@@ -119,13 +120,14 @@ def load_rig(path: AnyPath) -> Rig:
 def calibrate_rig(
     rig_file: AnyPath | Rig, *, folder: AnyPath | None = None, progress: Progress = silent
 ) -> RigCalibration:
-    """Every pair of a rig calibrated and placed, from the board images that its file names.
+    """Calibrate every pair of a rig and its pose, from the board images that the rig file names.
 
-    rig_file: or what `load_rig` made of it, changed or not.  folder: where a `Rig`'s paths start, which
-    is beside its file; without it the current one.
+    rig_file: a path, or a `Rig` from `load_rig`, changed or not.
+    folder: what a `Rig`'s paths are relative to; the current folder if None. Ignored for a path,
+        whose own folder is used.
 
-    `notes` and `failed` of what is returned say what was left out and why. Raises RigFileError,
-    CaptureError; FailedWork if no pair can be calibrated or the pairs do not hang together.
+    The result's `notes` and `failed` say what was left out and why. Raises RigFileError and
+    CaptureError; FailedWork if no pair can be calibrated or nothing ties the pairs together.
     """
     from bodyscan.captures.folder import open_captures
     from bodyscan.workflows.calibrate_rig import calibrate_rig as calibrate
@@ -138,10 +140,12 @@ def calibrate_rig(
 
 
 def import_calibration(rig_file: AnyPath, *, sigma_px: float | None = None) -> RigCalibration:
-    """What other programs calibrated, from the files that a rig file names as `known`.
+    """Import other programs' calibrations, from the files that the rig file names as `known`.
 
-    sigma_px: by how much its pixels may be off, instead of what the rig file says; without either
-    how exact it is is not known. Raises RigFileError; CalibrationFileError if no pair is left.
+    sigma_px: sigma of their pixels, px, overriding the rig file's; if neither gives one, the
+        accuracy is unknown.
+
+    Raises RigFileError; CalibrationFileError if no pair is left.
     """
     from bodyscan.workflows.import_rig import import_rig
 
@@ -158,9 +162,11 @@ def put_image(
     *,
     shot: str = "s01",
 ) -> Path:
-    """Hand an image in memory to `bodyscan watch`, as a file of its inbox; returns the file.
+    """Write an image held in memory into the inbox of `bodyscan watch`; return the file's path.
 
-    image: (height, width) uint8 or uint16.  scan: the folder's name, which becomes the job's.
+    scan: name of the scan's folder, which becomes the job's name.
+    image: (height, width) uint8 or uint16.
+
     Raises BadInput for a pair that the rig does not have.
     """
     from bodyscan.jobs.inbox import put_image as put
@@ -169,14 +175,14 @@ def put_image(
 
 
 def save_calibration(calibration: RigCalibration, folder: AnyPath) -> Path:
-    """Write calibration.json and its arrays into `folder`; the path of the JSON."""
+    """Write calibration.json and its arrays into `folder`; return the path of the JSON."""
     from bodyscan.registration.storage import save_calibration as save
 
     return save(calibration, Path(folder))
 
 
 def load_calibration(path: AnyPath) -> RigCalibration:
-    """What `save_calibration` or `bodyscan calibrate-rig` wrote, exact to the last bit.
+    """Read what `save_calibration` or `bodyscan calibrate-rig` wrote, exact to the last bit.
 
     Raises CalibrationFileError:
 
@@ -195,9 +201,9 @@ def load_calibration(path: AnyPath) -> RigCalibration:
 def triangulate(
     folder: AnyPath, calibration: RigCalibration, *, progress: Progress = silent
 ) -> Outcome[list[RangeImage]]:
-    """What each pair measured of a scan by itself, background and all, in its camera's frame.
+    """Each pair's range image of a scan, background included, in its camera's frame.
 
-    Pairs that gave nothing are failures of the outcome, with the reason. Raises CaptureError;
+    Pairs that gave nothing are in the outcome's `failures`, with the reason. Raises CaptureError;
     ScanFailed if no pair gave anything.
     """
     from bodyscan.captures.folder import open_scan
@@ -215,10 +221,11 @@ def scan(
     empty: AnyPath | None = None,
     progress: Progress = silent,
 ) -> Scan:
-    """One person's captures fused: a cloud, a closed mesh, and a verdict on them.
+    """Fuse one person's captures into a cloud and a closed mesh, with a verdict on them.
 
-    empty: captures of the rig with nobody in it, whose surfaces are cut away. Raises CaptureError;
-    ScanFailed if there is no body.
+    empty: captures of the rig with nobody in it; the surfaces they show are cut away.
+
+    Raises CaptureError; ScanFailed if there is no body.
 
     >>> ScanSettings(fusion=FusionSettings(points=200_000)).mesh.depth
     9
@@ -239,10 +246,11 @@ def save_scan(
     subject: str | None = None,
     when: datetime | None = None,
 ) -> StoredScan:
-    """Write the body model and what it is (scan.json) into `folder`; as it is read back.
+    """Write the body model and its description (scan.json) into `folder`; return it as read back.
 
-    calibration: where the one that it was made with is stored, which scan.json refers to by hash.
-    subject: a pseudonym, by which `bodyscan forget` finds all that was made of a person.
+    calibration: path of the stored calibration that the scan was made with; scan.json refers to it
+        by hash.
+    subject: pseudonym by which `bodyscan forget` finds everything made of a person.
     """
     from bodyscan.fusion.storage import Origin
     from bodyscan.fusion.storage import save_scan as save
@@ -253,7 +261,7 @@ def save_scan(
 
 
 def load_scan(folder: AnyPath) -> StoredScan:
-    """What `save_scan` or `bodyscan scan` wrote. Raises ResultError if it is missing or damaged."""
+    """Read what `save_scan` or `bodyscan scan` wrote. Raises ResultError if missing or damaged."""
     from bodyscan.fusion.storage import load_scan as load
 
     return load(Path(folder))
@@ -262,10 +270,11 @@ def load_scan(folder: AnyPath) -> StoredScan:
 def measure(
     body: Scan | StoredScan | BodyMesh, heights_mm: Sequence[float] | None = None
 ) -> Measurements:
-    """Stature, volume, area and the girths of horizontal slices, how much of each was measured.
+    """Stature, volume, area and girths of horizontal slices, each with the share measured.
 
-    heights_mm: of the slices over the floor, every 100 mm if none are given. Raises BadInput for
-    a height at which there is no body.
+    heights_mm: heights of the slices above the floor; every 100 mm if None.
+
+    Raises BadInput for a height at which there is no body.
     """
     from bodyscan.measurement.measurements import measure as measure_mesh
     from bodyscan.mesh.body import BodyMesh
@@ -280,10 +289,12 @@ def export_scan(
     *,
     frame: Literal["rig", "body"] = "rig",
 ) -> list[Path]:
-    """Write a scan for other programs, each file with a JSON beside it; the paths.
+    """Write a scan for other programs, each file with a JSON beside it; return the paths.
 
-    frame: the rig's, or the body's own (origin under it, x the way it faces). Raises BadInput for
-    a format that there is not; FailedWork where a face is to be removed and no neck is found.
+    frame: the rig's, or the body's own (origin beneath the body, x the way it faces).
+
+    Raises BadInput for an unknown format; FailedWork if a face is to be removed but no neck is
+    found.
 
     >>> ExportSettings().formats
     ('ply', 'obj', 'stl', 'glb')
@@ -301,9 +312,11 @@ def export_scan(
 
 
 def write_report(result: AnyPath, path: AnyPath | None = None) -> Verdict:
-    """One HTML file about a stored calibration or scan, report.html in it if no path is given.
+    """Write one HTML report on a stored calibration or scan, and return its verdict.
 
-    Its verdict is returned. Raises BadInput for what is neither.
+    path: where to write it; report.html inside `result` if None.
+
+    Raises BadInput for anything that is neither a calibration nor a scan.
     """
     from bodyscan.workflows.write_report import write_report as write
 

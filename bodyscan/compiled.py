@@ -1,9 +1,9 @@
-"""Loops over pixels that numpy would need many passes for, compiled by Numba.
+"""Loops over pixels that would take numpy many passes, compiled by Numba.
 
-The first call on a machine compiles (seconds) and leaves the result beside the source, in
-`__pycache__`; from then on it is loaded. Compiled functions take arrays and numbers, no objects;
-they release the interpreter's lock, so stages run them in threads, and they are compiled without
-fast-math and for one thread: the same input gives the same bytes.
+The first call on a machine compiles (seconds) and caches the result beside the source, in
+`__pycache__`; later calls load it. Compiled functions take arrays and numbers, no objects. They
+release the interpreter's lock, so that stages can run them in threads, and are compiled without
+fast-math and for a single thread, so that the same input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 
 def compiled(function: Function) -> Function:
-    """The function, compiled at its first call for the types it is given.
+    """Compile a function with Numba, at its first call for each set of argument types.
 
-    Division by zero gives infinity or NaN, as in numpy. What was kept on disk is good as long as the
-    function's file and those that it imports compiled functions from are unchanged. int() of a
-    uint8 is unsigned there, and differences of such wrap round: write float(), or np.int64().
-    Copy arrays in a loop: `a[i] = b` compiles the words of its error as well, two seconds a process.
+    Division by zero gives infinity or NaN, as in numpy. The cache on disk is valid as long as the
+    function's file, and the files it imports compiled functions from, are unchanged. Inside,
+    int() of a uint8 is unsigned and differences of such wrap round: write float() or np.int64().
+    Copy arrays in a loop: `a[i] = b` also compiles the text of its error, two seconds a process.
     """
     options = {"nogil": True, "error_model": "numpy"}
     try:
@@ -32,14 +32,17 @@ def compiled(function: Function) -> Function:
     except (
         RuntimeError,
         AttributeError,
-    ):  # no place for files, or a Numba that keeps them otherwise
+    ):  # nowhere to cache, or a Numba whose cache works differently
         return cast(Function, numba.njit(**options)(function))
     return cast(Function, kept)
 
 
 def _look_at_imports(kept: Any, function: Any) -> None:
-    """Numba looks at the date and size of the function's own file alone: it would go on with what
-    called functions were before their files changed."""
+    """Make the cache depend on the files of called functions too.
+
+    Numba checks the date and size of the function's own file alone, and would keep using stale
+    versions of the functions it calls.
+    """
     own = function.__code__.co_filename
     called = {
         value.py_func.__code__.co_filename

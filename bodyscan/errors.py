@@ -1,7 +1,7 @@
-"""What went wrong, where, and what to do about it.
+"""The errors that bodyscan raises: what went wrong, where, and what to do about it.
 
-`BadInput` is something a user can correct (the command line exits with 2); `FailedWork` is good input
-on which the work did not succeed (exit 1).
+`BadInput` is something the user can correct (the command line exits with 2); `FailedWork` is good
+input on which the work did not succeed (exit 1).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 
 class BodyscanError(Exception):
-    """Root of the tree. `what` went wrong, `where` (file, line, pair, shot), `remedy`: what to do."""
+    """Root of all errors: `what` went wrong, `where` (file, line, pair, shot), and the `remedy`."""
 
     exit_code = 1
 
@@ -24,12 +24,12 @@ class BodyscanError(Exception):
 
 
 def plainly(error: BodyscanError) -> str:
-    """What went wrong and what to do, where the place is said already."""
+    """What went wrong and what to do, for messages that already say where."""
     return f"{error.what}\n  {error.remedy}" if error.remedy else error.what
 
 
 def listed(reasons: Mapping[str, str]) -> str:
-    """Why each of several failed, a line each; what to do, once, however many it would help."""
+    """The reasons of several failures, one a line, then each distinct remedy once."""
     parts = {name: reason.partition("\n") for name, reason in reasons.items()}
     first = [f"\n  {name}: {what}" for name, (what, _, _) in parts.items()]
     rest = dict.fromkeys(remedy for _, _, remedy in parts.values())
@@ -73,11 +73,11 @@ class BoardNotFound(FailedWork):
 
 
 class DecodingFailed(FailedWork):
-    """The images of a stripe sequence do not add up to a stripe code."""
+    """The images of a stripe sequence do not form a valid stripe code."""
 
 
 class WrongDirection(DecodingFailed):
-    """Stripes run the other way than the rig file says."""
+    """The stripes run in the other direction from the one the rig file gives."""
 
 
 class DegeneratePoses(FailedWork):
@@ -85,7 +85,7 @@ class DegeneratePoses(FailedWork):
 
 
 class PairFailed(FailedWork):
-    """One pair could not be calibrated; the others go on."""
+    """One pair could not be calibrated; the others continue."""
 
 
 class RigDisconnected(FailedWork):
@@ -93,4 +93,4 @@ class RigDisconnected(FailedWork):
 
 
 class ScanFailed(FailedWork):
-    """A scan gives no body."""
+    """A scan yields no body."""

@@ -1,20 +1,19 @@
-"""Memory that one image has freed is used for the next one."""
+"""Keep memory that one image has freed, for the next one."""
 
 from __future__ import annotations
 
 import ctypes
 import sys
 
-TRIM_THRESHOLD, MMAP_MAX, ARENA_MAX = -1, -4, -8  # of glibc's malloc.h
+TRIM_THRESHOLD, MMAP_MAX, ARENA_MAX = -1, -4, -8  # from glibc's malloc.h
 NEVER = 2**31 - 1
 
 
 def keep_freed_memory() -> None:
-    """For processes of ours, before they start threads.
+    """Tell the C library to keep freed blocks. Call it before the process starts any thread.
 
-    The C library of most Linuxes hands large blocks back to the kernel once they are freed, and
-    the kernel clears them, page by page, when the next image wants as much. Other systems'
-    libraries are left as they are.
+    On most Linux systems the C library returns large blocks to the kernel when they are freed, and
+    the kernel clears them again, page by page, for the next image. Other systems are left alone.
     """
     if not sys.platform.startswith("linux"):
         return
@@ -22,4 +21,4 @@ def keep_freed_memory() -> None:
     if set_option is not None:
         set_option(TRIM_THRESHOLD, NEVER)
         set_option(MMAP_MAX, 0)
-        set_option(ARENA_MAX, 1)  # threads would keep memory of their own
+        set_option(ARENA_MAX, 1)  # otherwise each thread keeps memory of its own

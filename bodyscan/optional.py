@@ -1,4 +1,4 @@
-"""What a result stands without: pictures, tables, advice. It fails by itself, and says so."""
+"""Optional parts of a result (pictures, tables, advice), whose failure leaves the result intact."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ LOG = logging.getLogger("bodyscan")
 
 @contextmanager
 def optional(what: str, say: Callable[[str], object]) -> Iterator[None]:
-    """Whatever the block raises is one line to `say`, and its traceback a line of the debug log.
+    """Report any error of the block as one line to `say`; its traceback goes to the debug log.
 
-    Only for what comes after the result was written, or does not enter it.
+    Only for work that comes after the result was written, or that does not enter it.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""What a step of a workflow gives: its value, and what has to be said of it."""
+"""What a workflow step returns: its value, and what to tell the user about it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ Value = TypeVar("Value", covariant=True)
 
 @dataclass(frozen=True, eq=False)
 class Outcome(Generic[Value]):
-    """value: what was asked for, as far as it could be had.
+    """The result of a workflow step.
 
-    notes: a line for each thing that a person should know: what was dropped and why.
+    value: what was asked for, as far as it could be had.
+    notes: one line for each thing the user should know: what was dropped and why.
     failures: pairs that the step lost, by name, with the reason.
     """
 

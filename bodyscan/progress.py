@@ -1,4 +1,4 @@
-"""How a stage tells how far it is: stages call a plain function, the command line draws the bar."""
+"""How stages report progress: they call a plain function; the command line draws the bar."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 THREADS = 2
-"""Threads that a stage shares its work out to, and cores that a job of a batch takes: all times in
-docs/results.md were measured so; larger machines run more jobs side by side."""
+"""Threads that a stage uses, and cores that a job of a batch takes. All times in docs/results.md
+were measured with it; larger machines run more jobs side by side."""
 
 Progress = Callable[[str, int, int], None]
 Item = TypeVar("Item")
@@ -18,12 +18,12 @@ Error = TypeVar("Error", bound=Exception)
 
 
 def silent(stage: str, done: int, total: int) -> None:
-    """The progress of whoever does not want to know."""
+    """A `Progress` that reports nothing."""
 
 
 @contextmanager
 def step(progress: Progress, stage: str) -> Iterator[None]:
-    """Tell that a stage begins, and that it is done, unless it raises."""
+    """Report that a stage begins and, unless it raises, that it is done."""
     progress(stage, 0, 1)
     yield
     progress(stage, 1, 1)
@@ -37,7 +37,7 @@ def threaded(
     progress: Progress = silent,
     workers: int = THREADS,
 ) -> list[Result]:
-    """`work` on every item in threads, results in the items' order."""
+    """Run `work` on every item in threads; results are in the order of the items."""
     todo: Sequence[Item] = list(items)
     progress(stage, 0, len(todo))
     results = []
@@ -56,7 +56,7 @@ def attempt_each(
     stage: str,
     progress: Progress = silent,
 ) -> tuple[dict[Item, Result], dict[Item, Error]]:
-    """`work` on every item in threads: what came of it, and the errors of that kind, by item."""
+    """Run `work` on every item in threads; return results and errors of type `error`, by item."""
     todo = list(items)
     good: dict[Item, Result] = {}
     bad: dict[Item, Error] = {}
@@ -68,5 +68,5 @@ def attempt_each(
             bad[item] = found
 
     threaded(attempt, todo, stage=stage, progress=progress)
-    # In the items' order, whichever ended first.
+    # In the order of the items, whichever finished first.
     return {i: good[i] for i in todo if i in good}, {i: bad[i] for i in todo if i in bad}

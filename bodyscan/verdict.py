@@ -1,4 +1,4 @@
-"""The verdict on a scan, a calibration or an acceptance test: one grade, and the reasons for it."""
+"""The verdict on a scan, a calibration or an acceptance test: one grade and its reasons."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ MARKS: dict[str, Mark] = {
     "usable": "usable",
     "not judged": "usable",
 }
-"""What a grade stands for; what is not here is bad."""
+"""The mark that each grade stands for; any other grade is bad."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A scan is good, usable or to be taken again (repeat); a calibration good, usable or to be done
-    again (recalibrate); an acceptance test accepted, not accepted, or not judged.
+    """A grade with its reasons.
 
-    reasons: worst first; () where all is well.
+    grade: of a scan good, usable or repeat; of a calibration good, usable or recalibrate; of an
+        acceptance test accepted, not accepted or not judged.
+    reasons: worst first; () if there is nothing to report.
     """
 
     grade: Grade
@@ -36,11 +37,14 @@ class Verdict:
 
 
 class Announce(Protocol):
-    """Takes a scan's verdict as soon as it is known: as the points have it, before there is a mesh, and
-    the final one, which the mesh can only make worse."""
+    """Receives a scan's verdict as soon as it is known.
+
+    It is called with the verdict on the points, before there is a mesh, and with the final one,
+    which the mesh can only make worse.
+    """
 
     def __call__(self, verdict: Verdict, *, final: bool) -> None: ...
 
 
 def say_nothing(verdict: Verdict, *, final: bool) -> None:
-    """Where nobody waits for a verdict."""
+    """An `Announce` that does nothing."""

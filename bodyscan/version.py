@@ -1,3 +1,3 @@
-"""The version of this software, as every file it writes says."""
+"""The version of this software, as recorded in every file it writes."""
 
 __version__ = "0.1.0"

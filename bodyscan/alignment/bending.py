@@ -1,4 +1,4 @@
-"""Range images carried to one moment: every pixel by the motion of its cell of the body."""
+"""Carry range images to one moment: every pixel by the motion of its cell of the body."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bodyscan.reconstruction.range_image import RangeImage
 Numbers = NDArray[np.int32]
 
 BLOCK_MM = 8.0  # a quarter of a cell
-SAME_SURFACE_MM = 40.0  # in depth; an arm is farther in front of the trunk, or moves alike
+SAME_SURFACE_MM = 40.0  # in depth; an arm is farther in front of the trunk, or moves like it
 
 
 def at_once(
@@ -30,7 +30,7 @@ def at_once(
     *,
     workers: int = THREADS,
 ) -> list[RangeImage]:
-    """All range images as of the middle of the scan, if the person moved."""
+    """All range images carried to the middle of the scan, if the person moved."""
     if followed is None:
         return list(images)
 
@@ -45,10 +45,10 @@ def at_once(
 def bend(
     image: RangeImage, rig_from_camera: RigidTransform, cells: BodyCells, field: Array
 ) -> RangeImage:
-    """The range image with points and normals displaced by a field (C, 12) of the rig frame.
+    """Displace the points and normals of a range image by a field (C, 12), rig frame.
 
-    Which cell a pixel belongs to is looked up for one in each block of pixels, and goes smoothly
-    from block to block.
+    The cell of a pixel is looked up for one pixel in each block, and interpolated smoothly between
+    blocks.
     """
     valid = image.valid
     if not valid.any():
@@ -82,9 +82,10 @@ def bend(
 
 @compiled
 def _one_in_each_block(sigma_mm: Floats, corner: tuple[int, int], size: int) -> Numbers:
-    """(h, w) number of the measured pixel nearest to the middle of each block, -1 where none is.
+    """(h, w): number of the measured pixel nearest to each block's middle, -1 if there is none.
 
-    corner: where the part of the image begins; blocks are counted from the image's own."""
+    corner: where this part of the image begins; blocks are counted from the image's own corner.
+    """
     height, width = sigma_mm.shape
     top, left = corner
     above, before = top // size, left // size
@@ -115,10 +116,12 @@ def _bend(
     blocks: tuple[Numbers, Floats],
     motion: tuple[Array, Array],
 ) -> None:
-    """Displaces measured points (H, W, 3) and their normals.
+    """Displace measured points (H, W, 3) and their normals, camera frame.
 
-    blocks: their cells (h, w), -1 for none, and depths.  motion: cells' centres (C, 3) and fields
-    (C, 12), camera frame.  A pixel mixes those of the four blocks around it by how near they are.
+    blocks: cells (h, w) of the blocks, -1 for none, and their depths.
+    motion: centres (C, 3) of the cells and fields (C, 12).
+
+    A pixel blends the motions of the four blocks around it, weighted by nearness.
     """
     cell, depth = blocks
     centres, fields = motion
@@ -165,5 +168,6 @@ def _bend(
             a, b, c = normals[v, u]
             for k in range(3):
                 points[v, u, k] += shift[k]
-                # A surface's normal is carried by the inverse of its transpose, here to first order.
+                # A normal is carried by the inverse transpose of the deformation, here to first
+                # order.
                 normals[v, u, k] -= slope[k, 0] * a + slope[k, 1] * b + slope[k, 2] * c

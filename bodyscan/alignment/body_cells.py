@@ -1,7 +1,7 @@
-"""A body's surface in cells of a few centimetres, and how far apart they are as the body is made.
+"""Cells of a few centimetres on a body's surface, and their distances through the body.
 
-Distance goes along the surface and straight through what is solid: a hand is far from the thigh
-beside it, and an arm's front is as near its back as the arm is thick.
+Distances run along the surface and straight through what is solid: a hand is far from the thigh
+beside it, and the front of an arm is as near its back as the arm is thick.
 """
 
 from __future__ import annotations
@@ -19,21 +19,24 @@ from bodyscan.progress import THREADS
 
 CELL_MM = 35.0  # a breath bends by a hundredth of a millimetre over half of it
 FEWEST_POINTS = 5
-NEAR_MM = 55.0  # cells that touch have their centres within this
+NEAR_MM = 55.0  # centres of neighbouring cells are within this
 GAP_MM = 15.0  # half of what lies between a hand and a thigh, where nothing was seen
-SOME = 4  # of the points tell where that is
+SOME = 4  # of the points show where that gap is
 SAME_SIDE = -0.2  # cosine between neighbours' normals: round a finger, not across a gap
-STRAIGHT = 0.85  # cosine of the way through a limb to the normals at both its ends
+STRAIGHT = 0.85  # cosine between the line through a limb and the normals at both ends
 THICKEST_MM = 300.0
 LANDMARK_MM = 110.0
 
 
 @dataclass(frozen=True, eq=False)
 class BodyCells:
-    """C cells, rig frame: centres (C, 3) mm, normals (C, 3), and which neighbours (C, C) are how far
-    apart, mm.
+    """C cells of a body's surface, rig frame.
 
-    landmarks: (L,) cells; away: (L, C) mm, from each landmark to all cells through the body.
+    centres: (C, 3) mm.
+    normals: (C, 3).
+    links: distances of neighbouring cells, (C, C) mm.
+    landmarks: a few cells, (L,).
+    away: distances through the body from each landmark to all cells, (L, C) mm.
     """
 
     centres: Array
@@ -44,7 +47,7 @@ class BodyCells:
 
     @staticmethod
     def of(points: Array, normals: Array) -> tuple[BodyCells, Indices]:
-        """The cells of points (N, 3) with normals (N, 3), and each one's cell (N,), -1 for none."""
+        """Cells of points (N, 3) with normals (N, 3), and each point's cell (N,), -1 for none."""
         centres, turned, cell = _gather(points, normals, CELL_MM, FEWEST_POINTS)
         links = _link(centres, turned, points[::SOME])
         landmarks = _one_each(centres, LANDMARK_MM)
@@ -52,39 +55,42 @@ class BodyCells:
         return BodyCells(centres, turned, links, landmarks, away), cell
 
     def distances(self, starts: Indices) -> Array:
-        """(N, C) mm, from cells (N,) to all others through the body."""
+        """Distances through the body from cells (N,) to all others, (N, C) mm."""
         return _distances(self.links, starts)
 
     def find_many(self, points: Array, normals: Array) -> Indices:
-        """The same for a million points, neighbours together."""
+        """The same as `find` for a million points, handled in groups of neighbours."""
         centres, turned, number = _gather(points, normals, 0.4 * CELL_MM, 1)
         return self.find(centres, turned)[number]
 
     def find(self, points: Array, normals: Array) -> Indices:
-        """(N,) the cell that each point (N, 3) with its normal (N, 3) lies in, or is nearest to."""
+        """The cell (N,) of each point (N, 3) with its normal (N, 3), or the nearest one."""
         tree = cKDTree(np.hstack([self.centres, CELL_MM * self.normals]))
         there = tree.query(np.hstack([points, CELL_MM * normals]), workers=THREADS)[1]
         return np.asarray(there, np.int64)
 
     def alike(self, length_mm: float, least: float) -> Array:
-        """(C, M) smooth functions over the cells whose products sum to how alike two cells move,
-        exp(-(distance / length)^2 / 2). Of those less than `least` of the first none is kept."""
+        """Smooth functions (C, M) over the cells whose products sum to the cells' correlation.
+
+        The correlation is exp(-(distance / length)^2 / 2). Functions with less than `least` of the
+        first one's variance are dropped.
+        """
         closeness = np.exp(-0.5 * (self.away / length_mm) ** 2)
         among = closeness[:, self.landmarks]
-        # Distances through a body are not those of a flat space: what is negative is rounded off.
+        # Distances through a body are not Euclidean: negative eigenvalues are dropped.
         values, vectors = np.linalg.eigh(0.5 * (among + among.T))
         kept = values > least * values[-1]
         return np.asarray(closeness.T @ (vectors[:, kept] / np.sqrt(values[kept])))
 
     def slopes(self, values: Array) -> Array:
-        """(C, 3, M) gradients along the surface, per mm, of values (C, M)."""
+        """Gradients (C, 3, M) along the surface, per mm, of values (C, M)."""
         near = self.links.tocoo()
         beside = near.data < NEAR_MM
         i, j = near.row[beside], near.col[beside]
         step = self.centres[j] - self.centres[i]
         squares = np.zeros((len(self.centres), 3, 3))
         np.add.at(squares, i, step[:, :, None] * step[:, None, :])
-        # Across the surface there are no neighbours to tell a slope: there is none.
+        # Across the surface no neighbours determine a slope: take it as zero.
         across = self.normals[:, :, None] * self.normals[:, None, :]
         held = squares + CELL_MM**2 * (4.0 * across + 0.01 * np.eye(3))
         share = np.linalg.solve(held[i], step[:, :, None])[..., 0]
@@ -97,9 +103,9 @@ class BodyCells:
 
 
 def rigid_fields(cells: BodyCells, centre: Array, arm_mm: float) -> Array:
-    """(C, 12, 6) displacement fields: turns by 1 / arm_mm about a centre, shifts by 1 mm.
+    """Displacement fields (C, 12, 6): turns by 1 / arm_mm about a centre, and shifts by 1 mm.
 
-    Of each cell the displacement (3,) of its centre, then how it changes along x, y and z.
+    For each cell the displacement (3,) of its centre, then its derivatives along x, y and z.
     """
     off = cells.centres - centre
     fields = np.zeros((len(off), 4, 3, 6))
@@ -111,7 +117,7 @@ def rigid_fields(cells: BodyCells, centre: Array, arm_mm: float) -> Array:
 
 
 def modulated(fields: Array, cells: BodyCells, functions: Array) -> Array:
-    """(C, 12, M F) fields (C, 12, F) times each of the functions (C, M)."""
+    """Fields (C, 12, F) times each of the functions (C, M), as (C, 12, M F)."""
     wide = fields.reshape(len(fields), 4, 3, 1, -1)
     out = wide * functions[:, None, None, :, None]
     out[:, 1:] += cells.slopes(functions)[:, :, None, :, None] * wide[:, :1]
@@ -119,13 +125,13 @@ def modulated(fields: Array, cells: BodyCells, functions: Array) -> Array:
 
 
 def normal_field(cells: BodyCells) -> Array:
-    """(C, 12, 1): outwards by 1 mm."""
+    """A field (C, 12, 1) of 1 mm outwards."""
     slopes = cells.slopes(cells.normals).reshape(-1, 9)
     return np.hstack([cells.normals, slopes])[:, :, None]
 
 
 def displaced(field: Array, off: Array) -> Array:
-    """(N, 3) mm: where fields (N, 12) carry points that lie `off` (N, 3) their cells' centres."""
+    """Displacements (N, 3) mm by fields (N, 12) of points `off` (N, 3) their cells' centres."""
     return field[:, :3] + np.einsum("nki,nk->ni", field[:, 3:].reshape(-1, 3, 3), off)
 
 
@@ -144,7 +150,7 @@ def _distances(links: sparse.csr_array, starts: Indices) -> Array:
 def _gather(
     points: Array, normals: Array, size_mm: float, fewest: int
 ) -> tuple[Array, Array, Indices]:
-    """Means of the points in each cube that face alike, if they are enough; each one's cube or -1."""
+    """Means of points in each cube that face alike, if enough; each point's cube or -1."""
     axis = np.argmax(np.abs(normals), axis=1)
     side = 2 * axis + (np.take_along_axis(normals, axis[:, None], axis=1)[:, 0] > 0)
     cube = np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64)
@@ -162,7 +168,7 @@ def _gather(
 
 
 def _one_each(centres: Array, size_mm: float) -> Indices:
-    """Of each cube of that size the cell nearest to its middle."""
+    """The cell nearest to the middle of each cube of that size."""
     place = (centres - centres.min(axis=0)) / size_mm
     cube = np.floor(place).astype(np.int64)
     key = np.ravel_multi_index(tuple(cube.T), tuple(cube.max(axis=0) + 1))
@@ -171,7 +177,7 @@ def _one_each(centres: Array, size_mm: float) -> Indices:
 
 
 def _link(centres: Array, normals: Array, points: Array) -> sparse.csr_array:
-    """Neighbours on the surface, opposite sides of what is solid, and bridges to what is left over."""
+    """Link neighbours on the surface and opposite sides of what is solid; bridge leftover parts."""
     beside = cKDTree(centres).query_pairs(NEAR_MM, output_type="ndarray")
     beside = beside[np.sum(normals[beside[:, 0]] * normals[beside[:, 1]], axis=1) > SAME_SIDE]
     between = 0.5 * (centres[beside[:, 0]] + centres[beside[:, 1]])
@@ -198,7 +204,7 @@ def _graph(centres: Array, ends: Indices) -> sparse.csr_array:
 
 
 def _through(centres: Array, normals: Array) -> Indices:
-    """(N, 2): each cell, and the nearest one that looks the other way straight behind it."""
+    """(N, 2): cells, and for each the nearest one straight behind it that faces the other way."""
     x, n = (values.astype(np.float32) for values in (centres - centres.mean(axis=0), normals))
     depth = np.sum(x * n, axis=1) - x @ n.T  # [j, i]: of j behind i
     square = np.sum(x**2, axis=1)

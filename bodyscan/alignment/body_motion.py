@@ -1,9 +1,9 @@
-"""How a person's surface moved between the pairs' moments, from all overlaps together.
+"""How a person's surface moved between the pairs' moments, solved from all overlaps together.
 
-Kinds of motion share what the overlaps ask for: the whole body leans above its ankles or goes any
-other way, head and arms turn about their joints or shift, any part shifts, the trunk breathes. Each is
-a Gaussian process over surface and time, as large as the evidence says; beside them stands what the
-boards left open of the pairs' poses.
+Several kinds of motion compete to explain the overlaps: the whole body leans above its ankles or
+moves in any other way, head and arms turn about their joints or shift, any part shifts, the trunk
+breathes. Each is a Gaussian process over surface and time, as large as the evidence says; with them
+is solved what the boards left open of the pairs' poses.
 """
 
 from __future__ import annotations
@@ -30,30 +30,32 @@ from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.progress import threaded
 
-LEAN_MM = 1000.0  # above the ankles a body's middle: a unit of lean carries it by 1 mm
-PART_MM = 250.0  # how far what moves as one reaches: a forearm, half a thigh, a shoulder
+LEAN_MM = 1000.0  # the middle of a body above the ankles: a unit of lean moves it by 1 mm
+PART_MM = 250.0  # extent of what moves as one: a forearm, half a thigh, a shoulder
 LEAST_PART = 0.02
-ARM_MM = 400.0  # at which a part's turn displaces as much as its shift
+ARM_MM = 400.0  # at this distance a part's turn displaces as much as its shift
 FIRST_MM, WHOLE_MM = 1.0, 2.0
 SIZINGS = 3
-"""Of each round: what the evidence does not ask for shrinks by steps."""
+"""Resizings in each round: what the evidence does not ask for shrinks step by step."""
 SMALLEST_MM = 1e-3
 PARTS_MM = 0.25
-"""By so much parts above the legs may have moved where nothing was seen of it, a sixth of a breath:
-evidence sizes the parts of the whole body at once, and legs that stood still say nothing of a hip."""
+"""mm by which parts above the legs may have moved unseen, a sixth of a breath: evidence sizes the
+parts of the whole body at once, and legs that stood still say nothing about a hip."""
 APART_MM = 0.07
-"""By so much two pairs' surfaces lie apart in a cell for no motion of the body: calibrations bend by
-0.05 mm each, which no number of matches averages out."""
+"""mm between the surfaces of two pairs in a cell that no motion of the body explains: calibrations
+are bent by 0.05 mm each, which no number of matches averages out."""
 
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """One kind of motion: displacement fields (C, 12, M), mm, each along J courses.
+    """One kind of motion: displacement fields, each along J courses.
 
-    size: standard deviation of their amplitudes before anything was seen; precision: (M J, M J), in
-    its place, where it is known; alike: (J, J) covariance of each field's, where courses are not.
-    twists: (6, M) about the rig's origin, if the body goes as a whole; but for its feet: bends
-    (C, 12, M) is what fields are beside twists, which a pair's placing does not see to.
+    fields: (C, 12, M) mm.
+    size: prior standard deviation of the amplitudes.
+    precision: prior inverse covariance (M J, M J), instead of `size` where it is known.
+    alike: prior covariance (J, J) of each field's amplitudes, where courses are not independent.
+    twists: (6, M) about the rig's origin, if the body moves as a whole, apart from its feet.
+    bends: fields less twists, (C, 12, M), which no pose of a pair accounts for.
     """
 
     name: str
@@ -67,14 +69,16 @@ class Kind:
 
     @staticmethod
     def whole(name: str, cells: BodyCells, twists: Array, courses: Courses) -> Kind:
-        """Of the whole body."""
+        """A motion of the whole body."""
         fields = rigid_fields(cells, np.zeros(3), 1.0) @ twists
         return Kind(name, fields, courses, WHOLE_MM, twists=twists)
 
     @staticmethod
     def lean(cells: BodyCells, courses: Courses) -> Kind:
-        """About the ankles, as an inverted pendulum (Winter 1995), and round: feet stay where they
-        stand. What sways otherwise as a whole is less, and no more than the evidence asks for."""
+        """A lean about the ankles, as an inverted pendulum (Winter 1995), and a turn; feet stay.
+
+        Other sway of the whole body is smaller, and no larger than the evidence asks for.
+        """
         about_ankles = adjoint(RigidTransform(np.eye(3), ankles(cells)))[:, :3] / LEAN_MM
         whole = Kind.whole("lean", cells, about_ankles, courses)
         fields = modulated(whole.fields, cells, above_feet(cells)[:, None])
@@ -86,7 +90,7 @@ class Kind:
 
     @property
     def moves(self) -> bool:
-        """Whether it is the person's, not the pairs'."""
+        """Whether the motion is the person's rather than an error of the pairs."""
         return self.precision is None
 
     @property
@@ -98,17 +102,20 @@ class Kind:
         return np.eye(self.count) / self.size**2
 
     def during(self, pair: int) -> Array:
-        """(J,) courses from the middle to a pair's moment; of the pairs' own errors at that moment."""
+        """Courses (J,) from the middle to a pair's moment; for pose errors, at that moment."""
         return self.courses.values[pair] - self.courses.middle
 
 
 @dataclass(frozen=True, eq=False)
 class BodyMotion:
-    """fields: (C, 12, M) of all kinds.  amplitudes: (n,) of their fields and courses.
+    """The amplitudes of all kinds of motion.
 
-    normal: (n, n), what was seen of them, without any prior, its lower triangle; pull: (n,) its
-    right-hand side.  factor: (n, n) Cholesky's, lower, of their covariance's inverse in units (n,).
-    breaths: (K, J, J) that there may be and (K,) how likely each is (see `moments.breaths`).
+    fields: of all kinds, (C, 12, M).
+    amplitudes: of the fields along their courses, (n,).
+    normal: lower triangle of the information on them without any prior, (n, n).
+    pull: its right-hand side, (n,).
+    factor: lower Cholesky factor (n, n) of their inverse covariance in units (n,).
+    breaths: possible breaths (K, J, J) and their prior probabilities (K,), see `moments.breaths`.
     """
 
     kinds: tuple[Kind, ...]
@@ -124,8 +131,13 @@ class BodyMotion:
     def start(
         cells: BodyCells, seconds: Sequence[float | None], boards: Array, sway: Array
     ) -> BodyMotion:
-        """Nothing moved yet. boards: (6P, 6P) covariance of the pairs' poses; sway: (6,) standard
-        deviations of a usual turn (radians) and shift (mm) about the body's centre."""
+        """The state before anything has moved.
+
+        seconds: each pair's moment, None if not known.
+        boards: covariance (6P, 6P) of the pairs' poses.
+        sway: standard deviations (6,) of a usual turn (radians) and shift (mm) about the body's
+            centre.
+        """
         stance, pairs = Courses.of(of_stance, seconds), len(seconds)
         by_freedom = np.arange(6 * pairs).reshape(pairs, 6).T.ravel()
         known = invert_scaled(boards)[np.ix_(by_freedom, by_freedom)]
@@ -152,19 +164,19 @@ class BodyMotion:
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
-        """Where each kind's amplitudes stand."""
+        """Where each kind's amplitudes are."""
         ends = np.cumsum([0, *(kind.count for kind in self.kinds)]).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
     @cached_property
     def covariance(self) -> Array:
-        """(n, n) of the amplitudes."""
+        """Covariance of the amplitudes, (n, n)."""
         lower = np.tril(dpotri(self.factor, lower=True)[0])
         return (lower + np.tril(lower, -1).T) * self.units[:, None] * self.units
 
     @property
     def variances(self) -> Array:
-        """(n,) of the amplitudes: all that a round needs of the covariance, at half its price."""
+        """Variances of the amplitudes, (n,): all a round needs, at half the covariance's cost."""
         root = dtrtri(self.factor, lower=True)[0]
         return np.asarray(np.einsum("ij,ij->j", root, root) * self.units**2, np.float64)
 
@@ -172,7 +184,7 @@ class BodyMotion:
         return next(kind for kind in self.kinds if kind.name == name)
 
     def twist(self, pair: int, *, from_middle: bool = False) -> Array:
-        """(6,) a pair's own error and what moved the person as a whole, about the rig's origin."""
+        """A pair's own error and the motion of the whole person, (6,), about the rig's origin."""
         total = np.zeros(6)
         for kind in self.kinds:
             if kind.twists is not None:
@@ -181,16 +193,16 @@ class BodyMotion:
         return total
 
     def of(self, name: str, course: Array) -> Array:
-        """(M, ...) amplitudes of one kind's fields along courses (J, ...)."""
+        """Amplitudes (M, ...) of one kind's fields along courses (J, ...)."""
         k = self.kinds.index(self.kind(name))
         return np.asarray(self.amplitudes[self.slices[k]].reshape(-1, len(course)) @ course)
 
     def displacements(self, names: Sequence[str], *, from_middle: bool = False) -> Array:
-        """(P, C, 12) mm: what those kinds come to at each pair's moment."""
+        """Displacements (P, C, 12) mm by those kinds at each pair's moment."""
         return self._sum({k.name: k.fields for k in self.kinds if k.name in names}, from_middle)
 
     def bends(self, *, from_middle: bool = False) -> Array:
-        """(P, C, 12) mm: likewise of all kinds, beside `twist`."""
+        """Displacements (P, C, 12) mm by all kinds, apart from `twist`."""
         beside = {k.name: k.fields if k.twists is None else k.bends for k in self.kinds}
         return self._sum({n: f for n, f in beside.items() if f is not None}, from_middle)
 
@@ -207,8 +219,13 @@ class BodyMotion:
         evidence: Mapping[tuple[int, int], CellEvidence],
         speeds: Mapping[int, CellSpeeds] | None = None,
     ) -> BodyMotion:
-        """One step of all amplitudes, each kind as large as the evidence says; every round matches
-        anew. evidence: by pairs (a, b).  speeds: by pair, as its own stripes tell them."""
+        """One step of all amplitudes, with each kind as large as the evidence says.
+
+        Every round searches matches again.
+
+        evidence: by pairs (a, b).
+        speeds: by pair, from its own stripes.
+        """
         names, speeds = [kind.name for kind in self.kinds], speeds or {}
         now = self.displacements(names)
 
@@ -245,7 +262,7 @@ class BodyMotion:
         return motion
 
     def doubted(self) -> Array:
-        """(n, n) covariance of the amplitudes, had parts moved as people's do."""
+        """Covariance (n, n) of the amplitudes if parts had moved as people's do."""
         kinds = (
             replace(kind, size=max(kind.size, PARTS_MM)) if kind.name == "parts" else kind
             for kind in self.kinds
@@ -253,10 +270,13 @@ class BodyMotion:
         return replace(self, kinds=tuple(kinds))._settled().covariance
 
     def asked_of_poses(self) -> tuple[Array, Array]:
-        """(6P, 6P) and (6P,): normal equations of motions (6,), pair after pair, by which poses are off
-        beside what boards left open and whatever the person may have done meanwhile."""
+        """Normal equations (6P, 6P), (6P,) of pose errors, a motion (6,) for each pair.
+
+        The errors are those beyond what the boards left open, whatever the person may have done.
+        """
         pose = self.slices[0]
-        # The first kind: its columns of the lower triangle are whole but for its own block.
+        # Poses come first: their columns of the lower triangle are complete except for their own
+        # block.
         seen = self.normal[:, pose].copy()
         seen[pose] = np.tril(seen[pose]) + np.tril(seen[pose], -1).T
         information = seen[pose] - seen.T @ self.covariance @ seen
@@ -265,16 +285,17 @@ class BodyMotion:
         return information[np.ix_(by_pair, by_pair)], pull[by_pair]
 
     def _asked(self, seen: CellEvidence, apart: Array) -> tuple[Array, Array]:
-        """What an overlap asks of the fields, (M, M) and (M,); apart: (C, 12) of its two pairs now."""
+        """What an overlap asks of the fields, (M, M), (M,); apart: (C, 12) of its pairs now."""
         fields = self.fields[seen.cells]
         basis = fields.reshape(-1, fields.shape[2])
         wanted = np.einsum("cij,cj->ci", seen.information, apart[seen.cells]) - seen.gradient
         return basis.T @ (seen.information @ fields).reshape(basis.shape), basis.T @ wanted.ravel()
 
     def _settled(self) -> BodyMotion:
-        """With the solution of the normal equations and the prior.
+        """The motion that solves the normal equations with the prior.
 
-        They grow with the pairs: their matrix lies as LAPACK wants it, which works in its place.
+        These grow with the number of pairs: the matrix is laid out for LAPACK, which works in
+            place.
         """
         normal = self.normal.copy(order="F")
         for kind, own in zip(self.kinds, self.slices, strict=True):
@@ -289,8 +310,11 @@ class BodyMotion:
         return replace(self, amplitudes=amplitudes, factor=factor, units=units)
 
     def _in_breath(self) -> BodyMotion:
-        """Breathing as the evidence says, whatever else moved. Limbs' motion would explain most of a
-        breath too, but none of it comes and goes as that does, on the whole trunk at once."""
+        """Estimate the breath from the evidence, whatever else moved.
+
+        Motions of limbs could explain most of a breath too, but none of them comes and goes like a
+        breath on the whole trunk at once.
+        """
         breath = self.kind("breath")
         own = self.slices[self.kinds.index(breath)]
         known = np.linalg.inv(self.covariance[own, own])
@@ -300,7 +324,7 @@ class BodyMotion:
         return replace(self, kinds=tuple(kinds))
 
     def _resized(self) -> BodyMotion:
-        """Each kind as large as the evidence says (MacKay 1992): what it does not ask for shrinks."""
+        """Make each kind as large as the evidence says (MacKay 1992); unneeded ones shrink."""
         kinds, variances = [], self.variances
         for kind, some in zip(self.kinds, self.slices, strict=True):
             if kind.precision is None and kind.alike is None:
@@ -325,8 +349,12 @@ def _along(kind: Kind, cells: Indices, normals: Array, course: Array) -> Array:
 
 
 def outward_errors(motion: BodyMotion, name: str, course: Array, normals: Array) -> Array:
-    """(C, n): how much of what one kind comes to along normals (C, 3), with courses (J,), is not known,
-    as n independent errors of standard deviation 1."""
+    """Uncertainty of one kind's displacement along normals (C, 3), as independent errors.
+
+    course: (J,).
+
+    Returns (C, n): the effects of n errors of standard deviation 1.
+    """
     kind = motion.kind(name)
     own = motion.slices[motion.kinds.index(kind)]
     rows = _along(kind, np.arange(len(normals)), normals, course)
@@ -335,6 +363,8 @@ def outward_errors(motion: BodyMotion, name: str, course: Array, normals: Array)
 
 
 def observed(motion: BodyMotion, pair: int, cells: Indices, normals: Array) -> Array:
-    """(c, n): how each amplitude displaces cells along their normals (c, 3) as a pair saw them,
-    against the middle."""
+    """(c, n): displacement by each amplitude of cells along normals (c, 3), as a pair saw them.
+
+    Relative to the middle of the scan.
+    """
     return np.hstack([_along(kind, cells, normals, kind.during(pair)) for kind in motion.kinds])

@@ -1,4 +1,4 @@
-"""What a followed person did, part by part, as an operator would say it."""
+"""What a followed person did, part by part, in an operator's words."""
 
 from __future__ import annotations
 
@@ -11,18 +11,21 @@ from bodyscan.alignment.following import Followed
 from bodyscan.alignment.part_names import PARTS, name_parts
 
 MOST = 95.0
-ONE_WAY = 0.6  # of a breath's displacements goes outwards together
+ONE_WAY = 0.6  # this share of a breath's displacements goes outwards together
 SURE_SIGMAS = 4.0
 SHOWS = 0.5  # of a breath
 NEEDED_MM = 0.3
-"""Left of a part's motion: 2 mm of a girth. Who needs the part better is told to scan again."""
+"""Error left after correction: 2 mm of a girth. Who needs the part better is told to rescan."""
 
 
 @dataclass(frozen=True)
 class PartMotion:
-    """moved_mm: how far most of a part was carried at most, against where it was in the middle of the
-    scan.  left_mm: standard deviation of what is left of that, along the surface's normals.
-    seen_once: share of it that a single pair saw, so that no other could tell how it had moved."""
+    """How one part of a person moved.
+
+    moved_mm: largest displacement of most of the part from its place in the middle of the scan.
+    left_mm: standard deviation of what is left of it, along the surface's normals.
+    seen_once: share of the part that a single pair saw, so that no other could show how it moved.
+    """
 
     name: str
     moved_mm: float
@@ -36,9 +39,14 @@ class PartMotion:
 
 @dataclass(frozen=True)
 class PersonMotion:
-    """How each part moved that was seen, from the trunk outwards; breathed_mm: see `tell_breath`.
-    moment_ms: since the scan began, as of which all is; None (the mean of all) without times.
-    fuller_mm, fuller_sigma_mm: see `tell_fullness`."""
+    """How a person moved.
+
+    parts: the parts that were seen, from the trunk outwards.
+    breathed_mm: see `tell_breath`.
+    moment_ms: the moment everything is carried to, since the scan began; None (the mean of all)
+        without times.
+    fuller_mm, fuller_sigma_mm: see `tell_fullness`.
+    """
 
     parts: tuple[PartMotion, ...]
     breathed_mm: float | None
@@ -57,7 +65,7 @@ class PersonMotion:
 
     @property
     def summary(self) -> str:
-        """What it comes to for the operator; empty where no part was seen."""
+        """The motion in one line for the operator; empty if no part was seen."""
         if not self.parts:
             return ""
         left = np.sqrt(np.mean([part.left_mm**2 for part in self.parts]))
@@ -73,12 +81,12 @@ class PersonMotion:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """For the operator, after the summary."""
+        """Details for the operator, after the summary."""
         return (*(part.words for part in self.parts), *self.beside_parts)
 
     @property
     def beside_parts(self) -> tuple[str, ...]:
-        """Of what the parts have in common: the breath."""
+        """What the parts have in common: the breath."""
         breath = (
             "breath could not be told from other motion"
             if self.breathed_mm is None
@@ -98,7 +106,7 @@ class PersonMotion:
 
 
 def tell_parts(followed: Followed) -> tuple[PartMotion, ...]:
-    """Of the parts that were seen, from the trunk outwards."""
+    """Motions of the parts that were seen, from the trunk outwards."""
     part = name_parts(followed.cells)
     found = []
     for number, name in enumerate(PARTS):
@@ -119,8 +127,10 @@ def tell_parts(followed: Followed) -> tuple[PartMotion, ...]:
 
 
 def tell_breath(followed: Followed) -> float | None:
-    """mm, between the fullest and the emptiest trunk that a pair saw, where it rose most; None if
-    what bent most did not rise all over, or no more than is uncertain."""
+    """Rise of the trunk, mm, from the emptiest to the fullest that a pair saw, where it rose most.
+
+    None if what bent most did not rise all over, or by no more than its uncertainty.
+    """
     here = name_parts(followed.cells) == PARTS.index("trunk")
     if not here.any():
         return None
@@ -137,12 +147,14 @@ def tell_breath(followed: Followed) -> float | None:
 
 
 def tell_fullness(followed: Followed) -> tuple[float, float] | None:
-    """How far the front of the trunk stood before its place at mean breath, mm, in the mean, and the
-    standard deviation of that; None without moments or without a trunk."""
+    """Mean offset of the trunk's front before its place at mean breath, mm, and its sigma.
+
+    None without moments, or without a trunk.
+    """
     breathes = breathing(followed.cells) > SHOWS
     if followed.breath is None or not breathes.any():
         return None
     normals = followed.cells.normals[breathes]
     way = np.sum(followed.breath.field[breathes, :3] * normals, axis=1)
-    # What is not known is the course of the breath, which all of it has in common.
+    # What is uncertain is the course of the breath, which is common to all of the front.
     return -float(np.mean(way)), float(np.sqrt(np.mean(followed.breath.sigma_mm[breathes] ** 2)))

@@ -1,4 +1,4 @@
-"""Where a person's breath shows: on the trunk, in front more than behind."""
+"""Where a person's breath shows: on the trunk, more in front than behind."""
 
 from __future__ import annotations
 
@@ -9,27 +9,29 @@ from bodyscan.alignment.part_names import PARTS, leftward, name_parts
 from bodyscan.arrays import Array
 from bodyscan.progress import threaded
 
-LENGTH_MM = 110.0  # over which a trunk rises alike: a chest, a belly, a side
+LENGTH_MM = 110.0  # length over which a trunk rises alike: a chest, a belly, a side
 LEAST = 0.04
 PLACE = 0.35
-"""Of how far the front of a trunk rises as one, how much more or less any place of it does."""
+"""Variation of the rise from place to place, relative to the rise of the trunk's front as one."""
 SIZES_MM = np.array([0.02, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8])
-"""Standard deviations over time of where it rises most; a chest or belly rises by 2 to 8 mm at rest,
-1.4 of 4."""
-# Shares of the stature: breath begins to show above the hips, and no more above the collarbones.
+"""Standard deviations over time of the largest rise: a chest or belly rises by 2 to 8 mm at rest,
+and 4 mm are a standard deviation of 1.4."""
+# Shares of the stature: breath begins above the hips and ends above the collarbones.
 HIPS, WAIST, COLLAR, NECK = 0.47, 0.54, 0.79, 0.86
 EVIDENCE = 0.3
-"""By so much what was seen of all cells tells one breath from another: neighbouring cells err alike, by
-how calibrations bend, so that three count as one."""
+"""Weight of the cells' evidence for one breath against another: neighbouring cells share errors
+from bent calibrations, so that three count as one."""
 SMALL = 0.005
-"""Of a breath's variance: what is less than that tells no breath from another, and costs most."""
+"""Share of a breath's variance: with less, directions cannot tell breaths apart, and cost most."""
 BEHIND = 0.25
-"""Of the front: ribs rise to the sides too, less than half as far, and a back leans on nothing."""
+"""Relative to the front: ribs rise to the sides too, less than half as far, and a back is free."""
 
 
 def breath_fields(cells: BodyCells) -> Array:
-    """(C, 12, M) displacement fields outwards, of the trunk as one and of its places, smooth over it,
-    nothing elsewhere."""
+    """Displacement fields (C, 12, M) outwards: of the trunk as one, and of its places.
+
+    They are smooth over the trunk and zero elsewhere.
+    """
     as_one = breathing(cells)[:, None]
     functions = PLACE * cells.alike(LENGTH_MM, LEAST) * as_one
     shown = np.sum(functions**2, axis=0)
@@ -38,11 +40,14 @@ def breath_fields(cells: BodyCells) -> Array:
 
 
 def likely_breath(information: Array, pull: Array, breaths: Array, likely: Array) -> Array:
-    """(J, J) covariance of courses' amplitudes: the mean of all breaths (K, J, J) in all sizes, each as
-    likely (K,) as it was before, times how well it explains what was seen.
+    """Covariance (J, J) of a breath's amplitudes: the mean over all breaths in all sizes.
 
-    information (M J, M J), pull (M J,): normal equations of M fields along J courses, whatever else
-    moved.
+    Each counts by its prior probability times how well it explains what was seen.
+
+    information, pull: normal equations (M J, M J), (M J,) of M fields along J courses, whatever
+        else moved.
+    breaths: covariances (K, J, J).
+    likely: their prior probabilities (K,).
     """
     courses = breaths.shape[1]
     sizes, ways = np.linalg.eigh(breaths)
@@ -52,7 +57,7 @@ def likely_breath(information: Array, pull: Array, breaths: Array, likely: Array
     count = len(pull) // courses
 
     def gain(root: Array) -> Array:
-        """(S,) of one breath in all sizes: the logarithm of how well it explains what was seen."""
+        """Log evidence (S,) of one breath in all sizes."""
         seen = np.einsum("ai,manb,bj->minj", root, blocks, root, optimize=True)
         sizes, ways = np.linalg.eigh(seen.reshape(2 * (count * root.shape[1],)))
         along = (pull.reshape(-1, courses) @ root).ravel() @ ways
@@ -66,7 +71,7 @@ def likely_breath(information: Array, pull: Array, breaths: Array, likely: Array
 
 
 def breathing(cells: BodyCells) -> Array:
-    """(C,) how far breath may lift each cell, against the front of the trunk."""
+    """How far breath may lift each cell, relative to the front of the trunk, (C,)."""
     height = cells.centres[:, 2] / cells.centres[:, 2].max()
     left = leftward(cells)
     forward = cells.normals[:, :2] @ np.array([left[1], -left[0]])
@@ -76,6 +81,6 @@ def breathing(cells: BodyCells) -> Array:
 
 
 def _rising(values: Array, low: float, high: float) -> Array:
-    """0 below, 1 above, smooth between."""
+    """0 below `low`, 1 above `high`, smooth between."""
     t = np.clip((values - low) / (high - low), 0.0, 1.0)
     return np.asarray(t * t * (3.0 - 2.0 * t))

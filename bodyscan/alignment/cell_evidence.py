@@ -1,4 +1,4 @@
-"""What the overlap of two pairs asks of the body's cells: normal equations of an affine motion each."""
+"""What the overlap of two pairs asks of the body's cells: normal equations of affine motions."""
 
 from __future__ import annotations
 
@@ -16,9 +16,15 @@ from bodyscan.geometry.robust import spread
 
 @dataclass(frozen=True, eq=False)
 class CellEvidence:
-    """cells: (c,) in which two pairs overlap.  information (c, 12, 12) = J^T W J and gradient
-    (c, 12) = J^T W d, d the distances from the second's surface to the first's and J their Jacobian
-    by the first's displacement field in a cell (see `rigid_fields`)."""
+    """Normal equations of an overlap, cell by cell.
+
+    With d the distances from the second pair's surface to the first's, and J their Jacobian by the
+    first's displacement field in a cell (see `rigid_fields`).
+
+    cells: those in which the pairs overlap, (c,).
+    information: J^T W J, (c, 12, 12).
+    gradient: J^T W d, (c, 12).
+    """
 
     cells: Indices
     information: Array
@@ -26,7 +32,7 @@ class CellEvidence:
 
     @staticmethod
     def of(matches: Matches, cell: Indices, centres: Array, correlated: float) -> CellEvidence:
-        """cell: (M,) of each match.  Weights as in `OverlapEquations`."""
+        """Gather matches by cell; cell: (M,) of each match. Weights as in `OverlapEquations`."""
         seen = np.bincount(cell, minlength=len(centres)) > 0
         cells, number = np.flatnonzero(seen), (np.cumsum(seen) - 1)[cell]
         information = np.zeros((len(cells), 12, 12))
@@ -48,7 +54,7 @@ class CellEvidence:
         return CellEvidence(self.cells, self.information, -self.gradient)
 
     def doubted(self, misfit_mm: float) -> CellEvidence:
-        """Believed less, as no motion of the body explains more of a cell than up to this."""
+        """The same with less weight, for a misfit per cell that no motion of the body explains."""
         share = 1.0 / (1.0 + misfit_mm**2 * self._weight)
         return CellEvidence(
             self.cells, self.information * share[:, None, None], self.gradient * share[:, None]
@@ -56,7 +62,7 @@ class CellEvidence:
 
     @property
     def _weight(self) -> Array:
-        """(c,) 1/variance of a shift along the surface's normals."""
+        """Inverse variance of a shift along the surface's normals, (c,)."""
         return np.asarray(np.trace(self.information[:, :3, :3], axis1=1, axis2=2))
 
     @staticmethod
@@ -80,9 +86,9 @@ def _accumulate(
     spread_mm: float,
     equations: tuple[Array, Array],
 ) -> None:
-    """Adds M distances to their cells' lower triangles and gradients.
+    """Add M distances to the lower triangles and gradients of their cells.
 
-    places: of each, how far it lies from its cell's centre (M, 3), and its normal (M, 3).
+    places: offsets (M, 3) from the cell's centre, and normals (M, 3).
     """
     off, normals = places
     information, gradient = equations

@@ -1,4 +1,4 @@
-"""How fast the body's cells moved while one pair saw them, as that pair's own stripes tell it."""
+"""How fast the body's cells moved while one pair saw them, from that pair's own stripes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from bodyscan.geometry.velocity import SurfaceSpeeds
 
 @dataclass(frozen=True, eq=False)
 class CellSpeeds:
-    """Normal equations of the speeds (mm/s, rig frame) with which cells are carried back: against
-    the body's own.
+    """Normal equations of the speeds (mm/s, rig frame) that carry cells back, against their motion.
 
-    cells: (c,).  information (c, 3, 3), gradient (c, 3).  shared: (K, c, 3), information that errors
-    which all cells share, of standard deviation 1, have in common with them; beside: (K, K) and (K,)
-    that and what was seen of these errors.
+    cells: (c,).
+    information: (c, 3, 3).
+    gradient: (c, 3).
+    shared: information (K, c, 3) that cells have in common with K errors shared by all of them,
+        each of standard deviation 1.
+    beside: information (K, K) and gradient (K,) of these errors.
     """
 
     cells: Indices
@@ -30,7 +32,7 @@ class CellSpeeds:
 
     @staticmethod
     def of(told: SurfaceSpeeds, rig_from_camera: RigidTransform, cells: BodyCells) -> CellSpeeds:
-        """What a pair tells, each place in the cell that it lies in."""
+        """The speeds that a pair measured, each assigned to the cell it lies in."""
         points, facing = rig_from_camera.apply(told.points), rig_from_camera.rotate(told.facing)
         normals = -facing / np.linalg.norm(facing, axis=1, keepdims=True)
         cell = cells.find(points, normals)
@@ -39,7 +41,7 @@ class CellSpeeds:
         weight, facing, speed = told.sigma[near] ** -2.0, facing[near], -told.speed[near]
 
         def total(values: Array) -> Array:
-            """(c, ...) of values (n, ...)."""
+            """Sums (c, ...) of values (n, ...)."""
             flat = values.reshape(len(values), -1).T
             sums = [np.bincount(number, column, len(own)).astype(float) for column in flat]
             return np.asarray(np.stack(sums, axis=-1).reshape(len(own), *values.shape[1:]))
@@ -54,7 +56,7 @@ class CellSpeeds:
         )
 
     def asked(self, fields: Array) -> tuple[Array, Array]:
-        """(M, M) and (M,): normal equations of the rates at which fields (C, 12, M) grow."""
+        """Normal equations (M, M), (M,) of the rates at which fields (C, 12, M) grow."""
         own = fields[self.cells, :3]
         basis = own.reshape(-1, own.shape[2])
         shared = self.shared.reshape(len(self.shared), basis.shape[0]) @ basis

@@ -1,8 +1,8 @@
-"""One body out of many moments: a person followed while pair after pair sees them.
+"""Follow a person while pair after pair sees them: one body from many moments.
 
-Alignment places each pair by one rigid motion. Who breathes, or moves an arm, needs more: each pair's
-surface is carried, cell by cell of the body, to where it was in the middle of the scan. Only a
-person whose overlaps ask for it is; a mannequin is left as alignment has it.
+Alignment places each pair by one rigid motion. A person who breathes or moves an arm needs more:
+each pair's surface is carried, cell by cell of the body, to where it was in the middle of the scan.
+This is done only for people whose overlaps ask for it; a mannequin stays as aligned.
 """
 
 from __future__ import annotations
@@ -40,30 +40,34 @@ BENDING = (*LIMBS, *SHIFTS, "parts", "breath")
 MOVING = (*SWAYING, *BENDING)
 BLEND_MM = 60.0
 ROUNDS = 3  # the last with all points
-RING_MM = 20.0  # heights of one girth: less than a cell's
+RING_MM = 20.0  # band of heights in one girth: less than a cell's size
 STILL_MM = 0.1
-"""RMS of what no rigid motion explains; less does no harm, and calibrations bend by half of it."""
+"""RMS of motion beyond rigid ones; less does no harm, and calibrations bend by half of it."""
 
 UNSEEN = 0.7
-"""Of how far breath carried a place since a pair saw it: so much is not known long after. A pole's
-pairs tell place, speed and how that changes, so that soon after next to nothing is missing; a second
-later a quarter is (people cast by rays: 0.1 to 0.45 of a belly that nobody saw at its fullest)."""
+"""Share of a place's motion by breath since a pair saw it that is unknown long after. A pole's
+pairs show place, speed and its change, so soon after next to nothing is missing; a second later a
+quarter is (people simulated by ray casting: 0.1 to 0.45 of a belly that nobody saw at its
+fullest)."""
 
 NEARER = 0.95
-"""Overlaps that bending brings no nearer than this are apart by the pairs' own calibrations, which bend
-with the place and not with time."""
+"""If bending does not bring overlaps closer than this share, they are apart because of the pairs'
+own calibrations, which bend with place and not with time."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeanBreath:
-    """From the middle of the scan to mean breath: displacements (C, 12) as in `Followed.bends`, and the
-    standard deviation (C,) mm along the normals of what a girth there is not known by."""
+    """Motion from the middle of the scan to mean breath.
+
+    field: displacements (C, 12) as in `Followed.bends`.
+    sigma_mm: standard deviation (C,) along the normals, as it affects a girth there.
+    """
 
     field: Array
     sigma_mm: Array
 
     def along(self, cells: BodyCells, points: Array, normals: Array) -> tuple[Array, Array]:
-        """(N,) mm each, outwards, of points (N, 3) with normals (N, 3): way and sigma."""
+        """Displacement and sigma, outwards, (N,) mm each, of points (N, 3) with normals (N, 3)."""
         cell = cells.find_many(points, normals)
         way = displaced(self.field[cell], points - cells.centres[cell])
         return np.sum(way * normals, axis=1), self.sigma_mm[cell]
@@ -73,12 +77,13 @@ class MeanBreath:
 class Followed:
     """A person's motion, in cells of the body (see `BodyCells`).
 
-    bends: by pair, (C, 12) displacement fields from where the pair's placing has the surface to
-    where it was in the middle of the scan.  moved: (P, C, 3) mm, by pair, all that the
-    person moved between its moment and the middle.
-    seen: (P, C) which pairs saw which cells.  sigma_mm: (C,), of a cell's surface along its normal,
-    from what is not known of the motion and of the pairs' poses.
-    moment_ms: the middle of the scan; None (it is the mean of all) if no pair's moment is known.
+    bends: by pair, displacement fields (C, 12) from where the pair's pose puts the surface to where
+        it was in the middle of the scan.
+    moved: by pair, everything the person moved between its moment and the middle, (P, C, 3) mm.
+    seen: which pairs saw which cells, (P, C).
+    sigma_mm: sigma of a cell's surface along its normal, from the uncertainty of the motion and of
+        the pairs' poses, (C,).
+    moment_ms: the middle of the scan; None (the mean of all) if no pair's moment is known.
     breath: None without moments.
     """
 
@@ -93,7 +98,7 @@ class Followed:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """What one pair adds: points that take part, and each one's cell."""
+    """The points of one pair that take part, and the cell of each."""
 
     start: RigidTransform
     seen: OverlapPoints
@@ -109,7 +114,7 @@ class _View:
         return self.seen.inner
 
     def among(self, cell: Indices) -> _View:
-        """With the cell of each point; without the points that lie in none."""
+        """The view with each point's cell, without points that lie in none."""
         return replace(self, cell=cell).some(cell >= 0)
 
     def some(self, chosen: Mask | slice) -> _View:
@@ -125,11 +130,15 @@ def follow(
     *,
     workers: int = THREADS,
 ) -> tuple[Alignment, Followed | None, PlaceEvidence | None]:
-    """The alignment with a moving person's sway along time, and what else moved; None, and the
-    alignment as it was, for who stood still or if too little overlaps to tell. Then what all that says
-    of the pairs' places; None where a pair's moment is not known, to which any sway would be one.
+    """Follow a moving person.
 
-    images, rig_from_camera, prior, settings: what `align` got; aligned: what it made of them.
+    images, rig_from_camera, prior, settings: as given to `align`.
+    aligned: its result.
+
+    Returns the alignment with sway that follows time; the rest of the motion, None with the
+    alignment unchanged for a person who stood still or if too little overlaps; and what all this
+    says about the pairs' places, None if a pair's moment is unknown, since any sway would explain
+    those.
     """
     if not aligned.overlaps or not settings.sway_mm or aligned.refused:
         return aligned, None, None
@@ -198,13 +207,13 @@ def _places(
 
 
 def _middle_ms(images: Sequence[RangeImage]) -> float | None:
-    """As `Courses` has it."""
+    """The middle of the scan as in `Courses`, ms."""
     known = [image.time_ms for image in images if image.time_ms is not None]
     return 0.5 * (min(known) + max(known)) if known else None
 
 
 def _mean_breath(motion: BodyMotion, cells: BodyCells) -> MeanBreath:
-    """A motion's courses are about their mean: there a breath is half way."""
+    """Mean breath: the courses have mean zero, where a breath is half way."""
     middle = motion.kind("breath").courses.middle
     field = motion.kind("breath").fields @ motion.of("breath", middle)
     errors = outward_errors(motion, "breath", middle, cells.normals)
@@ -212,8 +221,10 @@ def _mean_breath(motion: BodyMotion, cells: BodyCells) -> MeanBreath:
 
 
 def sigmas_around(errors: Array, height: Array) -> Array:
-    """(C,) mm, standard deviations of errors (C, n), no more of each than what cells at the same height
-    (C,) have in common: the rest does not change a girth."""
+    """Standard deviations (C,) mm of errors (C, n), counting only what cells at one height share.
+
+    The rest does not change a girth. height: (C,) mm.
+    """
     near = np.exp(-0.5 * ((height[:, None] - height) / RING_MM) ** 2)
     own = np.linalg.norm(errors, axis=1)
     return own * np.linalg.norm(near @ errors, axis=1) / np.maximum(near @ own, 1e-12)
@@ -227,13 +238,13 @@ def _each_overlap(
     reach_mm: float,
     settings: AlignmentSettings,
 ) -> dict[tuple[int, int], Result]:
-    """What the matches of every two pairs, and their cells, say, the person as followed so far."""
+    """Measure the matches of every two pairs with the person as followed so far."""
     motion, cells = person
     placed = [view.start.moved(motion.twist(k)) for k, view in enumerate(views)]
     bends = motion.bends()
 
     def of_two(i: int, j: int) -> Result | None:
-        """The source carried to where it was when the target was seen."""
+        """Carry the source to where it was when the target was seen, and measure."""
         view = views[i]
         points, away = placed[i].apply(view.points.points), bends[i] - bends[j]
         points += displaced(away[view.cell], points - cells.centres[view.cell])
@@ -246,7 +257,7 @@ def _each_overlap(
 
 
 def _both_ways(said: Mapping[tuple[int, int], CellEvidence]) -> dict[tuple[int, int], CellEvidence]:
-    """What one way gets wrong on curves cancels."""
+    """Combine both directions of each overlap: errors of one direction on curves cancel."""
     gathered: dict[tuple[int, int], list[CellEvidence]] = {}
     for (i, j), evidence in said.items():
         one = evidence if i < j else evidence.turned()
@@ -255,7 +266,7 @@ def _both_ways(said: Mapping[tuple[int, int], CellEvidence]) -> dict[tuple[int, 
 
 
 def _is_unbent(motion: BodyMotion, seen: Mask) -> bool:
-    """Whether nothing moved that a rigid placing of each pair does not see to as well."""
+    """Whether nothing moved that rigid poses of the pairs do not account for as well."""
     return _far(motion, BENDING, seen) < STILL_MM
 
 
@@ -264,7 +275,7 @@ def _is_unswayed(motion: BodyMotion, seen: Mask, settings: AlignmentSettings) ->
 
 
 def _far(motion: BodyMotion, names: Sequence[str], seen: Mask) -> float:
-    """mm RMS."""
+    """RMS displacement by those kinds, mm."""
     moved = motion.displacements(names, from_middle=True)[seen][:, :3]
     return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
 
@@ -300,8 +311,10 @@ def _placed(
 
 
 def cell_sigmas(motion: BodyMotion, cells: BodyCells, seen: Mask) -> Array:
-    """(C,) mm along the normals, of what is not known of the shape: a motion of the whole does not
-    count.  Looked at in the landmarks, from which it changes slowly."""
+    """Sigma (C,) mm along the normals of the shape, not counting motions of the whole.
+
+    Computed at the landmarks, between which it changes slowly.
+    """
     pair, mark = np.nonzero(seen[:, cells.landmarks])
     there = cells.landmarks[mark]
     rows = np.concatenate(
@@ -313,7 +326,7 @@ def cell_sigmas(motion: BodyMotion, cells: BodyCells, seen: Mask) -> Array:
     off, normals = cells.centres[there] - BODY_CENTRE, cells.normals[there]
     whole = np.linalg.qr(np.hstack([np.cross(off, normals), normals]))[0]
     rows -= whole @ (whole.T @ rows)
-    # Legs stand on the floor: what overlaps do not ask for, they did not do.
+    # Legs stand on the floor: what overlaps do not ask of them, they did not do.
     stands = np.isin(name_parts(cells)[there], [PARTS.index(leg) for leg in LEGS])
     variance = np.sum((rows @ motion.covariance) * rows, axis=1)
     others = rows[~stands]
@@ -329,8 +342,10 @@ def cell_sigmas(motion: BodyMotion, cells: BodyCells, seen: Mask) -> Array:
 
 
 def _breath_unseen(motion: BodyMotion, cells: BodyCells, seen: Mask) -> Array:
-    """(C,) mm along the normals: how far breath carried each cell to the middle from when it was seen,
-    by how little that moment tells of the middle; of several moments the one that tells most."""
+    """How far breath carried each cell to the middle since it was seen, (C,) mm along normals.
+
+    Weighted by how little that moment tells about the middle; of several moments the most telling.
+    """
     moments = motion.kind("sway").courses
     ways = motion.displacements(("breath",), from_middle=True)[..., :3]
     apart = 1.0 - moments.values @ moments.middle

@@ -1,8 +1,8 @@
-"""Range images brought together where they overlap, the boards' solution and covariance as prior.
+"""Align range images where they overlap, with the boards' solution and covariance as prior.
 
-A multiway ICP: matches between all pairs, then one solve for the small motions of all of them
-together with the prior, so the ring closes and only what the boards leave open is improved.  Pairs
-that share hardly more than a rim are tied by that rim, believed less.  Pairs without overlap stay
+A multiway ICP: find matches between all pairs, then solve for small motions of all of them together
+with the prior, so that the ring closes and only what the boards leave open changes. Pairs that
+share hardly more than a rim are tied by that rim, with less weight. Pairs without overlap stay
 where the boards put them.
 """
 
@@ -35,14 +35,18 @@ from bodyscan.settings import AlignmentSettings
 
 Result = TypeVar("Result")
 
-FINE_ROUNDS = 2  # at the end, with all of them
+FINE_ROUNDS = 2  # the last rounds use all points
 UNKNOWN = 0, float("nan"), float("nan")
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """source and target pairs, about how many points they share, how far apart those lie before and
-    after, mm, and how far noise alone would put them.
+    """An overlap of two pairs.
+
+    source, target: names of the pairs.
+    points: approximate number of points that they share.
+    rms_before_mm, rms_after_mm: RMS distance of those before and after alignment.
+    expected_mm: RMS distance due to noise alone.
     """
 
     source: str
@@ -55,9 +59,13 @@ class Overlap:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """rig_from_camera after alignment; motion_mm, at the body's centre, of each pair that overlaps tie
-    to the largest group of them: how far others moved nobody saw; pairs refused because they wanted
-    to move farther than the prior allows, in sigmas; overlaps.
+    """The result of an alignment.
+
+    rig_from_camera: the aligned poses.
+    motion_mm: motion at the body's centre of each pair that overlaps tie to the largest group; how
+        far others moved is not observed.
+    refused: pairs that would have moved farther than the prior allows, with their motion in sigmas.
+    overlaps: all overlaps.
     """
 
     rig_from_camera: dict[str, RigidTransform]
@@ -75,7 +83,7 @@ class Alignment:
 
     @property
     def expected_mm(self) -> float:
-        """What `rms_after_mm` would be of noise alone."""
+        """The value of `rms_after_mm` for noise alone."""
         return _pool_rms([(o.points, o.expected_mm) for o in self.overlaps])
 
 
@@ -87,9 +95,9 @@ def align(
     *,
     workers: int = THREADS,
 ) -> Alignment:
-    """Small motions of all range images that bring their overlaps together.
+    """Find small motions of all range images that bring their overlaps together.
 
-    Each round believes the sway that the last one found, within the settings' bounds.
+    Each round assumes the sway found by the last one, within the bounds of the settings.
     """
     names = [image.pair for image in images]
     start = [rig_from_camera[name] for name in names]
@@ -107,7 +115,7 @@ def align(
         widest = sway.covariance(names, prior, sway.most)
         motion, refused = bound_motions(names, motion, widest, settings.limit_sigmas)
         moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
-        # Both with the same reach, so that they can be compared.
+        # Measure both with the same reach, so that they can be compared.
         was, now = (
             _each_overlap(_gap, pool, coarse, placings, settings.least_reach_mm, settings)
             for placings in (start, moved)
@@ -133,9 +141,10 @@ def _register(
     prior: PoseCovariance,
     settings: AlignmentSettings,
 ) -> Array:
-    """Motions (P, 6), rig frame: in each round matches anew, and one step of all pairs together.
+    """Motions (P, 6), rig frame, by rounds of new matches and one joint step of all pairs.
 
-    clouds: coarse, and for the last rounds fine."""
+    clouds: coarse, and fine for the last rounds.
+    """
     motion, sway = np.zeros((len(start), 6)), SwayPrior.of(settings)
     reach, scale = settings.reach_mm, 1.0
     equations = partial(OverlapEquations.of, correlated=settings.correlated)
@@ -157,7 +166,7 @@ def _each_overlap(
     reach_mm: float,
     settings: AlignmentSettings,
 ) -> dict[tuple[int, int], Result]:
-    """What the matches of every two pairs say, if they are enough."""
+    """Measure the matches of every two pairs that have enough of them."""
 
     def of_two(i: int, j: int) -> Result | None:
         matches = match_overlap(
@@ -169,14 +178,14 @@ def _each_overlap(
 
 
 def _largest_group(overlaps: Iterable[tuple[int, int]]) -> set[int]:
-    """Of the images that overlaps tie together; those that nothing ties are none."""
+    """The largest group of images tied by overlaps; images without any overlap form no group."""
     ties = list(overlaps)
     groups = tied_groups(sorted({image for both in ties for image in both}), ties)
     return max(groups, key=len, default=set())
 
 
 def _gap(matches: Matches) -> tuple[int, float, float]:
-    """How many matches, their RMS distance, and what that would be by their sigmas, mm."""
+    """Number of matches, their RMS distance, and its expected value by their sigmas, mm."""
     apart, sigma = matches.distances, matches.sigma_mm
     return len(apart), float(np.sqrt(np.mean(apart**2))), float(np.sqrt(np.mean(sigma**2)))
 

@@ -1,4 +1,4 @@
-"""Head and arms, which turn each as a whole about its joint with the trunk, and hardly shift."""
+"""Head and arms: each turns as a whole about its joint with the trunk and hardly shifts."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from bodyscan.arrays import Array
 
 LIMBS = ("head", "left arm", "right arm")
 SHIFTS = tuple(f"{limb} shift" for limb in LIMBS)
-BORDER_MM = 60.0  # over which what moves passes into what does not: a neck, a shoulder
+BORDER_MM = 60.0  # width over which a moving part blends into the rest: a neck, a shoulder
 
 
 def limb_fields(cells: BodyCells, arm_mm: float) -> dict[str, Array]:
-    """Of each limb, and of its shift, (C, 12, 3) displacement fields (see `rigid_fields`), smooth over
-    its border, in the middle of which its joint is; nothing of one that the body does not show."""
+    """Displacement fields (C, 12, 3) of each limb's turn and shift (see `rigid_fields`).
+
+    They fade smoothly across the limb's border, in whose middle the joint lies; limbs that the body
+    does not show have zero fields.
+    """
     part = name_parts(cells)
     near = np.exp(-0.5 * (cells.away / BORDER_MM) ** 2)
     fields = {}

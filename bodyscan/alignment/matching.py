@@ -1,6 +1,6 @@
 """Which points of two range images are the same spot of the subject.
 
-Each point is looked up in the other camera's pixel grid, which needs no search and knows where that
+Each point is looked up in the other camera's pixel grid, which needs no search and shows where that
 camera saw nothing.
 """
 
@@ -20,21 +20,23 @@ from bodyscan.reconstruction.range_image import RangeImage
 
 Vector = tuple[float, float, float]
 
-FACING = 0.7  # least cosine between the normals of what may be one spot
+FACING = 0.7  # least cosine between the normals of one spot
 EDGE_ON = 0.3  # least cosine between a normal and the viewing ray
 NEAREST_MM = 100.0
 RIM_PX = 4
-SEAM_RIM_PX = 2  # blur is narrower than this; its bias is what is left
+SEAM_RIM_PX = 2  # blur is narrower than this; only its bias remains
 SEAM_BIAS_MM = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class AlignmentPoints:
-    """What takes part in alignment of one range image, camera frame: N points with normals, standard
-    deviations along the normal, and whether they lie at the rim of what was measured.
+    """The points of one range image that take part in alignment, camera frame.
 
-    inner: (height, width), pixels away from the rim.  At silhouettes blur mixes a surface with
-    its brighter, better facing parts, which lifts it by a few tenths of a millimetre.
+    inner: (h, w), pixels away from the rim. At silhouettes blur mixes a surface with its
+        brighter parts that face the camera more, which lifts it by a few tenths of a millimetre.
+    points, normals: (N, 3).
+    sigma_mm: standard deviations along the normal, (N,).
+    rim: whether points lie at the rim of what was measured, (N,).
     """
 
     image: RangeImage
@@ -56,9 +58,13 @@ class AlignmentPoints:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """M spots seen twice, rig frame: points (M, 3) of the source, normals (M, 3), distances (M,) mm
-    from the target's surface to the source along the normal, their expected sigmas (M,) mm; source:
-    (M,) which of the source's points.
+    """M spots seen twice, rig frame.
+
+    points: of the source, (M, 3) mm.
+    normals: (M, 3).
+    distances: from the target's surface to the source along the normal, (M,) mm.
+    sigma_mm: their expected sigmas, (M,).
+    source: indices of the source's points, (M,).
     """
 
     points: Array
@@ -69,20 +75,22 @@ class Matches:
 
     @property
     def of_seam(self) -> Matches:
-        """With what rims are lifted by in their sigmas."""
+        """The same with the bias of rims included in the sigmas."""
         return replace(self, sigma_mm=np.hypot(self.sigma_mm, SEAM_BIAS_MM))
 
 
 def alignment_points(image: RangeImage, spacing_mm: float, rim_px: int = RIM_PX) -> AlignmentPoints:
-    """Points of every so many rows and columns, about `spacing_mm` apart where a surface faces the
-    camera; what is seen edge-on takes no part."""
+    """Points in every n-th row and column, about `spacing_mm` apart on surfaces facing the camera.
+
+    Surfaces seen edge-on take no part.
+    """
     return points_within_rims(image, spacing_mm, rim_px)[0]
 
 
 def points_within_rims(
     image: RangeImage, spacing_mm: float, *rims_px: int
 ) -> tuple[AlignmentPoints, ...]:
-    """`alignment_points` for each of several widths of the rim: the same points, in the same arrays."""
+    """`alignment_points` for several widths of the rim: the same points, in the same arrays."""
     valid = image.valid
     few = image.every(8)
     depth = image.points[few][..., 2][valid[few]]
@@ -92,7 +100,7 @@ def points_within_rims(
     seen = valid[some]
     points, normals = (a[some][seen].astype(np.float64) for a in (image.points, image.normals))
     facing = -np.einsum("nc,nc->n", points, normals) / np.linalg.norm(points, axis=-1)
-    chosen = facing > EDGE_ON  # a normal of NaN is not more
+    chosen = facing > EDGE_ON  # false for NaN normals as well
     points, normals = points[chosen], normals[chosen]
     sigma_mm = (image.sigma_mm[some][seen] * facing)[chosen]
     windows = (np.ones((2 * rim + 1, 2 * rim + 1), np.uint8) for rim in rims_px)
@@ -110,7 +118,7 @@ def match_projected(
     rig_from_target: RigidTransform,
     reach_mm: float,
 ) -> Matches:
-    """Each source point against the surface that the target camera saw in its direction."""
+    """Match each source point with the surface that the target camera saw in its direction."""
     target_from_source = rig_from_target.inverse() @ rig_from_source
     size, image = len(source.points), target.image
     points, normals = np.empty((size, 3)), np.empty((size, 3))
@@ -143,12 +151,13 @@ def _match_projected(
     reach_mm: float,
     matches: tuple[Array, Array, Array, Array, Indices],
 ) -> int:
-    """How many of the source's points were matched; what of them `matches` holds, target frame.
+    """Match the source's points and fill `matches`, target frame; return their number.
 
-    target_from_source: (3, 4).  source: points (N, 3), normals (N, 3), sigma_mm (N,), rim (N,).
+    target_from_source: (3, 4).
+    source: points (N, 3), normals (N, 3), sigma_mm (N,), rim (N,).
     target: points (H, W, 3), normals (H, W, 3), sigma_mm (H, W), inner (H, W), of the part of its
-    image that begins at the corner.
-    matches: the arrays of `Matches`, room for N.
+        image that begins at `corner`.
+    matches: the arrays of `Matches`, with room for N.
     """
     source_points, source_normals, source_sigma, rim = source
     target_points, target_normals, target_sigma, inner = target
@@ -176,7 +185,7 @@ def _match_projected(
         if not cosine > FACING:
             continue
         there = _vector(target_points[row, column])
-        # The length of the sum of two unit vectors, from the angle between them.
+        # Length of the sum of two unit vectors, from the cosine of their angle.
         size = np.sqrt(2.0 + 2.0 * cosine)
         distance = 0.0
         for k in range(3):
@@ -193,7 +202,7 @@ def _match_projected(
 
 @compiled
 def _carried(a_from_b: Array, vector: Array, moved: float) -> Vector:
-    """A vector (3,) turned by a_from_b (3, 4), and moved if `moved` is 1."""
+    """A vector (3,) rotated by a_from_b (3, 4), and translated if `moved` is 1."""
     m, (x, y, z) = a_from_b, (vector[0], vector[1], vector[2])
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] * moved,

@@ -1,4 +1,4 @@
-"""How alike a person's motion is at two moments: what is a little apart in time moved little."""
+"""How a person's motion at one moment correlates with another: little time apart, little motion."""
 
 from __future__ import annotations
 
@@ -11,45 +11,48 @@ from bodyscan.arrays import Array
 
 Correlation = Callable[[Array], Array]
 
-LEAST = 1e-3  # of the variance of the first course; less is not worth an unknown
+LEAST = 1e-3  # of the first course's variance; less is not worth an unknown
 STANCE_S = 0.8
-"""After which a stance has little to do with what it was: people sway at 0.1 to 1 Hz."""
+"""Time after which a stance has little to do with what it was: people sway at 0.1 to 1 Hz."""
 BREATHS_S = np.geomspace(2.5, 5.8, 12)
-"""From one breath to the next at rest: 10 to 24 a minute."""
+"""Duration of a breath at rest: 10 to 24 a minute."""
 USUAL_S, USUAL_SHARE = 3.75, 0.2
-"""16 a minute, give or take a fifth: adults at rest breathe 12 to 20 times. Half a breath alone looks
-much like a third of a deeper and slower one."""
-STEADY = 0.05  # of a breath's variance that does not come back with it
+"""16 a minute, give or take a fifth: adults at rest breathe 12 to 20 times. Half a breath alone
+looks much like a third of a deeper and slower one."""
+STEADY = 0.05  # share of a breath's variance that does not recur with it
 BEGUN = np.arange(8) * np.pi / 8.0
-"""Phases; half a turn later it is the same with the other sign."""
+"""Phases; half a turn later each recurs with the opposite sign."""
 LAG = 0.35
-"""Tangent of how far belly and chest are from breathing at once: 10 to 30 degrees at rest (Konno and
-Mead 1967)."""
+"""Tangent of the phase difference of belly and chest: 10 to 30 degrees at rest (Konno and Mead
+1967)."""
 IRREGULAR = 0.05
-"""Of a breath, what is no sine. What nobody saw is told by the sine alone: nothing in a scan says how
-much this is."""
+"""Share of a breath that is not a sine. What nobody saw is predicted by the sine alone, since
+nothing in a scan shows how large this share is."""
 STEP_S = 1e-3
 
 
 def of_stance(seconds: Array) -> Array:
-    """Correlation of a stance with that of so many seconds later: Matern's of 5/2, whose speed is
-    smooth too."""
+    """Correlation of a stance with itself after so many seconds.
+
+    Matern's of order 5/2, whose speed is smooth too.
+    """
     far = np.sqrt(5.0) * np.abs(seconds) / STANCE_S
     return np.asarray((1.0 + far + far**2 / 3.0) * np.exp(-far))
 
 
 def of_breath(seconds: Array) -> Array:
-    """Correlation of a breath: it comes back, but nobody knows how soon."""
+    """Correlation of a breath with itself after so many seconds; it recurs, nobody knows when."""
     turns = 2.0 * np.pi * np.asarray(seconds)[..., None] / BREATHS_S
     return np.asarray((1.0 - STEADY) * np.cos(turns).mean(axis=-1) + STEADY * of_stance(seconds))
 
 
 @dataclass(frozen=True, eq=False)
 class Courses:
-    """J courses over time, independent and of standard deviation 1, that motion is made of.
+    """J courses over time, independent and of standard deviation 1, of which motion is made.
 
-    values: (P, J) at the pairs' moments.  middle: (J,) at the moment that all is carried to.
-    speeds: (P, J) per second, 0 where a moment is not known.
+    values: at the pairs' moments, (P, J).
+    middle: at the moment to which everything is carried, (J,).
+    speeds: per second, (P, J), 0 for pairs whose moment is not known.
     """
 
     values: Array
@@ -62,8 +65,11 @@ class Courses:
 
     @staticmethod
     def of(correlation: Correlation, seconds: Sequence[float | None]) -> Courses:
-        """Pairs without a moment have a course each: theirs is like no other, and what all is
-        carried to is then the mean."""
+        """Courses for a correlation over time; seconds: each pair's moment, None if not known.
+
+        Pairs without a moment have a course each, correlated with no other; if no moment is known,
+        everything is carried to the mean.
+        """
         timed = [k for k, second in enumerate(seconds) if second is not None]
         alone = [k for k, second in enumerate(seconds) if second is None]
         at = np.array([second for second in seconds if second is not None])
@@ -90,14 +96,16 @@ class Courses:
 
     @staticmethod
     def steady(count: int) -> Courses:
-        """Of what is another for each pair, and does not move."""
+        """Courses of something that differs from pair to pair and does not move."""
         return Courses(np.eye(count), np.zeros(count), np.zeros((count, count)))
 
 
 def breaths(courses: Courses, seconds: Sequence[float | None]) -> tuple[Array, Array]:
-    """(K, J, J) covariances of the courses' amplitudes of K breaths, of each length and phase, and how
-    likely each is before anything was seen (K,). Where a moment is not known, one: every moment is its
-    own."""
+    """Covariances (K, J, J) of the courses' amplitudes for K breaths, and their priors (K,).
+
+    The breaths have every duration and phase. If a moment is not known there is only one, with
+    independent moments.
+    """
     at = np.array([second for second in seconds if second is not None])
     if len(at) < len(seconds):
         return np.eye(courses.count)[None], np.ones(1)
@@ -108,7 +116,7 @@ def breaths(courses: Courses, seconds: Sequence[float | None]) -> tuple[Array, A
     )
     waves = told @ np.stack([np.cos(turns), LAG * np.sin(turns)], axis=2)
     sines = 2.0 * waves @ np.swapaxes(waves, 1, 2)
-    # What the courses leave out has to leave the sum positive.
+    # What the courses leave out must leave the sum positive.
     any_way = told @ of_stance(knots[:, None] - knots) @ told.T + LEAST * np.eye(courses.count)
     usual = np.exp(-0.5 * (np.log(BREATHS_S / USUAL_S) / USUAL_SHARE) ** 2)
     likely = np.repeat(usual / (usual.sum() * len(BEGUN)), len(BEGUN))

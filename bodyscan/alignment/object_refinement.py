@@ -1,4 +1,4 @@
-"""The pairs' poses refined on a rigid object that its pairs scanned: ICP with the boards as prior."""
+"""Refine the pairs' poses on a rigid object that they scanned: ICP with the boards as prior."""
 
 from __future__ import annotations
 
@@ -17,8 +17,12 @@ STILL = AlignmentSettings(sway_mm=0.0, sway_deg=0.0)  # a rigid object
 
 @dataclass(frozen=True, eq=False)
 class ObjectRefinement:
-    """alignment: what the object's overlaps ask for.  rig_from_camera: of all pairs; those that
-    saw nothing of it, or would have moved farther than the boards allow, stay where they were."""
+    """The result of refining on an object.
+
+    alignment: what the object's overlaps ask for.
+    rig_from_camera: of all pairs; those that saw nothing of it, or would have moved farther than
+        the boards allow, stay where they were.
+    """
 
     alignment: Alignment
     rig_from_camera: dict[str, RigidTransform]
@@ -30,7 +34,7 @@ class ObjectRefinement:
 
     @property
     def lines(self) -> list[str]:
-        """Before and after, and who moved."""
+        """Figures before and after, and which pairs moved."""
         found = self.alignment
         said = [
             f"{len(found.overlaps)} overlaps: {found.rms_before_mm:.3f} mm RMS before, "
@@ -51,7 +55,9 @@ def refine_on_object(
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PoseCovariance,
 ) -> ObjectRefinement:
-    """images: one object that stood still while all pairs scanned it, its background cut away.
+    """Refine the poses of the pairs on an object.
+
+    images: of one object that stood still while all pairs scanned it, background removed.
 
     Raises FailedWork if no two pairs saw the same part of it.
     """

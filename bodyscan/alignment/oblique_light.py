@@ -1,11 +1,12 @@
-"""Light that enters skin obliquely and comes out aside: seen as a disagreement of pairs, and undone.
+"""Light that enters skin obliquely and comes out aside: found by comparing pairs, and undone.
 
-Under the surface light goes on as it was refracted, and what a camera sees entered a little before,
-against the way the light came: by `aside_mm` times the tangent of the refracted angle. A pixel so
-shows the stripe of a place beside, and its depth is wrong by where that stripe's sheet lies on the
-pixel's ray: by more where the surface leans over against the sheet, to the other side where the
-projector stands on the other side of the camera. Pairs that see the same skin under different
-slopes disagree by that, whatever the skin is like otherwise, and one length explains all of them.
+Below the surface light continues as refracted, so what a camera sees entered a little earlier, back
+along the direction of the light: by `aside_mm` times the tangent of the refracted angle. A pixel
+thus shows the stripe of a neighbouring place, and its depth is wrong by where that stripe's sheet
+meets the pixel's ray: by more where the surface leans against the sheet, and with the opposite sign
+if the projector stands on the other side of the camera. Pairs that see the same skin under
+different slopes disagree by that, whatever else the skin is like, and one length explains all of
+them.
 """
 
 from __future__ import annotations
@@ -33,38 +34,44 @@ from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
 
 REFRACTION = 1.4
-"""Index of skin (Tuchin, Tissue Optics, 2015: 1.36 to 1.45)."""
+"""Refractive index of skin (Tuchin, Tissue Optics, 2015: 1.36 to 1.45)."""
 STRIPES, FEWEST_SHEETS = 32, 3
 PARALLEL = 1e-3
-"""Radians between sheets: then light comes from a kilometre away, and its way is not known so well."""
+"""Angle between sheets, radians, below which light comes from a kilometre away and its direction is
+not known well enough."""
 WINDOW_MM = 7.0
-"""Over which normals are averaged: those of five pixels are as noisy as the effect is large."""
+"""Window over which normals are averaged: normals of five pixels are as noisy as the effect is
+large."""
 MOST_LIFT = 4.0
-"""Of a point along its ray, times how far aside: more it is nowhere but where light grazes."""
+"""Largest shift of a point along its ray per unit of `aside_mm`; only grazing light exceeds it."""
 ROUNDS = 2
-"""After the first, each leaves a tenth of what was left."""
+"""Rounds after the first; each leaves a tenth of the remainder."""
 FEWEST_IMAGES = 4
-"""Without any one of them the rest still has to be several."""
+"""Fewest images: with any one left out there must still be several."""
 TOLD_SIGMAS, LEAST_MM = 4.0, 0.05
-"""From which on it is believed: a surface that leans by 20 degrees then stands off by as much, which
-makes 0.3 mm of a girth."""
+"""Smallest length that is believed: a surface that leans by 20 degrees then stands off by as much,
+which makes 0.3 mm of a girth."""
 SHORTEST = np.float32(1e-3)
-"""Of a mean of unit normals."""
+"""Shortest mean of unit normals that has a direction."""
 FLATTEST = 0.1
-"""Cosine, of light, ray and sheet: flatter than that the effect has no size, nothing is measured."""
+"""Least cosine between light, ray and sheet: when flatter, the effect has no size and nothing is
+measured."""
 
 
 @dataclass(frozen=True, eq=False)
 class LightLine:
-    """Where a projector's sheets meet, camera frame.  origin: (3,) mm, the place of that line which is
-    nearest to the camera, taken for where light comes from.  along: (3,) unit."""
+    """The line in which a projector's sheets meet, camera frame.
+
+    origin: its point nearest to the camera, taken as the source of light, (3,) mm.
+    along: unit vector, (3,).
+    """
 
     origin: Array
     along: Array
 
     @staticmethod
     def of(sheets: LightSheets) -> LightLine | None:
-        """None where sheets are too few, or parallel: they meet nowhere."""
+        """The line of these sheets; None if there are too few, or they are parallel."""
         planes = sheets.tangent_planes(np.linspace(0.0, sheets.stripes, STRIPES + 2)[1:-1])
         planes = planes[np.isfinite(planes).all(axis=1)]
         if len(planes) < FEWEST_SHEETS:
@@ -76,9 +83,13 @@ class LightLine:
         return LightLine(two @ right[:2], right[2])
 
     def lift(self, points: Array, normals: Array) -> Array:
-        """How far points (N, 3) with unit normals (N, 3) towards the camera, camera frame, are seen
-        from where they are: (N,) mm along their rays, away from the camera, for 1 mm aside; NaN
-        where light or camera graze the surface or each other."""
+        """How far points are seen from where they are, (N,) mm along their rays for 1 mm aside.
+
+        points: (N, 3) mm, camera frame.
+        normals: unit, towards the camera, (N, 3).
+
+        Positive away from the camera; NaN where light or camera graze the surface or each other.
+        """
         light = points - self.origin
         light /= np.linalg.norm(light, axis=1, keepdims=True)
         ray = points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -86,7 +97,8 @@ class LightLine:
         sheet /= np.linalg.norm(sheet, axis=1, keepdims=True)
         facing = -np.sum(light * normals, axis=1)
         refracted = np.sqrt(1.0 - (1.0 - facing**2) / REFRACTION**2)
-        # Light lies in its sheet: across it, it goes aside by what the normal leans over.
+        # Light stays in its sheet: perpendicular to it, it goes aside by as much as the normal
+        # leans.
         aside = facing * np.sum(sheet * normals, axis=1) / (REFRACTION * refracted)
         across = np.sum(sheet * ray, axis=1)
         seen = -np.sum(ray * normals, axis=1)
@@ -96,26 +108,29 @@ class LightLine:
 
 @dataclass(frozen=True)
 class ObliqueLight:
-    """aside_mm: how far aside light comes out, over the tangent of the refracted angle; sigma_mm: of
-    that, from how much every single pair says in it."""
+    """The effect of oblique light.
+
+    aside_mm: how far aside light comes out, over the tangent of the refracted angle.
+    sigma_mm: its standard deviation, from the influence of every single pair.
+    """
 
     aside_mm: float
     sigma_mm: float
 
     @property
     def told(self) -> bool:
-        """Whether it is there; light never comes out before where it entered."""
+        """Whether the effect is there; light never comes out before the place where it entered."""
         return self.aside_mm > max(TOLD_SIGMAS * self.sigma_mm, LEAST_MM)
 
     @property
     def most_mm(self) -> float:
-        """What it may be."""
+        """Upper bound of the effect, mm."""
         return abs(self.aside_mm) + self.sigma_mm
 
 
 @dataclass(frozen=True, eq=False)
 class _Shared:
-    """What an overlap says: J^T W J (7, 7) and J^T W d (7,), by the source's motion and the length."""
+    """Equations of an overlap: J^T W J (7, 7), J^T W d (7,), by source motion and length."""
 
     information: Array
     gradient: Array
@@ -129,11 +144,13 @@ def take_out(
     prior: PoseCovariance,
     settings: AlignmentSettings,
 ) -> tuple[list[RangeImage], Alignment, ObliqueLight | None]:
-    """The images without the effect, if it is told, and how they then align; else all as it was, but
-    where it could be there unseen: then that is in the points' sigmas.
+    """Remove the effect from the images if it is significant, and align them again.
 
-    found: the images' alignment from `rig_from_camera`, which had to make up for it as poses can; so
-    what is left is asked for again.
+    found: the images' alignment from `rig_from_camera`, which compensated for the effect as far as
+        poses can, so the remainder is estimated again.
+
+    If it is not significant, images and alignment are returned unchanged, except that an effect
+    that could be there unnoticed goes into the points' sigmas.
     """
     first = find_oblique_light(images, found.rig_from_camera, lines, prior, settings)
     if first is None or not first.told:
@@ -160,15 +177,19 @@ def find_oblique_light(
     prior: PoseCovariance,
     settings: AlignmentSettings,
 ) -> ObliqueLight | None:
-    """One length for all overlaps, with the pairs' motions: what these explain as well counts for none.
+    """Estimate one length for all overlaps together with the pairs' motions.
 
-    rig_from_camera: aligned, so that what is left is small.  lines: of every image's projector. None
-    where fewer than four images overlap, or all that say something do so with one and the same.
+    What motions explain as well does not count.
+
+    rig_from_camera: aligned, so that the remainder is small.
+    lines: of every image's projector.
+
+    None if fewer than four images overlap, or all evidence depends on one image.
     """
     names = [image.pair for image in images]
     placed = [rig_from_camera[name] for name in names]
 
-    # Each image says its own, whatever the number of its points: a part of them tells as much.
+    # Each image is one piece of evidence, however many points it has: some of them are enough.
     correlated = max(settings.correlated / COARSE.step, 1.0)
 
     def points(image: RangeImage) -> OverlapPoints:
@@ -196,14 +217,16 @@ def find_oblique_light(
     without = np.array([_aside(overlaps, held, one) for one in seen])
     if not np.isfinite(without).all():
         return None
-    # Jackknife (Tukey 1958): images err each by itself, points of one image alike.
+    # Jackknife (Tukey 1958): images err independently, points of one image together.
     sigma = np.sqrt((len(seen) - 1) / len(seen) * np.sum((without - without.mean()) ** 2))
     return ObliqueLight(_aside(overlaps, held), float(sigma))
 
 
 def undo(image: RangeImage, line: LightLine, found: ObliqueLight) -> RangeImage:
-    """The range image with its points where the surface is, and what is not known of that in their
-    sigmas; where light or camera graze the surface, all of it."""
+    """Move the points of a range image to where the surface is, and enlarge their sigmas.
+
+    The sigmas include the uncertainty of the shift, or all of it where light or camera graze.
+    """
     valid = image.valid
     points, normals = image.points[valid].astype(np.float64), _steady(image)[valid]
     lift = line.lift(points, normals.astype(np.float64))
@@ -221,7 +244,7 @@ def undo(image: RangeImage, line: LightLine, found: ObliqueLight) -> RangeImage:
 
 
 def _steady(image: RangeImage) -> Floats:
-    """(h, w, 3) unit normals, each the mean of those around; so rims have some too."""
+    """Unit normals (h, w, 3), each averaged over a window, so that rims have some too."""
     known = np.isfinite(image.normals[..., 2]) & image.valid
     if not known.any():
         return image.normals
@@ -234,7 +257,7 @@ def _steady(image: RangeImage) -> Floats:
 
 @compiled
 def to_unit_length(normals: Floats) -> None:
-    """Of normals (N, 3); NaN where next to nothing is left of them."""
+    """Scale normals (N, 3) to unit length; NaN where hardly anything is left of them."""
     for n in range(len(normals)):
         x, y, z = normals[n, 0], normals[n, 1], normals[n, 2]
         length = np.sqrt(x * x + y * y + z * z)
@@ -245,8 +268,7 @@ def to_unit_length(normals: Floats) -> None:
 def _apart(
     line: LightLine, rig_from_camera: RigidTransform, points: Array, normals: Array
 ) -> Array:
-    """(N,) mm along normals (N, 3) by which a pair sees points (N, 3), rig frame, off their places, for
-    1 mm aside."""
+    """Offsets (N,) mm along normals (N, 3) at which a pair sees points (N, 3) for 1 mm aside."""
     camera_from_rig = rig_from_camera.inverse()
     seen, across = camera_from_rig.apply(points), camera_from_rig.rotate(normals)
     facing = np.sum(seen * across, axis=1) / np.linalg.norm(seen, axis=1)
@@ -261,7 +283,7 @@ def _shared(
     apart: Array,
     correlated: float,
 ) -> _Shared:
-    """As `OverlapEquations`, how far aside as the last unknown; matches without `apart` say nothing."""
+    """As `OverlapEquations`, the length as last unknown; matches without `apart` drop out."""
     rows = np.column_stack([np.cross(points, normals), normals, apart])
     variance = sigma_mm**2 + spread(distances, LEAST_SPREAD_MM) ** 2
     weight = np.isfinite(apart) / (variance + 0.25 * distances**2) / correlated
@@ -273,12 +295,15 @@ def _shared(
 def _aside(
     overlaps: Mapping[tuple[int, int], _Shared], held: Array, without: int | None = None
 ) -> float:
-    """The length that explains the overlaps best, of all images or without one, NaN if none is left;
-    held: (6P, 6P) inverse covariance of the pairs' motions."""
+    """The length that explains the overlaps best, NaN if none is left.
+
+    held: inverse covariance (6P, 6P) of the pairs' motions.
+    without: number of an image to leave out.
+    """
     size = len(held)
     normal, right = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
     normal[:size, :size] = held
-    # The target's motion has the opposite effect; `apart` is of both.
+    # The target's motion has the opposite effect; `apart` covers both images.
     signed = np.concatenate([np.eye(7)[:, :6], -np.eye(7)[:, :6], np.eye(7)[:, 6:]], axis=1)
     for (a, b), one in overlaps.items():
         if without in (a, b):

@@ -1,9 +1,10 @@
-"""The registration by Open3D: ICP of every two range images from coarse to fine, then a pose graph.
+"""Registration by Open3D: ICP of every two range images from coarse to fine, then a pose graph.
 
-ICP is point to plane with a robust kernel.  The graph has a node for each pair and one for the rig;
-edges between pairs weigh what their overlap says along its normals (Open3D's own matrices count points,
-as if these held in every direction), edges from the rig what the boards and the subject's sway allow.
-The boards' covariance between pairs has no place in such a graph, in `icp` it has.
+ICP is point to plane with a robust kernel. The graph has a node for each pair and one for the rig.
+Edges between pairs are weighted by what their overlap determines along its normals (Open3D's own
+matrices count points, as if these held in every direction); edges from the rig by what the boards
+and the subject's sway allow. Such a graph has no place for the boards' covariance between pairs,
+which `icp` does use.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ from bodyscan.settings import AlignmentSettings
 registration = o3d.pipelines.registration
 
 STEPS = 15
-"""Times that ICP matches anew with one reach, at most."""
+"""Most iterations of ICP with one reach."""
 KERNEL = 0.15
-"""Of the reach: distances beyond it count for less, 0.5 mm with the last one."""
+"""As a share of the reach: distances beyond it count for less, 0.5 mm at the last reach."""
 SWAYS = 3
-"""Times that the graph is solved, each with the sway that the last one found."""
+"""Number of times the graph is solved, each with the sway that the last solution found."""
 DIGITS = 9
-"""Of motions, radians and mm: Open3D's threads add up in any order."""
+"""Decimals of motions, radians and mm: Open3D's threads sum in any order."""
 RIG = 0
 """The graph's fixed node; pairs follow in their order."""
 
@@ -66,7 +67,7 @@ def register(
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
-    """The inner points of a range image in the rig frame, Open3D's and with their sigmas, mm."""
+    """Inner points of a range image as Open3D's cloud, rig frame, with their sigmas, mm."""
 
     cloud: o3d.geometry.PointCloud
     sigma_mm: Array
@@ -82,15 +83,17 @@ class _Placed:
 
 @dataclass(frozen=True, eq=False)
 class _Edge:
-    """motion: (4, 4), that brings the source onto the target.  information: (6, 6) of its rotation
-    and translation."""
+    """motion: (4, 4), brings the source onto the target.  information: (6, 6) on its rotation and
+    translation."""
 
     motion: Array
     information: Array
 
     def sigmas(self, covariance: Array) -> float:
-        """How far the source was moved, in standard deviations of such a covariance (6, 6): where
-        two share a rim only ICP slides along it."""
+        """How far the source was moved, in sigmas of such a covariance (6, 6).
+
+        If two share only a rim, ICP slides along it.
+        """
         twist = RigidTransform.from_matrix(self.motion).twist
         return float(np.sqrt(twist @ solve_scaled(covariance, twist) / 6.0))
 
@@ -98,7 +101,7 @@ class _Edge:
 def _bring_together(
     coarse: tuple[_Placed, _Placed], fine: tuple[_Placed, _Placed], settings: AlignmentSettings
 ) -> _Edge | None:
-    """ICP of source and target with a reach that halves each time; None if they share too little."""
+    """ICP of source and target with a reach halved each time; None if they share too little."""
     motion, reach = np.eye(4), settings.reach_mm
     steps = registration.ICPConvergenceCriteria(max_iteration=STEPS)
     while True:
@@ -123,7 +126,7 @@ def _bring_together(
 def _matches(
     source: _Placed, target: _Placed, found: o3d.pipelines.registration.RegistrationResult
 ) -> Matches:
-    """What ICP matched last, of spots that face alike."""
+    """The last matches of ICP, restricted to spots that face alike."""
     pairs = np.asarray(found.correspondence_set).reshape(-1, 2)
     i, j = pairs[np.argsort(pairs[:, 0])].T  # Open3D's threads leave them in any order
     onto = RigidTransform.from_matrix(found.transformation)
@@ -137,7 +140,7 @@ def _matches(
 
 
 def _solve_graph(edges: Mapping[tuple[int, int], _Edge], covariance: Array) -> Array:
-    """Motions (P, 6) of the pairs' nodes; covariance: (6P, 6P) of what they may be beforehand."""
+    """Motions (P, 6) of the pairs' nodes; covariance: their prior, (6P, 6P)."""
     graph = registration.PoseGraph()
     count = len(covariance) // 6
     graph.nodes.extend(registration.PoseGraphNode(np.eye(4)) for _ in range(count + 1))

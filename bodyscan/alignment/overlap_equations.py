@@ -1,4 +1,4 @@
-"""Normal equations of the overlaps, and the step that solves those of all pairs together."""
+"""Normal equations of the overlaps, and the step that solves them for all pairs together."""
 
 from __future__ import annotations
 
@@ -18,16 +18,24 @@ LEAST_SPREAD_MM = 0.01
 
 @dataclass(frozen=True, eq=False)
 class OverlapEquations:
-    """information (6, 6) = J^T W J and gradient (6,) = J^T W d, d the distances of matches and J
-    their Jacobian by the source's motion; the target's motion has the opposite effect."""
+    """Normal equations of one overlap.
+
+    With d the distances of matches and J their Jacobian by the source's motion; the target's motion
+    has the opposite effect.
+
+    information: J^T W J, (6, 6).
+    gradient: J^T W d, (6,).
+    """
 
     information: Array
     gradient: Array
 
     @staticmethod
     def of(matches: Matches, correlated: float) -> OverlapEquations:
-        """Distances far beyond their own spread count for little (Cauchy); `correlated` of them
-        count as one."""
+        """Sum up the matches; distances far beyond their robust sigma count for little (Cauchy).
+
+        correlated: number of matches that count as one.
+        """
         information, gradient = np.zeros((6, 6)), np.zeros(6)
         distances = matches.distances
         spots = (matches.points, matches.normals, distances, matches.sigma_mm)
@@ -38,8 +46,10 @@ class OverlapEquations:
 def solve_motions(
     overlaps: Mapping[tuple[int, int], OverlapEquations], motion: Array, covariance: Array
 ) -> Array:
-    """Motions (P, 6): matches pull together, the prior holds near zero. One step, since every round
-    of the alignment matches anew."""
+    """Motions (P, 6) by one step: matches pull pairs together, the prior holds them near zero.
+
+    One step is enough, since every round of the alignment matches anew.
+    """
     normal = np.asarray(np.linalg.inv(covariance), np.float64)
     right = np.zeros(motion.size)
     for (a, b), overlap in overlaps.items():
@@ -65,7 +75,7 @@ def _accumulate(
     information: Array,
     gradient: Array,
 ) -> None:
-    """Adds M distances (M,) along normals (M, 3) at points (M, 3) to the normal equations."""
+    """Add distances (M,) along normals (M, 3) at points (M, 3) to the normal equations."""
     jacobian = np.empty(6)
     for n in range(len(distances)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]

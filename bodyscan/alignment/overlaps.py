@@ -1,4 +1,4 @@
-"""What the overlaps of every two range images say."""
+"""Measure the overlaps of every two range images."""
 
 from __future__ import annotations
 
@@ -24,13 +24,16 @@ Result = TypeVar("Result")
 Name = TypeVar("Name", int, str)
 
 COARSE = slice(None, None, 4)
-"""Of the points; all of them take part only in the last rounds."""
+"""The points used in early rounds; all of them are used only in the last ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class OverlapPoints:
-    """What takes part of one range image: its inner part; and the same points nearly up to its rims,
-    for those with which it shares no more."""
+    """The points of one range image that take part.
+
+    inner: those of its inner part.
+    whole: the same points nearly up to its rims, for images with which it shares nothing more.
+    """
 
     inner: AlignmentPoints
     whole: AlignmentPoints
@@ -43,7 +46,7 @@ class OverlapPoints:
         return OverlapPoints(self.inner.some(chosen), self.whole.some(chosen))
 
     def carried(self, points: Array, normals: Array) -> OverlapPoints:
-        """The same points elsewhere: (N, 3) each."""
+        """The same points at other places and with other normals, (N, 3) each."""
         inner, whole = (
             replace(part, points=points, normals=normals) for part in (self.inner, self.whole)
         )
@@ -58,8 +61,11 @@ def match_overlap(
     reach_mm: float,
     fewest: int,
 ) -> Matches | None:
-    """As `match_projected`: of the inner parts, or if these share less than `fewest` spots, of all up
-    to the rims, believed less; None if that is too little too."""
+    """Match the inner parts as `match_projected` does, or else everything up to the rims.
+
+    Rims are used if the inner parts share less than `fewest` spots, and get less weight; None if
+    that is too little too.
+    """
     there = rig_from_source, rig_from_target, reach_mm
     matches = match_projected(source.inner, target.inner, *there)
     if len(matches.distances) < fewest:
@@ -70,16 +76,20 @@ def match_overlap(
 def each_overlap(
     pool: ThreadPoolExecutor, count: int, of_two: Callable[[int, int], Result | None]
 ) -> dict[tuple[int, int], Result]:
-    """What is said of each of `count` images as source and each other as target, where anything is:
-    both ways, so that what one way gets wrong on curves cancels."""
+    """Results for each of `count` images as source and each other as target, where there is one.
+
+    Both directions are used, so that errors of one direction on curves cancel.
+    """
     every_two = list(permutations(range(count), 2))
     found = zip(every_two, pool.map(lambda both: of_two(*both), every_two), strict=True)
     return {both: said for both, said in found if said is not None}
 
 
 def tied_groups(names: Iterable[Name], ties: Iterable[tuple[Name, Name]]) -> list[set[Name]]:
-    """Those of the names that ties join, directly or by way of others; one that none joins is a group
-    of its own. In the order of each group's first name."""
+    """Groups of names that ties join, directly or through others; the untied are alone.
+
+    In the order of each group's first name.
+    """
     group = {name: {name} for name in names}
     for one, other in ties:
         joined = group[one] | group[other]

@@ -10,16 +10,19 @@ from scipy.special import fdtri
 from bodyscan.arrays import Array
 
 FEWEST_SCANS = 3
-"""A person sways by as much as a pair may have moved: from so many scans on the two are told apart."""
+"""A person sways by as much as a pair may have moved: this many scans can tell the two apart."""
 BY_CHANCE, LEAST_MM = 1e-4, 0.3
 LEAST_SIGMA_MM = 0.05
 
 
 @dataclass(frozen=True)
 class PairDrift:
-    """shift: mean motion (3,) mm at the body's centre that its overlaps asked for, rig axes; sigma_mm
-    of it, from how much it varies from scan to scan; None with fewer than three scans.  limit_mm:
-    beyond it chance is out of the question."""
+    """Mean motion of a pair over several scans.
+
+    shift: mean motion (3,) mm at the body's centre that its overlaps asked for, rig axes.
+    sigma_mm: its standard deviation, from the variation between scans; None for fewer than three.
+    limit_mm: a shift beyond it is not chance.
+    """
 
     pair: str
     shift: tuple[float, float, float]
@@ -32,12 +35,12 @@ class PairDrift:
 
     @property
     def moved(self) -> bool:
-        """The same motion in every scan, which no sway explains."""
+        """Whether every scan shows the same motion, which no sway explains."""
         return self.shift_mm > self.limit_mm
 
 
 def mean_drift(name: str, shifts: Array) -> PairDrift:
-    """Of a pair or pole; shifts: (scans, 3) mm, at the body's centre."""
+    """The drift of a pair or pole; shifts: (scans, 3) mm, at the body's centre."""
     scans = len(shifts)
     x, y, z = (float(value) for value in shifts.mean(axis=0))
     if scans < FEWEST_SCANS:

@@ -9,14 +9,14 @@ from bodyscan.arrays import Array, Indices
 
 PARTS = ("trunk", "head", "left arm", "right arm", "left leg", "right leg")
 LEGS = PARTS[-2:]
-# Shares of the stature (Drillis and Contini 1966, rounded): where head and legs begin, how far it is
-# through the body from the navel to a fingertip at least, and from there to the shoulder.
+# Shares of the stature (Drillis and Contini 1966, rounded): where head and legs begin, the least
+# distance through the body from the navel to a fingertip, and from there to the shoulder.
 NECK, NAVEL, CROTCH, KNEE, TO_FINGERTIP, ARM = 0.86, 0.6, 0.47, 0.29, 0.35, 0.38
 FOOT, ANKLE, SHIN = 0.03, 0.05, 0.15
 
 
 def name_parts(cells: BodyCells) -> Indices:
-    """(C,) number in PARTS of the part that each cell belongs to, whichever way the person faces."""
+    """Number (C,) in PARTS of the part each cell belongs to, whichever way the person faces."""
     stature = float(cells.centres[:, 2].max())
     height = cells.centres[:, 2] / stature
     off = cells.centres[:, :2] - np.median(cells.centres[:, :2], axis=0)
@@ -36,7 +36,7 @@ def name_parts(cells: BodyCells) -> Indices:
 
 
 def ankles(cells: BodyCells) -> Array:
-    """(3,) mm, between them; where no shin was seen, below the middle of the body."""
+    """Midpoint of the ankles, (3,) mm; below the middle of the body if no shin was seen."""
     stature = float(cells.centres[:, 2].max())
     shins = cells.centres[:, 2] < SHIN * stature
     low = cells.centres[shins] if shins.any() else cells.centres
@@ -44,13 +44,13 @@ def ankles(cells: BodyCells) -> Array:
 
 
 def above_feet(cells: BodyCells) -> Array:
-    """(C,) 0 of the feet, 1 above the ankles."""
+    """(C,): 0 in the feet, 1 above the ankles."""
     height = cells.centres[:, 2] / cells.centres[:, 2].max()
     return np.clip((height - FOOT) / (ANKLE - FOOT), 0.0, 1.0)
 
 
 def leftward(cells: BodyCells) -> Array:
-    """(2,) to the subject's left: toes point forward, and who stands on none faces the rig's x."""
+    """Unit vector (2,) to the subject's left; toes point forward, or without them the rig's x."""
     height = cells.centres[:, 2] / cells.centres[:, 2].max()
     feet, shins = height < FOOT, (height > ANKLE) & (height < SHIN)
     forward = np.array([1.0, 0.0])

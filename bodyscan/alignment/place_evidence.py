@@ -1,8 +1,9 @@
-"""Poles that stand off, and a size that is off, told from all that one scan shows of a person's motion.
+"""Find poles that stand off, or a wrong size, from all that one scan shows of a person's motion.
 
-Pairs' motions alone (`pole_steps`) hardly tell poles that all moved outwards from a person who went
-round them in turn. But feet stay where they are while a body sways, breath lifts no leg, and stripes
-tell how fast each place went: a person who was followed leaves little that only poles explain.
+Pairs' motions alone (`pole_steps`) hardly tell poles that all moved outwards from a person who
+moved round them in turn. But feet stay in place while a body sways, breath lifts no leg, and
+stripes show how fast each place moved: a person who was followed leaves little that only poles
+    explain.
 """
 
 from __future__ import annotations
@@ -19,17 +20,21 @@ from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.transforms import RigidTransform
 
 SURE = 12.0
-"""Logarithm of how many times as well steps have to explain a scan. No model of people is exact: of ten
-sound ones that moved it was -9 to 3, and 5.8 of a restless one; of poles 3 mm off it is 70 and more.
-Of single pairs it was -9 to 3 in thirteen sound scans, four of them restless; 530 of one 5 mm off."""
+"""Log of the likelihood ratio that steps must reach. No model of people is exact: in ten sound
+scans of moving people it was -9 to 3, and 5.8 for a restless one; for poles 3 mm off it is 70 and
+more. For single pairs it was -9 to 3 in thirteen sound scans, four of them restless; 530 for one 5
+mm off."""
 LEAST_OUT_MM = 0.3
-"""2 mm of a girth; ten sound people came to 0.22 mm at most."""
+"""2 mm of a girth; for ten sound people it was 0.22 mm at most."""
 
 
 @dataclass(frozen=True)
 class SizeStep:
-    """All poles stand `out_mm` farther from the body than their calibration has them, or as much nearer
-    where it is negative: by that every radius of the body was too small.  sigma_mm: of that."""
+    """All poles stand farther from the body than calibrated, or nearer.
+
+    out_mm: how much farther, negative for nearer; every radius of the body was too small by that.
+    sigma_mm: its standard deviation.
+    """
 
     out_mm: float
     sigma_mm: float
@@ -37,10 +42,10 @@ class SizeStep:
 
 @dataclass(frozen=True, eq=False)
 class PlaceEvidence:
-    """What a scan says of P pairs' places, whatever the person may have done meanwhile.
+    """What a scan says about P pairs' places, whatever the person may have done meanwhile.
 
-    information (6P, 6P), pull (6P,): normal equations of motions, pair after pair, by which the pairs
-    stand off beside what their calibration left open.
+    information, pull: normal equations (6P, 6P), (6P,) of motions, pair after pair, by which the
+        pairs stand off beyond what their calibration left open.
     """
 
     names: tuple[str, ...]
@@ -52,7 +57,7 @@ class PlaceEvidence:
         return PlaceEvidence(tuple(names), *motion.asked_of_poses())
 
     def of_steps(self, ways: Array) -> _Told:
-        """What is said of motions along `ways` (6P, k), at the size in mm that explains it best."""
+        """Evidence for motions along `ways` (6P, k), at the size in mm that explains it best."""
         square, pull = ways.T @ self.information @ ways, ways.T @ self.pull
         own = np.eye(len(pull))
         found = []
@@ -66,7 +71,7 @@ class PlaceEvidence:
 
 @dataclass(frozen=True, eq=False)
 class _Told:
-    """gain: logarithm of how many times as well steps explain what was seen; steps (k,) mm, with their
+    """gain: log of the likelihood ratio of steps against none.  steps (k,) mm, with their
     covariance (k, k)."""
 
     gain: float
@@ -80,11 +85,14 @@ def find_off(
     poles: Mapping[str, str],
     freed: Collection[str] = (),
 ) -> PoleStep | SizeStep | None:
-    """What explains a scan better than any motion of the person: one pole that stands off, or one pair,
-    each pole by itself (`all_moved`), or all of them farther out or nearer.
+    """Find what explains a scan better than any motion of the person.
 
-    rig_from_camera: as calibrated.  poles: of each pair that stands on one.  freed: pairs of poles
-    that are known to have moved.
+    That is one pole or pair that stands off, each pole by itself (`all_moved`), or all of them
+    farther out or nearer.
+
+    rig_from_camera: as calibrated.
+    poles: the pole of each pair that stands on one.
+    freed: pairs of poles that are known to have moved.
     """
     sides = [poles.get(name, name) for name in seen.names]
     if len(set(sides)) < 2 or not set(seen.names) - set(freed):
@@ -117,7 +125,7 @@ def _does_harm(found: PoleStep | SizeStep) -> bool:
 
 
 def _moving_alone(names: Sequence[str], poles: Mapping[str, str]) -> dict[str, frozenset[str]]:
-    """Poles of several pairs, and single pairs where there are enough to tell which one it is."""
+    """Poles of several pairs, and single pairs if there are enough to tell which one it is."""
     return {
         name: pairs
         for name, pairs in moving_alone(names, poles).items()
@@ -126,14 +134,17 @@ def _moving_alone(names: Sequence[str], poles: Mapping[str, str]) -> dict[str, f
 
 
 def _step(name: str, pairs: frozenset[str], steps: Array) -> PoleStep:
-    """steps: (6,) mm, as in `_ways`."""
+    """A step of these pairs; steps: (6,) mm, as in `_ways`."""
     shift, turn = np.linalg.norm(steps.reshape(2, 3), axis=1)
     return PoleStep(name, pairs, float(shift), float(np.degrees(turn / ARM_MM)))
 
 
 def _ways(own: Mask) -> Array:
-    """(6P, 6) for the pairs (P,) that move as one: shifts of the body's centre by 1 mm, then turns
-    about it that move what is an arm's length away by as much."""
+    """Rigid motions (6P, 6) of the pairs (P,) that move as one.
+
+    Shifts of the body's centre by 1 mm, then turns about it that move a point at arm's length by 1
+    mm.
+    """
     rigid = np.zeros((6, 6))
     rigid[3:, :3] = np.eye(3)
     rigid[:3, 3:] = np.eye(3) / ARM_MM
@@ -144,7 +155,7 @@ def _ways(own: Mask) -> Array:
 def _outward(
     names: Collection[str], sides: list[str], rig_from_camera: Mapping[str, RigidTransform]
 ) -> Array:
-    """(P, 6): each pair carried level by 1 mm away from the body, its pole's pairs alike."""
+    """(P, 6): each pair moved level by 1 mm away from the body, all pairs of a pole alike."""
     away = np.array([rig_from_camera[name].translation - BODY_CENTRE for name in names])
     away[:, 2] = 0.0
     out = np.zeros((len(away), 6))

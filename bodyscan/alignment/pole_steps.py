@@ -1,9 +1,8 @@
 """A pole that was moved since the calibration, told from a person who moved while it was scanned.
 
-Both shift pairs against each other. But all pairs of a pole that was moved are off by the same, at
-once and whenever they fire, while a person moves smoothly: what pairs see within a moment of each
-other hardly differs. Which of the two explains the pairs' motions better is asked of both as
-Gaussian processes over time.
+Both shift pairs relative to each other. But all pairs of a moved pole are off by the same amount,
+whenever they fire, while a person moves smoothly: what pairs see within a moment of each other
+hardly differs. Both explanations are compared as Gaussian processes over time.
 """
 
 from __future__ import annotations
@@ -22,41 +21,44 @@ from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 
 FEWEST = 4
-"""pairs: of two or three, any may have been the one that moved."""
+"""pairs: with two or three, any could be the one that moved."""
 STEP_MM = 1.0
-"""What it is said from. Less is what calibrations of poles disagree by, and alignment takes it out."""
+"""Smallest step reported. Calibrations of poles disagree by less, and alignment corrects it."""
 SURE = 6.0
-"""Logarithm of how many times as well a moved pole has to explain it: 400 times."""
+"""Log of the likelihood ratio that a moved pole must reach: 400 times."""
 NOISE_MM = np.geomspace(0.05, 5.0, 9)
 SWAY_MM = np.geomspace(0.05, 20.0, 10)
 STILL_MM = 0.4
-"""What a mannequin seems to sway by, as calibrations disagree; a person who stands, by 1 to 5."""
+"""Apparent sway of a mannequin, because calibrations disagree; a standing person's is 1 to 5."""
 SHARED, SHARED_MM = 0.6, 0.9
-"""Of a sway, and at most: what its rigid motion leaves, alike for the pairs of a pole, which see one
-side. A side breathes by some 2 mm, and arms go their own ways: of ten sound people who stood half had a
-pole off by 1.5 to 4 mm, more than 0.3 of their sway can be."""
+"""Residual of the sway beyond rigid motion, relative to it and at most in mm; it is shared by the
+pairs of a pole, which see one side. A side breathes by some 2 mm, and arms move by themselves: of
+ten sound standing people half had a pole off by 1.5 to 4 mm, more than 0.3 of their sway can be."""
 STEPS_MM = np.geomspace(0.5, 30.0, 8)
 NEARLY = 0.5
-"""Correlation of a stance with that of 0.8 s later. A pole that fired when no other did, by
-that, saw a person who may have gone there meanwhile."""
+"""Correlation of a stance with itself 0.8 s later. If a pole fired at no other pole's time, by this
+measure, the person may have moved there meanwhile."""
 TOLD_SIGMAS = 8.0
-"""A shift of x sigmas one way has a logarithm of x^2 / 2 - 3 log(1 + x^2) for it: SURE at 5.8, and two
-more lest chance hides it."""
+"""A shift of x sigmas in one direction has a log likelihood ratio of x^2 / 2 - 3 log(1 + x^2): SURE
+is reached at 5.8, and two more keep chance from hiding it."""
 SEVERAL = 3
-"""scans: from so many on what is alike in all is no sway, whenever pairs fire."""
+"""scans: with this many, what is alike in all of them is not sway, whenever pairs fire."""
 ANYWHERE_MM = 100.0
-"""Of all pairs together: how the whole stands is not asked."""
+"""Prior of a common motion of all pairs, which is not of interest."""
 
 
 FREE = SwayPrior(30.0, 5.0, 1.0, 1.0)
-"""How far a pole that moved may have: farther off it shares no surface with the others."""
+"""How far a moved pole may have moved: farther off it shares no surface with the others."""
 
 
 @dataclass(frozen=True)
 class PoleStep:
-    """A pole, or a pair by itself, that stands off by shift_mm at the body's centre, and turned, from
-    where the others and its calibration put it.  name: `pole p1`.  all_moved: whether each of the
-    others has a step of its own, so that none is where it was."""
+    """A pole, or a pair by itself, that stands off from the others and its calibration.
+
+    name: `pole p1` or `pair p1-2`.
+    shift_mm, turn_deg: by how much, at the body's centre.
+    all_moved: whether each of the others has a step of its own, so that none is where it was.
+    """
 
     name: str
     pairs: frozenset[str]
@@ -66,7 +68,7 @@ class PoleStep:
 
     @staticmethod
     def of(name: str, pairs: frozenset[str], motions: Mapping[str, Array]) -> PoleStep:
-        """Against the mean of the others."""
+        """The step against the mean of the others."""
         own, others = (
             np.mean([twist for n, twist in motions.items() if (n in pairs) == its], axis=0)
             for its in (True, False)
@@ -76,9 +78,10 @@ class PoleStep:
 
 
 def moving_alone(names: Sequence[str], poles: Mapping[str, str]) -> dict[str, frozenset[str]]:
-    """What may have moved by itself, by what it is called: `pole p1`, `pair p1-2`.
+    """What may have moved by itself, keyed by its name: `pole p1`, `pair p1-2`.
 
-    poles: of the pairs that stand on one."""
+    poles: the pole of each pair that stands on one.
+    """
     groups = {f"pair {name}": frozenset([name]) for name in names}
     for pole in sorted({poles[name] for name in names if name in poles}):
         groups[f"pole {pole}"] = frozenset(name for name in names if poles.get(name) == pole)
@@ -86,16 +89,20 @@ def moving_alone(names: Sequence[str], poles: Mapping[str, str]) -> dict[str, fr
 
 
 Scan = tuple[Mapping[str, Array], Mapping[str, float | None]]
-"""motions: (6,) of each pair by its name, as alignment moved it: a rotation vector about the rig's
-origin, a translation.  moments_ms: when each saw the person; None where that is not known."""
+"""motions: (6,) of each pair by name, as alignment moved it: a rotation vector about the rig's
+origin and a translation.  moments_ms: when each saw the person; None if not known."""
 
 
 @dataclass(frozen=True)
 class StepSearch:
-    """step: the pole or pair that stands off in all scans, if one does.  least_mm: from which on it
-    would have been seen of any pole or pair; infinite if of some it cannot be told at all.  sway_mm:
-    a person's, for each axis, and own_mm: what pairs stand off besides, each by itself: standard
-    deviations."""
+    """The result of a search for a step.
+
+    step: the pole or pair that stands off in all scans, if one does.
+    least_mm: smallest step that would have been seen of any pole or pair; infinite if it cannot be
+        told at all for some.
+    sway_mm: standard deviation of the person's sway, per axis.
+    own_mm: standard deviation of each pair's own offset besides.
+    """
 
     step: PoleStep | None
     least_mm: float
@@ -106,10 +113,15 @@ class StepSearch:
 def find_steps(
     scans: Sequence[Scan], poles: Mapping[str, str], freed: Collection[str] = ()
 ) -> StepSearch:
-    """From one scan, or several since the calibration: a person sways otherwise in each, while what was
-    moved stands off by the same in all.  Of pairs whose moment is not known nobody can tell in one
-    scan.  poles: as in `moving_alone`.  freed: pairs of poles that are known to have moved: is there
-    another?  Where each pole moved, the one that stands off farthest is the step."""
+    """Find the step in one scan, or in several since the calibration.
+
+    poles: as in `moving_alone`.
+    freed: pairs of poles known to have moved; another one is searched for.
+
+    A person sways differently in each scan, while what was moved stands off the same way in all. In
+    a single scan nothing can be said about pairs whose moment is not known. If every pole moved,
+    the one that stands off farthest is the step.
+    """
     several = len(scans) >= SEVERAL
     seen = _Seen.of(scans, poles, freed, timed=not several)
     if len(set(seen.names)) < FEWEST:
@@ -127,7 +139,7 @@ def find_steps(
             continue
         spread = 1.0 / np.sqrt(own @ np.linalg.solve(believed, own.astype(float)))
         least = max(least, TOLD_SIGMAS * float(spread))
-        # A head or an arm that moved looks like the one pair that saw it: of those who stand.
+        # One pair may look moved because a head or an arm moved, unless the person hardly swayed.
         free = len(pairs) > 1 or several
         if not free and sway_mm > STILL_MM:
             least = np.inf
@@ -139,7 +151,7 @@ def find_steps(
         return StepSearch(None, np.inf)
     gain, step = max(found, key=lambda one: one[0])
     if not hidden:
-        # Of poles that all moved outwards none moved by itself, and the body comes out too thin.
+        # If all poles moved outwards none moved by itself, and the body comes out too thin.
         each = _evidence(seen, SWAY_MM, _alike(seen.names, poles), STEPS_MM)[0] - still
         if each > max(gain, SURE):
             gain = each
@@ -153,13 +165,13 @@ def find_steps(
 
 
 def _mean(motions: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
-    """Of each pair over the scans that have it."""
+    """Mean of each pair over the scans that have it."""
     names = dict.fromkeys(name for own in motions for name in own)
     return {name: np.mean([own[name] for own in motions if name in own], axis=0) for name in names}
 
 
 def loosened(boards: PoseCovariance, pairs: Collection[str]) -> PoseCovariance:
-    """The calibration's covariance with a pole's pairs free to move, all alike."""
+    """The calibration's covariance with a pole's pairs free to move together."""
     matrix, own = boards.matrix.copy(), FREE.of_one()
     places = [6 * boards.names.index(name) for name in pairs]
     for i in places:
@@ -171,16 +183,20 @@ def loosened(boards: PoseCovariance, pairs: Collection[str]) -> PoseCovariance:
 def motions_between(
     before: Mapping[str, RigidTransform], after: Mapping[str, RigidTransform]
 ) -> dict[str, Array]:
-    """(6,) by which each pair was moved, rig frame."""
+    """Twist (6,) by which each pair was moved, rig frame."""
     return {name: (after[name] @ before[name].inverse()).twist for name in after}
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What N pairs, those of each scan after those of another, saw.  motions: (N, 6) mm, of the body's
-    centre and of what is an arm's length from it.  sway: (N, N) correlations of a person's.  sides:
-    (N, N) 1 for those that saw the same side at once.  free: (N, N) mm2, of what is not asked: how a
-    scan stands as a whole, and poles known to have moved."""
+    """What N pairs saw, scan after scan.
+
+    motions: of the body's centre and of a point at arm's length, (N, 6) mm.
+    sway: correlations of a person's sway, (N, N).
+    sides: 1 for pairs that saw the same side in one scan, (N, N).
+    free: prior variances of what is not of interest, (N, N) mm2: how a scan stands as a whole, and
+        poles known to have moved.
+    """
 
     names: tuple[str, ...]
     motions: Array
@@ -192,7 +208,7 @@ class _Seen:
     def of(
         scans: Sequence[Scan], poles: Mapping[str, str], freed: Collection[str], *, timed: bool
     ) -> _Seen:
-        """timed: of pairs whose moment is known alone."""
+        """timed: leave out pairs whose moment is not known."""
         names: list[str] = []
         motions, sways, sides = [np.empty((0, 6))], [], []
         for moved, moments_ms in scans:
@@ -214,14 +230,14 @@ class _Seen:
 
 
 def _stances(moments_ms: Sequence[float | None]) -> Array:
-    """Correlations; a moment that is not known is like no other."""
+    """Correlations of stances; one at an unknown moment correlates with no other."""
     seconds = np.array([np.nan if at is None else 1e-3 * at for at in moments_ms], float)
     apart = seconds[:, None] - seconds
     return np.where(np.isnan(apart), np.eye(len(seconds)), of_stance(np.nan_to_num(apart)))
 
 
 def _alike(names: Sequence[str], poles: Mapping[str, str]) -> Array:
-    """(N, N) 1 for pairs of one pole."""
+    """(N, N): 1 for pairs of one pole."""
     side = [poles.get(name, name) for name in names]
     return np.equal.outer(side, side).astype(float)
 
@@ -229,9 +245,12 @@ def _alike(names: Sequence[str], poles: Mapping[str, str]) -> Array:
 def _evidence(
     seen: _Seen, sways_mm: Array, stepped: Array, steps_mm: Array
 ) -> tuple[float, Array, float, float]:
-    """Logarithm of the likelihood of the motions, at the sizes of sway, step and noise that explain
-    them best, the covariance (N, N) that these make, sway and noise.  stepped: (N, N), 1 for two that
-    have the same step."""
+    """Log likelihood of the motions at the best sizes of sway, step and noise.
+
+    stepped: 1 for two pairs that share a step, (N, N).
+
+    Also returns the covariance (N, N) at these sizes, and the sizes of sway and noise, mm.
+    """
     sway2, step2 = (sizes.ravel() for sizes in np.meshgrid(sways_mm**2, steps_mm**2))
     moved = (
         sway2[:, None, None] * seen.sway
@@ -239,7 +258,7 @@ def _evidence(
         + step2[:, None, None] * stepped
         + seen.free
     )
-    # Noise is added to the eigenvalues: one decomposition serves all its sizes.
+    # Noise adds to the eigenvalues, so one decomposition serves all its sizes.
     variances, ways = np.linalg.eigh(moved)
     noise2 = NOISE_MM**2
     variance = np.maximum(variances, 0.0)[:, None, :] + noise2[:, None]

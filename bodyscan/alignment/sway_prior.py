@@ -1,7 +1,7 @@
-"""A subject's sway: how far people move between the pairs' shots, believed, found and bounded.
+"""A subject's sway: how far people move between the pairs' shots, assumed, found and bounded.
 
-Alignment takes it out (see `icp`): each pair's pose may move about the body's centre as far as this
-prior lets it, besides what the boards left open.
+Alignment removes it (see `icp`): each pair's pose may move about the body's centre as far as this
+prior allows, in addition to what the boards left open.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.settings import BODY_CENTRE_MM, AlignmentSettings
 
 BODY_CENTRE = np.array(BODY_CENTRE_MM)
-SWAY_ROOM = 1.5  # standard deviations are believed this much larger than what was found
+SWAY_ROOM = 1.5  # assumed standard deviations over those found
 
 
 @dataclass(frozen=True)
 class SwayPrior:
-    """Standard deviations of a subject's motion between pairs: of a shift, and of a rotation about
-    the body's centre; 0 for a rigid object. What is found scales both, from `least` to `most`.
+    """Standard deviations of a subject's motion between pairs: a shift, and a rotation about the
+    body's centre; 0 for a rigid object. The sway found scales both, from `least` to `most`.
     """
 
     shift_mm: float
@@ -39,9 +39,9 @@ class SwayPrior:
         )
 
     def scale(self, motion: Array) -> float:
-        """How much the subject moved by motions (P, 6), in multiples of `shift_mm`.
+        """Size of motions (P, 6) in multiples of `shift_mm`, with some room.
 
-        A prior too tight would leave a part of the sway in; too wide it would let noise in.
+        Too tight a prior would leave part of the sway in; too wide a one would let noise in.
         """
         if not self.shift_mm:
             return 1.0
@@ -49,18 +49,18 @@ class SwayPrior:
         return float(np.clip(SWAY_ROOM * found, self.least, self.most))
 
     def covariance(self, names: Sequence[str], boards: PoseCovariance, scale: float = 1.0) -> Array:
-        """(6P, 6P): the calibration's covariance, plus for each pair a sway `scale` times the usual."""
+        """The calibration's covariance plus `scale` times each pair's usual sway, (6P, 6P)."""
         return boards.among(names) + np.kron(np.eye(len(names)), self.of_one(scale))
 
     def of_one(self, scale: float = 1.0) -> Array:
-        """(6, 6): of one pair's sway, rig frame."""
+        """Covariance of one pair's sway, rig frame, (6, 6)."""
         rotation, translation = scale * np.radians(self.rotation_deg), scale * self.shift_mm
         own = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
         carry = adjoint(RigidTransform(np.eye(3), BODY_CENTRE))
         return np.asarray(carry @ own @ carry.T)
 
     def loosen(self, boards: PoseCovariance, untied: Collection[str]) -> PoseCovariance:
-        """The calibration's covariance, and the sway of the pairs that no overlap ties."""
+        """The calibration's covariance plus the sway of the pairs that no overlap ties."""
         matrix, own = boards.matrix.copy(), self.of_one()
         for name in untied:
             here = slice(6 * boards.names.index(name), 6 * boards.names.index(name) + 6)
@@ -69,12 +69,12 @@ class SwayPrior:
 
 
 def centre_shifts(motion: Array) -> Array:
-    """(P, 3) mm: how far motions (P, 6) carry the body's centre."""
+    """How far motions (P, 6) carry the body's centre, (P, 3) mm."""
     return motion[:, 3:] + np.cross(motion[:, :3], BODY_CENTRE)
 
 
 def centre_sigmas(boards: PoseCovariance) -> dict[str, float]:
-    """mm, of each pair: how far its place alone may put the body's centre off."""
+    """How far each pair's pose error may put the body's centre off, mm."""
     return {
         name: float(np.linalg.norm(position_sigma(boards, name, BODY_CENTRE)))
         for name in boards.names
@@ -84,8 +84,10 @@ def centre_sigmas(boards: PoseCovariance) -> dict[str, float]:
 def bound_motions(
     names: Sequence[str], motion: Array, covariance: Array, limit_sigmas: float
 ) -> tuple[Array, dict[str, float]]:
-    """Motions (P, 6), 0 for pairs that moved more than `limit_sigmas` of their own prior (six
-    freedoms); and by how many sigmas these did."""
+    """Motions (P, 6), set to 0 for pairs that moved more than `limit_sigmas` of their own prior.
+
+    Sigmas are over six degrees of freedom; also returns those of the refused pairs.
+    """
     kept, refused = motion.copy(), {}
     for k, name in enumerate(names):
         block = covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]

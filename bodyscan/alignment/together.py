@@ -1,4 +1,4 @@
-"""All range images of a person brought together: the person followed, and poles that moved set free."""
+"""Bring all range images of a person together: follow the person, free the poles that moved."""
 
 from __future__ import annotations
 
@@ -26,8 +26,13 @@ from bodyscan.settings import AlignmentSettings
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """followed: of a person who moved.  shifted: poles, or pairs, that stand off, and size: all of them
-    do; both were set free.  search: for what moved by itself besides."""
+    """A person's range images brought together.
+
+    followed: the motion of a person who moved.
+    shifted: poles, or pairs, that stand off and were freed.
+    size: the common step outwards, if all poles were freed.
+    search: for what else moved by itself.
+    """
 
     alignment: Alignment
     followed: Followed | None
@@ -44,11 +49,15 @@ def bring_together(
     poles: Mapping[str, str],
     settings: AlignmentSettings,
 ) -> Together:
-    """images, rig_from_camera, boards, settings: what `align` got; aligned: what it made of them.
-    poles: of each pair that stands on one.
+    """Follow the person and free what stands off, in turn.
 
-    A person's motion and poles that stand off explain each other. So the person is followed first, as
-    if no pole had moved; what that leaves for poles alone to explain is set free, and all done anew.
+    images, rig_from_camera, boards, settings: as given to `align`.
+    aligned: its result.
+    poles: the pole of each pair that stands on one.
+
+    A person's motion and poles that stand off can explain each other. So the person is followed
+    first as if no pole had moved; what that leaves for poles alone to explain is freed, and all is
+    done again.
     """
     steps: list[PoleStep] = []
     size: SizeStep | None = None
@@ -74,7 +83,7 @@ def bring_together(
 
 
 def _sides(names: Collection[str], poles: Mapping[str, str]) -> list[list[str]]:
-    """The pairs of each pole; one that stands on none by itself."""
+    """The pairs of each pole; pairs that stand on none, one by one."""
     sides: dict[str, list[str]] = {}
     for name in names:
         sides.setdefault(poles.get(name, name), []).append(name)
@@ -92,7 +101,7 @@ def _search(
     poles: Mapping[str, str],
     known: Sequence[PoleStep],
 ) -> StepSearch:
-    """What moved by itself besides what is known to; one pole stays, or all would have moved."""
+    """Search for what else moved by itself; one pole stays, or all would have moved."""
     freed = _pairs(known)
     if len({poles.get(image.pair, image.pair) for image in images if image.pair not in freed}) < 2:
         return StepSearch(None, np.inf)
@@ -121,6 +130,6 @@ def _measured_again(
 def _tied_motions(
     rig_from_camera: Mapping[str, RigidTransform], found: Alignment
 ) -> dict[str, Array]:
-    """Of the pairs that overlaps tie."""
+    """Motions of the pairs that overlaps tie."""
     placed = {name: found.rig_from_camera[name] for name in found.motion_mm}
     return motions_between(rig_from_camera, placed)

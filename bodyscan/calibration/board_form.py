@@ -1,8 +1,8 @@
-"""The form of a board: of a face as found, and as unknowns (how its sheet is bent, where corners are).
+"""The form of a board: a face as found, and the unknowns of bend and print.
 
-A sheet stands over its plane by a polynomial of second and third degree; its corners lie in it a
-little beside where they should.  Both are known beforehand to some extent, so what boards in few
-poses cannot show stays as uncertain as it was, and is part of every covariance.
+The sheet departs from its plane by a polynomial of second and third degree, and its corners are
+printed slightly off their places. Both have priors, so whatever boards in few poses cannot show
+stays as uncertain as it was, and enters every covariance.
 """
 
 from __future__ import annotations
@@ -14,19 +14,21 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 
-# Of x and y; `_powers` has them in this order.
+# Powers of x and y, in the order of `_powers`.
 POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 THIRD_DEGREE = np.add.outer(np.arange(4), np.arange(4)) <= 3
 FALL = 0.3
-"""A coefficient of third degree is expected to be so many times as large as one of second."""
+"""Expected size of a third-degree coefficient relative to one of second degree."""
 DIGITS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class BoardFace:
-    """The sheet on which the corners of one face lie: over the plane of z_mm a polynomial of third
-    degree in x and y, of which middle (2,) becomes 0 and half (2,) mm from it 1.  coefficients:
-    (4, 4)."""
+    """The sheet on which the corners of one face lie, board frame.
+
+    Above the plane z = z_mm it is a polynomial of third degree in x and y, scaled so that `middle`
+    (2,) mm becomes 0 and `half` (2,) mm from it becomes 1; coefficients: (4, 4) mm.
+    """
 
     z_mm: float
     middle: Array
@@ -35,7 +37,7 @@ class BoardFace:
 
     @staticmethod
     def through(points: Array) -> BoardFace:
-        """The one nearest to corners (N, 3) mm, board frame."""
+        """The face nearest to corners (N, 3) mm, board frame."""
         low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
         middle, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, 1e-9)
         z_mm, (x, y) = float(np.median(points[:, 2])), ((points[:, :2] - middle) / half).T
@@ -44,18 +46,20 @@ class BoardFace:
         return BoardFace(z_mm, middle, half, found.reshape(4, 4))
 
     def height(self, places: Array) -> Array:
-        """(...) mm over the plane at places (..., 2) mm of the board."""
+        """Heights (...) mm above the plane at places (..., 2) mm of the board."""
         x, y = np.moveaxis((places - self.middle) / self.half, -1, 0)
         return np.asarray(np.polynomial.polynomial.polyval2d(x, y, self.coefficients))
 
 
 @dataclass(frozen=True, eq=False)
 class BoardForm:
-    """points: (N, 3) mm, the corners as the board is described.  heights: (7,) mm, coefficients of
-    POWERS, each less its own best plane; x and y are -1 and 1 at the outermost corners.
-    printed: (N, 2) mm, how far corners lie beside `points`.
+    """The form of a board as unknowns.
 
-    flatness_mm, print_mm: standard deviations of what is bent and printed, before any image.
+    points: corners as the board is described, (N, 3) mm.
+    heights: coefficients of POWERS, each less its own best plane, (7,) mm; x and y are -1 and 1 at
+        the outermost corners.
+    printed: how far corners lie from `points` in the sheet, (N, 2) mm.
+    flatness_mm, print_mm: prior standard deviations of heights and printed.
     """
 
     points: Array
@@ -66,7 +70,7 @@ class BoardForm:
 
     @staticmethod
     def flat(points: Array, flatness_mm: float, print_mm: float) -> BoardForm:
-        """As described, all corners (M, 3) of any views given."""
+        """A board as described; points (M, 3) are the corners of any views given."""
         known = np.unique(np.round(points, DIGITS) + 0.0, axis=0)
         return BoardForm(
             known, np.zeros(len(POWERS)), np.zeros((len(known), 2)), flatness_mm, print_mm
@@ -74,55 +78,55 @@ class BoardForm:
 
     @property
     def count(self) -> int:
-        """How many unknowns there are: heights, then corners' x and y."""
+        """Number of unknowns: heights, then the corners' x and y."""
         return len(self.heights) + self.printed.size
 
     @property
     def prior_sigmas(self) -> Array:
-        """(count,) mm; 1 nm at least, so that a board said to be exact is."""
+        """Prior standard deviations, (count,) mm; at least 1 nm, for boards described as exact."""
         bent = [self.flatness_mm * (1.0 if sum(power) == 2 else FALL) for power in POWERS]
         return np.maximum([*bent, *[self.print_mm] * self.printed.size], 1e-6)
 
     @property
     def exact(self) -> BoardForm:
-        """The same, known to be so."""
+        """The same form, taken to be exact."""
         return replace(self, flatness_mm=0.0, print_mm=0.0)
 
     @property
     def unknowns(self) -> Array:
-        """(count,) mm."""
+        """Values of the unknowns, (count,) mm."""
         return np.concatenate([self.heights, self.printed.ravel()])
 
     @property
     def out_of_plane_mm(self) -> float:
-        """From the lowest to the highest corner."""
+        """Height from the lowest to the highest corner, mm."""
         return float(np.ptp(self.basis(self.points[:, :2]) @ self.heights))
 
     def moved(self, step: Array) -> BoardForm:
-        """With a step (count,) added."""
+        """The form with a step (count,) added to its unknowns."""
         bent, printed = step[: len(POWERS)], step[len(POWERS) :]
         return replace(
             self, heights=self.heights + bent, printed=self.printed + printed.reshape(-1, 2)
         )
 
     def basis(self, places: Array) -> Array:
-        """(..., 7): how high each unit of `heights` lifts places (..., 2) mm of the board."""
+        """(..., 7): height at places (..., 2) mm of the board per unit of each of `heights`."""
         powers, plane = self._powers(places)
         return np.asarray(powers - plane @ self._planes, np.float64)
 
     def height(self, places: Array) -> Array:
-        """(...) mm over the plane at places (..., 2) mm of the board."""
+        """Heights (...) mm above the plane at places (..., 2) mm of the board."""
         powers, plane = self._powers(places)
         return np.asarray(powers @ self.heights - plane @ (self._planes @ self.heights), np.float64)
 
     def numbers(self, points: Array) -> Indices:
-        """(M,) of corners (M, 3) among `points`."""
+        """Indices (M,) of corners (M, 3) in `points`."""
         place = {key: k for k, key in enumerate(map(tuple, self.points.tolist()))}
         rounded = np.round(points, DIGITS) + 0.0
         return np.array([place[key] for key in map(tuple, rounded.tolist())], np.int64)
 
     def applied(self, points: Array, numbers: Indices) -> Array:
-        """Corners (M, 3) as described -> where they lie."""
+        """Where corners (M, 3) lie that are described as `points`."""
         return np.column_stack(
             [points[:, :2] + self.printed[numbers], points[:, 2] + self.height(points[:, :2])]
         )
@@ -142,7 +146,7 @@ class BoardForm:
         return np.asarray(np.linalg.lstsq(plane, powers, rcond=None)[0])
 
     def _powers(self, places: Array) -> tuple[Array, Array]:
-        """(..., 7) POWERS and (..., 3) 1, x, y of places (..., 2) mm."""
+        """POWERS (..., 7) and 1, x, y (..., 3) of places (..., 2) mm."""
         x, y = np.moveaxis((places - self._middle) / self._half, -1, 0)
         xx, yy = x * x, y * y
         powers = np.stack([xx, x * y, yy, xx * x, xx * y, x * yy, yy * y], axis=-1)

@@ -17,7 +17,7 @@ FEWEST_CORNERS = 8
 
 @dataclass(frozen=True, eq=False)
 class PlanarView:
-    """One board in one image: points (N, 3) of its frame, all at one z, and pixels (N, 2)."""
+    """One board in one image: points (N, 3) mm, board frame, all at one z, and pixels (N, 2)."""
 
     shot: str
     points: Array
@@ -30,7 +30,7 @@ def planar_view(view: BoardView, board: Board) -> PlanarView:
 
 
 def has_enough_corners(view: BoardView, board: Board) -> bool:
-    """Enough corners, not all along one line of the board."""
+    """Whether a view has enough corners, not all along one line of the board."""
     grid = view.corner_ids % corners_per_face(board)
     width = corner_grid(board)[0]
     columns, rows = grid % width, grid // width
@@ -39,10 +39,10 @@ def has_enough_corners(view: BoardView, board: Board) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class LocatedView:
-    """points (N, 3) of the board's frame seen at pixels (N, 2) by `pair`, with the pose they give.
+    """Points (N, 3) mm of a board seen at pixels (N, 2) by `pair`, with the pose they give.
 
-    alternatives: every `board_from_seen` under which the board looks the same to the detector
-    (identity first): a plain board may be numbered from its other end, or seen from its back.
+    alternatives: every `board_from_seen` under which the board looks the same to the detector,
+        identity first: a plain board may be numbered from its other end or seen from its back.
     """
 
     pair: str
@@ -59,7 +59,7 @@ class LocatedView:
 
     @property
     def target(self) -> tuple[str, str]:
-        """(shot, board): what several cameras may see at once."""
+        """(shot, board): what several cameras may see together."""
         return self.shot, self.board
 
     @property
@@ -67,7 +67,7 @@ class LocatedView:
         return len(self.alternatives) > 1
 
     def resolved(self, board_from_seen: RigidTransform) -> LocatedView:
-        """The same view with one of its alternatives taken for true."""
+        """The same view with one of its alternatives taken as true."""
         return replace(
             self,
             points=board_from_seen.apply(self.points),
@@ -77,7 +77,7 @@ class LocatedView:
 
 
 def greatest_displacement(a: RigidTransform, b: RigidTransform, reach_mm: float) -> float:
-    """How far two transforms differ, mm: translation, plus rotation acting at `reach_mm`."""
+    """Difference of two transforms, mm: translation plus rotation acting at `reach_mm`."""
     difference = a.inverse() @ b
     return float(np.linalg.norm(difference.translation) + difference.angle * reach_mm)
 
@@ -85,7 +85,8 @@ def greatest_displacement(a: RigidTransform, b: RigidTransform, reach_mm: float)
 def board_symmetries(board: Board) -> tuple[RigidTransform, ...]:
     """Every `board_from_seen` under which a plain board looks the same to the detector.
 
-    From its other end (unless the colour of its first square tells), and from its back.
+    A plain board may be numbered from its other end, unless the colour of its first square shows
+    which end it is, or seen from its back.
     """
     width, height = board.columns * board.square_mm, board.rows * board.square_mm
     found = [RigidTransform.identity()]

@@ -14,20 +14,22 @@ from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 
 BENDS = 2
-"""Times that a ray's point is lifted to where the board is bent: the first is off by what the board
-rises over a few tenths of a millimetre."""
+"""Iterations that lift a ray's point to a bent board's surface; the first alone is off by how much
+the board rises over a few tenths of a millimetre."""
 
 Height = Callable[[Array], Array]
-"""Places (..., 2) mm of a board -> (...) mm that it stands over its plane there."""
+"""Maps places (..., 2) mm of a board to heights (...) mm above its plane."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoundaryPoints:
     """Stripe boundaries of one pair carried onto its boards, camera frame.
 
-    index: (N,) boundary i, where s = i.  board: (N,) number of the shot.
-    points: (N, 3) mm.  per_pixel: (N, 3) mm, how a point moves on its board for one pixel across
-    the stripe.  sigma_px: (N,).
+    index: boundary i, where s = i, (N,).
+    board: number of the shot, (N,).
+    points: (N, 3) mm.
+    per_pixel: how a point moves on its board per pixel across the stripe, (N, 3) mm.
+    sigma_px: (N,) px.
     """
 
     index: Indices
@@ -38,23 +40,27 @@ class BoundaryPoints:
 
     @cached_property
     def board_errors(self) -> BoardErrors:
-        """From the points themselves, which lie on their boards."""
+        """Effects of board errors, from the points themselves, which lie on their boards."""
         return _board_errors(self)
 
 
 def points_on_board(
     camera: Camera, camera_from_board: RigidTransform, pixels: Array, height: Height | None = None
 ) -> Array:
-    """Eq. 18: pixels (N, 2) carried onto the board's plane z = 0, camera frame (N, 3) mm; onto the
-    board itself where its height is given."""
+    """Carry pixels (N, 2) onto a board, camera frame (N, 3) mm (Eq. 18).
+
+    Onto the board's plane z = 0, or onto its surface if `height` is given.
+    """
     return rays_on_board(camera.rays(pixels), camera_from_board, height)
 
 
 def rays_on_board(
     rays: Array, camera_from_board: RigidTransform, height: Height | None = None
 ) -> Array:
-    """Where rays (..., 3) of the camera frame meet the board's plane z = 0, (..., 3) mm; or the board,
-    which stands so high over it."""
+    """Where rays (..., 3), camera frame, meet a board, (..., 3) mm.
+
+    They meet its plane z = 0, or its surface if `height` is given.
+    """
     normal = camera_from_board.rotation[:, 2]
     flat = rays * (normal @ camera_from_board.translation / (rays @ normal))[..., None]
     if height is None:
@@ -67,7 +73,7 @@ def rays_on_board(
 
 
 def lifts(rays: Array, camera_from_board: RigidTransform, height: Array) -> Array:
-    """How far points on rays (..., 3) move along them where the board stands so high over its plane."""
+    """How far points move along their rays (..., 3) for a board `height` mm above its plane."""
     return np.asarray(rays * (height / (rays @ camera_from_board.rotation[:, 2]))[..., None])
 
 
@@ -82,7 +88,7 @@ def boundary_points(
     direction: Axis,
     height: Height | None = None,
 ) -> BoundaryPoints:
-    """Carry boundary pixels (N, 2) of one shot onto its board, flat unless its height is given."""
+    """Carry boundary pixels (N, 2) of one shot onto its board, flat unless `height` is given."""
     rays, across = camera.rays(pixels), 1 if direction == "horizontal" else 0
     half = np.zeros_like(rays)
     half[:, :2] = 0.5 * camera.rays_by_pixels(rays)[..., across]
@@ -93,7 +99,7 @@ def boundary_points(
 
 
 def concatenate(parts: Sequence[BoundaryPoints]) -> BoundaryPoints:
-    """The boundary points of several shots as one."""
+    """Join the boundary points of several shots."""
     return BoundaryPoints(
         *(
             np.concatenate([getattr(part, field.name) for part in parts])
@@ -108,7 +114,7 @@ def select(data: BoundaryPoints, kept: Mask) -> BoundaryPoints:
 
 
 def subsample(data: BoundaryPoints, most: int) -> BoundaryPoints:
-    """Every n-th boundary only, so that no more than about `most` points are left."""
+    """Keep every n-th boundary only, so that no more than about `most` points are left."""
     every = -(-len(data.index) // most)
     if every <= 1:
         return data
@@ -118,11 +124,12 @@ def subsample(data: BoundaryPoints, most: int) -> BoundaryPoints:
 
 @dataclass(frozen=True, eq=False)
 class BoardErrors:
-    """How a board that is not quite where it is thought to be moves its points.
+    """How a small error of a board's pose moves its points.
 
     effects: (N, 3): 1 for the board's shift, and a point's place on it (of unit variance) for its
-    two tilts.  along_ray: (N, 3) mm that the point moves along its ray for each mm of an effect
-    along the board's normal.  facing: (N,) |normal . ray|: mm from the board for each mm of depth.
+        two tilts.
+    along_ray: (N, 3) mm by which a point moves along its ray per mm of an effect along the normal.
+    facing: (N,) |normal . ray|: mm from the board per mm of depth.
     """
 
     effects: Array
@@ -147,5 +154,5 @@ def _board_errors(data: BoundaryPoints) -> BoardErrors:
 
 
 def _by_board(values: Array, board: Indices) -> Array:
-    """Sums (B, K) of values (N, K) over the points of each board."""
+    """Sums (B, K) of values (N, K) over each board's points."""
     return np.stack([np.bincount(board, column) for column in values.T], axis=-1)

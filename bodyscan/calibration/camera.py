@@ -1,4 +1,4 @@
-"""The camera of a pair: maximum likelihood over intrinsics and board poses, with covariance (3.1)."""
+"""Maximum-likelihood calibration of a camera and its board poses, with covariance (3.1)."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ CORNERS = Noise("corners", group=2, cauchy=4.0)
 
 @dataclass(frozen=True)
 class LensTrial:
-    """How one kind of lens did on boards that it was not fitted to.
+    """How one kind of lens did on held-out boards.
 
-    rms_px: of their corners, robustly weighted.  gain: by how many of its own standard errors it did
-    better than the lens it was tried against (the one chosen so far); None for the first.
+    rms_px: RMS error of their corners, px, robustly weighted.
+    gain: standard errors by which it beat the lens chosen so far; None for the first.
     """
 
     kind: str
@@ -46,11 +46,14 @@ class LensTrial:
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """camera with the covariance (P, P) of its parameters, and the board's pose in each shot.
+    """A calibrated camera.
 
-    rms_px: root mean square distance of corners to their reprojection, robustly weighted.
-    lenses: those tried on held-out boards; empty where the lens was given.  rays: how well each
-    pixel's is known; None where nobody asked.
+    camera, covariance: the camera, and the covariance (P, P) of its parameters.
+    camera_from_board: the board's pose in each shot.
+    residuals_px: (N, 2) for each shot.
+    rms_px: RMS distance of corners from their reprojection, robustly weighted.
+    lenses: lenses tried on held-out boards; empty if the lens was given.
+    rays: how well each pixel's ray is known; None if that was not computed.
     """
 
     camera: Camera
@@ -64,7 +67,7 @@ class CameraCalibration:
 
 @dataclass(frozen=True, eq=False)
 class CameraFit:
-    """A camera and `camera_from_board` of each of its views, with what that leaves over."""
+    """A camera with `camera_from_board` of each view, as fitted to them."""
 
     solution: Solution[_State]
 
@@ -78,28 +81,28 @@ class CameraFit:
 
     @property
     def residuals(self) -> tuple[Array, ...]:
-        """(N, 2) px of each view."""
+        """Of each view, (N, 2) px."""
         corners = self.solution.blocks[0]
         return _by_view(corners.residuals.reshape(-1, 2), corners)
 
     @property
     def weights(self) -> tuple[Array, ...]:
-        """(N,) of each view's corners, robust."""
+        """Robust weights of each view's corners, (N,)."""
         return _by_view(self.solution.weights[0][::2], self.solution.blocks[0])
 
     @cached_property
     def covariance(self) -> Array:
-        """(P, P) of the camera's parameters."""
+        """Covariance of the camera's parameters, (P, P)."""
         size = len(self.camera.parameters)
         return self.solution.variance * self.solution.covariance[:size, :size]
 
     @property
     def rms_px(self) -> float:
-        """Robustly weighted."""
+        """RMS distance of corners from their reprojection, robustly weighted."""
         return weighted_rms(self.residuals, self.weights)
 
     def calibration(self, views: Sequence[PlanarView]) -> CameraCalibration:
-        """Of the views it was fitted to."""
+        """The calibration that this fit gives; views: those it was fitted to."""
         shots = [view.shot for view in views]
         return CameraCalibration(
             self.camera,
@@ -127,17 +130,17 @@ class _State:
 def calibrate_camera(
     views: Sequence[PlanarView], width: int, height: int, lens: Lens = CHAPTERS_LENS
 ) -> CameraCalibration:
-    """Zhang's method with skew, and with a lens of the kind of `lens`, which it starts from.
+    """Zhang's method with skew, and a lens of the same kind as `lens`, which is the start.
 
-    Raises DegeneratePoses for fewer than three poses or poses that differ by a translation only.
+    Raises DegeneratePoses for fewer than three poses, or poses that differ only by a translation.
     """
     return fit_from_scratch(views, width, height, lens).calibration(views)
 
 
 def calibrate_known_camera(views: Sequence[PlanarView], camera: Camera) -> CameraCalibration:
-    """A camera with a prior, which its views may move as far as that lets them; one will do.
+    """Refine a camera with a prior on its views, within that prior; one view is enough.
 
-    Raises DegeneratePoses if there is none.
+    Raises DegeneratePoses if there is no view.
     """
     if not views:
         raise DegeneratePoses(
@@ -151,7 +154,7 @@ def calibrate_known_camera(views: Sequence[PlanarView], camera: Camera) -> Camer
 def fit_from_scratch(
     views: Sequence[PlanarView], width: int, height: int, lens: Lens = CHAPTERS_LENS
 ) -> CameraFit:
-    """As `calibrate_camera`."""
+    """The fit behind `calibrate_camera`."""
     if len(views) < FEWEST_POSES:
         raise DegeneratePoses(
             f"{len(views)} usable board poses, at least {FEWEST_POSES} are needed",
@@ -176,8 +179,11 @@ def fit_camera(
     settled: float = SETTLED,
     damping: float = DAMPING,
 ) -> CameraFit:
-    """Least squares over camera and boards from where they are, `camera_from_board` of each view;
-    damping: see `minimize`."""
+    """Fit camera and board poses by least squares, starting from those given.
+
+    poses: `camera_from_board` of each view.
+    settled, damping: see `minimize`.
+    """
     size = len(camera.parameters)
     solution = minimize(
         _State(camera, tuple(poses)),
@@ -194,15 +200,17 @@ def fit_camera(
 
 
 def weighted_rms(residuals: Sequence[Array], weights: Sequence[Array]) -> float:
-    """Of distances (N, 2) px with weights (N,), view by view."""
+    """Weighted RMS of distances (N, 2) px with weights (N,), given view by view."""
     weight = np.concatenate(weights)
     squared = np.sum(np.concatenate(residuals) ** 2, axis=1)
     return float(np.sqrt(np.sum(weight * squared) / np.sum(weight)))
 
 
 def known_beforehand(camera: Camera, columns: Indices) -> Block:
-    """What is known of a camera by itself: its prior if it has one, else that its lens bends little;
-    `columns` are its parameters'."""
+    """The prior on a camera: its own if it has one, otherwise that its lens bends little.
+
+    columns: indices of the camera's parameters among the unknowns.
+    """
     if camera.prior is None:
         return lens_prior(camera, columns[len(MATRIX) :])
     known = 1.0 / camera.prior.sigmas
@@ -211,8 +219,11 @@ def known_beforehand(camera: Camera, columns: Indices) -> Block:
 
 
 def lens_prior(camera: Camera, columns: Indices) -> Block:
-    """What is known of the lens beforehand: that it bends little. Keeps coefficients that the boards
-    leave open, or only the sum of, from running off; `columns` are theirs."""
+    """The prior on the lens: that it bends little.
+
+    It keeps coefficients that the boards leave open, or of which they give only the sum, from
+    running away. columns: indices of the coefficients among the unknowns.
+    """
     known = 1.0 / camera.lens.prior_sigmas
     return Block(known * camera.lens.coefficients, lambda: np.diag(known), columns, EXACT)
 
@@ -220,15 +231,15 @@ def lens_prior(camera: Camera, columns: Indices) -> Block:
 def locate_board(
     camera: Camera, view: PlanarView, start: RigidTransform | None = None
 ) -> tuple[RigidTransform, Array]:
-    """`camera_from_board` of one view for a known camera, and its residuals (N, 2) px."""
+    """`camera_from_board` of one view for a known camera, and the residuals (N, 2) px."""
     begun = roughly_located(camera, view) if start is None else start
     (pose,), (residuals,) = locate_boards(camera, [view], [begun])
     return pose, residuals
 
 
 def roughly_located(camera: Camera, view: PlanarView) -> RigidTransform:
-    """`camera_from_board` of one view by its homography: where `locate_boards` may start."""
-    # Where the lens folds, the pixel without its lens has to do.
+    """`camera_from_board` of one view from its homography: a start for `locate_boards`."""
+    # Where the lens folds there is no ray: use the pixel with the lens ignored.
     seen = camera.rays(view.pixels)[:, :2]
     normalized = np.where(np.isfinite(seen), seen, camera.normalized_from_pixels(view.pixels))
     return camera_from_plane(homography(view.points[:, :2], normalized), float(view.points[0, 2]))
@@ -241,8 +252,10 @@ def locate_boards(
     *,
     settled: float = SETTLED,
 ) -> tuple[tuple[RigidTransform, ...], tuple[Array, ...]]:
-    """`camera_from_board` of views whose corners err alike, for a known camera, and the residuals
-    (N, 2) px of each."""
+    """`camera_from_board` of each view for a known camera, and residuals (N, 2) px of each.
+
+    All corners share one noise level.
+    """
     solution = minimize(
         _State(camera, tuple(starts)),
         lambda state: [_corners_of_all(state, views, camera_free=False)],
@@ -271,8 +284,10 @@ def _camera(matrix: Array, lens: Lens, width: int, height: int) -> Camera:
 def _corners_of_all(
     state: _State, views: Sequence[PlanarView], *, camera_free: bool = True
 ) -> Block:
-    """Reprojection errors, px, a run for each view; by the camera's parameters, which come first if
-    free, and by its board's pose."""
+    """Reprojection errors, px, one run for each view.
+
+    Derivatives are by the camera's parameters, which come first if free, and by the board's pose.
+    """
     placed = zip(state.poses, views, strict=True)
     points = np.concatenate([pose.apply(view.points) for pose, view in placed])
     pixels = np.concatenate([view.pixels for view in views])
@@ -295,6 +310,6 @@ def _corners_of_all(
 
 
 def _by_view(values: Array, corners: Block) -> tuple[Array, ...]:
-    """What each corner of a block has, view by view."""
+    """Split the values of a block's corners by view."""
     assert corners.runs is not None
     return tuple(np.split(values, np.cumsum(corners.runs)[:-1] // 2))

@@ -1,4 +1,4 @@
-"""How much of each camera's picture the boards have covered: beyond, its lens is a guess."""
+"""How much of each camera's image the boards covered: beyond it, the lens is extrapolated."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from bodyscan.boards.view import BoardView
 from bodyscan.rig.rig import Rig
 
 CELLS = 64
-"""The picture is divided so finely, across and down."""
+"""Cells into which the image is divided, across and down."""
 TOO_LITTLE = 0.2
 
 
 def covered_share(pixels: Sequence[Array], width: int, height: int) -> float:
-    """Share of a picture that the hulls of the views' corners cover together; pixels (N, 2) each."""
+    """Share of an image inside the hulls of all views' corners; pixels: (N, 2) each."""
     mask = np.zeros((CELLS, CELLS), np.uint8)
     scale = np.array([CELLS / width, CELLS / height])
     for corners in pixels:
@@ -27,7 +27,7 @@ def covered_share(pixels: Sequence[Array], width: int, height: int) -> float:
 
 
 def coverage_notes(rig: Rig, views: Sequence[BoardView]) -> list[str]:
-    """A line for each camera of which the boards fill too little to know its lens."""
+    """One line for each camera whose boards cover too little of the image to determine its lens."""
     notes = []
     for pair in rig.pairs:
         own = [view.pixels for view in views if view.pair == pair.name]

@@ -1,8 +1,8 @@
 """A pair's light as a projector with a lens, which other programs describe as a camera.
 
-A projector with a lens is one already. Sheets of any other model are sampled over the camera's
-picture and about the boards' distance, each place known as well as its sheet is, and a projector is
-fitted to them; both directions of stripes are those of one projector.
+Sheets of a projector with a lens need no fit. Those of any other model are sampled over the
+camera's image and around the boards' distance, each place weighted by its sheet's sigma, and a
+projector is fitted to them; both directions of stripes belong to one projector.
 """
 
 from __future__ import annotations
@@ -26,29 +26,32 @@ from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 COLUMNS, ROWS, DEPTHS = 14, 11, 5
-"""At which sheets are looked at: of the camera's picture, and from NEAREST to FARTHEST."""
+"""The sampling grid: over the camera's image, and from NEAREST to FARTHEST in depth."""
 NEAREST, FARTHEST = 0.7, 1.4
-"""Times the distance of the boards: beyond it nobody has measured the sheets."""
+"""Times the distance of the boards; beyond this range the sheets were not measured."""
 FLOOR_PX = 0.02
-"""Of a projector's pixel: a fifth of what the best codes leave open in one of the camera's."""
+"""px of the projector, added to each sigma: a fifth of what the best codes leave uncertain in a
+pixel of the camera."""
 LIKELY = 3.0
-"""Sigmas of the sheets, root mean square. Sheets of that projector lie within one."""
+"""Largest RMS misfit accepted, in sigmas of the sheets; a real projector's lie within one."""
 FEWEST = 50
-"""Places of a direction of stripes, of which the camera sees none where it was not calibrated."""
+"""Fewest known places in a direction of stripes; none are known where nothing was calibrated."""
 LENS_TERMS = 4
 NEWTON_STEPS = 8
 SETTLED = 1e-6
-"""Of a stripe."""
+"""In stripes."""
 POSE = 6
 SKEW = POSE + MATRIX.index("gamma")
 
 
 @dataclass(frozen=True, eq=False)
 class FittedProjector:
-    """camera: the projector, a pixel for each stripe.  projector_from_camera: mm.
+    """A projector as a camera.
 
-    misfit_px: by how much the pair's sheets of light lie off its own, RMS over what is known as well;
-    predicted_px: what their noise alone would come to.  Both are 0 where it is exact.
+    camera: the projector, with one pixel for each stripe.
+    projector_from_camera: mm.
+    misfit_px: how far the pair's sheets lie from the projector's own, RMS weighted by their sigmas.
+    predicted_px: what their noise alone would give. Both are 0 where the projector is exact.
     """
 
     camera: Camera
@@ -59,8 +62,10 @@ class FittedProjector:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """points (N, 3), camera frame, mm, on the sheets at s (N,), known to sigma (N,) stripes.
-    axis: 0 for columns of the projector (vertical stripes), 1 for rows."""
+    """Points (N, 3) mm, camera frame, on the sheets at s (N,), with sigma (N,) in stripes.
+
+    axis: 0 for columns of the projector (vertical stripes), 1 for rows.
+    """
 
     points: Array
     s: Array
@@ -73,9 +78,9 @@ def fit_projector(
 ) -> FittedProjector:
     """The projector with a lens (k1, k2, p1, p2; more if it came with more) whose sheets these are.
 
-    With one direction alone its pixels are square and what lies along the stripes is not known: see
-    `projector_of_sheets`.  Raises BadInput where no such projector explains the sheets within their
-    noise, or only one whose picture is mirrored.
+    With a single direction of stripes its pixels are square and its place along the stripes is
+    unknown: see `projector_of_sheets`. Raises BadInput if no such projector explains the sheets
+    within their noise, or only one whose image is mirrored.
     """
     first = _samples(camera, light)
     start = light if isinstance(light, LensSheets) else _fitted_lens(light, first)
@@ -126,7 +131,7 @@ def _on_smooth_sheets(sheets: SmoothSheets, points: Array) -> tuple[Array, Array
 
 
 def _between_planes(sheets: LightPlanes, points: Array) -> tuple[Array, Array]:
-    """The same from the planes before and behind each point."""
+    """The same as `_on_smooth_sheets`, from the planes on either side of each point."""
     homogeneous = np.column_stack([points, np.ones(len(points))])
     off = homogeneous @ sheets.coefficients.T
     between = off[:, :-1] * off[:, 1:] <= 0.0
@@ -139,8 +144,10 @@ def _between_planes(sheets: LightPlanes, points: Array) -> tuple[Array, Array]:
 
 
 def _distance(camera: Camera, sheets: LightSheets) -> float:
-    """Of the boards, mm along the camera's axis; where nothing tells, of what the projector's middle
-    lights in the middle of the picture."""
+    """Distance of the boards along the camera's axis, mm.
+
+    If unknown, the distance at which the projector's middle lights the middle of the image.
+    """
     if isinstance(sheets, SmoothSheets):
         return float(sheets.middle[2])
     ray = camera.rays(np.array([[0.5 * camera.width, 0.5 * camera.height]]))
@@ -148,7 +155,7 @@ def _distance(camera: Camera, sheets: LightSheets) -> float:
 
 
 def _fitted_lens(light: LightSheets, samples: _Samples) -> LensSheets:
-    """Of one direction of stripes: sheets of a projector with a lens nearest to those sampled."""
+    """Sheets of a projector with a lens, fitted to samples of one direction of stripes."""
     pinhole = fit_pinhole(samples.points, samples.s)
     start = pinhole.sheets(samples.points, light.stripes, light.direction)
 
@@ -173,7 +180,7 @@ def _fitted_lens(light: LightSheets, samples: _Samples) -> LensSheets:
 def _with_other_way(
     projector: Camera, from_camera: RigidTransform, other: _Samples, stripes: int
 ) -> Camera:
-    """With focal length, centre and size that the other direction's stripes ask for."""
+    """The projector with focal length, centre and size along the other direction's axis."""
     seen = from_camera.apply(other.points)
     real = projector.lens.distort(seen[:, :2] / seen[:, 2:])[:, other.axis]
     focal, centre = np.polyfit(real, other.s - 0.5, 1, w=1.0 / other.sigma).tolist()
@@ -191,7 +198,10 @@ def _with_other_way(
 def _refined(
     projector: Camera, from_camera: RigidTransform, both: Sequence[_Samples], every_term: bool
 ) -> FittedProjector:
-    """Pose, focal lengths, centre and lens at once.  every_term: of the lens, also k3 and on."""
+    """Fit pose, focal lengths, centre and lens together.
+
+    every_term: whether lens terms from k3 on are fitted too.
+    """
     size = POSE + len(projector.parameters)
     last = size if every_term else POSE + len(MATRIX) + LENS_TERMS
     free: Indices = np.setdiff1d(np.arange(last), [SKEW])
@@ -234,7 +244,7 @@ def _off(light: Camera, from_camera: RigidTransform, samples: _Samples) -> Array
 
 
 def _slopes(light: Camera, from_camera: RigidTransform, samples: _Samples) -> Array:
-    """Of `_off` by a small motion of the projector and its parameters, (N, 6 + P)."""
+    """Derivatives of `_off` by a small motion of the projector and its parameters, (N, 6 + P)."""
     points = from_camera.apply(samples.points)
     by_parameter, by_point = light.jacobians(points)
     by_pose = by_point[:, samples.axis, None, :] @ twist_jacobian(points)
@@ -242,7 +252,7 @@ def _slopes(light: Camera, from_camera: RigidTransform, samples: _Samples) -> Ar
 
 
 def _judged(found: FittedProjector, both: Sequence[_Samples]) -> FittedProjector:
-    """With its misfit. Raises BadInput if noise does not explain it."""
+    """The projector with its misfit. Raises BadInput if noise does not explain it."""
     off = np.concatenate([_off(found.camera, found.projector_from_camera, own) for own in both])
     sigma = np.concatenate([own.sigma for own in both])
     sigmas = float(np.sqrt(np.mean((off / sigma) ** 2)))

@@ -1,9 +1,9 @@
-"""Whether a richer model shows boards that took no part better than a simpler one, by more than chance.
+"""Whether a richer model predicts held-out boards better than a simpler one, beyond chance.
 
-With residuals r of the richer model and r + d of the simpler one the squares differ by d^2 + 2 r d:
-the first is what the models themselves differ by, the second what noise adds, whose standard error is
-seen in its sums over parts that err independently.  So lenses, models of the light, bent boards and
-joint solves are all chosen by differences at the same points, never by a ratio of noisy totals.
+With residuals r of the richer model and r + d of the simpler one, squares differ by d^2 + 2 r d:
+the first term is the difference of the models, the second is due to noise, and its standard error
+shows in its sums over independent parts. Lenses, models of the light, bent boards and joint solves
+are all chosen by differences at the same points, never by a ratio of noisy totals.
 """
 
 from __future__ import annotations
@@ -17,14 +17,17 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.robust import cauchy_weights, spread
 
 CLEARLY = 3.0
-"""Standard errors by which a richer model has to do better: by chance once in 700 times."""
+"""Standard errors by which a richer model must be better: by chance once in 700 times."""
 CAUCHY_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """simple, rich: (N, D) residuals of the same points.  part: (N,) of several that err independently;
-    what errs together, as the corners of one board do, is in one."""
+    """Residuals (N, D) of the same points in two models, simple and rich.
+
+    part: (N,) number of a part whose errors are independent of other parts'; points that err
+        together, such as the corners of one board, share a part.
+    """
 
     simple: Array
     rich: Array
@@ -32,7 +35,7 @@ class Compared:
 
 
 def shared_weights(tried: Sequence[Array]) -> Array:
-    """(N,) of points with residuals (N, D) in each model: what no model explains counts for less."""
+    """Weights (N,) of points with residuals (N, D) in each model: low where no model fits."""
     size = tried[0].shape[1]
     least = np.min([np.sum(residuals**2, axis=1) for residuals in tried], axis=0)
     sigma = min(spread(residuals.ravel()) for residuals in tried)
@@ -41,8 +44,10 @@ def shared_weights(tried: Sequence[Array]) -> Array:
 
 
 def gain(*compared: Compared) -> float:
-    """By how many standard errors the richer model lowers the squares of what is held out; of several
-    kinds of points each counts in its own spread."""
+    """Standard errors by which the richer model lowers the squares of held-out residuals.
+
+    Each kind of points is scaled by its own robust sigma.
+    """
     gained, squares = 0.0, 0.0
     for one in compared:
         per_square = shared_weights([one.simple, one.rich]) / _least_spread(one) ** 2

@@ -1,8 +1,8 @@
-"""Camera, board poses and light sheets of one pair in one solve, on corners and stripes together.
+"""Refine camera, board poses and light sheets of one pair together, on corners and stripes.
 
-Stripes are straight-edged light on a flat board: they say how boards lie to each other far more
-finely than 48 corners do, and corners keep the scale.  Only for sheets that are smooth in s, whose few
-parameters are unknowns like any other.
+Stripes are straight-edged light on a flat board: they fix how boards lie relative to each other far
+more finely than 48 corners do, and corners fix the scale. Only for sheets that are smooth in s,
+whose few parameters are unknowns like any other.
 """
 
 from __future__ import annotations
@@ -35,23 +35,28 @@ Sheets = TypeVar("Sheets", bound=SmoothSheets)
 
 STEPS = 20
 SETTLED = 1e-2
-"""Variances: all unknowns a tenth of their standard deviation away would be as good."""
+"""Convergence, in variances: a tenth of a sigma in every unknown makes no difference."""
 CORNERS = Noise("corners, px", group=2, cauchy=4.0, least=1e-3)
 STRIPES = Noise("stripes, in sigmas", cauchy=4.0, least=1e-2)
 FLOOR_PX = 0.02
 LEAST_SHOWN = 1e-6
-"""Share of what is best known of a print, below which nothing is."""
+"""Information on a print below this share of the best-known direction's counts as none."""
 SPREADS_MM = np.append(0.0, np.geomspace(1e-3, 1.0, 121))
 AS_WELL = 1e-7
-"""Of a depth: to this share of it sheets stand for turned rays before their prior is felt."""
+"""Relative change of depth at which the sheets' prior takes effect when they stand in for rays."""
 TWIST_STEPS = (*[1e-6] * 3, *[1e-3] * 3)
-"""Radians and mm, for derivatives of a boundary point by its board's motion."""
+"""Radians and mm: steps for derivatives of a boundary point by its board's motion."""
 
 
 @dataclass(frozen=True, eq=False)
 class StripedBoard:
-    """One shot: its corners, and the stripe boundaries on it: pixels (N, 2), index (N,) with s = i,
-    sigma_px (N,) and across (2,), the unit vector across the stripes in the image.  board: its name.
+    """One shot: its corners and the stripe boundaries on it.
+
+    pixels: boundary points, (N, 2) px.
+    index: their boundaries, s = i, (N,).
+    sigma_px: (N,).
+    across: unit vector across the stripes in the image, (2,).
+    board: the board's name.
     """
 
     view: PlanarView
@@ -64,10 +69,11 @@ class StripedBoard:
 
 @dataclass(frozen=True, eq=False)
 class JointFit(Generic[Sheets]):
-    """What fits corners and stripes together; covariance (P, P) of the camera.  forms: of the boards
-    by name.
+    """The fit to corners and stripes together.
 
-    corners_rms_px is robustly weighted.
+    camera_covariance: (P, P).
+    corners_rms_px: robustly weighted.
+    forms: of the boards, by name.
     """
 
     camera: Camera
@@ -87,7 +93,7 @@ class _State(Generic[Sheets]):
 
     @property
     def first_pose(self) -> int:
-        """Where the poses begin among the unknowns; before them the camera's parameters."""
+        """Index of the first pose among the unknowns; the camera's parameters come before."""
         return len(self.camera.parameters)
 
     @property
@@ -100,7 +106,7 @@ class _State(Generic[Sheets]):
 
     @property
     def of_form(self) -> dict[str, Indices]:
-        """Which unknowns are each board's form."""
+        """Indices of the unknowns that are each board's form."""
         found, first = {}, self.first_form
         for name, form in self.forms.items():
             found[name] = np.arange(first, first + form.count)
@@ -124,7 +130,7 @@ class _State(Generic[Sheets]):
 def striped_board(
     view: PlanarView, camera: Camera, data: BoundaryPoints, number: int, board: str
 ) -> StripedBoard:
-    """The (binned) boundary points of one board as image measurements again; board: its name."""
+    """The (binned) boundary points of one board, as image measurements again; board: its name."""
     own = data.board == number
     across = np.median(
         camera.project(data.points[own] + data.per_pixel[own]) - camera.project(data.points[own]),
@@ -147,7 +153,7 @@ def carried(
     number: int,
     direction: Axis,
 ) -> BoundaryPoints:
-    """The boundary points of a flat board, as a camera and a pose have them."""
+    """The boundary points of a flat board, for a given camera and pose."""
     index, place = board.index.astype(np.int64), camera_from_board @ _face(board)
     return boundary_points(
         camera, place, index, board.pixels, board.sigma_px, board=number, direction=direction
@@ -164,10 +170,11 @@ def refine_jointly(
     bent: bool = True,
     steps: int = STEPS,
 ) -> JointFit[Sheets]:
-    """Least squares from a camera, poses and sheets found one after the other.
+    """Least squares, starting from camera, poses and sheets that were found one after the other.
 
-    Boards of which only corners are known take part with empty pixels.  bent: whether boards may have
-    another form than `forms` says; if not, that they may is in the covariance alone.
+    boards: those without stripes, known by corners alone, take part with empty pixels.
+    bent: whether the forms of the boards are fitted; if not, their uncertainty only enters the
+        covariance.
     """
     poses = tuple(camera_from_board[b.view.shot] for b in boards)
     fitted = forms if bent else {name: form.exact for name, form in forms.items()}
@@ -185,8 +192,11 @@ def known_apart(
     boards: Sequence[StripedBoard],
     forms: Mapping[str, BoardForm],
 ) -> JointFit[Sheets]:
-    """The same unknowns where they are, camera and boards known by corners alone, the sheets by the
-    stripes on such boards: with what is uncertain in the former in the latter's covariance."""
+    """The given solution unchanged, with the covariance of solving for corners and stripes in turn.
+
+    Camera and boards are known by corners alone, sheets by the stripes on those boards; the
+    former's uncertainty is carried into the latter's covariance.
+    """
     poses = tuple(camera_from_board[b.view.shot] for b in boards)
     solution = _solve(_State(camera, poses, sheets, dict(forms)), boards, 0)
     state = solution.state
@@ -205,10 +215,10 @@ def known_apart(
 
 
 def print_errors(fit: JointFit[Sheets], boards: Sequence[StripedBoard]) -> dict[str, float]:
-    """How far corners of each board were printed off, mm, as likely as can be for what `fit` found.
+    """Maximum-likelihood sigma of each board's print errors, mm, given what `fit` found.
 
-    In the directions in which corners and stripes know the corners' places each by itself, those found
-    are as wide as the print's errors and the noise together.
+    In each direction in which corners and stripes determine the corners' places, the places found
+    scatter by print errors and noise together.
     """
     poses = tuple(fit.camera_from_board[b.view.shot] for b in boards)
     state = _State(fit.camera, poses, fit.sheets, fit.forms)
@@ -230,7 +240,7 @@ def print_errors(fit: JointFit[Sheets], boards: Sequence[StripedBoard]) -> dict[
 
 
 def _likeliest_spread(values: Array, variances: Array) -> float:
-    """Standard deviation of what `values` (N,), seen with noise of `variances` (N,), scatter by."""
+    """Standard deviation of values (N,) seen with noise of `variances` (N,), noise taken off."""
     total = SPREADS_MM[:, None] ** 2 + variances
     misfit = np.sum(np.log(total) + values**2 / total, axis=1)
     return float(SPREADS_MM[np.argmin(misfit)])
@@ -267,8 +277,7 @@ def _fit(
 
 
 def _blocks(state: _State[Sheets], boards: Sequence[StripedBoard]) -> Iterator[Block]:
-    """Of each board its corners and its stripes; last what is known of camera, sheets and boards
-    beforehand."""
+    """Corners and stripes of each board, then the priors on camera, sheets and boards."""
     camera, sheets = np.arange(state.first_pose), np.arange(state.first_sheet, state.first_form)
     of_form = state.of_form
     with np.errstate(all="ignore"):
@@ -294,7 +303,7 @@ def _of_prior(form: BoardForm) -> Array:
 
 
 def _corners_of(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
-    """(N, 3) mm, camera frame: where the corners of the k-th board lie."""
+    """Where the corners of the k-th board lie, camera frame, (N, 3) mm."""
     form = state.forms[board.board]
     points = board.view.points
     return state.poses[k].apply(form.applied(points, form.numbers(points)))
@@ -306,20 +315,21 @@ def _corner_residuals(state: _State[Sheets], k: int, board: StripedBoard) -> Arr
 
 
 def _rays(camera: Camera, board: StripedBoard) -> Array:
-    """(2, N, 3) with z = 1: through the boundaries' pixels, and half a pixel across from them."""
+    """Rays (2, N, 3), z = 1: through boundary pixels, and half a pixel across from them."""
     return camera.rays(np.stack([board.pixels, board.pixels + 0.5 * board.across]))
 
 
 def _ray_slopes(camera: Camera, rays: Array) -> Array:
-    """(2, N, 2, P): how rays turn with the camera's parameters while their pixels stay, which undoes
-    what the parameters do to the pixels of rays that stay."""
+    """(2, N, 2, P): how the rays of fixed pixels turn with the camera's parameters.
+
+    The turn undoes what the parameters do to the pixels of fixed rays.
+    """
     by_parameter, _ = camera.jacobians(rays.reshape(-1, 3))
     return -(camera.rays_by_pixels(rays) @ by_parameter.reshape(*rays.shape[:2], 2, -1))
 
 
 def _offsets(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
-    """Offsets of the k-th board's boundaries from their sheets, over their sigma, (N,); rays:
-    `_rays`."""
+    """Offsets of the k-th board's boundaries from their sheets, over their sigma, (N,)."""
     points, across = _on_board(state, k, board, rays)
     return _over_sigma(state.sheets, state.sheets.at(board.index), board, points, across)
 
@@ -332,7 +342,7 @@ def _over_sigma(
 
 
 def _on_board(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
-    """(2, N, 3) mm: where rays meet the face on which the stripes were seen."""
+    """Where rays meet the face on which the stripes were seen, (2, N, 3) mm."""
     camera_from_face = state.poses[k] @ _face(board)
     form = state.forms[board.board]
     return rays_on_board(rays, camera_from_face, form.height if form.heights.any() else None)
@@ -343,13 +353,13 @@ def _face(board: StripedBoard) -> RigidTransform:
 
 
 def _sigma(board: StripedBoard, points: Array, across: Array, by_point: Array) -> Array:
-    """What one sigma_px across the stripe is worth in the offset's unit, (N,)."""
+    """One sigma_px across the stripe, in the offset's unit, (N,)."""
     leverage = np.abs(np.sum(by_point * (across - points), axis=1)) / 0.5
     return np.maximum(leverage, 1e-12) * board.sigma_px
 
 
 def _corner_jacobian(state: _State[Sheets], k: int, board: StripedBoard) -> Array:
-    """(2N, ...) by camera, this board's pose, and its form."""
+    """Derivatives (2N, ...) by camera, this board's pose, and its form."""
     points, form = _corners_of(state, k, board), state.forms[board.board]
     by_parameter, by_point = state.camera.jacobians(points)
     in_board = by_point @ state.poses[k].rotation
@@ -363,11 +373,10 @@ def _corner_jacobian(state: _State[Sheets], k: int, board: StripedBoard) -> Arra
 
 
 def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -> Array:
-    """Of the offsets over their sigma (N, ...), by camera, this board's pose, sheets, and the board's
-    heights.
+    """Derivatives (N, ...) of offsets over sigma, by camera, board pose, sheets and board heights.
 
-    By differences for camera and pose, since the sigma changes too: left out of the derivative, noise
-    would pull the focal lengths up.
+    Camera and pose by finite differences, because the sigma changes too: without its derivative,
+    noise would push the focal lengths up.
     """
     pose, slopes, face = state.poses[k], _ray_slopes(state.camera, rays), _face(board)
     points, across = both = _on_board(state, k, board, rays)
@@ -375,7 +384,8 @@ def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: A
     offset = state.sheets.offset(points, at, parameters=True)
     assert offset.by_parameter is not None
     sigma = _sigma(board, points, across, offset.by_point)
-    # A board rises by a thousandth of the way along it: as high as here, it is bent enough.
+    # The height of a board changes by a thousandth of a step along it, so it may be held constant
+    # here.
     height = state.forms[board.board].height((pose @ face).inverse().apply(both)[..., :2])
 
     def there(rays: Array, pose: RigidTransform) -> Array:
@@ -405,7 +415,7 @@ def _stripe_jacobian(state: _State[Sheets], k: int, board: StripedBoard, rays: A
 def allowing_for(
     fit: JointFit[Sheets], other: JointFit[Sheets], boards: Sequence[StripedBoard]
 ) -> JointFit[Sheets]:
-    """The same, with what another fit finds otherwise, which may be right, in its covariances."""
+    """The fit with covariances enlarged by its difference from another fit, which may be right."""
     there = _depths_by_sheets(fit.camera, fit.sheets, boards)
     rays = other.camera.rays(np.concatenate([board.pixels for board in boards]))
     depth = other.sheets.depth(rays, np.concatenate([board.index for board in boards]))
@@ -420,8 +430,11 @@ def allowing_for(
 
 @dataclass(frozen=True, eq=False)
 class _Depths:
-    """depth: (N, 1) of boundary points on boards.  Relative changes of it, (N, P) by the sheets'
-    unknowns and (N, C) by those of the camera, whose rays turn while their pixels stay."""
+    """Depths (N, 1) mm of boundary points on boards, and their relative derivatives.
+
+    by_sheets: (N, P), by the sheets' unknowns.
+    by_camera: (N, C), by the camera's parameters, which turn the rays of fixed pixels.
+    """
 
     depth: Array
     by_sheets: Array
@@ -443,7 +456,7 @@ def _depths_by_sheets(
 
 
 def _motion_of_sheets(sheets: SmoothSheets, by_sheets: Array, changes: Array) -> Array:
-    """(P, K): the sheets' unknowns that change depths relatively by `changes` (N, K), nearly."""
+    """(P, K): motions of the sheets' unknowns for relative changes of depth (N, K), nearly."""
     known = np.isfinite(by_sheets).all(axis=1) & np.isfinite(changes).all(axis=1)
     prior = AS_WELL * np.sqrt(np.count_nonzero(known)) * sheets.prior()[1]
     matrix = np.concatenate([by_sheets[known], prior])
@@ -452,11 +465,11 @@ def _motion_of_sheets(sheets: SmoothSheets, by_sheets: Array, changes: Array) ->
 
 
 def _of_depths(state: _State[Sheets], boards: Sequence[StripedBoard], covariance: Array) -> Array:
-    """(P, P) of the sheets as a depth sees them: with the rays that meet them.
+    """Covariance (P, P) of the sheets together with the rays that meet them, as it affects depths.
 
-    A camera that is a little wrong turns rays and sheets together. Its rays' part is written as a
-    motion of the sheets that changes the depths on the boards as much (what is left of it, a lens, is
-    in the rays' own sigma), so that both add up with the sign that they have.
+    A camera error turns rays and sheets together. The rays' part is expressed as the motion of the
+    sheets that changes depths on the boards equally, so that both add with their signs. What no
+    motion expresses, a lens, is in the rays' own sigma.
     """
     own = np.arange(state.first_sheet, state.first_form)
     there = _depths_by_sheets(state.camera, state.sheets, boards)

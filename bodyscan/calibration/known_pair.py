@@ -1,4 +1,4 @@
-"""A pair as another program calibrated it: read from its files, brought to our terms and checked."""
+"""A pair calibrated by another program: read from its files, converted to our terms and checked."""
 
 from __future__ import annotations
 
@@ -20,19 +20,23 @@ from bodyscan.rig.pair import Pair
 from bodyscan.stripes.stripe_code import StripeCode
 
 HELD_PX = 1e-6
-"""What a camera that is held may be moved by."""
+"""px by which a camera that is held fixed may still move."""
 NEAREST_MM, FARTHEST_MM = 5.0, 2e4
-"""Between a projector and its camera: lenses are wider than the one, rooms no wider than the other."""
+"""Plausible projector-to-camera distances: lenses are wider than the first, rooms no wider than the
+second."""
 GRID = 9
-"""Places of a picture, each way, at which a parameter's effect on its pixels is looked at."""
+"""Grid of image points, per axis, at which a parameter's effect on pixels is evaluated."""
 
 
 @dataclass(frozen=True, eq=False)
 class KnownPair:
-    """camera_from_world: mm, None if the file does not say.  projector: as a camera, with
-    `projector_from_camera`, mm; both None where nothing is known of it.
+    """What another program knows of a pair.
 
-    sigma_px: see `Known`.  source: the file and its format.
+    camera_from_world: mm, None if the file does not say.
+    projector: the projector as a camera, None if nothing is known of it.
+    projector_from_camera: mm, None if nothing is known of the projector.
+    sigma_px: see `Known`.
+    source: the file and its format.
     """
 
     camera: Camera
@@ -43,7 +47,7 @@ class KnownPair:
     source: str
 
     def sheets(self, code: StripeCode) -> LightSheets:
-        """Of the stripes that the projector shows."""
+        """Sheets of the stripes that the projector shows."""
         assert self.projector is not None
         assert self.projector_from_camera is not None
         middle = looked_at(self.camera, self.projector, self.projector_from_camera)
@@ -58,10 +62,10 @@ class KnownPair:
 
 
 def read_known_camera(pair: Pair, folder: Path) -> Camera:
-    """The camera of a pair with `known`, whose file lies relative to `folder`; its prior lets boards
-    move it by `sigma_px`, or holds it where none is given.
+    """Read the camera of a pair with `known`, whose file is relative to `folder`.
 
-    Raises CalibrationFileError for a file that is wrong or of another camera.
+    Its prior lets boards move it by `sigma_px`, or holds it fixed if none is given. Raises
+    CalibrationFileError for a file that is wrong or describes another camera.
     """
     assert pair.known is not None
     found = _find(pair.known, pair.known.camera, pair.name, folder)
@@ -71,8 +75,11 @@ def read_known_camera(pair: Pair, folder: Path) -> Camera:
 
 
 def read_known_pair(pair: Pair, folder: Path) -> KnownPair:
-    """All that is known of a pair with `known`. Raises as `read_known_camera`, and where lengths
-    lack a unit or the projector has no place."""
+    """Read all that is known of a pair with `known`.
+
+    Raises CalibrationFileError like `read_known_camera`, and also if lengths lack a unit or the
+    projector has no pose.
+    """
     known = pair.known
     assert known is not None
     found = _find(known, known.camera, pair.name, folder)
@@ -110,8 +117,10 @@ def _require_baseline(projector_from_camera: RigidTransform, where: str, known: 
 
 
 def parameter_sigmas(camera: Camera, sigma_px: float) -> Array:
-    """(P,) standard deviations of a camera's parameters: each by itself moves no pixel of the
-    picture by more than sigma_px, and one by just that."""
+    """Standard deviations (P,) of a camera's parameters for pixels with sigma_px.
+
+    Each parameter by itself moves the most affected image point by just sigma_px.
+    """
     u, v = (np.linspace(0.0, size - 1.0, GRID) for size in (camera.width, camera.height))
     rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1)).reshape(-1, 3)
     by_parameter, _ = camera.jacobians(rays[np.isfinite(rays).all(axis=1)])
@@ -151,10 +160,10 @@ def _pose(
 
 
 def _projector(found: FoundCamera, code: StripeCode) -> Camera:
-    """Where the file does not say how large the projector's picture is, a stripe is a pixel.
+    """The projector as a camera; if the file does not give its image size, a stripe is a pixel.
 
-    Stripes divide the picture evenly, or they are not those of this projector; and where waves begin
-    (`origin`) is counted in stripes, so that another width of them moves the waves.
+    Stripes must divide the image evenly, or they belong to another projector. The start of waves
+    (`origin`) is counted in stripes, so another stripe width would move the waves.
     """
     stripes = {way.direction: way.stripes for way in code.directions}
     if found.size is None:

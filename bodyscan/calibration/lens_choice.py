@@ -1,8 +1,8 @@
-"""Which lens a camera needs, found from boards that it was not fitted to.
+"""Choose the lens that a camera needs by held-out boards.
 
-A richer lens is taken where it shows boards that took no part better than the simpler one does, by
-more than chance makes of it. Their poses are fitted to either lens, so that nothing but the lens
-differs; boards near one another are held out together.
+A richer lens is taken where it predicts held-out boards better than the simpler one by more than
+chance. Poses of held-out boards are fitted with either lens, so that only the lens differs; boards
+near one another are held out together.
 """
 
 from __future__ import annotations
@@ -31,22 +31,26 @@ from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform
 
 FEWEST_PLACES = 4
-"""Without one of them a camera still has the three that it needs."""
+"""With one place held out, a camera still has the three that it needs."""
 MOST_FOLDS = 6
 SETTLED = 1e-2
-"""Variances: a tenth of a standard deviation of the camera changes nothing of what is held out."""
+"""Convergence, in variances: a tenth of a standard deviation changes nothing on held-out boards."""
 UNDAMPED = 1e-9
-"""Fits without a fold begin beside their minimum, where whole steps are right; damped ones creep along
-what boards hardly tell of a lens."""
+"""Fits without a fold start close to their minimum, where full steps are right; damped ones creep
+along directions in which boards hardly determine a lens."""
 NEAR = 0.05
-"""Boards are at one place where corners moved by less than this share of the board's own size in the
-picture: they try the lens where it was tried before."""
+"""Boards share a place if corners moved by less than this share of the board's own size in the
+image: they test the lens where it was tested before."""
 
 
 @dataclass(frozen=True, eq=False)
 class ChosenLens:
-    """The camera fitted with the lens chosen, and how each lens did; no trials: too few places, or
-    one lens only.  rays: how well the boards know each pixel's."""
+    """The chosen lens.
+
+    fit: the camera fitted with it.
+    trials: how each lens did; () if there were too few places, or one lens only.
+    rays: how well the boards determine each pixel's ray.
+    """
 
     fit: CameraFit
     trials: tuple[LensTrial, ...]
@@ -68,9 +72,11 @@ class _HeldOut:
 def calibrate_with_lenses(
     kinds: Sequence[type[Lens]], views: Sequence[PlanarView], width: int, height: int
 ) -> CameraCalibration:
-    """As `calibrate_camera`, with that of the kinds, the simplest first, that held-out boards choose.
+    """Calibrate a camera like `calibrate_camera`, with the lens that held-out boards choose.
 
-    Raises DegeneratePoses as it does.
+    kinds: lenses to choose from, simplest first.
+
+    Raises DegeneratePoses as `calibrate_camera` does.
     """
     start = fit_from_scratch(views, width, height, kinds[-1]())
     chosen = choose_lens(kinds, start.camera, start.poses, views)
@@ -85,8 +91,9 @@ def choose_lens(
 ) -> ChosenLens:
     """The simplest lens that no richer one clearly beats.
 
-    kinds: simplest first, each with the coefficients of the one before it and more.  camera: with the
-    last of them; poses: `camera_from_board` of each view, about.
+    kinds: simplest first, each with all coefficients of the one before and more.
+    camera: a start, with the last kind of lens.
+    poses: approximate `camera_from_board` of each view.
     """
     chosen = _fit(kinds[0], camera, poses, views)
     place = places(views)
@@ -125,8 +132,8 @@ def _fit(
 
 
 def places(views: Sequence[PlanarView]) -> Indices:
-    """(V,) number of the place in the picture at which each view shows its board; the views of one
-    shot share theirs."""
+    """Number (V,) of the place in the image at which each view shows its board; views of one shot
+    share theirs."""
     found: list[PlanarView] = []
     number = np.zeros(len(views), np.int64)
     of_shot: dict[str, int] = {}
@@ -139,7 +146,7 @@ def places(views: Sequence[PlanarView]) -> Indices:
 
 
 def _near(first: PlanarView, second: PlanarView) -> bool:
-    """Whether most of the corners that both show hardly moved."""
+    """Whether most of the corners seen in both views hardly moved."""
     number = {tuple(point): k for k, point in enumerate(np.round(first.points, 6).tolist())}
     both = [(number.get(tuple(p)), k) for k, p in enumerate(np.round(second.points, 6).tolist())]
     shared = np.array([pair for pair in both if pair[0] is not None])
@@ -150,7 +157,7 @@ def _near(first: PlanarView, second: PlanarView) -> bool:
 
 
 def _hold_out(fit: CameraFit, views: Sequence[PlanarView], place: Indices) -> _HeldOut:
-    """Each place, or one of MOST_FOLDS groups of them, in turn left out of a fit from `fit` on."""
+    """Leave out each place, or one of MOST_FOLDS groups of them, in turn; fits start from `fit`."""
     residuals: list[Array] = [np.empty(0)] * len(views)
     fold = place % MOST_FOLDS
     for number in np.unique(fold):

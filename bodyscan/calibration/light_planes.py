@@ -35,9 +35,10 @@ CAUCHY_SIGMAS = 3.0
 
 @dataclass(frozen=True, eq=False)
 class PlaneFit:
-    """planes, and the distance of every boundary point to its plane (N,) mm, NaN without one.
+    """Light planes and how well they fit.
 
-    rms_mm: robustly weighted root mean square of the distances.
+    distances_mm: distance of every boundary point from its plane, (N,), NaN without a plane.
+    rms_mm: robustly weighted RMS of the distances.
     """
 
     planes: LightPlanes
@@ -53,12 +54,13 @@ def fit_light_planes(
     board_error_mm: float = 0.0,
     fewest_points: int = FEWEST_POINTS,
 ) -> PlaneFit:
-    """One plane for each boundary seen on at least two boards, weighted least squares.
+    """Fit one plane to each boundary seen on at least two boards, by weighted least squares.
 
-    A point's weight is what one pixel of error moves it off the plane; outliers lose theirs
-    (Cauchy).  A boundary seen on one board only, or whose points lie on a line, gets no plane; a
-    board counts with `fewest_points`.  board_error_mm: how well the boards' places are known, for
-    the covariance (see `board_errors`).
+    board_error_mm: how well the boards' poses are known, for the covariance (see `board_errors`).
+    fewest_points: points from which a board counts.
+
+    A point is weighted by how far one pixel of error moves it off the plane; outliers lose weight
+    (Cauchy). A boundary seen on a single board, or whose points lie on a line, gets no plane.
     """
     count = stripes + 1
     enough = _boards_seen(data, count, fewest_points) >= 2
@@ -92,7 +94,7 @@ def _boards_seen(data: BoundaryPoints, count: int, fewest: int) -> Indices:
 def _weighted_planes(
     data: BoundaryPoints, weights: Array, count: int
 ) -> tuple[Array, Array, Array]:
-    """Planes (count, 4), how far their points open, and their moments (count, 4, 4)."""
+    """Planes (count, 4), how far their points extend off a line, and moments (count, 4, 4)."""
     homogeneous = np.column_stack([data.points, np.ones(len(data.points))])
     moments = np.empty((count, 4, 4))
     for i in range(4):
@@ -114,12 +116,12 @@ def _weighted_planes(
 def _covariance(
     planes: Array, moments: Array, data: BoundaryPoints, weights: Array, board_error_mm: float
 ) -> Array:
-    """(S + 1, 4, 4): inverse of the weighted normal equations on the planes' three freedoms, and
-    what boards out of place by board_error_mm add to it."""
+    """Covariance (S + 1, 4, 4): the inverse of the weighted normal equations in the planes' three
+    degrees of freedom, plus what board errors of board_error_mm add."""
     known = np.isfinite(planes[:, 0])
     covariance = np.full((len(planes), 4, 4), np.nan)
     normals = planes[known, :3]
-    # Two directions square to the normal, and the offset: the freedoms of a plane.
+    # A plane's degrees of freedom: two directions perpendicular to the normal, and the offset.
     helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     first = np.cross(normals, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -138,7 +140,7 @@ def _covariance(
 
 
 def _board_pull(planes: Array, data: BoundaryPoints, weights: Array) -> Array:
-    """(S + 1, boards, 4, 3): the pull of 1 mm of each board error at each plane."""
+    """(S + 1, boards, 4, 3): how 1 mm of each board error pulls on each plane."""
     errors = data.board_errors
     off = np.sum(planes[data.index, :3] * errors.along_ray, axis=1)
     effects = np.nan_to_num(off * weights)[:, None] * errors.effects

@@ -1,4 +1,4 @@
-"""The light of one pair: every model of its sheets is tried, held-out boards choose (3.2)."""
+"""The light sheets of one pair: every model is tried, and held-out boards choose (3.2)."""
 
 from __future__ import annotations
 
@@ -27,23 +27,25 @@ from bodyscan.geometry.smooth_sheets import SmoothSheets
 CHOICE_BINS, FIT_BINS = 4000, 25000
 START_BINS, START_STEPS, FOLD_STEPS = 1000, 15, 8
 AXIS_STARTS = (-0.5, 0.0, 0.5, 1.0, 1.5)
-"""Where a projector's axis may be, in heights of its image."""
+"""Starts for the projector's axis, in heights of its image."""
 FEWEST_BOARDS, FEWEST_POINTS = 2, 50
 PARTS = ("pinhole", "lens k1", "smooth planes")
-"""Models with a term left out that devices have: never chosen. Whether a term can be done without
-three or four boards hardly tell, and to leave it out by mistake costs several times what it costs to
-know it beforehand within what such devices have (the models' priors) and no better."""
+"""Models without a term that real devices have; they are never chosen. Three or four boards hardly
+show whether a term can be left out, and leaving it out by mistake costs several times as much as
+fitting it with a prior that covers such devices."""
 BINS_A_BOARD = 2
-"""So many bins of a boundary make a board count for a free plane."""
+"""Bins of a boundary from which a board counts for a free plane."""
 
 
 @dataclass(frozen=True, eq=False)
 class SheetsFit:
-    """model: its name in `held_out`, the figures of all that were tried, simplest first.
+    """The light sheets of a pair and how they were chosen.
 
-    rms_mm: distance of boundary points to their sheets, robustly weighted root mean square.
-    board_error_mm: how far out of place boards seem to be, from the held-out distances.
-    boards_seen: (S + 1,) on how many boards each boundary was seen.
+    model: its name in `held_out`.
+    held_out: figures of all models tried, simplest first.
+    rms_mm: distance of boundary points from their sheets, robustly weighted RMS.
+    board_error_mm: estimated error of the boards' poses, from the held-out distances.
+    boards_seen: number of boards on which each boundary was seen, (S + 1,).
     """
 
     sheets: LightSheets
@@ -55,18 +57,22 @@ class SheetsFit:
 
     @property
     def stripes_calibrated(self) -> int:
-        """Boundaries between two stripes that have a sheet: those seen on at least one board, for
-        the chapter's planes on two."""
+        """Number of boundaries between two stripes that have a sheet.
+
+        For smooth models those seen on at least one board, for the chapter's planes on two.
+        """
         if isinstance(self.sheets, LightPlanes):
             return int(self.sheets.calibrated[1:-1].sum())
         return int(np.count_nonzero(self.boards_seen[1:-1]))
 
 
 def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> SheetsFit:
-    """Sheets of light from boundaries on two or more boards, means over pieces of them, camera frame.
+    """Fit light sheets to boundaries on two or more boards, camera frame.
 
-    With two boards halves of them are held out, with three or more whole boards.  Raises
-    PairFailed with fewer than two boards, or hardly any boundaries on them.
+    bins: means over pieces of boundaries.
+
+    With two boards, halves of them are held out; with three or more, whole boards. Raises
+    PairFailed with fewer than two boards, or with hardly any boundaries on them.
     """
     boards = len(np.unique(bins.board))
     if boards < FEWEST_BOARDS or len(bins.index) < FEWEST_POINTS:
@@ -104,7 +110,7 @@ def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> She
 def smooth_models(
     data: BoundaryPoints, stripes: int, direction: Axis
 ) -> list[tuple[str, SmoothSheets]]:
-    """The models whose sheets change smoothly with s, simplest first, fitted to binned points."""
+    """Fit the models whose sheets change smoothly with s to binned points; simplest first."""
     few = subsample(data, START_BINS)
     pinhole = fit_pinhole(few.points, few.index.astype(float))
     plain = pinhole.sheets(data.points, stripes, direction)
@@ -122,8 +128,11 @@ def smooth_models(
 
 
 def _lens_start(plain: LensSheets, data: BoundaryPoints) -> LensSheets:
-    """A lens fitted from several places of its axis: planes hardly say where it is, and many
-    projectors shine upwards, with their axis at the image's edge or outside."""
+    """A lens fitted from several starts along its axis.
+
+    Planes hardly show where the axis is, and many projectors shine upwards, with their axis at the
+    image's edge or outside it.
+    """
     centres = [plain.parameters[1], *(share * plain.stripes for share in AXIS_STARTS)]
     starts = [plain.turned(float(centre)).with_lens(2) for centre in centres]
     fits = [fit_sheets(start, data, most_steps=START_STEPS) for start in starts]
@@ -131,7 +140,7 @@ def _lens_start(plain: LensSheets, data: BoundaryPoints) -> LensSheets:
 
 
 def count_boards(data: BoundaryPoints, stripes: int) -> Indices:
-    """(S + 1,) on how many boards each boundary was seen."""
+    """Number of boards on which each boundary was seen, (S + 1,)."""
     boards = int(data.board.max(initial=0)) + 1
     points = np.bincount(data.index * boards + data.board, minlength=(stripes + 1) * boards)
     return np.count_nonzero(points.reshape(stripes + 1, boards), axis=1).astype(np.int64)
@@ -140,7 +149,7 @@ def count_boards(data: BoundaryPoints, stripes: int) -> Indices:
 def fit_planes(
     bins: BoundaryPoints, stripes: int, direction: Axis, board_error_mm: float
 ) -> PlaneFit:
-    """The chapter's free planes from binned points."""
+    """Fit the chapter's free planes to binned points."""
     return fit_light_planes(
         bins, stripes, direction, board_error_mm=board_error_mm, fewest_points=BINS_A_BOARD
     )

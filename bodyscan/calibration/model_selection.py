@@ -1,4 +1,4 @@
-"""Which model of the light a pair needs, found from boards that the model was not fitted to."""
+"""Choose the model of the light that a pair needs, by held-out boards."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, spread
 
 MOST_FOLDS = 6
 CAP = 30.0
-"""No point counts for more than this many times the best model's median."""
+"""No point counts for more than this many times the best model's median distance."""
 THIRDS = (-0.6, 0.6)
-"""Cut a board in three along an axis, in standard deviations of its points' places there."""
+"""Cuts a board into thirds along an axis, in standard deviations of its points' places there."""
 OUTLIER = 4.0 * SIGMAS_PER_MEDIAN
 TRIMS = 3
 LEAST_SHARE = 0.01
-"""Boards are never taken for known so well that less than this share of the squared held-out
-distances is theirs."""
+"""Boards are never assumed to be known so well that they account for less than this share of the
+squared held-out distances."""
 
 
 @dataclass(frozen=True)
 class Candidate:
     """A model to try; candidates are listed simplest first.
 
-    fit: sheets from points, with the covariance of boards 1 mm out of place.
+    fit: sheets from points, with the covariance for boards 1 mm out of place.
     everywhere: gives sheets for every s, so that a ray it cannot measure counts against it.
-    whole: has all terms that such devices have, so that it may be chosen; others are tried to be told.
+    whole: has all terms that such devices have, and may be chosen; others are tried for
+        information.
     """
 
     name: str
@@ -42,13 +43,15 @@ class Candidate:
 
 @dataclass(frozen=True)
 class HeldOutModel:
-    """How well one model measured boards that it was not fitted to, mm from the board.
+    """How well one model measured held-out boards, as distances from the board, mm.
 
-    mean_mm: of the absolute distances, outliers capped, board by board.  median_mm: of all absolute
-    distances.  rms_mm: without outliers.  measured: share of the points that got a depth.  chosen:
-    whether this model is used.  gain: by how many standard errors it beat the model chosen among those
-    before it, which it had to by three; None for the first of those that may be chosen, and for what is
-    but a part of another.
+    mean_mm: mean absolute distance, outliers capped, every board weighted the same.
+    median_mm: median absolute distance.
+    rms_mm: RMS distance without outliers.
+    measured: share of the points that got a depth.
+    chosen: whether this model is used.
+    gain: standard errors by which it beat the model chosen among those before it, three being
+        required; None for the first that may be chosen, and for models that may not be.
     """
 
     model: str
@@ -62,7 +65,11 @@ class HeldOutModel:
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """left_out: (N,) the points that are measured.  rest: the others, which models are fitted to."""
+    """One split of the points.
+
+    left_out: the points to be measured, (N,).
+    rest: the others, to which models are fitted.
+    """
 
     left_out: Mask
     rest: BoundaryPoints
@@ -70,16 +77,17 @@ class Fold:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutErrors:
-    """distances: (N,) mm of the measured points from their boards, NaN where not measured.
+    """Distances measured with sheets that were fitted without the measured points.
 
-    sheets: fitted without each fold.
+    distances: of the points from their boards, (N,) mm, NaN where not measured.
+    sheets: those fitted without each fold.
     """
 
     distances: Array
     sheets: tuple[LightSheets, ...]
 
     def unit_variance(self, data: BoundaryPoints, folds: Sequence[Fold]) -> Array:
-        """(N,) mm^2, what the distances would be if boards were known to 1 mm (see `BoardErrors`)."""
+        """(N,) mm^2: variance of the distances if boards were known to 1 mm (see `BoardErrors`)."""
         errors = data.board_errors
         variance = np.sum(errors.effects**2, axis=1)
         for fold, sheets in zip(folds, self.sheets, strict=True):
@@ -89,10 +97,10 @@ class HeldOutErrors:
         return variance
 
     def board_error_mm(self, data: BoundaryPoints, folds: Sequence[Fold]) -> float:
-        """How far out of place boards must be, for distances as large as these are.
+        """Error of the boards' poses, mm, that would explain distances as large as these.
 
-        data: the points that were held out. Their own noise, seen in how neighbours on a boundary
-        differ, is taken off.
+        data: the points that were held out. Their own noise, seen in the differences of neighbours
+            on a boundary, is subtracted.
         """
         unit_variance = self.unit_variance(data, folds)
         known = np.isfinite(self.distances) & np.isfinite(unit_variance)
@@ -110,8 +118,11 @@ class HeldOutErrors:
 
 
 def split(data: BoundaryPoints) -> list[Fold]:
-    """The points, each left out once: by boards, in MOST_FOLDS groups at most; with only two boards, by
-    halves of one."""
+    """Split the points so that each is left out once.
+
+    They are left out by boards, in MOST_FOLDS groups at most; with only two boards, by halves of
+    one.
+    """
     boards, number = np.unique(data.board, return_inverse=True)
     if len(boards) > 2:
         group = number % MOST_FOLDS
@@ -133,7 +144,7 @@ def hold_out(candidate: Candidate, data: BoundaryPoints, folds: Sequence[Fold]) 
 
 
 def _measured(data: BoundaryPoints, fold: Fold) -> tuple[Array, Array, Array]:
-    """Of the points left out: rays (n, 3) with z = 1, s (n,), and their own depth (n,) mm."""
+    """Rays (n, 3) with z = 1, s (n,) and true depths (n,) mm of the points left out."""
     points, s = data.points[fold.left_out], data.index[fold.left_out].astype(float)
     return points / points[:, 2:], s, points[:, 2]
 
@@ -141,13 +152,13 @@ def _measured(data: BoundaryPoints, fold: Fold) -> tuple[Array, Array, Array]:
 def select_model(
     candidates: Sequence[Candidate], tried: Sequence[HeldOutErrors], data: BoundaryPoints
 ) -> tuple[int, tuple[HeldOutModel, ...]]:
-    """The number of the model to use, and the figures of all that measured anything.
-
-    Each is compared with the one chosen so far, and taken where it is clearly better.  How a held-out
-    board lies is fitted to either, so that nothing but the light differs.  Models that give no depth
-    where a stripe was seen too seldom are compared only where they do.
+    """Choose a model; return its number and the figures of all that measured anything.
 
     data: the points held out.
+
+    Each model is compared with the one chosen so far, and taken if clearly better. The pose of a
+    held-out board is fitted with either model, so that only the light differs. Models that give no
+    depth where a stripe was seen too seldom are compared only where they give one.
     """
     medians = [_median(np.abs(errors.distances)) for errors in tried]
     cap = CAP * min(medians)
@@ -186,7 +197,7 @@ def select_model(
 
 
 def parts_of_boards(data: BoundaryPoints) -> Indices:
-    """(N,) number of the ninth of its board in which each point lies."""
+    """Number (N,) of the ninth of its board in which each point lies."""
     across, down = (np.digitize(place, THIRDS) for place in data.board_errors.effects[:, 1:].T)
     _, board = np.unique(data.board, return_inverse=True)
     return np.asarray(9 * board + 3 * across + down, np.int64)
@@ -207,12 +218,12 @@ def without_motion(distances: Array, effects: Array, board: Indices) -> Array:
 
 
 def _capped(distances: Array, cap: float) -> Array:
-    """What was not measured counts as far off."""
+    """Clip distances; points that were not measured count as far off."""
     return np.asarray(np.clip(np.nan_to_num(distances, nan=cap), -cap, cap), np.float64)
 
 
 def _mean_of_boards(values: Array, board: Indices, known: Mask) -> float:
-    """Every board counts the same, however many points it has."""
+    """Mean over boards of the mean of each, so that every board counts the same."""
     count, total = np.bincount(board[known]), np.bincount(board[known], values[known])
     return float(np.mean(total[count > 0] / count[count > 0])) if known.any() else np.inf
 

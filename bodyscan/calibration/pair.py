@@ -1,4 +1,4 @@
-"""One pair from boards of known pose: do its stripes agree, its light sheets, and what they reach."""
+"""Calibrate one pair from boards of known pose: check its stripes, fit its light sheets."""
 
 from __future__ import annotations
 
@@ -35,21 +35,26 @@ from bodyscan.stripes.stripe_code import StripeCode
 
 @dataclass(frozen=True)
 class PairQuality:
-    """Figures of one pair: corners' RMS (px) over `poses` board poses, None if none was seen;
-    distances of boundary points to their sheets, RMS (mm), over `stripe_shots` boards; boundaries
-    with a sheet, of those thrown.
+    """Figures of one pair.
 
-    lenses: every kind of lens tried on held-out boards, simplest first; none where the lens was given,
-    or the boards stood in too few places.
-    held_out: every model of the light tried on boards it was not fitted to, simplest first.
-    refinement: of a pair by itself, whether camera, boards and light were refined together and why;
-    ways: every way that was tried on held-out boards; flatness_mm: their RMS about the boards, of the
-    first and of the one taken.  bent_mm: from the lowest to the highest corner of
-    each board, where boards turned out bent.
-    boards_mm: mean and RMS over the boards of how far the stripes measure them from where the
-    corners of all cameras put them.
-    imported: where another program's calibration was taken from, "" if it is our own; with
-    imported_sigma_px by how much its pixels may be off, None if that is not known.
+    corners_rms_px: RMS error of corners, px; None if no board was seen.
+    poses: number of board poses.
+    planes_rms_mm: RMS distance of boundary points from their sheets, mm.
+    stripe_shots: number of boards with stripes.
+    stripes_calibrated, stripes_projected: boundaries with a sheet, and all that are projected.
+    held_out: every model of the light tried on held-out boards, simplest first.
+    refinement: for a pair by itself, whether camera, boards and light were refined together and
+        why.
+    flatness_mm: RMS distance of held-out boards' stripes from the boards, before refinement and as
+        chosen.
+    ways: every refinement tried on held-out boards.
+    bent_mm: height from the lowest to the highest corner of each board found to be bent, mm.
+    boards_mm: mean and RMS over the boards of the offset at which stripes measure them, relative to
+        where the corners of all cameras put them.
+    lenses: every lens tried on held-out boards, simplest first; empty if the lens was given or the
+        boards stood in too few places.
+    imported: the file of another program that the calibration was taken from, "" if it is our own.
+    imported_sigma_px: sigma of its pixels, None if unknown.
     """
 
     corners_rms_px: float | None
@@ -70,7 +75,7 @@ class PairQuality:
 
     @property
     def unjudged(self) -> bool:
-        """Whether nothing is known of how exact it is."""
+        """Whether nothing is known about its accuracy."""
         return bool(self.imported) and self.imported_sigma_px is None
 
     @property
@@ -85,9 +90,10 @@ class PairQuality:
 class PairCalibration:
     """A calibrated pair, camera frame.
 
-    camera_covariance: (P, P) of the camera's parameters.
-    sheets: None for a camera without projector.  crossing: those of the stripes that cross them, if
-    there are any and they are known.
+    camera_covariance: covariance of the camera's parameters, (P, P).
+    sheets: None for a camera without a projector.
+    crossing: sheets of the crossing stripes, None if there are none or they are not known.
+    rays: how well each pixel's ray is known; None if that was not computed.
     """
 
     name: str
@@ -101,13 +107,16 @@ class PairCalibration:
 
 @dataclass(frozen=True, eq=False)
 class PlacedPair:
-    """A pair whose camera and boards are known: what its light sheets are fitted from.
+    """A pair whose camera and boards are known: the input for fitting its light sheets.
 
-    camera: as all corners of the rig have left it, with the covariance of its parameters.  own: the
-    camera as it was calibrated by itself.  lenses: those that were tried.  rays: how well each pixel's
-    is known.
-    views: number of the board views it took part with.  shots: those on which stripes were decoded,
-    with `camera_from_board` as the rig's solve has it.  alone: no other pair holds the boards.
+    camera, camera_covariance: the camera after the joint solve of the rig's corners, and the
+        covariance (P, P) of its parameters.
+    own: the camera as calibrated by itself.
+    lenses: those that were tried.
+    views: number of board views that it contributed.
+    shots: those with decoded stripes, with `camera_from_board` from the joint solve.
+    alone: whether no other pair fixes the boards.
+    rays: how well each pixel's ray is known.
     """
 
     name: str
@@ -124,7 +133,7 @@ class PlacedPair:
 
 
 def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
-    """Light sheets of one pair. Raises PairFailed if its stripes cannot give any."""
+    """Fit the light sheets of one pair. Raises PairFailed if its stripes do not give any."""
     quality = PairQuality(pair.rms_px, pair.views, lenses=pair.lenses)
     camera, projector = pair.camera, pair.projector
     if projector is None:
@@ -155,8 +164,8 @@ def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
         pair.name, camera, pair.camera_covariance, fit.sheets, quality, rays=pair.rays
     )
     if pair.alone:
-        # In a rig of several pairs the boards are held by all cameras together, far better than
-        # one pair's stripes could.
+        # In a rig of several pairs all cameras together fix the boards, far better than the stripes
+        # of one pair could.
         found, shots = _refined(found, pair.own, shots, points)
     crossed = _with_crossing(found, projector, shots)
     return Outcome(crossed.value, (*notes, *crossed.notes))
@@ -165,8 +174,10 @@ def calibrate_pair(pair: PlacedPair) -> Outcome[PairCalibration]:
 def _with_crossing(
     pair: PairCalibration, projector: StripeCode, shots: Sequence[StripedView]
 ) -> Outcome[PairCalibration]:
-    """With the sheets of the stripes that cross, if such were projected. The pair does without them
-    where they give none."""
+    """The pair with sheets of its crossing stripes, if any were projected.
+
+    If they give no sheets the pair does without, and a note says so.
+    """
     across = projector.crossing
     if across is None:
         return Outcome(pair)
@@ -187,7 +198,7 @@ def _with_crossing(
 def drop_disagreeing(
     name: str, shots: Sequence[StripedView], found: ProjectorMotion
 ) -> Outcome[tuple[StripedView, ...]]:
-    """The shots less those that do not fit. Raises PairFailed if the projector moved."""
+    """The shots without those that do not fit. Raises PairFailed if the projector moved."""
     names = [shot.view.shot for shot in shots]
     misfit = f"{found.together_px:.1f} px off together, {found.apart_px:.1f} px apart"
     if found.moved:
@@ -214,8 +225,10 @@ def _refined(
     shots: Sequence[StripedView],
     points: BoundaryPoints,
 ) -> tuple[PairCalibration, tuple[StripedView, ...]]:
-    """Camera, boards and light of a pair by itself in one solve, where held-out boards gain; and its
-    shots with the boards where that puts them."""
+    """Solve for camera, boards and light of a pair by itself together, if held-out boards gain.
+
+    Also returns its shots, with the boards' poses from that solve.
+    """
     assert pair.sheets is not None
     data = subsample(points, REFINED_BINS)
     boards = [

@@ -1,4 +1,4 @@
-"""The rival: a projector as a 2 x 4 matrix (Bolles 1981), by least squares."""
+"""The projector as a 2 x 4 matrix (Bolles 1981), by least squares: a rival model."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class PinholeProjector:
         return above / below
 
     def sheets(self, points: Array, stripes: int, direction: Axis) -> LensSheets:
-        """The same model as a projector without lens that shines at points (N, 3) on boards."""
+        """The same model as a projector without a lens that lights points (N, 3) mm on boards."""
         return LensSheets.pinhole(self.matrix, points.mean(axis=0), stripes, direction)
 
     def planes(self, stripes: int, direction: Axis) -> LightPlanes:
-        """The same model as light planes: all share one line, the projector's centre lies on it."""
+        """The same model as light planes, which share one line, through the projector's centre."""
         s = np.arange(stripes + 1.0)[:, None]
         planes = self.matrix[0] - s * self.matrix[1]
         planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
@@ -42,9 +42,9 @@ class PinholeProjector:
 
 
 def fit_pinhole(points: Array, s: Array) -> PinholeProjector:
-    """From points (N, 3) on boards, camera frame, and their stripe coordinates (N,); robust.
+    """Fit robustly to points (N, 3) on boards, camera frame, and their stripe coordinates (N,).
 
-    Linear start, then least squares on s with a Cauchy loss, on at most MOST_POINTS of them.
+    A linear start is followed by least squares on s with a Cauchy loss, on at most MOST_POINTS.
     """
     every = -(-len(points) // MOST_POINTS)
     points, s = points[::every], s[::every]
@@ -58,7 +58,7 @@ def fit_pinhole(points: Array, s: Array) -> PinholeProjector:
     def residuals(flat: Array) -> Array:
         return (scaled @ flat[:4]) / (scaled @ flat[4:]) - t
 
-    from scipy.optimize import least_squares  # a scan, which fits none, need not wait for it
+    from scipy.optimize import least_squares  # imported here because scans do not need it
 
     scale = 3.0 * spread(residuals(start), 1e-9)
     solved = least_squares(residuals, start, loss="cauchy", f_scale=scale).x.reshape(2, 4)

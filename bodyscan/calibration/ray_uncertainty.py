@@ -1,4 +1,4 @@
-"""What boards in one part of a picture say about its other parts."""
+"""How well camera rays are known where boards did not reach."""
 
 from __future__ import annotations
 
@@ -19,13 +19,15 @@ MOST_CORNERS = 3000
 def ray_uncertainty(
     chosen: Camera, richest: CameraFit, views: Sequence[PlanarView]
 ) -> RayUncertainty:
-    """Of the camera `chosen`, its boards' views fitted as well by the lens of `richest`.
+    """Uncertainty of the rays of the camera `chosen`.
 
-    richest: with the richest lens that held-out boards cannot tell from the chosen one; or just that.
-    Its covariance says what the boards leave open, far from them as well, where the chosen lens
-    would promise what nobody saw; and by as much as it differs from the chosen lens, that may be
-    wrong. A motion of the camera, as seen at its boards, is left out of both: it is the pose's, and
-    in the pose's covariance.
+    richest: a fit to the same views with the richest lens that held-out boards cannot tell from the
+        chosen one, or the chosen fit itself.
+
+    Its covariance shows what the boards leave open, even far from them, where the chosen lens would
+    promise what nobody saw; and the chosen lens may be wrong by as much as the two differ. A motion
+    of the camera, as seen at its boards, is removed from both: it belongs to the pose and is in the
+    pose's covariance.
     """
     camera = richest.camera
     corners = np.concatenate(
@@ -46,8 +48,11 @@ def ray_uncertainty(
 
 
 def _changes(chosen: Camera, camera: Camera, points: Array) -> tuple[Array, Array]:
-    """(N, 2, P + 1): by the parameters of `camera`, and how far it shows the points (N, 3) from where
-    `chosen` does; (N, 2, 6): by a motion of the points."""
+    """Changes of pixels at points (N, 3), camera frame.
+
+    (N, 2, P + 1): by the parameters of `camera`, and its difference from `chosen`.
+    (N, 2, 6): by a motion of the points.
+    """
     by_parameter, by_point = camera.jacobians(points)
     apart = camera.project(points) - chosen.project(points)
     return (
@@ -61,7 +66,7 @@ def _flat(by: Array) -> Array:
 
 
 def _filled(values: Array, shown: Mask) -> Array:
-    """On all nodes; where the lens folds, which has no rays, as the worst that has."""
+    """Values on all nodes; nodes without rays, where the lens folds, get the largest value."""
     every = np.full(shown.shape, values.max(initial=0.0))
     every[shown] = values
     return every

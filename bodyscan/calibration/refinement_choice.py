@@ -1,4 +1,4 @@
-"""Whether refining camera, boards and light sheets together is better, judged on held-out boards."""
+"""Decide by held-out boards whether to refine camera, boards and light sheets together."""
 
 from __future__ import annotations
 
@@ -33,27 +33,30 @@ from bodyscan.geometry.smooth_sheets import SmoothSheets
 
 FEWEST_BOARDS = 3
 REFINED_BINS = 6000
-"""So many bins of boundaries know camera, boards and sheets as well as all of them, to a tenth."""
+"""Bins of boundaries that determine camera, boards and sheets to a tenth as well as all bins do."""
 FOLD_STEPS = 5
-"""From the solution with all boards a fold's lies less than a standard deviation away."""
+"""A fold's solution lies less than a standard deviation from the solution with all boards."""
 PRINT_MM = 0.05
-"""How far a corner may be printed off, before images say it: what office printers and plotters do."""
+"""Prior sigma of a corner's printed place: what office printers and plotters do."""
 WAYS = APART, TOGETHER, BENT = (
     "corners, then stripes",
     "joint solve",
     "joint solve with bent boards",
 )
 NEEDED = (0.0, 0.0, CLEARLY)
-"""Standard errors by which each has to do better than the one before. A joint solve has no more
-unknowns than corners and stripes one after the other, only more evidence on them: it is refused where
-held-out boards become worse. Boards that are bent are a richer model."""
+"""Standard errors by which each must beat the one before. A joint solve has no more unknowns than
+corners and stripes in turn, only more evidence on them, and is refused only where held-out boards
+get worse. Bent boards are a richer model."""
 
 
 @dataclass(frozen=True)
 class RefinementTrial:
-    """One way to solve for a pair.  rms_mm: of held-out boards' stripes about the boards, their own
-    motion taken out.  gain: by how many standard errors it beat the way chosen among those before it
-    (see NEEDED); None for the first."""
+    """One method of solving for a pair.
+
+    rms_mm: RMS distance of held-out boards' stripes from the boards, the boards' motion removed.
+    gain: standard errors by which it beat the method chosen among those before it (see NEEDED);
+        None for the first.
+    """
 
     way: str
     rms_mm: float
@@ -63,8 +66,11 @@ class RefinementTrial:
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """fit: camera, boards and sheets of the way chosen, None where none could be tried; taken: whether
-    they are others than before.  reason: of it, in words.
+    """The method chosen.
+
+    fit: its camera, boards and sheets, None if none could be tried.
+    taken: whether they differ from those before.
+    reason: of the choice, in words.
     """
 
     fit: JointFit[SmoothSheets] | None
@@ -74,7 +80,7 @@ class Refinement:
 
     @property
     def flatness_mm(self) -> tuple[float, float] | None:
-        """RMS of held-out boards' stripes the first way and the one chosen."""
+        """RMS of held-out boards' stripes with the first method and with the one chosen."""
         chosen = [trial.rms_mm for trial in self.trials if trial.chosen]
         return (self.trials[0].rms_mm, chosen[0]) if chosen else None
 
@@ -86,10 +92,11 @@ def refine_where_better(
     data: BoundaryPoints,
     flatness_mm: Mapping[str, float],
 ) -> Refinement:
-    """Refine jointly if that shows boards better that took no part with their stripes.
+    """Refine jointly if that predicts boards better whose stripes took no part.
 
-    boards: in the order of `data.board`; data: binned boundary points of the unrefined calibration.
-    flatness_mm: what boards may be bent, by name.
+    boards: in the order of `data.board`.
+    data: binned boundary points of the unrefined calibration.
+    flatness_mm: how far boards may be bent, by name.
     """
     if not isinstance(sheets, SmoothSheets):
         return Refinement(None, False, "free planes are not refined")
@@ -140,7 +147,7 @@ def _flat(name: str, boards: Sequence[StripedBoard], flatness_mm: float) -> Boar
 
 
 def _said(trials: Sequence[RefinementTrial]) -> str:
-    """Which way was chosen, and by how much each was better than the one before."""
+    """Which method was chosen, and by how much each was better than the one before."""
     chosen = next(trial.way for trial in trials if trial.chosen)
     others = "; ".join(
         f"{trial.way}: {trial.gain:+.1f} standard errors on held-out boards"
@@ -152,8 +159,12 @@ def _said(trials: Sequence[RefinementTrial]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _HeldOut:
-    """What one way left of boards held out.  stripes: (N, 1) mm off the boards, whose own motion is
-    taken out, in the order of the data.  corners: (M, 2) px, board by board."""
+    """What one method left over on held-out boards.
+
+    stripes: distances from the boards, whose motion is removed, (N, 1) mm, in the order of the
+        data.
+    corners: (M, 2) px, board by board.
+    """
 
     stripes: Array
     corners: Array
@@ -162,8 +173,10 @@ class _HeldOut:
 def _hold_out(
     fits: Sequence[JointFit[SmoothSheets]], boards: Sequence[StripedBoard], data: BoundaryPoints
 ) -> list[_HeldOut]:
-    """Each board, or one of MOST_FOLDS groups of them, in turn left out; of so few that the camera
-    needs them all, their stripes alone."""
+    """Leave out each board, or one of MOST_FOLDS groups of them, in turn.
+
+    If there are so few boards that the camera needs them all, only their stripes are left out.
+    """
     stripes = [np.empty(len(data.index)) for _ in fits]
     corners = [[np.empty((0, 2))] * len(boards) for _ in fits]
     folds = min(len(boards), MOST_FOLDS)
@@ -187,7 +200,7 @@ def _hold_out(
 def _without(
     way: str, fit: JointFit[SmoothSheets], rest: Sequence[StripedBoard]
 ) -> JointFit[SmoothSheets]:
-    """As `fit`, from the rest of the boards."""
+    """Repeat `fit` from the rest of the boards."""
     poses = [fit.camera_from_board[board.view.shot] for board in rest]
     if way != APART:
         return refine_jointly(
@@ -219,8 +232,11 @@ def _unlit(board: StripedBoard) -> StripedBoard:
 def _off_board(
     one: JointFit[SmoothSheets], board: StripedBoard, start: JointFit[SmoothSheets]
 ) -> tuple[Array, Array]:
-    """(N,) mm: how far a board's boundary points, as camera and sheets measure them, lie off it; and
-    its corners' residuals (M, 2) px, the board placed by them."""
+    """Held-out errors of one board, whose pose is fitted to its corners.
+
+    (N,) mm: distances of its boundary points, as camera and sheets measure them, from the board.
+    (M, 2) px: residuals of its corners.
+    """
     form, view = one.forms[board.board], board.view
     really = replace(view, points=form.applied(view.points, form.numbers(view.points)))
     pose, residuals = locate_board(one.camera, really, start.camera_from_board[view.shot])

@@ -1,4 +1,4 @@
-"""Smooth sheets of light fitted to stripe boundaries on boards, with their covariance."""
+"""Fit smooth light sheets to stripe boundaries on boards, with their covariance."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ Sheets = TypeVar("Sheets", bound=SmoothSheets)
 
 MOST_STEPS = 25
 SETTLED = 0.01
-"""Variances: sheets a tenth of their standard deviation away would be as good."""
+"""Convergence, in variances: sheets a tenth of a standard deviation away would be as good."""
 POINTS = Noise("points on boards", cauchy=3.0, least=1e-3)
 FLOOR_PX = 0.02
-"""Added to every sigma: lens, board and camera are not known better than this, however many pixels
-a mean was taken over."""
+"""px, added to every sigma: lens, board and camera are not known better than this, however many
+pixels were averaged."""
 
 
 @dataclass(frozen=True, eq=False)
 class SheetFit(Generic[Sheets]):
-    """sheets with their covariance.
+    """Fitted sheets with their covariance.
 
-    distances_mm: (N,) of the points to them.  weights: (N,), robust.  noise: robust spread of the
-    distances, in the points' own standard deviations.
+    distances_mm: of the points from their sheets, (N,).
+    weights: robust weights of the points, (N,).
+    noise: robust sigma of the distances, in the points' own sigmas.
     """
 
     sheets: Sheets
@@ -49,10 +50,10 @@ def fit_sheets(
     board_error_mm: float = 0.0,
     most_steps: int = MOST_STEPS,
 ) -> SheetFit[Sheets]:
-    """Least squares of the points' offsets from their sheets: Cauchy loss, the model's prior.
+    """Least squares on offsets of points from sheets, with Cauchy loss and the model's prior.
 
-    board_error_mm: how well the boards' places are known (see `BoardErrors`). It does not change
-    the sheets but their covariance: a board's points err together, however many they are.
+    board_error_mm: how well the boards' poses are known (see `BoardErrors`). It changes only the
+        covariance: a board's points err together, however many they are.
     """
     _, jacobian = start.prior()
     solution = minimize(
@@ -78,7 +79,7 @@ def fit_sheets(
 
 
 def _blocks(sheets: SmoothSheets, data: BoundaryPoints) -> tuple[Block, Block]:
-    """The points' offsets over what their pixels' error is worth there, and the model's prior."""
+    """Offsets of the points, over what their pixel error is worth there, and the model's prior."""
     with np.errstate(all="ignore"):
         at = sheets.at(data.index.astype(float))
         offset = sheets.offset(data.points, at, parameters=True)
@@ -86,7 +87,7 @@ def _blocks(sheets: SmoothSheets, data: BoundaryPoints) -> tuple[Block, Block]:
     assert by_parameter is not None
     leverage = np.abs(np.einsum("ni,ni->n", offset.by_point, data.per_pixel))
     sigma = np.maximum(leverage, 1e-12) * np.hypot(data.sigma_px, FLOOR_PX)
-    # Sheets that leave points behind the projector are no sheets.
+    # Sheets that leave points behind the projector are invalid.
     value = np.where(offset.reach > 0.0, offset.value, np.nan)
     known, jacobian = sheets.prior()
     every = slice(0, jacobian.shape[1])
@@ -99,7 +100,7 @@ def _blocks(sheets: SmoothSheets, data: BoundaryPoints) -> tuple[Block, Block]:
 def _of_boards(
     solution: Solution[Sheets], data: BoundaryPoints, by_point: Array, board_error_mm: float
 ) -> Array:
-    """What each board's error on its own adds to the covariance (a sandwich, boards as clusters)."""
+    """Covariance added by each board's own pose error (a sandwich with boards as clusters)."""
     points, noise = solution.blocks[0], solution.covariance
     errors = data.board_errors
     off = np.einsum("ni,ni->n", by_point, errors.along_ray)

@@ -1,4 +1,4 @@
-"""Whether all boards of a pair saw the same light: a projector must not move between shots."""
+"""Check that all boards of a pair saw the same light: its projector must not move between shots."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from bodyscan.geometry.ray_depths import intersect_rays
 FEW_POINTS = 1200
 STEPS = 12
 SUSPECT_PX = 0.4
-"""Boards that agree this well are not looked at any further."""
+"""Boards that agree this well are not examined further."""
 FEWEST_AGREEING = 3
 """Two boards agree on nearly any light."""
 CLEARLY = 3.0
-"""Boards are told apart if that makes them agree so many times better."""
+"""Boards are split if that improves their agreement by this factor."""
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectorMotion:
-    """Boards, told apart so that each group agrees on the light.
+    """A split of the boards into two groups, each of which agrees on the light.
 
-    kept, others: numbers of the boards in two groups, in the order of the shots; `others` are a few
-    that do not fit, or, where the projector `moved`, all that were taken afterwards.  together_px,
-    apart_px: how well the stripes of all boards fit one light, and those of each group theirs.
+    kept, others: numbers of the boards in each group, in the order of the shots; `others` are a few
+        that do not fit or, where the projector `moved`, all that were taken afterwards.
+    together_px, apart_px: how well stripes fit one light for all boards, and one for each group.
     """
 
     kept: Indices
@@ -49,10 +49,12 @@ class ProjectorMotion:
 def find_projector_motion(
     data: BoundaryPoints, stripes: int, direction: Axis
 ) -> ProjectorMotion | None:
-    """None if all boards agree, or are fewer than three. `data.board` counts in the order of shots.
+    """Find boards that saw different light; None if all agree or there are fewer than three.
 
-    Raises PairFailed where stripes lie farther off than they are wide and most boards agree on no
-    light: images of several shots are mixed up, or the stripes are not those described.
+    data: its `board` counts in the order of the shots.
+
+    Raises PairFailed if stripes lie farther off than their width and most boards agree on no light:
+    images of different shots are mixed up, or the stripes are not those described.
     """
     few = subsample(data, FEW_POINTS)
     boards = np.unique(few.board)
@@ -83,8 +85,10 @@ def find_projector_motion(
 
 
 def board_offsets(data: BoundaryPoints, sheets: LightSheets) -> Array:
-    """(B,) mm: how far from its place, by the corners of all cameras, each board is measured by the
-    stripes: median along its normal, positive away from the camera."""
+    """Offsets (B,) mm of boards as measured by the stripes from where corners put them.
+
+    Median along the board's normal, positive away from the camera.
+    """
     rays = data.points / data.points[:, 2:]
     depth = intersect_rays(sheets, rays, data.index.astype(float)).depth
     off = (depth - data.points[:, 2]) * data.board_errors.facing
@@ -97,8 +101,7 @@ Misfit = Callable[[Sequence[Indices]], float]
 
 
 def _told_apart(boards: Indices, misfit: Misfit) -> Iterator[tuple[Indices, Indices, float, bool]]:
-    """Ways to tell boards apart, the simplest first: kept, others, how well the groups agree, and
-    whether the projector moved between them."""
+    """Possible splits, simplest first: kept, others, misfit in px, whether the projector moved."""
     left_out = _left_out(boards, misfit)
     yield next(left_out)
     yield from _before_and_after(boards, misfit)
@@ -106,8 +109,10 @@ def _told_apart(boards: Indices, misfit: Misfit) -> Iterator[tuple[Indices, Indi
 
 
 def _left_out(boards: Indices, misfit: Misfit) -> Iterator[tuple[Indices, Indices, float, bool]]:
-    """One board less, then more, each time the one without which the others agree best, while most
-    are left and they say something."""
+    """Drop one board after another, each time the one without which the others agree best.
+
+    Stops while most boards are left and their agreement still means something.
+    """
     kept, fewest = boards, max(FEWEST_AGREEING, len(boards) // 2 + 1)
     while len(kept) > fewest or kept is boards:
         apart, out = min((misfit([kept[kept != board]]), board) for board in kept)
@@ -118,8 +123,11 @@ def _left_out(boards: Indices, misfit: Misfit) -> Iterator[tuple[Indices, Indice
 def _before_and_after(
     boards: Indices, misfit: Misfit
 ) -> Iterator[tuple[Indices, Indices, float, bool]]:
-    """All before against all after, where they agree best. That the first two agree says nothing,
-    and the projector stands where the others saw it: they are left out."""
+    """Split all boards before a shot from all after it, where the groups agree best.
+
+    If only two boards come first, their agreement means nothing, and the projector stands where the
+    others saw it: the two are left out.
+    """
     cuts = range(2, len(boards) - 1)
     if cuts:
         apart, first = min((misfit([boards[:cut], boards[cut:]]), cut) for cut in cuts)
@@ -131,7 +139,7 @@ def _before_and_after(
 
 
 def _stripe_width(data: BoundaryPoints) -> float:
-    """px, the median over the boards' points: by how neighbouring boundaries of a board lie apart."""
+    """Width of a stripe, px: distance of neighbouring boundaries, median over the boards."""
     widths = []
     for board in np.unique(data.board):
         own = data.board == board
@@ -145,8 +153,10 @@ def _stripe_width(data: BoundaryPoints) -> float:
 def _misfit(
     data: BoundaryPoints, groups: Sequence[Indices], stripes: int, direction: Axis
 ) -> float:
-    """Root mean square over boards of the median distance (px) of its stripes from its group's
-    sheets. Sheets that may bow, so that no kind of projector is taken for one that moved."""
+    """RMS over boards of the median distance (px) of a board's stripes from its group's sheets.
+
+    The sheets may bow, so that no kind of projector is mistaken for one that moved.
+    """
     medians = []
     for group in groups:
         own = select(data, np.isin(data.board, group))

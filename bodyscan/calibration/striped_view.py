@@ -1,4 +1,4 @@
-"""The stripes of one pair on its boards: what was decoded near each, averaged and carried onto it."""
+"""The stripes of one pair on its boards: decoded near each, averaged, and carried onto it."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from bodyscan.stripes.stripe_map import StripeMap
 
 FEWEST_STRIPE_SHOTS = 2
 RIM_SQUARES = 0.1
-"""Of the outermost squares so much is left out: beside the print the board may be cut unevenly."""
+"""Share of the outermost squares left out: beside the print a board may be cut unevenly."""
 BIN_PX = 16
-"""Along a boundary, which is straight over so short a piece: its sagitta is below a thousandth of a
-pixel. Ten times fewer points are left."""
+"""Length of a bin along a boundary, which is straight over so short a piece: its sagitta is below a
+thousandth of a pixel. Ten times fewer points remain."""
 
 FEWEST_BANDS = 4
-"""Across a board, of those bins: sheets of light bow across their width."""
+"""Fewest such bins across a board: sheets bow across their width."""
 AROUND_PX = 16.0
-"""Decoding a boundary looks at pixels up to 7 px beside it (`indirect_light`, `albedo_edges`), and at
-boundaries of its run up to 6 px away, which look so far in turn."""
+"""Decoding a boundary uses pixels up to 7 px beside it (`indirect_light`, `albedo_edges`) and
+boundaries of its run up to 6 px away, which in turn use pixels as far beside them."""
 
 Box = tuple[Array, Array]
 """Least and greatest (u, v), px."""
@@ -50,8 +50,13 @@ Box = tuple[Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class BoardBoundaries:
-    """Stripe boundaries of one shot that lie near a board: index (N,), pixels (N, 2), sigma (N,); and
-    those of the stripes that cross them, if there are such."""
+    """Stripe boundaries of one shot near a board.
+
+    index: (N,).
+    pixels: (N, 2) px.
+    sigma_px: (N,) px.
+    crossing: those of the crossing stripes, if there are any.
+    """
 
     index: Indices
     pixels: Array
@@ -61,9 +66,9 @@ class BoardBoundaries:
 
 @dataclass(frozen=True, eq=False)
 class StripedView:
-    """A board that a pair saw, where it lies in the camera frame, and the stripes decoded on it.
+    """A board that a pair saw, with its pose and the stripes decoded on it.
 
-    face: of a board that is known not to be flat, the face that was seen.
+    face: the face that was seen, if the board is known not to be flat.
     """
 
     view: LocatedView
@@ -73,7 +78,7 @@ class StripedView:
 
     @property
     def camera_from_face(self) -> RigidTransform:
-        """Of the face that was seen: its corners lie at z = 0, or about it where it is not flat."""
+        """Transform from the face that was seen; its corners lie at z = 0, or near it if bent."""
         z_mm = self.face.z_mm if self.face else self.view.points[0, 2]
         return self.view.camera_from_board @ RigidTransform(np.eye(3), np.array([0.0, 0.0, z_mm]))
 
@@ -81,7 +86,8 @@ class StripedView:
 def boundaries_near(stripes: StripeMap, box: Box, crop: Crop = WHOLE) -> BoardBoundaries:
     """The boundaries within a box around a view.
 
-    crop: rows and columns of the image that the stripe map is of."""
+    crop: rows and columns of the image that the stripe map covers.
+    """
     low, high = box
     pixels = stripes.boundary_pixels + [crop[1].start or 0, crop[0].start or 0]
     (u, v), (left, top), (right, bottom) = pixels.T, low, high
@@ -103,14 +109,14 @@ def crop_around(boxes: Sequence[Box]) -> Crop:
 
 
 def box_around(view: BoardView | LocatedView) -> Box:
-    """Where its board lies, of which not all corners may be seen."""
+    """A box around a view's board, of which some corners may not have been seen."""
     low, high = view.pixels.min(axis=0), view.pixels.max(axis=0)
     reach = 0.5 * (high - low)
     return low - reach, high + reach
 
 
 def box_of_print(camera: Camera, board: Board, view: LocatedView) -> Box:
-    """Where a board of known pose shows its print: a part of the box around its view."""
+    """A box around the print of a board of known pose, within the box around its view."""
     low, high = box_around(view)
     grid = np.indices((board.columns + 1, board.rows + 1)).reshape(2, -1).T * board.square_mm
     on_face = np.column_stack([grid, np.full(len(grid), view.points[0, 2])])
@@ -126,15 +132,15 @@ def box_of_print(camera: Camera, board: Board, view: LocatedView) -> Box:
 
 
 def bands_apart(code: StripeCode, boxes: Sequence[Box]) -> int:
-    """One in how many bands of BIN_PX along the stripes gives a fit as many bins as it takes, though of
-    all stripes half may fall beside the boards."""
+    """Take one in this many bands of BIN_PX along the stripes for as many bins as a fit uses, even
+    if half of all stripes miss the boards."""
     along = 0 if code.direction == "horizontal" else 1
     pieces = sum(float(high[along] - low[along]) / BIN_PX for low, high in boxes)
     return max(int(0.5 * code.stripes * pieces / FIT_BINS), 1)
 
 
 def most_apart(boxes: Sequence[Box], camera: CameraSpec) -> int:
-    """One in how many bands leaves FEWEST_BANDS across what the picture shows of every board."""
+    """Largest band step that leaves FEWEST_BANDS across the visible part of every board."""
     size = np.array([camera.width, camera.height])
     shown = [np.minimum(high, size) - np.maximum(low, 0.0) for low, high in boxes]
     return max(int(np.min(shown) / (FEWEST_BANDS * BIN_PX)), 1)
@@ -143,7 +149,7 @@ def most_apart(boxes: Sequence[Box], camera: CameraSpec) -> int:
 def boundaries_on_boards(
     name: str, camera: Camera, projector: StripeCode, shots: Sequence[StripedView]
 ) -> BoundaryPoints:
-    """The boundaries of all shots on their boards, `board` counting the shots.
+    """Carry the boundaries of all shots onto their boards; `board` counts the shots.
 
     Raises PairFailed if fewer than two boards carry stripes.
     """
@@ -180,7 +186,7 @@ def on_board(
     *,
     bin_px: int = BIN_PX,
 ) -> BoundaryPoints:
-    """What lies `on_print`, carried there."""
+    """Boundaries `on_print`, carried onto the board."""
     means = on_print(camera, projector, board, camera_from_face, boundaries, bin_px)
     return boundary_points(
         camera,
@@ -202,10 +208,12 @@ def on_print(
     boundaries: BoardBoundaries,
     bin_px: int = BIN_PX,
 ) -> BoardBoundaries:
-    """Means over bin_px pixels along each boundary, of what lies on the board's checkered area: stripes
-    fall on the wall and floor too. Means of such means are as they were."""
+    """Average boundaries on the board's checkered area over bin_px pixels along each.
+
+    Stripes on the wall and floor are dropped. Averaging a second time changes nothing.
+    """
     place = camera_from_face
-    # A ray and where it meets the board's plane are images of each other: x ~ [r1 r2 t] (X, Y, 1).
+    # A homography relates a ray to where it meets the board's plane: x ~ [r1 r2 t] (X, Y, 1).
     plane = np.column_stack([place.rotation[:, :2], place.translation])
     rim = RIM_SQUARES * board.square_mm
     area = np.array([board.columns * board.square_mm, board.rows * board.square_mm]) - rim
@@ -222,7 +230,7 @@ def on_print(
 def bin_boundaries(
     boundaries: BoardBoundaries, kept: Mask, direction: Axis, bin_px: int = BIN_PX
 ) -> BoardBoundaries:
-    """Weighted means over bin_px pixels along each boundary, of those that are `kept` (N,)."""
+    """Weighted means over bin_px pixels along each boundary, of points that are `kept` (N,)."""
     index, pixels = boundaries.index[kept], boundaries.pixels[kept]
     if not len(index):
         return BoardBoundaries(index, pixels, boundaries.sigma_px[kept])
@@ -242,8 +250,10 @@ def bin_boundaries(
 def _look_inside(
     rays: Table, board_from_ray: Array, area: Array, pixels: Array, inside: Mask
 ) -> None:
-    """inside (N,): whether the rays of pixels (N, 2) meet the board where x and y (mm) lie between
-    area's last and its first two (3,)."""
+    """Set inside (N,): whether the rays of pixels (N, 2) meet the board in its checkered area.
+
+    area: (3,) mm; x and y lie between its last entry and its first two.
+    """
     h = board_from_ray
     for n in range(len(pixels)):
         x, y = look_up(rays, pixels[n, 0], pixels[n, 1])

@@ -1,4 +1,4 @@
-"""Zhang's closed form: homographies of a plane, the camera's matrix with skew, the plane's poses.
+"""Zhang's closed form: homographies of a plane, the camera matrix with skew, poses of the plane.
 
 Source: Z. Zhang, A Flexible New Technique for Camera Calibration, PAMI 22(11), 2000.
 """
@@ -35,8 +35,8 @@ def homography(plane: Array, pixels: Array) -> Array:
 def matrix_from_homographies(homographies: Sequence[Array], width: int, height: int) -> Array:
     """A of Eq. 1 with skew, (3, 3), from at least three homographies.
 
-    Falls back to a camera without skew and a central principal point where noise leaves the full
-    form without a real solution.  Raises DegeneratePoses if the planes are (nearly) parallel.
+    Falls back to a camera without skew and with a central principal point if noise leaves the full
+    form without a real solution. Raises DegeneratePoses if the planes are (nearly) parallel.
     """
     refuse_parallel(homographies, width, height)
     size = np.diag([2.0 / width, 2.0 / width, 1.0]) @ np.array(
@@ -53,7 +53,7 @@ def matrix_from_homographies(homographies: Sequence[Array], width: int, height: 
 def refuse_parallel(homographies: Sequence[Array], width: int, height: int) -> None:
     """Raise DegeneratePoses if all planes have one orientation (pure translation, Zhang 1998).
 
-    Parallel planes share their vanishing line; a rough camera turns lines into plane normals.
+    Parallel planes share their vanishing line, which a rough camera turns into a plane normal.
     """
     rough = np.array([[1.2 * width, 0, width / 2], [0, 1.2 * width, height / 2], [0, 0, 1.0]])
     lines = np.stack([np.linalg.inv(h).T[:, 2] for h in homographies])

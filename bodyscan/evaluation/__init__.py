@@ -1,6 +1,6 @@
-"""Results against what is known: surfaces and bodies of simulation, spheres and planes of artefacts.
+"""Compare results with known values: simulated bodies, spheres and planes of artefacts.
 
-surface (signed distances, coverage), body (girths, sway left in), comparison (scan against scan);
-planes, spheres and sphere_search (one range image on artefacts); artefacts, acceptance_file and
+surface (signed distances, coverage), body (girths, remaining sway), comparison (scan against scan);
+planes, spheres and sphere_search (one range image of artefacts); artefacts, acceptance_file and
 acceptance_readings (the acceptance test).
 """

@@ -15,7 +15,7 @@ from bodyscan.files.model_file import apply_changes, load_model
 
 _REMEDY = "Correct the acceptance file; docs/report.md explains every key."
 MOST_SPHERES = 6
-"""Spheres are told apart by trying every order of them."""
+"""Most spheres: they are identified by trying every order of them."""
 
 Positive = Annotated[float, Field(gt=0)]
 Vector = tuple[float, float, float]
@@ -41,13 +41,13 @@ class Spheres(Model):
 
 
 class Plate(Model):
-    """A flat plate, width and height."""
+    """A flat plate: its width and height."""
 
     size_mm: tuple[Positive, Positive] = (400.0, 300.0)
 
 
 class Limits(Model):
-    """Largest values allowed, mm; one that is not given is reported and not judged."""
+    """Largest values allowed, mm; figures without a limit are reported but not judged."""
 
     probing_form_mm: Positive | None = None
     probing_size_mm: Positive | None = None
@@ -59,7 +59,7 @@ class Limits(Model):
 
 
 class AcceptanceFile(Model):
-    """The whole file."""
+    """The whole acceptance file."""
 
     version: Literal[1] = 1
     spheres: Spheres = Spheres()
@@ -68,7 +68,7 @@ class AcceptanceFile(Model):
 
 
 def load_acceptance(path: Path | None, changes: Mapping[str, float] = {}) -> AcceptanceFile:
-    """The file (the defaults if there is none) with some limits changed.
+    """Read an acceptance file, or take the defaults if `path` is None, and change some limits.
 
     Raises AcceptanceError that names every problem.
     """
@@ -85,7 +85,7 @@ def load_acceptance(path: Path | None, changes: Mapping[str, float] = {}) -> Acc
 
 
 def limit_from(text: str) -> tuple[str, float]:
-    """`flatness_mm=0.5` as name and value. Raises AcceptanceError."""
+    """Parse `flatness_mm=0.5` into name and value. Raises AcceptanceError."""
     name, _, value = text.partition("=")
     try:
         return name.strip(), float(value)

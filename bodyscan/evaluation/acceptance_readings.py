@@ -1,4 +1,4 @@
-"""What an acceptance test read, and the figures that follow from it."""
+"""The readings of an acceptance test, and the figures that follow from them."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class PlateRow:
 
 @dataclass(frozen=True)
 class Readings:
-    """All that was read.  problems: places where an artefact was not found, or not by all."""
+    """All readings.  problems: places where artefacts were not found, or not all of them."""
 
     spheres: tuple[SphereRow, ...] = ()
     spacings: tuple[SpacingRow, ...] = ()
@@ -74,19 +74,19 @@ class Figure:
 
     @property
     def title(self) -> str:
-        """As people read it."""
+        """The name in words."""
         return self.name.removesuffix("_mm").replace("_", " ")
 
     @property
     def exceeded(self) -> bool:
-        """A limit on what was not measured is not kept either."""
+        """Whether a limit is violated, which includes one on a figure that was not measured."""
         return self.limit_mm is not None and (
             self.value_mm is None or abs(self.value_mm) > self.limit_mm
         )
 
 
 def figures(readings: Readings, file: AcceptanceFile) -> list[Figure]:
-    """The test's figures, the worst of all places and shots, with their limits."""
+    """The test's figures, the worst over all places and shots, with their limits."""
     merged = [row for row in readings.spheres if row.view == ALL]
     single = [row for row in readings.spheres if row.view != ALL]
     plates = [row for row in readings.plates if row.view == ALL]
@@ -116,7 +116,7 @@ def figures(readings: Readings, file: AcceptanceFile) -> list[Figure]:
 
 
 def grade_acceptance(found: Sequence[Figure], readings: Readings) -> Verdict:
-    """Not accepted where a limit is exceeded or an artefact was not read."""
+    """The verdict: not accepted if a limit is exceeded or an artefact was not read."""
     reasons = [
         f"{one.name}: {one.value_mm:.3f} mm ({one.where}), limit {one.limit_mm:g} mm"
         if one.value_mm is not None
@@ -135,7 +135,7 @@ def grade_acceptance(found: Sequence[Figure], readings: Readings) -> Verdict:
 def acceptance_document(
     readings: Readings, found: Sequence[Figure], file: AcceptanceFile, **origin: Any
 ) -> dict[str, Any]:
-    """What acceptance.json holds."""
+    """The content of acceptance.json."""
     return origin | {
         "schema": "bodyscan-acceptance",
         "version": 1,

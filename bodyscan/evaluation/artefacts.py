@@ -1,7 +1,7 @@
-"""Artefacts of an acceptance test read from points: spheres and a plate of known size.
+"""Read the artefacts of an acceptance test from points: spheres and a plate of known size.
 
-The figures are modelled on VDI/VDE 2634 parts 2 and 3 and on ISO 20685-2: what is computed is said
-here; it is no test by these standards, which ask for more (artefacts, places, operators).
+The figures are modelled on VDI/VDE 2634 parts 2 and 3 and on ISO 20685-2. What is computed is
+stated here; it is not a test by these standards, which require more (artefacts, places, operators).
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from bodyscan.evaluation.sphere_search import find_spheres
 from bodyscan.evaluation.spheres import Sphere, fit_sphere
 
 REJECTED = 0.003
-"""So many of the points may be left out, the farthest off, as VDI/VDE 2634 allows."""
+"""Share of the points, the farthest off, that may be left out, as VDI/VDE 2634 allows."""
 SHELL_SHARE = 0.9
 """ISO 20685-2 asks for the shell that holds nine tenths of the points."""
 OWN = 0.15
-"""Points so far off a sphere's surface, in radii, are not taken for its own."""
+"""Points farther off a sphere's surface than this, in radii, do not belong to it."""
 FACING = 0.8
-"""Nor those whose normal is farther than 37 degrees from the radius: a stand, a rim."""
+"""Nor do points whose normal is farther than 37 degrees from the radius: a stand, a rim."""
 TRIES, TRY_POINTS = 600, 3000
 NEAR_PLATE_MM, RIM_MM, CELL_MM = 4.0, 12.0, 10.0
 FEWEST_ON_PLATE = 300
@@ -37,8 +37,11 @@ FEWEST_ON_PLATE = 300
 class SphereReading:
     """One sphere, from points (all pairs merged, or one pair's).
 
-    form_mm: range of the radial distances from the best sphere, 3 per mille of the points left
-    out.  shell_mm: width that holds 90 %.  size_mm: its diameter less the calibrated one.
+    fitted: the best sphere.
+    points: number of points on it.
+    form_mm: range of the radial distances from it, 3 per mille of the points left out.
+    shell_mm: width of the shell that holds 90 % of the points.
+    size_mm: its diameter less the calibrated one.
     """
 
     fitted: Sphere
@@ -50,8 +53,13 @@ class SphereReading:
 
 @dataclass(frozen=True, eq=False)
 class PlateReading:
-    """flatness_mm: range of the distances from the best plane, 3 per mille left out.  rms_mm: of
-    all.  area_mm2: of the hull of what was measured, before its rim was left out."""
+    """One plate.
+
+    points: number of points on it.
+    flatness_mm: range of the distances from the best plane, 3 per mille left out.
+    rms_mm: RMS of all distances.
+    area_mm2: of the hull of what was measured, before its rim was left out.
+    """
 
     points: int
     flatness_mm: float
@@ -62,7 +70,7 @@ class PlateReading:
 def locate_spheres(
     points: Array, normals: Array, radius_mm: float, centres_mm: Array
 ) -> list[Sphere]:
-    """The artefact's spheres among points (N, 3) with outward normals, in the artefact's order.
+    """Find the artefact's spheres, in its order, among points (N, 3) with outward normals.
 
     Raises FailedWork if not all are found.
     """
@@ -77,9 +85,9 @@ def locate_spheres(
 
 
 def read_sphere(points: Array, normals: Array, near: Sphere, radius_mm: float) -> SphereReading:
-    """The sphere `near` a place, from those of points (N, 3) that are its own.
+    """Read the sphere `near` a place, from those of points (N, 3) that belong to it.
 
-    Raises FailedWork for too few.
+    Raises FailedWork if there are too few.
     """
     arm = points - near.centre
     length = np.linalg.norm(arm, axis=1)
@@ -102,8 +110,10 @@ def spacing_errors(readings: list[SphereReading], centres_mm: Array) -> Array:
 
 
 def read_plate(points: Array, normals: Array) -> PlateReading:
-    """The largest plane among points (N, 3) with normals, either way, its rim and all that is not
-    joined to it left out. Raises FailedWork if there is none."""
+    """Read the largest plane among points (N, 3) with normals, which may face either side.
+
+    Its rim and everything not joined to it are left out. Raises FailedWork if there is none.
+    """
     if len(points) < FEWEST_ON_PLATE:
         raise FailedWork(f"{len(points)} points are too few for a plate")
     normal, offset = _largest_plane(points, np.random.default_rng(0))
@@ -134,19 +144,19 @@ def _drop_farthest(off: Array) -> Array:
 
 
 def _shell(off: Array) -> float:
-    """The narrowest interval that holds nine tenths of the distances (N,)."""
+    """Width of the narrowest interval that holds nine tenths of the distances (N,)."""
     ordered = np.sort(off)
     held = max(1, round(SHELL_SHARE * len(ordered)))
     return float(np.min(ordered[held - 1 :] - ordered[: len(ordered) - held + 1]))
 
 
 def _largest_plane(points: Array, rng: np.random.Generator) -> tuple[Array, float]:
-    """The plane through three of the points that most of them lie near (Fischler and Bolles 1981)."""
+    """The plane through three points that most points lie near (Fischler and Bolles 1981)."""
     some = points[rng.choice(len(points), min(TRY_POINTS, len(points)), replace=False)]
     a, b, c = np.moveaxis(some[rng.integers(0, len(some), (TRIES, 3))], 1, 0)
     normals = np.cross(b - a, c - a)
     doubled_area = np.linalg.norm(normals, axis=1, keepdims=True)
-    wide = doubled_area[:, 0] > CELL_MM**2  # three of one place, or in a line, make no plane
+    wide = doubled_area[:, 0] > CELL_MM**2  # three in one place or line: no plane
     normals, a = normals[wide] / doubled_area[wide], a[wide]
     if not len(normals):
         raise FailedWork("no plate is among the points")
@@ -157,14 +167,14 @@ def _largest_plane(points: Array, rng: np.random.Generator) -> tuple[Array, floa
 
 
 def _in_plane(normal: Array) -> Array:
-    """(3, 2) two directions at right angles in the plane."""
+    """(3, 2): two perpendicular unit vectors in the plane."""
     right = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(normal, right)], axis=1)
 
 
 def _largest_piece(flat: Array) -> Mask:
-    """(N,) which of flat points (N, 2) belong to the piece with most of them; cells of it touch."""
+    """Which flat points (N, 2) belong to the largest piece, whose cells touch, (N,)."""
     cells = np.floor((flat - flat.min(axis=0)) / CELL_MM).astype(np.int64)
     taken = np.zeros(cells.max(axis=0) + 1, bool)
     taken[tuple(cells.T)] = True
@@ -173,8 +183,7 @@ def _largest_piece(flat: Array) -> Mask:
 
 
 def _within_rim(flat: Array) -> tuple[Mask, float]:
-    """(N,) which of flat points (N, 2) lie farther than the rim's width inside their hull, and the
-    hull's area."""
+    """Which flat points (N, 2) lie inside their hull's rim, (N,), and the hull's area."""
     hull = ConvexHull(flat)
     inward = -(flat @ hull.equations[:, :2].T + hull.equations[:, 2])
     return inward.min(axis=1) > RIM_MM, float(hull.volume)

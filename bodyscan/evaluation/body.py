@@ -1,4 +1,4 @@
-"""A scanned body held against the simulated one: sway left in, girths, stature, coverage."""
+"""Compare a scanned body with the simulated one: remaining sway, girths, stature, coverage."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ from bodyscan.mesh.body import BodyMesh
 
 STEP_MM = 20.0
 TORSO = (0.46, 0.86)  # of the stature: crotch to shoulders
-WHOLE = 0.97  # of a girth measured, and no hair; what is filled is a guess and said to be one
-STEEPEST_COSINE = 0.17  # seen at more than 80 degrees does not count as seen
+WHOLE = 0.97  # of a girth measured, and not hair: what is filled is a declared guess
+STEEPEST_COSINE = 0.17  # a surface seen at more than 80 degrees does not count as seen
 SPOTS = 60_000
 
 
 @dataclass(frozen=True, eq=False)
 class SwayResidual:
-    """rig_from_still: where the model has the body of the truth.  apart_mm: RMS over pairs and the
-    body of what is left of calibration error and sway, along all axes.
+    """What is left of calibration error and sway.
+
+    rig_from_still: where the model has the true body.
+    apart_mm: RMS of what is left, over pairs and the body, along all axes.
     """
 
     rig_from_still: RigidTransform
@@ -36,7 +38,12 @@ class SwayResidual:
 def sway_residual(
     found: Mapping[str, RigidTransform], true_pairs: Mapping[str, Any], vertices: Array
 ) -> SwayResidual:
-    """found: rig_from_camera as the scan used it; true_pairs: `pairs` of truth.json."""
+    """Compare poses with the truth.
+
+    found: rig_from_camera as the scan used it.
+    true_pairs: `pairs` of truth.json.
+    vertices: the true body.
+    """
     body = vertices[:: max(1, len(vertices) // 500)]
     placed = []
     for name, placing in found.items():
@@ -53,7 +60,9 @@ def sway_residual(
 class GirthErrors:
     """Tape girths of the trunk, mesh minus truth, where at least 97 % of the girth was measured.
 
-    worst_mm, rms_mm over `heights` slices; stature_mm: its error.
+    heights: number of slices.
+    rms_mm, worst_mm, worst_at_mm: RMS and worst error over them, and the latter's height.
+    stature_mm: error of the stature.
     """
 
     heights: int
@@ -66,19 +75,22 @@ class GirthErrors:
 def girth_errors(
     mesh: BodyMesh, vertices: Array, faces: Indices, *, mean_breath: bool = False
 ) -> GirthErrors:
-    """mesh in the truth's frame; vertices, faces: the truth, at mean breath or at the mesh's moment."""
+    """Errors of a mesh in the truth's frame.
+
+    vertices, faces: the truth, at mean breath or at the mesh's moment.
+    """
     return compare_girths(mesh, true_girths(vertices, faces), mean_breath=mean_breath)
 
 
 def true_girths(vertices: Array, faces: Indices) -> Measurements:
-    """Of the trunk of the truth, every `STEP_MM`."""
+    """Girths of the true trunk, every `STEP_MM`."""
     stature = float(vertices[:, 2].max())
     levels = np.arange(TORSO[0] * stature, TORSO[1] * stature, STEP_MM).tolist()
     return measure(_as_measured(vertices, faces), levels)
 
 
 def compare_girths(mesh: BodyMesh, true: Measurements, *, mean_breath: bool = False) -> GirthErrors:
-    """mesh in the truth's frame.  true: see `true_girths`."""
+    """Errors of a mesh in the truth's frame; true: see `true_girths`."""
     ours = measure(mesh, [one.height_mm for one in true.slices], mean_breath=mean_breath)
     errors = {
         one.height_mm: error
@@ -117,9 +129,9 @@ def _as_measured(vertices: Array, faces: Indices) -> BodyMesh:
 def coverage_of_seen(
     points: Array, vertices: Array, faces: Indices, true_pairs: Mapping[str, Any]
 ) -> tuple[float, float]:
-    """Share of the truth that some camera and its projector see, and of it, what points cover.
+    """Share of the truth that some camera and its projector see, and the share of that covered.
 
-    points in the truth's frame; covered within 1 mm along the normal.
+    points: in the truth's frame; they cover what is within 1 mm along the normal.
     """
     spots, normals = sample_surface(vertices, faces, SPOTS, seed=0)
     scene = o3d.t.geometry.RaycastingScene()
@@ -144,7 +156,7 @@ def coverage_of_seen(
 
 
 def _in_sight(scene: Any, spots: Array, normals: Array, eye: Array) -> Mask:
-    """(N,) which spots face the eye, with nothing between."""
+    """Which spots face the eye with nothing in between, (N,)."""
     way = eye - spots
     distance = np.linalg.norm(way, axis=1)
     facing = np.sum(way * normals, axis=1) > STEEPEST_COSINE * distance

@@ -1,5 +1,4 @@
-"""A scan held against another scan or a known surface: signed distances, as they stand or laid on
-each other."""
+"""Compare a scan with another scan or a known surface, as they stand and fitted."""
 
 from __future__ import annotations
 
@@ -19,18 +18,21 @@ from bodyscan.mesh.body import BodyMesh
 
 SAMPLE = 30_000
 REACHES_MM = (40.0, 10.0, 3.0)
-"""A point's partner may be so far away, round after round."""
+"""Search radius, round after round."""
 LIKE_A_BODY = (0.2, 5.0)
-"""Sizes that differ by more than this are not of one subject, or not both in mm."""
+"""Ratios of size outside this range mean another subject, or that not both are in mm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """vertices: numbers (N,) of the mesh's measured vertices.  signed_mm: (N,) their distances from
-    the other surface, positive outside it.  figures: of all of them.
+    """Signed distances of a scan from another surface.
 
-    is_scan: whether the other is a scan, not a surface of its own.  fitted: whether the scan was laid
-    on it first, by `other_from_scan`.
+    name: of the other.
+    is_scan: whether the other is a scan rather than a known surface.
+    vertices: numbers of the mesh's measured vertices, (N,).
+    signed_mm: their distances, positive outside the other surface, (N,).
+    figures: statistics of the distances.
+    fitted: whether the scan was first fitted to the other, by `other_from_scan`.
     """
 
     name: str
@@ -43,10 +45,10 @@ class Comparison:
 
 
 def compare_surfaces(mesh: BodyMesh, other: Path) -> list[Comparison]:
-    """The mesh's measured part against `other`: a scan's folder or a PLY in mm, rig frame.
+    """Compare the mesh's measured part with `other`, a scan's folder or a PLY in mm, rig frame.
 
-    First as they stand, then with the scan fitted to the other as a whole.  Raises ResultError or
-    BadInput where `other` cannot be read, or cannot be the same subject.
+    First as they stand, then with the scan fitted to the other as a whole. Raises ResultError or
+    BadInput if `other` cannot be read, or cannot be the same subject.
     """
     vertices, faces = _surface(other)
     share = np.ptp(mesh.vertices, axis=0).max() / max(float(np.ptp(vertices, axis=0).max()), 1e-9)
@@ -97,7 +99,7 @@ def _is_scan(path: Path) -> bool:
 
 
 def _name(path: Path) -> str:
-    """`truth/subject.ply`, but `scan` of a scan's folder."""
+    """`truth/subject.ply`, but `scan` for a scan's folder."""
     whole = path.resolve()
     if path.name == FILE_NAME:
         return whole.parent.name
@@ -105,7 +107,7 @@ def _name(path: Path) -> str:
 
 
 def _surface(path: Path) -> tuple[Array, Indices]:
-    """vertices (V, 3) mm, faces (F, 3)."""
+    """Vertices (V, 3) mm and faces (F, 3)."""
     if _is_scan(path):
         mesh = load_scan(path if path.is_dir() else path.parent).mesh
         return mesh.vertices, mesh.faces

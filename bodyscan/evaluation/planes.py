@@ -1,4 +1,4 @@
-"""A flat plane in a range image: how far it is from flat, and how much of that is no noise."""
+"""A flat plane in a range image: how far it is from flat, and how much of that is not noise."""
 
 from __future__ import annotations
 
@@ -15,9 +15,12 @@ DEGREE = 6
 
 @dataclass(frozen=True, eq=False)
 class Flatness:
-    """points: how many.  normal (3,) and offset_mm of the best plane, normal . p = offset.
+    """Flatness of points measured on a plane.
 
-    rms_mm: of the points' distances from it.  systematic_rms_mm: of what is smooth in them.
+    points: number of points.
+    normal, offset_mm: the best plane, normal . p = offset; normal: (3,).
+    rms_mm: RMS of the points' distances from it.
+    systematic_rms_mm: RMS of the smooth part of the distances.
     """
 
     points: int
@@ -28,7 +31,7 @@ class Flatness:
 
 
 def best_plane(points: Array) -> tuple[Array, float]:
-    """Unit normal (3,) and offset of the plane through points (N, 3), least squares."""
+    """Unit normal (3,) and offset of the plane through points (N, 3), by least squares."""
     middle = points.mean(axis=0)
     centred = points - middle
     _, vectors = np.linalg.eigh(centred.T @ centred)
@@ -37,10 +40,10 @@ def best_plane(points: Array) -> tuple[Array, float]:
 
 
 def flatness(points: Array, degree: int = DEGREE) -> Flatness:
-    """Of points (N, 3) measured on a flat plane.
+    """Flatness of points (N, 3) measured on a flat plane.
 
-    The smooth part of the distances is a polynomial of so high a degree over the plane (products
-    of Legendre polynomials); noise of N points puts only sqrt(terms / N) of itself there.
+    The smooth part of the distances is a polynomial of this degree over the plane (products of
+    Legendre polynomials); noise of N points contributes only sqrt(terms / N) of itself to it.
     """
     normal, offset = best_plane(points)
     distances = points @ normal - offset
@@ -49,7 +52,7 @@ def flatness(points: Array, degree: int = DEGREE) -> Flatness:
 
 
 def smooth_part(points: Array, values: Array, degree: int = DEGREE) -> Array:
-    """(N,): the polynomial over a plane nearest to values (N,) at points (N, 3)."""
+    """The polynomial over a plane nearest to values (N,) at points (N, 3), (N,)."""
     middle = points.mean(axis=0)
     centred = points - middle
     _, vectors = np.linalg.eigh(centred.T @ centred)
@@ -58,5 +61,5 @@ def smooth_part(points: Array, values: Array, degree: int = DEGREE) -> Array:
     rows = legendre.legvander2d(place[:, 0], place[:, 1], [degree, degree])
     total = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)).ravel()
     rows = rows[:, total <= degree]
-    # Products of Legendre polynomials are all but orthogonal: their normal equations lose nothing.
+    # Products of Legendre polynomials are nearly orthogonal: normal equations lose no accuracy.
     return np.asarray(rows @ np.linalg.lstsq(rows.T @ rows, rows.T @ values)[0], np.float64)

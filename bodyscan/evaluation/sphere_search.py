@@ -1,4 +1,4 @@
-"""Spheres of a known radius found in a range image, by votes for their centres."""
+"""Find spheres of a known radius in a range image, by votes for their centres."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from bodyscan.evaluation.spheres import FEWEST_POINTS, Sphere, fit_sphere
 from bodyscan.geometry.robust import spread
 
 VOTE_CELL = 0.2  # radii: size of a cell in which votes for a centre are counted
-TAKEN = 1.15  # radii from a centre within which points are no other sphere's
-OFF_SURFACE = 0.15  # radii that a sphere's own points may lie off its surface
-ROUNDER = 0.5  # by how much a sphere must explain its points better than a plane does
+TAKEN = 1.15  # radii from a centre within which points belong to no other sphere
+OFF_SURFACE = 0.15  # radii by which a sphere's own points may lie off its surface
+ROUNDER = 0.5  # largest misfit of a sphere relative to a plane's
 
 
 def find_spheres(points: Array, normals: Array, radius: float, count: int) -> list[Sphere]:
     """The `count` spheres of one radius in a range image, numbered from top left to bottom right.
 
-    points, normals: (H, W, 3), normals towards the camera, NaN where nothing was measured. Every
-    point votes for the place one radius behind it; where votes gather is a centre.  Raises
+    points, normals: (H, W, 3), normals towards the camera, NaN where nothing was measured.
+
+    Every point votes for the place one radius behind it, and centres are where votes gather. Raises
     FailedWork if fewer are found.
     """
     flat, votes = points.reshape(-1, 3), (points - radius * normals).reshape(-1, 3)
@@ -57,13 +58,15 @@ def _find_sphere(points: Array, votes: Array, radius: float) -> Sphere | None:
     sphere = fit_sphere(own, radius)
     normal, offset = best_plane(own)
     flat = spread(own @ normal - offset)
-    # Ground between the spheres gathers votes too, but a plane explains it better.
+    # Ground between the spheres gathers votes too, but a plane fits it better.
     return sphere if spread(sphere.distances(own)) < ROUNDER * flat else None
 
 
 def _in_reading_order(spheres: list[Sphere]) -> list[Sphere]:
-    """Rows from the top of the image down, each from left to right: a row ends where the next
-    sphere is more than a radius lower."""
+    """Rows from the top of the image down, each from left to right.
+
+    A row ends where the next sphere is more than a radius lower.
+    """
     by_height = sorted(spheres, key=lambda sphere: float(sphere.centre[1]))
     rows: list[list[Sphere]] = []
     for sphere in by_height:

@@ -1,8 +1,8 @@
-"""Spheres fitted to points, and judged by the chapter's Eq. 19.
+"""Fit spheres to points, and judge them by the chapter's Eq. 19.
 
-E is a mean square, in mm^2: the chapter calls it a distance. It is nearly blind to how a pair was
-calibrated (a slightly wrong scale or bend moves a sphere far more than it dents it), so the
-distances between the spheres' centres are judged too.
+E is a mean square, in mm^2, though the chapter calls it a distance. It is nearly blind to how a
+pair was calibrated (a slightly wrong scale or bend moves a sphere far more than it dents it), so
+the distances between the spheres' centres are judged too.
 """
 
 from __future__ import annotations
@@ -19,22 +19,24 @@ from bodyscan.geometry.least_squares import Block, Noise, minimize
 
 @dataclass(frozen=True, eq=False)
 class Sphere:
-    """centre (3,) and radius, mm, in the frame of the points it was fitted to."""
+    """centre: (3,) and radius, mm, in the frame of the points it was fitted to."""
 
     centre: Array
     radius: float
 
     def distances(self, points: Array) -> Array:
-        """(N,) mm of points (N, 3) from the surface, positive outside."""
+        """Distances (N,) mm of points (N, 3) from the surface, positive outside."""
         return np.linalg.norm(points - self.centre, axis=-1) - self.radius
 
 
 @dataclass(frozen=True, eq=False)
 class SphereAccuracy:
-    """One sphere of known radius, as it was measured.
+    """One measured sphere of known radius.
 
-    points: how many.  given: fitted with its radius held.  fitted: with its radius free.
-    e_given, e_fitted: Eq. 19 for either, mm^2.
+    points: number of points.
+    given: the fit with its radius held.
+    fitted: the fit with its radius free.
+    e_given, e_fitted: Eq. 19 for each, mm^2.
     """
 
     points: int
@@ -45,7 +47,7 @@ class SphereAccuracy:
 
 
 def mean_square(points: Array, sphere: Sphere) -> float:
-    """Eq. 19, E in mm^2, over all of the points (N, 3): none is left out."""
+    """Eq. 19, E in mm^2, over all points (N, 3): none is left out."""
     return float(np.mean(sphere.distances(points) ** 2))
 
 
@@ -55,9 +57,11 @@ SURFACE = Noise("distance from the surface", cauchy=4.0)
 
 
 def fit_sphere(points: Array, radius: float | None = None) -> Sphere:
-    """Through points (N, 3): least distances from the surface, Cauchy loss.
+    """Fit a sphere to points (N, 3): least distances from the surface, Cauchy loss.
 
-    radius: held if given.  Raises FailedWork for fewer than 50 points.
+    radius: held if given.
+
+    Raises FailedWork for fewer than 50 points.
     """
     if len(points) < FEWEST_POINTS:
         raise FailedWork(f"{len(points)} points are too few for a sphere")
@@ -81,7 +85,7 @@ def fit_sphere(points: Array, radius: float | None = None) -> Sphere:
 
 
 def measure_sphere(points: Array, radius: float) -> SphereAccuracy:
-    """A sphere of known radius from all points (N, 3) measured on it."""
+    """Measure a sphere of known radius from all points (N, 3) on it."""
     given, fitted = fit_sphere(points, radius), fit_sphere(points)
     return SphereAccuracy(
         len(points), given, fitted, mean_square(points, given), mean_square(points, fitted)
@@ -90,15 +94,18 @@ def measure_sphere(points: Array, radius: float) -> SphereAccuracy:
 
 @dataclass(frozen=True)
 class CentreDistances:
-    """Distances between sphere centres against the truth: RMS of their errors (mm), and the scale:
-    measured over true, less 1, in ppm."""
+    """Distances between sphere centres against the truth.
+
+    rms_mm: RMS of their errors.
+    scale_ppm: measured over true, less 1, in ppm.
+    """
 
     rms_mm: float
     scale_ppm: float
 
 
 def centre_distances(measured: Array, true: Array) -> CentreDistances:
-    """From centres (N, 3) as measured and as they are, in any two frames."""
+    """Compare centres (N, 3) as measured and as they are, each in any frame."""
     found, wanted = pdist(measured), pdist(true)
     scale = float(found @ wanted / (wanted @ wanted)) - 1.0
     return CentreDistances(float(np.sqrt(np.mean((found - wanted) ** 2))), 1e6 * scale)

@@ -1,4 +1,4 @@
-"""How far points lie from a surface that is known."""
+"""How far points lie from a known surface."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Deviation:
 
 
 def signed_distances(points: Array, vertices: Array, faces: Indices) -> Array:
-    """(N,) mm from points (N, 3) to a closed triangle mesh, positive outside it.
+    """Distances (N,) mm of points (N, 3) from a closed triangle mesh, positive outside it.
 
     The sign is that of the angle-weighted pseudo-normal at the nearest spot (Baerentzen and Aanaes
     2005).
@@ -47,7 +47,7 @@ def signed_distances(points: Array, vertices: Array, faces: Indices) -> Array:
 
 
 def _pseudo_normals(vertices: Array, faces: Indices, face: Indices, barycentric: Array) -> Array:
-    """(N, 3) normals, of any length, at spots on faces: the face's, or its edge's or corner's."""
+    """(N, 3): normals, of any length, at spots on faces: the face's, or its edge's or corner's."""
     corners = vertices[faces]
     sides = np.roll(corners, -1, axis=1) - corners  # side k runs from corner k to the next
     cross = np.cross(sides[:, 0], sides[:, 1])
@@ -64,7 +64,7 @@ def _pseudo_normals(vertices: Array, faces: Indices, face: Indices, barycentric:
 
 
 def _neighbours(faces: Indices) -> Indices:
-    """(F, 3) the face across each side; the face itself where there is none."""
+    """(F, 3): the face across each side, or the face itself if there is none."""
     edges, count = directed_edges(faces), int(faces.max()) + 1
     keys, opposite = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
     order = np.argsort(keys)
@@ -74,7 +74,7 @@ def _neighbours(faces: Indices) -> Indices:
 
 
 def _corner_normals(count: int, faces: Indices, sides: Array, unit: Array) -> Array:
-    """(V, 3) sums of the normals around each vertex, weighted by the faces' angles there."""
+    """(V, 3): sums of the normals around each vertex, weighted by the faces' angles there."""
     along = sides / np.maximum(np.linalg.norm(sides, axis=-1, keepdims=True), 1e-300)
     cosine = -np.einsum("fkc,fkc->fk", along, np.roll(along, 1, axis=1))
     weighted = np.arccos(cosine.clip(-1.0, 1.0))[..., None] * unit[:, None]
@@ -97,8 +97,8 @@ def deviation(signed_mm: Array) -> Deviation:
 
 
 def normalized_errors(signed_mm: Array, sigma_mm: NDArray[np.floating[Any]]) -> tuple[float, float]:
-    """Errors over their sigmas: robust spread (1 if honest), and the share beyond three sigmas (0.003
-    if Gaussian)."""
+    """Robust sigma of errors over their sigmas (1 if honest), and the share beyond three sigmas
+    (0.003 if Gaussian)."""
     over = np.abs(signed_mm / sigma_mm)
     return float(np.median(over) / 0.6745), float(np.mean(over > 3.0))
 
@@ -106,7 +106,7 @@ def normalized_errors(signed_mm: Array, sigma_mm: NDArray[np.floating[Any]]) -> 
 def covered_spots(
     points: Array, spots: Array, normals: Array, within_mm: float = 1.0, spacing_mm: float = 2.0
 ) -> Mask:
-    """(N,) which spots (N, 3) of a surface with normals (N, 3) points (M, 3) cover.
+    """Which spots (N, 3) of a surface with normals (N, 3) are covered by points (M, 3), (N,).
 
     A spot is covered if a point lies within `within_mm` along the surface's normal and, sideways,
     within `spacing_mm`, since even a perfect cloud has gaps between its points.

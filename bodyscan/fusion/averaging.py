@@ -20,8 +20,8 @@ from bodyscan.mesh.body import BodyCloud
 from bodyscan.progress import THREADS
 
 AT_A_TIME = 1 << 16  # samples whose sums fit into a processor's cache
-EVERY = 8  # spot of an overlap that is looked at to learn how far two surfaces are apart
-# Columns of the sums over the surfaces that show a point, its own among them: weights; weights
+EVERY = 8  # one spot of an overlap in this many is used to find how far apart surfaces are
+# Columns of the sums over the surfaces that show a point, its own included: weights; weights
 # times shift, its square, grey level, normal; squares of weight times sigma; weights against it.
 WEIGHT, SHIFT, SHIFT2, GREY, SPREAD, AGAINST, NORMAL, SUMS = 0, 1, 2, 3, 4, 5, 6, 9
 
@@ -33,7 +33,7 @@ def average(
     grey: EvenGrey,
     workers: int = THREADS,
 ) -> BodyCloud:
-    """Weighted means of each sample and what agrees with it; the outvoted are dropped."""
+    """Average each sample with what agrees with it; outvoted samples are dropped."""
     general = scatter(samples, surfaces, evidence) ** 2
 
     def part(start: int) -> tuple[NDArray[Any], ...]:
@@ -58,7 +58,7 @@ def average(
 def scatter(
     samples: Samples, surfaces: Sequence[SmoothSurface], evidence: Sequence[Evidence]
 ) -> float:
-    """Typical distance between pairs over its standard deviation by their sigmas; at least 1."""
+    """Typical distance between pairs in units of its predicted sigma; at least 1."""
     ratios = [np.empty(0)]
     for surface, one in zip(surfaces, evidence, strict=True):
         ours, theirs = samples.sigma_mm[one.index[::EVERY]], surface.sigma_mm[one.at[::EVERY]]
@@ -71,7 +71,7 @@ def scatter(
 def _own_sums(
     normals: Floats, sigma_mm: Floats, weights: Floats, levels: Floats
 ) -> tuple[Array, Bytes]:
-    """Sums (N, 9) over the samples' own surfaces alone, and by how many each was seen."""
+    """Sums (N, 9) over the samples' own surfaces alone, and how many surfaces showed each (one)."""
     sums = np.zeros((len(weights), SUMS))
     for n in range(len(weights)):
         weight = float(weights[n])
@@ -91,7 +91,7 @@ def _add(
     sums: Array,
     seen: Bytes,
 ) -> None:
-    """Points `at` of a surface (normals, sigma, weight, grey levels) to the sums at `index`."""
+    """Add points `at` of a surface (normals, sigmas, weights, greys) to the sums at `index`."""
     normals, sigma_mm, weights, levels = surface
     for n in range(len(index)):
         here, there = index[n], at[n]
@@ -110,10 +110,10 @@ def _add(
 def _means(
     points: Floats, normals: Floats, sums: Array, seen: Bytes, general: float
 ) -> tuple[Array, Floats, Floats, Bytes, Bytes]:
-    """The cloud's points, normals, sigmas, colours and how many saw them, of what is not outvoted.
+    """Points, normals, sigmas, colours and number of pairs for what was not outvoted.
 
-    Pairs that disagree by more than their sigmas say (`general`, in variances) make everything that
-    much less certain, and a place where they do so by more than three times that even more.
+    If pairs disagree by more than their sigmas predict (`general`, in variances), every sigma is
+    enlarged by that; places that disagree by more than three times their sigmas get even more.
     """
     kept = np.flatnonzero(sums[:, AGAINST] < sums[:, WEIGHT])
     where, turned = np.empty((len(kept), 3)), np.empty((len(kept), 3), np.float32)

@@ -1,9 +1,9 @@
-"""Grey levels of the pairs evened out, so that a body's colour shows no seam from pair to pair.
+"""Even out the pairs' grey levels, so that a body's colour shows no seam between pairs.
 
-Two things differ between cameras that see the same spot: their exposures, and how squarely each
-one's projector, which stands beside it, lights the spot. A matt surface is as bright as the cosine of
-the light's incidence, over the squared distance; what light the room adds makes that less, by a
-power from 0 to 1. The overlaps tell that power and the exposures.
+Cameras that see the same spot differ in two ways: their exposures, and how squarely each one's
+projector, which stands beside it, lights the spot. A matt surface is as bright as the cosine of the
+light's incidence, over the squared distance; light of the room weakens that dependence, by a power
+from 0 to 1. The overlaps determine that power and the exposures.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples
 
 DARKEST, BRIGHTEST = 8, 250
-"""Grey levels beyond which nothing is said of the light"""
+"""Grey levels beyond which a pixel says nothing about the light."""
 FEWEST = 200
-SPOTS = 5000  # of an overlap are enough to compare exposures
-HOLD = 1e-3  # of an overlap's weight: pairs without overlap keep their own brightness
-FLATTEST = 0.1  # cosine: what is lit flatter than this is mostly lit by the room
+SPOTS = 5000  # spots of an overlap that suffice to compare exposures
+HOLD = 1e-3  # relative to an overlap's weight: pairs without overlap keep their own brightness
+FLATTEST = 0.1  # cosine: surfaces lit at a flatter angle are mostly lit by the room
 
 
 @dataclass(frozen=True, eq=False)
 class EvenGrey:
-    """Evened grey levels, float32: of the samples (N,), and of each surface's points."""
+    """Evened grey levels, float32: of the samples, (N,), and of each surface's points."""
 
     samples: Floats
     surfaces: list[Floats]
@@ -39,7 +39,7 @@ class EvenGrey:
 def even_brightness(
     samples: Samples, surfaces: Sequence[SmoothSurface], evidence: Sequence[Evidence]
 ) -> EvenGrey:
-    """As if all pairs were exposed alike and lit the body evenly."""
+    """Grey levels as if all pairs were exposed alike and lit the body evenly."""
     centres = [surface.rig_from_camera.translation for surface in surfaces]
     of_surfaces = [
         _shades(surface.points, surface.normals, centre)
@@ -77,8 +77,12 @@ def even_brightness(
 
 @dataclass(frozen=True, eq=False)
 class _Overlap:
-    """Where surfaces a and b show the same spots: logarithms (N,) of b's grey levels over a's, and of
-    the light that falls there. spots: how many these stand for."""
+    """Spots shown by both surfaces a and b.
+
+    ratio: logarithm of b's grey level over a's, (N,).
+    shade: the same for the light that falls there, (N,).
+    spots: number of spots that these stand for.
+    """
 
     a: int
     b: int
@@ -111,10 +115,12 @@ def _overlaps(
 
 
 def light_power(overlaps: Sequence[tuple[Floats, Floats]]) -> float:
-    """From 0 to 1: with which power of the light that falls on a spot its grey level rises.
+    """The power, 0 to 1, with which the grey level of a spot rises with the light that falls on it.
 
-    overlaps: logarithms (N,) of one camera's grey levels over another's, and of the light's. Within
-    each overlap, so that exposures do not matter; the least sum of absolute errors.
+    overlaps: logarithms (N,) of one camera's grey levels over another's, and of the light's.
+
+    Fitted within each overlap, so that exposures do not matter, by the least sum of absolute
+    errors.
     """
     if not overlaps:
         return 0.0
@@ -134,10 +140,11 @@ def _weighted_median(values: Array, weights: Array) -> float:
 
 
 def gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Floats:
-    """(count,) factors that bring the pairs' grey levels together, their geometric mean 1.
+    """Factors (count,) that bring the pairs' grey levels together, with geometric mean 1.
 
-    ratios: (a, b, log of b's grey level over a's where both see one spot, how many spots). Least
-    squares in logarithms, so that the factors go round the ring without a step.
+    ratios: (a, b, log of b's grey level over a's at common spots, number of spots).
+
+    Least squares in logarithms, so that the factors go round the ring without a step.
     """
     normal, right = HOLD * np.eye(count), np.zeros(count)
     for a, b, ratio, spots in ratios:
@@ -152,8 +159,10 @@ def gains(ratios: Sequence[tuple[int, int, float, int]], count: int) -> Floats:
 
 @compiled
 def _shades(points: Floats, normals: Floats, centre: Array) -> Floats:
-    """(N,) logarithms of the light that points of a surface get from one beside a camera's centre, but
-    for a constant: cosine of its incidence over the squared distance."""
+    """Logarithm (N,) of the light that a surface gets from beside a camera, up to a constant.
+
+    That is the cosine of its incidence over the squared distance.
+    """
     shades = np.empty(len(points), np.float32)
     for n in range(len(points)):
         towards = distance2 = 0.0

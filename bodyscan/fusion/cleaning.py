@@ -1,4 +1,4 @@
-"""What is not the subject, or not a surface, leaves the range images.
+"""Remove from range images whatever is not the subject, or not a surface.
 
 Everything happens on the pixel grid, where a neighbour is one step away.
 """
@@ -21,16 +21,16 @@ from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.rig import Volume
 
-STEEPEST = 5.0  # depth per sideways step on a surface still worth having: tan 79 degrees
+STEEPEST = 5.0  # depth per sideways step on the steepest useful surface: tan 79 degrees
 DISTANCES_PX = np.hypot(*np.mgrid[-2:3, -2:3])  # of a pixel's neighbours
 BACKGROUND_MM = 4.0  # a subject stands out from the background by more than this
 QUANTUM_MM = 0.25  # cv2.filterSpeckles works on 16-bit integers: +-8 m in steps of this
 # Of dark gaps:
-WIDEST_GAP_PX = 7  # of the gap and half of its slopes: several times the blur
-DARKER = 2.0  # times, than the surfaces around
-ROOM_PX = 8  # around a part that is kept: farther than any later window reaches beyond a rim
-GAP_MARGIN_PX = 1  # beside what is so dark, where the two mix
-LEAST_STEP = 30  # grey levels; less may be noise on something dark
+WIDEST_GAP_PX = 7  # width of the gap and half of its slopes: several times the blur
+DARKER = 2.0  # times darker than the surfaces around
+ROOM_PX = 8  # around a kept part: farther than any later window reaches beyond a rim
+GAP_MARGIN_PX = 1  # beside such dark pixels, where the two mix
+LEAST_STEP = 30  # grey levels; less may be noise on a dark surface
 
 
 def clean(
@@ -42,12 +42,13 @@ def clean(
     smallest_patch_mm2: float = 150.0,
     workers: int = THREADS,
 ) -> list[RangeImage]:
-    """The same range images with nothing measured where a pixel shows no part of the subject.
+    """The same range images, with nothing measured where a pixel shows no part of the subject.
 
-    Cut away are: what lies outside the scan volume (floor, walls), what the rig sees without a
-    subject (`empty`: range images of that, of some or all pairs), flying pixels at silhouettes,
-    grazing surfaces, narrow dark gaps (see there), and disconnected patches smaller than
-    `smallest_patch_mm2`.
+    empty: range images of the rig without a subject, of some or all pairs.
+    smallest_patch_mm2: smaller disconnected patches are removed.
+
+    Removed are: everything outside the scan volume (floor, walls), what `empty` shows, flying
+    pixels at silhouettes, grazing surfaces, narrow dark gaps (see `dark_gaps`), and small patches.
     """
     nobody = {image.pair: image for image in empty}
 
@@ -70,7 +71,7 @@ def clean(
 
 
 def require_subject(cleaned: Sequence[RangeImage]) -> list[RangeImage]:
-    """Those that show something of the subject. Raises ScanFailed if none does."""
+    """The images that show some of the subject. Raises ScanFailed if none does."""
     seen = [image for image in cleaned if image.valid.any()]
     if not seen:
         raise ScanFailed(
@@ -87,13 +88,13 @@ def apply_mask(image: RangeImage, kept: Mask) -> RangeImage:
 
 
 def cut_to_volume(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> RangeImage:
-    """With points about what lies inside the scan volume alone; cleaning leaves no others."""
+    """Crop to what lies inside the scan volume; cleaning leaves nothing else."""
     box = crop_of(inside(image, rig_from_camera, volume)) or (slice(0, 1), slice(0, 1))
     return image.cut(widened(box, ROOM_PX))
 
 
 def inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -> Mask:
-    """(h, w): measured, and within the scan volume's upright cylinder."""
+    """(h, w): where a point was measured inside the upright cylinder of the scan volume."""
     within = np.empty(image.sigma_mm.shape, np.bool_)
     size = (volume.radius_mm, volume.bottom_mm, volume.top_mm)
     _inside(image.points, image.sigma_mm, rig_from_camera.matrix[:3], size, within)
@@ -101,9 +102,9 @@ def inside(image: RangeImage, rig_from_camera: RigidTransform, volume: Volume) -
 
 
 def in_front_of(image: RangeImage, empty: RangeImage) -> Mask:
-    """(h, w): measured in front of what the same camera sees without a subject.
+    """(h, w): where a point was measured in front of what the camera sees without a subject.
 
-    The nearest background of the pixels around counts, for the edges of things in the room.
+    The nearest background among neighbouring pixels counts, because of edges of things in the room.
     """
     window = np.ones((3, 3), np.uint8)
     far = np.where(empty.open_depth > 0.0, empty.open_depth, np.float32(np.inf))
@@ -112,11 +113,11 @@ def in_front_of(image: RangeImage, empty: RangeImage) -> Mask:
 
 
 def drop_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -> Floats:
-    """Depth (h, w), NaN where there is none, of the pixels that enough neighbours agree with.
+    """Depth (h, w) of pixels that enough neighbours agree with; NaN elsewhere.
 
-    A straight rim of a surface leaves a pixel 14 of its 24 neighbours; a flying pixel hangs between
-    the front and the back and finds few within `step_mm` per step. Two passes: the second no
-    longer counts what the first cut.
+    At a straight rim of a surface a pixel has 14 of its 24 neighbours; a flying pixel hangs between
+    front and back, and has few within `step_mm` per step. A second pass no longer counts what the
+    first removed.
     """
     limits = np.where(DISTANCES_PX > 0, step_mm * DISTANCES_PX, -1.0).astype(np.float32)
     for _ in range(2):
@@ -126,21 +127,21 @@ def drop_flying_pixels(depth: Floats, step_mm: float, *, supporters: int = 13) -
 
 
 def drop_speckles(depth: Floats, step_mm: float, smallest_px: float) -> Mask:
-    """(h, w): pixels in connected patches of at least `smallest_px`; jumps in depth cut."""
+    """(h, w): pixels in connected patches of at least `smallest_px`, split at jumps in depth."""
     quanta = np.clip(np.nan_to_num(depth) / QUANTUM_MM, 0, 32767).astype(np.int16)
     patches, _ = cv2.filterSpeckles(quanta, 0, int(smallest_px), step_mm / QUANTUM_MM)
     return patches > 0
 
 
 def dark_gaps(grey: Bytes) -> Mask:
-    """(height, width) pixels of an image (height, width) that lie in a narrow dark gap or at its rim.
+    """(height, width): pixels in a narrow dark gap of an image (height, width), or at its rim.
 
-    Into the gap between two toes hardly any light falls. What a camera sees there is the blur of
-    the bright skin on both sides, with their stripes: it is measured as a bridge from one side to
-    the other, smooth, and seen alike by other cameras.
+    Hardly any light falls into the gap between two toes. What a camera sees there is the blur of
+    the bright skin on both sides, with its stripes: it is measured as a smooth bridge from one side
+    to the other, and other cameras see the same.
 
-    A morphological closing fills what is narrower than its window and has brighter surfaces on both
-    sides; something dark and wide (hair, cloth, the background beside a silhouette) stays.
+    A morphological closing fills what is narrower than its window with brighter surfaces on both
+    sides; dark and wide things (hair, cloth, the background beside a silhouette) stay.
     """
     window = np.ones((WIDEST_GAP_PX, WIDEST_GAP_PX), np.uint8)
     around = cv2.morphologyEx(grey, cv2.MORPH_CLOSE, window).astype(np.float32)
@@ -157,9 +158,10 @@ def _inside(
     size: tuple[float, float, float],
     within: Mask,
 ) -> None:
-    """within (H, W): which points (H, W, 3) that have a sigma lie in an upright cylinder.
+    """Set within (H, W): which points (H, W, 3) with a sigma lie in an upright cylinder.
 
-    rig_from_camera: (3, 4).  size: of the cylinder, its radius, bottom and top, mm.
+    rig_from_camera: (3, 4).
+    size: radius, bottom and top of the cylinder, mm.
     """
     m, (radius, bottom, top) = rig_from_camera, size
     for v in range(within.shape[0]):
@@ -175,10 +177,10 @@ def _inside(
 
 @compiled
 def _keep_supported(padded: Floats, limits: Floats, supporters: int, kept: Floats) -> None:
-    """kept (h, w): the depths that at least `supporters` neighbours agree with, else NaN.
+    """Set kept (h, w): depths that at least `supporters` neighbours agree with, NaN elsewhere.
 
-    padded: (h + 4, w + 4) depths, two more pixels on all sides.  limits: (5, 5) how far each
-    neighbour's depth may be off.
+    padded: depths with two more pixels on all sides, (h + 4, w + 4).
+    limits: how far each neighbour's depth may differ, (5, 5).
     """
     height, width = kept.shape
     count = np.empty(width, np.uint8)

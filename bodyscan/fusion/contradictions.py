@@ -1,4 +1,4 @@
-"""Who sees through whose surfaces: how much of what pairs say of each other's points, and of whom."""
+"""How much pairs see through each other's surfaces, and which pair or pole is to blame."""
 
 from __future__ import annotations
 
@@ -16,14 +16,18 @@ from bodyscan.fusion.thinning import Samples
 Counts = NDArray[np.int64]
 TINY_MM = 1e-6
 MOST_OF_IT = 0.5
-"""A group is blamed if less than so much of the share is left without it."""
+"""A group is blamed if less than this part of the share is left without it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Contradictions:
-    """pairs: P of them.  asked: (P, P), how often the pair of the row said something of points of
-    the column's; against: how often it was that there is no surface.  by_noise: the share of all that
-    would be so of one surface, for what both points' sigmas hold."""
+    """How often pairs contradict each other's points.
+
+    pairs: P of them.
+    asked: how often the pair of the row said something about points of the column's, (P, P).
+    against: how often it said that there is no surface, (P, P).
+    by_noise: share of contradictions expected for a single surface, by the sigmas of both points.
+    """
 
     pairs: tuple[str, ...]
     asked: Counts
@@ -38,7 +42,7 @@ class Contradictions:
         surfaces: Sequence[SmoothSurface],
         agreement_mm: float,
     ) -> Contradictions:
-        """evidence: of each pair, the surface with its number, about all samples."""
+        """Count what each pair's surface says about all samples; evidence: one for each pair."""
         starts = samples.starts
 
         def counted(index: Numbers) -> Counts:
@@ -60,17 +64,16 @@ class Contradictions:
 
     @property
     def share(self) -> float:
-        """Of all that one pair said of another's points, what spoke against them."""
+        """Share of contradictions in everything that pairs said about each other's points."""
         return float(self.against.sum() / max(self.asked.sum(), 1))
 
     @property
     def beyond_noise(self) -> float:
-        """What noise does not explain of the share."""
+        """The share that noise does not explain."""
         return self.share - self.by_noise
 
     def blamed(self, groups: Mapping[str, frozenset[str]]) -> str:
-        """The smallest of the groups without which the others agree best; "" if none makes a
-        difference that tells."""
+        """The smallest of the groups without which the others agree best; "" if none stands out."""
         left = {name: self._without(group).share for name, group in groups.items()}
         fair = [
             name
@@ -78,7 +81,7 @@ class Contradictions:
             if len(self.pairs) > len(group) + 1 and left[name] < MOST_OF_IT * self.share
         ]
         least = min((left[name] for name in fair), default=0.0)
-        # One of its pairs is as good as a pole where it alone is to blame.
+        # If a single pair is to blame, leaving it out is as good as leaving out its pole.
         near = [name for name in fair if left[name] <= least + 0.1 * (self.share - least)]
         return min(near, key=lambda name: (len(groups[name]), left[name]), default="")
 

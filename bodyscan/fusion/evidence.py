@@ -20,17 +20,18 @@ from bodyscan.geometry.quadratic_table import Table, look_up
 Numbers = NDArray[np.int32]
 
 SAME_WAY = 0.6  # cosine between the normals of what may be one surface
-NEAREST_MM = 1.0  # what is behind the camera is not asked about
-EDGE_ON = 0.1  # a camera that sees a point flatter than this is not asked about it
+NEAREST_MM = 1.0  # points behind the camera are not examined
+EDGE_ON = 0.1  # cameras that see a point flatter than this are not asked about it
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """What one other surface says about samples, in their order.
 
-    index: of the samples that it agrees with.  at: number of its point there.  shift_mm: from the
-    sample along its normal to that surface.  against_index, against_at: likewise, where it
-    contradicts the sample.
+    index: numbers of the samples that it agrees with.
+    at: numbers of its points there.
+    shift_mm: from the sample along its normal to that surface.
+    against_index, against_at: the same where it contradicts the sample.
     """
 
     index: Numbers
@@ -43,10 +44,10 @@ class Evidence:
 def compare(
     samples: Samples, surface: SmoothSurface, number: int, agreement_mm: float, double_mm: float
 ) -> Evidence:
-    """What `surface` (the `number`th) says about the samples that do not come from it.
+    """What `surface` (number `number`) says about the samples that do not come from it.
 
-    It agrees where it lies within `agreement_mm` of them; it contradicts them where it is a second
-    skin within `double_mm`, or was seen through them.
+    It agrees if it lies within `agreement_mm` of them, and contradicts them if it is a double
+    surface within `double_mm`, or was seen through them.
     """
     count = len(samples.points)
     index, at = np.empty(count, np.int32), np.empty(count, np.int32)
@@ -85,11 +86,13 @@ def _compare(
     limits_mm: tuple[float, float],
     evidence: tuple[Numbers, Numbers, Floats, Numbers, Numbers],
 ) -> tuple[int, int]:
-    """Fill in the evidence; how many samples are agreed with and how many contradicted.
+    """Fill in the evidence; return how many samples are agreed with and how many contradicted.
 
-    samples: points and normals.  own: range of samples that are the surface's own.  surface:
-    points, normals and the image of their numbers, which begins at `corner`.  bent: its points are
-    no longer seen at their pixels.  limits_mm: of agreement, and of a second skin.
+    samples: points and normals.
+    own: range of the samples that are the surface's own.
+    surface: points, normals and the image of their numbers, which begins at `corner`.
+    bent: whether its points are no longer seen at their pixels.
+    limits_mm: of agreement, and of a double surface.
     """
     points, normals = samples
     surface_points, surface_normals, numbers = surface
@@ -130,7 +133,7 @@ def _compare(
             index[agreed], at[agreed], shifts[agreed] = n, there, shift
             agreed += 1
         elif (same and abs(shift) < limits_mm[1]) or outward < -limits_mm[0]:
-            # A second skin close by, or a surface that was seen through the sample.
+            # A double surface close by, or a surface that was seen through the sample.
             against_index[contradicted], against_at[contradicted] = n, there
             contradicted += 1
     return agreed, contradicted
@@ -138,7 +141,7 @@ def _compare(
 
 @compiled
 def _faces(point: Floats, normal: Floats, centre: Array) -> bool:
-    """Whether a point looks towards a camera's centre: n.(centre - point) > EDGE_ON * distance."""
+    """Whether a point faces a camera's centre: n.(centre - point) > EDGE_ON * distance."""
     towards = distance2 = 0.0
     for k in range(3):
         away = centre[k] - point[k]
@@ -149,7 +152,7 @@ def _faces(point: Floats, normal: Floats, centre: Array) -> bool:
 
 @compiled
 def _in_camera(point: Floats, camera_from_rig: tuple[Array, Array]) -> tuple[float, float, float]:
-    """A point of the rig frame in the camera's."""
+    """A point of the rig frame in the camera frame."""
     r, t = camera_from_rig
     return (
         r[0, 0] * point[0] + r[0, 1] * point[1] + r[0, 2] * point[2] + t[0],

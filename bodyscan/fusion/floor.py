@@ -1,4 +1,4 @@
-"""Where the floor is seen to lie: heights are counted from z = 0, whatever the person stands on."""
+"""Find the height of the floor: heights count from z = 0, whatever the person stands on."""
 
 from __future__ import annotations
 
@@ -12,22 +12,24 @@ from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.rig import Volume
 
 REACH_MM = 60.0
-"""What lies higher is an instep or a step to stand on."""
+"""Anything higher is an instep, or a step to stand on."""
 LEVEL = 0.985
-"""Cosine to the vertical, 10 degrees: of feet, only spots are as level."""
+"""Cosine to the vertical, 10 degrees: only spots of a foot are as level."""
 EVERY_PX = 4
 FEWEST = 300
-"""points, of every fourth pixel in both directions: a patch of 10 x 10 cm or so"""
+"""points, with one pixel in four along each axis: a patch of about 10 x 10 cm."""
 FEWEST_PAIRS = 2
 
 
 def find_floor(
     images: Sequence[RangeImage], rig_from_camera: Mapping[str, RigidTransform], volume: Volume
 ) -> float | None:
-    """Height z, mm, rig frame: the median over the pairs that see level ground within the volume; None
-    where fewer than two do.
+    """Height z of the floor, mm, rig frame.
 
-    images: as decoded, not cleaned.  rig_from_camera: as calibrated; a floor does not sway.
+    The median over the pairs that see level ground within the volume; None if fewer than two do.
+
+    images: as decoded, not cleaned.
+    rig_from_camera: as calibrated; a floor does not sway.
     """
     heights = [_level(image, rig_from_camera[image.pair], volume) for image in images]
     seen = [float(np.median(own)) for own in heights if len(own) >= FEWEST]
@@ -35,7 +37,7 @@ def find_floor(
 
 
 def _level(image: RangeImage, at: RigidTransform, volume: Volume) -> Array:
-    """(N,) heights of what faces upwards near z = 0."""
+    """Heights (N,) of points that face upwards near z = 0."""
     some = image.every(EVERY_PX)
     kept = image.valid[some]
     points = at.apply(image.points[some][kept].astype(np.float64))

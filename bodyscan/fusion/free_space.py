@@ -1,4 +1,4 @@
-"""Which places the cameras saw through, so that no surface can be there."""
+"""Which places cameras saw through, so that no surface can be there."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.depth_buffer import nearest_faces
 from bodyscan.reconstruction.range_image import RangeImage
 
-RAY_SPACING_MM = 3.0  # on a subject in the middle of the rig
+RAY_SPACING_MM = 3.0  # at a subject in the middle of the rig
 WIDEST_GAP_MM = 200.0
 
 
@@ -21,7 +21,9 @@ WIDEST_GAP_MM = 200.0
 class Guess:
     """A closed surface that is partly filled.
 
-    vertices: (V, 3) float32, rig frame.  faces: (F, 3).  filled: (F,).
+    vertices: (V, 3) float32, rig frame.
+    faces: (F, 3).
+    filled: (F,).
     """
 
     vertices: Floats
@@ -40,9 +42,9 @@ def sees_through(
     rig_from_camera: RigidTransform,
     margin_mm: float,
 ) -> Mask:
-    """Which points (N, 3), rig frame, one camera saw through, by at least `margin_mm`.
+    """Which points (N, 3), rig frame, one camera saw through by at least `margin_mm`.
 
-    Either something was measured behind them, or they lie in a gap: `gaps`.
+    Either something was measured behind them, or they lie in a gap: see `gaps`.
     """
     in_camera = _transform_points(points, rig_from_camera.inverse())
     ahead = in_camera[:, 2] > 1.0
@@ -74,11 +76,11 @@ def gaps(
     stride: int,
     blocks: tuple[slice, slice],
 ) -> Mask:
-    """Blocks of stride x stride pixels, of those in a window, that look through a gap of the body.
+    """Blocks of stride x stride pixels in a window that look through a gap of the body.
 
-    There nothing was measured, their middle shows made-up faces of the guessed surface only, and there
-    is measured surface to the left and to the right: between the legs, between arm and trunk.
-    What lies before or behind measured surface looks at a part in shadow instead; and a
+    In such a block nothing was measured, its middle shows only filled faces of the guessed surface,
+    and there is measured surface to the left and to the right: between the legs, between arm and
+    trunk. A filled face in front of or behind measured surface is a part in shadow instead, and a
     part of the outline that nobody measured (dark hair) has measured surface on one side at most.
     """
     rows, columns = (stride * np.arange(some.start, some.stop) + stride // 2 for some in blocks)
@@ -98,7 +100,7 @@ def gaps(
 
 
 def _stride(camera: Camera, depth_mm: float) -> int:
-    """Pixels between rays, where things are that far away."""
+    """Pixels between rays at that depth."""
     return max(1, round(RAY_SPACING_MM * camera.alpha / depth_mm))
 
 
@@ -109,8 +111,10 @@ def _in_blocks(
     stride: int,
     blocks: tuple[slice, slice],
 ) -> Floats:
-    """(V, 3) column and row of the block that shows each vertex in its middle, and depth; NaN for what
-    is not before the camera."""
+    """(V, 3): column and row of the block that shows each vertex in its middle, and depth.
+
+    NaN for vertices that are not in front of the camera.
+    """
     seen = _transform_points(vertices, rig_from_camera.inverse())
     seen[seen[:, 2] < 1.0] = np.nan
     pixels = (image.camera.project(seen.astype(float)) - stride // 2) / stride
@@ -126,6 +130,6 @@ def _within(mask: Mask, reach: int) -> Mask:
 
 
 def _transform_points(points: Floats, a_from_b: RigidTransform) -> Floats:
-    """Points (..., 3) float32 in b to a; several times quicker than numpy on triples."""
+    """Points (..., 3) float32 in b to a; several times faster than numpy on triples."""
     matrix = np.column_stack([a_from_b.rotation, a_from_b.translation])
     return cv2.transform(points.reshape(1, -1, 3), matrix).reshape(points.shape)

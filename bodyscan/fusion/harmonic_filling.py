@@ -1,7 +1,7 @@
-"""Values on a grid where nobody measured any: harmonic, that is each the mean of its neighbours.
+"""Harmonic values on a grid where nothing was measured: each is the mean of its neighbours.
 
-Solved on grids twice, four and eight times as coarse first: sweeps move what is near, levels what is
-far. Nodes may have a least value: places that cameras saw through are outside, whatever the
+Solved first on grids two, four and eight times as coarse: sweeps settle what is near, levels what
+is far. Nodes may have a lower bound: places that cameras saw through are outside, whatever their
 neighbours say.
 """
 
@@ -20,10 +20,11 @@ OVERSHOOT = 1.6  # successive over-relaxation
 
 
 def fill_harmonically(values: Floats, fixed: Mask, least: Floats, sure: float) -> Floats:
-    """Values (a, b, c) with those that are not fixed filled in; the grid's rim has to be fixed.
+    """Fill in the values (a, b, c) that are not fixed; the grid's rim must be fixed.
 
-    least: (a, b, c), of nodes that are not fixed; -inf for no bound.  sure: a node that a coarser
-    grid gives a value farther from 0 keeps it: only where zero lies is asked for.
+    least: lower bounds (a, b, c) of nodes that are not fixed; -inf for none.
+    sure: nodes that a coarser grid puts farther from 0 keep its value, since only the zero set
+        matters.
     """
     if min(values.shape) <= COARSEST or any(size % 2 for size in values.shape):
         found, sweeps = np.where(fixed, values, np.maximum(np.float32(0.0), least)), COARSEST_SWEEPS
@@ -39,11 +40,10 @@ def fill_harmonically(values: Floats, fixed: Mask, least: Floats, sure: float) -
 
 
 def _halved(values: Floats, fixed: Mask, least: Floats) -> tuple[Floats, Mask, Floats]:
-    """Each node for eight: fixed at the mean of those that are; the mean of the bounds if all have
-    one."""
+    """One node for eight: the mean of the fixed ones, and of the bounds if all have one."""
 
     def total(part: Floats) -> Floats:
-        # An axis at a time: numpy's reduction over three of them takes several times as long.
+        # One axis at a time: numpy's reduction over three axes takes several times as long.
         part = part[::2] + part[1::2]
         part = part[:, ::2] + part[:, 1::2]
         return part[:, :, ::2] + part[:, :, 1::2]
@@ -61,7 +61,7 @@ def _doubled(coarse: Floats) -> Floats:
 def _relax(
     values: Floats, some: NDArray[np.int32], shape: tuple[int, ...], least: Floats, sweeps: int
 ) -> None:
-    """Gauss and Seidel's sweeps over some nodes, to and fro, with over-relaxation."""
+    """Gauss-Seidel sweeps over some nodes, in alternating order, with over-relaxation."""
     a, b = shape[0] * shape[1], shape[1]
     keep, share = np.float32(1.0 - OVERSHOOT), np.float32(OVERSHOOT / 6.0)
     for sweep in range(sweeps):
@@ -70,5 +70,5 @@ def _relax(
             at = some[n if way > 0 else len(some) - 1 - n]
             others = values[at - a] + values[at + a] + values[at - b] + values[at + b]
             new = keep * values[at] + share * (others + values[at + way])
-            new += share * values[at - way]  # last: it was computed just now, and is waited for
+            new += share * values[at - way]  # last: it was computed just now and is still in flight
             values[at] = max(new, least[at])

@@ -1,8 +1,8 @@
-"""Where the surface likely is, as signed distances on a coarse grid that leaves no node out.
+"""Likely signed distances to the surface, on a coarse grid that leaves no node out.
 
-Near the cloud its points say. Elsewhere distances are filled in harmonically, which continues the
-surface from rim to rim. But what cameras saw through is outside: a first guess webs gaps over, free
-space opens them. And so is what lies below the floor.
+Near the cloud its points determine them. Elsewhere distances are filled in harmonically, which
+continues the surface from rim to rim. But what cameras saw through is outside, and so is what lies
+below the floor: a first guess spans gaps, and free space opens them.
 """
 
 from __future__ import annotations
@@ -25,22 +25,24 @@ from bodyscan.mesh.surface_nets import surface_nets
 from bodyscan.progress import threaded
 from bodyscan.reconstruction.range_image import RangeImage
 
-CELL_MM = 7.0  # of the coarse grid: half a finger, so that what is filled follows the rims
-ROOM_MM = 60.0  # around the cloud: as far as a harmonic surface stands out where nobody measured
-REACH_MM = 10.0  # of a point: from a rim the surface goes on straight for a cell before it bends
-FEWEST_CELLS = 5  # of room: more than a point's reach and the cells beside
-ENOUGH_POINTS = 250_000  # for the coarse grid: nine in reach of a node
+CELL_MM = 7.0  # of the coarse grid: half a finger, so that the filled surface follows the rims
+ROOM_MM = 60.0  # around the cloud: as far as a harmonic surface bulges where nothing was measured
+REACH_MM = 10.0  # of a point: from a rim the surface continues straight for a cell before it bends
+FEWEST_CELLS = 5  # of room: more than a point's reach and the neighbouring cells
+ENOUGH_POINTS = 250_000  # for the coarse grid: nine within reach of a node
 KNOWN_WEIGHT = 0.05  # of a node: one point 7 mm away
-RIM = 0.3  # of the reach, at the grid's rim: little, or what is missing would cave in
-SURE = 0.75  # of the reach: so far from the surface a coarser grid is right about the side
-MARGIN_MM = 10.0  # a camera sees through where what it measured lies so much farther away
+RIM = 0.3  # of the reach, at the grid's rim: small, or missing parts would cave in
+SURE = 0.75  # of the reach: this far from the surface a coarser grid has the side right
+MARGIN_MM = 10.0  # a camera sees through a place if what it measured is this much farther away
 
 
 @dataclass(frozen=True, eq=False)
 class Distances:
     """Signed distances at all nodes of a grid, negative inside.
 
-    values: (a, b, c) mm.  origin: (3,) mm, the first node.  cell_mm: from node to node.
+    values: (a, b, c) mm.
+    origin: the first node, (3,) mm.
+    cell_mm: from node to node.
     """
 
     values: Floats
@@ -56,9 +58,10 @@ def likely_distances(
     *,
     workers: int,
 ) -> Distances:
-    """Of a closed surface through the cloud, on a grid that has room around it.
+    """Signed distances of a closed surface through the cloud, on a grid with room around it.
 
-    finest_mm: no cell is smaller.  range_images: as measured, background and all.
+    finest_mm: no cell is smaller.
+    range_images: as measured, background included.
     """
     cell_mm = max(CELL_MM, finest_mm)
     bricks = _grid_around(cloud.points, cell_mm)
@@ -89,8 +92,11 @@ def likely_distances(
 
 
 def _mirror(values: Floats | Mask, below: int, where: Mask) -> None:
-    """Make nodes below the floor what those above are, so that what is filled in between comes to
-    the floor upright: nobody sees the soles, but they stand on it."""
+    """Mirror nodes from above the floor to below it, where `where` is true.
+
+    What is filled in between then meets the floor upright: nobody sees the soles, but they stand on
+        it.
+    """
     count = min(below, values.shape[2] - below)
     if count > 0:
         under = np.s_[..., below - count : below]
@@ -114,7 +120,7 @@ def _seen_through(
     rig_from_camera: dict[str, RigidTransform],
     workers: int,
 ) -> Mask:
-    """(a, b, c) nodes inside a guessed surface, away from the cloud, that cameras saw through."""
+    """Nodes (a, b, c) inside a guessed surface, away from the cloud, that cameras saw through."""
     free = np.zeros(guess.shape, bool)
     if not range_images:
         return free
@@ -135,14 +141,14 @@ def _seen_through(
 
 
 def crossed(distances: Distances, cell_mm: float, shape: tuple[int, ...]) -> Mask:
-    """Which bricks (a, b, c) of a finer grid from the same origin the surface passes through."""
+    """Which bricks (a, b, c) of a finer grid with the same origin the surface passes through."""
     wanted = np.zeros(shape, np.bool_)
     _find_crossed(distances.values, cell_mm / distances.cell_mm, wanted)
     return wanted
 
 
 def interpolated(distances: Distances, bricks: Bricks) -> Floats:
-    """Distances at the nodes of a finer grid from the same origin."""
+    """Distances at the nodes of a finer grid with the same origin."""
     found = np.empty(bricks.shape, np.float32)
     _interpolate(distances.values, bricks.cell_mm / distances.cell_mm, bricks.places, found)
     return found
@@ -164,13 +170,13 @@ def _find_crossed(values: Floats, ratio: float, wanted: Mask) -> None:
 
 @compiled
 def _below(brick: int, ratio: float) -> int:
-    """The coarse node at or before a brick and the cell before it."""
+    """The coarse node at or before the cell that precedes a brick."""
     return max(int((SIDE * brick - 2) * ratio), 0)
 
 
 @compiled
 def _above(brick: int, ratio: float, size: int) -> int:
-    """After the coarse node at or behind a brick and the cell behind it."""
+    """One past the coarse node at or behind the cell that follows a brick."""
     return min(int((SIDE * brick + SIDE + 1) * ratio) + 2, size)
 
 

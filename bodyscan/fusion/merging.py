@@ -1,4 +1,4 @@
-"""Aligned range images to one cloud: smooth each, thin, and average what several pairs saw.
+"""Merge aligned range images into one cloud: smooth each, thin, average what several pairs saw.
 
 Neighbours are found on pixel grids: inside an image by its own grid, in another image by
 projecting the point into it. No search tree is built.
@@ -38,7 +38,7 @@ def merge(
     *,
     workers: int = THREADS,
 ) -> MergedCloud:
-    """One evenly spread cloud of about `settings.points` points from aligned, cleaned range images.
+    """Merge aligned, cleaned range images into one even cloud of about `settings.points` points.
 
     Surfaces of two pairs within `settings.agreement_mm` along the normal are averaged by weight;
     between that and `settings.double_mm` they are a double surface, of which the heavier one stays.

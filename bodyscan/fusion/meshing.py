@@ -1,4 +1,4 @@
-"""A closed mesh from a cloud: signed distances on a grid, their zero set, what was filled marked."""
+"""A closed mesh from a cloud: signed distances on a grid, their zero set, filled faces marked."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from bodyscan.settings import MeshSettings
 
 FEWEST_POINTS = 1000
 TELLING = 20_000
-"""Points, about, that say which piece of a surface is the subject."""
-GUESS_WEIGHT = np.float32(0.1)  # against the points': a seam's width, where these become few
+"""Approximate number of points that decide which piece of a surface is the subject."""
+GUESS_WEIGHT = np.float32(0.1)  # relative to the points': matters in a seam, where they become few
 
 
 def mesh(
@@ -36,11 +36,13 @@ def mesh(
     *,
     workers: int = THREADS,
 ) -> BodyMesh:
-    """One closed manifold surface around a cloud, faces outward.
+    """One closed manifold surface around a cloud, with faces outward.
 
-    range_images: as measured, background and all (not cleaned); with them, gaps that cameras saw
-    through are not webbed over. A vertex farther than `settings.reach_mm` from every point was
-    measured by nobody. Raises ScanFailed if no closed surface comes out.
+    range_images: as measured, background included (not cleaned); with them, gaps that cameras saw
+        through are not webbed over.
+
+    A vertex farther than `settings.reach_mm` from every point counts as not measured. Raises
+    ScanFailed if no closed surface comes out.
     """
     shape = closed_surface(cloud, settings, range_images, rig_from_camera, workers=workers)
     return attach_attributes(*shape, cloud, settings.reach_mm)
@@ -54,7 +56,7 @@ def closed_surface(
     *,
     workers: int = THREADS,
 ) -> tuple[Array, Indices]:
-    """Vertices (V, 3) mm and faces (F, 3) of the mesh, as exact as a grid's; otherwise as `mesh`."""
+    """Vertices (V, 3) mm and faces (F, 3) of the mesh, only as exact as the grid; see `mesh`."""
     if len(cloud.points) < FEWEST_POINTS:
         raise ScanFailed(
             f"a cloud of {len(cloud.points)} points is too small for a mesh",
@@ -84,8 +86,8 @@ def signed_distances(
 ) -> tuple[Bricks, Floats]:
     """A sparse grid around a closed surface, and the signed distances at its nodes, mm.
 
-    Near the cloud as its points say, elsewhere as is likely (`hole_filling`), and in between both,
-    so that there is no seam and no place without a side.
+    Near the cloud they follow its points, elsewhere `hole_filling`, with a blend in between, so
+    that there is no seam and every place has a side.
     """
     likely = likely_distances(cloud, cell_mm, range_images, rig_from_camera, workers=workers)
     extent = likely.cell_mm * np.array(likely.values.shape)
@@ -100,10 +102,10 @@ def signed_distances(
 def attach_attributes(
     vertices: Array, faces: Indices, cloud: BodyCloud, reach_mm: float
 ) -> BodyMesh:
-    """Brought onto the points, with normals, what the points know, and what was filled.
+    """Fit the mesh to the points, with normals, the points' attributes, and what was filled.
 
-    A grid's vertices are as exact as its cells are small; they move along their normals to where
-    the points around say, less the farther these are.
+    A grid's vertices are only as exact as its cells are small; they move along their normals to
+    where the points around are, by less the farther away those are.
     """
     normals = vertex_normals(vertices, faces)
     around = support(vertices, normals, cloud, reach_mm)

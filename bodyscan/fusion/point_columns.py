@@ -1,7 +1,8 @@
-"""The nearest points of a cloud, within a reach, found in columns of a grid.
+"""Find the nearest points of a cloud within a reach, in columns of a grid.
 
-All points of a body lie on its skin, and all are asked for within the same few millimetres: sorting
-them into columns from front to back takes a tenth of the time of building a tree, and asking half.
+All points of a body lie on its skin, and all queries have the same reach of a few millimetres:
+sorting points into columns from front to back takes a tenth of the time of building a tree, and a
+query half.
 """
 
 from __future__ import annotations
@@ -18,10 +19,11 @@ from bodyscan.progress import THREADS, threaded
 
 @dataclass(frozen=True, eq=False)
 class PointColumns:
-    """Points (N, 3) by columns along x, `reach_mm` wide.
+    """Points (N, 3) in columns along x, `reach_mm` wide.
 
-    order: (N,) the points, column after column.  start: (y, z) columns, where each one begins; the
-    rim's columns are empty.  low: (2,) mm, y and z where the columns begin.
+    order: indices of the points, column after column, (N,).
+    start: where each column begins, by (y, z); columns at the rim are empty.
+    low: y and z where the columns begin, (2,) mm.
     """
 
     points: Array
@@ -32,7 +34,7 @@ class PointColumns:
 
     @staticmethod
     def of(points: Array, reach_mm: float) -> PointColumns:
-        """Of a cloud that is asked for points within a reach."""
+        """Columns for a cloud and the reach of all queries."""
         low = points[:, 1:].min(axis=0) - reach_mm
         across = ((points[:, 1:] - low) / reach_mm).astype(np.int64)
         shape = across.max(axis=0) + 2
@@ -42,8 +44,11 @@ class PointColumns:
         return PointColumns(points[order], order, start[:-1].reshape(shape), low, reach_mm)
 
     def nearest(self, places: Array, count: int) -> tuple[Array, Indices]:
-        """Of places (M, 3): distances (M, count) of the nearest points, rising, infinite where no more
-        lie within the reach, and which these are (M, count), N for those."""
+        """The nearest points to places (M, 3).
+
+        Distances (M, count) mm, ascending, infinite if fewer points lie within the reach; and their
+        indices (M, count), N for missing ones.
+        """
         distance = np.full((len(places), count), np.inf)
         near = np.full((len(places), count), len(self.points))
         ends = np.linspace(0, len(places), THREADS + 1).astype(int)
@@ -66,7 +71,7 @@ class PointColumns:
 
 @compiled
 def _sort(column: Indices, start: Indices) -> Indices:
-    """(N,) points by column, in their own order within each."""
+    """Indices (N,) of points by column, in their own order within each."""
     free, order = start.copy(), np.empty(len(column), np.int64)
     for n in range(len(column)):
         order[free[column[n]]] = n
@@ -84,7 +89,7 @@ def _find(
     distance: Array,
     near: Indices,
 ) -> None:
-    """Fills in distances (M, k) and places in the order (M, k) of the nearest, rising."""
+    """Fill in distances (M, k) and positions (M, k) in `order` of the nearest points, ascending."""
     most = distance.shape[1]
     height, width = start.shape
     for v in range(len(places)):

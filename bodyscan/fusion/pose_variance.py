@@ -1,4 +1,4 @@
-"""What a point's error bar owes to how well pairs are placed, and a moving person is followed."""
+"""What the pairs' poses, and the following of a moving person, add to each point's sigma."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def add_pose_variance(
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PoseCovariance,
 ) -> BodyCloud:
-    """The cloud with sigmas along the normals that allow for the pairs' poses too.
+    """The cloud with the pairs' pose errors included in its sigmas along the normals.
 
     A small motion (w, t) of a pair moves a point p along its normal n by (p x n).w + n.t. The
-    variance is the mean over the pairs that face the point: what they share does not average out.
+    variance is the mean over the pairs that face the point: shared errors do not average out.
     """
     centres = np.array([placing.translation for placing in rig_from_camera.values()])
     covariances = np.array([prior.of(name) for name in rig_from_camera])
@@ -46,10 +46,11 @@ def add_pose_variance(
 
 
 def add_motion_variance(cloud: BodyCloud, placed: BodyCloud, followed: Followed) -> BodyCloud:
-    """The cloud with sigmas that allow for what is not known of the person's motion.
+    """The cloud with the uncertainty of the person's motion included in its sigmas.
 
-    placed: the cloud with the pairs' poses, as the boards know them, in its sigmas.  Following
-    leaves out what moves the body as a whole, which they hold: the larger of both counts.
+    placed: the cloud with the pairs' pose errors, as known from the boards, in its sigmas.
+        Following leaves out motions of the body as a whole, which these include: the larger of both
+            counts.
     """
     cell = followed.cells.find_many(cloud.points, cloud.normals.astype(np.float64))
     sigma_mm = np.hypot(cloud.sigma_mm, followed.sigma_mm[cell])
@@ -64,8 +65,10 @@ def _placing(
     covariances: Array,
     placing_mm: Array,
 ) -> None:
-    """Writes standard deviations (N,) along the normals, mm, that come of the poses of the pairs
-    at `centres` (P, 3) with `covariances` (P, 6, 6)."""
+    """Write standard deviations (N,) mm along the normals due to pose errors.
+
+    Pairs stand at `centres` (P, 3) with `covariances` (P, 6, 6).
+    """
     lever = np.empty(6)
     for n in range(len(points)):
         (x, y, z), (a, b, c) = points[n], normals[n]

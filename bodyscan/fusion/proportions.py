@@ -1,8 +1,8 @@
-"""What no person who stands by himself is shaped like: who lies, and things that are carried.
+"""Find shapes that no freely standing person has: somebody who lies, or things that are carried.
 
-A bag or a backpack is measured as exactly as skin, and nothing that cameras see tells it from a body.
-But bodies change slowly with height and are wider than deep at the chest. What is beyond that is asked
-about, and no more: skirts end at once too, and were meant to be scanned.
+A bag or a backpack is measured as exactly as skin, and nothing in the images tells it from a body.
+But bodies change slowly with height, and chests are wider than deep. Anything else raises a
+question, no more: skirts end abruptly too, and were meant to be scanned.
 """
 
 from __future__ import annotations
@@ -19,26 +19,27 @@ from bodyscan.mesh.slices import Loop, height_ranges, loops_at
 from bodyscan.verdict import Grade
 
 STEP = 1.0 / 54.0
-"""of the height: 30 mm of an adult"""
+"""of the height: 30 mm of an adult."""
 LOW, HIGH = 0.28, 0.78
-"""of the height: from the knees, above swelling calves, to the armpits, below narrowing shoulders"""
+"""of the height: from the knees, above swelling calves, to the armpits, below narrowing
+shoulders."""
 SOON = 0.21
-"""Logarithm of the section's area over that of the next height: under arms and breasts, and along
-thighs, it is 0.09 to 0.17; the top of a bag at the hip is 0.25, that of a box 0.5."""
+"""Logarithm of the ratio of neighbouring sections' areas: 0.09 to 0.17 under arms and breasts and
+along thighs; 0.25 at the top of a bag at the hip, 0.5 at that of a box."""
 CHEST = 0.66, 0.75
 DEEP = 1.0
-"""Depth over width of a chest between the arms: 0.65 to 0.75 of average people, 0.9 of a barrel."""
+"""Depth over width of a chest between the arms: 0.65 to 0.75 on average, 0.9 for a barrel chest."""
 ALIKE = 0.5
-"""of the larger leg's section, that of the other"""
+"""Section of the smaller leg relative to the larger one."""
 FLAT = 0.8
-"""Height over the farthest that it reaches to the side: arms held out make it 1"""
+"""Height over the largest horizontal extent: 1 with arms held out."""
 LIMB_MM2 = 1500.0
 HAND_MM2 = 6000.0
-"""A fist and its thumb. Hands that hang begin at once, between two heights; no bag is as small."""
+"""A fist with its thumb. Hanging hands begin abruptly, between two heights; no bag is as small."""
 NECK = 0.86
-"""of the height: a backpack ends below"""
+"""of the height: a backpack ends below."""
 MEASURED = 0.6
-"""of a section's outline: where fillings close it, it may be of any size"""
+"""of a section's outline: one closed by filling may be of any size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +55,14 @@ class _Section:
 
 @dataclass(frozen=True)
 class Load:
-    """Heights over the floor between which the trunk's outline holds more than a body, mm."""
+    """Range of heights above the floor, mm, where the trunk's outline holds more than a body."""
 
     low_mm: float
     high_mm: float
 
 
 def odd_proportions(mesh: BodyMesh) -> Iterator[tuple[Grade, str]]:
-    """A question for each thing that no standing person by himself is shaped like."""
+    """A question for each feature that no freely standing person has."""
     top, across = _extents(mesh)
     if top < FLAT * across:
         yield (
@@ -76,8 +77,11 @@ def odd_proportions(mesh: BodyMesh) -> Iterator[tuple[Grade, str]]:
 
 
 def find_loads(mesh: BodyMesh) -> tuple[Load, ...]:
-    """Where a standing person's trunk goes on at once in something larger, up to where that ends, or to
-    the neck; and what is deep around a chest that is deeper than wide."""
+    """Loads of a standing person: where the trunk's outline suddenly grows, and deep chests.
+
+    The first reach up to where the outline shrinks again, or to the neck; the second over the
+    heights where a chest is deeper than wide.
+    """
     top, across = _extents(mesh)
     if top < FLAT * across:
         return ()
@@ -87,7 +91,7 @@ def find_loads(mesh: BodyMesh) -> tuple[Load, ...]:
     begins: float | None = None
     for below, above in pairwise(trunk):
         own = _change(_trunk_of(below), _trunk_of(above))
-        # Arms that join the trunk change its outline alone, and a bag in a hand changes all but it.
+        # Arms that join the trunk change only its outline, and a bag in a hand changes all others.
         if begins is None and min(own, _change(below, above)) > SOON:
             begins = below.height_mm
         elif own < -SOON and (begins is not None or _change(below, above) < -SOON):
@@ -106,7 +110,7 @@ def find_loads(mesh: BodyMesh) -> tuple[Load, ...]:
 
 
 def _extents(mesh: BodyMesh) -> tuple[float, float]:
-    """mm: up, and farthest to the side."""
+    """Height, and largest horizontal extent, mm."""
     across = float(np.ptp(mesh.vertices[:, :2], axis=0).max())
     return float(mesh.vertices[:, 2].max()), across
 
@@ -128,7 +132,7 @@ def _measured(loops: Sequence[Loop]) -> bool:
 
 
 def _changes(sections: Sequence[_Section]) -> Iterator[tuple[Grade, str]]:
-    """Along the legs, and from above where they join, which is a step by itself, to the armpits."""
+    """Sudden changes along the legs, and from above the crotch (one itself) to the armpits."""
     crotch = _crotch(sections)
     steps = {
         0.5 * (below.height_mm + above.height_mm): abs(_change(below, _without_hands(above, below)))
@@ -147,7 +151,7 @@ def _changes(sections: Sequence[_Section]) -> Iterator[tuple[Grade, str]]:
 
 
 def _crotch(sections: Sequence[_Section]) -> int:
-    """Number of the lowest section that is not on two legs."""
+    """Number of the lowest section that is not through two legs."""
     return next((k for k, one in enumerate(sections) if not _on_two_legs(one)), len(sections))
 
 
@@ -156,14 +160,16 @@ def _trunk_of(section: _Section) -> _Section:
 
 
 def _change(below: _Section, above: _Section) -> float:
-    """Logarithm of how many times larger the upper one is, for each height between neighbours: some of
-    those may not have been measured."""
+    """Logarithm of the ratio of areas, upper to lower, per step in height.
+
+    Sections in between may be missing if they were not measured.
+    """
     heights = max(round((above.share - below.share) / STEP), 1)
     return float(np.log(above.area_mm2 / below.area_mm2)) / heights
 
 
 def _without_hands(above: _Section, below: _Section) -> _Section:
-    """Without what is as small as hands and was not there below."""
+    """The section without loops as small as hands that were not there below."""
     there = len(below.loops)
     more = [loop for loop in above.loops[there:] if loop.area_mm2 > HAND_MM2]
     return replace(above, loops=(*above.loops[:there], *more))
@@ -186,7 +192,7 @@ def _chest(sections: Sequence[_Section]) -> Iterator[tuple[Grade, str]]:
 
 
 def _deep_chest(sections: Sequence[_Section]) -> list[_Section]:
-    """Of a chest that is deeper than wide, between two arms, which say which way is sideways."""
+    """Sections of a chest deeper than wide, between two arms, which show the sideways axis."""
     chest = [one for one in sections if CHEST[0] <= one.share <= CHEST[1] and len(one.loops) == 3]
     ratios = [_depth_over_width(one.loops) for one in chest]
     return chest if ratios and float(np.median(ratios)) > DEEP else []

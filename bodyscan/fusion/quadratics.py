@@ -1,4 +1,4 @@
-"""Local quadratic fits to an image of inverse depths, full windows fast and the others robustly.
+"""Local quadratic fits to an image of inverse depths: fast in full windows, robust in all others.
 
 Savitzky and Golay (1964), in two dimensions. Where a window is full, the fit is a handful of fixed
 convolutions; at rims, holes and jumps in depth it is a robust least-squares fit to the pixels that
@@ -18,8 +18,8 @@ from bodyscan.fusion.robust_windows import fit_windows
 
 OUTLIER_SIGMAS = 5.0
 WORST_MISFIT = 4.0  # mean square residual over 5 x 5 pixels, in variances
-NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal variable
-EVERY = 8  # row that is looked at to learn how large the noise is
+NORMAL_MEDIAN = 0.6745  # median of the absolute value of a standard normal variable
+EVERY = 8  # one row in this many is used to estimate the noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +33,10 @@ class Fit:
 
 
 def fit_quadratics(inverse: Floats, noise: Floats, reach: int, pixel_mm: float) -> tuple[Fit, Mask]:
-    """Fits to an inverse depth, 0 where there is none, and at which pixels they succeed.
+    """Fit an inverse depth, 0 where nothing was measured; return the fits and where they succeed.
 
-    noise: its standard deviation, believed but for its size, which is taken from the residuals
-    where they are larger.  reach: windows have 2 reach + 1 pixels a side, of `pixel_mm` on the
-    surface.
+    noise: its standard deviation; only the scale is corrected, if residuals are larger.
+    reach: windows have 2 reach + 1 pixels a side, of `pixel_mm` on the surface.
     """
     valid = inverse > 0
     closed, whole = close_holes(inverse, valid)
@@ -57,7 +56,7 @@ def fit_quadratics(inverse: Floats, noise: Floats, reach: int, pixel_mm: float) 
     _square_misfits(inverse, noise, fit.value, fitted, squares, calm)
     misfit = cv2.boxFilter(squares, -1, (5, 5), borderType=cv2.BORDER_CONSTANT)
     easy = (misfit < WORST_MISFIT) & (cv2.erode(calm, window, borderValue=1) > 0)
-    easy.ravel()[cut] = True  # seen to
+    easy.ravel()[cut] = True  # already fitted robustly
     uneasy = np.flatnonzero(valid & ~easy)
     fit_windows(padded, noise, uneasy, reach, pixel_mm, fits, fitted)
     return fit, fitted
@@ -69,7 +68,7 @@ def _size_of_noise(inverse: Floats, noise: Floats, fit: Fit, full: Mask) -> np.f
     if not there.any():
         return np.float32(1.0)
     residual = (inverse - fit.value)[::EVERY][there] / noise[::EVERY][there]
-    # A residual lacks the share of its own noise that the fit took up.
+    # A residual lacks the part of its own noise that the fit absorbed.
     own_share = np.square(fit.sigma[::EVERY][there][0] / noise[::EVERY][there][0])
     typical = np.median(np.abs(residual)) / np.sqrt(1.0 - own_share)
     return np.float32(max(1.0, typical / NORMAL_MEDIAN))
@@ -84,8 +83,9 @@ def _square_misfits(
     squares: Floats,
     calm: Bytes,
 ) -> None:
-    """Squared residuals over variances, 0 where nothing was measured; calm: 0
-    at outliers and pixels that have no fit, else 1.
+    """Set squared residuals over variances, 0 where nothing was measured, and `calm`.
+
+    calm: 0 at outliers and at pixels without a fit, else 1.
     """
     for row in range(inverse.shape[0]):
         for column in range(inverse.shape[1]):
@@ -99,7 +99,7 @@ def _square_misfits(
 
 
 def close_holes(inverse: Floats, valid: Mask) -> tuple[Floats, Mask]:
-    """With values in holes of a few pixels, so that they do not spoil the windows around them.
+    """Fill holes of a few pixels, so that they do not spoil the windows around them.
 
     The mean of opposite neighbours up to two pixels away, exact on a plane; at least four of the
     twelve opposite pairs must be there.

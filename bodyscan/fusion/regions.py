@@ -1,9 +1,9 @@
-"""What the points of a cloud are: skin, hair, dark cloth; by how dark they are, how rough, and where.
+"""Label the points of a cloud as skin, hair or dark cloth by darkness, roughness and place.
 
-One person's skin is as bright as itself within a factor of two, moles and lips and what is left of
-shading among it. Black cloth and dark hair are darker than a third of that; what lies between is not
-decided. Hair and cloth differ in place first: hair grows on the head and hangs from there. And
-hair is rough by what its strands and locks stand apart, where noise lets that be seen at all.
+One person's skin varies in brightness by a factor of two, moles, lips and remaining shading
+included. Black cloth and dark hair are darker than a third of that; anything in between is
+undecided. Hair and cloth differ in place first: hair grows on the head and hangs from there. And
+hair is rough because its strands and locks stand apart, where noise lets that be seen at all.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ from bodyscan.progress import threaded
 from bodyscan.reconstruction.range_image import RangeImage
 
 DARK, DIM = 1 / 3, 1 / 2
-"""Of the subject's usual brightness. Moles have 0.45 of the skin around; black hair and cloth reflect
-3 to 6 % of the light, skin 10 (very dark) to 65 %."""
+"""Relative to the subject's usual brightness. Moles have 0.45 of the skin around; black hair and
+cloth reflect 3 to 6 % of the light, skin 10 (very dark) to 65 %."""
 SOME_BRIGHTER = 0.1
-"""Of the points, by so much that the usual ones would be dark beside them: which of the two is skin,
-under black clothes or white ones, is then not known."""
+"""Share of points so bright that the usual ones would be dark beside them: it is then not known
+which of the two is skin, under black clothes or white ones."""
 CELL_MM = 30.0
-"""Less than what hair and a collar are apart; some hundred pixels."""
+"""Smaller than the distance of hair and a collar; some hundred pixels."""
 SMALLEST = 3e-4
-"""Of the points: 5 cm2 of a person, less than any girth notices."""
+"""Share of the points: 5 cm2 of a person, too little to affect any girth."""
 MOST = 0.5
-"""Of a cell's points: what is dim among the dark is dark, and what is bright a highlight."""
+"""Share of a cell's points: dim points among dark ones are dark, and bright ones highlights."""
 ROUGH, ROUGH_MM = 3.0, 0.2
-"""Times what sigmas say, which on dark surfaces were seen to be wrong by two; and half of what locks of
-hair stand apart, as far as that is left in a window of 7 mm."""
-FEWEST = 50  # pixels that tell how rough a cell is
-HEAD_WIDE = 0.12  # of the stature: about the body's axis, what leans forward and has long hair
+"""ROUGH: times what sigmas predict, which were found wrong by a factor of two on dark surfaces.
+ROUGH_MM: half of what locks of hair stand apart, as far as a window of 7 mm preserves it."""
+FEWEST = 50  # pixels needed to tell how rough a cell is
+HEAD_WIDE = 0.12  # of the stature: around the axis, for heads that lean forward and long hair
 
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """A grid of cubes around the body: its lowest corner, mm, and how many there are each way."""
+    """A grid of cubes around the body: its lowest corner, mm, and its size along each axis."""
 
     origin: Array
     shape: tuple[int, ...]
@@ -56,7 +56,7 @@ class _Cells:
     @staticmethod
     def around(points: Array) -> _Cells:
         low, high = points.min(axis=0), points.max(axis=0)
-        # A layer besides on all sides, so that neighbours exist.
+        # One more layer on all sides, so that every cell has neighbours.
         shape = np.floor((high - low) / CELL_MM).astype(int) + 3
         return _Cells(low - CELL_MM, tuple(shape.tolist()))
 
@@ -66,22 +66,22 @@ class _Cells:
 
     @property
     def centres(self) -> Array:
-        """(count, 3) mm."""
+        """Centres of the cells, (count, 3) mm."""
         place = np.stack(np.unravel_index(np.arange(self.count), self.shape), axis=-1)
         return self.origin + CELL_MM * (place + 0.5)
 
     def find(self, points: Array) -> Indices:
-        """(N,) number of the cell of each point (N, 3); the nearest of what is outside."""
+        """Number (N,) of the cell of each point (N, 3); the nearest cell for points outside."""
         place = np.floor((points - self.origin) / CELL_MM).astype(np.int64)
         return np.ravel_multi_index(tuple(place.T), self.shape, mode="clip")
 
     def patches(self, taken: Mask) -> Indices:
-        """(count,) number of the patch of neighbours that a cell belongs to, 0: not taken."""
+        """Number (count,) of the patch of neighbours that each cell belongs to, 0 if not taken."""
         label = ndimage.label(taken.reshape(self.shape), np.ones((3, 3, 3)))[0]
         return np.asarray(label.ravel(), np.int64)
 
     def mostly(self, said: Mask, among: Mask) -> Mask:
-        """(count,) where of a cell and its neighbours that are `among` more than half are `said`."""
+        """(count,): cells around which most of the `among` cells are `said` too."""
         counts = [
             ndimage.uniform_filter(some.reshape(self.shape).astype(float), 3).ravel()
             for some in (said & among, among)
@@ -91,8 +91,12 @@ class _Cells:
 
 @dataclass(frozen=True, eq=False)
 class _Texture:
-    """Of each cell (count,): whether that is known; whether it is rough beyond noise; whether it is
-    smooth, noise and all."""
+    """Texture of each cell, (count,).
+
+    known: whether enough pixels were examined.
+    rough: whether it is rough beyond noise.
+    smooth: whether it is smooth, noise included.
+    """
 
     known: Mask
     rough: Mask
@@ -105,10 +109,13 @@ def label_regions(
     rig_from_camera: Mapping[str, RigidTransform],
     window_mm: float,
 ) -> Bytes:
-    """(N,) of each point its number in `mesh.regions.NAMES`.
+    """Number (N,) of each point's region in `mesh.regions.NAMES`.
 
-    range_images: what the cloud was merged from.  window_mm: over which they were smoothed. All are
-    unsure where the images are too dark, or so much is so bright that it is open what is skin.
+    range_images: those that the cloud was merged from.
+    window_mm: window over which they were smoothed.
+
+    All points are unsure if the images are too dark, or if so much is so bright that it is open
+    which part is skin.
     """
     grey = cloud.colours[:, 0].astype(np.float32)
     usual = float(np.median(grey))
@@ -137,7 +144,7 @@ def label_regions(
 
 
 def _coverings(head: Mask, on_head: Mask, rough: Mask, smooth: Mask) -> Indices:
-    """(count,) what dark cells are: of the head, of what is one patch with it, and of all else."""
+    """What dark cells (count,) are: on the head, in one patch with it, and elsewhere."""
     hanging = np.where(rough, HAIR, np.where(smooth, DARK_CLOTH, UNSURE))
     elsewhere = np.where(rough, UNSURE, DARK_CLOTH)
     worn = np.where(smooth, DARK_CLOTH, HAIR)
@@ -145,7 +152,7 @@ def _coverings(head: Mask, on_head: Mask, rough: Mask, smooth: Mask) -> Indices:
 
 
 def _head(points: Array, places: Array) -> Mask:
-    """(M,) which places (M, 3) lie on the head of a body that stands."""
+    """Which places (M, 3) lie on the head of a standing body, (M,)."""
     top = points[:, 2].max()
     above = points[points[:, 2] > 0.5 * top, :2]
     across = np.linalg.norm(places[:, :2] - np.median(above, axis=0), axis=1)
@@ -160,7 +167,7 @@ def _texture(
     rig_from_camera: Mapping[str, RigidTransform],
     window_mm: float,
 ) -> _Texture:
-    """Of what is dark, and of the head; elsewhere neither is told."""
+    """Texture of dark cells and of the head; elsewhere it is not known."""
     asked = dark | head
 
     def looked_at(image: RangeImage) -> Misfits | None:
@@ -187,9 +194,11 @@ def lies_in(
     asked: Mask,
     wanted: Mask,
 ) -> None:
-    """wanted (H, W): which points (H, W, 3) that have a sigma lie in cells that are asked about.
+    """Set wanted (H, W): which points (H, W, 3) with a sigma lie in the cells that are asked for.
 
-    rig_from_camera: (3, 4).  origin: (3,) mm, of the cells (a, b, c); beyond them the nearest counts.
+    rig_from_camera: (3, 4).
+    origin: lowest corner of the cells (a, b, c), (3,) mm; points outside count for the nearest
+        cell.
     """
     m, low = rig_from_camera, origin
     for v in range(wanted.shape[0]):
@@ -218,8 +227,8 @@ def _told(cells: _Cells, found: Sequence[Misfits]) -> _Texture:
 
 
 def _medians(values: Floats, group: Indices, count: int) -> Array:
-    """(count,) of each group's values (N,), none below 0; 0 of one without."""
-    # The bits of floats that are not negative are in the floats' order: one sort of plain numbers.
+    """Median of each group's values (N,), none of them negative; 0 for an empty group."""
+    # The bits of non-negative floats sort like the floats: one sort of plain integers.
     bits = np.asarray(values, np.float32).view(np.uint32)
     keys = np.sort((group.astype(np.uint64) << np.uint64(32)) | bits)
     sizes = np.bincount(group, minlength=count)

@@ -1,6 +1,6 @@
 """Robust quadratic fits in single windows of an image, for pixels near rims, holes and jumps.
 
-Trimmed least squares: fitted again to the samples that lie close to the fit before. Many windows
+Trimmed least squares: each fit is repeated with the samples close to the previous one. Many windows
 are fitted side by side, so that every operation runs along memory.
 """
 
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
 
-LANES = 128  # windows fitted side by side: what fits into a processor's cache
-ROUNDS_SIGMAS = (8.0, 3.0)  # how close samples have to be to the fits before
-OWN_SIGMAS = 4.0  # a pixel farther than this off its own fit does not belong to the surface
+LANES = 128  # windows fitted side by side: as many as fit into a processor's cache
+ROUNDS_SIGMAS = (8.0, 3.0)  # how close samples must be to the previous fit
+OWN_SIGMAS = 4.0  # a pixel farther than this off its own fit is not on the surface
 FIRST_RADIUS_PX = 2.5
-SHARPEST_RADIUS_MM = 6.0  # prior: surfaces curve more tightly than this only now and then
+SHARPEST_RADIUS_MM = 6.0  # prior: surfaces rarely curve more tightly than this
 FEWEST_SAMPLES = 15
 ZERO, ONE, FOUR = np.float32(0.0), np.float32(1.0), np.float32(4.0)
-FAR = np.float32(1e6)  # sigmas off: no part of the surface
+FAR = np.float32(1e6)  # sigmas off: not part of the surface
 
-# A quadratic's six terms are du^U dv^V. Its normal equations are made of 21 moments: sums over the
+# A quadratic has six terms du^U dv^V. Its normal equations consist of 21 moments: sums over the
 # samples of du^i dv^j, i + j < 5, and then of du^i dv^j times the sample, i + j < 3.
 U, V = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
 POWERS = [(i, j) for i in range(5) for j in range(5 - i)]
@@ -42,12 +42,16 @@ def fit_windows(
 ) -> None:
     """Fit a quadratic at some pixels to whatever in the window lies on the same surface.
 
-    padded: (h + 2 reach, w + 2 reach) inverse depths, 0 where nothing was measured and all round.
-    noise: (h, w), their standard deviation.  pixels: flat indices of measured ones.  reach: windows
-    have 2 reach + 1 pixels a side.  fits: value, slopes per column and row, sigma, (h, w), filled
-    in at the pixels.  fitted: (h, w), there true if the pixel lies on its own fit with enough
-    company.  Begins with the closest neighbours, which see a step beside them for what it is; a
-    weak prior on the second derivatives keeps one-sided windows calm.
+    padded: inverse depths (h + 2 reach, w + 2 reach), 0 where nothing was measured and all round.
+    noise: their standard deviation, (h, w).
+    pixels: flat indices of measured pixels.
+    reach: windows have 2 reach + 1 pixels a side.
+    pixel_mm: width of a pixel on the surface.
+    fits: value, slopes per column and row, and sigma, (h, w), filled in at the pixels.
+    fitted: (h, w), set true there if the pixel lies on its own fit with enough other samples.
+
+    Starts with the closest neighbours, which recognise a step beside them; a weak prior on the
+    second derivatives keeps one-sided windows stable.
     """
     count = (2 * reach + 1) ** 2
     samples, weights = np.zeros((count, LANES), np.float32), np.zeros((count, LANES), np.float32)
@@ -56,7 +60,7 @@ def fit_windows(
     own, unit = np.ones(LANES, np.float32), np.ones(LANES, np.float32)
     step = np.ones(LANES, np.float32)
     for start in range(0, len(pixels), LANES):
-        block = pixels[start : start + LANES]  # lanes that the last one leaves over count nothing
+        block = pixels[start : start + LANES]  # unused lanes of the last block do not matter
         _gather(padded, block, reach, samples)
         for b, pixel in enumerate(block):
             own[b], unit[b] = samples[count // 2, b], noise.ravel()[pixel]
@@ -80,7 +84,7 @@ def fit_windows(
 
 @compiled
 def _gather(padded: Floats, pixels: NDArray[np.intp], reach: int, samples: Floats) -> None:
-    """The windows' samples (samples, LANES), one window after the other."""
+    """Gather the samples of the windows, (samples, LANES), one window after another."""
     side, width = 2 * reach + 1, padded.shape[1] - 2 * reach
     for b in range(len(pixels)):
         row, column = pixels[b] // width, pixels[b] % width
@@ -93,8 +97,10 @@ def _gather(padded: Floats, pixels: NDArray[np.intp], reach: int, samples: Float
 def _begin(
     samples: Floats, own: Floats, unit: Floats, step: Floats, reach: int, weights: Floats
 ) -> None:
-    """Samples less the centre's, over its noise, FAR where they cannot be of its surface; weights:
-    1 for the closest of the others."""
+    """Subtract the centre's sample and divide by its noise; set the first weights.
+
+    Samples that cannot be on the centre's surface become FAR; weights are 1 for the closest others.
+    """
     n = 0
     for dv in range(-reach, reach + 1):
         for du in range(-reach, reach + 1):
@@ -111,7 +117,7 @@ def _weigh_first(
     first = ONE if distance < FIRST_RADIUS_PX else ZERO
     for b in range(len(sample)):
         off = (sample[b] - own[b]) / unit[b]
-        # Four sigmas, and as much as the steepest surface that is worth having rises.
+        # Four sigmas, plus as much as the steepest useful surface rises.
         near = (sample[b] > ZERO) & (abs(off) < FOUR + FOUR * step[b] * distance)
         sample[b] = off if near else FAR
         weight[b] = first if near else ZERO
@@ -119,7 +125,7 @@ def _weigh_first(
 
 @compiled
 def _sum(samples: Floats, weights: Floats, reach: int, moments: Array) -> None:
-    """Moments (21, LANES) of the windows, row by row of the window."""
+    """Moments (21, LANES) of the windows, summed row by row."""
     rows, product = np.empty((8, LANES), np.float32), np.empty(LANES, np.float32)
     moments[:] = 0.0
     n = 0
@@ -144,10 +150,10 @@ def _sum(samples: Floats, weights: Floats, reach: int, moments: Array) -> None:
 
 @compiled
 def _solve(moments: Array, prior: Array, solution: Array, variance: Array) -> None:
-    """The six coefficients and the variance of the first.  prior: ridge on the last three.
+    """Solve for the six coefficients and the first's variance. prior: ridge on the last three.
 
-    Gauss's elimination from the last unknown to the second; the first one's pivot is then its
-    inverse variance. Positive definite, so no pivoting.
+    Gaussian elimination from the last unknown to the second; the first one's pivot is then its
+    inverse variance. The matrix is positive definite, so no pivoting is needed.
     """
     normal, factor = np.empty((6, 6, LANES)), np.empty(LANES)
     for i in range(6):
@@ -172,7 +178,7 @@ def _solve(moments: Array, prior: Array, solution: Array, variance: Array) -> No
 
 @compiled
 def _reweigh(samples: Floats, solution: Array, reach: int, width: float, weights: Floats) -> None:
-    """1 for the samples within `width` of the fits, 0 for the others."""
+    """Set weights to 1 for samples within `width` of the fits, 0 for the others."""
     a, b, c, d, e, f = [solution[k].astype(np.float32) for k in range(6)]
     n = 0
     for dv in range(-reach, reach + 1):
@@ -193,7 +199,7 @@ def _weigh(
     width: np.float32,
     weight: Floats,
 ) -> None:
-    """`_reweigh` for one pixel of the windows, of which each has its quadratic in du."""
+    """`_reweigh` for one pixel of the windows, each of which has its quadratic in du."""
     for b in range(len(sample)):
         off = sample[b] - (constant[b] + du * (slope[b] + du * curvature[b]))
         weight[b] = ONE if abs(off) < width else ZERO

@@ -1,4 +1,4 @@
-"""How rough a measured surface is, beside what its sigmas say that noise makes of a smooth one."""
+"""How rough a measured surface is, compared with the noise that its sigmas predict."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from bodyscan.reconstruction.range_image import RangeImage
 
 @dataclass(frozen=True, eq=False)
 class Misfits:
-    """Of pixels that have a whole window around them, N of them.
+    """Misfits of N pixels that have a whole window around them.
 
-    points: (N, 3) mm, rig frame.  misfit_mm: (N,) off the smooth surface through the window, along
-    the ray.  expected_mm: (N,) what that is by noise, standard deviation.
+    points: (N, 3) mm, rig frame.
+    misfit_mm: distance along the ray from the smooth surface through the window, (N,).
+    expected_mm: its standard deviation by noise, (N,).
     """
 
     points: Array
@@ -31,7 +32,7 @@ class Misfits:
 def misfits(
     image: RangeImage, rig_from_camera: RigidTransform, box: Crop, window_mm: float
 ) -> Misfits:
-    """Of the pixels in a box of a range image, to the quadratic in a window of about `window_mm`."""
+    """Misfits of the pixels in a box to the quadratic in a window of about `window_mm`."""
     sigma_mm, points = image.sigma_mm[box], image.points[box]
     common = np.zeros_like(sigma_mm) if image.common_mm is None else image.common_mm[box]
     whole = (slice(0, sigma_mm.shape[0]), slice(0, sigma_mm.shape[1]))
@@ -47,6 +48,6 @@ def misfits(
     length = np.linalg.norm(seen, axis=1) * seen[:, 2]
     basis = window_basis(reach)
     own_share = np.linalg.inv(basis.T @ basis)[0, 0]
-    left = np.float32(np.sqrt(1.0 - own_share))  # of a pixel's own noise in its misfit
+    left = np.float32(np.sqrt(1.0 - own_share))  # share of its own noise left in a misfit
     placed = rig_from_camera.apply(seen.astype(np.float64))
     return Misfits(placed, np.abs(off) * length, left * noise[full] * length)

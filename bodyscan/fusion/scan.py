@@ -36,21 +36,25 @@ from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Announce, Verdict, say_nothing
 
 Made = Callable[[BodyCloud | BodyMesh], None]
-"""Takes a scan's cloud, and then its mesh, as soon as each is there; from any thread."""
+"""Called with a scan's cloud, and then with its mesh, as soon as each exists; from any thread."""
 
 
 def no_use(body: BodyCloud | BodyMesh) -> None:
-    """Where nobody waits for them."""
+    """A `Made` that does nothing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A body model, how it came about and whether it is good.  measured: points of each pair's
-    cleaned range image.  failed: pairs that gave none, with the reason.  range_images: cleaned, of
-    the pairs that saw the subject, cut to where they did and carried to one moment; rig_from_camera:
-    where each stood to it, after alignment.  person: how a body that moved did, part by part.  notes:
-    what was said of the range images, such as what of their stripes was not used.  oblique_light: how
-    far aside light comes out of the skin, as far as overlaps tell it.
+    """A body model, how it was made, and whether it is good.
+
+    measured: number of points in each pair's cleaned range image.
+    failed: pairs that gave none, with the reason.
+    range_images: cleaned, of the pairs that saw the subject, cropped to it and carried to one
+        moment.
+    rig_from_camera: each pair's pose relative to the subject, after alignment.
+    person: how a moving body moved, part by part.
+    notes: on the range images, such as stripes that were not used.
+    oblique_light: how far aside light comes out of the skin, as far as overlaps show it.
     """
 
     cloud: BodyCloud
@@ -76,11 +80,12 @@ def fuse(
     announce: Announce = say_nothing,
     made: Made = no_use,
 ) -> Scan:
-    """Range images of one person, background and all, to body model and mesh.
+    """Fuse range images of one person, background included, to a body model and mesh.
 
-    measured: with the pairs that gave none as failures. empty: as in `clean`. announce: told what the
-    points alone say of the scan, before the mesh is made. made: given the cloud while that is made, and
-    the mesh while it is judged.
+    measured: with pairs that gave none as failures.
+    empty: as in `clean`.
+    announce: called with the verdict on the points alone, before the mesh is made.
+    made: called with the cloud while the mesh is made, and with the mesh while it is judged.
 
     Raises ScanFailed if they show no body.
     """
@@ -150,7 +155,7 @@ def fuse(
         return known
 
     with step(progress, "meshing"), ThreadPoolExecutor(1) as beside:
-        # Of a mesh most is made on one core: what it is not made of is found out on the other.
+        # Meshing mostly uses one core, so regions are labelled on the other meanwhile.
         naming = beside.submit(named)
         shape = closed_surface(cloud, settings.mesh, images, placing)
         cloud = naming.result()
@@ -170,8 +175,11 @@ def fuse(
 def _light_lines(
     seen: Sequence[RangeImage], calibration: RigCalibration
 ) -> dict[str, LightLine] | None:
-    """Of each pair; None where one has no sheets of light, or points are of stripes of both
-    directions, which oblique light moves each their own way."""
+    """The light line of each pair.
+
+    None if a pair has no light sheets, or if points come from stripes of both directions, each of
+    which oblique light moves differently.
+    """
     pairs = [calibration.pairs.get(image.pair) for image in seen]
     sheets = {pair.name: pair.sheets for pair in pairs if pair is not None}
     found = {name: LightLine.of(one) for name, one in sheets.items() if one is not None}
@@ -182,14 +190,14 @@ def _light_lines(
 def _silent(
     poles: Mapping[str, str], asked: Sequence[str], seeing: Sequence[str]
 ) -> tuple[str, ...]:
-    """Poles of which no pair saw anybody. One pair alone may look over a child's head."""
+    """Poles of which no pair saw anybody; a single pair may look over a child's head."""
     count = Counter(poles[name] for name in asked if name in poles)
     seen = {poles.get(name) for name in seeing}
     return tuple(pole for pole, pairs in count.items() if pairs > 1 and pole not in seen)
 
 
 def _breathing(surface: BodyMesh, followed: Followed | None) -> BodyMesh:
-    """With the way to mean breath, where it is known."""
+    """The mesh with the displacement to mean breath, where that is known."""
     if followed is None or followed.breath is None:
         return surface
     way, sigma = followed.breath.along(

@@ -1,4 +1,4 @@
-"""scan.json read: whatever is in it is of the kind that reports and exports take it for."""
+"""Read scan.json, checking that everything in it is of the type that reports and exports expect."""
 
 from __future__ import annotations
 
@@ -93,8 +93,10 @@ class _Facts(_Part):
 
 
 def read_facts(folder: Path) -> dict[str, Any]:
-    """The content of the scan.json in `folder`, of a scan that gave a model (it has `sha256`) or did
-    not. Raises ResultError for what is missing or is not one."""
+    """Read the scan.json in `folder`, whether or not its scan gave a model (then it has `sha256`).
+
+    Raises ResultError for a file that is missing or not a scan.json.
+    """
     file = folder / FILE_NAME
     try:
         facts = read_json_object(file)
@@ -109,7 +111,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
 
 
 def told_verdict(facts: dict[str, Any]) -> Verdict | None:
-    """None for a scan of before there were verdicts."""
+    """The stored verdict; None for scans from before there were verdicts."""
     told = facts.get("verdict")
     return Verdict(told["grade"], tuple(told["reasons"])) if told else None
 

@@ -1,4 +1,4 @@
-"""What makes a scan good, usable for some purposes, or to be taken again."""
+"""Grade a scan: good, usable for some purposes, or to be repeated."""
 
 from __future__ import annotations
 
@@ -37,67 +37,66 @@ GRADES: tuple[Grade, ...] = ("good", "usable", "repeat")
 SOME_FILLED, MOST_FILLED = 0.12, 0.5
 SOME_DISAGREEMENT_MM, DISAGREEMENT_SIGMAS = 0.4, 2.0
 GIRTH_PER_MM = 2.0 * np.pi
-"""mm that a girth is wrong by, where its surface stands 1 mm off all round"""
+"""mm by which a girth is wrong if its surface is 1 mm off all round."""
 SOME_CONTRADICTED, MOST_CONTRADICTED = 0.005, 0.02  # below 0.001 where all is well
 CALIBRATED_SIGMAS = 3.0
-"""Pairs that alignment moves by less may stand as the boards left it open; nobody moved."""
+"""Motions of pairs smaller than this may be errors that the boards left open: nobody moved."""
 LEFT_OF_MOTION = 0.2
-"""What no motion of the whole body explains, arms and breath, of how far a pair saw a person move."""
+"""Share of a pair's motion that no motion of the whole body explains: arms and breath."""
 TWICE, THRICE = 2.0, 3.0
-"""times the girth that is usable: of all of a motion; of what following a person left."""
+"""Times the usable girth error: for the whole motion; for what following a person left."""
 SOME_MOTION_MM = UseLimits().usable_girth_mm / GIRTH_PER_MM / LEFT_OF_MOTION
 SOME_LEFT_MM = UseLimits().usable_girth_mm / GIRTH_PER_MM
 CAMERA_MM, TURNED_DEG, STAYED = 1000.0, 5.0, 0.25
-"""A pole that is bumped turns about its foot, and its view of the body goes along: where the body's
-middle stays within a quarter of that, and the turn is no bump's, it was the body that turned. Few
-cameras stand nearer to it than this."""
+"""A bumped pole turns about its foot and takes its view of the body with it. If the body's middle
+stays within a quarter of that, and the turn is too large for a bump, the body turned. Few cameras
+stand nearer to it than this."""
 FLOOR_MM = 4.0
-"""What ISO 20685-1 allows a stature, for all errors together; floors are flat to 2 mm over a metre."""
+"""What ISO 20685-1 allows for stature, for all errors; floors are flat to 2 mm over a metre."""
 CELL_MM = 50.0
 SIDE_BY_SIDE = 0.4  # of the taller one's height
 SMALL_PIECE = 0.01
 LEVELS = np.arange(0.08, 0.95, 0.03)
-"""of the height: every 50 mm of an adult"""
+"""of the height: every 50 mm of an adult."""
 LEGS = 0.62
-"""of the height: below it a person may stand on two legs, even one whose hair gave no data"""
+"""of the height: below it a person may stand on two legs, even if hair hides some stature."""
 BULKY = 0.35
-"""of the largest outline at a height: an arm is 0.2 of the trunk, a hand 0.1 of a thigh"""
+"""of the largest outline at a height: an arm is 0.2 of the trunk, a hand 0.1 of a thigh."""
 TRUNK_MM2 = 25_000.0
-"""An outline as large is no arm's: raised arms beside a neck are as large as it."""
+"""An outline this large is not an arm: arms raised beside a neck are as large as the neck."""
 LIMB_MM2 = 1500.0
-"""A wrist; fingers are less."""
+"""A wrist; fingers are smaller."""
 FINGERTIPS = 0.33
-"""of the height: hands that hang down end at 0.37"""
+"""of the height: hanging hands end at 0.37."""
 THING_MM2 = 300.0
 """A stick of 20 mm."""
 MOST_RINGS = 5
-"""Both hands on the hips, or held by one another, thighs, knees and heels that touch: five."""
+"""Both hands on the hips or holding each other, and touching thighs, knees and heels: five."""
 OUTSIDE_MM = 15.0
 SOME_OUTSIDE, MOST_OUTSIDE = 0.01, 0.2
 RIM_MM, AT_RIM = 10.0, 3e-4
 BAND_MM = 50.0
 SOLES_MM = 50.0
 ONE_SIDE = 0.7
-"""Cosine to the cameras' mean direction: within 45 degrees of it all of them see the same half."""
+"""Cosine to the cameras' mean direction: within 45 degrees of it, all of them see the same half."""
 UNKNOWN_BAND = 0.5
 CROWN_MM = 5.0
-"""A dome's top 5 mm are 40 mm across; of a head that ends where its hair begins they are what closes
-it."""
+"""A dome's top 5 mm are 40 mm across; if a head ends where its hair begins, they close it."""
 SOME_SATURATED = 0.05
-"""of the skin: highlights on nose and forehead are less"""
+"""of the skin: highlights on nose and forehead are less."""
 LEAST_YIELD = 0.6
-"""of the skin: shadows of arms and chin leave 0.85 and more"""
+"""of the skin: shadows of arms and chin leave 0.85 and more."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigEvidence:
-    """What a verdict goes by of the rig and its calibration.
+    """What a verdict takes from the rig and its calibration.
 
-    unjudged: pairs whose calibration was imported and says nothing of how exact it is.
-    nominal: how the distances between cameras compare with those of their nominal places, if known.
-    cameras: (N, 3) where those of the whole rig stand; None for all round. What none of them could see
-    is no reason to repeat.
-    boards_mm: how exactly each pair's place is known, see `centre_sigmas`.
+    unjudged: pairs with an imported calibration of unknown accuracy.
+    nominal: distances between cameras compared with their nominal positions, if known.
+    cameras: positions (N, 3) of all the rig's cameras; None for all round. What none of them could
+        see is no reason to repeat.
+    boards_mm: how well each pair's pose is known, see `centre_sigmas`.
     """
 
     volume: Volume
@@ -120,11 +119,14 @@ class RigEvidence:
 
 @dataclass(frozen=True, eq=False)
 class ImageEvidence:
-    """What a verdict goes by of the range images.
+    """What a verdict takes from the range images.
 
-    failed: pairs that gave none, with the reason. silent: poles of which no pair saw anybody.
-    agreements: of pairs that project stripes of two directions. seams: see `judge_seams`.
-    contradictions: see `merge`. floor_mm: at which height the floor is seen, see `find_floor`.
+    failed: pairs that gave none, with the reason.
+    silent: poles of which no pair saw anybody.
+    agreements: of pairs that project stripes of two directions.
+    seams: see `judge_seams`.
+    contradictions: see `merge`.
+    floor_mm: height at which the floor is seen, see `find_floor`.
     """
 
     failed: Mapping[str, str] = field(default_factory=dict)
@@ -146,19 +148,21 @@ def grade_scan(
     mesh: BodyMesh | None = None,
     surface: SurfaceCheck | None = None,
 ) -> Verdict:
-    """The worst of all findings decides; the reasons come worst first.
+    """Grade a scan by the worst of all findings; the reasons come worst first.
 
-    use: how wrong a girth may be. together: what alignment made of the images; None where it took no
-    part. person: how a body that moved did. mesh: None while there is none yet: what it alone would
-    show is left out. surface: see `check_surface`.
+    use: how wrong a girth may be.
+    together: what alignment made of the images; None if it took no part.
+    person: how a moving body moved.
+    mesh: None while there is none; findings that need it are then left out.
+    surface: see `check_surface`.
 
-    A check that fails by itself leaves the scan usable at best, and says so.
+    A check that itself fails leaves the scan usable at best, and says so.
     """
     alignment = together.alignment if together else None
     shifted = together.shifted if together else ()
     size = together.size if together else None
     seams, contradictions = images.seams, images.contradictions
-    # What is filled touches anything, and has any shape.
+    # Filled surface touches anything and has any shape.
     filled = surface.filled_share if surface else mesh.filled_share if mesh else 1.0
     shape = mesh if filled <= MOST_FILLED else None
     checks: dict[str, Callable[[], Iterable[Finding]]] = {
@@ -218,7 +222,7 @@ def _pairs(failed: Mapping[str, str], alignment: Alignment | None) -> Iterator[F
 
 
 def _silent(poles: Sequence[str]) -> Iterator[Finding]:
-    """How much of the body that costs is for the gaps to say."""
+    """Poles that saw nobody; `_gaps` says how much of the body is missing."""
     for name in poles:
         yield (
             "usable",
@@ -237,7 +241,7 @@ def _calibration(unjudged: Sequence[str]) -> Iterator[Finding]:
 
 
 def _rig_size(size: NominalSize | None) -> Iterator[Finding]:
-    """Whoever scans need not have read what was said when the rig was calibrated."""
+    """The rig's size, because whoever scans need not have read the remarks on the calibration."""
     if size is None or size.mark == "good":
         return
     yield (
@@ -257,7 +261,7 @@ def _directions(agreements: Mapping[str, Agreement]) -> Iterator[Finding]:
 
 
 def _seams(seams: SeamReport | None, use: UseLimits) -> Iterator[Finding]:
-    """Poles and pairs whose surfaces do not go on where the others' end."""
+    """Poles and pairs whose surfaces do not continue where the others' end."""
     if seams is None:
         return
     for misfit in find_misfits(seams.seams, seams.groups, use.good_girth_mm / GIRTH_PER_MM):
@@ -277,9 +281,12 @@ def _seams(seams: SeamReport | None, use: UseLimits) -> Iterator[Finding]:
 
 
 def _shifted(steps: Sequence[PoleStep]) -> Iterator[Finding]:
-    """Alignment has taken it out; what that left is for the seams to say. But whether a single pair
-    stands elsewhere or measures wrongly (another lens, rows lost), which no placing mends, nobody can
-    tell. And where several moved, nothing but what the overlaps tie holds the body's size."""
+    """Poles and pairs that alignment found shifted, and corrected.
+
+    What the correction left is for the seams to say. But whether a single pair stands elsewhere or
+    measures wrongly (another lens, rows lost), which no pose corrects, cannot be told. And if
+    several moved, only the overlaps determine the body's size.
+    """
     for step in steps:
         gone = np.radians(step.turn_deg) * CAMERA_MM
         if step.turn_deg > TURNED_DEG and step.shift_mm < STAYED * gone:
@@ -299,7 +306,7 @@ def _shifted(steps: Sequence[PoleStep]) -> Iterator[Finding]:
 
 
 def _size(size: SizeStep | None, use: UseLimits) -> Iterator[Finding]:
-    """Taken out as well; but where a calibration is wrong everywhere, overlaps alone hold the size."""
+    """A common step outwards, corrected too; only overlaps then determine the body's size."""
     if size is None:
         return
     costs = abs(size.out_mm) * GIRTH_PER_MM
@@ -313,7 +320,7 @@ def _size(size: SizeStep | None, use: UseLimits) -> Iterator[Finding]:
 
 
 def _floor(height_mm: float | None, *, moved: bool) -> Iterator[Finding]:
-    """moved: whether poles were brought to the others: then it may be the others that moved."""
+    """The floor's height; moved: whether poles were aligned, perhaps to others that moved."""
     if height_mm is None or abs(height_mm) <= FLOOR_MM:
         return
     yield (
@@ -327,8 +334,10 @@ def _floor(height_mm: float | None, *, moved: bool) -> Iterator[Finding]:
 def _own_places(
     search: StepSearch | None, use: UseLimits, boards_mm: Mapping[str, float]
 ) -> Iterator[Finding]:
-    """Pairs that stand off where neither sway nor the boards' own error takes them; head and arms of
-    people may, by themselves."""
+    """Pairs off by more than sway and the boards' own errors explain.
+
+    A person's head and arms may cause that by moving by themselves.
+    """
     if search is None:
         return
     boards = np.array(list(boards_mm.values()) or [0.0])
@@ -345,7 +354,7 @@ def _own_places(
 
 
 def _disagreement(alignment: Alignment | None) -> Iterator[Finding]:
-    """Seams are judged free of noise; this is about noise that sigmas do not hold."""
+    """Noise that sigmas do not include; seams are judged without noise."""
     if alignment is None:
         return
     rms, expected = alignment.rms_after_mm, alignment.expected_mm
@@ -364,8 +373,11 @@ def _motion(
     use: UseLimits,
     boards_mm: Mapping[str, float],
 ) -> Iterator[Finding]:
-    """Of a person who was followed, what that left; of others, how far the pairs were moved, and by
-    more than they may stand off themselves."""
+    """The effect of motion on girths.
+
+    If the person was followed, what that left; otherwise how far the pairs were moved, beyond what
+    their own pose errors explain.
+    """
     for part in person.parts if person else ():
         costs = part.left_mm * GIRTH_PER_MM
         if costs > use.usable_girth_mm:
@@ -393,8 +405,10 @@ def _motion(
 def _contradictions(
     found: Contradictions | None, seams: SeamReport | None, *, explained: bool
 ) -> Iterator[Finding]:
-    """Pairs that see through each other's surfaces, which points near each other do not tell.
-    explained: poles were said to have moved, and brought to the others, which should have ended that.
+    """Pairs that see through each other's surfaces, which nearby points alone do not show.
+
+    explained: whether poles were found to have moved and were aligned, which should have ended
+        that.
     """
     if found is None or found.beyond_noise <= SOME_CONTRADICTED:
         return
@@ -448,8 +462,7 @@ def _company(cloud: BodyCloud) -> Iterator[Finding]:
 
 
 def _limbs(mesh: BodyMesh) -> Iterator[Finding]:
-    """More trunks, legs or arms side by side than one person has, whatever touches, and what stands
-    beside the legs of one who stands."""
+    """More trunks, legs or arms side by side than one person has, and things beside the legs."""
     top = float(mesh.vertices[:, 2].max())
     low, high = height_ranges(mesh.vertices, mesh.faces)
     doubled, many, beside = [], [], []
@@ -497,7 +510,7 @@ def _cuts(cloud: BodyCloud, volume: Volume) -> Iterator[Finding]:
 
 
 def _omissions(cloud: BodyCloud, mesh: BodyMesh) -> Iterator[Finding]:
-    """Points that the mesh, one closed piece, has no surface for."""
+    """Points for which the mesh, one closed piece, has no surface."""
     some = cloud.points[:: max(1, len(cloud.points) // 20_000)]
     distance = cKDTree(mesh.vertices).query(some, distance_upper_bound=OUTSIDE_MM)[0]
     outside = np.isinf(distance)
@@ -551,7 +564,7 @@ def _other_side(mesh: BodyMesh) -> Iterator[Finding]:
 
 
 def _yields(surface: SurfaceCheck | None) -> Iterator[Finding]:
-    """Pairs that gave less than they looked at: what others measured beside them shows it."""
+    """Pairs that measured less than they looked at, as shown by what others measured there."""
     if surface is None:
         return
     for name, share in surface.saturated.items():
@@ -572,7 +585,7 @@ def _yields(surface: SurfaceCheck | None) -> Iterator[Finding]:
 
 
 def _gaps(cloud: BodyCloud, surface: SurfaceCheck | None) -> Iterator[Finding]:
-    """The made-up share of all, and of each height."""
+    """The filled share of the whole, and of each height."""
     if surface is None:
         return
     filled = surface.filled_share

@@ -1,7 +1,7 @@
-"""Steps where the surfaces of two pairs meet, told apart from their noise.
+"""Steps where the surfaces of two pairs meet, separated from noise.
 
-Alignment looks a few millimetres far, and what it leaves out it does not see: a pair that stands
-wrong by more than that overlaps with nothing, or with what is not the same spot. Here pairs are
+Alignment looks only a few millimetres far, and does not see what it leaves out: a pair off by more
+than that overlaps with nothing, or with something that is not the same spot. Here pairs are
 compared nearly up to their rims and over centimetres, and judged by the median of every patch,
 which noise hardly moves.
 """
@@ -32,24 +32,24 @@ from bodyscan.reconstruction.range_image import RangeImage
 
 SPACING_MM = 3.0
 REACH_MM = 40.0
-"""A pole off by more shares no surface any more; an arm is farther from the trunk."""
+"""A pole that is farther off shares no surface any more; an arm is farther from the trunk."""
 PATCH_MM = 40.0
-"""A limb's width: what is less wide moves no girth."""
+"""A limb's width: anything narrower affects no girth."""
 FEWEST = 8
-"""matches of a patch."""
+"""matches in a patch."""
 CORRELATED = 5.0
-"""matches that err as one, being neighbours"""
+"""neighbouring matches that count as one, because they share their errors."""
 MEDIAN_SIGMA = 1.2533
-"""of a median, over that of a mean"""
+"""Sigma of a median over that of a mean."""
 LEAST_SHARE = 0.01
-"""of all that was measured: a pair that saw less moves no girth"""
+"""of everything that was measured: a pair that saw less affects no girth."""
 FAR = 1 << 12
-"""patches from one end of any volume to the other, and more"""
+"""More patches than from one end of any volume to the other."""
 
 
 @dataclass(frozen=True, eq=False)
 class Seam:
-    """What two pairs both saw, in patches: how far apart (N,) mm, with the sigmas (N,) of that."""
+    """What two pairs both saw, by patches: distances (N,) mm and their sigmas (N,)."""
 
     pairs: tuple[str, str]
     apart_mm: Array
@@ -61,7 +61,7 @@ class Seam:
 
 
 def typical_step(seams: Sequence[Seam]) -> float:
-    """mm: what three of four patches keep to, less what noise alone would make it.
+    """Step that three of four patches do not exceed, less what noise alone would give, mm.
 
     One patch in four may show something else, such as hair or a hand that moved.
     """
@@ -80,8 +80,11 @@ class Misfit:
 
 @dataclass(frozen=True, eq=False)
 class SeamReport:
-    """The seams of a scan.  groups: see `find_misfits`.  untied: groups of pairs that share no surface
-    with the largest, which shows how they stand."""
+    """The seams of a scan.
+
+    groups: see `find_misfits`.
+    untied: groups of pairs that share no surface with the largest, so their place is not confirmed.
+    """
 
     seams: tuple[Seam, ...]
     groups: Mapping[str, frozenset[str]]
@@ -93,7 +96,11 @@ def judge_seams(
     rig_from_camera: Mapping[str, RigidTransform],
     poles: Mapping[str, str],
 ) -> SeamReport:
-    """images: cleaned.  poles: of each pair that stands on one."""
+    """Find the seams of a scan.
+
+    images: cleaned.
+    poles: the pole of each pair that stands on one.
+    """
     seams = find_seams(images, rig_from_camera)
     names = [image.pair for image in images]
     groups = moving_alone(names, poles)
@@ -106,7 +113,7 @@ def find_seams(
     images: Sequence[RangeImage],
     rig_from_camera: Mapping[str, RigidTransform],
 ) -> tuple[Seam, ...]:
-    """Of every two pairs that saw the same surface, after alignment; images: cleaned."""
+    """Seams of every two pairs that saw the same surface, after alignment; images: cleaned."""
     with ThreadPoolExecutor(THREADS) as pool:
         seen = list(pool.map(lambda im: alignment_points(im, SPACING_MM, SEAM_RIM_PX), images))
         found = pool.map(lambda two: _seam(two[0], two[1], rig_from_camera), combinations(seen, 2))
@@ -118,7 +125,7 @@ def find_misfits(
 ) -> tuple[Misfit, ...]:
     """The fewest pairs without which all others keep to `limit_mm`, worst first.
 
-    groups: by what they are called, poles and single pairs: what may have moved by itself.
+    groups: what may have moved by itself, poles and single pairs, by name.
     """
     found: list[Misfit] = []
     while _worst_step(groups, seams) > limit_mm:
@@ -166,7 +173,7 @@ def _seam(
 
 
 def _patches(matches: Matches) -> tuple[Array, Array]:
-    """Median distances of patches, and their sigmas from how the distances scatter."""
+    """Median distances of patches, and their sigmas from the scatter of the distances."""
     x, y, z = np.floor(matches.points / PATCH_MM).astype(np.int64).T
     _, number, count = np.unique((x * FAR + y) * FAR + z, return_inverse=True, return_counts=True)
     middle = _medians(matches.distances, number, count)
@@ -179,9 +186,9 @@ def _patches(matches: Matches) -> tuple[Array, Array]:
 
 
 def _medians(values: Array, number: Indices, count: Indices) -> Array:
-    """Of the values of each number, from 0."""
+    """Median of the values of each number, counted from 0."""
     rising = np.argsort(values)
-    # Few patches: numbers of 16 bits are sorted in one pass.
+    # There are few patches, and 16-bit numbers are sorted in one pass.
     few = number[rising].astype(np.min_scalar_type(len(count)))
     ordered = values[rising[np.argsort(few, kind="stable")]]
     return ordered[np.cumsum(count) - count + count // 2]

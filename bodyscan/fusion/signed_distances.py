@@ -11,15 +11,15 @@ from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.bricks import SIDE, Bricks
 
 REACH_CELLS = 1.3  # of a point: an edge that crosses the surface ends within one cell
-MOST_SIGMAS = 3.0  # a point says at most so much more, or less, than the middle one
+MOST_SIGMAS = 3.0  # largest ratio of a point's sigma to the median one, either way
 
 
 def splat(cloud: BodyCloud, bricks: Bricks, reach: float = REACH_CELLS) -> tuple[Floats, Floats]:
-    """Signed distances (B, SIDE, SIDE, SIDE) mm, negative inside, and what they weigh.
+    """Signed distances (B, SIDE, SIDE, SIDE) mm, negative inside, and their weights.
 
-    A point claims its tangent plane: at the nodes within `reach` cells it says how far these lie
-    before it, and is believed the less the farther they are from the point itself; and by its
-    sigma. 1: as much as one point right at the node. Without points: weight and distance 0.
+    Each point contributes its tangent plane to the nodes within `reach` cells, as their distance in
+    front of it, with a weight that falls with their distance from the point and with its sigma. A
+    weight of 1 is one point right at the node; without points both weight and distance are 0.
     """
     middle = float(np.median(cloud.sigma_mm))
     relative = np.clip(cloud.sigma_mm / max(middle, 1e-6), 1.0 / MOST_SIGMAS, MOST_SIGMAS)
@@ -61,7 +61,7 @@ def _add_planes(
     sums: Floats,
     weights: Floats,
 ) -> None:
-    """Sums of weight times distance, and of weights, in cells; places: (N, 3), in cells."""
+    """Add up weights, and weights times distances in cells; places: (N, 3), in cells."""
     size = int(2 * reach) + 1
     for n in range(len(places)):
         x, y, z = places[n, 0], places[n, 1], places[n, 2]

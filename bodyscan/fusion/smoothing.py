@@ -1,7 +1,7 @@
-"""A range image becomes a smooth surface with normals.
+"""Turn a range image into a smooth surface with normals.
 
-On a plane the inverse depth 1/z is affine in ideal image coordinates, so that a quadratic in the
-pixel coordinates, fitted around each pixel, follows a curved body closely.
+On a plane the inverse depth 1/z is affine in ideal image coordinates, so that a quadratic in pixel
+coordinates, fitted around each pixel, follows a curved body closely.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from bodyscan.reconstruction.range_image import RangeImage
 
 Numbers = NDArray[np.int32]
 
-JUMP_PX = 8.0  # in depth between neighbours, in widths of a pixel: steeper than STEEPEST_COSINE
-STEEPEST_COSINE = 0.17  # a surface seen at more than 80 degrees is not worth having
-OWN_SHARE = np.float32(0.01)  # of a pixel's sigma is its own: what rounding leaves of a difference
-EVERY = 4  # row that is looked at to learn how large a pixel is
+JUMP_PX = 8.0  # jump in depth between neighbours, in pixel widths: steeper than STEEPEST_COSINE
+STEEPEST_COSINE = 0.17  # a surface seen at more than 80 degrees is useless
+OWN_SHARE = np.float32(0.01)  # least share of its sigma that is a pixel's own: rounding
+EVERY = 4  # one row in this many is used to find the size of a pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +36,10 @@ class SmoothSurface:
 
     corner: (column, row) of the crop's first pixel in the camera's image.
     number: (h, w) int32, of the point that a pixel shows, row by row; -1 where it shows none.
-    points, normals: (n, 3) float32, mm, unit and towards the camera.
-    sigma_mm: (n,) float32, standard deviation of the smoothed point along its normal: what smoothing
-    leaves of the pixels' own noise, and all that they share.
+    points: (n, 3) float32, mm.
+    normals: (n, 3) float32, unit, towards the camera.
+    sigma_mm: (n,) float32, standard deviation of the smoothed point along its normal: what
+        smoothing leaves of the pixels' own noise, and everything that they share.
     rim: (n,) float32, rises from near 0 at the rim to 1 well inside.
     weight: (n,) float32, rim/sigma^2.
     colours: (n,) uint8.
@@ -79,7 +80,7 @@ def smooth(
 
 
 def pixel_size(inverse: Floats, camera: Camera) -> float:
-    """mm from pixel to pixel on what is half-way deep; inverse: 1/z, 0 where nothing was measured."""
+    """Size of a pixel at the median depth, mm; inverse: 1/z, 0 where nothing was measured."""
     some = inverse[::EVERY]
     return float(np.median(1.0 / some[some > 0])) / camera.alpha
 
@@ -132,8 +133,10 @@ def _surface(
 
 
 def _distance_to_rim(depth: Floats, jump: float) -> Floats:
-    """Pixels to the nearest one, from 1, that has no depth (0) or lies `jump` of its depth in front
-    of another."""
+    """Distance in pixels, from 1, to the nearest rim.
+
+    A rim is a pixel without depth (0), or one in front of another by `jump` of its depth.
+    """
     inner = cv2.dilate(depth, np.ones((3, 3), np.uint8)) < np.float32(1.0 + jump) * depth
     padded = np.pad(inner.astype(np.uint8), 1)
     return cv2.distanceTransform(padded, cv2.DIST_L2, 3)[1:-1, 1:-1] + np.float32(1.0)
@@ -143,8 +146,10 @@ def _distance_to_rim(depth: Floats, jump: float) -> Floats:
 def inverse_depths(
     points: Floats, sigma_mm: Floats, common_mm: Floats, ends: tuple[int, int, int, int]
 ) -> tuple[Floats, Floats]:
-    """1/z and its standard deviation (h, w), less what neighbours share, 0 where nothing was measured,
-    within `ends`."""
+    """1/z and its standard deviation (h, w) within `ends`, without what neighbours share.
+
+    0 where nothing was measured.
+    """
     top, bottom, left, right = ends
     inverse = np.zeros((bottom - top, right - left), np.float32)
     noise = np.zeros_like(inverse)
@@ -172,10 +177,10 @@ def _lay_out(
     images: tuple[Floats, Numbers],
     surface: tuple[Floats, Floats, Floats],
 ) -> int:
-    """Fill in depth and number (h, w), and points, normals and sigmas; how many there are.
+    """Fill in depth and number (h, w), and points, normals and sigmas; return how many there are.
 
-    measured: points (height, width, 3), camera frame, and the common part of their sigmas.  fit: value,
-    slopes, sigma of 1/z.
+    measured: points (height, width, 3), camera frame, and the shared part of their sigmas.
+    fit: value, slopes and sigma of 1/z.
     rig_from_camera: rotation and translation.
     """
     value, slope_u, slope_v, fit_sigma = fit
@@ -200,7 +205,7 @@ def _lay_out(
                 along = rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2]
                 points[n, k] = along * z + translation[k]
                 normals[n, k] = rotation[k, 0] * a + rotation[k, 1] * b + rotation[k, 2] * c
-            # Along the ray a point moves by length * dz; along the normal by its cosine's share.
+            # Along the ray a point moves by length * dz, along the normal by the cosine of that.
             own, shared = fit_sigma[row, column] * z * z * length, common_mm[i, j]
             sigma[n] = np.sqrt(own * own + shared * shared) * cosine
             n += 1
@@ -213,13 +218,13 @@ def _normal(
 ) -> tuple[float, float, float]:
     """Unit normal towards the camera, camera frame, from the slopes of 1/z per pixel.
 
-    A plane n.P = d has 1/z = n.(x, y, 1) / d in ideal normalized coordinates; the slopes per
-    pixel are carried there by the derivative of the projection.
+    A plane n.P = d has 1/z = n.(x, y, 1) / d in ideal normalised coordinates; the slopes per pixel
+    are converted to these by the derivative of the projection.
     """
     u_by_x, u_by_y, v_by_x, v_by_y = slopes(projection, x, y)
     slope_x = by_u * u_by_x + by_v * v_by_x
     slope_y = by_u * u_by_y + by_v * v_by_y
     rest = inverse - x * slope_x - y * slope_y
-    # n.P has the sign of d * (1/d), so n looks away from the camera: turn it round.
+    # n.P has the sign of d * (1/d), so n points away from the camera: flip it.
     shrink = -1.0 / np.sqrt(slope_x * slope_x + slope_y * slope_y + rest * rest)
     return slope_x * shrink, slope_y * shrink, rest * shrink

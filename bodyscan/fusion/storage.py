@@ -1,4 +1,4 @@
-"""A scan's result on disk: `cloud.ply`, `mesh.ply`, and `scan.json`, written last, that vouches."""
+"""A scan's result on disk: `cloud.ply`, `mesh.ply`, and `scan.json`, written last."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Origin:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """As scan.json begins."""
+        """The entries that scan.json begins with."""
         return {
             "schema": SCHEMA,
             "version": VERSION,
@@ -63,7 +63,7 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class StoredScan:
-    """facts: the content of scan.json."""
+    """A scan as read back; facts: the content of scan.json."""
 
     cloud: BodyCloud
     mesh: BodyMesh
@@ -71,7 +71,7 @@ class StoredScan:
 
 
 def make_room(folder: Path, overwrite: bool) -> None:
-    """Raises ResultError if a model lies in `folder` already and may not be replaced."""
+    """Raise ResultError if `folder` holds a model that may not be replaced."""
     if (folder / FILE_NAME).exists() and (folder / CLOUD_NAME).exists() and not overwrite:
         raise ResultError(
             "a scan's result lies here already",
@@ -81,9 +81,9 @@ def make_room(folder: Path, overwrite: bool) -> None:
 
 
 def clear(folder: Path) -> None:
-    """Remove a result and what was made of it: nothing of one person stays beside another's.
+    """Remove a result and what was made of it, so that no two persons' files stay side by side.
 
-    A folder that holds no result is left as it is.
+    A folder that holds no result is left unchanged.
     """
     if not (folder / FILE_NAME).exists():
         return
@@ -96,7 +96,7 @@ def clear(folder: Path) -> None:
 
 
 def save_scan(scan: Scan, folder: Path, origin: Origin) -> Path:
-    """Write the body model and what it is into `folder`; returns the path of scan.json."""
+    """Write the body model and its description into `folder`; return the path of scan.json."""
     (folder / FILE_NAME).unlink(missing_ok=True)
 
     def write(name: str) -> str:
@@ -132,7 +132,7 @@ def save_scan(scan: Scan, folder: Path, origin: Origin) -> Path:
 
 
 def save_failure(error: ScanFailed, folder: Path, origin: Origin) -> Path:
-    """Write a scan.json that says why there is no model; one of an earlier try goes."""
+    """Write a scan.json that says why there is no model; files of an earlier try are removed."""
     for name in (FILE_NAME, CLOUD_NAME, MESH_NAME):
         (folder / name).unlink(missing_ok=True)
     reasons = tuple(line.strip() for line in str(error).splitlines())
@@ -144,8 +144,9 @@ def save_failure(error: ScanFailed, folder: Path, origin: Origin) -> Path:
 
 
 def load_scan(folder: Path) -> StoredScan:
-    """Read what `save_scan` wrote. Raises ResultError if it is missing, incomplete or damaged, or
-    if the scan gave no model.
+    """Read what `save_scan` wrote.
+
+    Raises ResultError if it is missing, incomplete or damaged, or if the scan gave no model.
     """
     facts = read_facts(folder)
     if "sha256" not in facts:
@@ -167,7 +168,7 @@ def load_scan(folder: Path) -> StoredScan:
 
 
 def refuse_repeat(folder: Path, facts: Mapping[str, Any]) -> None:
-    """Raises FailedWork for a scan to be repeated: what is made of it would be taken for right."""
+    """Raise FailedWork for a scan to be repeated: anything made from it would be taken as right."""
     verdict = facts.get("verdict") or {}
     if verdict.get("grade") == "repeat":
         reasons = "".join(f"\n  {reason}" for reason in verdict["reasons"])

@@ -1,7 +1,7 @@
 """What the points of a cloud say about each vertex of a surface laid through them.
 
-Every point claims its tangent plane. Around a vertex that was measured there are points enough,
-their planes agree with each other, and they pass close to the vertex.
+Every point contributes its tangent plane. Around a measured vertex there are enough points, their
+planes agree with each other, and they pass close to the vertex.
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ NEIGHBOURS = 8
 RANGE = 0.5
 LIFTED = 0.25
 TORN = 0.125
-LEAST_WEIGHT = 0.3  # of a point right at the vertex: one point is 3 mm away
-LEAST_SHARE = 1 / 6  # of what the middle vertex has: at a straight rim it is a half
+LEAST_WEIGHT = 0.3  # relative to a point right at the vertex: one point 3 mm away
+LEAST_SHARE = 1 / 6  # of the median vertex's weight: at a straight rim it is a half
 
-STEEPEST_TURN = 0.3  # cosine of the angle by which a face may turn
+STEEPEST_TURN = 0.3  # cosine of the largest angle by which a face may turn
 
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """Of V vertices by the points within a reach.
+    """Support of V vertices by the points within a reach.
 
-    nearest: (V,) the nearest point.  sigma_mm: (V,) its standard deviation.
-    weight: (V,) of the nearest points together, 1 for one at the vertex itself that faces as it does,
-    0 if there is none.
-    shift_mm: (V,) from the vertex along its normal to where those points' tangent planes lie on the
-    average.  spread_mm: (V,) RMS of the planes about that average.
+    nearest: index of the nearest point, (V,).
+    sigma_mm: its standard deviation, (V,).
+    weight: of the nearest points together, (V,): 1 for one at the vertex itself that faces like it,
+        0 if there is none.
+    shift_mm: from the vertex along its normal to the mean of those points' tangent planes, (V,).
+    spread_mm: RMS of the planes about that mean, (V,).
     """
 
     nearest: Indices
@@ -47,10 +48,10 @@ class Support:
 
     @property
     def measured(self) -> Mask:
-        """(V,) whether a vertex lies where the points say, and these agree.
+        """(V,): whether a vertex lies where the points are, and these agree.
 
-        Not beyond the rim of what was seen (too little weight), not where the grid's cells lift the
-        surface off the points (fingertips), not where points of different surfaces meet (between
+        False beyond the rim of what was seen (too little weight), where the grid's cells lift the
+        surface off the points (fingertips), and where points of different surfaces meet (between
         toes, at the corner of an eye).
         """
         lifted = np.abs(self.shift_mm) > np.maximum(LIFTED * self.reach_mm, 4.0 * self.sigma_mm)
@@ -60,7 +61,7 @@ class Support:
 
 
 def support(vertices: Array, normals: Floats, cloud: BodyCloud, reach_mm: float) -> Support:
-    """Of vertices (V, 3) with unit normals (V, 3) by a cloud."""
+    """Support of vertices (V, 3) with unit normals (V, 3) by a cloud."""
     distance, near = PointColumns.of(cloud.points, reach_mm).nearest(vertices, NEIGHBOURS)
     weight, shift, spread = _average_planes(
         np.ascontiguousarray(vertices),
@@ -71,15 +72,15 @@ def support(vertices: Array, normals: Floats, cloud: BodyCloud, reach_mm: float)
         cloud.normals,
         RANGE * reach_mm,
     )
-    nearest = np.minimum(near[:, 0], len(cloud.points) - 1)  # of those without: any
+    nearest = np.minimum(near[:, 0], len(cloud.points) - 1)  # for those without: any
     return Support(nearest, cloud.sigma_mm[nearest], weight, shift, spread, reach_mm)
 
 
 def fit_to_points(vertices: Array, faces: Indices, normals: Floats, around: Support) -> Array:
-    """The vertices (V, 3), moved along their normals to where the points around say.
+    """Move the vertices (V, 3) along their normals to where the points around are.
 
-    The less the less weight these have: where the points end, the surface has no step. Where a face
-    would fold over, its corners move by half of that, then a quarter, then not at all.
+    The move is smaller if their weight is, so that there is no step where the points end. Where a
+    face would fold over, its corners move by half of that, then a quarter, then not at all.
     """
     farthest = LIFTED * around.reach_mm
     move = np.minimum(around.weight, 1.0) * np.clip(around.shift_mm, -farthest, farthest)
@@ -108,9 +109,12 @@ def _average_planes(
     point_normals: Floats,
     scale_mm: float,
 ) -> tuple[Array, Array, Array]:
-    """Weight, shift and spread as in `Support`, from the nearest points (V, k), as scipy gives them:
-    sorted, infinitely far where there are no more. A point's weight falls off as a Gaussian with
-    its distance; a point that faces another way has no say in the shift, but in the spread.
+    """Weight, shift and spread as in `Support`, from the nearest points.
+
+    distance, near: (V, k), sorted by distance, infinite where there are no more points.
+
+    A point's weight falls off as a Gaussian of its distance; a point that faces another direction
+    counts for the spread but not for the shift.
     """
     count, most = near.shape
     weight, shift, spread = np.zeros(count), np.zeros(count), np.zeros(count)

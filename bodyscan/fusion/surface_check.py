@@ -1,6 +1,6 @@
-"""The mesh held against the range images: what of it was measured, and what each pair should have seen.
+"""Compare the mesh with the range images: what was measured, and what each pair should have seen.
 
-The cloud is thinned to as many points as were asked for; what was measured does not depend on that.
+The cloud is thinned to a requested number of points; what was measured does not depend on that.
 """
 
 from __future__ import annotations
@@ -18,20 +18,23 @@ from bodyscan.reconstruction.range_image import RangeImage
 
 SPOTS = 20_000
 REACH_MM = 10.0
-"""A mesh of few points strays from what was measured by that; webs and soles lie farther off."""
+"""A mesh of few points may be this far off what was measured; webs and soles are farther off."""
 FACING = 0.5
-"""Cosine from which on a camera that looks at skin should measure it, 60 degrees."""
+"""Least cosine at which a camera that looks at skin should measure it, 60 degrees."""
 FEWEST_SPOTS = 50
 WHITE = 254
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceCheck:
-    """Some faces: heights (N,) mm, areas (N,) mm2 they stand for, and whether nobody measured them.
+    """A sample of the mesh's faces, and how much each pair measured.
 
-    yields: of each pair, the share of what others measured, and what it looks at, that it measured
-    something of; pairs that look at next to nothing are left out.  saturated: of each pair, the share
-    of what it measured, or looked at in vain, that is white in its lit image.
+    heights_mm: heights of the faces, (N,).
+    areas_mm2: areas that they stand for, (N,).
+    filled: whether nobody measured them, (N,).
+    yields: by pair, share of the faces that it looks at and others measured, at which it measured
+        anything; pairs that look at next to nothing are left out.
+    saturated: by pair, share of those faces that are white in its lit image.
     """
 
     heights_mm: Array
@@ -48,7 +51,7 @@ class SurfaceCheck:
 def check_surface(
     mesh: BodyMesh, images: Sequence[RangeImage], rig_from_camera: Mapping[str, RigidTransform]
 ) -> SurfaceCheck:
-    """images: cleaned, of all pairs that gave some."""
+    """Compare the mesh with range images: cleaned, of all pairs that gave some."""
     some = slice(None, None, max(1, len(mesh.faces) // SPOTS))
     corners = mesh.vertices[mesh.faces[some]]
     places = corners.mean(axis=1)
@@ -58,7 +61,7 @@ def check_surface(
     count = np.sum([look.measured for look in looks], axis=0)
     yields, saturated = {}, {}
     for image, look in zip(images, looks, strict=True):
-        # What this pair alone says of itself is no witness.
+        # What a pair alone says about itself is not evidence.
         asked = look.faces & (count - look.measured > 0)
         if np.count_nonzero(asked) >= FEWEST_SPOTS:
             yields[image.pair] = float(np.mean(look.shown[asked]))
@@ -69,8 +72,13 @@ def check_surface(
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """One camera at N spots: which face it inside its picture, at which it measured something, at
-    which it measured the spot itself, and which are white."""
+    """One camera's view of N spots.
+
+    faces: spots that face it inside its image.
+    shown: spots at whose pixel it measured something.
+    measured: spots that it measured themselves.
+    white: spots that are white in its lit image.
+    """
 
     faces: Mask
     shown: Mask

@@ -1,4 +1,4 @@
-"""Many points to a given number of evenly spread samples, one for each voxel."""
+"""Thin many points to a given number of evenly spread samples, one for each voxel."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ Numbers = NDArray[np.uint32]
 
 FEWEST_POINTS = 1000
 FIRST_GUESS_MM = 1.2
-CLOSE_ENOUGH = 0.05  # to the wanted number, for the last correction to settle the rest
+CLOSE_ENOUGH = 0.05  # to the wanted number; the last correction settles the rest
 ROUNDS = 4
-SOME_LAYERS, MANY = 4, 300_000  # of the blocks of voxels every so many layers tell enough
-MOST_BLOCKS = 1 << 28  # of voxels in the box around all points
+SOME_LAYERS, MANY = 4, 300_000  # with many points, one layer of blocks in so many is counted
+MOST_BLOCKS = 1 << 28  # in the box around all points
 BADNESS_STEPS = np.float32(1 << 29)
 EMPTY = np.int64((1 << 63) - 1)
 
@@ -32,7 +32,8 @@ EMPTY = np.int64((1 << 63) - 1)
 class Samples:
     """N points taken from the surfaces, surface by surface, rig frame.
 
-    starts: (surfaces + 1,) where each one's points begin.  weight: as in SmoothSurface.
+    starts: where each surface's points begin, (surfaces + 1,).
+    weight: as in SmoothSurface.
     """
 
     points: Floats
@@ -44,7 +45,10 @@ class Samples:
 
 
 def take_samples(surfaces: Sequence[SmoothSurface], points: int) -> Samples:
-    """About `points` evenly spread samples of all surfaces."""
+    """About `points` evenly spread samples of all surfaces.
+
+    Raises ScanFailed if there are next to no points.
+    """
     ends = np.cumsum([0, *(len(surface.points) for surface in surfaces)])
     if ends[-1] < FEWEST_POINTS:
         raise ScanFailed(
@@ -76,10 +80,11 @@ def take_samples(surfaces: Sequence[SmoothSurface], points: int) -> Samples:
 
 
 def voxel_size_for(points: Floats, wanted: int) -> float:
-    """Edge (mm) of the voxels of which about `wanted` are occupied; points (N, 3) mm.
+    """Edge (mm) of voxels of which about `wanted` are occupied; points (N, 3) mm.
 
-    A surface occupies voxels in inverse proportion to their edge squared, as long as its points
-    lie closer together than that; corrections settle it. Of many points a part is looked at.
+    The number of voxels that a surface occupies is inversely proportional to the square of their
+    edge, as long as points are closer than that; corrections settle the rest. If there are many
+    points, only part of them is counted.
     """
     size = FIRST_GUESS_MM
     box = _bounds(points)
@@ -96,7 +101,7 @@ def voxel_size_for(points: Floats, wanted: int) -> float:
 def one_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDArray[np.intp]:
     """Indices of one point in each occupied voxel: the nearest to its centre.
 
-    `second_rate` (N,) points are taken only where a voxel has no other.
+    second_rate: points taken only where a voxel has no other, (N,).
     """
     box, scale = _bounds(points), np.float32(1.0 / voxel_mm)
     chosen = np.zeros(len(points), np.bool_)
@@ -112,10 +117,11 @@ def one_per_voxel(points: Floats, second_rate: Mask, voxel_mm: float) -> NDArray
 
 @dataclass(frozen=True, eq=False)
 class _Voxels:
-    """The voxels that points lie in.
+    """The voxels that points lie in, numbered by blocks, so that neighbours are close in memory.
 
-    They are numbered by blocks, cubes of them, so that neighbours lie together in memory.
-    point: (M,) index of a point.  number: (M,) of its voxel.  count: how many numbers there are.
+    point: index of a point, (M,).
+    number: number of its voxel, (M,).
+    count: how many numbers there are.
     """
 
     point: Numbers
@@ -126,11 +132,11 @@ class _Voxels:
     def of(
         points: Floats, box: tuple[Floats, Floats], voxel_mm: float, layers: int, layer: int = 0
     ) -> _Voxels:
-        """Of the points in every `layers`-th layer of blocks, from `layer` on."""
+        """Voxels of the points in every `layers`-th layer of blocks, starting from `layer`."""
         low, high = box
         scale = np.float32(1.0 / voxel_mm)
         across = np.floor((high - low) * scale).astype(int) + 1
-        bits = 2  # blocks of 4 x 4 x 4, or more for a box that has too many of them
+        bits = 2  # blocks of 4 x 4 x 4, or larger for a box that would have too many
         while np.prod((across >> bits) + 1.0) > MOST_BLOCKS:
             bits += 1
         blocks = np.zeros((across >> bits) + 1, np.int32)
@@ -164,8 +170,10 @@ def _number(
     point: Numbers,
     number: Numbers,
 ) -> tuple[int, int]:
-    """Fill in `point` and `number`, numbering blocks (0: not yet met) as they are met; how many
-    points, and how many blocks."""
+    """Fill in `point` and `number`, numbering blocks as they are met (0: not yet met).
+
+    Returns the numbers of points and of blocks.
+    """
     kept, met, within = 0, 0, (1 << bits) - 1
     for n in range(len(points)):
         z = int((points[n, 2] - low[2]) * scale)
@@ -185,7 +193,7 @@ def _number(
 
 @compiled
 def _count_occupied(voxels: Numbers, count: int) -> int:
-    """How many of `count` voxels are among `voxels`."""
+    """How many of `count` voxels occur in `voxels`."""
     found = np.zeros(count, np.bool_)
     occupied = 0
     for voxel in voxels:
@@ -205,7 +213,7 @@ def _choose(
     count: int,
     chosen: Mask,
 ) -> None:
-    """Mark in chosen (N,) the best points of their voxels; see `_Voxels`."""
+    """Mark the best point of each voxel in chosen (N,); see `_Voxels`."""
     # Badness and index share one integer, so that each voxel is one place in memory.
     best = np.full(count, EMPTY)
     for m in range(len(point)):

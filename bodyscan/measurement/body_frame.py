@@ -1,4 +1,4 @@
-"""The body's own frame: floor at z = 0, origin under the body, x the way it faces, y to its left."""
+"""The body's own frame: floor at z = 0, origin under the body, x where it faces, y to its left."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.geometry.transforms import RigidTransform
 
-UPPER_BODY = 0.45  # of the stature: hips, trunk and arms, which are wider than they are deep
+UPPER_BODY = 0.45  # of the stature: hips, trunk and arms, which together are wider than deep
 
 
 def rig_from_body(vertices: Array) -> RigidTransform:
-    """Of a standing body, vertices (V, 3) mm in the rig frame, evenly spread.
+    """Pose of a standing body in the rig frame, from evenly spread vertices (V, 3) mm.
 
-    Only turned about the vertical and moved along the floor.  The upper body is widest from side to
-    side; of the two ways across that, the subject faces the one nearer to the rig's x.
+    It is only turned about the vertical and moved along the floor. The upper body is widest from
+    side to side; of the two directions across that, the subject faces the one nearer to the rig's
+    x.
     """
     upper = vertices[vertices[:, 2] > UPPER_BODY * vertices[:, 2].max(), :2]
     middle = 0.5 * (np.percentile(upper, 2, axis=0) + np.percentile(upper, 98, axis=0))

@@ -1,7 +1,7 @@
-"""Where the head ends under hair: an ellipsoid through the skin that shows, as heads are made.
+"""Where the head ends under hair: an ellipsoid through the visible skin, with usual head sizes.
 
-Forehead and temples lie on the braincase, which is an ellipsoid within a few millimetres; what they
-leave open of it is known of heads in general. Hair is on top of the head, never below.
+Forehead and temples lie on the braincase, which is an ellipsoid to within a few millimetres; what
+they leave open is taken from heads in general. Hair only adds on top of the head.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minim
 BRAINCASE_MM = 85.0
 """Below the top of the hair: brows begin 95 to 125 mm below the top of an adult's head."""
 CELL_MM = 15.0
-"""A braincase's dents and bulges are as wide as that and wider: what lies closer errs alike."""
+"""Size of a braincase's smallest dents and bulges: closer points err alike."""
 MISFIT_MM = 4.0
 """Standard deviation of a braincase from an ellipsoid."""
 FEWEST = 12
 """Cells: 27 cm2 of skin, half a forehead."""
 AXES_MM = np.array([97.0, 76.0, 97.0])
-"""Half the length and breadth of heads (ANSUR II, both sexes: 195 and 151 mm), and from the level of
+"""Half the length and breadth of heads (ANSUR II, both sexes: 195 and 151 mm), and the height from
 the brows to the top."""
 SIZE, SHAPE = 0.06, 0.04
-"""Standard deviations, relative: of all three together (children too), and of each by itself."""
+"""Relative standard deviations: of all three axes together (children included), and of each."""
 SKIN = Noise("skin from a braincase", cauchy=2.5, known=1.0)
-FAR_MM = 100.0  # of a centre from where it is first looked for: nothing is known of it
+FAR_MM = 100.0  # prior of the centre about its start, which says nothing
 
 
 @dataclass(frozen=True)
 class HeadTop:
-    """height_mm: of the top of the head over the floor.  sigma_mm: of that."""
+    """Height of the top of the head above the floor, mm, and its sigma."""
 
     height_mm: float
     sigma_mm: float
@@ -41,7 +41,7 @@ class HeadTop:
 
 @dataclass(frozen=True, eq=False)
 class _Ellipsoid:
-    """centre: (3,) mm.  size, shape: logarithms of the axes over the usual, all and each, (4,)."""
+    """centre: (3,) mm.  size: logarithms of the axes over the usual, common and for each, (4,)."""
 
     centre: Array
     size: Array
@@ -55,7 +55,7 @@ class _Ellipsoid:
         return float(self.centre[2] + self.axes[2])
 
     def distances(self, points: Array) -> tuple[Array, Array]:
-        """(N,) mm of points (N, 3) from the surface, to first order, and by centre and size (N, 7)."""
+        """Distances (N,) mm of points (N, 3) to first order, and by centre and size (N, 7)."""
         scaled = (points - self.centre) / self.axes
         radius = np.linalg.norm(scaled, axis=1)
         slope = scaled / self.axes / radius[:, None]
@@ -66,9 +66,12 @@ class _Ellipsoid:
 
 
 def estimate_head_top(skin: Array, hair_top_mm: float) -> HeadTop | None:
-    """From the skin (N, 3) mm of a head, in the body's frame (x ahead, z up), and how high its hair
-    reaches; None where no skin shows. Where forehead and temples are covered it is no more than
-    that the head ends between skin and hair.
+    """Estimate the top of the head from its skin and the height of its hair.
+
+    skin: points (N, 3) mm in the body frame (x forward, z up).
+
+    None if no skin shows. If forehead and temples are covered, only that the head ends between skin
+    and hair is known.
     """
     if not len(skin):
         return None
@@ -85,7 +88,7 @@ def estimate_head_top(skin: Array, hair_top_mm: float) -> HeadTop | None:
 
 
 def _fit(places: Array, hair_top_mm: float) -> Solution[_Ellipsoid]:
-    """To skin at places (N, 3), with what is known of heads as priors."""
+    """Fit an ellipsoid to skin at places (N, 3), with usual head sizes as priors."""
     middle = np.array([places[:, 0].max() - AXES_MM[0], places[:, 1].mean(), 0.0])
     middle[2] = hair_top_mm - AXES_MM[2]
     known = np.concatenate([np.full(3, FAR_MM), [SIZE], np.full(3, SHAPE)])
@@ -105,7 +108,7 @@ def _fit(places: Array, hair_top_mm: float) -> Solution[_Ellipsoid]:
 
 
 def _between(estimate: float, sigma: float, low: float, high: float) -> HeadTop:
-    """What is left of a normal distribution between what skin and hair leave open."""
+    """Truncate a normal distribution to the range that skin and hair leave open."""
     ends = (low - estimate) / sigma, (high - estimate) / sigma
     left = truncnorm(*ends, loc=estimate, scale=sigma)
     return HeadTop(float(left.mean()), float(left.std()))

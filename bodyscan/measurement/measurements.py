@@ -1,4 +1,4 @@
-"""First measurements of a body mesh, in the pose in which it stood."""
+"""Basic measurements of a body mesh, in the pose in which the body stood."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ SPECK_MM2 = 50.0  # less than a fingertip
 CROWN_MM = 20.0
 MOSTLY = 0.5
 HEAD_MM, FACE_MM = 150.0, 250.0
-"""From a crown sidewards, what a head reaches at most; down to the chin."""
+"""Largest sideways reach of a head from its crown, and largest distance down to the chin."""
 HAND_MM = 200.0
-"""Below where a hand begins to touch the body it may go on to touch."""
+"""Below the height where a hand first touches the body, it may keep touching this far down."""
 
 
 @dataclass(frozen=True)
@@ -35,16 +35,18 @@ class Girth:
     """One part of the body in a horizontal slice.
 
     part: trunk (neck and head too), left leg, right leg, left arm, right arm; "trunk and left arm"
-    where a hand touches the trunk and the outline goes round both, "trunk and load" where it goes round
-    what no body is shaped like.  girth_mm: along the surface.
-    tape_mm: as a tape runs (convex hull).  width_mm, depth_mm: extent to the side and forward.
-    centre_mm: (x, y), body frame.  measured: share of girth_mm that was measured, not filled.
-    girth_range_mm, tape_range_mm: what they may be, given what was not: see `Outline`.
-
-    A trunk that filled surface joins to arms is cut there, and closed straight.
-    breath_sigma_mm: standard deviation of girth_mm and tape_mm by what is not known of the breath; None
-    where nothing is.  regions: shares of girth_mm that run over skin, hair, dark cloth and what is
-    unsure, by their names; None where that is not known.
+        where a hand touches the trunk and the outline goes round both; "trunk and load" where it
+        goes round something that no body is shaped like.
+    girth_mm: along the surface. A trunk joined to arms by filled surface is cut there, and closed
+        straight.
+    tape_mm: as a tape runs (convex hull).
+    width_mm, depth_mm: extent to the side and forward.
+    centre_mm: (x, y), body frame.
+    measured: share of girth_mm that was measured, not filled.
+    girth_range_mm, tape_range_mm: possible values, given what was not measured: see `Outline`.
+    breath_sigma_mm: sigma of girth_mm and tape_mm due to the breath's uncertainty; None if that
+        is not known.
+    regions: shares of girth_mm over skin, hair, dark cloth and unsure, by name; None if not known.
     """
 
     part: str
@@ -62,13 +64,13 @@ class Girth:
 
     @property
     def measured_skin(self) -> float:
-        """Share of girth_mm that was measured and is no hair."""
+        """Share of girth_mm that was measured and is not hair."""
         return self.measured - (self.regions[NAMES[HAIR]] if self.regions else 0.0)
 
 
 @dataclass(frozen=True)
 class Slice:
-    """The name_parts of the body at one height over the floor."""
+    """The parts of the body at one height above the floor."""
 
     height_mm: float
     girths: tuple[Girth, ...]
@@ -81,11 +83,15 @@ class Slice:
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """stature_mm: highest point over the floor, in pose, of hair where there is some.
-    stature_measured: share of the crown's surface (its top 20 mm) that was measured.  measured: share
-    of the whole surface.  at_mean_breath: whether the breath of the scan's own moment was taken out.
-    crown: the region that most of the measured crown is; None where that is not known.  head: where
-    the head ends, under hair too; None where nothing says so.  regions: shares of the area.
+    """Measurements of a body.
+
+    stature_mm: highest point above the floor, in pose, including hair.
+    stature_measured: share of the crown's surface (its top 20 mm) that was measured.
+    measured: share of the whole surface that was measured.
+    at_mean_breath: whether the breath of the scan's own moment was removed.
+    crown: the region of most of the measured crown; None if not known.
+    head: where the head ends, even under hair; None if unknown.
+    regions: shares of the area.
     """
 
     stature_mm: float
@@ -104,10 +110,12 @@ class Measurements:
 def measure(
     mesh: BodyMesh, heights_mm: Sequence[float] | None = None, *, mean_breath: bool = True
 ) -> Measurements:
-    """Stature, volume, area, and the slices at heights (every 100 mm of the body if none are given).
+    """Measure stature, volume, area, and slices at some heights.
 
-    mean_breath: of a person who breathed, as at mean breath; or else as of the scan's moment. Raises
-    BadInput for a height at which there is no body.
+    heights_mm: heights of the slices; every 100 mm of the body if None.
+    mean_breath: measure a breathing person as at mean breath, instead of at the scan's moment.
+
+    Raises BadInput for a height at which there is no body.
     """
     breathes = mean_breath and mesh.breath is not None
     mesh, fuller = (mesh.at_mean_breath(), mesh.at_mean_breath(1.0)) if breathes else (mesh, None)
@@ -116,7 +124,7 @@ def measure(
     vertices = frame.inverse().apply(mesh.vertices)
     contacts, loads = _contacts(vertices, mesh), find_loads(mesh)
     if heights_mm is None:
-        # Of a body seen in part, what there is of it.
+        # If only part of a body was seen, whatever there is of it.
         every = np.arange(STEP_MM, stature, STEP_MM).tolist()
         slices = [_slice(vertices, mesh, height, contacts, loads) for height in every]
     else:
@@ -156,7 +164,7 @@ def measure(
 
 
 def _crown_region(areas: Array, kinds: Bytes | None, crown: Mask) -> str | None:
-    """What more than half of it is, or "unsure"."""
+    """The region that makes up more than half of the crown, or "unsure"."""
     if kinds is None or not crown.any():
         return None
     found = shares(kinds[crown], areas[crown])
@@ -164,7 +172,10 @@ def _crown_region(areas: Array, kinds: Bytes | None, crown: Mask) -> str | None:
 
 
 def _head_top(vertices: Array, mesh: BodyMesh, stature: float, crown: str | None) -> HeadTop | None:
-    """Of a bare crown that itself; or else what the skin around says. vertices: body frame."""
+    """Top of the head: the crown itself if it is bare, or an estimate from the skin around.
+
+    vertices: body frame.
+    """
     if mesh.regions is None or crown is None:
         return None
     top = vertices[:, 2] > stature - CROWN_MM
@@ -176,7 +187,7 @@ def _head_top(vertices: Array, mesh: BodyMesh, stature: float, crown: str | None
 
 
 def _doubted(level: Slice, fuller: Slice | None) -> Slice:
-    """With what girths are longer on a body that is a standard deviation of its breath fuller."""
+    """The slice with sigmas: how much longer girths are on a body one sigma of breath fuller."""
     girths = []
     for girth in level.girths:
         other = fuller.of(girth.part) if fuller and girth is level.of(girth.part) else None
@@ -186,7 +197,7 @@ def _doubted(level: Slice, fuller: Slice | None) -> Slice:
 
 
 def heights_from(text: str) -> list[float]:
-    """Heights written as "800,1050", mm. Raises BadInput if one is no number."""
+    """Heights written as "800,1050", mm. Raises BadInput if one is not a number."""
     try:
         return [float(word) for word in text.split(",")]
     except ValueError as error:
@@ -201,8 +212,10 @@ def _share(areas: Array, which: Mask, among: Mask) -> float:
 
 @dataclass(frozen=True)
 class _Contact:
-    """An arm whose hand touches the trunk, at heights from low_mm to high_mm; y_mm: of its middle just
-    above, body frame."""
+    """An arm whose hand touches the trunk at heights from low_mm to high_mm.
+
+    y_mm: of the arm's middle just above, body frame.
+    """
 
     side: str
     low_mm: float
@@ -242,7 +255,7 @@ def _slice(
     contacts: Sequence[_Contact],
     loads: Sequence[Load],
 ) -> Slice | None:
-    """None where there is no body."""
+    """The slice at one height, None if there is no body."""
     loops = _loops(vertices, mesh, height_mm)
     if not loops:
         return None
@@ -259,8 +272,8 @@ def _slice(
 def name_parts(loops: Sequence[Loop]) -> list[str]:
     """Which part of the body each loop of a slice is; body frame, largest loop first.
 
-    A loop that holds the middle (y = 0) well inside is the trunk; then all others are arms. If
-    none does, the largest on each side is a leg.
+    A loop with the middle (y = 0) well inside is the trunk, and then all others are arms. If there
+    is none, the largest on each side is a leg.
     """
     reach = [(loop.segments[..., 1].min(), loop.segments[..., 1].max()) for loop in loops]
     is_trunk = [holds_middle(loop.segments[..., 1]) for loop in loops]

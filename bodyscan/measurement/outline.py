@@ -1,9 +1,8 @@
-"""A slice's outline where nobody measured it: cut where filled surface joins two limbs, and how long
-it may be.
+"""A slice's outline where nothing was measured: cut where filled surface joins limbs, with a range.
 
 A web between arm and trunk is filled in front and behind. Cut there, with the trunk closed along
-itself, the outline is that of the trunk; as meshed it is that of trunk and arms together. Which of
-the two is nearer to the body was not seen: both are given.
+itself, the outline is that of the trunk; as meshed it is that of trunk and arms together. Which is
+nearer to the body was not observed, so both are given.
 """
 
 from __future__ import annotations
@@ -18,19 +17,21 @@ from bodyscan.arrays import Array
 from bodyscan.mesh.slices import Loop, Run, joined, runs_of
 
 SHORTEST_GAP_MM = 15.0
-"""A straight line across less, on a limb, is shorter than the limb's curve by less than 0.5 mm."""
+"""A straight line across a shorter gap on a limb is less than 0.5 mm shorter than the curve."""
 LIMB = 2.0 / np.pi
 """Chord over arc of half a circle: a limb goes round by more, the trunk's own side by less."""
 INSIDE = 0.15
-"""of its width: how far inside a trunk the body's middle lies (y = 0)"""
+"""of its width: least distance of the body's middle (y = 0) from a trunk's edges."""
 
 Range = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """loop: cut where filled surface joins limbs.  girth_range_mm, tape_range_mm: from closed
-    straight across all that was not measured, to as meshed.
+    """An outline, and how long it may be.
+
+    loop: cut where filled surface joins limbs.
+    girth_range_mm, tape_range_mm: from closed straight across everything unmeasured, to as meshed.
     """
 
     loop: Loop
@@ -39,7 +40,7 @@ class Outline:
 
 
 def outline(loop: Loop) -> Outline:
-    """Of a loop of a slice, body frame."""
+    """The outline of a slice's loop, body frame."""
     runs = runs_of(loop, SHORTEST_GAP_MM)
     kept = _trunk_alone(loop, runs) if holds_middle(loop.segments[..., 1]) else runs
     own = joined(loop, kept) if len(kept) < len(runs) else loop
@@ -50,7 +51,7 @@ def outline(loop: Loop) -> Outline:
 
 
 def holds_middle(y: Array) -> bool:
-    """Whether an outline's points, y to the left, lie on both sides of the body's middle."""
+    """Whether an outline's points (y to the left) lie on both sides of the body's middle."""
     low, high = float(y.min()), float(y.max())
     return min(high, -low) > INSIDE * (high - low)
 
@@ -64,7 +65,7 @@ def _trunk_alone(loop: Loop, runs: Sequence[Run]) -> Sequence[Run]:
 
 
 def _in_two(runs: Sequence[Run]) -> Iterator[tuple[Sequence[Run], Sequence[Run]]]:
-    """Both ways round, every cut from one filled run to another; these belong to neither part."""
+    """Every cut from one filled run to another, both ways round, without these two runs."""
     gaps = [k for k, run in enumerate(runs) if not run.measured]
     for one, other in combinations(gaps, 2):
         inner, outer = runs[one + 1 : other], [*runs[other + 1 :], *runs[:one]]
@@ -74,7 +75,7 @@ def _in_two(runs: Sequence[Run]) -> Iterator[tuple[Sequence[Run], Sequence[Run]]
 
 
 def _is_limb(loop: Loop, runs: Sequence[Run]) -> bool:
-    """Whether it lies on one side of the middle, and goes round more than half way."""
+    """Whether the runs lie on one side of the middle and go round more than half way."""
     arc = sum(loop.lengths[run.segments].sum() for run in runs)
     across = loop.segments[runs[0].first, 0] - loop.segments[runs[-1].last, 1]
     return bool(np.linalg.norm(across) < LIMB * arc) and not _on_both_sides(loop, runs)

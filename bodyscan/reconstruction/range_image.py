@@ -21,19 +21,19 @@ class RangeImage:
 
     points: (h, w, 3) float32, mm.
     normals: (h, w, 3) float32, unit, towards the camera; NaN at the rim of a surface.
-    sigma_mm: (h, w) float32, standard deviation of the point along its viewing ray; NaN
-    where nothing was measured, whatever stands in the others.
+    sigma_mm: (h, w) float32, standard deviation of the point along its viewing ray; NaN where
+        nothing was measured, whatever the other arrays hold there.
     colours: (h, w) uint8, grey level of the lit image.
-    beyond: (h, w) bool, where the camera saw something behind the scan volume; None if all
-    that was seen has a point.
+    beyond: (h, w) bool, where the camera saw something behind the scan volume; None if everything
+        seen has a point.
     agreement: of stripes of two directions, if such were projected.
-    time_ms: the one moment for which the depths stand, ms since the scan began; None if not known.
-    velocity: of the body at that moment; None where the stripes or the times do not tell it.
-    common_mm: (h, w) float32, of sigma_mm the part that neighbours share, since it comes of
-    the calibration: it does not shrink where they are averaged. None: there is none.
-    bent: whether points were since carried to another moment, off the rays of their pixels.
+    time_ms: the moment for which the depths hold, ms since the scan began; None if not known.
+    velocity: of the body at that moment; None where stripes or times do not determine it.
+    common_mm: (h, w) float32, the part of sigma_mm that neighbours share because it comes from the
+        calibration: it does not shrink when they are averaged. None if there is none.
+    bent: whether points were carried to another moment, off the rays of their pixels.
     corner: row and column of the camera's image at which the kept part begins.
-    whole_depth, whole_colours: of one that was cut, `open_depth` and `lit` from before.
+    whole_depth, whole_colours: `open_depth` and `lit` from before a cut.
     """
 
     pair: str
@@ -59,7 +59,7 @@ class RangeImage:
 
     @property
     def open_depth(self) -> Floats:
-        """(height, width): how deep the camera saw, z, mm; inf behind the scan volume, 0 if unknown."""
+        """(height, width): depth z seen, mm; inf behind the scan volume, 0 if unknown."""
         if self.whole_depth is not None:
             return self.whole_depth
         depth = np.where(self.valid, self.points[..., 2], np.float32(0.0))
@@ -77,15 +77,17 @@ class RangeImage:
         return self.colours if self.whole_colours is None else self.whole_colours
 
     def every(self, step: int, first: int = 0) -> Crop:
-        """Of the kept part every so many rows and columns, counted in the camera's image: the same
-        pixels whatever is kept."""
+        """Every n-th row and column of the kept part, counted in the camera's image.
+
+        These are the same pixels whatever part is kept.
+        """
         top, left = self.corner
         return slice((first - top) % step, None, step), slice((first - left) % step, None, step)
 
     def cut(self, box: Crop) -> RangeImage:
-        """With points in a box of the kept part alone: a third of the memory where that is a body.
+        """Keep points in a box of the kept part only: a third of the memory when that is a body.
 
-        How deep the camera saw, and its image, stay whole.
+        `open_depth` and `lit` stay whole.
         """
         top, left = self.corner
         common = None if self.common_mm is None else self.common_mm[box].copy()

@@ -1,4 +1,4 @@
-"""Which stripes each pixel of a pair may see of the scan volume."""
+"""Which stripes each pixel of a pair may see in the scan volume."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from bodyscan.stripes.stripe_limits import StripeLimits
 
 BLOCKS_ACROSS = 40
 STEP_STRIPES = 8
-MARGIN_STRIPES = 1.5  # runs of boundaries need a neighbour, and between corners limits are linear
+MARGIN_STRIPES = 1.5  # runs of boundaries need a neighbour, and limits are linear between corners
 MARGIN_MM = 30.0  # beside the cylinder and above it
-LAYER_MM, AROUND_MM = 25.0, 60.0  # what lies lower than this is wanted so near to what stands
+LAYER_MM, AROUND_MM = 25.0, 60.0  # lower points are wanted only this close to what stands
 NEAREST_MM, FARTHEST_MM = 50.0, 1e5
 ANYTHING = 1e6  # more stripes than there are
 
@@ -26,10 +26,10 @@ ANYTHING = 1e6  # more stripes than there are
 def stripes_in_volume(
     pair: PairCalibration, rig_from_camera: RigidTransform, volume: Volume
 ) -> StripeLimits | None:
-    """The stripes that light what stands in the scan volume, or lies beside it at its bottom.
+    """The stripes that light whatever stands in the scan volume, or lies beside it at its bottom.
 
-    None, that is everything, if the pair has no projector, or if depth does not grow (or fall)
-    with s all over the volume: the projector stands in the picture.
+    None, meaning all, if the pair has no projector, or if depth does not grow (or fall) with s all
+    over the volume: then the projector stands in the image.
     """
     if pair.sheets is None:
         return None
@@ -58,7 +58,7 @@ def stripes_in_volume(
     limits += np.array([-MARGIN_STRIPES, MARGIN_STRIPES, 0.0])[:, None, None]
     unknown = np.array([-ANYTHING, ANYTHING, ANYTHING])[:, None, None]
     limits = np.where(np.isnan(limits), unknown, limits).astype(np.float32)
-    # In the volume's middle, as the camera sees it; it may stand at the rig's origin itself.
+    # At the middle of the volume as the camera sees it; the camera may stand at the rig's origin.
     seen = near < far
     middle_mm = 0.5 * float(np.median((near + far)[seen])) if seen.any() else FARTHEST_MM
     around_px = AROUND_MM * pair.camera.alpha / middle_mm
@@ -68,11 +68,11 @@ def stripes_in_volume(
 def volume_interval(
     rays: Array, rig_from_camera: RigidTransform, volume: Volume, *, raised_mm: float
 ) -> tuple[Array, Array]:
-    """Depths z (...) mm at which rays (..., 3), camera frame, z = 1, enter and leave the scan volume.
+    """Depths z (...) mm at which rays (..., 3), camera frame, z = 1, enter and leave the volume.
 
-    It is taken a little wider and higher, and its bottom raised. Where a ray misses it, it leaves
-    before it enters, or both where it comes nearest to the axis, so that between rays both are
-    smooth.
+    The volume is taken a little wider and higher, with its bottom raised. A ray that misses it
+    leaves before it enters, or does both where it is nearest to the axis, so that depths are smooth
+    across rays.
     """
     ahead, start = rig_from_camera.rotate(rays), rig_from_camera.translation
     radius = volume.radius_mm + MARGIN_MM
@@ -96,13 +96,14 @@ def _bulges(
     ends: tuple[Array, Array],
     limits: Array,
 ) -> tuple[Array, Array]:
-    """By how many stripes near and far (rows, columns) at blocks' corners have to give way so that
-    what is linear between them cuts nothing off.
+    """Stripes by which near and far (rows, columns) at the corners of blocks must be widened.
 
-    ends: depths at which the rays enter and leave.  They do so by the volume's wall or its bottom;
-    where one gives way to the other inside of a block, the limits bend. The margin covers that, but
-    not before a camera so low that it looks along the bottom. A block's middle, where inverse depth
-    is nearly linear in s, tells at least half of it.
+    ends: depths at which the rays enter and leave.
+
+    Limits are linear between corners, but bend where the volume's wall gives way to its bottom
+    inside a block. The margin covers that, except for a camera so low that it looks along the
+    bottom. The middle of a block, where inverse depth is nearly linear in s, shows at least half of
+    the bend.
     """
     near, far = ends
     stripes = np.where(near < far, limits[1] - limits[0], 0.0)
@@ -117,13 +118,13 @@ def _bulges(
 
 
 def _block_means(corners: Array) -> Array:
-    """(rows - 1, columns - 1, ...): of each block's four corners."""
+    """Mean of each block's four corners, (rows - 1, columns - 1, ...)."""
     rows = corners[1:] + corners[:-1]
     return 0.25 * (rows[:, 1:] + rows[:, :-1])
 
 
 def _corner_rays(camera: Camera, block_px: int) -> Array:
-    """(rows, columns, 3) through the corners of blocks of pixels that cover the picture."""
+    """Rays (rows, columns, 3) through the corners of blocks of pixels that cover the image."""
     sizes = camera.width, camera.height
     edges = (np.arange(0.0, size + block_px, block_px) - 0.5 for size in sizes)
     return camera.rays(np.stack(np.meshgrid(*edges), axis=-1))
@@ -131,10 +132,12 @@ def _corner_rays(camera: Camera, block_px: int) -> Array:
 
 @compiled
 def _reach(inverse: Array, s: Array, wanted: Array, found: Array) -> None:
-    """s (rows, columns) at which rays reach the inverse depths `wanted`, if two sheets tell.
+    """Set found (rows, columns): s at which rays reach the inverse depths `wanted`.
 
-    inverse: (rows, columns, K), falling, of the sheets at s (K,), or NaN. A sheet's inverse depth
-    along a ray is nearly linear in s: so it is taken to be, between the sheets and past the last.
+    inverse: of the sheets at s (K,), falling, or NaN, (rows, columns, K); at least two are needed.
+
+    A sheet's inverse depth along a ray is nearly linear in s, and is taken to be so between the
+    sheets and past the last.
     """
     for row in range(wanted.shape[0]):
         for column in range(wanted.shape[1]):

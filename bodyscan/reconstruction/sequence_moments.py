@@ -1,5 +1,4 @@
-"""When a pair saw what, and how its sheets tell motion from that: what decoding needs to show a body at
-one moment."""
+"""When a pair saw what, and how its sheets show motion: what decoding needs for a single moment."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ from bodyscan.stripes.stripe_code import StripeCode
 
 MS = 1000.0
 FASTEST_MM_S = 40.0
-"""In depth, RMS over what a pair sees: more than twice what the restless do."""
+"""Depth speed, RMS over what a pair sees: more than twice that of restless people."""
 
 
 def sequence_moments(
@@ -31,17 +30,16 @@ def sequence_moments(
     frame_ms: Mapping[str, float] | None,
     pairs: int = 1,
 ) -> tuple[Moments, ...]:
-    """Of the stripes, and of those that cross them, which are wanted at the same moment.
+    """Moments of the stripes and of the crossing stripes, for which the same moment is wanted.
 
-    pairs: of the rig. Each is asked whether the subject moved: noise that says so of one in a hundred
-    would say it of every sixth mannequin before sixteen.
-
-    frame_ms: when each image was taken, by its name; times are in seconds then. Where it is not known,
-    images are taken to have come one after the other in the code's order or in that in which they are
-    best shown, and times are counted in images: motion can be taken out by that as well, only its speed
-    is not known.
+    frame_ms: when each image was taken, by name; times are then in seconds. None if not known:
+        images are assumed to follow one another in the code's order, or in the order in which they
+        are best shown, and times are counted in images. Motion can be removed with that too,
+        without its speed.
+    pairs: number of pairs in the rig. Each is tested for motion: noise that gives one false alarm
+        in a hundred would give one for every sixth mannequin in front of sixteen pairs.
     """
-    # Sidak's, for looks that are independent.
+    # Sidak's correction for independent tests.
     chance = -np.expm1(np.log1p(-CHANCE) / (pairs * len(code.directions)))
     told_of = partial(_moments, pair, code, frames, chance)
     if frame_ms is not None:
@@ -76,7 +74,7 @@ def _moments(
 
 
 def _times(way: StripeCode, names: ImageNames, frame_ms: Mapping[str, float]) -> dict[str, Array]:
-    """Of the images of each kind, s."""
+    """Times of the images of each kind, s."""
     return {
         kind.name: np.array([frame_ms[name] for name in names.of_kind(kind, count)]) / MS
         for kind, count in way.image_counts.items()

@@ -12,17 +12,21 @@ from bodyscan.geometry.scaled_systems import gram, invert_scaled, solve_scaled
 from bodyscan.reconstruction.surface_cells import Cells
 
 KNOT_MM, REACH_MM = 80.0, 150.0
-"""From knot to knot, about a limb's width, and over which speeds are akin (a part of a trunk)."""
+"""Distance of knots, about a limb's width, and correlation length of speeds (part of a trunk)."""
 SIZES = np.geomspace(0.02, 50.0, 40)
-"""Standard deviations of the field that are tried, mm per unit of time; before them, none."""
+"""Standard deviations tried for the field, mm per unit of time."""
 SIGMAS = 3.0
-"""What is left over counts where noise alone gives it once in some hundred times."""
+"""A remainder counts if noise alone exceeds it about once in several hundred times."""
 
 
 @dataclass(frozen=True, eq=False)
 class CellSpeeds:
-    """What the cells tell, (cells,) each: speed along the rays, mm per unit of time, its weight
-    (1/variance; 0 where nothing is known), and its derivatives by a twist (cells, 6)."""
+    """What the cells say, (cells,) each.
+
+    speed: along the rays, mm per unit of time.
+    weight: 1/variance of the speed, 0 where nothing is known.
+    by_twist: derivatives by a twist, (cells, 6).
+    """
 
     speed: Array
     weight: Array
@@ -31,15 +35,18 @@ class CellSpeeds:
 
 @dataclass(frozen=True, eq=False)
 class Knots:
-    """share: (cells, knots) of each knot in the cells' middles, linear between.  akin: (knots, knots),
-    correlation of their speeds before anything is seen."""
+    """Knots of the field.
+
+    share: weight of each knot in the middle of each cell, linear in between, (cells, knots).
+    akin: prior correlation of their speeds, (knots, knots).
+    """
 
     share: Array
     akin: Array
 
     @staticmethod
     def over(cells: Cells, known: Mask, mm_per_px: float) -> Knots:
-        """Those with evidence.  known: (cells,) where speeds are.  mm_per_px: on the surface."""
+        """Knots with evidence; known: cells with a speed, (cells,); mm_per_px: on the surface."""
         step = KNOT_MM / mm_per_px
         columns, rows = (
             np.arange(np.ceil(size / step) + 1.0) * step for size in (cells.width, cells.height)
@@ -57,9 +64,10 @@ class Knots:
 
 @dataclass(frozen=True, eq=False)
 class FieldFit:
-    """A twist (6,) and speeds of the knots (K,), with the covariance of both (6 + K, 6 + K).
+    """A twist (6,) and speeds of the knots (K,), with their joint covariance (6 + K, 6 + K).
 
-    explained: by how much the twist lowers chi-square.  is_bent: whether there is a field at all.
+    explained: reduction of chi-square by the twist.
+    is_bent: whether there is a field at all.
     """
 
     twist: Array
@@ -73,17 +81,19 @@ class FieldFit:
         return np.asarray(cells.by_twist @ self.twist + knots.share @ self.field, np.float64)
 
     def variance(self, cells: CellSpeeds, knots: Knots) -> Array:
-        """(cells,) of it."""
+        """Variance of the speed, (cells,)."""
         jacobian = np.hstack([cells.by_twist, knots.share])
         return np.asarray(np.sum((jacobian @ self.covariance) * jacobian, axis=1), np.float64)
 
 
 def fit_field(cells: CellSpeeds, knots: Knots, twist_sigmas: Array, *, bent: float) -> FieldFit:
-    """Twist and field together; the field is 0 where there is no evidence of one.
+    """Fit twist and field together; the field is 0 where there is no evidence for one.
 
-    twist_sigmas: (6,) of the twist's prior. The field's size is the one under which what was seen is
-    likeliest (its other unknowns integrated out).  bent: there is one where that is likelier than none
-    by more, twice the logarithm.
+    twist_sigmas: prior sigmas of the twist, (6,).
+    bent: twice the log likelihood ratio from which a field is taken to exist.
+
+    The field's size is the one that makes the observations likeliest, with all other unknowns
+    integrated out.
     """
     problem = _Problem.of(cells, knots, twist_sigmas)
     gains = problem.gains(SIZES)
@@ -101,8 +111,10 @@ def fit_field(cells: CellSpeeds, knots: Knots, twist_sigmas: Array, *, bent: flo
 
 
 def unexplained(cells: CellSpeeds, knots: Knots, left: Array) -> Array:
-    """(cells,) variance of speed, (mm per unit of time)^2, that what is `left` over (cells,) shows
-    around each cell beyond noise."""
+    """Variance of speed (cells,), (mm per unit of time)^2, beyond noise in the residuals `left`.
+
+    left: (cells,); each cell's variance is that of the residuals around it.
+    """
     known = cells.weight > 0.0
     share, weight = knots.share[known], cells.weight[known]
     count = share.sum(axis=0)
@@ -114,7 +126,7 @@ def unexplained(cells: CellSpeeds, knots: Knots, left: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Normal equations of twist and field, the field's prior left out; the knots' correlations."""
+    """Normal equations of twist and field without the field's prior; the knots' correlations."""
 
     normal: Array
     right: Array
@@ -130,7 +142,7 @@ class _Problem:
         return _Problem(normal, weighted.T @ cells.speed[known], knots.akin)
 
     def gains(self, sizes: Array) -> Array:
-        """Logarithms of how much likelier what was seen is under fields of these sizes than none."""
+        """Log likelihood ratios of the observations with fields of these sizes against none."""
         rest, power = self._beside_twist
         variance = sizes[:, None] ** 2
         seen = 1.0 + variance * power
@@ -138,7 +150,7 @@ class _Problem:
 
     @cached_property
     def _beside_twist(self) -> tuple[Array, Array]:
-        """Of the field's independent parts, the twist projected out: gradient and curvature (K,)."""
+        """Gradient and curvature (K,) of the field's independent parts, the twist projected out."""
         by_twist = solve_scaled(self.normal[:6, :6], self.normal[:6].T).T
         normal = self.normal[6:, 6:] - self.normal[6:, :6] @ by_twist[:, 6:]
         right = self.right[6:] - self.normal[6:, :6] @ solve_scaled(

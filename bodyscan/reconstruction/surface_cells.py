@@ -1,4 +1,4 @@
-"""A coarse picture of the surface that one pair saw: a plane in each cell of some pixels."""
+"""A coarse model of the surface that one pair saw: a plane in each cell of some pixels."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from bodyscan.arrays import Array, Indices
 
 FEWEST = 6
 LEAST_SPREAD = 0.15
-"""Of a cell, standard deviation of its places each way: less tells no slope."""
+"""Least standard deviation of places in a cell, relative to its width: less determines no slope."""
 MOST_ROUGH_MM = 3.0
-"""Where points are this far off their cell's plane, RMS, there are two surfaces in it: limbs are 30 mm
-thick and more, and what a cell of 16 px cuts off a finger bends by less."""
+"""A cell whose points are this far off its plane, RMS, contains two surfaces: limbs are 30 mm thick
+or more, and the part of a finger in a cell of 16 px bends by less."""
 
 
 @dataclass(frozen=True)
 class Cells:
-    """An image of width x height px cut into cells of `px` x `px`."""
+    """An image of width x height px, divided into cells of `px` x `px`."""
 
     width: int
     height: int
@@ -35,12 +35,12 @@ class Cells:
 
     @property
     def middles(self) -> tuple[Array, Array]:
-        """Of columns and rows of cells, px."""
+        """Middles of the columns and rows of cells, px."""
         rows, columns = (np.arange(0.5 * self.px, n * self.px, self.px) - 0.5 for n in self.shape)
         return columns, rows
 
     def of(self, pixels: Array) -> Indices:
-        """(...) flat number of the cell that places (..., 2) px lie in."""
+        """Flat number (...) of the cell in which places (..., 2) px lie."""
         rows, columns = self.shape
         place = np.floor((pixels + 0.5) / self.px).astype(np.int64)
         row, column = np.clip(place[..., 1], 0, rows - 1), np.clip(place[..., 0], 0, columns - 1)
@@ -50,11 +50,15 @@ class Cells:
 def fit_planes(
     cells: Cells, pixels: Array, rays: Array, depth: Array, weights: Array
 ) -> tuple[Array, Array]:
-    """(cells, 3) each: p of each cell's plane p.P = 1, camera frame, 1/mm, and P in the middle of
-    what was seen of it; NaN where none is known.
+    """Fit a plane to each cell, camera frame.
 
-    From places (N, 2) px with rays (N, 3), z = 1, and depths (N,) mm: 1/z = p.x along the ray x, so
-    that the fit is linear.  weights: (N,), of what else is averaged over the same places.
+    pixels: places, (N, 2) px.
+    rays: of these places, z = 1, (N, 3).
+    depth: (N,) mm.
+    weights: (N,), those of anything else averaged over the same places.
+
+    Returns (cells, 3) each: p of the plane p.P = 1, 1/mm, and P in the middle of what was seen of
+    it; NaN where unknown. Along the ray x, 1/z = p.x, so the fit is linear.
     """
     cell = cells.of(pixels)
     count = np.bincount(cell, minlength=cells.count)
@@ -81,6 +85,6 @@ def fit_planes(
 
 
 def _ray_step(pixels: Array, rays: Array) -> float:
-    """How far rays move at z = 1 from a pixel to the next, on the whole."""
+    """Typical distance between the rays of neighbouring pixels at z = 1."""
     moved = np.prod(np.std(rays[:, :2], axis=0)) / max(np.prod(np.std(pixels, axis=0)), 1e-12)
     return float(np.sqrt(moved))

@@ -1,9 +1,9 @@
 """A body's motion while one pair saw it, from the comb of its stripe boundaries (`stripes.comb`).
 
-At a pixel that stays where it is, a surface p.P = 1 that moves by V is seen to change its depth z by
-p.V z. V is a rigid motion, and besides it a smooth field of speed along the rays, as large as the
-evidence asks for (limbs, breath). What a rigid motion does within the surface itself is not seen, and
-stays as wide as people's motions are.
+At a fixed pixel, a surface p.P = 1 that moves by V changes its depth z by p.V z. V is a rigid
+motion plus a smooth field of speed along the rays, as large as the evidence asks for (limbs,
+breath). What a rigid motion does within the surface itself is not observed, and stays as uncertain
+as people's motions are.
 """
 
 from __future__ import annotations
@@ -28,34 +28,38 @@ from bodyscan.stripes.comb import TEETH, Comb
 from bodyscan.stripes.one_moment import StripeMotion
 
 CELLS_ACROSS, CELL_WINDOWS = 80, 1.2
-"""Of a picture, and the least length of a cell in windows: with less it would not know its slope."""
+"""Cells across an image, and least size of a cell in windows: a smaller one would have no slope."""
 FEWEST = 200
-"""Windows: fewer tell a speed worse than people move."""
+"""Windows: fewer determine a speed less well than people's usual speed is known."""
 TWIST_SIGMAS = np.array([0.05] * 3 + [30.0] * 3)
-"""Prior about the middle of what is seen, radians and mm per unit of time: in a second several times
-what people who stand do, so that it rules only where nothing is seen."""
+"""Prior about the middle of what is seen, radians and mm per unit of time: several times what
+standing people do in a second, so that it matters only where nothing is seen."""
 BENT_MM = 600.0
-"""A cell that is so many times smaller knows a speed to that share of it: its plane is a chord of a
-body that is round. Renderings with cells of 14 and 28 mm: off by 3 and 6 % of the speed."""
+"""A cell's size over this is the relative error of its speed, since its plane is a chord of a round
+body. In renderings with cells of 14 and 28 mm speeds are off by 3 and 6 %."""
 SETTLED = 1e-3
-"""Variances: a thirtieth of a sigma."""
+"""Convergence, in variances: a thirtieth of a sigma."""
 FEWEST_BANDS = 5
 NEIGHBOURS = 2.0 / 3.0
-"""Squares of differences between neighbours tell a variance as well as so many independent errors each
-(von Neumann 1941): every value stands in two of them."""
+"""Squared differences of neighbours determine a variance as well as this many independent errors
+each (von Neumann 1941), because every value is in two of them."""
 TEETH_NOISE = Noise("teeth", cauchy=3.0)
 SIGMAS = 3.0
-"""A speed counts beyond so many of what all windows may have in common."""
+"""A speed counts beyond this many sigmas of what all windows may have in common."""
 CHANCE = 0.005
-"""Of either alarm though nothing moved, in a whole scan: one mannequin in a hundred."""
+"""Probability of either false alarm in a whole scan: one mannequin in a hundred."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Teeth:
-    """What windows (N,) tell: their cell, speed in depth (mm per unit of time), its sigma, and dz/ds.
+    """What N windows say.
 
-    band: number of the stripes that a window is made of.  by_twist: (cells, 6), how a twist about
-    `middle` changes the depth.  points: (cells, 3) in their middles.
+    cell: number of their cell, (N,).
+    band: number of the stripes that a window is made of, (N,).
+    speed: in depth, mm per unit of time, (N,), with its sigma (N,).
+    per_stripe: dz/ds, (N,).
+    by_twist: change of depth by a twist about `middle`, (cells, 6).
+    points: in the middles of the cells, (cells, 3).
     common: standard deviation of speed that all windows share.
     """
 
@@ -73,9 +77,9 @@ class _Teeth:
 def tell_motion(
     camera: Camera, sheets: LightSheets, comb: Comb, *, chance: float = CHANCE
 ) -> StripeMotion | None:
-    """None where too little was seen. Units of time are those of the comb.
+    """The motion of a body; None if too little was seen. Units of time are those of the comb.
 
-    chance: with which what stands still may be told to have moved rigidly, and to have bent.
+    chance: probability with which something still may be found to have moved rigidly, or bent.
     """
     if len(comb.speed) < FEWEST:
         return None
@@ -112,21 +116,21 @@ def tell_motion(
 
 
 def _limit(freedoms: int, independent: float, chance: float) -> float:
-    """Of a chi-square whose variance is known from so many independent errors."""
+    """Limit of a chi-square whose variance is known from so many independent errors."""
     if not np.isfinite(independent):
         return float(chdtri(freedoms, chance))
     return float(freedoms * fdtri(freedoms, independent, 1.0 - chance))
 
 
 def _cells(camera: Camera, comb: Comb) -> Cells:
-    """From the middle of one half of a window to that of the other is half its length."""
+    """Cells sized by the windows; the middles of a window's halves are half its length apart."""
     window = 2.0 * float(np.median(np.linalg.norm(comb.pixels[:, 1] - comb.pixels[:, 0], axis=1)))
     cell_px = round(max(camera.width / CELLS_ACROSS, CELL_WINDOWS * window))
     return Cells(camera.width, camera.height, cell_px)
 
 
 def _teeth(camera: Camera, sheets: LightSheets, comb: Comb, cells: Cells) -> _Teeth:
-    """Of the windows whose cells have a plane."""
+    """Speeds of the windows whose cells have a plane."""
     rays = camera.rays(comb.pixels)
     found = intersect_rays(sheets, rays, comb.s)
     seen = np.isfinite(found.depth).all(axis=1) & (comb.sigma > 0.0)
@@ -153,8 +157,10 @@ def _teeth(camera: Camera, sheets: LightSheets, comb: Comb, cells: Cells) -> _Te
 
 
 def _weights(teeth: _Teeth) -> tuple[Array, float]:
-    """(N,) 1/variance of the windows' speeds, less for those that are far off a rigid motion; and by
-    how many independent errors it is known."""
+    """Inverse variances (N,) of the windows' speeds, and the number of independent errors.
+
+    Windows far off a rigid motion get less.
+    """
     by_twist = teeth.by_twist[teeth.cell]
 
     def blocks(twist: Array) -> tuple[Block, ...]:
@@ -172,12 +178,13 @@ def _weights(teeth: _Teeth) -> tuple[Array, float]:
 
 
 def _band_share(band: Indices, left: Array, weights: Array) -> tuple[Array, float]:
-    """(N,) to what share of their weights windows count, because those of the same stripes err alike:
-    a projector that strays moves a boundary all along its stripe. And of how many independent errors
-    that is known, which is what a test has to allow for.
+    """Share (N,) of their weights at which windows count, because those of one stripe err alike.
 
-    left: (N,) speeds that no rigid motion explains. From one band of stripes to the next a body's
-    speed hardly changes, so that what their means are apart beyond noise is the stripes' own.
+    A projector that strays moves a boundary all along its stripe. Also returns the number of
+    independent errors from which that is known, for which a test must allow.
+
+    left: speeds that no rigid motion explains, (N,). A body's speed hardly changes from one band of
+        stripes to the next, so the differences of their means beyond noise are due to the stripes.
     """
     count = int(band.max()) + 1
     weight, mean = np.bincount(band, weights, count), _mean_by(band, left, weights, count)
@@ -187,7 +194,7 @@ def _band_share(band: Indices, left: Array, weights: Array) -> tuple[Array, floa
     noise = (1.0 / weight[1:][both] + 1.0 / weight[:-1][both]) / 2.0
     square = np.diff(mean)[both] ** 2 / 2.0
     usual = max(float(np.median(SIGMAS_PER_MEDIAN**2 * square - noise)), 0.0)
-    # The median's own error is that of a third as many bands: from it follow the weights of a mean.
+    # The median's error is that of a third as many bands; the weights of a mean follow from it.
     trust = (noise + usual) ** -2.0
     shared = max(float(np.average(square - noise, weights=trust)), 0.0)
     said = trust * (noise + shared)
@@ -202,20 +209,20 @@ def _by_cell(cells: Cells, teeth: _Teeth, weights: Array) -> CellSpeeds:
 
 
 def _mean_by(cell: Indices, values: Array, weights: Array, count: int) -> Array:
-    """(count,) weighted means of values (N,) by their cells; 0 where there are none."""
+    """Weighted means (count,) of values (N,) by cell; 0 where there are none."""
     total = np.maximum(np.bincount(cell, weights, count), 1e-300)
     return np.asarray(np.bincount(cell, weights * values, count) / total, np.float64)
 
 
 def _filled(grid: Array) -> Array:
-    """A grid (K, rows, columns) with NaN replaced by the nearest cell that is known."""
+    """A grid (K, rows, columns) with NaN replaced by the nearest known cell."""
     unknown = np.isnan(grid[0])
     row, column = distance_transform_edt(unknown, return_distances=False, return_indices=True)
     return np.asarray(grid[:, row, column], np.float64)
 
 
 def _seen(speeds: CellSpeeds, teeth: _Teeth, lost: Array, share: float) -> SurfaceSpeeds:
-    """lost: (cells,) variance of what is no smooth motion.  share: as of `_velocity`."""
+    """lost: variance of what is not smooth motion, (cells,).  share: as in `_velocity`."""
     known = speeds.weight > 0.0
     speed = speeds.speed[known]
     return SurfaceSpeeds(
@@ -228,8 +235,10 @@ def _seen(speeds: CellSpeeds, teeth: _Teeth, lost: Array, share: float) -> Surfa
 
 
 def _velocity(fit: FieldFit, teeth: _Teeth, seen: SurfaceSpeeds, share: float) -> Velocity:
-    """About the camera's centre; what all windows share is a motion along the middle's ray.  share: of
-    the speed, by which it may be off."""
+    """The velocity about the camera's centre.
+
+    What all windows share is a motion along the middle's ray. share: relative error of the speed.
+    """
     about_camera = adjoint(RigidTransform(np.eye(3), teeth.middle))
     shared = np.append(np.zeros(3), teeth.common * teeth.middle / teeth.middle[2])
     twist = about_camera @ fit.twist

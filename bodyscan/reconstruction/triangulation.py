@@ -21,17 +21,17 @@ from bodyscan.stripes.stripe_map import StripeMap
 NORMAL_WINDOW_PX = 5
 REACH = NORMAL_WINDOW_PX // 2
 MANY, FEW_MEET = 1000, 0.01
-"""Pixels that saw both directions, and the share of them that must have both depths: all of a right
-calibration but for wrong codes."""
-ZERO, ONE = np.float32(0.0), np.float32(1.0)  # a float64 among them would make all of it float64
+"""Pixels that saw both directions, and the share of them that must have both depths: with a right
+calibration all of them do, except for wrong codes."""
+ZERO, ONE = np.float32(0.0), np.float32(1.0)  # one float64 would make it all float64
 
 
 def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeImage:
-    """Points, normals and sigma on the camera's pixel grid, camera frame, mm; of stripes of both
-    directions where they were projected and calibrated.
+    """Points, normals and sigmas on the camera's pixel grid, camera frame, mm.
 
-    Raises BadInput if the pair has no projector, the image size is another, or stripes of both
-    directions contradict each other as those of a wrong calibration do.
+    Stripes of both directions are used if they were projected and calibrated. Raises BadInput if
+    the pair has no projector, the image size differs, or the directions contradict each other as
+    with a wrong calibration.
     """
     camera = pair.camera
     if pair.sheets is None:
@@ -49,18 +49,19 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
     if pair.crossing is not None and stripes.crossing is not None:
         across = stripes.crossing
         *others, common_too = _triangulated(pair, pair.crossing, across.s, across.sigma)
-        # Crossing stripes are decoded wherever they are, not in the scan volume alone.
+        # Crossing stripes are decoded everywhere, not only in the scan volume.
         alone = np.full(sigma_mm.shape, stripes.beyond is None)
         apart, counted = _apart(pair, stripes, (points, sigma_mm), (others[0], others[1]))
         share = common_mm / sigma_mm, common_too / others[1]
         points, sigma_mm, agreement = combine(points, sigma_mm, *others, alone=alone)
-        # Each way's calibration is as much of its own sigma; of both together, of the larger share.
+        # Each direction's calibration has a share of its own sigma; the merged point gets the
+        # larger one.
         common_mm = sigma_mm * np.fmax(*share)
         if agreement is not None:
             agreement = replace(agreement, apart_stripes=apart, stripes=counted)
         _require_fit(pair, stripes, agreement)
     normals = grid_normals(points, np.isfinite(sigma_mm))
-    # A copy: the lit image is one of a stack, which would stay as long as it does.
+    # A copy: the lit image is part of a stack, which would be kept alive with it.
     images = (stripes.lit.copy(), stripes.beyond)
     return RangeImage(
         pair.name, camera, points, normals, sigma_mm, *images, agreement, common_mm=common_mm
@@ -73,8 +74,10 @@ def _apart(
     one: tuple[Floats, Floats],
     other: tuple[Floats, Floats],
 ) -> tuple[float, int]:
-    """How far the way that tells depth less is from the points of the better one, in its stripes
-    (robust sigma), and their number."""
+    """Distance of the direction with less accurate depth from the better one's points.
+
+    In its stripes, as a robust sigma; also returns the number of its stripes.
+    """
     assert pair.sheets is not None
     assert pair.crossing is not None
     assert stripes.crossing is not None
@@ -86,8 +89,11 @@ def _apart(
 
 
 def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement | None) -> None:
-    """Raises BadInput where no right calibration leaves both directions so far apart. One from
-    elsewhere knows its sheets wherever there are stripes: where the two meet nowhere, it is wrong."""
+    """Raise BadInput if no right calibration leaves both directions so far apart.
+
+    An imported calibration knows its sheets wherever there are stripes: if the two meet nowhere, it
+    is wrong.
+    """
     assert stripes.crossing is not None
     decoded = np.count_nonzero(np.isfinite(stripes.s) & np.isfinite(stripes.crossing.s))
     meet = agreement.pixels if agreement else 0
@@ -111,8 +117,11 @@ def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement
 def _triangulated(
     pair: PairCalibration, sheets: LightSheets, s: Floats, sigma: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """As `triangulate_image`; a ray that is known to so many pixels makes s as uncertain as the
-    stripes are fine there, and its neighbours' alike."""
+    """`triangulate_image` with the uncertainty of the pair's rays.
+
+    An error of a ray in pixels acts as an error of s, by the stripes per pixel there, alike for its
+    neighbours.
+    """
     camera, of_rays = pair.camera, None
     if pair.rays is not None:
         finest = stripes_per_pixel(sheets, camera, s)
@@ -121,12 +130,12 @@ def _triangulated(
 
 
 def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:
-    """Unit normals (H, W, 3) towards the camera, from the points (H, W, 3) of a small window.
+    """Unit normals (H, W, 3) towards the camera, from points (H, W, 3) in a small window.
 
-    measured: (H, W), where there are points, if that is known.
+    measured: where there are points, (H, W), if that is known.
 
-    A plane fitted to 1/z, which is affine in the image coordinates on a plane; NaN where the
-    window is not whole: what lies at a rim is not to be relied on.
+    Fits a plane to 1/z, which is affine in image coordinates on a plane; NaN where the window is
+    incomplete, because points at a rim are not reliable.
     """
     normals = np.full(points.shape, np.nan, np.float32)
     shown = crop_of(np.isfinite(points[..., 2]) if measured is None else measured)
@@ -137,9 +146,9 @@ def grid_normals(points: Floats, measured: Mask | None = None) -> Floats:
 
 @compiled
 def _grid_normals(points: Floats, box: tuple[int, int, int, int], normals: Floats) -> None:
-    """The normals (H, W, 3) of points (H, W, 3), row by row of a box that holds all points.
+    """Set the normals (H, W, 3) of points (H, W, 3), row by row of a box that holds all points.
 
-    recent: x/z, y/z and 1000/z of the last five rows.  A NaN spreads over all windows it is in.
+    `recent` holds x/z, y/z and 1000/z of the last five rows. A NaN spreads to all windows it is in.
     """
     top, bottom, left, right = box
     width = right - left
@@ -161,7 +170,7 @@ def _grid_normals(points: Floats, box: tuple[int, int, int, int], normals: Float
 
 @compiled
 def _affine_in_image(points: Floats, x: Floats, y: Floats, inverse: Floats) -> None:
-    """x/z, y/z and 1000/z (W,) of a row of points (W, 3)."""
+    """Set x/z, y/z and 1000/z (W,) of a row of points (W, 3)."""
     for u in range(len(points)):
         per_z = ONE / points[u, 2]
         x[u], y[u] = points[u, 0] * per_z, points[u, 1] * per_z
@@ -170,8 +179,10 @@ def _affine_in_image(points: Floats, x: Floats, y: Floats, inverse: Floats) -> N
 
 @compiled
 def _slopes(rows: Floats, v: int, middle: Floats, slope_u: Floats, slope_v: Floats) -> None:
-    """Slopes by column and by row (W,) of the planes fitted in the windows of row v, times 50, and
-    row v itself; from column 2 on, that is of the windows' middles.  Row w is rows[w % 5] (5, W)."""
+    """Slopes by column and row (W,) of planes fitted in the windows of row v, times 50; row v.
+
+    All are given for the windows' middles, which begin at column 2. Row w is rows[w % 5], (5, W).
+    """
     above2, above, here = rows[(v - 2) % 5], rows[(v - 1) % 5], rows[v % 5]
     below, below2 = rows[(v + 1) % 5], rows[(v + 2) % 5]
     width = len(here)
@@ -189,16 +200,16 @@ def _slopes(rows: Floats, v: int, middle: Floats, slope_u: Floats, slope_v: Floa
 
 @compiled
 def _normals(middle: Floats, slope_u: Floats, slope_v: Floats, normals: Floats) -> None:
-    """Normals (W, 3) of a row from what `_slopes` says of x/z, y/z and 1000/z (3, W).
+    """Normals (W, 3) of a row from the results of `_slopes` for x/z, y/z and 1000/z (3, W).
 
-    1/z = p x + q y + r is the plane p X + q Y + r Z = 1, whose normal (p, q, r) points away: from
-    slopes by column and row to those by x and y, all times the determinant.
+    1/z = p x + q y + r is the plane p X + q Y + r Z = 1, whose normal (p, q, r) points away. Slopes
+    by column and row are converted to slopes by x and y, all times the determinant.
     """
     x, y, inverse = middle[0], middle[1], middle[2]
     x_u, y_u, inverse_u = slope_u[0], slope_u[1], slope_u[2]
     x_v, y_v, inverse_v = slope_v[0], slope_v[1], slope_v[2]
     windows = len(normals) - 2 * REACH
-    # In arrays of its own, which the compiler knows not to overlap, it computes eight at once.
+    # With separate arrays, which the compiler knows not to overlap, it computes eight at once.
     p, q = np.empty(windows, np.float32), np.empty(windows, np.float32)
     r = np.empty(windows, np.float32)
     for u in range(windows):

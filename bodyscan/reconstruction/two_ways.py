@@ -1,7 +1,7 @@
-"""Points that stripes of two directions measure: of both, as well as each is known, where they agree.
+"""Combine the points measured by stripes of two directions, weighted by their sigmas.
 
-A pixel's ray meets a sheet of each family. Both depths are of the same ray, so that they differ by
-what decoding and calibration are off, and by nothing else: a check that needs no board.
+A pixel's ray meets a sheet of each direction. Both depths lie on the same ray, so they differ only
+by errors of decoding and calibration: a check that needs no board.
 """
 
 from __future__ import annotations
@@ -14,25 +14,30 @@ from bodyscan.arrays import Floats, Mask
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 
 MOST_OFF = 5.0
-"""Sigmas: noise alone does not get there; a wrong code does, or a pixel that saw two surfaces."""
+"""Sigmas: noise alone does not reach it; a wrong code does, or a pixel that saw two surfaces."""
 BELIEVED = 2.0
-"""Sigmas that the ways may commonly be apart: beyond, sigmas lack most of what is wrong (those of a
-calibration made elsewhere lack all of its own error), and cannot say what each way is worth."""
+"""Sigmas by which the directions may usually differ. Beyond, sigmas lack most of the error (an
+imported calibration's lack all of its own) and cannot weight the directions."""
 FEWEST = 100
 SOME_APART = 2e-3
 """Of the projector's picture: calibrations reproject to half a pixel or one of some 1000, a
-thousandth; twice that is no noise of theirs."""
+thousandth; twice that is more than their noise."""
 MOST_APART = 2e-2
-"""Of the projector's picture, about half a degree: no calibration is off by that, a wrong pose, sign
-or number of stripes is by more."""
+"""Of the projector's picture, about half a degree: no calibration is off by that, while a wrong
+pose, sign or number of stripes is off by more."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far the two ways were apart along the rays of `pixels` that have both: robust sigma, mm,
-    and the same in the sigmas that both depths claim.  dropped: pixels beyond MOST_OFF of those, or
-    of the claimed ones if these are larger, which have no point.  apart_stripes: the same in the
-    stripes, of so many, of the way that tells depth less."""
+    """How well the two directions agree.
+
+    pixels: number of pixels that have both depths.
+    apart_mm: robust sigma of their difference along the rays, mm.
+    apart_sigmas: the same in units of the sigmas of both depths.
+    dropped: pixels beyond MOST_OFF times that, or times their sigmas if larger, which get no point.
+    apart_stripes: the same in stripes of the direction with less accurate depth.
+    stripes: number of stripes of that direction.
+    """
 
     pixels: int
     apart_mm: float
@@ -43,12 +48,12 @@ class Agreement:
 
     @property
     def moderate(self) -> bool:
-        """Whether a calibration, not noise, is off by more than calibrations are."""
+        """Whether the calibration, not noise, is off by more than is usual."""
         return self._beyond(SOME_APART)
 
     @property
     def impossible(self) -> bool:
-        """Whether no calibration that is right is off by so much."""
+        """Whether no right calibration is off by so much."""
         return self._beyond(MOST_APART)
 
     @property
@@ -71,13 +76,14 @@ class Agreement:
 def combine(
     points: Floats, sigma_mm: Floats, crossing: Floats, crossing_mm: Floats, *, alone: Mask
 ) -> tuple[Floats, Floats, Agreement | None]:
-    """Points (H, W, 3) with sigma (H, W) along their rays from those of each way, NaN where none;
-    None where too few pixels have both.
+    """Points (H, W, 3) and sigmas (H, W) along their rays, from those of both directions.
 
-    alone: (H, W), where the crossing stripes may tell a point by themselves. Depths are weighted
-    by what their sigmas say. Sigmas that claim too little (calibrations of other programs have none)
-    make every pixel disagree alike: what is dropped is far beyond what most do, and the better way
-    alone tells the depth, the other being a check.
+    alone: where the crossing stripes may give a point by themselves, (H, W).
+
+    NaN where there are none; the agreement is None if too few pixels have both. Depths are weighted
+    by their sigmas. If the sigmas are too small (an imported calibration may have none), all pixels
+    disagree alike: then only those far beyond the others are dropped, and the better direction
+    alone gives the depth, the other being a check.
     """
     points, sigma_mm = points.copy(), sigma_mm.copy()
     both = np.isfinite(sigma_mm) & np.isfinite(crossing_mm)
@@ -92,7 +98,7 @@ def combine(
     off = along / np.sqrt(variance + variance_too)
     sigmas = SIGMAS_PER_MEDIAN * float(np.median(np.abs(off)))
     wrong = np.abs(off) > MOST_OFF * max(sigmas, 1.0)
-    share = variance / (variance + variance_too)  # of the other: weights are 1 / variance
+    share = variance / (variance + variance_too)  # of the other direction: weights are 1 / variance
     if sigmas > BELIEVED:
         share = np.full_like(share, float(np.median(share) > 0.5))
     points[both] = one + share[:, None] * (other - one)

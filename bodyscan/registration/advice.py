@@ -1,4 +1,4 @@
-"""What holds a rig together, what is weak in it, and which shots would help most."""
+"""What holds a rig together, where it is weak, and which further shots would help most."""
 
 from __future__ import annotations
 
@@ -27,13 +27,17 @@ from bodyscan.rig.rig import Rig
 WORTH = 0.8
 """Further shots that leave more than this share of a sigma are not worth taking."""
 WEAK_TIMES = 2.0
-"""A link is weak if its sigma is so many times that of the usual link of the best chain."""
+"""A link is weak if its sigma is this many times the usual one of the best chain."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """Two pairs that saw boards at the same moments; sigma_mm of second's place seen from first,
-    by all boards of the rig together."""
+    """Two pairs that saw boards at the same moments.
+
+    shots: how many.
+    sigma_mm: of the second pair's position relative to the first, by all boards of the rig
+        together.
+    """
 
     first: str
     second: str
@@ -43,9 +47,11 @@ class Link:
 
 @dataclass(frozen=True, eq=False)
 class MoreShots:
-    """`shots` more of the board at `place` bring the sigma of `pair` from before to after.
+    """How far `shots` more of the board at `place` reduce the sigma of `pair`.
 
-    between: the two pairs whose common view of it matters most.  halves: whether after is half.
+    between: the two pairs whose common view of it matters most.
+    before_mm, after_mm: the sigma without and with them.
+    halves: whether they halve it.
     """
 
     pair: str
@@ -59,11 +65,16 @@ class MoreShots:
 
 @dataclass(frozen=True, eq=False)
 class Advice:
-    """links: all, least known first.  chain: those by which all pairs are tied together best.
+    """What ties a rig together, and what would improve it.
 
-    bridges: links without which the rig falls apart; crucial: shots (with board) likewise.  weak:
-    links of the chain far less known than its usual ones; no other link does better there.
-    worst: the pair least known in the rig frame, and its sigma (mm, all axes together).
+    links: all of them, least known first.
+    chain: those that tie all pairs together best.
+    bridges: links without which the rig falls apart.
+    weak: links of the chain far less known than its usual ones; no other link ties their sides
+        better.
+    crucial: shots (with board) without which the rig falls apart.
+    worst, worst_sigma_mm: the pair least known in the rig frame, and its sigma over all axes.
+    more: the most useful further shots; None if none would help.
     """
 
     links: tuple[Link, ...]
@@ -77,7 +88,7 @@ class Advice:
 
     @property
     def lines(self) -> list[str]:
-        """For the builder of the rig."""
+        """The advice, for the builder of the rig."""
         said = [
             f"{_shots(link.shots)} in common is all that ties {link.first} to {link.second}, and with "
             "them the parts of the rig on either side"
@@ -98,7 +109,7 @@ class Advice:
 
 
 def advise(rig: Rig, placed: RigSolution) -> Advice:
-    """Links, weak spots and the most useful further shots of a placed rig."""
+    """Links, weak spots and the most useful further shots of a solved rig."""
     links = links_of(placed)
     graph = view_graph(placed.views, sorted(placed.rig_from_camera))
     bridging = {frozenset(edge) for edge in nx.bridges(graph)}
@@ -122,7 +133,7 @@ def advise(rig: Rig, placed: RigSolution) -> Advice:
 
 
 def links_of(placed: RigSolution) -> tuple[Link, ...]:
-    """Every two pairs that share a shot, the least known first."""
+    """Every two pairs that share a shot, least known first."""
     found = []
     graph = view_graph(placed.views, sorted(placed.rig_from_camera))
     for first, second, targets in graph.edges(data="targets"):
@@ -133,8 +144,8 @@ def links_of(placed: RigSolution) -> tuple[Link, ...]:
 
 
 def best_chain(links: Sequence[Link]) -> tuple[Link, ...]:
-    """The links (a minimum spanning tree by sigma) that tie all pairs together best, the least
-    known first."""
+    """The links that tie all pairs together best, a minimum spanning tree by sigma; least known
+    first."""
     graph = nx.Graph()
     graph.add_edges_from(
         (link.first, link.second, {"link": link, "sigma": link.sigma_mm}) for link in links
@@ -144,7 +155,7 @@ def best_chain(links: Sequence[Link]) -> tuple[Link, ...]:
 
 
 def crucial_shots(placed: RigSolution) -> tuple[Target, ...]:
-    """Shots whose loss would leave pairs that no shared view ties to the others."""
+    """Shots without which some pairs would share no view with the others."""
     graph = nx.Graph()
     graph.add_nodes_from(("pair", name) for name in placed.rig_from_camera)
     graph.add_edges_from((("pair", view.pair), ("shot", view.target)) for view in placed.views)
@@ -152,9 +163,9 @@ def crucial_shots(placed: RigSolution) -> tuple[Target, ...]:
 
 
 def more_shots(rig: Rig, placed: RigSolution, pair: str) -> MoreShots | None:
-    """The place for a board where fewest more shots halve the sigma of `pair`'s position.
+    """The place for a board at which the fewest further shots halve the sigma of `pair`'s position.
 
-    None where no place in the scan volume is seen by two pairs, or no shot would tell anything new.
+    None if no place in the scan volume is seen by two pairs, or no shot would add information.
     """
     usual, _ = Counter(view.board for view in placed.views).most_common(1)[0]
     places = board_places(rig.board(usual), rig.volume, placed.cameras, placed.rig_from_camera)
@@ -175,7 +186,7 @@ def more_shots(rig: Rig, placed: RigSolution, pair: str) -> MoreShots | None:
     if best.after_mm2[-1] > 0.98 * best.before_mm2:
         return None
     shots = best.shots_to_halve or MOST_SHOTS
-    # By what boards have shown of themselves; how much is gained, by corners that err independently.
+    # The sigma as boards have shown it; the gain as if corners erred independently.
     here = placed.rig_from_camera[pair].translation
     before = float(np.linalg.norm(position_sigma(placed.covariance, pair, here)))
     gained = float(np.sqrt(best.after_mm2[shots - 1] / best.before_mm2))
@@ -191,7 +202,7 @@ def more_shots(rig: Rig, placed: RigSolution, pair: str) -> MoreShots | None:
 
 
 def _preference(sharpening: SigmaReduction) -> tuple[int, float]:
-    """Fewest shots to halve; where that is equal or out of reach, most gained."""
+    """Sort key: fewest shots to halve; if equal or out of reach, the largest gain."""
     shots = sharpening.shots_to_halve
     return shots or MOST_SHOTS + 1, float(sharpening.after_mm2[(shots or MOST_SHOTS) - 1])
 
@@ -199,7 +210,7 @@ def _preference(sharpening: SigmaReduction) -> tuple[int, float]:
 def _between(
     knowledge: RigInformation, place: BoardPlace, pair: str, shots: int
 ) -> tuple[str, str]:
-    """The two pairs whose views of that board alone would tell most."""
+    """The two pairs whose views of that board alone would add most."""
 
     def left(two: tuple[str, str]) -> float:
         information = knowledge.information(place.seen_only_by(two))
@@ -209,7 +220,7 @@ def _between(
 
 
 def _facing(degrees: float) -> str:
-    """In words; x is the way the subject faces, y the subject's left."""
+    """A direction in words; x is the way the subject faces, y the subject's left."""
     ways = (
         "front",
         "front left",

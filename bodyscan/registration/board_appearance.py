@@ -1,4 +1,4 @@
-"""Boards that look otherwise than described, told from all their views together, and said in words."""
+"""Boards that look different from their description, judged by all their views together."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
 LEAST_VIEWS = 3
-"""So many views of the line beside it, and none of the last line itself, before that is doubted."""
+"""Views in which the neighbouring line must be seen before a last line never seen is doubted."""
 
 
 def without_odd_mirrored(views: Sequence[BoardView]) -> tuple[list[BoardView], list[str]]:
-    """Views without those that one camera saw the other way round than in most of its images: there
-    a picture was flipped, or a mirror stood in it.  With a line for each."""
+    """Drop views that one camera saw mirrored unlike most of its images; also a line for each.
+
+    In those an image was flipped, or showed a mirror.
+    """
     groups: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
     for view in views:
         groups[view.pair, view.board].append(view)
@@ -39,7 +41,7 @@ def without_odd_mirrored(views: Sequence[BoardView]) -> tuple[list[BoardView], l
 
 
 def appearance_notes(rig: Rig, views: Sequence[BoardView]) -> list[str]:
-    """A line for each way in which a board differs from its description in the rig file."""
+    """One line for each difference between a board and its description in the rig file."""
     return [
         line
         for board in rig.boards
@@ -86,7 +88,7 @@ def _notes_of_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
 
 
 def _lines_never_seen(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
-    """Where the board as described has a last row or column that no view shows."""
+    """Lines on a last row or column of the described board that no view shows."""
     columns, rows = corner_grid(board)
     for face in range(board.faces):
         seen = np.zeros((rows, columns), np.int64)

@@ -1,4 +1,4 @@
-"""Whether the boards are what the rig file says, by how much of them is found."""
+"""Check the boards against the rig file, by how much of them is found."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
 SELDOM = 0.5
-"""Boards of which fewer corners are found in the usual view are doubted, if no pose fits either."""
+"""Boards are doubted if fewer of their corners are found in the usual view, and no pose fits."""
 
 
 def describe_board(board: Board) -> str:
-    """The board as the rig file has it, for a message."""
+    """The board as the rig file describes it, for a message."""
     marker = f", markers of {board.marker_mm:g} mm, {board.dictionary}" if board.marker_mm else ""
     return (
         f"board {board.name} ({board.kind}, {board.columns} columns x {board.rows} rows of squares "
@@ -25,7 +25,7 @@ def describe_board(board: Board) -> str:
 
 
 def boards_not_found(rig: Rig, views: Sequence[BoardView], images: int) -> list[str]:
-    """A line for each board that none of the images shows as the rig file describes it."""
+    """One line for each board that no image shows as the rig file describes it."""
     seen = {view.board for view in views}
     return [
         f"{describe_board(board)} was found in none of {images} images: check it against the board "
@@ -37,7 +37,7 @@ def boards_not_found(rig: Rig, views: Sequence[BoardView], images: int) -> list[
 
 
 def describe_findings(rig: Rig, views: Sequence[BoardView], images: int) -> str:
-    """For when no camera could be calibrated: how much of each board was seen, and what to check."""
+    """How much of each board was seen and what to check, for when no camera could be calibrated."""
     lines = boards_not_found(rig, views, images)
     for board in rig.boards:
         own = [

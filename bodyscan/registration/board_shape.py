@@ -1,7 +1,7 @@
-"""Boards as they really are: bent, or printed a little off, found from all views of them together.
+"""Boards as they really are, bent or printed a little off, found from all views of them together.
 
-As OpenCV's calibrateCameraRO frees the object's points, but for every board of a rig at once, all
-cameras together; and taken only where boards that took no part are met better with it.
+Like OpenCV's calibrateCameraRO this frees the object's points, but for every board of a rig at once
+and with all cameras together; it is used only where held-out boards fit better with it.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from bodyscan.registration.normal_equations import CORNERS
 
 ROUNDS = 15
 HASTE = 1.6
-"""Corners go so many times as far as they would by themselves: cameras and poses follow them."""
+"""Over-relaxation of the corner steps: cameras and poses follow the corners."""
 SETTLED = 4e-6
 PRIOR = 4e-3
-"""How far a corner lies from where it should, before any picture says more: as shares of the board's
-diagonal (a millimetre in 250), for it may be given in any unit."""
+"""Prior sigma of a corner's place, as a share of the board's diagonal (a millimetre in 250),
+because boards may be given in any unit."""
 SUSPECT = 1.25
-"""Offsets are looked into where they lower the squared residuals by so many variances each: noise
-alone lowers them by one; of 48 corners or more by 1.25 once in 700 times."""
+"""Offsets are examined if they lower the squared residuals by this many variances each: noise alone
+lowers them by one, and with 48 corners or more by 1.25 once in 700 times."""
 FEWEST_TARGETS = 6
 DIGITS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class BoardShape:
-    """Where a board's corners lie: points (N, 3) nominal, offsets (N, 3), board frame, mm.
+    """Where a board's corners lie: nominal points (N, 3) and offsets (N, 3), board frame, mm.
 
-    The offsets hold no common motion; their size is the file's on average, since pictures alone
-    cannot tell a larger board that is farther away.
+    The offsets contain no common motion, and on average keep the size that the rig file gives,
+    since images alone cannot tell a larger board farther away.
     """
 
     points: Array
@@ -50,7 +50,7 @@ class BoardShape:
 
     @property
     def diagonal(self) -> float:
-        """From the first corner to the last, mm."""
+        """Distance from the first corner to the last, mm."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
     @property
@@ -59,7 +59,7 @@ class BoardShape:
 
     @property
     def out_of_plane_mm(self) -> float:
-        """From the lowest to the highest corner of a face."""
+        """Height from the lowest to the highest corner of a face, mm."""
         return max(
             float(np.ptp(self.offsets[self.points[:, 2] == z, 2]))
             for z in np.unique(self.points[:, 2])
@@ -67,30 +67,30 @@ class BoardShape:
 
     @property
     def stretch(self) -> tuple[float, float]:
-        """How much longer than said the board is along its columns and its rows, relative."""
+        """Relative excess length of the board along its columns and along its rows."""
         along = (np.polyfit(self.points[:, axis], self.offsets[:, axis], 1)[0] for axis in range(2))
         x, y = (float(value) for value in along)
         return x, y
 
     def face(self, points: Array) -> BoardFace:
-        """The face of which a view saw corners (M, 3), through all that any view saw of it."""
+        """The face on which a view saw corners (M, 3), through every corner of it in any view."""
         away = np.abs(self.points[:, 2] - np.median(points[:, 2]))
         return BoardFace.through((self.points + self.offsets)[away <= away.min() + 1e-3])
 
     def numbers(self, points: Array) -> Indices:
-        """(M,) which of its corners nominal points (M, 3) are, -1 for unknown ones."""
+        """Indices (M,) of nominal points (M, 3) among its corners, -1 for unknown ones."""
         number = {key: k for k, key in enumerate(_keys(self.points))}
         return np.array([number.get(key, -1) for key in _keys(points)], np.int64)
 
     def applied(self, points: Array) -> Array:
-        """Nominal points (M, 3) of this board -> where they lie; unknown ones stay."""
+        """Where nominal points (M, 3) of this board lie; unknown ones stay."""
         chosen = self.numbers(points)
         return points + np.where(chosen[:, None] >= 0, self.offsets[chosen], 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class ShapedSolution:
-    """The solve with boards as found: shapes by board name, views with their true points, notes."""
+    """The solve with boards as found: shapes by board name, and views with their true points."""
 
     solution: JointSolution
     views: list[LocatedView]
@@ -101,7 +101,7 @@ class ShapedSolution:
 def with_board_shapes(
     views: Sequence[LocatedView], solution: JointSolution, *, root: str, refine_cameras: bool
 ) -> ShapedSolution:
-    """Estimate the boards' shapes if the residuals call for it; keep them if held-out boards agree."""
+    """Estimate board shapes if the residuals call for it; keep them if held-out boards agree."""
     plain = ShapedSolution(solution, list(views), {}, ())
     targets = sorted({view.target for view in views})
     if len(targets) < FEWEST_TARGETS or _gain_per_unknown(views, solution) < SUSPECT:
@@ -122,7 +122,7 @@ def with_board_shapes(
 def with_same_shapes(
     views: Sequence[LocatedView], solution: JointSolution, found: ShapedSolution, *, root: str
 ) -> ShapedSolution:
-    """Shapes estimated anew where `found` has some: with other lenses, or other views."""
+    """Estimate the shapes in `found` again, for other lenses or other views."""
     if not found.shapes:
         return replace(found, solution=solution, views=list(views))
     return replace(_estimate(views, solution, root, True, found.shapes), notes=found.notes)
@@ -151,8 +151,10 @@ def _estimate(
     refine_cameras: bool,
     start: Mapping[str, BoardShape] | None = None,
 ) -> ShapedSolution:
-    """Shapes and everything else in turn, until both stand; from the boards as described, or shapes
-    that the solution has."""
+    """Alternate between shapes and everything else until both settle.
+
+    start: shapes that the solution has; None for boards as described.
+    """
     shapes = _flat(views)
     if start:
         shapes = {
@@ -179,7 +181,7 @@ def _estimate(
 
 
 def _flat(views: Sequence[LocatedView]) -> dict[str, BoardShape]:
-    """All corners that any view shows, by board, where they should be."""
+    """Flat shapes of all corners that any view shows, by board."""
     boards = sorted({view.board for view in views})
     seen = (np.concatenate([v.points for v in views if v.board == name]) for name in boards)
     nominal = (np.unique(np.round(points, DIGITS) + 0.0, axis=0) for points in seen)
@@ -187,7 +189,7 @@ def _flat(views: Sequence[LocatedView]) -> dict[str, BoardShape]:
 
 
 def _without_motion(shape: BoardShape) -> BoardShape:
-    """The same shape, turned, shifted and sized as the nominal board."""
+    """The same shape, with the pose and size of the nominal board."""
     moved = shape.points + shape.offsets
     fitted = rigid_fit(moved, shape.points).apply(moved)
     middle = shape.points.mean(axis=0)
@@ -202,7 +204,7 @@ def _corner_steps(
     shapes: Mapping[str, BoardShape],
     solution: JointSolution,
 ) -> dict[str, Array]:
-    """A Gauss-Newton step (N, 3) mm of every corner by itself, held near the nominal board."""
+    """Gauss-Newton steps (N, 3) mm of single corners, with a prior at the nominal board."""
     information, pull, variance = _corner_equations(shaped, numbers, shapes, solution)
     steps = {}
     for name, shape in shapes.items():
@@ -214,7 +216,7 @@ def _corner_steps(
 
 
 def _gain_per_unknown(views: Sequence[LocatedView], solution: JointSolution) -> float:
-    """By how many variances a free corner would lower the squared residuals, per coordinate."""
+    """Mean reduction of the squared residuals per coordinate of freed corners, in variances."""
     shapes = _flat(views)
     numbers = [shapes[view.board].numbers(view.points) for view in views]
     information, pull, variance = _corner_equations(views, numbers, shapes, solution)
@@ -232,10 +234,10 @@ def _corner_equations(
     shapes: Mapping[str, BoardShape],
     solution: JointSolution,
 ) -> tuple[dict[str, Array], dict[str, Array], float]:
-    """J^T W J (N, 3, 3), J^T W r (N, 3) of each board's corners, and the variance in px2.
+    """J^T W J (N, 3, 3) and J^T W r (N, 3) of each board's corners, and the variance in px2.
 
-    shaped: with points where they are thought to lie; numbers: which corners of their board's shape
-    these are.
+    shaped: views with points where they are thought to lie.
+    numbers: indices of these points in their board's shape.
     """
     ends = np.cumsum([len(shape.points) for shape in shapes.values()])
     first = dict(zip(shapes, [0, *ends[:-1].tolist()], strict=True))
@@ -260,8 +262,11 @@ def _corner_equations(
 
 
 def _by_corner(views: Sequence[LocatedView], solution: JointSolution) -> tuple[Array, Array]:
-    """Derivatives (N, 2, 3) px/mm of what one pair sees of corners by their places on their boards,
-    and the residuals (N, 2) px."""
+    """Derivatives and residuals of the corners seen by one pair.
+
+    (N, 2, 3) px/mm: of pixels by the corners' places on their boards.
+    (N, 2) px: residuals.
+    """
     pair = views[0].pair
     camera, camera_from_root = solution.cameras[pair], solution.root_from_camera[pair].inverse()
     placed = [camera_from_root @ solution.root_from_board[view.target] for view in views]
@@ -274,7 +279,8 @@ def _by_corner(views: Sequence[LocatedView], solution: JointSolution) -> tuple[A
 def _hold_out(
     views: Sequence[LocatedView], solution: JointSolution, root: str, refine_cameras: bool
 ) -> Compared:
-    """Boards held out, posed by the rest's cameras, flat and in the shape that the rest give them."""
+    """Residuals of held-out boards, flat and in the shape found from the rest, both posed by the
+    rest's cameras."""
     targets = sorted({view.target for view in views})
     flat_ones, bent_ones, part = [], [], []
     for half in range(2):
@@ -296,8 +302,11 @@ def _hold_out(
 
 
 def _without_extremes(compared: Compared) -> Compared:
-    """Less the board that speaks most for the shape and the one that speaks most against it: where
-    half the views leave a lens open beyond their boards, one board there would decide alone."""
+    """Drop the board most in favour of the shape and the one most against it.
+
+    Where half of the views leave a lens open beyond their boards, one board there would decide
+    alone.
+    """
     better = np.sum(compared.simple**2 - compared.rich**2, axis=1)
     boards = np.unique(compared.part)
     order = boards[np.argsort([better[compared.part == board].mean() for board in boards])]
@@ -306,7 +315,7 @@ def _without_extremes(compared: Compared) -> Compared:
 
 
 def _median(residuals: Array) -> float:
-    """px; the median, which a few wrong views do not change."""
+    """Median length, px, which a few wrong views do not change."""
     return float(np.sqrt(np.median(np.sum(residuals**2, axis=1))))
 
 

@@ -1,7 +1,7 @@
-"""The joint solve with every view judged by itself: wrong ones out, and back in where they fit.
+"""The joint solve with every view judged separately: wrong ones leave, and return once they fit.
 
-A view that is out takes no part, but is judged again by each solve that follows: what it was put out
-for may have been a lens that was too simple, a board thought flat, or a neighbour.
+A view that has left takes no part, but each later solve judges it again: the reason may have been a
+lens that was too simple, a board thought to be flat, or another view.
 """
 
 from __future__ import annotations
@@ -20,14 +20,19 @@ ROUNDS = 4
 
 @dataclass(frozen=True, eq=False)
 class ConsistentSolve:
-    """solution: of all views but the wrong ones.  notes: a line for each cause of being wrong."""
+    """The joint solve of consistent views.
+
+    solution: of all views but the wrong ones.
+    wrong: keys of those.
+    notes: one line for each cause of being wrong.
+    """
 
     solution: JointSolution
     wrong: frozenset[ViewKey]
     notes: tuple[str, ...] = ()
 
     def kept(self, views: Sequence[LocatedView]) -> list[LocatedView]:
-        """Those of the views that took part."""
+        """The views that took part."""
         return [view for view in views if view.key not in self.wrong]
 
 
@@ -40,7 +45,7 @@ def solve_consistently(
     limit_px: float,
     wrong: Collection[ViewKey] = (),
 ) -> ConsistentSolve:
-    """Solve and judge in turn until both stand; `wrong`: views to begin without."""
+    """Alternate between solving and judging until both settle; `wrong`: views to begin without."""
     at = ConsistentSolve(solution, frozenset(wrong))
     for turn in range(ROUNDS):
         kept = at.kept(views)
@@ -52,7 +57,7 @@ def solve_consistently(
         if now == at.wrong:
             return ConsistentSolve(solved, now, found.notes)
         whole_cameras = 2 * len(now) > len(views)  # see `rig_solve`
-        last = whole_cameras or turn >= ROUNDS - 2  # nothing comes and goes for ever
+        last = whole_cameras or turn >= ROUNDS - 2  # so that no view leaves and returns for ever
         at = ConsistentSolve(solved, now | at.wrong if last else now, found.notes)
         if whole_cameras:
             break
@@ -60,7 +65,7 @@ def solve_consistently(
 
 
 def _boards_of(views: Sequence[LocatedView], solution: JointSolution) -> JointSolution:
-    """With a pose of each of the views' boards and of no other."""
+    """The solution with poses of exactly those boards that the views show."""
     own = {
         view.target: solution.root_from_camera[view.pair] @ view.camera_from_board for view in views
     }

@@ -1,8 +1,8 @@
-"""Which pair or pole of a calibrated rig has moved since, told from boards that several pairs see.
+"""Which pair or pole of a calibrated rig has moved, found from boards that several pairs see.
 
-Every view of a board says where its camera stands to the board. Seen through the calibration, all
-views of one board must agree; pairs whose views do not, have moved. One pair or one whole pole
-after the other is let go, the one first that explains most, until all that is left fits.
+Every view of a board gives the board's pose in its camera. Carried through the calibration, all
+views of one board must agree; pairs whose views do not have moved. Single pairs or whole poles are
+freed one after another, each time the one that explains most, until the rest fits.
 """
 
 from __future__ import annotations
@@ -22,22 +22,25 @@ from bodyscan.geometry.transforms import RigidTransform, adjoint, twist_jacobian
 from bodyscan.registration.view_graph import Target
 
 Group = tuple[str, tuple[str, ...]]
-"""A name for people, and the pairs that move as one."""
+"""A name to show, and the pairs that move as one."""
 
 SIGNIFICANT = 45.0
-"""Chi-squared of six freedoms exceeded once in twenty million: nothing moves by chance."""
+"""Chi-squared with six degrees of freedom exceeds this once in twenty million by chance."""
 LEAST_MM, LEAST_DEG = 0.1, 0.005
-"""Smaller moves, however surely seen, harm no scan."""
+"""Smaller moves, however significant, harm no scan."""
 MOST_STEPS = 10
-SETTLED = 1e-3  # of chi-squared, beside SIGNIFICANT
+SETTLED = 1e-3  # of chi-squared, compared with SIGNIFICANT
 CORRELATED = 3.0
-"""Corners of one view share what lens and detector do to them: so many count as one."""
+"""Corners of one view share errors of lens and detector: this many count as one."""
 
 
 @dataclass(frozen=True, eq=False)
 class SeenPose:
-    """A board as one pair sees it: `camera_from_board`, with the covariance (6, 6) of its motion in
-    the camera frame (rotation vector in radians, translation in mm)."""
+    """A board as one pair sees it.
+
+    covariance: (6, 6) of its motion in the camera frame (rotation vector in radians, translation in
+        mm).
+    """
 
     pair: str
     target: Target
@@ -50,7 +53,7 @@ class SeenPose:
 
 
 def seen_pose(view: LocatedView, camera: Camera, sigma_px: float) -> SeenPose:
-    """From a view's corners, each off by `sigma_px` and so many together (see CORRELATED)."""
+    """A board's pose from a view's corners, each off by `sigma_px`, correlated as in CORRELATED."""
     points = view.camera_from_board.apply(view.points)
     jacobian = camera.jacobians(points)[1] @ twist_jacobian(points)
     jacobian = jacobian.reshape(-1, 6)
@@ -63,10 +66,12 @@ def seen_pose(view: LocatedView, camera: Camera, sigma_px: float) -> SeenPose:
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """Pairs that moved together: one pair, or all of a pole.
+    """A motion of pairs that moved together: one pair, or all of a pole.
 
-    motion: in the rig frame, `new rig_from_camera = motion @ old`.  covariance: (6, 6) of it.
-    shift_mm, sigma_mm: of the cameras' middle, and its standard deviation.  turn_deg: the rotation.
+    motion: in the rig frame, `new rig_from_camera = motion @ old`.
+    covariance: (6, 6) of the motion's twist.
+    shift_mm, sigma_mm: shift of the cameras' centroid, and its sigma over all axes.
+    turn_deg: angle of the rotation.
     """
 
     name: str
@@ -80,10 +85,12 @@ class Move:
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """moves: in the order found, the clearest first.  rig_from_board: of the boards used.
+    """What moved.
 
-    misfit: root mean square over the pairs of how far their views are off, in sigmas, after all
-    moves; `misfit_before`: without any.  lonely: pairs that share no board with another.
+    moves: in the order found, the clearest first.
+    rig_from_board: of the boards used.
+    misfit_before, misfit: RMS of what the views are off, in sigmas, before and after all moves.
+    lonely: pairs that share no board with another.
     """
 
     moves: tuple[Move, ...]
@@ -99,7 +106,13 @@ def find_drift(
     prior: PoseCovariance,
     poles: Mapping[str, str],
 ) -> Drift:
-    """poles: the pole of each pair that stands on one. Boards that one pair alone sees say nothing."""
+    """Find the pairs and poles that moved.
+
+    prior: covariance of the calibrated `rig_from_camera`.
+    poles: the pole of each pair that stands on one.
+
+    Boards that only one pair sees carry no information.
+    """
     shared = [pose for pose in poses if len({p.pair for p in poses if p.target == pose.target}) > 1]
     pairs = tuple(sorted({pose.pair for pose in shared}))
     lonely = tuple(sorted({pose.pair for pose in poses} - set(pairs)))
@@ -137,7 +150,7 @@ def find_drift(
 
 
 def _groups(pairs: Sequence[str], poles: Mapping[str, str]) -> list[Group]:
-    """Every pair, and every pole with several of them."""
+    """Every pair, and every pole with several pairs."""
     groups: list[Group] = [(f"pair {name}", (name,)) for name in pairs]
     for pole in sorted({poles[name] for name in pairs if name in poles}):
         own = tuple(name for name in pairs if poles.get(name) == pole)
@@ -148,7 +161,7 @@ def _groups(pairs: Sequence[str], poles: Mapping[str, str]) -> list[Group]:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """cost: chi-squared.  motions: of each group let go, covariance (6G, 6G) of their twists."""
+    """cost: chi-squared.  motions: of each freed group, covariance (6G, 6G) of their twists."""
 
     cost: float
     motions: list[RigidTransform]
@@ -158,7 +171,7 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False)
 class _Placings:
-    """Unknowns: small twists (P, 6) of the pairs, motions of the groups, the boards."""
+    """Unknowns: small twists (P, 6) of the pairs, motions of the groups, poses of the boards."""
 
     small: Array
     motions: list[RigidTransform]
@@ -177,7 +190,7 @@ class _Placings:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """prior_root: (6P, 6P), its square is the information on the pairs' twists."""
+    """prior_root: (6P, 6P), square root of the information on the pairs' twists."""
 
     poses: tuple[SeenPose, ...]
     pairs: tuple[str, ...]
@@ -196,7 +209,7 @@ class _State:
             [np.zeros(0, int), *(6 * prior.names.index(name) + np.arange(6) for name in pairs)]
         )
         covariance = prior.matrix[np.ix_(order, order)]
-        # The pair that holds the rig frame has no covariance at all: it is known to a micron.
+        # The pair that fixes the rig frame has zero covariance: give it a micron.
         covariance = covariance + np.diag(np.tile([1e-6**2] * 3 + [1e-3**2] * 3, len(pairs)))
         boards = {
             target: _agreed([p for p in poses if p.target == target], rig_from_camera)
@@ -205,8 +218,8 @@ class _State:
         return _State(tuple(poses), pairs, rig_from_camera, _whitener(covariance), boards)
 
     def solved(self, groups: Sequence[Group]) -> _Fit:
-        """Small motions of all pairs as far as the calibration allows, of the groups without limit,
-        and of the boards, as twists in the rig frame."""
+        """Solve for pair motions within the calibration's covariance, free motions of the groups,
+        and boards; all as twists in the rig frame."""
         first_group = 6 * len(self.pairs)
         first_board = first_group + 6 * len(groups)
         start = _Placings(
@@ -229,7 +242,7 @@ class _State:
         )
 
     def _blocks(self, groups: Sequence[Group], placings: _Placings) -> Iterator[Block]:
-        """Of each view how far it puts its board from where it is; first what is known of pairs."""
+        """The prior on the pairs, then for each view the offset of its board."""
         pairs, targets = list(self.pairs), list(placings.boards)
         of_group = {name: g for g, (_, own) in enumerate(groups) for name in own}
         held = placings.small.ravel()
@@ -268,20 +281,23 @@ class _State:
 def _gap(
     pose: SeenPose, rig_from_camera: RigidTransform, rig_from_board: RigidTransform
 ) -> tuple[Array, Array]:
-    """How far (twist in the rig frame) a view puts its board from where it is, (6,) in standard
-    deviations, and the matrix (6, 6) that brings twists to those."""
+    """Offset of a view's board from its current pose, and how twists change it.
+
+    (6,): the offset as a twist in the rig frame, in standard deviations.
+    (6, 6): the matrix that brings twists to standard deviations.
+    """
     gap = rig_from_camera @ pose.camera_from_board @ rig_from_board.inverse()
     root = pose.whitener @ adjoint(rig_from_camera.inverse())
     return root @ gap.twist, root
 
 
 def _side_by_side(signs: Array, root: Array) -> Array:
-    """The matrix (6, 6) once for each sign, (6, 6 S)."""
+    """The matrix (6, 6), repeated with each of S signs, (6, 6 S)."""
     return np.concatenate([sign * root for sign in signs], axis=1)
 
 
 def _whitener(covariance: Array) -> Array:
-    """The matrix that brings what has this covariance to independent standard deviations."""
+    """The matrix that maps a vector of this covariance to independent standard deviations."""
     if not len(covariance):
         return covariance
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
@@ -290,10 +306,10 @@ def _whitener(covariance: Array) -> Array:
 def _agreed(
     poses: Sequence[SeenPose], rig_from_camera: Mapping[str, RigidTransform]
 ) -> RigidTransform:
-    """Where most views say that a board lies: the view from which the others differ least."""
+    """A board's pose by majority: the view from which the others differ least."""
 
     def off(board: RigidTransform) -> float:
-        """Median distance of all views from a pose, in sigmas squared."""
+        """Median squared distance of all views from a pose, in sigmas squared."""
         gaps = (_gap(pose, rig_from_camera[pose.pair], board) for pose in poses)
         return float(np.median([sigmas @ sigmas for sigmas, _ in gaps]))
 

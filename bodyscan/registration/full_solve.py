@@ -1,10 +1,10 @@
 """The joint solve's last steps, over all parameters of our own cameras.
 
-COLMAP's cameras have neither skew nor pixels that are not square; what each pair's own calibration
-got wrong of these would go into the placings, unseen by their covariance. pycolmap brings the rig
-together from a start that may be centimetres off, and its result is within a few hundredths of a
-millimetre; here the package's own solver ends it, with the same corners, a Cauchy loss by their own
-spread and every parameter free. It is also what follows when views are left out or boards bent.
+COLMAP's cameras have neither skew nor non-square pixels; errors of each pair's own calibration in
+these would go into the poses, unseen by their covariance. pycolmap brings the rig together from a
+start that may be centimetres off, to within a few hundredths of a millimetre; the package's own
+solver then finishes with the same corners, a Cauchy loss scaled by their own robust sigma, and
+every parameter free. It also runs again after views are dropped or boards found to be bent.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from bodyscan.registration.normal_equations import CORNERS, corners_seen
 
 MOST_STEPS = 12
 SETTLED = 1e-3
-"""Variances: before the last step all unknowns were within 0.03 of their standard deviations of the
-minimum; that step leaves a few thousandths."""
+"""Convergence, in variances: before the last step all unknowns were within 0.03 standard deviations
+of the minimum; that step leaves a few thousandths."""
 
 
 def solve_fully(
@@ -47,7 +47,7 @@ def solve_fully(
 
 
 class _Unknowns:
-    """Which columns are whose: the pairs' motions but the root's, the boards', then the cameras'."""
+    """Columns of the unknowns: motions of all pairs but the root, of boards, then cameras."""
 
     def __init__(self, solution: JointSolution, root: str, refine_cameras: bool) -> None:
         self.refine_cameras = refine_cameras
@@ -83,7 +83,7 @@ class _Unknowns:
 def _blocks(
     of_pair: Sequence[Sequence[LocatedView]], solution: JointSolution, unknowns: _Unknowns
 ) -> Iterator[Block]:
-    """Of each pair the corners of its views, then what is known of each camera."""
+    """The corners of each pair's views, then the priors on the cameras."""
     placings = solution.cameras, solution.root_from_camera, solution.root_from_board
     for views in of_pair:
         pair = views[0].pair
@@ -102,10 +102,10 @@ def _blocks(
 
 
 def camera_priors(camera: Camera, own: Indices) -> Iterator[Block]:
-    """What is known of a camera, whose parameters' columns are `own`, beforehand.
+    """Priors on a camera whose parameters have the columns `own`.
 
-    Its prior, or its matrix about where it stands: that does not pull, but keeps what no view shows
-    from running off; and its lens as `lens_prior` has it.
+    Its own prior, or one on its matrix around the current values, which does not pull but keeps
+    what no view shows from running away; and the lens as in `lens_prior`.
     """
     if camera.prior is None:
         known = np.diag(1.0 / camera.prior_sigmas[: len(MATRIX)])
@@ -114,5 +114,5 @@ def camera_priors(camera: Camera, own: Indices) -> Iterator[Block]:
 
 
 def _without_motion(linearize: Callable[[], Array]) -> Callable[[], Array]:
-    """Of the root camera, which holds the frame."""
+    """Derivatives without those by the motion of the root camera, which fixes the frame."""
     return lambda: linearize()[:, 6:]

@@ -1,4 +1,4 @@
-"""Truth without truth: the rig placed twice, from halves of the shots, must agree with itself."""
+"""A check without ground truth: the rig solved from either half of the shots must agree."""
 
 from __future__ import annotations
 
@@ -21,25 +21,27 @@ from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_frame import RigFrame
 
 REACH_MM = 1300.0
-"""How far ahead of a camera a pose matters: about where the subject stands."""
+"""Distance ahead of a camera at which its pose matters: about where the subject stands."""
 ATTEMPTS = 200
 FEWEST_BOARDS = 3
-"""Of a camera in a half: from fewer its lens and focal length do not follow."""
+"""Fewest boards per camera in a half: fewer do not determine its lens and focal length."""
 TIMES_WHOLE = 5.0
-"""Two halves should differ by twice the sigma of the whole: either knows the rig from half as much,
-and both err. Beyond this a half lacks something that holds the rig, not only shots, and says nothing
-of the whole."""
-RANK_SHARE = 1e-9  # eigenvalues below this share of the largest are the frame's, taken out
+"""Limit on the expected difference of two halves, in sigmas of the whole. They should differ by
+twice that sigma, since each has half of the evidence and both err. Beyond the limit a half lacks
+something that holds the rig together, not only shots, and says nothing about the whole."""
+RANK_SHARE = 1e-9  # smaller eigenvalues are those of the frame, which was removed
 
 
 @dataclass(frozen=True, eq=False)
 class HalvesComparison:
-    """Differences between two solutions of the rig, second minus first, the common motion taken out.
+    """Differences between two solutions of the rig, second minus first, common motion removed.
 
-    names: the pairs compared.  apart: those that are not, which saw too few boards in a half or could
-    not be placed from it.  halves: the shots of each.  shifts_mm: (P, 3) of the camera centres, rig
-    frame.  sigmas_mm: (P, 3) expected.
-    over_expected: RMS of all differences over what the covariances promise; 1 is honest.
+    names: the pairs compared.
+    apart: pairs not compared, which saw too few boards in a half or could not be solved from it.
+    halves: the shots of each.
+    shifts_mm: of the camera centres, (P, 3), rig frame.
+    sigmas_mm: expected sigmas of the shifts, (P, 3).
+    over_expected: RMS of all differences in units of what the covariances predict; 1 is honest.
     """
 
     names: tuple[str, ...]
@@ -51,7 +53,7 @@ class HalvesComparison:
 
     @property
     def summary(self) -> str:
-        """One line."""
+        """The comparison in one line."""
         shift, sigma = rms_length(self.shifts_mm), rms_length(self.sigmas_mm)
         without = f" (without {', '.join(self.apart)}, not known from a half)" if self.apart else ""
         return (
@@ -62,13 +64,13 @@ class HalvesComparison:
 
 
 def compare_halves(rig: Rig, placed: RigSolution, *, seed: int = 0) -> HalvesComparison:
-    """Place the rig from either half of its shots and compare, pair by pair.
+    """Solve the rig from either half of its shots and compare, pair by pair.
 
-    Each half's frame is held by one pair and carried to where `placed` has that pair; the common
-    motion that remains is the frame's own and is taken out.  Raises FailedWork if there are fewer
-    than two pairs, if no halves tie two of them together with boards enough for their cameras, or if
-    halves know the rig so much worse than all shots do that nothing follows; RigDisconnected as
-    `solve_rig`.
+    Each half's frame is fixed by one pair and carried to where `placed` has that pair; the
+    remaining common motion is the frame's own and is removed. Raises FailedWork if there are fewer
+    than two pairs, if no halves tie two of them together with enough boards for their cameras, or
+    if halves determine the rig so much worse than all shots that nothing follows; RigDisconnected
+    as `solve_rig`.
     """
     everyone = tuple(sorted(placed.rig_from_camera))
     if len(everyone) < 2:
@@ -106,10 +108,10 @@ def compare_halves(rig: Rig, placed: RigSolution, *, seed: int = 0) -> HalvesCom
 def split_shots(
     views: Sequence[LocatedView], names: Sequence[str], *, seed: int = 0
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """The pairs that two halves of the shots, drawn by chance, both tie together with boards enough
-    for each; and the halves: of many draws those in which most pairs are.
+    """Split the shots at random into two halves that both tie as many pairs together as possible.
 
-    Raises FailedWork if in none two are.
+    Returns the pairs tied together in both, with enough boards for each, and the shots of the two
+    halves: the best of many draws. Raises FailedWork if no draw ties two pairs.
     """
     shots = sorted({view.shot for view in views})
     rng = np.random.default_rng(seed)
@@ -136,7 +138,7 @@ def _not_halved(shots: int) -> FailedWork:
 
 
 def _tied(halves: Sequence[Sequence[LocatedView]], names: Sequence[str]) -> tuple[str, ...]:
-    """The largest group of pairs that every half ties together, with boards enough for each."""
+    """The largest group of pairs that every half ties together, with enough boards for each."""
     group = set(names)
     while True:
         left = set(group)
@@ -153,10 +155,11 @@ def _tied(halves: Sequence[Sequence[LocatedView]], names: Sequence[str]) -> tupl
 def _placed_by(
     rig: Rig, placed: RigSolution, names: Sequence[str], shots: Sequence[str], holder: str
 ) -> tuple[dict[str, RigidTransform], PoseCovariance]:
-    """`rig_from_camera` of these pairs from these shots alone, and its covariance, in the frame of
-    `placed`; without those that disagree with the others there.
+    """`rig_from_camera` of these pairs from these shots alone, and its covariance.
 
-    Raises FailedWork if the holder does."""
+    In the frame of `placed`, without pairs that disagree with the others there. Raises FailedWork
+    if the holder does.
+    """
     held = rig.model_copy(update={"rig_frame": RigFrame(pair=holder)})
     views = [view for view in placed.views if view.shot in shots and view.pair in names]
     cameras = {name: placed.cameras[name] for name in names}
@@ -167,14 +170,14 @@ def _placed_by(
     to_rig = placed.rig_from_camera[holder] @ half.rig_from_camera[holder].inverse()
     carry = np.kron(np.eye(len(half.covariance.names)), adjoint(to_rig))
     placings = {name: to_rig @ t for name, t in half.rig_from_camera.items()}
-    # How much more than independent corners boards err is seen better on all of them.
+    # The excess over independent corners is better determined by all boards.
     unseen = max(placed.excess / half.excess, 1.0)
     matrix = unseen * carry @ half.covariance.matrix @ carry.T
     return placings, PoseCovariance(half.covariance.names, matrix)
 
 
 def _centre_sigmas(covariance: Array, centres: Array) -> Array:
-    """(P, 3) mm of the camera centres (P, 3), from the covariance (6P, 6P) of the pairs' motions."""
+    """Sigmas (P, 3) mm of camera centres (P, 3), from the covariance (6P, 6P) of their motions."""
     count, shown = len(centres), twist_jacobian(centres)
     own = covariance.reshape(count, 6, count, 6)[range(count), :, range(count)]
     variance = np.einsum("pii->pi", shown @ own @ shown.transpose(0, 2, 1))
@@ -182,8 +185,10 @@ def _centre_sigmas(covariance: Array, centres: Array) -> Array:
 
 
 def _without_common_motion(centres: Array, ahead: Array) -> Array:
-    """(6P, 6P): takes from all pairs' motions the one that moves them alike, least squares over
-    each camera's centre and the place it looks at."""
+    """(6P, 6P): removes from the pairs' motions the part common to all.
+
+    Least squares over each camera's centre and the place it looks at.
+    """
     points = np.concatenate([centres, centres + REACH_MM * ahead])
     own = twist_jacobian(points).reshape(2, len(centres), 3, 6)
     weights = np.einsum("kpij,kpil->pjl", own, own)  # (P, 6, 6)
@@ -192,7 +197,7 @@ def _without_common_motion(centres: Array, ahead: Array) -> Array:
 
 
 def _over_expected(differences: Array, covariance: Array) -> float:
-    """RMS of the differences in units of their standard deviations, correlations and all."""
+    """RMS of the differences in their standard deviations, with correlations."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     known = values > RANK_SHARE * values[-1]

@@ -1,8 +1,8 @@
-"""How well the joint solve knows its unknowns, as its own boards show it.
+"""How well the joint solve knows its unknowns, judged by its own boards.
 
 Corners do not err independently: what lens, light and detector do to one they do to its neighbours,
-and to the same board in the same place again. So each place of a board is one piece of evidence, and
-how much larger its pull on the unknowns is than independent corners would make it is seen, and goes
+and to the same board in the same place again. So each place of a board is one piece of evidence;
+how much larger its pull on the unknowns is than that of independent corners is measured and goes
 into the covariance (a sandwich with places as clusters; Liang and Zeger, Biometrika 73, 1986).
 """
 
@@ -22,16 +22,20 @@ from bodyscan.registration.normal_equations import NormalEquations
 from bodyscan.registration.view_graph import Target
 
 NEAR = 0.05
-"""Boards are in one place if none of their corners is farther off than this share of their size."""
+"""Boards share a place if no corner is farther off than this share of their size."""
 KNOWN_FROM = 10.0
-"""A place's own excess counts for half where it is known from so many degrees of freedom; the rest is
-what all places show together."""
+"""Degrees of freedom at which a place's own excess counts for half; the rest is what all places
+show together."""
 
 
 @dataclass(frozen=True, eq=False)
 class HonestCovariance:
-    """poses: of the pairs.  cameras: (P, P) of each camera's parameters, where they were free.
-    excess: by how many times the variances are what independent corners promise, over all places."""
+    """Covariance of the joint solve's unknowns.
+
+    poses: of the pairs.
+    cameras: (P, P) of each camera's parameters, where they were free.
+    excess: factor on the variances that independent corners predict, over all places.
+    """
 
     poses: PoseCovariance
     cameras: dict[str, Array]
@@ -41,7 +45,7 @@ class HonestCovariance:
 def honest_covariance(
     equations: NormalEquations, places: Sequence[Sequence[Target]]
 ) -> HonestCovariance:
-    """places: the targets of each; every target in one."""
+    """The sandwich covariance; places: the targets of each, every target in one."""
     rest = np.setdiff1d(
         np.arange(len(equations.matrix)),
         np.append(equations.held, np.arange(equations.first_board, equations.first_camera)),
@@ -67,7 +71,7 @@ def honest_covariance(
 def board_places(
     views: Sequence[LocatedView], rig_from_board: Mapping[Target, RigidTransform]
 ) -> list[list[Target]]:
-    """Targets grouped by where their board stood, each with the first that is near it."""
+    """Group targets by where their board stood, each with the first one near it."""
     sizes = {
         name: float(np.linalg.norm(np.ptp(points, axis=0)))
         for name in {view.board for view in views}
@@ -95,17 +99,18 @@ class _Excess:
 
 
 def _excess(information: Array, pulls: Array, inverse: Array, variance: float) -> _Excess:
-    """How many times larger than those of independent corners the squares of each place's pull are.
+    """How many times larger the square of each place's pull is than for independent corners.
 
-    A pull is taken in the unknowns' own standard deviations.  Its square expected: tr(S - S S), S the
-    place's share of all information; less than S because the solve followed it.
+    A pull is measured in the unknowns' own standard deviations. The expected square is tr(S - S S),
+    where S is the place's share of all information; it is less than S because the solve followed
+    the place.
     """
     shares = information @ inverse
     kept = shares - shares @ shares
     expected = np.einsum("kii->k", kept)
     freedoms = expected**2 / np.maximum(np.einsum("kij,kji->k", kept, kept), 1e-300)
     found = np.einsum("ki,ij,kj->k", pulls, inverse, pulls) / variance
-    if not expected.sum() > 1.0:  # one place alone: nothing is seen of how it errs
+    if not expected.sum() > 1.0:  # a single place: its errors cannot be judged
         return _Excess(np.ones(len(pulls)), 1.0)
     pooled = max(float(found.sum() / expected.sum()), 1.0)
     own = found / np.maximum(expected, 1e-12)
@@ -118,7 +123,7 @@ def _excess(information: Array, pulls: Array, inverse: Array, variance: float) -
 def _without_board(
     columns: Indices, matrix: Array, gradient: Array, held: Indices
 ) -> tuple[Indices, Array, Array]:
-    """A target's part with its board's motion eliminated, or known where it holds the frame."""
+    """A target's part with its board's motion eliminated, or fixed if the board holds the frame."""
     a, b = slice(0, len(columns) - 6), slice(len(columns) - 6, len(columns))
     reduced, pull = matrix[a, a], gradient[a]
     if columns[-1] not in held:
@@ -130,7 +135,7 @@ def _without_board(
 
 
 def _all_but_boards(equations: NormalEquations, rest: Indices) -> Array:
-    """All information on the unknowns `rest`, priors and all, boards eliminated."""
+    """All information on the unknowns `rest`, priors included, boards eliminated."""
     boards = np.arange(equations.first_board, equations.first_camera)
     every = np.setdiff1d(np.arange(len(equations.matrix)), boards)
     where = np.searchsorted(every, rest)

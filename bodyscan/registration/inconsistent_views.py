@@ -1,6 +1,6 @@
-"""Views of one board at one moment that cannot all be true: which, and why.
+"""Views of one board at one moment that cannot all be true: which they are, and why.
 
-Judged with the cameras as placed: every view by itself fits some pose of the board to within the
+Judged with the cameras as solved: every view by itself fits some pose of the board to within the
 corners' noise; together they must fit one.
 """
 
@@ -27,15 +27,17 @@ OTHER_SIZE = 0.005
 """A board whose squares seem to differ by this share is another board."""
 SAME_SIZE_SHOTS = 3
 STEPS = 15
-SETTLED = 1e-2  # variances: far less than tells a wrong view from a right one
+SETTLED = 1e-2  # variances: far less than separates a wrong view from a right one
 CORNERS = Noise("corners", group=2, least=0.1 * LEAST_BAD_PX)
 
 
 @dataclass(frozen=True, eq=False)
 class InconsistentViews:
-    """wrong: the views not to be used.  notes: a line for each cause, naming shot and pairs.
+    """Views that contradict the others.
 
-    sizes: of a board that seems to have larger or smaller squares, by the board's name.
+    wrong: the views not to be used.
+    notes: one line for each cause, naming shot and pairs.
+    sizes: name and relative size of boards whose squares seem larger or smaller.
     """
 
     wrong: tuple[LocatedView, ...]
@@ -45,20 +47,23 @@ class InconsistentViews:
 
 @dataclass(frozen=True, eq=False)
 class BoardFit:
-    """One board pose for several views: residuals (N, 2) px of each view, and how large the board
-    seems."""
+    """One board pose for several views.
+
+    residuals: (N, 2) px of each view.
+    size: the board's apparent size, relative to its description.
+    """
 
     residuals: tuple[Array, ...]
     size: float
 
     @property
     def rms_px(self) -> Array:
-        """(V,) of each view."""
+        """RMS error of each view, (V,)."""
         return np.array([rms_length(residuals) for residuals in self.residuals])
 
 
 def single_view_errors(views: Iterable[LocatedView], cameras: Mapping[str, Camera]) -> Array:
-    """RMS px (V,) of each view about the pose it was located at by itself."""
+    """RMS error of each view at the pose it was located at by itself, (V,) px."""
     return np.array(
         [
             rms_length(
@@ -70,7 +75,7 @@ def single_view_errors(views: Iterable[LocatedView], cameras: Mapping[str, Camer
 
 
 def error_limit(own: Array) -> float:
-    """px: a view farther off than this does not fit the rig. own: (V,) from `single_view_errors`."""
+    """Error in px beyond which a view does not fit the rig. own: (V,) from `single_view_errors`."""
     return max(TIMES_OWN * float(np.median(own)), LEAST_BAD_PX)
 
 
@@ -95,7 +100,7 @@ def find_inconsistent_views(
 
 
 def _wrong_squares(sizes: Sequence[tuple[str, float]]) -> Iterator[str]:
-    """A line for each board that seems to have the same other size in shot after shot."""
+    """One line for each board that seems to have the same other size in shot after shot."""
     for name in sorted({name for name, _ in sizes}):
         own = np.array([size for board, size in sizes if board == name])
         usual = float(np.median(own))
@@ -109,7 +114,7 @@ def _wrong_squares(sizes: Sequence[tuple[str, float]]) -> Iterator[str]:
 def _examine_board(
     group: list[LocatedView], solution: JointSolution, limit_px: float
 ) -> InconsistentViews:
-    """Which of one board's views at one moment are wrong, since not all of them can be true."""
+    """Find which of one board's views at one moment are wrong, given that not all can be true."""
     shot, board = group[0].target
     start = _placing(group, solution)
     own = [_fit_from_both([view], solution, start).rms_px[0] for view in group]
@@ -147,8 +152,10 @@ def _largest_agreement(
     start: RigidTransform,
     limit_px: float,
 ) -> list[LocatedView]:
-    """Leave out views one by one, each time the one without which the others agree best; none are
-    left where two disagree, since nothing says which is right."""
+    """Leave out views one by one, each time the one without which the others agree best.
+
+    Returns none if only two are left and disagree, since nothing shows which is right.
+    """
     kept = list(views)
     while len(kept) > 2:
         rests = [[view for view in kept if view is not out] for out in kept]
@@ -167,7 +174,7 @@ def _fit_from_both(
     *,
     free_size: bool = False,
 ) -> BoardFit:
-    """The board pose (and size) that fits all views, from the first view's own pose or `start`."""
+    """The board pose (and size) that fits all views, begun from the first view's or `start`."""
     own = solution.root_from_camera[views[0].pair] @ views[0].camera_from_board
     first = fit_board(views, solution, own, free_size=free_size)
     if len(views) == 1:
@@ -183,7 +190,7 @@ def fit_board(
     *,
     free_size: bool = False,
 ) -> BoardFit:
-    """The board pose (and size) that fits all views, from `placing` on."""
+    """The board pose (and size) that fits all views, starting from `placing`."""
     unknowns = 7 if free_size else 6
     fitted = minimize(
         (placing, 1.0),
@@ -201,7 +208,7 @@ def fit_board(
 def _corners(
     view: LocatedView, solution: JointSolution, state: tuple[RigidTransform, float], unknowns: int
 ) -> Block:
-    """Reprojection errors, px, by the board's motion and its size."""
+    """Reprojection errors, px; derivatives by the board's motion and size."""
     (placing, size), camera = state, solution.cameras[view.pair]
     camera_from_root = solution.root_from_camera[view.pair].inverse()
     in_root = placing.apply(size * view.points)
@@ -225,7 +232,7 @@ def _error(view: LocatedView, solution: JointSolution, placing: RigidTransform) 
 
 
 def _placing(group: Sequence[LocatedView], solution: JointSolution) -> RigidTransform:
-    """Of the views' board; where none of them took part in the solve, the first one's own."""
+    """Pose of the views' board; if none took part in the solve, the first view's own."""
     own = solution.root_from_camera[group[0].pair] @ group[0].camera_from_board
     return solution.root_from_board.get(group[0].target, own)
 

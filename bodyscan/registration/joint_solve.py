@@ -1,7 +1,7 @@
 """The rig in one solve (pycolmap): cameras are sensors of one rig, shots are frames, corners known.
 
-Ceres, behind pycolmap, does what it is best at: thousands of corners, a start that may be centimetres
-off, sparse. It knows neither skew nor pixels that are not square, so `full_solve` follows it.
+Ceres, behind pycolmap, does what it does best: thousands of corners, sparse, from a start that may
+be centimetres off. It knows neither skew nor non-square pixels, so `full_solve` follows it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WITHOUT_LENS = "SIMPLE_PINHOLE"
 
 @dataclass(frozen=True, eq=False)
 class JointSolution:
-    """All poses in the root camera's frame, mm, and the cameras: what a solve starts from, or found."""
+    """Cameras, and all poses in the root camera's frame, mm: the start or the result of a solve."""
 
     root_from_camera: dict[str, RigidTransform]
     root_from_board: dict[Target, RigidTransform]
@@ -44,8 +44,8 @@ def solve_jointly(
 ) -> JointSolution:
     """Bundle adjustment with the boards' corners as constant points and a Cauchy loss.
 
-    A world of COLMAP is one board; each (shot, board) is a frame, so `rig_from_world` is
-    `root_from_board`.  Raises FailedWork if the solver does not converge.
+    COLMAP's world is one board, and each (shot, board) is a frame, so `rig_from_world` is
+    `root_from_board`. Raises FailedWork if the solver does not converge.
     """
     cameras = start.cameras
     names = [root, *sorted(set(cameras) - {root})]
@@ -56,13 +56,14 @@ def solve_jointly(
         model.add_camera(colmap_camera(cameras[name], ids[name]))
     model.add_rig(_colmap_rig(names, start.root_from_camera))
     points = _add_points(model, views)
-    if not points:  # a single view of a camera that is known; `full_solve` needs no start
+    if not points:  # a single view of a known camera; `full_solve` needs no start
         return start
     seen = _seen_by_colmap(views, cameras)
     for number, target in enumerate(targets, start=1):
         group = [view for view in views if view.target == target]
         _add_frame(model, number, group, ids, seen, points, start.root_from_board[target])
-    # What others found of a camera, and how well, Ceres is not told: `full_solve` goes by it.
+    # Ceres is not told of cameras' priors, so hold those cameras here; `full_solve` uses the
+    # priors.
     known = [ids[name] for name in names if cameras[name].prior is not None]
     _adjust(model, refine_cameras, loss_px, known)
     rig = model.rig(1)
@@ -79,9 +80,9 @@ def solve_jointly(
 
 
 def colmap_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
-    """COLMAP's model of the lens: no skew and square pixels, see `colmap_pixels`.
+    """COLMAP's model of a camera, without skew and with square pixels; see `colmap_pixels`.
 
-    A lens that COLMAP does not have is taken out of the pixels instead and kept as it is.
+    A lens that COLMAP does not have is removed from the pixels instead and stays unchanged.
     """
     lens = camera.lens
     return pycolmap.Camera(
@@ -99,7 +100,7 @@ def colmap_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
 
 
 def colmap_pixels(camera: Camera, pixels: Array) -> Array:
-    """OpenCV px (N, 2) -> COLMAP px (N, 2) of `colmap_camera`: without skew, beta brought to alpha."""
+    """OpenCV px (N, 2) to COLMAP px (N, 2) of `colmap_camera`: no skew, beta equal to alpha."""
     square = camera.without_skew(
         pixels if camera.lens.colmap_model else camera.without_lens(pixels)
     )
@@ -110,7 +111,7 @@ def colmap_pixels(camera: Camera, pixels: Array) -> Array:
 def _seen_by_colmap(
     views: Sequence[LocatedView], cameras: Mapping[str, Camera]
 ) -> dict[ViewKey, Array]:
-    """`colmap_pixels` of each view, those of one camera together."""
+    """`colmap_pixels` of each view, computed camera by camera."""
     seen: dict[ViewKey, Array] = {}
     for pair in sorted({view.pair for view in views}):
         own = [view for view in views if view.pair == pair]
@@ -156,9 +157,9 @@ def _colmap_rig(names: Sequence[str], root_from_camera: dict[str, RigidTransform
 def _add_points(
     model: pycolmap.Reconstruction, views: Sequence[LocatedView]
 ) -> dict[tuple[str, tuple[float, ...]], int]:
-    """One constant point for each corner of each board; keyed by board and rounded place.
+    """Add one constant point for each corner of each board, keyed by board and rounded place.
 
-    COLMAP refuses a point that a single view observes: such a corner is left out.
+    COLMAP refuses a point observed in a single view: such corners are left out.
     """
     seen = Counter(key for view in views for key in _point_keys(view))
     keys = sorted(key for key, count in seen.items() if count > 1)
@@ -219,7 +220,7 @@ def _adjust(
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = loss_px
     options.ceres.solver_options.gradient_tolerance = 1e-6
-    options.ceres.solver_options.function_tolerance = 1e-6  # `full_solve` ends it
+    options.ceres.solver_options.function_tolerance = 1e-6  # `full_solve` finishes
     options.ceres.solver_options.num_threads = 2
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.images:

@@ -1,5 +1,7 @@
-"""Which further shots of a board would tell most about a pair's place: information added, not
-guessed."""
+"""Which further shots of a board would add most to what is known of a pair's position.
+
+Computed from the information they would add.
+"""
 
 from __future__ import annotations
 
@@ -24,22 +26,25 @@ from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Volume
 
 HEIGHTS_MM = {"knee": 500.0, "waist": 1000.0, "chest": 1350.0}
-# Shots at one place differ a little, as held boards do: about x, about y, in the board's plane.
+# Shots at one place differ a little, as hand-held boards do: about x, y and the board's normal.
 TILTS_DEG = ((20.0, 0.0, 0.0), (-20.0, 0.0, 15.0), (0.0, 20.0, -15.0))
 LEAST_FACING = 0.4  # cosine between the board's normal and the line of sight
 FEWEST_CORNERS = 12
 EDGE_PX = 5.0
 MOST_SHOTS = 60
-APART = 0.35  # of the volume's radius: boards are tried so far off the middle, too
+APART = 0.35  # of the volume's radius: boards are also tried this far off the middle
 STEP_DEG = 15.0
 
 
 @dataclass(frozen=True, eq=False)
 class BoardPlace:
-    """Where a board might be held: a few tilts of it about one place.
+    """Where a board might be held: a few tilts of it at one place.
 
-    facing_deg: azimuth of the front's normal in the rig frame.  views: of each tilt, by the pairs
-    that would see it.
+    height: name of the height, a key of HEIGHTS_MM.
+    centre_mm: the board's centre, rig frame, (3,).
+    facing_deg: azimuth of the front's normal, rig frame.
+    rig_from_board: of each tilt.
+    views: of each tilt, those of the pairs that would see it.
     """
 
     height: str
@@ -65,8 +70,10 @@ def board_places(
     cameras: Mapping[str, Camera],
     rig_from_camera: Mapping[str, RigidTransform],
 ) -> list[BoardPlace]:
-    """Upright boards at knee, waist and chest, facing between any two cameras; those that at least
-    two pairs would see."""
+    """Upright boards at knee, waist and chest height, facing between any two cameras.
+
+    Only those that at least two pairs would see.
+    """
     found = []
     for height, z in HEIGHTS_MM.items():
         if not volume.bottom_mm < z < volume.top_mm:
@@ -86,11 +93,11 @@ def board_places(
 
 
 def facings(placings: Iterable[RigidTransform], two_faced: bool) -> list[float]:
-    """Azimuths (radians) halfway between any two cameras, as seen from the rig's axis."""
+    """Azimuths (radians) halfway between any two cameras, seen from the rig's axis."""
     places = np.array([placing.translation[:2] for placing in placings])
     towards = places / np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-9)
     between = np.array([a + b for a, b in combinations(towards, 2)]).reshape(-1, 2)
-    between = between[np.linalg.norm(between, axis=1) > 0.2]  # opposite cameras: no way between
+    between = between[np.linalg.norm(between, axis=1) > 0.2]  # opposite cameras: nothing between
     degrees = np.degrees(np.arctan2(between[:, 1], between[:, 0]))
     steps = np.rint(degrees / STEP_DEG) * STEP_DEG % (180.0 if two_faced else 360.0)
     return [float(np.radians(step)) for step in np.unique(steps)]
@@ -98,20 +105,20 @@ def facings(placings: Iterable[RigidTransform], two_faced: bool) -> list[float]:
 
 @dataclass(frozen=True, eq=False)
 class SigmaReduction:
-    """Variance (mm2, all three axes together) of one pair's place after 1, 2, ... more shots."""
+    """Variance (mm2, over all three axes) of one pair's position after 1, 2, ... more shots."""
 
     before_mm2: float
     after_mm2: Array
 
     @property
     def shots_to_halve(self) -> int | None:
-        """Fewest shots that halve the sigma; None if so many as were tried do not."""
+        """Fewest shots that halve the sigma; None if the most that were tried do not."""
         enough = np.flatnonzero(self.after_mm2 <= self.before_mm2 / 4.0)
         return int(enough[0]) + 1 if enough.size else None
 
 
 class RigInformation:
-    """The information that the rig's shots hold, ready to have that of other shots added."""
+    """The information in the rig's shots, ready to have that of other shots added."""
 
     def __init__(
         self,
@@ -122,7 +129,8 @@ class RigInformation:
         self._equations = equations
         self._cameras, self._placings = cameras, rig_from_camera
         information = equations.without_boards()
-        # A board that holds the frame is gone from it already; a pair that does goes here.
+        # A board that holds the frame has been eliminated already; a pair that does is removed
+        # here.
         held_pair = equations.held[equations.held < equations.first_board]
         self._unknowns = len(information)
         self._free = np.setdiff1d(np.arange(self._unknowns), held_pair)
@@ -132,10 +140,10 @@ class RigInformation:
         self._inverse = invert_scaled(scaled)
 
     def information(self, place: BoardPlace) -> Array:
-        """What one shot there says, the mean of its tilts; scaled, free unknowns only."""
+        """Information in one shot there, averaged over its tilts; scaled, free unknowns only."""
         total = np.zeros((len(self._free), len(self._free)))
         for pose, views in zip(place.rig_from_board, place.views, strict=True):
-            if len(views) < 2:  # its own pose is unknown: one camera alone learns no pose
+            if len(views) < 2:  # a board seen by one camera adds nothing
                 continue
             shot = normal_equations(
                 views,
@@ -151,10 +159,10 @@ class RigInformation:
         return total * np.outer(self._scale, self._scale) / len(place.views)
 
     def after(self, information: Array, pair: str, most: int = MOST_SHOTS) -> SigmaReduction:
-        """How a pair's place sharpens with 1 to `most` shots of that information each.
+        """How the variance of a pair's position falls with 1 to `most` shots of that information.
 
-        The matrix inversion lemma in the basis in which the added information is diagonal, so that
-        all numbers of shots come at once.
+        Uses the matrix inversion lemma in the basis in which the added information is diagonal,
+        which gives all numbers of shots at once.
         """
         start = 6 * self._equations.names.index(pair)
         jacobian = np.zeros((3, self._unknowns))
@@ -174,7 +182,7 @@ class RigInformation:
 
 
 def _tilted(board: Board, centre: Array, ahead: Array) -> Iterator[RigidTransform]:
-    """`rig_from_board` of an upright board whose front looks along `ahead`, slightly tilted."""
+    """`rig_from_board` of an upright board whose front looks along `ahead`, with small tilts."""
     down = np.array([0.0, 0.0, -1.0])
     upright = np.column_stack([np.cross(down, -ahead), down, -ahead])
     middle = board.square_mm / 2.0 * np.array([board.columns, board.rows, 0.0])
@@ -189,7 +197,7 @@ def _views(
     cameras: Mapping[str, Camera],
     rig_from_camera: Mapping[str, RigidTransform],
 ) -> Iterator[LocatedView]:
-    """What each camera would see of the board, without noise."""
+    """Views that each camera would have of the board, without noise."""
     corners, count = corner_points(board), corners_per_face(board)
     for name, placing in rig_from_camera.items():
         camera_from_board = placing.inverse() @ rig_from_board

@@ -1,4 +1,4 @@
-"""The size of a rig by the nominal places of its cameras: all its lengths come from boards' squares."""
+"""Check a rig's size, which comes from board squares, by its cameras' nominal positions."""
 
 from __future__ import annotations
 
@@ -15,21 +15,25 @@ from bodyscan.rig.rig import Rig
 from bodyscan.verdict import Mark
 
 OTHER_SIZE, REFUSED_SIZE = 0.03, 0.10
-"""Of distances between cameras as a tape measures them. A girth is as wrong: 27 mm of 900 at 3 %."""
+"""Relative error of the distances between cameras, as measured with a tape. Girths are wrong by the
+same share: 27 mm of 900 at 3 %."""
 LEAST_APART_MM = 100.0
 
 
 @dataclass(frozen=True)
 class NominalSize:
-    """ratio: how many times as far apart the cameras stand as their nominal places.  boards: whose
-    squares said so."""
+    """The rig's size relative to its nominal poses.
+
+    ratio: distances between cameras, divided by those between their nominal positions.
+    boards: those whose squares give the rig's lengths.
+    """
 
     ratio: float
     boards: tuple[Board, ...] = ()
 
     @property
     def mark(self) -> Mark:
-        """Bad where no tape measure errs so far."""
+        """Bad if the ratio is off by more than any tape measure errs."""
         off = abs(self.ratio - 1.0)
         return "bad" if off > REFUSED_SIZE else "usable" if off > OTHER_SIZE else "good"
 
@@ -48,8 +52,8 @@ class NominalSize:
 
 
 def nominal_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> NominalSize | None:
-    """By the median of all distances between cameras; None where fewer than two nominal places are
-    known."""
+    """The size by the median over all distances between cameras; None if fewer than two nominal
+    positions are known."""
     nominal = {p.name: np.array(p.nominal.position_mm) for p in rig.pairs if p.nominal}
     ratios = [
         float(
@@ -63,8 +67,10 @@ def nominal_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> Nom
 
 
 def check_nominal_size(rig: Rig, rig_from_camera: Mapping[str, RigidTransform]) -> list[str]:
-    """A line if the cameras stand farther apart, or nearer, than they are meant to. Raises FailedWork
-    where no tape measure errs so far."""
+    """A note if the cameras stand farther apart, or closer, than they are meant to.
+
+    Raises FailedWork if they are off by more than any tape measure errs.
+    """
     size = nominal_size(rig, rig_from_camera)
     if size is None or size.mark == "good":
         return []

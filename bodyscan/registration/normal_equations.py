@@ -1,7 +1,7 @@
-"""What all corners say of all unknowns of a rig: the normal equations of the joint solve.
+"""The joint solve's normal equations: what all corners say about all unknowns of a rig.
 
 They give the covariance of every pose, what further shots would add, and the last steps of the
-solve itself, with what COLMAP's cameras lack (skew, pixels that are not square).
+solve itself, including what COLMAP's cameras lack (skew, non-square pixels).
 """
 
 from __future__ import annotations
@@ -24,8 +24,12 @@ CORNERS = Noise("corners", group=2, cauchy=4.0)
 
 @dataclass(frozen=True, eq=False)
 class OfTarget:
-    """What the views of one board at one moment add: J^T W J (C, C) and J^T W r (C,) of the unknowns
-    `columns` (C,), of which its own motion is the last six."""
+    """The contribution of the views of one board at one moment.
+
+    columns: indices of its unknowns, (C,); the board's own motion is the last six.
+    matrix: J^T W J, (C, C).
+    gradient: J^T W r, (C,).
+    """
 
     columns: Indices
     matrix: Array
@@ -34,12 +38,17 @@ class OfTarget:
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """matrix: J^T W J, px2 per unit of either unknown.  gradient: J^T W r.
+    """Normal equations of the joint solve.
 
-    Unknowns: motions of the pairs `names` (6 each), motions of the boards `targets` (6 each), then
-    the parameters of each pair's camera, of which there are `parameters` (0 each if cameras are
-    held).  held: unknowns that the rig frame's definition fixes.  variance_px2: of a corner's
-    coordinate.  parts: of each target, in their order; the prior is in none.
+    The unknowns are motions of the pairs `names` (6 each), motions of the boards `targets` (6
+    each), then the parameters of each pair's camera.
+
+    parameters: number of parameters of each camera, 0 if cameras are held.
+    matrix: J^T W J, px2 per unit of either unknown.
+    gradient: J^T W r.
+    held: unknowns fixed by the definition of the rig frame.
+    variance_px2: variance of one coordinate of a corner.
+    parts: contributions of the targets, in their order; the priors are in none of them.
     """
 
     names: tuple[str, ...]
@@ -61,7 +70,7 @@ class NormalEquations:
 
     @property
     def camera_columns(self) -> list[Indices]:
-        """Which unknowns are the parameters of each pair's camera."""
+        """Indices of the unknowns that are the parameters of each pair's camera."""
         return _runs(self.first_camera, self.parameters)
 
     @property
@@ -73,7 +82,7 @@ class NormalEquations:
         return np.setdiff1d(np.arange(len(self.matrix)), self.held)
 
     def without_boards(self) -> Array:
-        """Information on pairs and cameras, the boards eliminated.
+        """Information on pairs and cameras, with the boards eliminated.
 
         A board that holds the rig frame is known instead. Source: Schur complement, Triggs et al.,
         Bundle Adjustment - A Modern Synthesis, 2000, 6.1.
@@ -98,11 +107,12 @@ def normal_equations(
     cameras_free: bool,
     camera_prior: bool = True,
 ) -> NormalEquations:
-    """The joint solve's normal equations where it stands; Cauchy weights, a corner at a time.
+    """The joint solve's normal equations at the given poses, with Cauchy weights per corner.
 
-    A corner q of the rig frame is seen at R^T (q - t); a motion of the board and the opposite
-    motion of the camera change that alike, so both share one Jacobian.  `camera_prior` adds what is
-    known of cameras beforehand; leave it out where views are to be added to other views.
+    camera_prior: adds the cameras' priors; False where views are to be added to other views.
+
+    A corner q in the rig frame is seen at R^T (q - t); a motion of the board and the opposite
+    motion of the camera change that alike, so both share one Jacobian.
     """
     names = tuple(sorted(rig_from_camera))
     targets = sorted(rig_from_board)
@@ -162,7 +172,7 @@ def _of_target(
     board: Indices,
     spread: float,
 ) -> OfTarget:
-    """Of views with residuals (2N,), jacobians (2N, C) by the unknowns `columns` (C,)."""
+    """From views with residuals (2N,), and jacobians (2N, C) by the unknowns `columns` (C,)."""
     others = np.setdiff1d(np.concatenate([board, *columns]), board)
     every = np.append(others, board)
     place = {column: k for k, column in enumerate(every.tolist())}
@@ -176,7 +186,7 @@ def _of_target(
 
 
 def _runs(first: int, sizes: Sequence[int]) -> list[Indices]:
-    """Consecutive numbers from `first`, as many in each run as `sizes` says."""
+    """Consecutive numbers from `first`, in runs of the given sizes."""
     return np.split(np.arange(first, first + sum(sizes)), np.cumsum(sizes)[:-1])
 
 
@@ -202,8 +212,11 @@ def corners_seen(
     *,
     cameras_free: bool,
 ) -> tuple[Array, Callable[[], Array]]:
-    """Reprojection errors (2N,) px of one pair's views, and what gives their Jacobian (2N, 12 + P): by
-    the camera's motion, each board's motion, and the camera's parameters if free."""
+    """Reprojection errors (2N,) px of one pair's views, and a function for their Jacobian.
+
+    The Jacobian (2N, 12 + P) is by the camera's motion, each board's motion, and the camera's
+    parameters if free.
+    """
     pair = views[0].pair
     camera = cameras[pair]
     in_rig = np.concatenate([rig_from_board[view.target].apply(view.points) for view in views])

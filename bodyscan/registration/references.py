@@ -1,8 +1,8 @@
 """The size of a rig by references: certified lengths, measured by the cameras as boards place them.
 
-All lengths of a rig come from what `square_mm` says of prints, which paper and printers change by
-parts in a thousand. Boards of references take no part in the solve; their corners are
-triangulated, and what they come to against the certificate is how much all prints are off.
+All lengths of a rig come from the `square_mm` of prints, which paper and printers change by parts
+in a thousand. Boards of references take no part in the solve; their corners are triangulated, and
+the ratio of their measured to their certified length shows how far off all prints are.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ from bodyscan.rig.reference import Reference
 from bodyscan.rig.rig import Rig
 
 FEWEST = 6
-"""corners of a board that two cameras saw: fewer say little of its middle, and hide a wrong one."""
+"""Corners of a board that two cameras must see: fewer give its middle poorly, and hide a wrong
+one."""
 DISAGREE_SIGMAS = 4.0
-"""References farther apart than that contradict each other: once in 10,000 by chance."""
+"""References that differ by more contradict each other: once in 10,000 by chance."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """How many times as large all is as `square_mm` says; sigma: relative; 0 where nothing fixes it."""
+    """True size over that by `square_mm`, and its relative sigma, 0 if nothing fixes it."""
 
     factor: float = 1.0
     sigma: float = 0.0
@@ -47,7 +48,7 @@ class _Reading:
 
 
 def solving_views(rig: Rig, views: Sequence[BoardView]) -> list[BoardView]:
-    """Those that place the rig: of boards that are no reference, if there are any."""
+    """Views that place the rig: those of boards that are not references, if there are any."""
     certified = {name for reference in rig.references for name in reference.boards}
     if certified.issuperset(board.name for board in rig.boards):
         return list(views)
@@ -55,9 +56,10 @@ def solving_views(rig: Rig, views: Sequence[BoardView]) -> list[BoardView]:
 
 
 def find_size(rig: Rig, placed: RigSolution, views: Sequence[BoardView]) -> Outcome[Size]:
-    """By all references together, with a line on each.
+    """The rig's size by all references together, with a note on each.
 
-    Raises FailedWork for a size that is no printer's error, or references that contradict each other.
+    Raises FailedWork for a size that no printer's error explains, or references that contradict
+    each other.
     """
     found: dict[str, Size] = {}
     notes: list[str] = []
@@ -95,7 +97,7 @@ def find_size(rig: Rig, placed: RigSolution, views: Sequence[BoardView]) -> Outc
 
 
 def resized(rig: Rig, factor: float) -> Rig:
-    """The rig with the squares that its boards turned out to have."""
+    """The rig with the square sizes that its boards turned out to have."""
     certified = {name for reference in rig.references for name in reference.boards}
     alone = certified.issuperset(board.name for board in rig.boards)
     return rig.model_copy(
@@ -135,7 +137,7 @@ def _refuse(rig: Rig, found: dict[str, Size], size: Size) -> None:
 
 
 def _mean(readings: Sequence[_Reading]) -> tuple[float, float]:
-    """Of all shots, and its sigma, larger where shots scatter more than each promises."""
+    """Mean over all shots and its sigma, larger if shots scatter more than their sigmas say."""
     lengths = np.array([one.length_mm for one in readings])
     weights = np.array([one.sigma_mm**-2 for one in readings])
     mean = float(weights @ lengths / weights.sum())
@@ -146,7 +148,7 @@ def _mean(readings: Sequence[_Reading]) -> tuple[float, float]:
 def _readings(
     rig: Rig, reference: Reference, placed: RigSolution, views: Sequence[BoardView]
 ) -> Iterator[_Reading]:
-    """One for each shot in which two cameras saw enough of all its boards."""
+    """One reading for each shot in which two cameras saw enough of all its boards."""
     for shot in sorted({view.shot for view in views if view.board in reference.boards}):
         seen = []
         for name in reference.boards:
@@ -163,8 +165,10 @@ def _readings(
 
 
 def triangulated(placed: RigSolution, views: Sequence[BoardView]) -> tuple[Indices, Array]:
-    """Numbers (N,) of the corners of one board that several placed cameras saw, and where they are,
-    (N, 3) mm, rig frame: nearest to all rays."""
+    """Triangulate the corners of one board that several solved cameras saw.
+
+    Returns their numbers (N,) and positions (N, 3) mm, rig frame, nearest to all rays.
+    """
     views = [view for view in views if view.pair in placed.rig_from_camera]
     if len({view.pair for view in views}) < 2:
         return np.zeros(0, np.int64), np.zeros((0, 3))
@@ -187,28 +191,32 @@ def triangulated(placed: RigSolution, views: Sequence[BoardView]) -> tuple[Indic
 
 
 def _along(board: Board, ids: Indices, points: Array, excess: float) -> _Reading:
-    """Of one board: its size against its layout, as a similarity has it."""
+    """The length of one board, from the scale of a similarity onto its layout."""
     layout = corner_points(board)
     length = board_length(board)
     own, found = layout[ids], rigid_fit(layout[ids], points).inverse().apply(points)
     spread = own - own.mean(axis=0)
     scale = float(np.sum(spread * found) / np.sum(spread**2))
     left = found - found.mean(axis=0) - scale * spread
-    # As corners err along the board, which is less than towards the cameras.
+    # Corners err less along the board than towards the cameras.
     sigma = np.sqrt(excess * np.sum(np.sum(spread * left, axis=1) ** 2)) / np.sum(spread**2)
     return _Reading(scale * length, float(sigma) * length)
 
 
 def board_length(board: Board) -> float:
-    """mm between the first and the last corner of a row of corners."""
+    """Distance between the first and the last corner of a row of corners, mm."""
     layout = corner_points(board)
     return float(np.linalg.norm(layout[corner_grid(board)[0] - 1] - layout[0]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Middle:
-    """Where the middle of a board is, (3,) mm, rig frame; left: (N, 3) by how much its corners lie
-    elsewhere; lever: corners to one side leave the middle at the end of one, of their own spread."""
+    """The middle of a board.
+
+    place: (3,) mm, rig frame.
+    left: residuals (N, 3) mm of its corners.
+    lever: distance of the middle from the corners' centroid, in units of their RMS radius.
+    """
 
     place: Array
     left: Array

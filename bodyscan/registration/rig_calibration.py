@@ -1,4 +1,4 @@
-"""A calibrated rig: every pair, where it stands, and how well that is known."""
+"""A calibrated rig: every pair, its pose, and how well that is known."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from bodyscan.rig.rig import Rig
 
 @dataclass(frozen=True, eq=False)
 class SeenCorners:
-    """Board corners that one camera saw and that the joint solve used.
+    """Board corners that one camera saw and the joint solve used.
 
-    pixels: (N, 2) float32, where they were seen.  residuals_px: (N, 2) float32, projected less seen.
-    target: (N,) int16, number of its (shot, board) among those of `rig_from_board`, sorted.
+    pixels: where they were seen, (N, 2) float32.
+    residuals_px: projected less seen, (N, 2) float32.
+    target: number of the corner's (shot, board) in sorted `rig_from_board`, (N,) int16.
     """
 
     pixels: Floats
@@ -29,12 +30,17 @@ class SeenCorners:
 
 @dataclass(frozen=True, eq=False)
 class RigCalibration:
-    """rig: what the rig file said.  pairs and rig_from_camera: by the pair's name.
+    """A calibrated rig.
 
-    rig_from_board: by (shot, board).  failed: pairs that could not be calibrated, with the reason.
-    notes: views that were dropped and other things a builder should know.  advice: how well the
-    poses of the pairs are known, and what would help most, in words.  seen: the corners that the
-    joint solve used, by the pair's name; empty in calibrations stored before they were kept.
+    rig: content of the rig file.
+    pairs, rig_from_camera: by the pair's name.
+    covariance: of the poses of the pairs.
+    rig_from_board: by (shot, board).
+    failed: pairs that could not be calibrated, with the reason.
+    notes: views that were dropped, and other things a builder should know.
+    advice: how well the pairs' poses are known, and what would help most, in words.
+    seen: the corners that the joint solve used, by pair; empty in calibrations stored before
+        corners were kept.
     """
 
     rig: Rig

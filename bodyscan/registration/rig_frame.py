@@ -36,11 +36,11 @@ def frame_board_turn(
     root_from_camera: Mapping[str, RigidTransform],
     root_from_board: Mapping[Target, RigidTransform],
 ) -> RigidTransform:
-    """`board_from_seen` of the board that fixes the rig frame, if that board is a plain one.
+    """`board_from_seen` of the board that fixes the rig frame, if it is a plain one.
 
-    Such a board may be numbered from its other end, or lie on its other face, as far as pictures can
-    tell: of all readings, that under which the cameras stand nearest to where they are meant to, or
-    at least above the floor.
+    Images cannot tell whether such a board is numbered from its other end or lies on its other
+    face. Of all readings this takes the one that puts the cameras nearest to their nominal
+    positions, or at least above the floor.
     """
     target = frame_target(rig)
     if (
@@ -68,7 +68,7 @@ def rig_from_root(
     root_from_camera: Mapping[str, RigidTransform],
     root_from_board: Mapping[Target, RigidTransform],
 ) -> RigidTransform:
-    """Carries the joint solve's root frame into the rig frame.
+    """Transform from the joint solve's root frame to the rig frame.
 
     Raises BadInput if the board or pair that should fix the frame was not seen or calibrated.
     """
@@ -94,10 +94,10 @@ def rig_from_root(
 def rig_from_world(
     rig: Rig, world_from_camera: Mapping[str, RigidTransform]
 ) -> RigidTransform | None:
-    """Carries the frame of cameras that another program placed into the rig frame; None where the rig
-    file does not say where the pair stands that holds it.
+    """Transform from the frame of cameras that another program placed to the rig frame.
 
-    Raises BadInput if that pair is not among them.
+    None if the rig file does not give the pose of the pair that holds it. Raises BadInput if that
+    pair is not among them.
     """
     pair = rig.frame_pair
     if pair is None or (rig.rig_frame.pair is None and pair.nominal is None):
@@ -112,8 +112,10 @@ def _at_its_nominal_pose(
     done: str = "calibrated",
     source: str = "that pair's captures",
 ) -> RigidTransform:
-    """Carries the frame of `from_camera` to where the pair stands as it should.  done, source: how it
-    was to be known, and from what."""
+    """Transform that puts a pair at its nominal pose.
+
+    done, source: for the error, how its pose was to be known and from what.
+    """
     if pair.name not in from_camera:
         raise BadInput(
             f"the rig frame is fixed by pair {pair.name}, which could not be {done}",

@@ -1,8 +1,8 @@
-"""Each camera's lens in a rig of several: chosen after all were solved with the richest.
+"""The lens of each camera in a rig of several, chosen after all were solved with the richest one.
 
-So no view is thought wrong because a lens was too simple, and boards that turned out bent try the
-lenses in the shape they have.  Cameras of a rig are as a rule of one make: what none can prove by
-itself all may together.
+So no view is thought wrong because a lens was too simple, and boards found to be bent test the
+lenses in their true shape. Cameras of a rig are usually of one make: what none can prove alone, all
+may prove together.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from bodyscan.rig.rig import Rig
 
 
 def lens_notes(trials: Mapping[str, Sequence[LensTrial]]) -> list[str]:
-    """A line for each camera that the chapter's lens does not describe."""
+    """One line for each camera that the chapter's lens does not describe."""
     return [
         f"{name}: lens {chosen.kind}, by {chosen.gain:.0f} standard errors"
         f"{'' if chosen.gain >= CLEARLY else ', as cameras of its make'}: boards held out fit to "
@@ -42,8 +42,11 @@ def lens_notes(trials: Mapping[str, Sequence[LensTrial]]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class ChosenLenses:
-    """The solution with the lenses chosen; by camera, how each lens did where its lens was open, and
-    how well each pixel's ray is known by the corners, if those err independently."""
+    """The solution with the chosen lenses.
+
+    trials: by camera whose lens was open, how each lens did.
+    rays: by camera, how well the corners determine each pixel's ray if they err independently.
+    """
 
     solution: JointSolution
     trials: dict[str, tuple[LensTrial, ...]]
@@ -51,16 +54,17 @@ class ChosenLenses:
 
 
 def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolution) -> ChosenLenses:
-    """Held-out boards choose each camera's lens, its own or those of all cameras of its make
-    together; one that the rig file names stays.
+    """Choose each camera's lens by held-out boards, its own or those of all cameras of its make.
 
-    views: their points where the boards' corners really lie.
+    A lens that the rig file names stays.
+
+    views: with points where the boards' corners really lie.
     """
     open_lens = {pair.name for pair in rig.pairs if pair.camera.lens == AUTO}
     looked = {
         name: _Looked.of(name, views, solution)
         for name in sorted(solution.cameras)
-        if solution.cameras[name].prior is None  # or another program knew it
+        if solution.cameras[name].prior is None  # otherwise another program gave it
         and any(view.pair == name for view in views)
     }
     kinds = {
@@ -86,7 +90,7 @@ def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolutio
 
 @dataclass(frozen=True, eq=False)
 class _Looked:
-    """A camera, solved with the richest lens, and what it saw: poses `camera_from_board`."""
+    """A camera solved with the richest lens, its views and their `camera_from_board`."""
 
     camera: Camera
     poses: list[RigidTransform]
@@ -111,7 +115,7 @@ class _Looked:
 
 
 def _of_one_make(looked: Mapping[str, _Looked]) -> Iterator[list[str]]:
-    """Cameras whose pictures are of one size, as far as images tell what is of one make."""
+    """Groups of cameras with images of one size, as far as images show which are of one make."""
     size = {name: (own.camera.width, own.camera.height) for name, own in looked.items()}
     for one in sorted(set(size.values())):
         yield [name for name in looked if size[name] == one]
@@ -122,11 +126,11 @@ def _choose_together(
     looked: Mapping[str, _Looked],
     kinds: Mapping[str, Sequence[type[Lens]]],
 ) -> dict[str, ChosenLens]:
-    """The lenses, Brown's in place of the chapter's where all cameras together call for it and a
-    camera's own boards do not speak against it.
+    """The lenses, with Brown's in place of the chapter's where the cameras together call for it.
 
-    A decentring too small for one camera to prove is not zero: left out, it hides in the principal
-    point, whose sigma knows nothing of it.  What a rational lens has besides hides nowhere.
+    A camera's own boards must not speak against it. A decentring too small for one camera to prove
+    is not zero: left out, it hides in the principal point, whose sigma does not account for it. The
+    other terms of a rational lens hide nowhere.
     """
     found = dict(chosen)
     said = {name: _gain(lens, Brown) for name, lens in found.items()}
@@ -143,12 +147,12 @@ def _choose_together(
 
 
 def _gain(lens: ChosenLens, kind: type[Lens]) -> float | None:
-    """By how many standard errors this camera's own boards call for such a lens; None if not tried."""
+    """Standard errors by which this camera's own boards call for such a lens; None if not tried."""
     return next((trial.gain for trial in lens.trials if trial.kind == kind.kind), None)
 
 
 def _with_what_followed(trials: Sequence[LensTrial], again: ChosenLens) -> tuple[LensTrial, ...]:
-    """Trials of which the last refused a lens, when it was taken after all and richer ones tried."""
+    """The trials, when a lens first refused was taken after all and richer ones were tried."""
     *before, refused = trials
     taken = replace(refused, chosen=again.fit.camera.lens.kind == refused.kind)
     return (*(replace(trial, chosen=False) for trial in before), taken, *again.trials[1:])

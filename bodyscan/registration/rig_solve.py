@@ -1,8 +1,8 @@
-"""From board views of many pairs to one placed rig: graph, joint solve, bad views out, rig frame.
+"""From board views of many pairs to one solved rig: graph, joint solve, bad views out, rig frame.
 
-Two solvers follow each other: pycolmap's bundle adjustment (`joint_solve`) brings everything together
-from the graph's rough start; our own least squares (`full_solve`) ends it with every parameter of our
-cameras, and is what is repeated when views are taken out or boards turn out bent.
+Two solvers follow each other. pycolmap's bundle adjustment (`joint_solve`) brings everything
+together from the graph's rough start; our own least squares (`full_solve`) finishes with every
+parameter of our cameras, and is repeated when views are dropped or boards found to be bent.
 """
 
 from __future__ import annotations
@@ -51,22 +51,26 @@ from bodyscan.registration.view_graph import (
 from bodyscan.rig.rig import Rig
 
 LOSSES_PX = (10.0, 0.3)
-"""First as wide as a start from one wrong view is off: with the second alone a pair stays with the
-few views that it was placed by, and all others seem wrong."""
+"""The first is as wide as a start from one wrong view is off: with the second alone a pair stays
+with the few views that it was placed by, and all others seem wrong."""
 COARSE_PX = 30.0
-"""What a view may be off where only the graph has placed the pairs."""
+"""What a view may be off while the pairs are placed by the graph alone."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigSolution:
-    """Everything in the rig frame; cameras as the joint solve left them; rms_px of each pair.
+    """The solved rig, rig frame.
 
-    views: those used, their points where the boards' corners really lie.  board_shapes: of boards
-    that are not as described, where others' views confirm it.  lenses: those tried on held-out
-    boards, by camera; of cameras whose lens was open.  camera_covariances: (P, P) of each camera's
-    parameters, where the solve refined them.  excess: by how many times variances are larger than
-    corners that err independently would make them, as the boards' places show.  rays: how well each
-    pixel's is known, by camera.
+    rig_from_camera, covariance: poses of the pairs.
+    cameras: as the joint solve left them.
+    rms_px: RMS error of corners, by pair.
+    views: those used, with points where the boards' corners really lie.
+    board_shapes: of boards that differ from their description, confirmed by held-out boards.
+    lenses: by camera whose lens was open, those tried on held-out boards.
+    camera_covariances: covariance (P, P) of each camera's parameters, where the solve refined them.
+    excess: factor by which variances exceed those of corners that err independently, judged by the
+        places of boards.
+    rays: by camera, how well each pixel's ray is known.
     """
 
     rig_from_camera: dict[str, RigidTransform]
@@ -84,8 +88,8 @@ class RigSolution:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """judged: the last solve of boards as they are; shaped: that solve with the shapes found for
-    them, and its views; dropped: views left out.  lenses: if they were chosen."""
+    """judged: the last solve of boards as described or in shape.  shaped: that solve with the board
+    shapes found, and its views.  dropped: views left out.  lenses: None if not chosen."""
 
     judged: ConsistentSolve
     shaped: ShapedSolution
@@ -102,13 +106,13 @@ def solve_rig(
 ) -> Outcome[RigSolution]:
     """Join all pairs by their shared board views.
 
-    cameras: with the richest lens to be tried; of those whose lens the rig file leaves open, held-out
-    boards choose unless `choose` is False.  Pairs that agree with the others in too few shots to be
-    placed are failures.
+    cameras: with the richest lens to be tried.
+    choose: whether held-out boards choose the lens of cameras for which the rig file leaves it
+        open.
 
-    Raises RigDisconnected if groups of pairs share no view, only views whose board numbering leaves
-    their poses open, or only views that contradict each other; BadInput if nothing fixes the rig
-    frame.
+    Pairs that agree with the others in too few shots are in `failures`. Raises RigDisconnected if
+    groups of pairs share no view, only views whose board numbering leaves their poses open, or only
+    views that contradict each other; BadInput if nothing fixes the rig frame.
     """
     start, left_out = initial_poses(views, sorted(cameras))
     while True:
@@ -138,8 +142,8 @@ def _solve(
     start: Mapping[str, RigidTransform],
     choose: bool,
 ) -> _Solved:
-    """Solve with the richest lenses, take out what cannot be true, choose the lenses, solve again and
-    take back in what fits after all."""
+    """Solve with the richest lenses, drop wrong views, choose the lenses, solve again, and take
+    back views that fit after all."""
     names = sorted(start)
     graph = view_graph(views, names)
     root = max(names, key=lambda name: (graph.degree(name), name))
@@ -151,7 +155,7 @@ def _solve(
         [view for view in resolved if view.target in doubtful], solution, COARSE_PX
     ).wrong
     kept = [view for view in resolved if view not in gross]
-    # One camera alone was solved with its skew already; nothing is left to join.
+    # A single camera was solved with its skew already, and there is nothing to join.
     several = len(names) > 1
     for loss_px in LOSSES_PX:
         solution = solve_jointly(kept, solution, root=root, refine_cameras=several, loss_px=loss_px)
@@ -164,7 +168,7 @@ def _solve(
     judged = solve(resolved, solution, wrong=[view.key for view in gross])
     shaped = ShapedSolution(judged.solution, judged.kept(resolved), {}, ())
     lenses: ChosenLenses | None = None
-    # With strangers among them all are solved again.
+    # If pairs are to be left out, the others are solved again anyway.
     if several and not _strangers(shaped.views, _dropped(resolved, judged)):
         shaped = with_board_shapes(shaped.views, judged.solution, root=root, refine_cameras=True)
         solution = shaped.solution
@@ -183,7 +187,7 @@ def _dropped(views: Sequence[LocatedView], judged: ConsistentSolve) -> list[Loca
 
 
 def _strangers(kept: Sequence[LocatedView], dropped: Sequence[LocatedView]) -> list[str]:
-    """Pairs most of whose shared views had to be taken out."""
+    """Pairs most of whose shared views had to be dropped."""
     everything = [*kept, *dropped]
     count = Counter(view.target for view in everything)
     shared = Counter(view.pair for view in everything if count[view.target] > 1)
@@ -255,13 +259,13 @@ def corner_residuals(
     rig_from_camera: Mapping[str, RigidTransform],
     rig_from_board: Mapping[Target, RigidTransform],
 ) -> Array:
-    """(N, 2) px: where a view's corners should be seen less where they are."""
+    """(N, 2) px: projected less seen corners of a view."""
     camera_from_board = rig_from_camera[view.pair].inverse() @ rig_from_board[view.target]
     return cameras[view.pair].project(camera_from_board.apply(view.points)) - view.pixels
 
 
 def _robust_rms(parts: Sequence[Array]) -> float:
-    """RMS distance of corners, px, with the weights of the solve's loss: outliers do not count."""
+    """RMS distance of corners, px, with the weights of the solve's loss against outliers."""
     if not parts:
         return float("nan")
     residuals = np.concatenate(parts).ravel()

@@ -1,4 +1,4 @@
-"""What a rig's solve used of each camera, for the report: loading a calibration needs no solver."""
+"""The corners a rig's solve used, for the report: loading a calibration then needs no solver."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bodyscan.registration.rig_solve import RigSolution, corner_residuals
 
 
 def seen_corners(placed: RigSolution, names: Iterable[str]) -> dict[str, SeenCorners]:
-    """By the pair's name, for those of `names` that were placed."""
+    """The corners by pair, for those of `names` that were placed."""
     number = {target: k for k, target in enumerate(sorted(placed.rig_from_board))}
     found = {}
     for name in sorted(set(names) & set(placed.rig_from_camera)):

@@ -1,7 +1,7 @@
-"""Whether a calibration that was read can be one: sizes, names, and numbers that cameras can have.
+"""Check a calibration that was read: sizes, names, and numbers that real cameras can have.
 
-A wrong number that loads is a wrong body under a good verdict. So whatever a file holds is held
-against what any camera, pose and covariance must be; a hash says besides whether it was changed.
+A wrong number that loads gives a wrong body with a good verdict. So everything in a file is checked
+against what any camera, pose and covariance must satisfy; a hash also shows whether it was changed.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from bodyscan.stripes.stripe_code import StripeCode
 ORTHONORMAL = 1e-6  # rounding leaves 1e-15; at 2 m this is 2 um
 SYMMETRIC, POSITIVE = 1e-6, -1e-6  # of a correlation, which is 1 at most; solves leave 1e-9
 NARROWEST, WIDEST = 0.0175, 7.5  # width over focal length: fields of view of 1 and 150 degrees
-MOST_UNLIKE = 2.0  # focal lengths along columns and rows: cameras that skip every other line
+MOST_UNLIKE = 2.0  # ratio of the two focal lengths: cameras that skip every other line
 MOST_SKEW = 0.1  # of the focal length: axes 6 degrees off a right angle; sensors are cut far better
 FARTHEST_MM = 1e5  # 100 m from the rig's centre
-SEES = 0.5  # of a picture that rays can be drawn through: what is less is no lens but a slip
+SEES = 0.5  # of an image that rays pass through: less is a slip, not a lens
 
 Fault = tuple[str, str]
-"""Where, as in `pairs.p1.camera`, and what, in words that follow it."""
+"""Where, as in `pairs.p1.camera`, and what is wrong, in words that follow it."""
 
 
 def find_faults(calibration: RigCalibration) -> Iterator[Fault]:
-    """Everything that no calibration can be like."""
+    """Everything in a calibration that no calibration can have."""
     yield from _names(calibration)
     known = {pair.name: pair for pair in calibration.rig.pairs}
     for name, pair in calibration.pairs.items():
@@ -56,7 +56,7 @@ def find_faults(calibration: RigCalibration) -> Iterator[Fault]:
 
 
 def camera_faults(camera: Camera, pair: Pair, place: str) -> Iterator[Fault]:
-    """Of a camera against the picture that the rig file says it takes."""
+    """Faults of a camera, given the image size and pair that the rig file describes."""
     size = (camera.width, camera.height)
     if size != (pair.camera.width, pair.camera.height):
         yield (
@@ -77,7 +77,7 @@ def camera_faults(camera: Camera, pair: Pair, place: str) -> Iterator[Fault]:
     if not abs(camera.gamma) < MOST_SKEW * camera.alpha:
         yield f"{place}.gamma", f"is more skew than a sensor has (got {camera.gamma:g})"
     for name, value, length in zip(("u0", "v0"), (camera.u0, camera.v0), size, strict=True):
-        # Beyond the picture it may lie, where that was cut out of a larger one.
+        # It may lie outside an image that was cropped from a larger one.
         if not -length < value < 2.0 * length:
             yield f"{place}.{name}", f"lies far outside of the picture (got {value:g})"
     if not np.all(np.isfinite(camera.lens.coefficients)) or _drawn(camera) < SEES:
@@ -86,7 +86,7 @@ def camera_faults(camera: Camera, pair: Pair, place: str) -> Iterator[Fault]:
 
 
 def pose_faults(pose: RigidTransform, place: str) -> Iterator[Fault]:
-    """Of what must be a rotation and a translation of human size."""
+    """Faults of a pose: it must be a rotation with a translation of plausible size."""
     rotation = pose.rotation
     if not (np.all(np.isfinite(rotation)) and np.all(np.isfinite(pose.translation))):
         yield place, "holds what is not a number"
@@ -99,7 +99,7 @@ def pose_faults(pose: RigidTransform, place: str) -> Iterator[Fault]:
 
 
 def covariance_faults(matrix: Array, size: int, place: str) -> Iterator[Fault]:
-    """Of what must be a covariance of `size` numbers; all zero is one too (nothing unknown)."""
+    """Faults of a covariance (size, size); all zero is allowed (nothing is uncertain)."""
     if not isinstance(matrix, np.ndarray) or matrix.shape != (size, size):
         yield place, f"is of shape {np.shape(matrix)}, but {size} x {size} is wanted"
     elif matrix.dtype.kind not in "fiu" or not np.all(np.isfinite(matrix)):
@@ -211,7 +211,7 @@ def _seen(seen: SeenCorners, boards: int, place: str) -> Iterator[Fault]:
 
 
 def _drawn(camera: Camera) -> float:
-    """Share of the picture that rays go through."""
+    """Share of the image that rays pass through."""
     across = (np.arange(9) + 0.5) / 9.0
     pixels = np.stack(np.meshgrid(across * camera.width, across * camera.height), axis=-1)
     with np.errstate(all="ignore"):

@@ -1,7 +1,7 @@
-"""Calibrations on disk: `calibration.json`, diffable and exact, dense arrays beside it as .npz.
+"""Calibrations on disk: an exact, diffable `calibration.json` and dense arrays as .npz.
 
-The JSON holds the hash of the arrays and one of all that it says itself, so that neither is changed
-by hand, by a disk or by a copy that broke off without anyone's knowing.
+The JSON holds the hash of the arrays and one of its own content, so that a change by hand, a disk
+fault or an interrupted copy does not go unnoticed.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from bodyscan.version import __version__
 SCHEMA = "bodyscan-calibration"
 VERSION = 2
 WITHOUT_HASH = 1
-"""The version before, which is read as well: it had no hash of the JSON itself."""
+"""The previous version, also read: it had no hash of the JSON itself."""
 HASH = "sha256"
 EDITED = "the calibration was edited by hand, and the change accepted"
-MOST_FAULTS = 5  # are named
+MOST_FAULTS = 5  # how many an error lists
 FILE_NAME = "calibration.json"
 HISTORY = "history"
 ARRAYS_NAME = "calibration.npz"
@@ -49,7 +49,7 @@ CHANGED = f"restore the file from a copy, or calibrate again; {ACCEPT}"
 
 
 def refuse_existing(folder: Path, overwrite: bool) -> None:
-    """Raises CalibrationFileError if a calibration lies in `folder` already and may not be replaced."""
+    """Raise CalibrationFileError if `folder` holds a calibration that may not be replaced."""
     if (folder / FILE_NAME).exists() and not overwrite:
         raise CalibrationFileError(
             "a calibration lies here already",
@@ -60,21 +60,23 @@ def refuse_existing(folder: Path, overwrite: bool) -> None:
 
 
 def keep_former(folder: Path) -> Path | None:
-    """Copy the calibration in `folder` to `history/HASH` in it, by the hash that scans refer to it
-    with; the copy's folder, None if there is nothing to keep. To be done before it is replaced."""
+    """Copy the calibration in `folder` into its `history/HASH`, before it is replaced.
+
+    HASH is the one by which scans refer to it. Returns the copy's folder, None if there is none.
+    """
     if not (folder / FILE_NAME).exists():
         return None
     kept = folder / HISTORY / calibration_id(folder)
-    with suppress(FileNotFoundError):  # one without its arrays is as damaged there as here
-        for name in (ARRAYS_NAME, FILE_NAME):  # the one that vouches for both comes last
+    with suppress(FileNotFoundError):  # without its arrays it is as damaged there as here
+        for name in (ARRAYS_NAME, FILE_NAME):  # the JSON, which vouches for both, comes last
             write_bytes(kept / name, read_regular(folder / name))
     return kept
 
 
 def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
-    """Write `calibration.json` and `calibration.npz` into `folder`; returns the JSON's path.
+    """Write `calibration.json` and `calibration.npz` into `folder`; return the JSON's path.
 
-    Until the JSON has changed, which it does at once, one that `keep_former` kept is what is loaded.
+    Until the JSON is replaced, which is atomic, the calibration that `keep_former` kept is loaded.
     """
     arrays: dict[str, Any] = {"placing_covariance": calibration.covariance.matrix}
     for name, pair in calibration.pairs.items():
@@ -116,8 +118,10 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
 def load_calibration(path: Path, *, accept_changed: bool = False) -> RigCalibration:
     """Read a calibration from its folder or its JSON file.
 
-    accept_changed: although it is not as it was stored. Raises CalibrationFileError if files are
-    missing, changed, of another schema version, or hold what no calibration can be like.
+    accept_changed: read it although it has changed since it was stored.
+
+    Raises CalibrationFileError if files are missing, changed, of another schema version, or hold
+    what no calibration can have.
     """
     file = path / FILE_NAME if path.is_dir() else path
     if file.suffix in (".yaml", ".yml"):
@@ -164,15 +168,17 @@ def load_calibration(path: Path, *, accept_changed: bool = False) -> RigCalibrat
 
 
 def accept_calibration(path: Path) -> Path:
-    """Store a calibration that was edited as one that holds, with a note that says so; the path of
-    its JSON. Raises as `load_calibration` for all but the change."""
+    """Store an edited calibration as valid, with a note that says so; return the path of its JSON.
+
+    Raises as `load_calibration`, except for the change.
+    """
     folder = path if path.is_dir() else path.parent
     found = load_calibration(folder, accept_changed=True)
     return save_calibration(replace(found, notes=(*found.notes, EDITED)), folder)
 
 
 def _arrays_of(file: Path, content: dict[str, Any]) -> Path:
-    """The arrays beside the JSON; those kept, if it was being replaced when that broke off."""
+    """The arrays beside the JSON, or the kept ones if a replacement was interrupted."""
     beside, kept = (
         file.with_name(ARRAYS_NAME),
         file.parent / HISTORY / file_hash(file) / ARRAYS_NAME,
@@ -283,7 +289,7 @@ def _under(prefix: str, arrays: dict[str, Any]) -> dict[str, Any]:
 
 
 def _quality(content: dict[str, Any]) -> PairQuality:
-    """Strictly of the types that its fields have."""
+    """Read the quality, requiring exactly the types of its fields."""
     odd = content.keys() - {part.name for part in fields(PairQuality)}
     if odd:
         raise ValueError(f"quality has no {', '.join(sorted(odd))}")
@@ -291,7 +297,7 @@ def _quality(content: dict[str, Any]) -> PairQuality:
 
 
 def _transform(matrix: Any) -> RigidTransform:
-    """As written, to the last bit: no orthonormalisation on reading."""
+    """Read a transform exactly, to the last bit: no orthonormalisation."""
     array = np.array(matrix)
     if array.shape != (4, 4) or array.dtype.kind not in "fiu" or any(array[3] != (0, 0, 0, 1)):
         raise ValueError(f"{matrix} is not a 4 x 4 matrix of a rigid motion")

@@ -17,10 +17,10 @@ from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.transforms import RigidTransform
 
 AGREEMENT = 0.04
-"""Poses that differ by this share of the boards' usual distance agree: graphs place pairs roughly."""
+"""Poses that differ by this share of the usual distance of boards agree: the graph is rough."""
 FEWEST_VOTES = 3
 FEWEST_APART = 3
-"""shots: of so many taken together two agree, whichever end they are numbered from."""
+"""shots: among this many, taken together, two agree, whichever end they are numbered from."""
 BOARD_REACH = 0.3
 MOST_CANDIDATES = 12
 
@@ -30,11 +30,14 @@ Group = dict[str, RigidTransform]
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """What the boards shared by two groups of pairs say of their relative pose.
+    """What the boards shared by two groups of pairs say about their relative pose.
 
-    agreeing: the shared targets that agree with it.  rivals: votes of the best contradicting pose,
-    which only boards with an ambiguous numbering (or wrong views) can have.  ambiguous: whether any
-    of the boards may be numbered in more than one way.
+    targets: the shared targets.
+    agreeing: those that agree with the pose.
+    rivals: votes of the best contradicting pose, which only boards with an ambiguous numbering, or
+        wrong views, can have.
+    corners: number of corners in the shared views.
+    ambiguous: whether any of the boards may be numbered in more than one way.
     """
 
     first_from_second: RigidTransform
@@ -50,15 +53,18 @@ class RelativePose:
 
     @property
     def decided(self) -> bool:
-        """Most boards agree on one pose, more than on any other; or three that no two contradict by
-        agreeing on another: placed so, the others fit more closely than graphs can tell, or are
-        found to be wrong."""
+        """Whether the pose is settled.
+
+        Either most boards agree on it, more than on any other pose; or three do, and no two agree
+        on another: with this pose the rest turn out to fit more closely than the graph can tell, or
+        to be wrong.
+        """
         most = self.votes > self.rivals and 2 * self.votes > len(self.targets)
         return most or (self.votes >= FEWEST_VOTES and self.rivals <= 1)
 
     @property
     def strength(self) -> tuple[bool, int, int]:
-        """Decided ties first, then those with most corners."""
+        """Sort key: decided ties first, then those with most corners."""
         return self.decided, min(self.votes - self.rivals, 2), self.corners
 
 
@@ -77,13 +83,13 @@ def view_graph(views: Iterable[LocatedView], pairs: Sequence[str]) -> nx.Graph:
 def initial_poses(
     views: Sequence[LocatedView], pairs: Sequence[str]
 ) -> tuple[dict[str, RigidTransform], dict[str, str]]:
-    """Placings of the pairs in a frame they share, and pairs left out, each with the reason.
+    """Poses of the pairs in a common frame, and the pairs left out, each with the reason.
 
-    Groups of placed pairs grow together, the best decided tie first; a tie between two groups is
-    voted on by all boards that any pair of the one and any of the other saw at the same moment.
-    Pairs that see the boards elsewhere in every shot are left out if most pairs do agree.
-    Raises RigDisconnected, naming the groups and what would tie them, the shots whose board's
-    numbering leaves a tie open, or the pairs of which no two agree.
+    Groups of placed pairs grow together, the best decided tie first. All boards that any pair of
+    one group and any of the other saw at the same moment vote on the tie. Pairs that see the boards
+    elsewhere in every shot are left out if most pairs do agree. Raises RigDisconnected, naming the
+    groups and what would tie them, the shots whose board numbering leaves a tie open, or the pairs
+    of which no two agree.
     """
     _refuse_disconnected(view_graph(views, pairs))
     targets, reach = _by_target(views), _usual_distance(views)
@@ -113,7 +119,7 @@ def initial_poses(
 
 
 def not_together(names: Iterable[str]) -> str:
-    """What is said of pairs whose views agree with those of others in too few shots."""
+    """The message on pairs whose views agree with those of others in too few shots."""
     return (
         f"the relative pose of {', '.join(sorted(names))} that follows from shared boards differs "
         "from shot to shot: their pictures were not taken together with the others', or the board "
@@ -122,7 +128,7 @@ def not_together(names: Iterable[str]) -> str:
 
 
 def _most(groups: Sequence[Group], best: RelativePose) -> tuple[Group, dict[str, str]]:
-    """The group that holds most pairs, if it holds more than half; the others are left out."""
+    """The group with most pairs, if it has more than half of them; the others are left out."""
     largest = max(groups, key=len)
     others = sorted(name for group in groups if group is not largest for name in group)
     if 2 * len(largest) <= len(largest) + len(others):
@@ -137,9 +143,9 @@ def _most(groups: Sequence[Group], best: RelativePose) -> tuple[Group, dict[str,
 def place_boards(
     views: Sequence[LocatedView], root_from_camera: Mapping[str, RigidTransform]
 ) -> tuple[list[LocatedView], dict[Target, RigidTransform], set[Target]]:
-    """Resolve every view's alternative and place every board.
+    """Resolve every view's alternatives and place every board.
 
-    Returns the views, `root_from_board` of each target, and the targets on which they disagree.
+    Returns the views, `root_from_board` of each target, and the targets whose views disagree.
     """
     kept: list[LocatedView] = []
     boards: dict[Target, RigidTransform] = {}
@@ -163,7 +169,7 @@ def _readings(
     placing: RigidTransform,
     reach: float,
 ) -> list[tuple[float, LocatedView]]:
-    """The ways to number a view's board, each with how far (mm) it puts it from a placing."""
+    """Every numbering of a view's board, with its distance (mm) from a given pose."""
     readings = [view.resolved(choice) for choice in view.alternatives]
     root = root_from_camera[view.pair]
     return [
@@ -190,8 +196,8 @@ def _agreed_placing(
 
 
 def _usual_distance(views: Sequence[LocatedView]) -> float:
-    """How far boards are from cameras, mm: the measure of all agreement, since a board's squares may
-    be given in any unit."""
+    """Usual distance of boards from cameras, mm: the unit of all agreement, because the squares of
+    a board may be given in any unit."""
     distances = [float(np.linalg.norm(view.camera_from_board.translation)) for view in views]
     return float(np.median(distances)) if distances else 1.0
 
@@ -252,7 +258,7 @@ def _size(view: LocatedView) -> int:
 
 
 def _gaps(candidate: RigidTransform, others: Sequence[RigidTransform], reach: float) -> Array:
-    """`greatest_displacement` of one transform and many, (N,) mm."""
+    """`greatest_displacement` between one transform and many others, (N,) mm."""
     rotations = np.array([other.rotation for other in others])
     shifts = np.array([other.translation for other in others]) - candidate.translation
     cosines = (np.einsum("ij,nij->n", candidate.rotation, rotations) - 1.0) / 2.0
@@ -301,5 +307,5 @@ def _open_tie(first: Group, second: Group, tie: RelativePose) -> RigDisconnected
 
 
 def _shots(targets: Iterable[Target]) -> str:
-    """Their names, the first six."""
+    """Names of the shots, the first six."""
     return ", ".join(sorted({shot for shot, _ in targets})[:6])

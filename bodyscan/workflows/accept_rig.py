@@ -1,4 +1,4 @@
-"""An acceptance test: artefacts read at several places, judged, reported."""
+"""An acceptance test: read artefacts at several places, judge the readings, write the report."""
 
 from __future__ import annotations
 
@@ -28,8 +28,12 @@ from bodyscan.workflows.read_artefacts import read_plates, read_spheres
 
 @dataclass(frozen=True)
 class Acceptance:
-    """figures: the worst of all places, with their limits.  file: where they lie; page: the report,
-    None where it could not be made, as `notes` say."""
+    """The result of an acceptance test.
+
+    figures: the worst over all places, with their limits.
+    file: path of acceptance.json.
+    page: path of the report, None if it could not be made, as `notes` say.
+    """
 
     figures: tuple[Figure, ...]
     verdict: Verdict
@@ -45,8 +49,8 @@ def read_captures(
     file: AcceptanceFile,
     progress: Progress = silent,
 ) -> Readings:
-    """Readings of captured artefacts, a folder a place."""
-    # All are opened before the first is read: a folder that is none costs no work.
+    """Read captured artefacts, one folder a place."""
+    # Open them all before reading the first, so that a wrong folder fails before any work is done.
     places = [
         (folder, open_scan(calibration.rig, folder), read)
         for folders, read in ((spheres, read_spheres), (plates, read_plates))
@@ -67,9 +71,10 @@ def judge_readings(
     *,
     synthetic: bool,
 ) -> Acceptance:
-    """Figures and verdict, written to acceptance.json and acceptance.html in `out`.
+    """Write figures and verdict to acceptance.json and acceptance.html in `out`, and return them.
 
-    stored: where the calibration lies.  synthetic: the artefacts were simulated.
+    stored: path of the calibration.
+    synthetic: whether the artefacts were simulated.
     """
     found = figures(readings, file)
     origin = calibration_id(stored)
@@ -77,7 +82,7 @@ def judge_readings(
     file_path, page_path = out / "acceptance.json", out / "acceptance.html"
     write_json(file_path, content)
     notes: list[str] = []
-    page_path.unlink(missing_ok=True)  # one of an earlier test
+    page_path.unlink(missing_ok=True)  # left by an earlier test
     with optional("report", notes.append):
         page = acceptance_page(found, readings, calibration.rig.name, origin, synthetic)
         write_text(page_path, render(page))

@@ -1,4 +1,4 @@
-"""The rig's calibration, stage by stage: boards, cameras, one joint solve, light sheets, advice."""
+"""Calibration of a rig, stage by stage: boards, cameras, joint solve, light sheets, advice."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ from bodyscan.workflows.rig_remarks import JoinedRig, remarked
 
 COUNTED = re.compile(r"\d+ (?=markers of|of)")
 MOST_SEEN = 3
-"""Images without a board of which an error says what they show instead."""
+"""Images without a board whose findings an error quotes."""
 
 
 def calibrate_rig(
     rig: Rig, captures: Captures, progress: Progress = silent, *, folder: Path = HERE
 ) -> RigCalibration:
-    """Board images in, calibrated rig out, with advice on it.
+    """Calibrate a rig from its board images, and add advice.
 
-    folder: what the files of cameras that are `known` are relative to.
+    folder: what the paths of `known` cameras are relative to.
 
-    A bad image or pair costs that image or pair and is named in `failed` or `notes`.  Raises
-    FailedWork if no pair is left, RigDisconnected if the pairs do not hang together, BadInput if
+    A bad image or pair costs only that image or pair, and is named in `failed` or `notes`. Raises
+    FailedWork if no pair is left, RigDisconnected if nothing ties the pairs together, BadInput if
     nothing fixes the rig frame.
     """
     boards = find_all_boards(rig, captures, progress)
@@ -71,9 +71,11 @@ def calibrate_rig(
 def calibrate_folder(
     rig_file: Path, folder: Path, progress: Progress = silent
 ) -> tuple[RigCalibration, Path]:
-    """As `calibrate_rig`, kept in `folder` as soon as it stands and again with what is said of it;
-    and the path of its JSON. One that lay there moves into its history. Raises RigFileError and
-    CaptureError besides."""
+    """Calibrate a rig like `calibrate_rig` and save it; return it and the path of its JSON.
+
+    It is saved once as soon as it is solved and again with the remarks on it. A calibration already
+    in `folder` moves into its history. Raises RigFileError and CaptureError as well.
+    """
     rig = load_rig(rig_file)
     captures = open_captures(rig, rig_file)
     boards = find_all_boards(rig, captures, progress)
@@ -98,18 +100,19 @@ def join_rig(
     *,
     folder: Path = HERE,
 ) -> JoinedRig:
-    """From boards found in images to the calibration, with nothing in it that it stands without."""
+    """From boards found in images to the calibration, without its optional parts."""
     cameras = calibrate_cameras(rig, boards.value, progress, folder=folder)
     searched = len(captures.sequences) - len(boards.refused)
     failures = cameras.failures
     if searched and not boards.value:
-        # More poses of a board that is not as described would not help.
+        # More poses of a board that differs from its description would not help.
         failures = {name: reason.partition("\n")[0] for name, reason in failures.items()}
     cameras = replace(cameras, failures=boards.blamed_on_images(failures, captures))
     if not cameras.value:
         raise _nothing_calibrated(rig, cameras.failures, _seen_instead(rig, boards, searched))
     located = locate_views(rig, solving_views(rig, boards.value), cameras.value)
-    # Reading images takes one core and none of the interpreter's lock; solving and fitting the other.
+    # Reading images takes one core without the interpreter's lock; solving and fitting take the
+    # other.
     with ThreadPoolExecutor(1 + THREADS) as beside:
         solving = beside.submit(_solve, rig, boards.value, located, cameras)
         fits: dict[str, Future[Outcome[PairCalibration]]] = {}
@@ -124,7 +127,7 @@ def join_rig(
             solved = solving.result()
         rig, placed = solved.rig, solved.joined.value
         for name in placed.rig_from_camera:
-            if name not in fits:  # nothing of it was to be decoded
+            if name not in fits:  # none of its images had to be decoded
                 fit(name, decoded.value)
         fitted = _fitted(
             fits, sorted(set(placed.rig_from_camera) - set(decoded.failures)), progress
@@ -159,8 +162,8 @@ def join_rig(
 
 
 def _seen_instead(rig: Rig, boards: FoundBoards, searched: int) -> str:
-    """What images show that have no board as described, one image for each such thing, however many
-    markers were counted."""
+    """What images without the described board show instead: one image for each kind of finding,
+    whatever the number of markers counted."""
     shown: dict[str, str] = {}
     for note in boards.notes:
         _, found, what = note.partition("no board found:")
@@ -182,7 +185,7 @@ def _join_pairs(
     try:
         return solve_rig(rig, views, {name: own.camera for name, own in cameras.value.items()})
     except BadInput as error:
-        # The board or pair that fixes the frame may be missing because pairs failed before.
+        # The board or pair that fixes the frame may be missing because a pair failed earlier.
         before = "; ".join(f"{name}: {reason}" for name, reason in cameras.failures.items())
         remedy = f"{error.remedy}\n  left out before: {before}" if before else error.remedy
         raise BadInput(error.what, where=error.where, remedy=remedy) from error
@@ -190,8 +193,13 @@ def _join_pairs(
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """rig: with boards of the size that references give them, and what is said of that, sized.
-    located: each board by itself.  joined: the joint solve."""
+    """The joint solve and what led to it.
+
+    rig: with board sizes corrected by reference lengths.
+    sized: notes on that correction.
+    located: each view's board pose by itself.
+    joined: the joint solve.
+    """
 
     rig: Rig
     sized: tuple[str, ...]
@@ -225,9 +233,11 @@ def _decode(
     through: Through,
     progress: Progress,
 ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
-    """Stripes on the boards, where each camera by itself sees them: of tens of millions of boundaries
-    means on the print alone, of as many as light sheets are fitted to. A pair by itself, whose stripes
-    place the boards too, has all of them."""
+    """Decode the stripes on the boards, where each camera by itself sees them.
+
+    Of tens of millions of boundaries, only means on the print are kept, as many as light sheets are
+    fitted to. A pair by itself, whose stripes also place the boards, keeps all of them.
+    """
     known = {view.key: view for view in located}
     wanted = [view for view in boards if view.key in known]
 
@@ -236,7 +246,7 @@ def _decode(
 
     def box(view: BoardView) -> Box:
         if solving.done():
-            solving.result()  # Of pairs that nothing joins no more is decoded.
+            solving.result()  # once the joint solve has failed, nothing more is decoded
         return print_of(view)
 
     def printed(view: BoardView, seen: BoardBoundaries) -> BoardBoundaries:
@@ -261,7 +271,7 @@ def _fit_sheets(
     name: str,
     boundaries: Mapping[ViewKey, BoardBoundaries],
 ) -> Outcome[PairCalibration]:
-    """Light sheets of a pair, once it is placed."""
+    """Fit a pair's light sheets, once its pose is solved."""
     solved = solving.result()
     return calibrate_pair(
         _placed_pair(solved.rig, solved.joined.value, name, cameras[name], boundaries)
@@ -286,7 +296,7 @@ def _fitted(
 
 
 def striped(rig: Rig, placed: RigSolution, view: LocatedView, seen: BoardBoundaries) -> StripedView:
-    """A view with its stripes, its board where the joint solve has it."""
+    """A view with its stripes and with its board's pose from the joint solve."""
     shape = placed.board_shapes.get(view.board)
     return StripedView(
         _as_solved(placed, view),
@@ -297,7 +307,7 @@ def striped(rig: Rig, placed: RigSolution, view: LocatedView, seen: BoardBoundar
 
 
 def _as_solved(placed: RigSolution, view: LocatedView) -> LocatedView:
-    """A view with its board where the joint solve has it."""
+    """A view with its board's pose from the joint solve."""
     camera_from_rig = placed.rig_from_camera[view.pair].inverse()
     return replace(view, camera_from_board=camera_from_rig @ placed.rig_from_board[view.target])
 
@@ -329,8 +339,11 @@ def _placed_pair(
 
 
 def update_poses(rig: Rig, placed: RigSolution, pair: PairCalibration) -> RigSolution:
-    """Where a pair's stripes changed its camera: camera and boards as that camera sees them, the
-    board that fixes the rig frame where it lies. Only a pair by itself is refined so."""
+    """The solution with poses updated where a pair's stripes changed its camera.
+
+    Camera and boards are as the new camera sees them; the board that fixes the rig frame stays
+    where it is. Only a pair by itself is refined this way.
+    """
     if pair.camera == placed.cameras[pair.name]:
         return placed
     seen = {

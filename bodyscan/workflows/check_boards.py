@@ -1,4 +1,4 @@
-"""Whether a calibrated rig still is what it was, told from a shot of a board; and its repair."""
+"""Check with shots of a board whether a calibrated rig is unchanged, and repair it."""
 
 from __future__ import annotations
 
@@ -27,17 +27,18 @@ from bodyscan.workflows.find_boards import find_all_boards, locate_views
 
 LEAST_NOISE_PX = 0.02
 IMPORTED_PX = 0.5
-"""RMS of corners that OpenCV's users commonly end with."""
+"""RMS error of corners, px, that OpenCV's users commonly reach."""
 STRIPE_SIGMAS, STRIPE_MM = 5.0, 0.25
-"""Stripes are off a board by so many sigmas, and by so much, before a projector is blamed."""
+"""A projector is blamed only if its stripes are off a board by this many sigmas and this far."""
 
 
 @dataclass(frozen=True)
 class StripeOffset:
-    """How far the surface that a pair's stripes measure lies from the board that its corners show.
+    """How far the surface measured by a pair's stripes lies from the board shown by its corners.
 
-    offset_mm: median over all boards, positive away from the camera.  sigma_mm: what the
-    calibration expects.  turned_mm: half the difference between the board's ends, of its tilt.
+    offset_mm: median over all boards, positive away from the camera.
+    turned_mm: the tilt, as half the difference between the board's two ends.
+    sigma_mm: the sigma that the calibration predicts.
     """
 
     pair: str
@@ -47,16 +48,20 @@ class StripeOffset:
 
     @property
     def moved(self) -> bool:
-        """Whether the projector no longer stands to its camera as it did."""
+        """Whether the projector has moved relative to its camera."""
         off = max(abs(self.offset_mm), abs(self.turned_mm))
         return off > max(STRIPE_SIGMAS * self.sigma_mm, STRIPE_MM)
 
 
 @dataclass(frozen=True, eq=False)
 class BoardCheck:
-    """drift: of the cameras.  stripes: of the projectors whose stripes were taken on a board.
+    """What shots of a board say about a calibrated rig.
 
-    seen: pairs that saw a board.  unseen: calibrated pairs that did not.  notes: what was dropped.
+    drift: of the cameras.
+    stripes: of the projectors whose stripes were taken on a board.
+    seen: pairs that saw a board.
+    unseen: calibrated pairs that did not.
+    notes: what was dropped.
     """
 
     drift: Drift
@@ -73,10 +78,10 @@ class BoardCheck:
 def check_boards(
     calibration: RigCalibration, captures: Captures, progress: Progress = silent
 ) -> BoardCheck:
-    """One or more shots of the calibration's boards, as the calibrated rig sees them.
+    """Compare the calibrated rig with one or more shots of the calibration's boards.
 
-    A board that one pair alone sees tells whether its stripes measure it where its corners are.
-    Raises BoardNotFound if no board is seen by two pairs, nor striped before one.
+    A board seen by a single pair still shows whether that pair's stripes lie where its corners are.
+    Raises BoardNotFound if no board is seen by two pairs and none has decoded stripes on it.
     """
     views = find_all_boards(calibration.rig, captures, progress)
     seen_by = locate_views(calibration.rig, views.value, _cameras(calibration))
@@ -88,7 +93,7 @@ def check_boards(
     drift = find_drift(
         poses, calibration.rig_from_camera, calibration.covariance, calibration.rig.poles
     )
-    # Which end of a plain board is which does not matter to its surface.
+    # Which end of a plain board is which makes no difference to its surface.
     stripes = _stripe_offsets(calibration, captures, views.value, seen_by.value, progress)
     notes = (*views.notes, *seen_by.notes, *stripes.notes)
     if not drift.rig_from_board and not stripes.value:
@@ -101,7 +106,7 @@ def check_boards(
 def _nothing_seen(
     captures: Captures, seen: Sequence[LocatedView], notes: Sequence[str]
 ) -> BoardNotFound:
-    """Why there is nothing to hold the rig against, with all that was said on the way."""
+    """The error for captures that show nothing to compare the rig with, and every note so far."""
     turned = sorted({view.board for view in seen if view.ambiguous})
     what = (
         f"board {', '.join(turned)} looks the same turned round, so that cameras cannot be held "
@@ -119,9 +124,9 @@ def _nothing_seen(
 
 
 def repaired(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibration:
-    """The calibration with the pairs that moved where they are now, everything else as it was.
+    """The calibration with the moved pairs at their new poses, everything else unchanged.
 
-    Of a moved pair the covariance is that of its move; what tied it to the others is gone.
+    The covariance of its move is added to that of each moved pair.
     """
     placing = dict(calibration.rig_from_camera)
     names = calibration.covariance.names
@@ -148,12 +153,12 @@ def move_line(move: Move) -> str:
 
 
 def _noise_px(calibration: RigCalibration, pair: str) -> float:
-    """Of one coordinate of a corner, as the calibration saw it."""
+    """Sigma of one coordinate of a corner, px, as measured by the calibration."""
     return max(_corners_px(calibration.pairs[pair]) / np.sqrt(2.0), LEAST_NOISE_PX)
 
 
 def _corners_px(pair: PairCalibration) -> float:
-    """RMS of its corners; of a pair that was imported what such calibrations reach."""
+    """RMS error of a pair's corners, px; for an imported pair, what such calibrations reach."""
     known = pair.quality.corners_rms_px
     return known if known is not None else pair.quality.imported_sigma_px or IMPORTED_PX
 
@@ -172,7 +177,7 @@ def _stripe_offsets(
     located: Sequence[LocatedView],
     progress: Progress,
 ) -> Outcome[tuple[StripeOffset, ...]]:
-    """Of every pair that took stripes on a board it saw."""
+    """Stripe offsets of every pair that took stripes on a board it saw."""
     known = {view.key: view for view in located if calibration.pairs[view.pair].sheets is not None}
     wanted = [view for view in views if view.key in known]
     decoded = decode_on_boards(calibration.rig, captures, wanted, progress)
@@ -189,7 +194,7 @@ def _stripe_offsets(
 def _off_board(
     calibration: RigCalibration, view: LocatedView, boundaries: BoardBoundaries
 ) -> Array:
-    """(N, 3): distance from the board along its normal (mm), place on it (-1 to 1), its sigma."""
+    """(N, 3): distance from the board along its normal (mm), place on it (-1 to 1), sigma (mm)."""
     rig, pair = calibration.rig, calibration.pairs[view.pair]
     projector = rig.pair(view.pair).projector
     assert projector is not None

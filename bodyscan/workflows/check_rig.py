@@ -1,4 +1,4 @@
-"""`bodyscan check-calibration`: which check a folder of captures allows, and what it says in words."""
+"""`bodyscan check-calibration`: choose the check that fits the captures, and word its result."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from bodyscan.workflows.check_scans import ScanCheck, check_scans
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """Either of the checks, in words; `lines` begins with the verdict."""
+    """The result of either check, in words; the first of `lines` is the verdict."""
 
     check: BoardCheck | ScanCheck
     lines: tuple[str, ...]
 
     @property
     def valid(self) -> bool:
-        """Whether the rig is known to be what it was; False where a check cannot tell."""
+        """Whether the rig is known to be unchanged; False if a check cannot tell."""
         if isinstance(self.check, ScanCheck) and not self.check.decided:
             return self.check.quiet
         return self.check.valid
 
     def repaired(self, calibration: RigCalibration) -> RigCalibration:
-        """Raises FailedWork where the check cannot tell where things are now."""
+        """The repaired calibration. Raises FailedWork if the check cannot say what moved where."""
         if isinstance(self.check, ScanCheck):
             raise FailedWork(
                 "people's scans tell that something moved, not exactly where it is now",
@@ -57,12 +57,12 @@ def check_rig(
     *,
     follow_links: bool = False,
 ) -> Findings:
-    """Folders of one kind: shots of the board, or scans of people.
+    """Check a rig with folders of one kind: shots of the board, or scans of people.
 
-    follow_links: though the calibration's rig file does not say so.
+    follow_links: follow links even if the calibration's rig file does not allow it.
 
-    Raises CaptureError for folders without captures, BadInput for a mixture, BoardNotFound,
-    ScanFailed if there is nobody in a scan.
+    Raises CaptureError for folders without captures, BadInput for a mixture of kinds,
+    BoardNotFound, and ScanFailed if nobody is in a scan.
     """
     if follow_links:
         described = calibration.rig.model_copy(update={"follow_links": True})
@@ -82,7 +82,7 @@ def check_rig(
 
 
 def _named_apart(parts: Sequence[Captures]) -> list[Captures]:
-    """Shots of several folders, each with its folder's number before its name."""
+    """Captures of several folders, with the folder's number before each shot's name."""
     if len(parts) == 1:
         return list(parts)
     return [

@@ -1,4 +1,4 @@
-"""What ordinary scans of people say of a rig: a pair that always has to be moved the same way."""
+"""What ordinary scans of people say about a rig: whether a pair always has to move the same way."""
 
 from __future__ import annotations
 
@@ -22,18 +22,21 @@ from bodyscan.workflows.range_images import reconstruct_range_images
 
 OVERLAP_MM = 0.5
 MOST_UNSEEN_MM = 5.0
-"""A pole that moved by less alignment takes out of a scan: girths are still good to 2 mm
+"""mm: alignment corrects a pole that moved by less; girths are still good to 2 mm
 (docs/results.md, faults)."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScanCheck:
-    """before_mm, after_mm: of each scan, RMS of its overlaps, before and after the pairs were moved.
+    """What scans of people say about a rig.
 
-    pairs: what the overlaps asked of each.  poles: likewise, of poles whose pairs moved alike.
-    search: for what moved by itself, by when each pair saw the person.
-    apart: groups of pairs between which no scan has an overlap, the largest first; empty if there is
-    one group. How groups stand to each other is not seen: moved far enough, they share nothing.
+    before_mm, after_mm: of each scan, RMS distance of its overlaps before and after alignment.
+    pairs: the motion that the overlaps asked of each pair.
+    poles: the same for poles whose pairs moved alike.
+    search: the search for single moves, given the time at which each pair saw the person.
+    apart: groups of pairs that no overlap of any scan connects, the largest first; empty if there
+        is only one group. How groups stand relative to each other is not observed: pairs that moved
+        far enough share nothing.
     """
 
     before_mm: tuple[float, ...]
@@ -45,18 +48,18 @@ class ScanCheck:
 
     @property
     def unseen_mm(self) -> float:
-        """What moved by less, a pair or a pole, would not be told from a person's motion."""
+        """The largest move of a pair or pole, mm, that could pass for a person's motion."""
         by_mean = max(drift.limit_mm for drift in (*self.pairs, *self.poles))
         return min(by_mean, self.search.least_mm)
 
     @property
     def decided(self) -> bool:
-        """Whether a move is told from sway before it does harm, and all pairs are joined."""
+        """Whether a harmful move can be told from sway, and all pairs are connected."""
         return self.unseen_mm <= MOST_UNSEEN_MM and not self.apart
 
     @property
     def quiet(self) -> bool:
-        """Whether nothing calls for an explanation, neither sway nor a move."""
+        """Whether there is nothing to explain, neither sway nor a move."""
         still = all(drift.shift_mm < LEAST_MM for drift in self.pairs)
         return still and max(self.before_mm) < OVERLAP_MM and not self.apart
 
@@ -69,7 +72,7 @@ class ScanCheck:
 def check_scans(
     calibration: RigCalibration, scans: Sequence[Captures], progress: Progress = silent
 ) -> ScanCheck:
-    """Raises ScanFailed if a scan shows nobody."""
+    """Align these scans of people and judge the rig. Raises ScanFailed if one shows nobody."""
     alignments, moments = [], []
     for captures in scans:
         images = reconstruct_range_images(calibration, captures, progress).value
@@ -88,7 +91,12 @@ def judge_scans(
     poles: Mapping[str, str],
     moments_ms: Sequence[Mapping[str, float | None]] | None = None,
 ) -> ScanCheck:
-    """poles: of each pair that stands on one.  moments_ms: of each scan, when pairs saw the person."""
+    """Judge a rig by the alignments of its scans.
+
+    rig_from_camera: the calibrated poses.
+    poles: the pole of each pair that stands on one.
+    moments_ms: of each scan, the time at which each pair saw the person; None if not known.
+    """
     shifts = {
         name: np.array(
             [

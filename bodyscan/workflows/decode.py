@@ -1,4 +1,4 @@
-"""Stripe sequences from their files to stripe maps, and those on boards to stripe boundaries."""
+"""Decode stripe sequences: image files to stripe maps, and boards to stripe boundaries."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from bodyscan.stripes.stripe_map import ResponseShare, StripeMap
 NUMBER = re.compile(r"\d[\d.]*%?(, \d[\d.]*%?)*")
 MOST_REASONS = 3
 FEW = 2
-"""So many shots are told one by one, more with the same fault together."""
+"""Up to this many shots are reported one by one; more that share a fault, together."""
 
 Failure = tuple[ImageSequence, BodyscanError]
 Keep = Callable[[BoardView, BoardBoundaries], BoardBoundaries]
 Through = Callable[[str, Mapping[ViewKey, BoardBoundaries]], None]
-"""Takes a pair's name and what all of its shots gave."""
+"""Called with a pair's name and the boundaries from all of its shots."""
 
 
 def decode_sequence(
@@ -57,13 +57,14 @@ def decode_sequence(
     bands: LineBands | None = None,
     workers: int = 1,
 ) -> StripeMap:
-    """Read and decode what `pair` took in one shot; limits, moments, bands: see `decode_stripes`.
+    """Read and decode what `pair` took in one shot.
 
-    crop: rows and columns of the images to decode; the map is of these alone.
+    limits, moments, bands: see `decode_stripes`.
+    crop: rows and columns of the images to decode; the map covers these alone.
 
-    Raises ImageError for bad files, DecodingFailed (naming pair and shot) for frames that do not
-    add up or a pair without projector. Where only images of the stripes that cross are missing, bad
-    or in disorder, the map is that of the others and says why.
+    Raises ImageError for bad files; DecodingFailed (naming pair and shot) for frames that do not
+    form a code, or a pair without a projector. If only images of the crossing stripes are missing,
+    bad or out of order, the map is that of the other direction and says why.
     """
     where = f"pair {sequence.pair}, shot {sequence.shot}"
     if pair.projector is None:
@@ -99,7 +100,7 @@ def _all(view: BoardView, boundaries: BoardBoundaries) -> BoardBoundaries:
 
 
 def _no_use(_pair: str, _found: Mapping[ViewKey, BoardBoundaries]) -> None:
-    """Where nobody waits for single pairs."""
+    """A `Through` that does nothing."""
 
 
 def decode_on_boards(
@@ -113,12 +114,14 @@ def decode_on_boards(
     every: Mapping[str, int] = MappingProxyType({}),
     through: Through = _no_use,
 ) -> Outcome[dict[ViewKey, BoardBoundaries]]:
-    """Stripe boundaries near each of these views; sequences that are bad are noted.
+    """Decode stripe boundaries near each of these views; bad sequences become notes.
 
-    box: where the board of a view shows stripes that are wanted.  keep: what is kept of a view's, of
-    which a rig has tens of millions.  every: by pair, of how many bands of BIN_PX along the stripes one
-    is enough; shots take turns.  through: told of each pair as soon as its last sequence is done, from
-    any thread.  A pair of which none can be decoded is a failure.
+    box: the part of a view's image in which stripes are wanted.
+    keep: selects the boundaries of a view to keep; a rig has tens of millions.
+    every: by pair, keep one in this many bands of BIN_PX along the stripes; shots take turns.
+    through: called with each pair as soon as its last sequence is done, from any thread.
+
+    A pair none of whose sequences can be decoded is a failure.
     """
     wanted: dict[tuple[str, str], list[BoardView]] = defaultdict(list)
     for view in views:
@@ -180,7 +183,7 @@ def decode_on_boards(
 def _without_stripes(
     rig: Rig, wanted: Iterable[tuple[str, str]], striped: set[str]
 ) -> dict[str, str]:
-    """Pairs with a projector that saw the board, but of which no sequence is there, with the reason."""
+    """Pairs with a projector that saw the board but have no stripe sequence, with the reason."""
     shots = dict(wanted)
     return {
         pair.name: "no stripe sequence was found in any shot of the board: there is no image such as "
@@ -192,11 +195,11 @@ def _without_stripes(
 
 
 def one_way_notes(faults: Mapping[ImageSequence, str]) -> Iterator[str]:
-    """A line for each pair and reason for which stripes that cross are not used."""
+    """One line for each pair and each reason why its crossing stripes are not used."""
     shots: dict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)
     for sequence, fault in faults.items():
         if fault:
-            # What differs from shot to shot, shares and names of files, is that of the first.
+            # Details that differ between shots, shares and file names, are quoted from the first.
             alike = NUMBER.sub("", fault.partition("such as")[0])
             shots[sequence.pair, alike].append((sequence.shot, fault))
     for (pair, _), own in sorted(shots.items()):
@@ -208,24 +211,24 @@ def one_way_notes(faults: Mapping[ImageSequence, str]) -> Iterator[str]:
 
 
 def responses_in(stripes: StripeMap) -> list[ResponseShare]:
-    """Of a stripe map and the one that crosses it, those that the projector's response moved."""
+    """Response corrections in a stripe map and its crossing map."""
     maps = (stripes, stripes.crossing)
     return [one.response for one in maps if one is not None and one.response is not None]
 
 
 def response_notes(responses: Mapping[str, Sequence[ResponseShare]]) -> Iterator[str]:
-    """A line a pair whose projector's response was taken out: that of the shot where it was most."""
+    """One line for each pair with a corrected projector response, quoting its strongest shot."""
     for pair, shares in sorted(responses.items()):
         if shares:
             yield f"{pair}: {max(shares, key=lambda share: share.response_rms)}"
 
 
 def failed_pairs(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:
-    """Pairs that failed in every shot, with the reason; of several reasons the first few."""
+    """Pairs that failed in every shot, with the reason, or the first few of several reasons."""
     reasons: dict[str, dict[str, str]] = defaultdict(dict)
     for sequence, error in failures:
         said = plainly(error)
-        # Shares of pixels differ from shot to shot where the fault is one.
+        # One fault gives a different share of pixels in each shot.
         reasons[sequence.pair].setdefault(NUMBER.sub("", said), said)
     return {
         pair: next(iter(said.values()))
@@ -238,7 +241,7 @@ def failed_pairs(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:
 
 
 def failure_notes(failures: Sequence[Failure]) -> Iterator[str]:
-    """A line a shot, or one for all shots of a pair that failed alike."""
+    """One line a shot, or one for all shots of a pair that failed alike."""
     same: dict[tuple[str, str], list[Failure]] = defaultdict(list)
     for failure in failures:
         same[failure[0].pair, plainly(failure[1])].append(failure)

@@ -1,4 +1,4 @@
-"""A stored calibration's sigma over the scan volume, as a picture beside it."""
+"""Draw a stored calibration's sigma over the scan volume, as a picture beside it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ FILE_NAME = "sigma-map.png"
 
 
 def draw_sigma_map(calibration: Path, path: Path | None = None) -> Path:
-    """Where the picture is; beside the calibration if no path is given.
+    """Draw the map and return the picture's path, beside the calibration if no path is given.
 
-    Raises BadInput for a path that is not a PNG's, CalibrationFileError.
+    Raises BadInput for a path that does not end in .png, CalibrationFileError.
     """
     path = path or (calibration if calibration.is_dir() else calibration.parent) / FILE_NAME
     if path.suffix.lower() != ".png":

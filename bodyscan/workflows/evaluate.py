@@ -1,4 +1,4 @@
-"""A simulated workspace held against the truth beside it: calibration, cloud and mesh."""
+"""Compare a simulated workspace's calibration, cloud and mesh with the truth beside it."""
 
 from __future__ import annotations
 
@@ -33,9 +33,11 @@ BodyAt = Callable[[float], Array]
 
 @dataclass(frozen=True, eq=False)
 class RigDeviation:
-    """Errors of each pair against truth in the rig frame as defined, nothing else aligned.
+    """Errors of each pair against the truth, in the rig frame as defined, without any alignment.
 
-    centres_mm: (P, 3).  rotations_deg: (P,).  sigmas: (P, 3) of the centres, as reported.
+    centres_mm: errors of the camera centres, (P, 3).
+    rotations_deg: (P,).
+    sigmas_mm: reported sigmas of the centres, (P, 3).
     """
 
     names: tuple[str, ...]
@@ -54,8 +56,12 @@ class RigDeviation:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The simulator's truth: facts is truth.json; the subject's surface in mm, rig frame; of one who
-    moved, at mid-scan, and the same at mean breath."""
+    """The simulator's truth.
+
+    facts: content of truth.json.
+    vertices, faces: the subject's surface, mm, rig frame; for a moving subject, at mid-scan.
+    at_mean_breath: vertices of a moving subject at mean breath.
+    """
 
     facts: dict[str, Any]
     vertices: Array | None
@@ -64,7 +70,7 @@ class Truth:
 
 
 def load_truth(folder: Path) -> Truth:
-    """Read `truth/`. Raises BadInput if there is none: real captures have no truth."""
+    """Read `truth/`. Raises BadInput if there is none, as for real captures."""
     try:
         facts = json.loads((folder / "truth.json").read_text("utf-8"))
     except (OSError, ValueError) as error:
@@ -87,7 +93,7 @@ def load_truth(folder: Path) -> Truth:
 
 
 def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
-    """Camera centres and rotations against the truth. Raises BadInput for a rig it does not know."""
+    """Compare camera poses with the truth. Raises BadInput for a rig the truth does not know."""
     from bodyscan.geometry.pose_covariance import position_sigma
 
     names = tuple(sorted(calibration.rig_from_camera))
@@ -109,12 +115,13 @@ def compare_rig(calibration: RigCalibration, truth: Truth) -> RigDeviation:
 
 
 def evaluate_workspace(workspace: Path, body_at: BodyAt | None = None) -> str:
-    """A text with every figure, and deviation pictures beside the scan.
+    """Compare a workspace with its truth; return a text of all figures, and draw pictures.
 
-    body_at: of a subject who moved, the vertices of the truth's surface at a moment, ms since the
-    scan began: a scan without some pairs shows another moment than the middle of all. Raises
-    BadInput without truth, CalibrationFileError, ResultError; a figure that cannot be had is a line
-    that says so.
+    body_at: vertices of a moving subject's true surface at a moment, ms since the scan began; a
+        scan that lacks some pairs stands for another moment than mid-scan.
+
+    Pictures of the deviations are written beside the scan. Raises BadInput without a truth,
+    CalibrationFileError, ResultError; a figure that cannot be computed is a line that says so.
     """
     truth = load_truth(workspace / "truth")
     calibration = load_calibration(workspace / "calibration")
@@ -146,16 +153,16 @@ def evaluate_workspace(workspace: Path, body_at: BodyAt | None = None) -> str:
 def _scan_lines(
     stored: StoredScan, folder: Path, calibration: RigCalibration, truth: Truth
 ) -> list[str]:
-    """Figures of a scan, one after the other; pictures into its folder."""
+    """Lines with the figures of a scan; its pictures are written into its folder."""
     assert truth.vertices is not None
     assert truth.faces is not None
     surface, pairs = (truth.vertices, truth.faces), truth.facts["pairs"]
     place = sway_residual(_placings(stored, calibration), pairs, truth.vertices)
     still_from_rig = RigidTransform.identity()
-    if "motion" in truth.facts:  # laid onto the body as it was then
+    if "motion" in truth.facts:  # fit to the body as it was then
         still_from_rig = fit_to_surface(stored.cloud.points, *surface)
     elif truth.facts["settings"]["person"]["sway_mm"]:
-        still_from_rig = place.rig_from_still.inverse()  # who sways stands nowhere in particular
+        still_from_rig = place.rig_from_still.inverse()  # a swaying subject has no fixed pose
     own, body = stored.mesh, transform_mesh(stored.mesh, still_from_rig)
     points = still_from_rig.apply(stored.cloud.points)
     cloud = signed_distances(points, *surface)
@@ -207,7 +214,7 @@ def _scan_lines(
 
 
 def _placings(stored: StoredScan, calibration: RigCalibration) -> dict[str, RigidTransform]:
-    """rig_from_camera of the pairs in the scan, aligned where they were."""
+    """rig_from_camera of the pairs in the scan, as aligned if they were."""
     measured = [name for name, points in stored.facts["measured"].items() if points]
     alignment = stored.facts["alignment"]
     if alignment is None:

@@ -1,4 +1,4 @@
-"""Boards found in all lit images, cameras calibrated from them, and each board's pose per view."""
+"""Find boards in all lit images, calibrate cameras from them, and find each view's board pose."""
 
 from __future__ import annotations
 
@@ -48,21 +48,24 @@ from bodyscan.rig.rig import Rig
 
 HERE = Path()
 NO_POSE_PX = 1.0
-"""A view that is farther off its best pose than this, and than NO_POSE_TIMES its camera's usual
-error, shows another board or mixed-up corners: real corners are good to a few tenths of a pixel."""
+"""A view farther off its best pose than this, px, and than NO_POSE_TIMES its camera's usual error,
+shows another board or mixed-up corners: real corners are good to a few tenths of a pixel."""
 NO_POSE_TIMES = 6.0
 LOOKED_AT = 3
-"""Images of a pair without a board that are looked at closely: seconds each."""
+"""Images without a board, per pair, that are examined closely: seconds each."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundBoards(Outcome[list[BoardView]]):
-    """refused: images in which no board could be looked for, each with the error."""
+    """The boards found.
+
+    refused: images in which no board could be looked for, each with the error.
+    """
 
     refused: Mapping[ImageSequence, BodyscanError] = field(default_factory=dict)
 
     def blamed_on_images(self, failures: Mapping[str, str], captures: Captures) -> dict[str, str]:
-        """The failures of cameras; of those that too few images could be used of, why."""
+        """Failures of cameras, with the reason replaced where too few images could be used."""
         return {name: self._refusal(name, captures) or why for name, why in failures.items()}
 
     def _refusal(self, pair: str, captures: Captures) -> str:
@@ -70,15 +73,17 @@ class FoundBoards(Outcome[list[BoardView]]):
         errors = [error for sequence, error in self.refused.items() if sequence.pair == pair]
         if not errors or taken - len(errors) >= FEWEST_POSES:
             return ""
-        # The commonest: of few images, one may be bad for a reason of its own.
+        # The most common error: when images are few, one may be bad for a reason of its own.
         usual = Counter(error.what for error in errors).most_common(1)[0][0]
         error = next(error for error in errors if error.what == usual)
         return f"{len(errors)} of its {taken} images cannot be used: {error}"
 
 
 def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -> FoundBoards:
-    """Boards in all lit images, or those taken for the board; images that cannot be read, or show no
-    board, are noted."""
+    """Find boards in the board image of every sequence: the lit one, or one taken for the board.
+
+    Images that cannot be read, or that show no board, become notes.
+    """
 
     def find(sequence: ImageSequence) -> tuple[list[BoardView], BodyscanError | None]:
         try:
@@ -113,9 +118,9 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
 
 
 def _given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[BoardView]:
-    """The board whose corners were found elsewhere, [] if that found none.
+    """The board whose corners were found elsewhere, [] if none were.
 
-    Raises BadInput when the rig has several boards: whose corners they are is not said.
+    Raises BadInput when the rig has several boards, because the corners do not say whose they are.
     """
     if len(rig.boards) != 1:
         raise BadInput(
@@ -139,8 +144,11 @@ def _given_view(rig: Rig, captures: Captures, sequence: ImageSequence) -> list[B
 def write_found_corners(
     path: Path, rig: Rig, captures: Captures, views: Sequence[BoardView]
 ) -> None:
-    """A corners.vnl of the rig's only board as it was found in every image, by its path in the capture
-    folder; of a rig with several boards there is none."""
+    """Write the corners of the rig's only board in every image as corners.vnl.
+
+    Images are named by their path in the capture folder. Nothing is written for a rig with several
+    boards.
+    """
     if len(rig.boards) != 1:
         return
     count = len(corner_points(rig.boards[0]))
@@ -163,7 +171,7 @@ def write_found_corners(
 def _look_closer(
     rig: Rig, views: Sequence[BoardView], without: Sequence[ImageSequence]
 ) -> dict[ImageSequence, str]:
-    """What images without a board do show, of pairs that saw none often enough, or usually do."""
+    """What images without a board do show, for pairs that saw few boards or missed few."""
     chosen: list[ImageSequence] = []
     for pair in rig.pairs:
         own = [sequence for sequence in without if sequence.pair == pair.name]
@@ -186,11 +194,11 @@ def calibrate_cameras(
     *,
     folder: Path = HERE,
 ) -> Outcome[dict[str, CameraCalibration]]:
-    """Every pair's camera by itself; those that cannot be calibrated are failures.
+    """Calibrate every pair's camera by itself; those that fail are in `failures`.
 
-    What is `known` of one is read from files relative to `folder`, and held or only begun with.
-    Lenses are those that the rig file names. Otherwise a pair alone gets the one that its held-out
-    boards choose; pairs of a rig get the richest, since the joint solve chooses.
+    What is `known` of a camera is read from files relative to `folder`, and held fixed or used as a
+    start. The rig file names the lenses; otherwise a pair by itself gets the one that its held-out
+    boards choose, and pairs of a rig get the richest, since the joint solve chooses later.
     """
 
     def calibrate(name: str) -> CameraCalibration:
@@ -242,7 +250,7 @@ def _known_notes(name: str, known: Known, found: CameraCalibration) -> Iterator[
 def locate_views(
     rig: Rig, views: Sequence[BoardView], cameras: Mapping[str, CameraCalibration]
 ) -> Outcome[list[LocatedView]]:
-    """The pose of each board in the camera that saw it; views that fit no pose are dropped."""
+    """Find the pose of each board in the camera that saw it; drop views that fit no pose."""
     usable = [
         view
         for view in views
@@ -250,7 +258,7 @@ def locate_views(
     ]
     fitted: dict[ViewKey, tuple[RigidTransform, Array]] = {}
     for name, found in cameras.items():
-        # All at once: a solve of one board's pose takes as many calls as one of thirty.
+        # All at once: solving for one board's pose takes as many calls as for thirty.
         own = [view for view in usable if view.pair == name]
         planar = [planar_view(view, rig.board(view.board)) for view in own]
         starts = [roughly_located(found.camera, view) for view in planar]

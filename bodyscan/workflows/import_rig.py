@@ -1,4 +1,4 @@
-"""A calibration made elsewhere as one of ours: what the rig file says is known, and nothing solved."""
+"""Import a calibration made elsewhere, as the rig file gives it; nothing is solved."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 
 USUAL_PX = 1.0
-"""Of pixels whose calibration says nothing of itself, where alignment must be told how far pairs may
-be off each other: what people take for good."""
+"""Sigma, px, of pixels whose calibration states none, for alignment, which must know how far pairs
+may be off relative to each other: what is commonly called good."""
 USUAL_DISTANCE_MM = 1300.0
-"""Of what is scanned, where that is."""
+"""Distance of the scanned surface from a camera, where that sigma applies."""
 
 
 def import_folder(
     rig_file: Path, folder: Path, sigma_px: float | None = None
 ) -> tuple[RigCalibration, Path]:
-    """As `import_rig`, of a rig file and kept in `folder`; and the path of its JSON."""
+    """Import a rig as `import_rig` does and save it in `folder`; return it and its JSON's path."""
     rig = load_rig(rig_file)
     found = import_rig(rig, Path(rig_file).parent, sigma_px)
     keep_former(folder)
@@ -39,12 +39,13 @@ def import_folder(
 
 
 def import_rig(rig: Rig, folder: Path, sigma_px: float | None = None) -> RigCalibration:
-    """The pairs of which the rig file says where they are calibrated, files relative to `folder`.
+    """Import the pairs whose calibration the rig file names, in files relative to `folder`.
 
-    The rig frame is where `rig_frame` puts its pair, or the first pair's `nominal` that pair;
-    without either it is the world of the files.  sigma_px: of all pairs, instead of the rig file's.
-    A pair whose file is wrong is in `failed`.  Raises BadInput if no pair is left or a board is to
-    fix the rig frame.
+    sigma_px: sigma of the pixels of all pairs, overriding the rig file's.
+
+    The rig frame is the one in which `rig_frame` puts its pair, or else the one in which the first
+    pair has its `nominal` pose; without either it is the world of the files. A pair whose file is
+    wrong is in `failed`. Raises BadInput if no pair is left or a board is to fix the rig frame.
     """
     if rig.rig_frame.shot is not None:
         raise BadInput(
@@ -76,7 +77,7 @@ def import_rig(rig: Rig, folder: Path, sigma_px: float | None = None) -> RigCali
 
 
 def known_errors_of(rig_file: Path) -> list[str]:
-    """What is wrong with the files that a rig file names as `known`, a line or two each."""
+    """What is wrong with the files that a rig file names as `known`, one or two lines each."""
     errors = []
     for pair in load_rig(rig_file).pairs:
         try:
@@ -140,8 +141,8 @@ def _calibrated(pair: Pair, known: KnownPair) -> PairCalibration:
 def _covariance(
     known: dict[str, KnownPair], rig_from_camera: dict[str, RigidTransform]
 ) -> PoseCovariance:
-    """Each pair by itself as far off as its pixels, at the distance of what is scanned; nothing to
-    be off from if there is only one."""
+    """Covariance of the poses: each pair independently off by as much as its pixels, at the usual
+    distance; zero for a single pair, which has nothing to be off from."""
     names = tuple(sorted(known))
     matrix = np.zeros((6 * len(names),) * 2)
     for k, name in enumerate(names if len(names) > 1 else ()):

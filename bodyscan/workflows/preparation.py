@@ -1,7 +1,7 @@
-"""What is made ready before a scan is whole: its calibration loaded, range images of what came.
+"""Prepare a scan while it arrives: load the calibration, make range images of complete pairs.
 
-A pair's images are decoded as soon as they are there, while other pairs still take theirs; what is
-left after the last image is its own pair and what joins them all.
+A pair's images are decoded as soon as they are there, while other pairs still take theirs. After
+the last image, only its own pair and the steps that join all pairs remain.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ Stamp = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class _Made:
-    """stamps: size and time of change of every file, as they were when it was made of them."""
+    """A range image and the stamps (size, time of change) of the files it was made from."""
 
     range_image: Reconstructed
     stamps: tuple[Stamp, ...]
 
 
 class Preparation:
-    """One calibration, loaded once, and the range images of scans that are still arriving."""
+    """A calibration, loaded once, and the range images of scans that are still arriving."""
 
     def __init__(self, calibration: Path) -> None:
         """Raises CalibrationFileError as `load_calibration` does."""
@@ -40,10 +40,10 @@ class Preparation:
         self._made: dict[Path, dict[ImageSequence, Future[_Made | None]]] = {}
 
     def prepare(self, folder: Path, pairs: Collection[str]) -> None:
-        """Begin to decode what these pairs took, if all of it is there: as many at a time as there are
-        threads, however few each call names.
+        """Start decoding what these pairs took, if all of it is there.
 
-        What is amiss is left to the scan, which tries again and says so; nothing is raised for it.
+        Any number of pairs may be named in each call; as many are decoded at a time as there are
+        threads. Nothing is raised: faults are left to the scan, which tries again and reports them.
         """
         try:
             captures = open_scan(self.calibration.rig, folder)
@@ -63,8 +63,10 @@ class Preparation:
         own |= {sequence: self._pool.submit(make, sequence) for sequence in wanted}
 
     def made_of(self, captures: Captures) -> dict[ImageSequence, Reconstructed]:
-        """The range images made of these captures whose files have stayed as they were; those that
-        are being made are waited for. They are given away, so that none is kept twice."""
+        """Hand over the range images of these captures whose files have not changed since.
+
+        Waits for those being made. They are handed over once, so that none is kept twice.
+        """
         made: dict[ImageSequence, Future[_Made | None]] = {}
         for folder in captures.folders:
             made |= self._made.pop(folder, {})
@@ -81,8 +83,8 @@ class Preparation:
 
 
 def _stamps(captures: Captures, sequence: ImageSequence) -> tuple[Stamp, ...]:
-    """Of the images, and of captures.yaml, which says when they were taken; (0, 0) for a file that is
-    not there."""
+    """Stamps of the images and of captures.yaml, which says when they were taken; (0, 0) for a
+    missing file."""
     stamps = []
     for path in (*(folder / FILE_NAME for folder in captures.folders), *sequence.paths):
         try:

@@ -1,4 +1,4 @@
-"""All pairs of a scan: images to range images. A pair that fails is named and left out."""
+"""Make range images of all pairs of a scan; a pair that fails is named and left out."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from bodyscan.stripes.stripe_map import ResponseShare
 from bodyscan.workflows.decode import decode_sequence, one_way_notes, response_notes, responses_in
 
 Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...], StripeMotion | None, str]
-"""A range image, and what was found on the way: the projector's response, what moved, and why the
-stripes that cross were not used."""
+"""A range image with the projector's response, the motion, and why the crossing stripes were not
+used."""
 
 
 def reconstruct_sequence(
@@ -35,9 +35,10 @@ def reconstruct_sequence(
     *,
     volume_only: bool = False,
 ) -> Reconstructed:
-    """What one calibrated pair saw in one shot, within the scan volume and a little around it.
+    """What one calibrated pair saw in one shot, in the scan volume and a little around it.
 
-    volume_only: keep the part of the picture that shows something inside alone, `RangeImage.cut`.
+    volume_only: crop to the part of the image that shows the scan volume (`RangeImage.cut`).
+
     Raises ImageError and DecodingFailed as `decode_sequence` does.
     """
     pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
@@ -51,7 +52,8 @@ def reconstruct_sequence(
     stripes = decode_sequence(sequence, spec, limits=limits, moments=moments)
     image, motion = reconstruct_range_image(pair, stripes), stripes.motion
     if motion is not None and motion.is_significant and image.agreement is not None:
-        # What stands still, and is seen with faults that look like motion, agrees better as it is.
+        # A still subject seen with faults that look like motion agrees better without the
+        # correction.
         still = decode_sequence(sequence, spec, limits=limits)
         standing = reconstruct_range_image(pair, still)
         if standing.agreement and standing.agreement.apart_mm < image.agreement.apart_mm:
@@ -72,10 +74,12 @@ def reconstruct_range_images(
     made: Mapping[ImageSequence, Reconstructed] = MappingProxyType({}),
     volume_only: bool = False,
 ) -> Outcome[list[RangeImage]]:
-    """The range image of every calibrated pair; pairs that gave none are failures.
+    """The range image of every calibrated pair; pairs that gave none are in `failures`.
 
-    They show the scan volume and a little around it. made: those of sequences that were made while
-    others still arrived.  volume_only: see `reconstruct_sequence`.
+    Range images show the scan volume and a little around it.
+
+    made: range images made already, while other sequences were still arriving.
+    volume_only: see `reconstruct_sequence`.
 
     Raises ScanFailed if no pair gives one.
     """
@@ -118,8 +122,10 @@ def reconstruct_range_images(
 
 
 def motion_notes(motions: Mapping[str, StripeMotion], *, timed: bool) -> Iterator[str]:
-    """What pairs saw the subject do while each saw it.  timed: whether speeds are per second; otherwise
-    they are from one image to the next."""
+    """Notes on how the subject moved while each pair saw it.
+
+    timed: whether speeds are per second rather than from one image to the next.
+    """
     moved = {pair: motion for pair, motion in motions.items() if motion.is_significant}
     if not moved:
         return

@@ -1,4 +1,4 @@
-"""Artefacts measured as a person is: captures decoded, placed by the calibration, merged, judged."""
+"""Measure artefacts as a person is measured: decode, place by the calibration, merge, judge."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import FusionSettings
 from bodyscan.workflows.range_images import reconstruct_range_images
 
-FUSION = FusionSettings(points=200_000)  # a sphere of 60 mm has some 3,000 of them
+FUSION = FusionSettings(points=200_000)  # about 3,000 of them on a sphere of 60 mm
 FEWEST_OF_ONE = 400
-"""A single pair's sphere or plate is judged from so many points on."""
+"""Fewest points from which a single pair's sphere or plate is judged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ def read_spheres(
     file: AcceptanceFile,
     progress: Progress = silent,
 ) -> Readings:
-    """Every shot of a folder of the spheres at one place."""
+    """Read every shot of a folder of the spheres at one place."""
     centres, radius = np.array(file.spheres.centres_mm), file.spheres.radius_mm
 
     def read(shot: str, clouds: Sequence[_Cloud]) -> Readings:
@@ -75,7 +75,7 @@ def read_plates(
     file: AcceptanceFile,
     progress: Progress = silent,
 ) -> Readings:
-    """Every shot of a folder of the plate at one place."""
+    """Read every shot of a folder of the plate at one place."""
     width, height = file.plate.size_mm
 
     def row(shot: str, cloud: _Cloud) -> PlateRow:
@@ -87,7 +87,7 @@ def read_plates(
         rows = [row(shot, clouds[0])]
         for cloud in clouds[1:]:
             if len(cloud.points) >= FEWEST_OF_ONE:
-                with suppress(BodyscanError):  # it sees an edge of it alone
+                with suppress(BodyscanError):  # this pair sees only an edge of it
                     rows.append(row(shot, cloud))
         return Readings(plates=tuple(rows))
 
@@ -101,7 +101,7 @@ def _each_shot(
     read: Callable[[str, Sequence[_Cloud]], Readings],
     progress: Progress,
 ) -> Readings:
-    """What `read` makes of every shot's clouds; a shot that fails is a problem, and named."""
+    """Sum `read` over the clouds of every shot; a shot that fails is listed as a problem."""
     total = Readings()
     for shot in captures.shots:
         try:
@@ -114,8 +114,10 @@ def _each_shot(
 def _clouds(
     calibration: RigCalibration, captures: Captures, shot: str, progress: Progress
 ) -> list[_Cloud]:
-    """All pairs' points merged as a scan's are (without alignment), then each pair's own, rig
-    frame. Raises ScanFailed."""
+    """All pairs' points merged like a scan's (without alignment), then each pair's own; rig frame.
+
+    Raises ScanFailed.
+    """
     one = replace(captures, shots=(shot,), sequences=captures.of_shot(shot))
     images = reconstruct_range_images(calibration, one, progress).value
     cleaned = clean(images, calibration.rig_from_camera, calibration.rig.volume)

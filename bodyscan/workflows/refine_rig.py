@@ -1,4 +1,4 @@
-"""A calibrated rig refined on a rigid object that its pairs scanned."""
+"""Refine a calibrated rig on a rigid object scanned by its pairs."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ def refine_rig(
 ) -> Outcome[RigCalibration]:
     """The calibration with the pairs brought closer together, within what the boards allow.
 
-    captures: a scan of an object that stood still, called `name` in the calibration's notes.
-    Raises FailedWork where the overlaps do not come closer, ScanFailed if nothing was scanned.
+    captures: a scan of an object that stood still.
+    name: what the calibration's notes call it.
+
+    Raises FailedWork if the overlaps do not come closer, ScanFailed if nothing was scanned.
     """
     measured = reconstruct_range_images(calibration, captures, progress)
     with step(progress, "aligning"):

@@ -1,4 +1,4 @@
-"""What is said of a calibrated rig beside the calibration itself: its boards, its ties, its halves."""
+"""Remarks on a calibrated rig, apart from the calibration itself: boards, ties, halves."""
 
 from __future__ import annotations
 
@@ -19,8 +19,12 @@ from bodyscan.registration.rig_solve import RigSolution
 
 @dataclass(frozen=True, eq=False)
 class JoinedRig:
-    """A calibration as it stands, and what remarks on it come from: the joint solve, which holds
-    pairs that failed later too, all boards that were found, and how many images could be searched."""
+    """A calibration and what the remarks on it are made from.
+
+    placed: the joint solve, including pairs that failed later.
+    views: all boards that were found.
+    images: number of images that could be searched.
+    """
 
     calibration: RigCalibration
     placed: RigSolution
@@ -29,8 +33,10 @@ class JoinedRig:
 
 
 def remarked(found: JoinedRig, progress: Progress = silent) -> RigCalibration:
-    """The calibration with notes on its boards, and advice. It stands without any of them: what
-    cannot be said is noted."""
+    """The calibration with notes on its boards, and advice.
+
+    None of these is essential: a remark that fails is replaced by a note.
+    """
     own, placed = found.calibration, found.placed
     notes: list[str] = list(own.notes)
     advice: list[str] = []
@@ -50,7 +56,7 @@ def remarked(found: JoinedRig, progress: Progress = silent) -> RigCalibration:
 
 
 def stripe_board_notes(pairs: Mapping[str, PairCalibration]) -> Iterator[str]:
-    """A line on whether stripes measure the boards where the corners put them."""
+    """A line on how far the boards as measured by the stripes lie from their corners."""
     boards = {n: p.quality.boards_mm for n, p in pairs.items() if p.quality.boards_mm is not None}
     if boards:
         worst = max(sorted(boards), key=lambda name: boards[name][1])

@@ -1,4 +1,4 @@
-"""One person's capture folder fused, kept in a folder with pictures of it."""
+"""Scan one person's capture folder; save the result in a folder, with pictures of it."""
 
 from __future__ import annotations
 
@@ -32,14 +32,18 @@ def scan_folder(
     preparation: Preparation | None = None,
     announce: Announce = say_nothing,
 ) -> tuple[Scan, Path, Outcome[list[Path]]]:
-    """The scan, its scan.json in `out`, and the pictures beside it, written once the result is kept.
-    A result that lay there goes. Pictures are drawn while a core is free: the cloud's while it is
-    meshed, the mesh's while it is judged.
+    """Scan a capture folder; return the scan, its scan.json in `out` and the pictures beside it.
 
-    empty: captures of the rig with nobody in it. follow_links: though the calibration's rig file does
-    not say so. preparation: what was loaded and decoded before. announce: told the verdict as the
-    points alone have it, and once the result is kept the final one. Raises ScanFailed after saying so
-    in scan.json.
+    Earlier results in `out` are removed. Pictures are drawn while a core is free, the cloud's
+    during meshing and the mesh's during judging, and written once the result is saved.
+
+    empty: captures of the rig with nobody in it.
+    follow_links: follow links even if the calibration's rig file does not allow it.
+    preparation: what was loaded and decoded before.
+    announce: called with the verdict on the points alone, and with the final one once the result is
+        saved.
+
+    Raises ScanFailed after recording it in scan.json.
     """
     rig = preparation.calibration if preparation else load_calibration(calibration)
     described = rig.rig

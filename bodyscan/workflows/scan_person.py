@@ -1,4 +1,4 @@
-"""One person: images to range images, and these to a body cloud and a closed mesh."""
+"""Scan one person: images to range images, and these to a body cloud and a closed mesh."""
 
 from __future__ import annotations
 
@@ -25,10 +25,12 @@ def scan_person(
     announce: Announce = say_nothing,
     made: Made = no_use,
 ) -> Scan:
-    """Person images in, body model and mesh out.
+    """Make a body model and mesh from images of a person.
 
-    empty: captures of the rig without anybody in it, whose surfaces are no part of the subject.
-    reconstructed: see `reconstruct_range_images`.  announce, made: see `fuse`.
+    empty: captures of the rig with nobody in it, whose surfaces are not part of the subject.
+    reconstructed: see `reconstruct_range_images`.
+    announce, made: see `fuse`.
+
     Raises ScanFailed if no pair, or no part of a body inside the scan volume, is left.
     """
     images = reconstruct_range_images(

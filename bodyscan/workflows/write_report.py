@@ -1,4 +1,4 @@
-"""A stored calibration or scan, reported as one HTML file."""
+"""Report a stored calibration or scan as one HTML file."""
 
 from __future__ import annotations
 
@@ -16,10 +16,13 @@ FILE_NAME = "report.html"
 def write_report(
     result: Path, path: Path | None = None, other: Path | None = None
 ) -> tuple[Path, Verdict]:
-    """Where the report is, and its verdict.
+    """Write the report; return its path and its verdict.
 
-    result: what calibrate-rig or scan wrote. path: report.html in the result if not given.
-    other: a scan or a known surface to compare with. Raises BadInput for what is no result.
+    result: what calibrate-rig or scan wrote.
+    path: report.html in the result if None.
+    other: a scan or a known surface to compare with.
+
+    Raises BadInput for anything that is not a result.
     """
     folder = result if result.is_dir() else result.parent
     path = path or folder / FILE_NAME
@@ -28,6 +31,6 @@ def write_report(
     page = build_page(result, other)
     write_text(path, render(page))
     if page.subject is not None and path.parent.resolve() != folder.resolve():
-        # As beside an export: so that `bodyscan forget` knows whose it is.
+        # As beside an export, so that `bodyscan forget` knows whose it is.
         write_json(path.with_name(f"{path.name}.json"), {"subject": page.subject})
     return path, page.verdict
