@@ -54,8 +54,7 @@ class LightPlanes:
     """One plane per boundary, each independent of its neighbours.
 
     coefficients: (S + 1, 4), row i is (a, b, c, d) of the plane at s = i: ax + by + cz + d = 0,
-    camera
-        frame, mm, (a, b, c) a unit vector, d >= 0. A row of NaN: the stripe is not calibrated.
+        camera frame, mm, (a, b, c) a unit vector, d >= 0. A row of NaN: the stripe is not calibrated.
     covariance: (S + 1, 4, 4) of the coefficients.
     direction: which way the stripes run in the image.
     """

@@ -70,8 +70,7 @@ class Board(Model):
     @property
     def believed_flatness_mm(self) -> float:
         """Standard deviation, before any image, of the height difference between the board's lowest
-        and
-        highest corners: `flatness_mm`, or FLATNESS times its diagonal."""
+        and highest corners: `flatness_mm`, or FLATNESS times its diagonal."""
         if self.flatness_mm is not None:
             return self.flatness_mm
         return FLATNESS * self.square_mm * math.hypot(self.columns, self.rows)

@@ -32,7 +32,7 @@ from bodyscan.stripes.usable_pixels import (
 )
 
 REACH = 3
-"""Images before and after the brightest in which its light may be seen; they are bytes."""
+"""Images before and after the brightest in which its light may be seen."""
 
 SAMPLES = 15
 MAX_SECOND = 0.3
