@@ -24,7 +24,7 @@ INNER = np.stack(np.meshgrid(STEPS, STEPS), axis=-1)
 
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
-    """A camera without the file's unit of length applied.
+    """A camera, or a projector described as one, read from a file.
 
     matrix: A of Eq. 1, (3, 3), px, whole numbers at pixel centres.
     size: of its image, (width, height) px; None if the file does not say.
