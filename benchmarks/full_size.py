@@ -36,8 +36,8 @@ def four_pole() -> str:
 
 
 def living() -> str:
-    """The section of docs/results.md on the woman standing as
-    people do, calibrated by `three_pole`."""
+    """The section of docs/results.md on the woman standing as people do, calibrated by
+    `three_pole`."""
     workspace = PROJECT / "bench" / "standing"
     rig, subject = PROJECT / "rigs" / "three-pole-12.yaml", _subject("woman_average")
     commands = _commands(rig, workspace, subject)
@@ -146,8 +146,8 @@ def run_commands(
 
 
 def _from_project(argument: object) -> str:
-    """An argument with paths relative to the project, so that
-    no folder of this machine is printed."""
+    """An argument with paths relative to the project, so that no folder of this machine is
+    printed."""
     if isinstance(argument, Path) and argument.is_relative_to(PROJECT):
         return str(argument.relative_to(PROJECT))
     return str(argument)

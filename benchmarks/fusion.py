@@ -321,8 +321,8 @@ def _multiway(workspace: Path, folder: Path) -> Step:
 
 
 def _voxels(size: float) -> Callable[[Path, Path], Step]:
-    """All points into voxels at the poses of our calibration;
-    those of size 1 are kept for meshing."""
+    """All points into voxels at the poses of our calibration; those of size 1 are kept for
+    meshing."""
 
     def step(workspace: Path, folder: Path) -> Step:
         _, seen, placed, _, cloud = _kept(folder / "ours")

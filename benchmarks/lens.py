@@ -237,8 +237,8 @@ class Body:
         return np.asarray(np.abs(share - 1.0) * np.linalg.norm(points, axis=1) < ON_BODY_MM)
 
     def distances(self, points: Array) -> tuple[Array, Array]:
-        """Signed distances (N,) mm from the plane of the nearest
-        face, outside positive, and normals (N, 3)."""
+        """Signed distances (N,) mm from the plane of the nearest face, outside positive, and
+        normals (N, 3)."""
         centred = points - self._centre
         found = self._scene.compute_closest_points(o3d.core.Tensor(centred.astype(np.float32)))
         normals = found["primitive_normals"].numpy().astype(float)

@@ -59,8 +59,8 @@ Correlation of the two: {np.corrcoef(off, told)[0, 1]:+.2f}.
 def _errors(
     joined: JoinedRig, decoded: dict[ViewKey, BoardBoundaries], truth: Truth
 ) -> Iterator[Array]:
-    """Errors (2, B) mm for each pair, less their means: boards
-    against the truth, and by the stripes."""
+    """Errors (2, B) mm for each pair, less their means: boards against the truth, and by the
+    stripes."""
     placed, rig, facts = joined.placed, joined.calibration.rig, truth.facts
     for name, pair in joined.calibration.pairs.items():
         true = RigidTransform.from_matrix(facts["pairs"][name]["rig_from_camera"]).inverse()

@@ -1,5 +1,5 @@
-"""What a user waits for: a cold command, a job of a batch, a
-warm scan; compared with image reading."""
+"""What a user waits for: a cold command, a job of a batch, a warm scan; compared with image
+reading."""
 
 from __future__ import annotations
 

@@ -91,8 +91,8 @@ def _agreeing(board: Board, markers: Markers) -> int:
 
 
 def _marker_side(board: Board, markers: Markers) -> float | None:
-    """Side of a marker, mm, from the markers' spacing
-    whatever `marker_mm` says; None if unclear."""
+    """Side of a marker, mm, from the markers' spacing whatever `marker_mm` says; None if
+    unclear."""
     layouts = (board, board.model_copy(update={"legacy_layout": not board.legacy_layout}))
     for described in layouts if board.kind == "charuco" else (board,):
         ids, printed = marker_corners(described)
@@ -123,8 +123,8 @@ def _other_dictionaries(image: Bytes, board: Board) -> str:
 
 
 def _resized(board: Board, markers: Markers) -> Iterator[tuple[int, int, int]]:
-    """Other numbers of columns and rows that most markers
-    fit: how many, minus the rows, columns."""
+    """Other numbers of columns and rows that most markers fit: how many, minus the rows,
+    columns."""
     sizes = [
         (board.columns + more, board.rows + taller)
         for more, taller in product((0, *OTHER_SIZES), repeat=2)

@@ -34,8 +34,7 @@ exposure is the shorter one."""
 def merge_exposures(stacks: Sequence[Greys], names: Sequence[str], where: str) -> Floats:
     """Merge exposures into images (F, H, W) float32, in grey levels of the shortest.
 
-    stacks: (F, H, W) grey levels of each exposure, the shortest first, the same image at the same
-        index.
+    stacks: (F, H, W) grey levels of each exposure, the shortest first, images in equal order.
     names: of the exposures.
 
     Raises ImageError for exposures that are out of order or cannot be compared.
@@ -54,8 +53,8 @@ def merge_exposures(stacks: Sequence[Greys], names: Sequence[str], where: str) -
 
 
 def _merged(images: Sequence[Greys], lines: Sequence[tuple[float, float]]) -> Floats:
-    """One image (H, W) from its exposures; lines: offset and
-    slope that bring each to the shortest."""
+    """One image (H, W) from its exposures; lines: offset and slope that bring each to the
+    shortest."""
     total = images[0].astype(np.float32)
     weights = np.ones_like(total)
     for image, (offset, slope) in zip(images[1:], lines[1:], strict=True):

@@ -35,7 +35,7 @@ class Velocity:
     covariance: (6, 6) of the twist. Motion of a surface within itself cannot be seen; such
     directions
         keep the width of the prior, that of people who stand.
-    seen: the speeds behind it, including those of things that do not move with the rest.
+    seen: the speeds behind it, including those of parts that do not move rigidly.
     """
 
     twist: Array

@@ -86,8 +86,8 @@ def _captures_content(folder: Path) -> dict[str, Any]:
 
 
 def nearest_calibration(scans: Path) -> Path:
-    """The `calibration` folder in the folder of the scans,
-    beside it or above it. Raises BadInput."""
+    """The `calibration` folder in the folder of the scans, beside it or above it. Raises
+    BadInput."""
     absolute = scans.absolute()
     for above in (absolute, *list(absolute.parents)[:2]):
         if (above / "calibration" / CALIBRATION).exists():

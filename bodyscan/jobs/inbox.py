@@ -37,8 +37,8 @@ _LOSSLESS = (".png", ".tif", ".tiff", ".bmp", ".pgm")
 
 @dataclass(frozen=True)
 class Arrival:
-    """What has arrived of a scan. whole: pairs with all their
-    images. complete: nothing more is expected."""
+    """What has arrived of a scan. whole: pairs with all their images. complete: nothing more is
+    expected."""
 
     whole: tuple[str, ...]
     complete: bool

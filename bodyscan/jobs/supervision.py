@@ -171,8 +171,8 @@ def open_log(path: Path) -> Any:
 
 
 def environment(threads: int) -> dict[str, str]:
-    """Environment with the libraries' threads; BLAS gets one,
-    since stages use the rest themselves."""
+    """Environment with the libraries' threads; BLAS gets one, since stages use the rest
+    themselves."""
     return os.environ | {
         "OMP_NUM_THREADS": str(threads),
         "OPENCV_FOR_THREADS_NUM": str(threads),

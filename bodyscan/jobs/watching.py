@@ -46,8 +46,8 @@ from bodyscan.jobs.supervision import (
 )
 
 POLL_S = 0.1
-"""Greatest delay until an image is found after it was
-written: a twentieth of the time to a verdict."""
+"""Greatest delay until an image is found after it was written: a twentieth of the time to a
+verdict."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,8 @@ def watch(
 
 @dataclass
 class _Watching:
-    """scans: not ended yet. running: jobs handed over, in
-    order, each with its number of attempts."""
+    """scans: not ended yet. running: jobs handed over, in order, each with its number of
+    attempts."""
 
     watched: Watched
     listen: Listen

@@ -100,8 +100,8 @@ def work(folder: Path, kinds: Kinds, tell: Tell) -> None:
 
 
 def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
-    """Run a stage and put its results in place, provided
-    that its inputs did not change meanwhile."""
+    """Run a stage and put its results in place, provided that its inputs did not change
+    meanwhile."""
     made = job.folder / f"{_BEING_MADE}{stage.name}-{secrets.token_hex(4)}"
     made.mkdir()
 

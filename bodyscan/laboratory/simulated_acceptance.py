@@ -85,8 +85,8 @@ def _placed(
     way: tuple[float, float, float],
     middle: Array,
 ) -> RigidTransform:
-    """A pose with the artefact's x axis along `way`, its y
-    axis level, and its `middle` at `share`."""
+    """A pose with the artefact's x axis along `way`, its y axis level, and its `middle` at
+    `share`."""
     x = np.array(way) / np.linalg.norm(way)
     beside = np.cross([0.0, 0.0, 1.0], x)
     y = beside / np.linalg.norm(beside) if np.linalg.norm(beside) > 1e-9 else np.array([0.0, 1, 0])

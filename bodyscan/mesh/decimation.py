@@ -192,8 +192,8 @@ def _farthest(
 
 
 def _split_faces(faces: Indices, some: Indices, vertex_count: int) -> Indices:
-    """Split N faces in three around new vertices, numbered from `vertex_count` on; returns faces
-    (F + 2 N, 3)."""
+    """Split N faces in three around new vertices, numbered from `vertex_count` on; returns faces (F
+    + 2 N, 3)."""
     a, b, c = faces[some].T
     middle = vertex_count + np.arange(len(some))
     faces = faces.copy()

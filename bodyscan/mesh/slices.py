@@ -94,8 +94,8 @@ def hull_mm(points: Array) -> float:
 
 
 def runs_of(loop: Loop, shortest_gap_mm: float) -> tuple[Run, ...]:
-    """A loop's stretches in order; unmeasured ones shorter
-    than `shortest_gap_mm` count as measured."""
+    """A loop's stretches in order; unmeasured ones shorter than `shortest_gap_mm` count as
+    measured."""
     nodes, number = np.unique(loop.ends, return_inverse=True)
     ends = number.reshape(-1, 2)
     label = _stretches(ends, loop.measured, len(nodes))

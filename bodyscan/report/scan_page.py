@@ -201,8 +201,8 @@ def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
 
 
 def _person(person: Mapping[str, Any]) -> Section:
-    """The section on a person who moved while being scanned:
-    what moved, how far, and how certainly."""
+    """The section on a person who moved while being scanned: what moved, how far, and how
+    certainly."""
     columns = (
         Column("part"),
         Column("moved", "mm", "most of it at most, against where it was in the middle.", digits=1),

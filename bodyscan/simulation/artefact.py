@@ -43,8 +43,8 @@ class SimulatedRig:
 
 
 def open_workspace(workspace: Path) -> SimulatedRig:
-    """The rig that `bodyscan simulate` built there. Raises
-    BadInput if it is not of this version."""
+    """The rig that `bodyscan simulate` built there. Raises BadInput if it is not of this
+    version."""
     remedy = "give a folder that this version of `bodyscan simulate` wrote"
     try:
         truth = json.loads((workspace / "truth" / "truth.json").read_text("utf-8"))

@@ -55,8 +55,8 @@ class LightTable:
 def table_index(
     s: NDArray[np.floating], stripes: int, blur: NDArray[np.integer] | None = None
 ) -> NDArray[np.int32]:
-    """Table entry of a stripe coordinate (NaN: outside the
-    sweep), in the row of its blur if several."""
+    """Table entry of a stripe coordinate (NaN: outside the sweep), in the row of its blur if
+    several."""
     entries = (stripes + 2 * PAD) * FINE
     place = np.nan_to_num((s + PAD) * FINE, nan=0.0, posinf=0.0, neginf=0.0)
     index = np.clip(place, 0, entries - 1).astype(np.int32)
@@ -89,8 +89,8 @@ def light_table(
 
 
 def _smeared(values: Floats, blurs: tuple[float, ...]) -> Floats:
-    """Values (N,) blurred by each blur, (B, N); block-wise
-    Fourier transforms are ten times quicker."""
+    """Values (N,) blurred by each blur, (B, N); block-wise Fourier transforms are ten times
+    quicker."""
     if max(blurs) <= 0:
         return np.repeat(values[None], len(blurs), axis=0)
     padded = np.pad(values, PAD * FINE, mode="edge")

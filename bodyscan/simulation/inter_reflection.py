@@ -149,8 +149,8 @@ def _sums(group: Indices, values: NDArray[np.floating]) -> Array:
 
 
 def _nearest_to_mean(group: Indices, points: Floats) -> Indices:
-    """Numbers (K,) of the points (N, 3) nearest to each group's
-    mean: unlike it, they lie on a surface."""
+    """Numbers (K,) of the points (N, 3) nearest to each group's mean: unlike it, they lie on a
+    surface."""
     count = np.bincount(group)
     off = points - (_sums(group, points) / count[:, None])[group]
     order = np.lexsort((np.sum(off**2, axis=1), group))

@@ -94,8 +94,8 @@ class Joint:
 
 @dataclass(frozen=True)
 class Breath:
-    """mm: from breathed out to breathed in. period_s. phases:
-    of chest and belly at time 0, radians."""
+    """mm: from breathed out to breathed in. period_s. phases: of chest and belly at time 0,
+    radians."""
 
     mm: float
     period_s: float
@@ -281,8 +281,8 @@ def _wander(fields: dict[str, Any]) -> Wander:
 
 
 def body_of(truth: Path) -> LivingBody | None:
-    """The body in a workspace's folder `truth`; None if the
-    subject did not move, or is unreadable."""
+    """The body in a workspace's folder `truth`; None if the subject did not move, or is
+    unreadable."""
     try:
         motion = json.loads((truth / "truth.json").read_text("utf-8"))["motion"]
         return load_body(motion, truth / "body.npz")

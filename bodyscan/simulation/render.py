@@ -334,8 +334,8 @@ class _Between:
         return _Between(tuple(tables), facets, light)
 
     def add_to(self, seen: _Seen, scene: Scene, view: View) -> None:
-        """Add its light to the pixels of every frame: it varies
-        slowly, so one sample per pixel suffices."""
+        """Add its light to the pixels of every frame: it varies slowly, so one sample per pixel
+        suffices."""
         for band in view.bands:
             hits = scene.cast(band.rays[:, :, band.rays.shape[2] // 2].reshape(-1, 3))
             found = self.facets.irradiance(hits, self.radiosity)

@@ -173,8 +173,7 @@ class Scene:
         directions: (R, C, 3) neighbouring rays from the origin, z = 1.
         ends, towards: (R, C, 3) where they end in the empty room, and the direction from there to
             the light's source, NaN without light.
-        step: largest distance between two of the rays; nothing shows or is dark only between two
-            rays that are not reported.
+        step: largest distance between two of the rays, so that nothing between two is missed.
         """
         (left, top), (right, bottom) = self._outline
         x, y = directions[..., 0], directions[..., 1]

@@ -1,5 +1,5 @@
-"""Skin as light sees it: light enters, spreads and leaves
-elsewhere, displaced if it came obliquely."""
+"""Skin as light sees it: light enters, spreads and leaves elsewhere, displaced if it came
+obliquely."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ from bodyscan.compiled import compiled
 
 REACH_PX = 4
 FEWEST, FEWEST_BESIDE = 6, 2
-"""Pixels with a code in the window, and on each side of its
-middle: at a rim a line is unreliable."""
+"""Pixels with a code in the window, and on each side of its middle: at a rim a line is
+unreliable."""
 
 LEAST_SLOPE = 0.35
 """Stripes per pixel: in wider stripes neighbours have the same code, and a line says nothing."""

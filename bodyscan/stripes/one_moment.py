@@ -161,8 +161,8 @@ def _mean_size(values: Array) -> float:
 
 @compiled
 def _at_places(grid: Array, cell_px: int, column: Array, row: Array) -> Array:
-    """A grid (2, rows, columns) at places (N,), px, as (2, N);
-    constant beyond the outermost middles."""
+    """A grid (2, rows, columns) at places (N,), px, as (2, N); constant beyond the outermost
+    middles."""
     found = np.empty((2, column.size))
     rows, columns = grid.shape[1:]
     for n in range(column.size):

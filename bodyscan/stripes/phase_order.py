@@ -23,8 +23,8 @@ CHANCE = 1e-4
 """Greatest chance of a wrong order: one flying pixel in ten thousand, which cleaning finds."""
 
 MOST_SIGMAS = 4.5
-"""Between two waves at one pixel: one in 150,000 by noise;
-otherwise the pixel sees two surfaces."""
+"""Between two waves at one pixel: one in 150,000 by noise; otherwise the pixel sees two
+surfaces."""
 
 TOLD = -2.0 * math.log(CHANCE)
 """How much greater chi squared of the second-best order must be."""

@@ -30,7 +30,7 @@ ALIKE = 0.1
 MAX_MEAN_ERROR = 0.15
 MAX_SHARE_AMISS = 0.15
 AFAR = 0.3
-"""Share of a period, between the phase and the middle of its half period; normally 1/4."""
+"""Share of a period between the phase and the middle of its half period; normally at most 1/4."""
 
 LEAP = 0.6
 """Share of a period, between neighbouring pixels on both sides of a boundary of half periods."""

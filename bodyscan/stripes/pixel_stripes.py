@@ -52,8 +52,8 @@ def pixel_stripe_map(
 
 
 def whole_numbers(s: Floats, sigma: Floats, blur2: float) -> Boundaries:
-    """Boundaries where s passes a whole number between two
-    neighbours on a line, interpolated linearly."""
+    """Boundaries where s passes a whole number between two neighbours on a line, interpolated
+    linearly."""
     here, there = s[:, :-1], s[:, 1:]
     step = there - here
     whole = np.rint((here + there) / 2)

@@ -35,9 +35,9 @@ MAX_SHARE_BEYOND = 0.05
 MIN_FLIPS = 50
 WRONG_WAY = 2.0
 MIN_SHARE_CLEAR = 0.5
-"""Share of changes of one bit that are free of noise and in step. Wrong frames leave hardly any; in
-a right sequence light that varied between frames, and rims, put up to a third of a coarse bit's
-out."""
+"""Least share in step of one-bit changes that are free of noise. Wrong frames leave hardly any in
+step; in a right sequence light that varied between frames, and rims, put up to a third of a coarse
+bit's changes out of it."""
 TREND_PX, TREND = 16, 3
 """Stripes gained over so many pixels without a jump: more than misread ones give."""
 MIN_SHARE_IN_STEP, MIN_SHARE_WITHOUT_INVERSES = 0.6, 0.75

@@ -1,5 +1,5 @@
-"""Whether the stripes of neighbouring pixels are
-consecutive, for codes that number them directly."""
+"""Whether the stripes of neighbouring pixels are consecutive, for codes that number them
+directly."""
 
 from __future__ import annotations
 

@@ -43,8 +43,8 @@ def wave_variance(waves: Sequence[WaveSeen], images: Sequence[Greys], usable: Ma
 
 
 def _misfits(waves: Sequence[WaveSeen], images: Sequence[Greys], some: Indices) -> Iterator[Array]:
-    """Quantities that would be zero without noise, at some
-    pixels, each with one image's variance."""
+    """Quantities that would be zero without noise, at some pixels, each with one image's
+    variance."""
     for one, other in pairwise(waves):
         apart = one.mean.ravel()[some] - other.mean.ravel()[some]
         yield apart / np.sqrt(1.0 / one.wave.steps + 1.0 / other.wave.steps)

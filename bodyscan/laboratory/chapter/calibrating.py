@@ -120,8 +120,8 @@ def calibrate_ours(
 
 @dataclass(frozen=True, eq=False)
 class SigmaTrial:
-    """Errors over sigmas of many calibrations from noisy
-    corners, (seeds, P) for the `parameters`."""
+    """Errors over sigmas of many calibrations from noisy corners, (seeds, P) for the
+    `parameters`."""
 
     parameters: tuple[str, ...]
     errors: Array

@@ -37,8 +37,8 @@ def fit_invariable_baseline(
 def fit_variable_baseline(
     data: BoundaryPoints, stripes: int, direction: Axis, *, fit_tilt: bool = True
 ) -> LightPlanes:
-    """A baseline and an angle for each stripe, and one tilt
-    for all; see `fit_invariable_baseline`."""
+    """A baseline and an angle for each stripe, and one tilt for all; see
+    `fit_invariable_baseline`."""
     return _fit(data, stripes, direction, own_baseline=True, fit_tilt=fit_tilt)
 
 

@@ -115,8 +115,8 @@ class PhaseShift(StripeCode):
 
     @property
     def half_periods(self) -> int:
-        """Number of half periods of the single wave in all
-        stripes, the last one perhaps incomplete."""
+        """Number of half periods of the single wave in all stripes, the last one perhaps
+        incomplete."""
         return math.ceil(2.0 * self.stripes / self._lengths[0] - 1e-9)
 
     @property

@@ -22,8 +22,8 @@ LARGEST_NUMBER = 254
 
 
 class StripeIndex(StripeCode):
-    """Stripe numbers in one image; boards are looked for in
-    the lit image, taken without stripes."""
+    """Stripe numbers in one image; boards are looked for in the lit image, taken without
+    stripes."""
 
     kinds: ClassVar = (INDEX,)
     uses_dark: ClassVar = False
