@@ -24,8 +24,10 @@ NODES = 0.5 + 0.5 * np.cos(np.pi * (np.arange(3) + 0.5) / 3.0)
 
 @dataclass(frozen=True, eq=False)
 class QuadraticTable:
-    """coefficients: (rows, columns, 2, 6) of x^i y^j, both from 0 to 1 across a cell.
-        The outermost cells form a ring around the tabulated rectangle that means "outside".
+    """A tabulated map with two values.
+
+    coefficients: (rows, columns, 2, 6) of x^i y^j, both from 0 to 1 across a cell. The outermost
+        cells form a ring around the tabulated rectangle that means "outside".
     frame: (4,) the ring's least x and y, then cells per unit of x and of y.
     error: the largest deviation of a quadratic from a fitted value, in the values' unit.
     """
