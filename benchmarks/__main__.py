@@ -64,11 +64,12 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "mutants": mutants.report,
 }
 SLOW = ("mutants", "day", "sigmas-rigs")
-"""Run when named, not with all."""
+"""Run only when named."""
 
 
 def main() -> None:
-    """Sections that are not run keep what the last run found, and say how old it is."""
+    """Run benchmarks; other sections keep the results of
+    their last run, and say how old they are."""
     named = sys.argv[1:] or [name for name in BENCHMARKS if name not in SLOW]
     sections = _sections()
     for name in named:
@@ -87,7 +88,7 @@ def main() -> None:
 
 
 def _origin(load: float) -> str:
-    """The line that says where a section comes from."""
+    """The line that says how a section was made."""
     commit = _git("rev-parse", "--short=7", "HEAD")
     changed = (
         " with changes that are not committed" if _git("status", "--porcelain", "bodyscan") else ""
@@ -98,7 +99,7 @@ def _origin(load: float) -> str:
 
 
 def _processor() -> str:
-    """Its name and generation, or the instruction set where the system names neither."""
+    """The processor's name and generation, or the instruction set if the system gives neither."""
     try:
         told = dict(re.findall(r"(.+?)\s*: (.+)", Path("/proc/cpuinfo").read_text("utf-8")))
         return f"{told['model name']} (family {told['cpu family']})"
@@ -107,14 +108,14 @@ def _processor() -> str:
 
 
 MEASURED = ("bodyscan", "benchmarks")
-"""The folders whose commits make a section old."""
+"""The folders whose commits make a section outdated."""
 
 _ORIGIN = re.compile(r"^\*Commit ([0-9a-f]{7,})[^*]*\*", re.MULTILINE)
 _AGE = re.compile(r"\n\*\*Older than the code\*\*[^\n]*\n")
 
 
 def _aged(section: str) -> str:
-    """The section with a line on how many commits have changed the package since, if any have."""
+    """The section with a line on how many commits have changed the package since, if any."""
     section = _AGE.sub("\n", section)
     title, _, rest = section.partition("\n")
     origin = _ORIGIN.search(section)
@@ -131,7 +132,7 @@ def _aged(section: str) -> str:
 
 
 def _git(*arguments: str) -> str:
-    """What git says of this project; "" where it cannot."""
+    """Output of git for this project; "" if it fails."""
     try:
         done = subprocess.run(
             ["git", *arguments], capture_output=True, text=True, cwd=PROJECT, check=False

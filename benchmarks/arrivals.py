@@ -1,4 +1,5 @@
-"""Scans that arrive image by image at the speed of a rig: how long `watch` takes after the last one."""
+"""Scans that arrive image by image at a rig's speed: how
+long `watch` takes after the last image."""
 
 from __future__ import annotations
 
@@ -16,14 +17,18 @@ from typing import IO, Any
 
 PROJECT = Path(__file__).parents[1]
 FRAME_S = 1.0 / 120.0
-"""From one image to the next, pair after pair: as the simulated rigs take them."""
+"""From one image to the next, pair after pair, as the simulated rigs take them."""
 PATIENCE_S = 600.0
 
 
 @dataclass(frozen=True)
 class Answered:
-    """Seconds from a scan's last image to the verdict of its points; to the final one, when cloud and
-    mesh are kept; to the end of its job, with pictures, exports and report."""
+    """Seconds from a scan's last image.
+
+    verdict: to the first verdict, on its points.
+    mesh: to the final verdict, with cloud and mesh stored.
+    end: to the end of its job, with pictures, exports and report.
+    """
 
     verdict: float
     mesh: float
@@ -31,7 +36,7 @@ class Answered:
 
 
 def answers(person: Path, calibration: Path, runs: int) -> list[Answered]:
-    """Of the same scan, arriving so many times in one resident process, after once to warm it up."""
+    """Timings of `runs` arrivals of the same scan in one resident process, after a warm-up."""
     with tempfile.TemporaryDirectory(dir=person.parent.parent) as folder:
         inbox = Path(folder) / "inbox"
         inbox.mkdir()
@@ -66,7 +71,7 @@ def _answered(person: Path, arriving: Path, events: queue.SimpleQueue[dict[str, 
 
 
 def _arrive(person: Path, arriving: Path) -> None:
-    """Link the images one by one, pair after pair; what describes them first."""
+    """Link the images one by one, pair after pair, after the files that describe them."""
     files = [path for path in person.rglob("*") if path.is_file()]
     files.sort(key=lambda path: (path.parent != person, path))
     for path in files:

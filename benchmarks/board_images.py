@@ -1,7 +1,7 @@
-"""Lit images of a simulated rig's boards, without stripes and room: a second a view, not minutes.
+"""Lit images of a simulated rig's boards, without stripes and room: a second per view, not minutes.
 
-The simulator's own cameras, plan of shots, prints, blur and sensor noise; the board alone, flat, in
-front of grey, lit from the projector.  Corners are then found as in real images.
+The simulator's own cameras, plan of shots, prints, blur and sensor noise; the board alone, flat,
+against grey, lit from the projector. Corners are then found as in real images.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SETTINGS = SimulationSettings()
 
 @dataclass(frozen=True, eq=False)
 class SeenRig:
-    """rig, its true pairs by name, the shots, and every board view a detector found."""
+    """A rig, its true pairs by name, the shots, and every board view that a detector found."""
 
     rig: Rig
     pairs: dict[str, TruePair]
@@ -52,8 +52,8 @@ def see_boards(
 ) -> SeenRig:
     """Draw a rig and a plan of board shots, render every view, find the corners.
 
-    stored: an npz file of corners, read if it is there, else written: the same arguments give the
-    same corners.
+    stored: an npz file of corners, read if it exists, else written: the same arguments give the
+        same corners.
     """
     pairs = build_pairs(rig, SETTINGS, lambda k: np.random.default_rng([seed, 1, k]))
     count = shots or default_shots(len(pairs))
@@ -76,8 +76,8 @@ def see_boards(
 
 
 def save_views(views: Sequence[BoardView], path: Path) -> None:
-    """Corners as npz: one row of `which` (pair, shot, board) and of `turnable` a view, the corners
-    of all views one after the other, `counts` of them each."""
+    """Save corners as npz: per view one row of `which` (pair, shot, board) and of `turnable`; the
+    corners of all views concatenated, with their numbers in `counts`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(
         path,
@@ -90,7 +90,7 @@ def save_views(views: Sequence[BoardView], path: Path) -> None:
 
 
 def load_views(path: Path) -> tuple[BoardView, ...]:
-    """What `save_views` wrote."""
+    """Views that `save_views` wrote."""
     with np.load(path) as stored:
         cuts = np.cumsum(stored["counts"])[:-1]
         parts = zip(
@@ -174,7 +174,7 @@ def _shading(pair: TruePair, camera_from_board: RigidTransform, rays: Floats) ->
     normal = camera_from_board.rotation[:, 2].astype(np.float32)
     height = np.float32(normal @ camera_from_board.translation)
     slope = rays @ normal[:2] + normal[2]
-    # Beside the board its plane may run edge-on or behind the camera: only the board itself counts.
+    # Off the board its plane may be edge-on or behind the camera: only the board itself counts.
     steep = np.where(np.abs(slope) < 1e-3, np.float32(1e-3), slope)
     depth = np.clip(height / steep, 0.3 * pair.reach_mm, 3.0 * pair.reach_mm)
     source = np.asarray(pair.projector.source(np.array([pair.projector.stripes / 2.0])))[0]
@@ -186,7 +186,7 @@ def _shading(pair: TruePair, camera_from_board: RigidTransform, rays: Floats) ->
 
 
 def _texture(board: Board, face: int) -> Floats:
-    """The print's albedo, `TEXELS_PER_MM`, its margin round it."""
+    """The print's albedo at `TEXELS_PER_MM`, including its margin."""
     size = 2.0 * board.margin_mm + board.square_mm * np.array([board.columns, board.rows])
     x, y = (
         (np.arange(round(length * TEXELS_PER_MM)) + 0.5) / TEXELS_PER_MM - board.margin_mm

@@ -1,7 +1,7 @@
-"""Range images of a simulated person cast by rays: what pairs would make of images, without images.
+"""Range images of a simulated person by ray casting, without rendering images.
 
-A scan at full size takes a quarter of an hour to render; this takes seconds.  Depths, speeds and
-calibration are off by what those of rendered scans are (`bench/standing`, full size, workshop).
+A scan at full size takes a quarter of an hour to render; this takes seconds. Depths, speeds and
+calibration have the errors of rendered scans (`bench/standing`, full size, workshop).
 """
 
 from __future__ import annotations
@@ -35,29 +35,34 @@ from bodyscan.simulation.truth import describe_camera
 
 PROJECT = Path(__file__).parents[1]
 SCALE = 0.45
-"""Of the images: pixels of 2 mm. With larger ones poles share too little to be tied."""
+"""Image scale: pixels of 2 mm. With larger ones poles share too little to be tied."""
 NOISE_MM = 0.09
-"""Of a pixel that faces the camera; a slanting one's grows as 1 / cosine."""
+"""Noise of a pixel that faces the camera; for a slanting one it grows as 1 / cosine."""
 COMMON_MM = 0.04
-"""Of all depths of a pair, by its light planes."""
+"""Common error of all depths of a pair, due to its light planes."""
 SHIFT_MM, TURN_DEG = 0.045, 0.0023
-"""Of each pair's place, at the person."""
+"""Pose error of each pair, at the person."""
 LEAST_COSINE = 0.2
 SPEED_MM_S, SHARED_MM_S, SHARED_PART = 5.0, 0.3, 0.028
-"""Of one place's speed, of what all places of a pair are off by, and of that as a part of the speed."""
+"""Error of one place's speed, of all places of a pair
+together, and of that as a share of the speed."""
 PLACE_MM = 17.0
 """From one such place to the next."""
 STEP_MS = 20.0
 LEAP_MM = 0.3
-"""Where a pixel's depth changes otherwise than steadily in two steps, another surface came into it."""
+"""If a pixel's depth changes unevenly by this much over two steps, another surface came into it."""
 STANCE_DEG, STANCE_MM = 5.0, 15.0
-"""How people place themselves when they are asked to stand on the same marks again."""
+"""Variation when people are asked to stand on the same marks again."""
 
 
 @dataclass(frozen=True, eq=False)
 class CastScan:
-    """images: of each pair.  body, moment_ms: what was true, and when.  stance: where the person stood,
-    from the body's frame."""
+    """A cast scan and its truth.
+
+    images: of each pair.
+    body, moment_ms: the true body, and the scan's moment.
+    stance: where the person stood, from the body's frame.
+    """
 
     calibration: RigCalibration
     images: tuple[RangeImage, ...]
@@ -70,7 +75,7 @@ class CastScan:
         return np.asarray(self.body.rest.triangles, np.int64)
 
     def vertices(self, ms: float | None = None, *, breathing: bool = True) -> Array:
-        """(N, 3) mm, rig frame; in the middle of the scan if no moment is given."""
+        """True vertices (N, 3) mm, rig frame; by default in the middle of the scan."""
         moment = self.moment_ms if ms is None else ms
         return self.stance.apply(self.body.vertices(moment, breathing=breathing))
 
@@ -84,9 +89,11 @@ def cast_person(
     start: Literal["one-after-another", "together", "poles"] = "one-after-another",
     size: float = 1.0,
 ) -> CastScan:
-    """A person of `data/subjects` and of `presets.SUBJECTS`; all that is random follows from the seed.
+    """Cast a person of `data/subjects` and of `presets.SUBJECTS`; everything random follows from
+    the seed.
 
-    size: of the body, besides the preset's."""
+    size: of the body, besides the preset's.
+    """
     rng = np.random.default_rng([seed, 1])
     full = load_rig(PROJECT / "rigs" / f"{rig_name}.yaml")
     rig = scale_rig(full, SCALE, CALIBRATION)
@@ -124,7 +131,7 @@ def _calibrated(rig: Rig, pairs: Mapping[str, TruePair], seed: int) -> RigCalibr
 def _cast(
     pair: TruePair, calibration: RigCalibration, scan: CastScan, rng: np.random.Generator
 ) -> RangeImage:
-    """What the pair sees at the scan's moment."""
+    """The pair's range image for the scan's moment."""
     grid = pair.camera.width * np.arange(pair.camera.height)[:, None]
     pixels = np.stack(np.divmod(grid + np.arange(pair.camera.width), pair.camera.width), axis=-1)
     rays = pair.camera.directions(pixels[..., ::-1].reshape(-1, 2).astype(float))
@@ -160,7 +167,7 @@ def _cast(
 
 
 def _seen(pair: TruePair, rays: Array, scan: CastScan, ms: float) -> tuple[Array, Array]:
-    """(N,) depths of rays (N, 3), NaN where nothing is lit, and (N, 3) normals."""
+    """Depths (N,) of rays (N, 3), NaN where nothing is lit, and normals (N, 3)."""
     surface = replace(scan.body.surface(ms), vertices=scan.vertices(ms))
     surface = replace(surface, normals=scan.stance.rotate(np.asarray(surface.normals)))
     scene = Scene([surface.moved(pair.rig_from_camera.inverse())])
@@ -172,7 +179,7 @@ def _seen(pair: TruePair, rays: Array, scan: CastScan, ms: float) -> tuple[Array
 
 
 def _speeds(points: Array, facing: Array, rate: Array, rng: np.random.Generator) -> SurfaceSpeeds:
-    """As stripes tell them."""
+    """Speeds with the errors of those measured from stripes."""
     sigma = np.full(len(rate), SPEED_MM_S)
     shared = np.stack([np.full(len(rate), SHARED_MM_S), SHARED_PART * rate], axis=1)
     off = sigma * rng.standard_normal(len(rate)) + shared @ rng.standard_normal(2)

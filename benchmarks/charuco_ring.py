@@ -1,5 +1,5 @@
-"""Four real cameras around a board: shots left out of the solve, their corners triangulated; other
-programs on the same corners."""
+"""Four real cameras around a board: corners of held-out shots triangulated, with our solve and with
+other programs on the same corners."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ STORED = Path(__file__).parents[1] / "bench" / "charuco-ring" / "corners.npz"
 DIVERGED_PX = 10.0
 SAME_PLACE_MM = 15.0
 BOARD_REACH_MM = 100.0
-"""Two shots show one place where no corner of the board, which reaches this far from its middle,
-moves by more than SAME_PLACE_MM."""
+"""Two shots show one place if no corner of the board, which extends this far from its middle, moves
+by more than SAME_PLACE_MM."""
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What one program made of all folds: its shots' scores and the seconds of each solve, or why
+    """Results of one program on all folds: its shots' scores and the seconds of each solve, or why
     there are none."""
 
     shots: list[FreeTriangulation]
@@ -113,7 +113,7 @@ def _lens_rows(placed: RigSolution) -> list[str]:
 
 
 def same_places(placed: RigSolution) -> list[tuple[str, ...]]:
-    """Shots grouped by where the board is, each with the first shot near it."""
+    """Shots grouped by the board's place, each with the first shot near it."""
     targets = sorted(placed.rig_from_board)
     board = placed.rig_from_board
     groups: dict[str, list[str]] = {}
@@ -146,7 +146,7 @@ def _ours(folds: Sequence[RigWithoutShots], seconds: float) -> Run:
 
 
 def _seconds(rig: Rig, held: RigWithoutShots) -> float:
-    """Wall clock of one joint solve."""
+    """Wall-clock time of one joint solve."""
     start = time.perf_counter()
     solve_rig(rig, held.used, held.cameras)
     return time.perf_counter() - start

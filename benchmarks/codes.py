@@ -1,4 +1,4 @@
-"""Every code on the same scenes: a board, and a hollow whose sides throw light on each other."""
+"""Every code on the same scenes: a board, and a hollow whose sides light each other."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ projector does not light, over those that it does.
 
 
 def hollow() -> Scene:
-    """A groove 110 mm deep, 400 mm away, and a bar of 14 mm before its middle; camera frame."""
+    """A groove 110 mm deep, 400 mm away, and a 14 mm bar in front of its middle; camera frame."""
     down, crease = np.array([0.0, 140.0, 0.0]), np.array([-10.0, -70.0, 400.0])
     sides = [110.0 * np.array([np.sin(turn), 0.0, -np.cos(turn)]) for turn in np.radians([-35, 35])]
     bar = grid_surface(

@@ -1,7 +1,7 @@
-"""How costs grow: seconds and memory of a scan by pairs and megapixels, and over a day in one process.
+"""How costs grow: time and memory of a scan by pairs and megapixels, and over a day in one process.
 
-Everything is made of one rendered pair: it is calibrated, and stands around a lathed figure as often
-as wanted, where it sees the same each time; so its images are linked, not rendered again.
+Everything is made of one rendered pair: it is calibrated, and placed around a lathed figure as
+often as needed. As it sees the same from everywhere, its images are linked, not rendered again.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ PROJECT = Path(__file__).parents[1]
 PAIRS, MEGAPIXELS = (4, 8, 12, 16, 32), (1.0, 2.0, 5.0)
 BOARD_SHOTS, SEED = 6, 5
 DAY, DAY_PAIRS, DAY_MEGAPIXELS, DAY_FIGURE = 300, 4, 0.1, 0.5
-"""Small scans of a figure half as large, so that a day takes minutes: what a process keeps of scans has
-nothing to do with their size."""
+"""Small scans of a figure half as large, so that a day takes minutes: what a process retains of
+scans does not depend on their size."""
 SAMPLED = 25
-"""Scans of a day whose seconds are averaged."""
+"""Scans of a day over which seconds are averaged."""
 
 
 def report(pairs: tuple[int, ...] = PAIRS, megapixels: tuple[float, ...] = MEGAPIXELS) -> str:
@@ -65,7 +65,7 @@ A day of {DAY} scans ({DAY_PAIRS} pairs of {DAY_MEGAPIXELS:g} megapixels, the fi
 def make_pair(folder: Path, megapixels: float, figure: float = 1.0) -> Path:
     """A workspace of one pair that looks at the figure's middle, simulated and calibrated.
 
-    figure: how many times as large it is.
+    figure: its size factor.
     """
     from bodyscan.rig.rig_file import load_rig, write_rig
     from bodyscan.rig.rig_frame import RigFrame
@@ -93,7 +93,7 @@ def make_pair(folder: Path, megapixels: float, figure: float = 1.0) -> Path:
 
 
 def _write_figure(path: Path, size: float) -> None:
-    """Turned on a lathe, metres, z up; every pair around it sees the same.  size: about its middle."""
+    """Write a figure turned on a lathe, metres, z up, which looks the same from all around."""
     import open3d as o3d
 
     heights, turns = np.linspace(0.0, 1.7, 120), np.linspace(0.0, 2.0 * np.pi, 96, endpoint=False)
@@ -124,7 +124,7 @@ def _write_figure(path: Path, size: float) -> None:
 
 
 def around(one: Path, count: int, folder: Path) -> Path:
-    """A workspace in which the pair of another stands in `count` places around the figure."""
+    """A workspace in which the pair of another one stands in `count` places around the figure."""
     from bodyscan.captures.captures_file import CapturesFile, ShotEntry, write_captures_file
     from bodyscan.geometry.pose_covariance import PoseCovariance
     from bodyscan.geometry.transforms import RigidTransform
@@ -180,7 +180,7 @@ def _scanned(rig: Path) -> str:
 
 
 def _day(rig: Path) -> tuple[float, float, float, float]:
-    """Of a day: mean seconds of the first scans and of the last, MiB after the first and at the end."""
+    """Mean seconds of a day's first and last scans, MiB after the first scan and at the end."""
     line = [sys.executable, "-m", "benchmarks.costs", str(rig)]
     done = subprocess.run(line, capture_output=True, text=True, cwd=PROJECT, check=True)
     seconds, held = json.loads(done.stdout.splitlines()[-1])
@@ -194,7 +194,7 @@ def _day(rig: Path) -> tuple[float, float, float, float]:
 
 
 def main(rig: Path, scans: int = DAY) -> None:
-    """A day of the resident process that `watch` keeps; prints seconds and MiB of each scan."""
+    """Run a day in the resident process that `watch` keeps; prints seconds and MiB of each scan."""
     from bodyscan.settings import ScanSettings
     from bodyscan.workflows.preparation import Preparation
     from bodyscan.workflows.scan_folder import scan_folder

@@ -1,7 +1,7 @@
-"""Faults put into sound captures of a subject: each gives what `fuse` starts from.
+"""Faults put into sound captures of a subject: each returns what `fuse` starts from.
 
-A pole that moved is a calibration that has it elsewhere; images are changed where the fault is in
-images; what stands in the volume besides the subject is ray-cast with the calibrated cameras.
+A moved pole is a calibration that has it elsewhere; faults in images change the images; what stands
+in the volume besides the subject is ray-cast with the calibrated cameras.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ CAST_NOISE_MM = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Sound:
-    """A rig and a subject, simulated: what the scan is without any fault.
+    """A simulated rig and subject: the scan without any fault.
 
-    other: range images of another person.  vertices, faces: the subject's true surface, rig frame.
-    girths: of that.
+    other: range images of another person.
+    vertices, faces: the subject's true surface, rig frame.
+    girths: of that surface.
     """
 
     calibration: RigCalibration
@@ -54,7 +55,7 @@ Case = tuple[RigCalibration, Outcome[list[RangeImage]]]
 
 @dataclass(frozen=True)
 class Fault:
-    """named: words of which one has to stand in the verdict; () where nothing is wrong."""
+    """named: words of which the verdict must contain one; () if nothing is wrong."""
 
     name: str
     named: tuple[str, ...]
@@ -89,7 +90,7 @@ def faults() -> Iterator[Fault]:
 
 
 def faults_of_the_living() -> Iterator[Fault]:
-    """What may be taken for a person's own motion."""
+    """Faults that may be mistaken for a person's own motion."""
     for mm in (2.0, 5.0, 15.0, 25.0):
         yield _moved("pole p2", f"aside {mm:g} mm", mm, 1, 0.0)
     yield _moved("pole p1", "out 5 mm", 5.0, 0, 0.0)
@@ -119,7 +120,7 @@ def _all_out(mm: float) -> Fault:
 
 
 def _moved(what: str, how: str, mm: float, way: int, degrees: float) -> Fault:
-    """way: 0 away from the axis, 1 sideways."""
+    """A moved part of the rig. way: 0 away from the axis, 1 sideways."""
     name = what.split()[1]
 
     def inject(sound: Sound) -> Case:
@@ -154,7 +155,7 @@ def _exchanged(sound: Sound) -> Case:
 
 
 def _edited(sound: Sound) -> Case:
-    """Points come out 1 % wider than they are: depths stay."""
+    """Points come out 1 % wider than they are; depths are unchanged."""
     wider = np.array([1.01, 1.01, 1.0], np.float32)
     images = [
         replace(image, points=image.points * wider) if image.pair == "p2-2" else image
@@ -238,27 +239,27 @@ def _changed(pair: str, change: Callable[[Path], None]) -> Callable[[Sound], Cas
 
 
 def _rewrite(path: Path, change: Callable[[Bytes], Bytes]) -> None:
-    """In a file of its own: the other is a link to the sound one."""
+    """Rewrite an image as a separate file: the original is a link to the sound one."""
     grey = change(np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), np.uint8))
     path.unlink()
     cv2.imwrite(str(path), grey)
 
 
 def _two_people(sound: Sound) -> Case:
-    """Side by side, their hands in one another."""
+    """Two people side by side, hand in hand."""
     half = 0.5 * np.ptp(sound.vertices[:, 1]) - 15.0
     parts = [(sound.vertices + [0.0, side * half, 0.0], sound.faces) for side in (-1.0, 1.0)]
     return _cast(sound, parts)
 
 
 def _behind(sound: Sound) -> Case:
-    """Chest to back, 330 mm from middle to middle."""
+    """Two people chest to back, 330 mm from middle to middle."""
     parts = [(sound.vertices + [side * 165.0, 0.0, 0.0], sound.faces) for side in (-1.0, 1.0)]
     return _cast(sound, parts)
 
 
 def _backpack(sound: Sound) -> Case:
-    """160 mm deep, from the waist to the shoulders."""
+    """A backpack 160 mm deep, from the waist to the shoulders."""
     height = 0.72 * float(sound.vertices[:, 2].max())
     x, y, z = sound.vertices.T
     back = float(x[(np.abs(z - height) < 60.0) & (np.abs(y) < 100.0)].min())
@@ -269,7 +270,7 @@ def _backpack(sound: Sound) -> Case:
 
 
 def _hand_on_hip(sound: Sound) -> Case:
-    """A bar from the trunk to the middle of the left forearm, whose other end is the hand's."""
+    """A bar from the trunk to the middle of the left forearm, in place of a hand on the hip."""
     x, y, z = sound.vertices[np.abs(sound.vertices[:, 2] - 850.0) < 15.0].T
     arm = y > 0.7 * y.max()
     length = float(y[arm].mean()) - 120.0
@@ -281,7 +282,7 @@ def _hand_on_hip(sound: Sound) -> Case:
 
 
 def _stick(sound: Sound) -> Case:
-    """From the floor to above the hand that holds it."""
+    """A stick from the floor to above the hand that holds it."""
     hand = sound.vertices[np.argmax(sound.vertices[:, 1])]
     made = o3d.geometry.TriangleMesh.create_cylinder(20.0, 1000.0, resolution=40)
     stick = np.asarray(made.vertices) + [hand[0], hand[1] + 5.0, 510.0]
@@ -289,7 +290,7 @@ def _stick(sound: Sound) -> Case:
 
 
 def _chair(sound: Sound) -> Case:
-    """Its seat touches the calves' backs at 430 mm; four legs and a back."""
+    """A chair: its seat touches the backs of the calves at 430 mm; four legs and a back."""
     boxes = [
         ((420.0, 420.0, 30.0), (-330.0, 0.0, 430.0)),
         ((30.0, 420.0, 450.0), (-530.0, 0.0, 680.0)),
@@ -307,7 +308,7 @@ def _chair(sound: Sound) -> Case:
 
 
 def _hair(sound: Sound) -> Case:
-    """Nothing comes back from the topmost 250 mm."""
+    """Dark hair: the topmost 250 mm reflect nothing."""
     top = float(sound.vertices[:, 2].max()) - 250.0
     images = []
     for image in sound.images:
@@ -350,7 +351,7 @@ def _seen(
     lit = scene.cast_rays(_rays(source, hit - source))["t_hit"].numpy() > 1.0 - 1e-3
     length = np.linalg.norm(rays, axis=-1)
     facing = -np.sum(normals * rays, axis=-1) / length
-    # A silhouette's pixels mix both sides and are cut by a decoder.
+    # Silhouette pixels mix both sides; a decoder removes them.
     whole = ndimage.binary_erosion(seen & lit & (facing > 0.1))
     points = (
         rays

@@ -1,8 +1,9 @@
-"""Faults put into captures of two subjects on both rigs: what the verdict says, and what they cost.
+"""Faults put into captures of two subjects on both rigs: the verdicts, and the cost of the faults.
 
-At half size, the people alone: their rigs are calibrated by `calibration_from_truth`. What was rendered
-in bench/faults stays, 2 minutes each on two idle cores; a fault takes some 10 s, a core a column.
-python -m benchmarks.faults RIG SUBJECT [WORDS] prints one column, of faults whose names hold WORDS.
+At half size, the people alone: their rigs are calibrated by `calibration_from_truth`. Renderings
+are kept in bench/faults, 2 minutes each on two idle cores; a fault takes some 10 s, one core per
+column. python -m benchmarks.faults RIG SUBJECT [WORDS] prints one column, for faults whose names
+hold WORDS.
 """
 
 from __future__ import annotations
@@ -40,20 +41,23 @@ KINDS = {
     "standing": ["--subject-preset", "standing"],
     "ideal": ["--subject-preset", "mannequin", "--preset", "ideal"],
 }
-"""How a subject is rendered: workshop devices, but for ideal ones."""
+"""How a subject is rendered: with workshop devices, except for `ideal`."""
 CRASHED = "crashed"
 IDEAL, LIVING = "ideal devices", "a living person"
 SWAY_MM, SWAYS = 5.0, 3
 SETTINGS = ScanSettings(
     fusion=FusionSettings(points=250_000), mesh=MeshSettings(depth=8, reach_mm=8.0)
 )
-"""Half-size images: half of the points in each direction, and cells of twice the size."""
+"""Half-size images: half as many points along each axis, and cells of twice the size."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """girth_mm: the worst error of a girth of the trunk that is given as measured; None if none is.
-    named: whether the verdict says what is wrong."""
+    """How one fault was judged.
+
+    girth_mm: the worst error of a trunk girth reported as measured; None if there is none.
+    named: whether the verdict names the fault.
+    """
 
     rig: str
     subject: str
@@ -81,8 +85,8 @@ def _workspace(rig: str, subject: str, kind: str) -> Path:
 
 
 def _simulate(rig: str, subject: str) -> None:
-    """At half size; the other subject too, whom faults mix in. A mirror's smile is left out:
-    `calibration_from_truth` has true planes."""
+    """Simulate at half size; also the other subject, which some faults mix in. A mirror's smile is
+    left out, because `calibration_from_truth` has true planes."""
     other = next(name for name in SUBJECTS if name != subject)
     for who, kind in (*((subject, kind) for kind in KINDS), (other, "mannequin")):
         workspace = _workspace(rig, who, kind)
@@ -102,7 +106,7 @@ def _of(rig: str, subject: str) -> list[Found]:
 
 
 def _listed() -> dict[str, list[Fault]]:
-    """By the kind of captures that they are put into; sound scans first."""
+    """Faults by the kind of captures they are put into, sound scans first."""
     ideal = [replace(fault, name=f"{fault.name}, {IDEAL}") for fault in _nothing()[:2]]
     return {"mannequin": [*_nothing(), *faults()], "standing": [*_living()], "ideal": ideal}
 
@@ -187,7 +191,7 @@ def _costs(one: Found, mm: float) -> bool:
 
 
 def _nothing() -> list[Fault]:
-    """Sound scans: as they are, and with draws of a sway between the pairs."""
+    """Sound scans: as they are, and with random sways between the pairs."""
     return [
         Fault("none", (), lambda sound: (sound.calibration, Outcome(sound.images))),
         *(Fault(f"none, {SWAY_MM:g} mm of sway ({k})", (), _swaying(k)) for k in range(SWAYS)),
@@ -195,7 +199,7 @@ def _nothing() -> list[Fault]:
 
 
 def _swaying(seed: int) -> Callable[[Sound], Case]:
-    """As a person on two feet does while the pairs fire in turn: `SWAY_MM` at the head."""
+    """Sway as of a person on two feet while the pairs fire in turn: `SWAY_MM` at the head."""
 
     def inject(sound: Sound) -> Case:
         rng = np.random.default_rng(seed)
@@ -227,8 +231,8 @@ def _at_speed(
     rig_from_camera: Mapping[str, RigidTransform],
     turns: Mapping[str, Array],
 ) -> list[RangeImage]:
-    """With what a body's turns (3,) about the rig's origin, in radians a scan, do to the speeds that
-    stripes tell: a sway that they deny would be poles that moved."""
+    """Add the effect of a body's turns (3,) about the rig's origin, in radians per scan, to the
+    speeds measured from stripes: a sway that these contradict would look like moved poles."""
     times = [image.time_ms for image in images if image.time_ms is not None]
     found = []
     for image in images:
@@ -250,12 +254,12 @@ def _judge(rig: str, subject: str, fault: Fault, sound: Sound) -> Found:
         scan = fuse(calibration, measured, SETTINGS)
     except BodyscanError as error:
         return Found(rig, subject, fault.name, "refused", None, True, str(error))
-    except Exception as error:  # costs its cell, not the hour of the others
+    except Exception as error:  # costs its cell, not the hours of the others
         return Found(rig, subject, fault.name, CRASHED, None, False, repr(error))
     try:
         errors = compare_girths(scan.mesh, sound.girths)
         worst = errors.worst_mm if np.isfinite(errors.worst_mm) else None
-    except BodyscanError:  # of a body cut short no girth is given
+    except BodyscanError:  # a body cut short gives no girth
         worst = None
     said = " | ".join(scan.verdict.reasons)
     named = any(word in said for word in fault.named)

@@ -1,4 +1,4 @@
-"""Cameras judged by boards they were not joined on: triangulated corners against the true board."""
+"""Cameras judged by held-out boards: triangulated corners against the true board."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ from bodyscan.workflows.find_boards import calibrate_cameras, locate_views
 
 @dataclass(frozen=True)
 class FreeTriangulation:
-    """One shot: corners seen by two or more cameras, RMS reprojection of the triangulated corners
-    (px), RMS distance of the triangulated corners to the rigidly fitted board (mm): as the rig file
-    describes it, and as its shape was found from the other shots (the same where it was not).
+    """One shot, with the corners that two or more cameras saw.
+
+    rms_px: RMS reprojection error of the triangulated corners.
+    rms_mm: RMS distance of the triangulated corners to the rigidly fitted board of the rig file.
+    rms_shaped_mm: the same for the board's shape as found from the other shots, if it was.
     """
 
     shot: str
@@ -40,7 +42,7 @@ def triangulate_board(
     rig_from_camera: dict[str, RigidTransform],
     shape: BoardShape | None = None,
 ) -> FreeTriangulation:
-    """The views of one board in one shot, each corner triangulated by itself."""
+    """Triangulate each corner of one board in one shot independently."""
     corners, number = np.unique(
         np.concatenate([np.round(view.points, 6) for view in views]), axis=0, return_inverse=True
     )
@@ -82,8 +84,13 @@ def _off_board(corners: Array, points: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class RigWithoutShots:
-    """cameras: each calibrated by itself without the shots left out; `used` views of the others and
-    the rig placed by them; `left_out`: views of the shots left out."""
+    """A rig calibrated without some shots.
+
+    cameras: each calibrated independently, without those shots.
+    used: views of the other shots.
+    placed: the rig as solved from these.
+    left_out: views of the shots left out.
+    """
 
     cameras: dict[str, Camera]
     used: tuple[LocatedView, ...]
@@ -92,7 +99,7 @@ class RigWithoutShots:
 
 
 def without_shots(rig: Rig, found: Sequence[BoardView], shots: Collection[str]) -> RigWithoutShots:
-    """The rig calibrated by all views but those of `shots`.
+    """The rig calibrated from all views except those of `shots`.
 
     Raises what `solve_rig` raises.
     """
@@ -111,7 +118,7 @@ def triangulate_shots(
     rig_from_camera: dict[str, RigidTransform],
     shapes: Mapping[str, BoardShape],
 ) -> list[FreeTriangulation]:
-    """The board of every shot that two or more cameras saw; shapes: by board's name."""
+    """The board of every shot that two or more cameras saw; shapes: by the board's name."""
     by_shot = {
         shot: [view for view in views if view.shot == shot]
         for shot in sorted({view.shot for view in views})
@@ -124,7 +131,8 @@ def triangulate_shots(
 
 
 def pooled(results: Sequence[FreeTriangulation]) -> tuple[float, float, float]:
-    """RMS over all shots: reprojection (px), distance to the board as described and as found (mm)."""
+    """RMS over all shots: reprojection (px), distance to the
+    board as described and as found (mm)."""
     px = sum(r.observations * r.rms_px**2 for r in results) / sum(r.observations for r in results)
     known = [r for r in results if np.isfinite(r.rms_mm)]
     count = sum(r.corners for r in known)

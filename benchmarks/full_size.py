@@ -1,4 +1,5 @@
-"""Rigs at full size: simulated, calibrated, a subject scanned, all of it held against the truth."""
+"""Rigs at full size: simulated, calibrated, a subject
+scanned, everything compared with the truth."""
 
 from __future__ import annotations
 
@@ -25,17 +26,18 @@ WORKSPACE = PROJECT / "bench" / "three-pole-12"
 
 
 def three_pole() -> str:
-    """The section of docs/results.md of three poles, twelve pairs and the woman."""
+    """The section of docs/results.md on three poles, twelve pairs and the woman."""
     return _report("Three poles, twelve pairs", "three-pole-12", "woman_average")
 
 
 def four_pole() -> str:
-    """The section of docs/results.md of four poles, sixteen pairs and the man."""
+    """The section of docs/results.md on four poles, sixteen pairs and the man."""
     return _report("Four poles, sixteen pairs", "four-pole-16", "man_average")
 
 
 def living() -> str:
-    """The section of docs/results.md of the woman as people stand, calibrated by `three_pole`."""
+    """The section of docs/results.md on the woman standing as people do, calibrated by
+    `three_pole`."""
     workspace = PROJECT / "bench" / "standing"
     rig, subject = PROJECT / "rigs" / "three-pole-12.yaml", _subject("woman_average")
     commands = _commands(rig, workspace, subject)
@@ -76,7 +78,7 @@ def _by_parts(workspace: Path) -> str:
 def _report(title: str, rig: str, subject: str) -> str:
     workspace = PROJECT / "bench" / rig
     commands = _commands(PROJECT / "rigs" / f"{rig}.yaml", workspace, _subject(subject))
-    commands["simulate"] += ["--subject-preset", "mannequin"]  # people are `living`
+    commands["simulate"] += ["--subject-preset", "mannequin"]  # people are in `living`
     outputs, seconds, memory = run_commands(commands, workspace)
     rows = "\n".join(f"| `{name}` | {seconds[name]:.1f} | {memory[name]:.1f} |" for name in outputs)
     return f"""## {title}, full size (synthetic)
@@ -117,7 +119,7 @@ def _against_truth(outputs: dict[str, str]) -> str:
 
 
 def _commands(rig: Path, workspace: Path, subject: Path) -> dict[str, list[object]]:
-    """The arguments of what a user would type, in order."""
+    """The arguments that a user would type, in order."""
     result = workspace / "scan"
     person, calibration = workspace / "captures" / "person", workspace / "calibration"
     return {
@@ -132,7 +134,7 @@ def _commands(rig: Path, workspace: Path, subject: Path) -> dict[str, list[objec
 def run_commands(
     commands: dict[str, list[object]], workspace: Path
 ) -> tuple[dict[str, str], dict[str, float], dict[str, float]]:
-    """What each command printed, how long it took (s), and its peak memory (GiB)."""
+    """Output of each command, its duration (s), and its peak memory (GiB)."""
     outputs, seconds, memory = {}, {}, {}
     for name, arguments in commands.items():
         if name == "simulate" and (workspace / "truth" / "truth.json").exists():
@@ -144,17 +146,18 @@ def run_commands(
 
 
 def _from_project(argument: object) -> str:
-    """Paths relative to the project: what is printed names no folder of this machine."""
+    """An argument with paths relative to the project, so that no folder of this machine is
+    printed."""
     if isinstance(argument, Path) and argument.is_relative_to(PROJECT):
         return str(argument.relative_to(PROJECT))
     return str(argument)
 
 
 def _run(arguments: list[str]) -> tuple[str, float]:
-    """What a bodyscan command printed, and the peak memory (GiB) of its own process."""
+    """Output of a bodyscan command, and the peak memory (GiB) of its own process."""
     with tempfile.TemporaryFile("w+") as printed:
         line = [sys.executable, "-m", "bodyscan", *arguments]
-        wide = {**os.environ, "COLUMNS": "150"}  # a row a pair
+        wide = {**os.environ, "COLUMNS": "150"}  # one row per pair
         process = subprocess.Popen(
             line, stdout=printed, stderr=subprocess.PIPE, text=True, cwd=PROJECT, env=wide
         )

@@ -1,6 +1,7 @@
-"""From range images to cloud and mesh: our way and two others on the same range images, in one run.
+"""From range images to cloud and mesh: our method and two others on the same range images, in one
+run.
 
-Each step runs in a process of its own, so that its peak memory is its own:
+Each step runs in a process of its own, so that peak memory is measured per step:
 python -m benchmarks.fusion STEP WORKSPACE FOLDER
 """
 
@@ -33,8 +34,8 @@ SETTINGS = ScanSettings()
 ICP_VOXEL_MM, ICP_REACH_MM = 3.0, 6.0
 MEASURED_MM = 4.0  # a vertex nearer than this to a point of the cloud was measured
 VOXELS, DEPTHS = (1.0, 1.5, 2.0), (8, 9, 10)
-"""What rivals are tried with: voxels in multiples of those that give as many points as ours, depths of
-Poisson's octree. Of each the best against the truth is shown."""
+"""Settings tried for rivals: voxel sizes as multiples of the one that gives as many points as ours,
+and depths of Poisson's octree. The best of each, compared with the truth, is shown."""
 OURS, RUNS = ("read", "ours", "mesh"), 5
 MULTIWAY, BY_OPEN3D = "open3d-multiway", "ours-by-open3d"
 NAMES = {
@@ -131,12 +132,12 @@ def _in_a_process(step: str, workspace: Path, folder: Path) -> Figures:
 
 
 def main(step: str, workspace: Path, folder: Path) -> None:
-    """One step; the last line it prints are its figures as JSON."""
+    """Run one step; the last line printed is its figures as JSON."""
     work, finish = _STEPS[step](workspace, folder)
     result, times, yardstick = None, [], []
     paths = _images_of(workspace) if step == "ours" else []
     for _ in range(RUNS if step in OURS else 1):
-        result = None  # the last run's memory is free for this one
+        result = None  # frees the last run's memory for this one
         if step == "ours":
             yardstick.append(_timed(lambda: _read_with_opencv(paths))[0])
         seconds, result = _timed(work)
@@ -149,7 +150,7 @@ def main(step: str, workspace: Path, folder: Path) -> None:
 
 
 def _timed(work: Callable[[], Any]) -> tuple[tuple[float, float], Any]:
-    """Seconds of wall clock and of processor, and what came of it."""
+    """Wall-clock and processor seconds, and the result."""
     wall, cpu = time.perf_counter(), time.process_time()
     result = work()
     return (time.perf_counter() - wall, time.process_time() - cpu), result
@@ -252,9 +253,9 @@ def _mesh(workspace: Path, folder: Path) -> Step:
 
 
 def versions(full: Any) -> Figures:
-    """How far the light version and the full one are from each other, and where each meets itself.
+    """Distances between the light version and the full one, and self-intersections of each.
 
-    Distances, mm, are those of random spots of the light mesh and of all vertices of the full one.
+    Distances, mm, are those of random points on the light mesh and of all vertices of the full one.
     """
     from benchmarks.self_intersections import self_intersections
     from bodyscan.evaluation.surface import sample_surface, signed_distances
@@ -292,7 +293,7 @@ def _versions_line(figures: Figures) -> str:
 
 
 def _by_open3d(workspace: Path, folder: Path) -> Step:
-    """Our range images and our merging, the registration between them Open3D's."""
+    """Our range images and our merging, with Open3D's registration between them."""
     from bodyscan.alignment.icp import align
     from bodyscan.fusion.merging import merge
     from bodyscan.settings import AlignmentSettings
@@ -309,7 +310,7 @@ def _by_open3d(workspace: Path, folder: Path) -> Step:
 
 
 def _multiway(workspace: Path, folder: Path) -> Step:
-    """What Open3D's own tutorial does: ICP of every two, pose graph, all points into voxels."""
+    """The method of Open3D's own tutorial: ICP of every two, pose graph, all points into voxels."""
     _, seen, placed, _, cloud = _kept(folder / "ours")
     spacing = _spacing(cloud)
 
@@ -320,7 +321,8 @@ def _multiway(workspace: Path, folder: Path) -> Step:
 
 
 def _voxels(size: float) -> Callable[[Path, Path], Step]:
-    """All points into voxels where our calibration puts them; those of size 1 are kept for meshing."""
+    """All points into voxels at the poses of our calibration; those of size 1 are kept for
+    meshing."""
 
     def step(workspace: Path, folder: Path) -> Step:
         _, seen, placed, _, cloud = _kept(folder / "ours")
@@ -346,7 +348,7 @@ def _voxels(size: float) -> Callable[[Path, Path], Step]:
 
 
 def _placed(seen: Any, placed: Any) -> list[Any]:
-    """Range images as Open3D's clouds in the rig frame, those of their points that have a normal."""
+    """Range images as Open3D's clouds in the rig frame, without points that have no normal."""
     import open3d as o3d
 
     clouds = []
@@ -361,7 +363,7 @@ def _placed(seen: Any, placed: Any) -> list[Any]:
 
 
 def multiway(seen: Any, placed: Any, voxel_mm: float) -> Any:
-    """Open3D's multiway registration of range images from where calibration puts them, merged."""
+    """Open3D's multiway registration of range images, started from the calibration, and merged."""
     import open3d as o3d
 
     registration = o3d.pipelines.registration
@@ -396,7 +398,7 @@ def multiway(seen: Any, placed: Any, voxel_mm: float) -> Any:
 
 def poisson(points: Array, normals: Array, depth: int) -> tuple[Array, Indices]:
     """Vertices and faces of Open3D's screened Poisson surface (Kazhdan and Hoppe 2013), in one
-    thread: more would add up in another order each time."""
+    thread: several would add up in a different order each time."""
     import open3d as o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
@@ -454,7 +456,7 @@ def _scan_of(workspace: Path) -> tuple[Any, Any]:
 
 
 def _spacing(cloud: BodyCloud) -> float:
-    """Edge of the voxels that give about as many points as ours."""
+    """Voxel size that gives about as many points as ours."""
     from bodyscan.fusion.thinning import voxel_size_for
 
     return voxel_size_for(cloud.points.astype(np.float32), len(cloud.points))

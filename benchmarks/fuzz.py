@@ -1,6 +1,7 @@
-"""Damaged files of every kind that is read: nothing but the program's own errors may come out.
+"""Damaged files of every kind that is read: only the program's own errors may be raised.
 
-python -m benchmarks.fuzz [COUNT] [SEED]: so many, each kind in turn; any other error is printed once.
+python -m benchmarks.fuzz [COUNT] [SEED] tries COUNT files, each kind in turn; any other error is
+printed once.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ PROJECT = Path(__file__).parents[1]
 STORED = PROJECT / "tests" / "data" / "stored-0.1.0"
 COUNT = 100_000
 LONGEST_S = 20
-"""A file that takes longer hangs whoever reads it."""
+"""A file that takes longer would hang its reader."""
 EXPECTED = (BodyscanError, NoImage)
 WORDS = (
     b"", b"- ", b": ", b"{", b"[", b"]", b"}", b"&a ", b"*a", b"<<: *a", b"null", b"-1", b"0",
@@ -83,7 +84,7 @@ Every kind of file that is read, with a few bytes exchanged, cut, repeated or of
 
 @dataclass(frozen=True)
 class Kind:
-    """One file of a kind of which all is there, below a folder, and what reads it."""
+    """A kind of file: one of them, in a folder with everything it needs, and its reader."""
 
     name: str
     file: str
@@ -91,7 +92,7 @@ class Kind:
 
 
 def fuzz(count: int, seed: int = 0) -> Counter[str]:
-    """What came out that should not have, and how often, after `count` files."""
+    """Unexpected errors in `count` files, and how often each occurred."""
     found: Counter[str] = Counter()
     rng = np.random.default_rng(seed)
     signal.signal(signal.SIGALRM, _too_long)
@@ -124,7 +125,7 @@ def fuzz(count: int, seed: int = 0) -> Counter[str]:
 
 
 def damaged(whole: bytes, rng: np.random.Generator) -> bytes:
-    """With a few places exchanged, cut, repeated, or of one bit changed; most near to the start,
+    """With a few places exchanged, cut, repeated, or with one bit changed; mostly near the start,
     where headers are."""
     data = bytearray(whole)
     for _ in range(rng.integers(1, 5)):

@@ -1,4 +1,4 @@
-"""How well a pair measures a board it was not calibrated on: planes against rival projectors."""
+"""How well a pair measures a held-out board: planes against rival projectors."""
 
 from __future__ import annotations
 
@@ -32,8 +32,11 @@ from bodyscan.workflows.find_boards import calibrate_cameras, find_all_boards
 
 @dataclass(frozen=True)
 class HeldOutBoard:
-    """One model on one held-out board: median absolute distance of measured points to the board's
-    plane, RMS of the points about their own best plane (flatness), share of points measured.
+    """One model on one held-out board.
+
+    median_mm: median absolute distance of measured points to the board's plane.
+    flatness_rms_mm: RMS of the points about their own best plane.
+    measured: share of points measured.
     """
 
     model: str
@@ -52,10 +55,10 @@ class _Shot:
 
 
 def hold_out_boards(rig: Rig, captures: Captures, pair: str) -> list[HeldOutBoard]:
-    """Hold each shot out in turn, fit every model on the others, measure the held-out board.
+    """Hold each shot out in turn, fit every model to the others, measure the held-out board.
 
-    Boards are placed by their corners and a camera calibrated on all of them; the stripes of the
-    held-out board take no part in any fit.  Raises PairFailed with fewer than three boards.
+    Boards are located by their corners and a camera calibrated on all of them; the stripes of the
+    held-out board take no part in any fit. Raises PairFailed with fewer than three boards.
     """
     camera, shots = _shots(rig, captures, pair)
     results = []
@@ -128,7 +131,8 @@ def _shots(rig: Rig, captures: Captures, pair: str) -> tuple[CameraCalibration, 
 
 
 def _corners_with_stripe(rig: Rig, shot: _Shot) -> tuple[Array, Array, Array]:
-    """Corners (N, 3), their pixels (N, 2) and stripe coordinates (N,), where all three are known."""
+    """Corners (N, 3), their pixels (N, 2) and stripe
+    coordinates (N,), where all three are known."""
     u, v = np.split(shot.view.pixels.astype(np.float32), 2, axis=1)
     s = cv2.remap(
         shot.stripes.s, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan

@@ -1,4 +1,5 @@
-"""Projectors with a lens: each pair of a rig on a body, held against a perfect calibration of it."""
+"""Projectors with a lens: each pair of a rig on a body,
+compared with a perfect calibration of it."""
 
 from __future__ import annotations
 
@@ -84,7 +85,7 @@ intrinsics, takes up most of it.
 
 
 def make_data(workspace: Path) -> None:
-    """Simulate and calibrate what is not there yet."""
+    """Simulate and calibrate what does not exist yet."""
     if not (workspace / "truth" / "truth.json").exists():
         lens = Projection(kind="pinhole", k1=LENS_K1, k2=0.0)
         simulate(
@@ -143,14 +144,14 @@ def _row(name: str, model: str, sets: list[Array], few: Mask) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """s (N,) of the pixels that both measure; points (N, 3) of each, its own camera frame, mm."""
+    """s (N,) of the pixels measured by both; points (N, 3) of each in its own camera frame, mm."""
 
     s: Array
     ours: Array
     true: Array
 
     def on_body(self, body: Body, body_from_camera: RigidTransform) -> _Measured:
-        """Some of the pixels, those that see the body and not what stands behind it."""
+        """A sample of the pixels that see the body rather than what is behind it."""
         on = body.struck(body_from_camera, self.true)
         chosen = np.flatnonzero(on)[:: max(1, int(on.sum()) // MOST_PIXELS)]
         return _Measured(self.s[chosen], self.ours[chosen], self.true[chosen])
@@ -174,7 +175,8 @@ def true_projector(facts: dict[str, Any]) -> PinholeProjector:
 
 
 def true_depth(projector: PinholeProjector, rays: Array, s: Array) -> Array:
-    """(N,) depth mm at which rays (N, 3) with z = 1 meet the sheets s (N,), by the secant rule."""
+    """Depth (N,) mm at which rays (N, 3) with z = 1 meet the
+    sheets s (N,), by the secant method."""
     near, far = np.full(len(s), 1000.0), np.full(len(s), 1500.0)
     off_near = projector.stripe(rays * near[:, None]) - s
     for _ in range(20):
@@ -187,7 +189,7 @@ def true_depth(projector: PinholeProjector, rays: Array, s: Array) -> Array:
 
 
 def striped_shots(rig: Rig, workspace: Path) -> dict[str, list[str]]:
-    """By pair, the shots in which it took stripes of a board."""
+    """Shots in which each pair took stripes of a board."""
     captures = open_captures(rig, workspace / "rig.yaml")
     return {
         pair.name: [s.shot for s in captures.of_pair(pair.name) if s.has_stripes]
@@ -198,7 +200,7 @@ def striped_shots(rig: Rig, workspace: Path) -> dict[str, list[str]]:
 def boards_reached(
     rig: Rig, facts: dict[str, Any], pair: str, shots: dict[str, list[str]], s: Array
 ) -> Indices:
-    """(N,) on how many boards that the camera saw the sheets s (N,) fell, of the truth."""
+    """Number (N,) of boards seen by the camera on which the true sheets s (N,) fell."""
     true = facts["pairs"][pair]
     camera, projector = TrueCamera(**true["camera"]), true_projector(true)
     camera_from_rig = RigidTransform.from_matrix(true["rig_from_camera"]).inverse()
@@ -216,7 +218,7 @@ def boards_reached(
 
 
 class Body:
-    """The true surface, ready for points."""
+    """The true surface, ready for queries."""
 
     def __init__(self, vertices: Array, faces: Indices) -> None:
         self._centre = vertices.mean(axis=0)
@@ -227,7 +229,7 @@ class Body:
         )
 
     def struck(self, body_from_camera: RigidTransform, points: Array) -> Mask:
-        """(N,) whether the ray of a point (N, 3), camera frame, meets the body about there."""
+        """Whether the ray of a point (N, 3), camera frame, meets the body near that point, (N,)."""
         start = body_from_camera.translation - self._centre
         ways = body_from_camera.rotate(points)
         rays = np.hstack([np.broadcast_to(start, ways.shape), ways]).astype(np.float32)
@@ -235,14 +237,15 @@ class Body:
         return np.asarray(np.abs(share - 1.0) * np.linalg.norm(points, axis=1) < ON_BODY_MM)
 
     def distances(self, points: Array) -> tuple[Array, Array]:
-        """(N,) mm from the plane of the nearest face, outside positive, and its normal (N, 3)."""
+        """Signed distances (N,) mm from the plane of the nearest face, outside positive, and
+        normals (N, 3)."""
         centred = points - self._centre
         found = self._scene.compute_closest_points(o3d.core.Tensor(centred.astype(np.float32)))
         normals = found["primitive_normals"].numpy().astype(float)
         return np.sum((centred - found["points"].numpy()) * normals, axis=1), normals
 
     def aligned(self, points: Array) -> Array:
-        """Points moved rigidly to the surface: point to plane, outliers aside."""
+        """Points moved rigidly onto the surface: point to plane, without outliers."""
         for _ in range(ROUNDS):
             off, normals = self.distances(points)
             near = np.abs(off) < OUTLIER * max(float(np.median(np.abs(off))), 1e-6)

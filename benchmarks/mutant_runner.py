@@ -1,10 +1,11 @@
-"""Runs pytest in forks of one process that has imported what is heavy: a mutant's run starts at once.
+"""Runs pytest in forks of a process with all heavy imports done, so that a mutant's run starts at
+once.
 
-`python benchmarks/mutant_runner.py LOGS`, in a copy of the project that is changed from outside. Each
-line read is JSON: `tests` (files or single tests, the nearest first), `slow` (whether slow tests are
-run) and `cache`, the folder in which Numba keeps what it compiled. Each line written says which test
-failed first: "" where none did, the file where one could not be imported. A test at work for longer
-than PATIENCE_S hangs: it failed.
+`python benchmarks/mutant_runner.py LOGS`, in a copy of the project that is changed from outside.
+Each line read is JSON: `tests` (files or single tests, the nearest first), `slow` (whether slow
+tests are run) and `cache`, the folder for Numba's compiled code. Each line written names the test
+that failed first: "" if none did, the file if one could not be imported. A test that works for
+longer than PATIENCE_S hangs and counts as failed.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ import pytest
 from hypothesis import Phase, settings
 
 PATIENCE_S = 150.0
-"""Of processor time, for one test with what it makes for others: compiling takes a minute at worst."""
+"""Processor time for one test including its fixtures: compiling takes a minute at worst."""
 PATIENCE_WALL_S = 1200.0
-"""For all of a mutant's tests, asleep or awake, on a machine that others share."""
+"""Wall-clock time for all of a mutant's tests, on a machine shared with others."""
 HEAVY = (
     "cv2", "networkx", "open3d", "pycolmap", "pydantic", "scipy.interpolate", "scipy.ndimage",
     "scipy.optimize", "scipy.sparse.linalg", "scipy.spatial", "scipy.stats", "typer", "yaml",
@@ -34,15 +35,16 @@ HEAVY = (
 
 
 class FirstFailure:
-    """Quick tests before slow ones, nearest files first; says in a file where the first one failed."""
+    """Runs quick tests before slow ones, nearest files
+    first; writes the first failure to a file."""
 
     def __init__(self, answer: Path) -> None:
         self.answer = answer
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_configure(self) -> None:
-        """Hypothesis tries as few examples as in `make test-quick`, the same every time, and does not
-        simplify what fails."""
+        """Let Hypothesis try as few examples as in `make test-quick`, the same every time, and not
+        shrink failures."""
         settings.register_profile(
             "mutants",
             deadline=None,
@@ -60,7 +62,7 @@ class FirstFailure:
         items.sort(key=lambda one: (bool(one.get_closest_marker("slow")), files.index(one.path)))
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        self.answer.write_text(nodeid, "utf-8")  # what stands there where a test never ends
+        self.answer.write_text(nodeid, "utf-8")  # this remains if a test never ends
         signal.setitimer(signal.ITIMER_PROF, PATIENCE_S)
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
@@ -89,7 +91,8 @@ def _first_failure(tests: list[str], slow: bool, cache: str, logs: Path) -> str:
 
 
 def _run(tests: list[str], slow: bool, cache: str, logs: Path, answer: Path) -> int:
-    """In a fork, in a session of its own that can be ended as a whole: pytest's exit code."""
+    """pytest's exit code from a fork, which has a session of
+    its own that can be killed as a whole."""
     try:
         os.setsid()
         log = os.open(logs / "log", os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
@@ -101,12 +104,12 @@ def _run(tests: list[str], slow: bool, cache: str, logs: Path, answer: Path) -> 
         options += [] if slow else ["-m", "not slow"]
         options += ["--hypothesis-profile=mutants", f"--basetemp={logs / 'made'}"]
         return int(pytest.main([*options, *tests], [FirstFailure(answer)]))
-    except BaseException:  # whatever a mutant does, the fork does not go on as its parent
+    except BaseException:  # whatever a mutant does, the fork must not go on as its parent
         return 1
 
 
 def main() -> None:
-    """Answers line by line until there are no more."""
+    """Answer line by line until there are no more."""
     logs = Path(sys.argv[1])
     for name in HEAVY:
         __import__(name)

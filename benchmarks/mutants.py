@@ -34,14 +34,14 @@ PROJECT = Path(__file__).parents[1]
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.txt")
 """Blocks of a path, the lines that differ, and `# why` nobody could notice."""
 SURVIVED_FIRST = Path(__file__).with_name("first_survivors.txt")
-"""Likewise those of the published sample that survived when it was drawn: tests written to find them
-say nothing of the faults that no sample drew, so they count as survivors for good."""
+"""Likewise those of the published sample that survived when it was drawn: tests written to find
+them say nothing about faults that no sample drew, so they count as survivors for good."""
 WORK = PROJECT / "build" / "mutants"
 """The copies, what Numba compiled in them, and which test found which mutant, which is tried first
-the next time."""
+next time."""
 FOUND_BY = WORK / "found_by.json"
 RUNS = 2
-"""Mutants tried at a time, each in a copy of its own."""
+"""Mutants tried at a time, each in its own copy."""
 ROOMS = (
     "geometry",
     "stripes",
@@ -66,24 +66,24 @@ BESIDE = (
     "bodyscan/workflows/accept_rig.py",
     "bodyscan/workflows/check_rig.py",
 )
-"""Mathematics and verdicts in rooms that are for something else."""
+"""Mathematics and verdicts in rooms with another purpose."""
 FILES = ("__init__.py", "storage.py", "ply.py", "acceptance_file.py", "scene.py")
-"""Neither: what stands there reads, writes or names."""
+"""Neither mathematics nor verdicts: these files read, write or name things."""
 OPERATORS = re.compile(
     r"core/(ReplaceBinaryOperator_(Add_Sub|Sub_Add|Mul_Div|Div_Mul|Pow_Mul)"
     r"|ReplaceComparisonOperator_(Lt_LtE|LtE_Lt|Gt_GtE|GtE_Gt|Lt_Gt|Gt_Lt|LtE_GtE|GtE_LtE|Eq_NotEq)"
     r"|ReplaceUnaryOperator_Delete_(USub|Invert|Not)|NumberReplacer|ReplaceAndWithOr|ReplaceOrWithAnd"
     r"|ReplaceTrueWithFalse|ReplaceFalseWithTrue|ZeroIterationForLoop)"
 )
-"""Of cosmic-ray's operators those that one might write by mistake; the others end in a TypeError."""
+"""Those of cosmic-ray's operators that imitate mistakes; the others end in a TypeError."""
 DECLARATION = re.compile(r"-\s*@", re.MULTILINE)
-"""Lines in which nothing is worked out: decorators."""
+"""Lines that compute nothing: decorators."""
 GUARD = re.compile(r"strict=\s*(True|False)|[*/],")
-"""Of zip what it refuses, which callers cannot give; and the star before arguments that are named."""
+"""What zip refuses, which callers cannot pass; and the star before keyword-only arguments."""
 NEAREST, FIRST = 9, 2
-"""Test files tried, and how many of them alone at first, which is cheap and mostly enough; those
-farther away ask for little of the module that nearer ones do not. With six, tests of parts beside it
-kept those of whole sequences away, which find most."""
+"""Test files tried, and how many of them alone at first, which is cheap and usually enough; files
+farther away use little of the module that nearer ones do not. With six, tests of neighbouring parts
+kept out those of whole sequences, which find most."""
 
 
 @dataclass(frozen=True)
@@ -107,11 +107,11 @@ class Copy:
     cache: Path
     runner: subprocess.Popen[str]
     sound: dict[str, bool] = field(default_factory=dict)
-    """Of tests that failed with a mutant: whether they pass without."""
+    """For tests that failed with a mutant: whether they pass without."""
 
 
 def main() -> None:
-    """Prints each mutant's fate as it is known, and the section for docs/results.md at the end."""
+    """Print each mutant's fate as it is known, and the section for docs/results.md at the end."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--count", type=int, default=COUNT)
     options.add_argument("--seed", type=int, default=SEED)
@@ -122,7 +122,7 @@ def main() -> None:
 
 COUNT = 50
 SEED = 11
-"""Of the published sample: survivors of other seeds were read and mended before it was drawn."""
+"""Of the published sample: survivors of other seeds were examined and fixed before it was drawn."""
 
 
 def report(count: int = COUNT, seed: int = SEED, modules: Sequence[str] = ()) -> str:
@@ -136,7 +136,7 @@ def report(count: int = COUNT, seed: int = SEED, modules: Sequence[str] = ()) ->
 def _section(
     seed: int, sample: Sequence[Mutant], tried: Sequence[Mutant], fates: Mapping[str, str]
 ) -> str:
-    """Of a sample, those of it that are not equivalent, and which test found each of these."""
+    """The section on a sample: those of it that are not equivalent, and which test found each."""
     first = _blocks(SURVIVED_FIRST)
     left = [one for one in tried if not fates[one.key]]
     survived = [one for one in tried if one.key in first or not fates[one.key]]
@@ -159,7 +159,7 @@ find {since} of these; what still survives:
 
 
 def _fates(mutants: Sequence[Mutant]) -> dict[str, str]:
-    """By mutant the test that finds it, or ""."""
+    """The test that finds each mutant, or ""."""
     copies: SimpleQueue[Copy] = SimpleQueue()
     for number in range(RUNS):
         copies.put(_copy(WORK / str(number)))
@@ -192,7 +192,7 @@ def _modules() -> list[str]:
 
 
 def _sample(modules: Sequence[str], count: int, seed: int) -> Iterator[Mutant]:
-    """As many of each module; what is drawn of one does not depend on which others there are."""
+    """The same number from each module; the draw from one does not depend on the others."""
     draws = {path: random.Random(f"{seed} {path}") for path in modules}
     order = sorted(modules, key=lambda path: draws[path].random())
     waiting = {path: _mutants(path, draws[path]) for path in order}
@@ -210,8 +210,8 @@ def _sample(modules: Sequence[str], count: int, seed: int) -> Iterator[Mutant]:
 
 
 def _mutants(path: str, rng: random.Random) -> Iterator[Mutant]:
-    """Those of one module, shuffled."""
-    # cosmic-ray imports parts of parso in an order that parso 0.8.7 does not bear.
+    """Mutants of one module, shuffled."""
+    # cosmic-ray imports parts of parso in an order that breaks parso 0.8.7.
     import parso.python.tree
     import parso.tree  # noqa: F401
     from cosmic_ray.ast import ast_nodes, get_ast
@@ -250,7 +250,7 @@ def _blocks(path: Path) -> set[str]:
 
 
 def _copy(folder: Path) -> Copy:
-    """The project as it stands, dates and all: what was compiled in the last copy stays good."""
+    """Copy the project, including file dates: what was compiled in the last copy remains valid."""
     project, cache, logs = (folder / name for name in ("project", "compiled", "logs"))
     shutil.rmtree(project, ignore_errors=True)
     for path in (cache, logs):
@@ -286,9 +286,9 @@ def _environment(project: Path) -> dict[str, str]:
 
 
 def _found_by(mutant: Mutant, copy: Copy, hint: str) -> str:
-    """The first test that fails with the mutant in place and passes without it; "" where none does.
+    """The first test that fails with the mutant in place and passes without it; "" if none does.
 
-    hint: the test that found it in an earlier run is tried first, "" where there is none.
+    hint: the test that found it in an earlier run is tried first, "" if there is none.
     """
     tests = _tests_of(mutant.path)
     if not tests:
@@ -309,10 +309,10 @@ def _found_by(mutant: Mutant, copy: Copy, hint: str) -> str:
 
 @contextmanager
 def _in_place(mutant: Mutant, copy: Copy) -> Iterator[Path]:
-    """The file changed, and the folder for what Numba compiles meanwhile.
+    """Put the mutant into its file; yields the folder for what Numba compiles meanwhile.
 
-    Numba's caches of callers know nothing of what callees call: files that import the mutant count as
-    new. Afterwards all is as old as it was, and what was compiled before is good again.
+    Numba's caches of callers do not notice changes in callees, so files that import the mutant
+    count as new. Afterwards all dates are restored, and what was compiled before is valid again.
     """
     callers = [copy.project / path for path in _compiled_importers(mutant.path)]
     place = copy.project / mutant.path
@@ -321,7 +321,7 @@ def _in_place(mutant: Mutant, copy: Copy) -> Iterator[Path]:
     cache = copy.cache
     if callers:
         cache = copy.cache.with_name("compiled-mutant")
-        shutil.rmtree(cache, ignore_errors=True)  # of a run that was broken off
+        shutil.rmtree(cache, ignore_errors=True)  # of an interrupted run
         shutil.copytree(copy.cache, cache, copy_function=os.link)
     try:
         place.write_text(mutant.code, "utf-8")
@@ -350,7 +350,8 @@ def _first_failure(tests: Sequence[str], slow: bool, cache: Path, copy: Copy) ->
 
 @lru_cache
 def _imports() -> dict[str, frozenset[str]]:
-    """By file of the package and the tests, which of these files it imports. Paths in the project."""
+    """For each file of the package and the tests, which of
+    these files it imports; project paths."""
     files = [one for name in ("bodyscan", "tests") for one in (PROJECT / name).rglob("*.py")]
     named = {}
     for one in files:
@@ -374,8 +375,8 @@ def _imports() -> dict[str, frozenset[str]]:
 
 @lru_cache
 def _tests_of(path: str) -> tuple[str, ...]:
-    """The test files nearest to a module by imports, those of other rooms a step farther; of equally
-    near ones first those that are called like it, then those that import least besides."""
+    """The test files nearest to a module by imports, those of other rooms a step farther; of
+    equally near ones first those named like it, then those that import least besides."""
     imports = _imports()
     distance, step, reached = {path: 0}, 0, {path}
     while reached:
@@ -395,7 +396,7 @@ def _tests_of(path: str) -> tuple[str, ...]:
 
 @lru_cache
 def _compiled_importers(path: str) -> tuple[str, ...]:
-    """Files with compiled functions that reach a module's, itself among them if it has any."""
+    """Files with compiled functions that call a module's, including itself if it has any."""
     imports = _imports()
 
     def compiles(one: str) -> bool:

@@ -1,4 +1,5 @@
-"""What the stripes could add to a rig's solve: how boards err, and what their stripes know of it.
+"""What the stripes could add to a rig's solve: the boards' errors, and what their stripes know of
+them.
 
 Needs the workspace that `three-pole` simulates (benchmarks/full_size.py).
 """
@@ -58,7 +59,8 @@ Correlation of the two: {np.corrcoef(off, told)[0, 1]:+.2f}.
 def _errors(
     joined: JoinedRig, decoded: dict[ViewKey, BoardBoundaries], truth: Truth
 ) -> Iterator[Array]:
-    """(2, B) mm of each pair, less their means: boards off the truth, and as the stripes have it."""
+    """Errors (2, B) mm for each pair, less their means: boards against the truth, and by the
+    stripes."""
     placed, rig, facts = joined.placed, joined.calibration.rig, truth.facts
     for name, pair in joined.calibration.pairs.items():
         true = RigidTransform.from_matrix(facts["pairs"][name]["rig_from_camera"]).inverse()

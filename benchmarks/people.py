@@ -1,4 +1,4 @@
-"""People cast by rays: how exact scans of people who move are, and how well they repeat."""
+"""People cast by rays: accuracy and repeatability of scans of people who move."""
 
 from __future__ import annotations
 
@@ -26,21 +26,26 @@ from bodyscan.simulation.living import LivingBody
 WOMAN, MAN = "woman_average", "man_average"
 THREE, FOUR = "three-pole-12", "four-pole-16"
 SCANS = tuple(((THREE, FOUR)[seed % 2], seed) for seed in range(31, 41))
-"""Of each person who stands: by turns on either rig."""
+"""For each person who stands: alternately on both rigs."""
 RESTLESS = ((THREE, WOMAN, 21), (THREE, MAN, 22), (FOUR, WOMAN, 23), (FOUR, MAN, 24))
 ARMPITS = 0.75
-"""Of the stature: above, what counts as trunk depends on where the arms hang."""
+"""Share of the stature: above it, what counts as trunk depends on where the arms hang."""
 MOSTLY = 0.5
-"""A vertex is an arm's if more than half of its turns take it along."""
+"""A vertex is an arm's if it follows more than half of the arm's rotation."""
 Job = tuple[str, str, str, int]
 """Rig, subject, preset, seed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """errors_mm, over_sigmas: (N,) of the cloud, laid onto the body of the scan's moment.  of_arms:
-    (N,) of its points.  girths_mm: by the number of its height, as a tape runs, at mean breath;
-    true_mm: of the body then.  grade: the verdict."""
+    """One scan compared with the truth.
+
+    errors_mm, over_sigmas: (N,) of the cloud, aligned to the body of the scan's moment.
+    of_arms: (N,) which of its points lie on arms.
+    girths_mm: by the number of its height, as a tape runs, at mean breath.
+    true_mm: of the true body then.
+    grade: the verdict.
+    """
 
     errors_mm: Array
     over_sigmas: Array
@@ -93,7 +98,7 @@ calibrated anew. Of the girths at all heights: standard deviation over these sca
 
 
 def scan_person(job: Job) -> Found:
-    """Cast, fused, measured."""
+    """Cast, fuse and measure one person."""
     cast = cast_person(*job)
     scan = fuse(cast.calibration, Outcome(cast.images), ScanSettings())
     vertices, faces = cast.vertices(), cast.faces
@@ -107,12 +112,12 @@ def scan_person(job: Job) -> Found:
 
 
 def of_arms(points: Array, vertices: Array, body: LivingBody) -> Mask:
-    """(N,) whether points (N, 3) lie on an arm.  vertices: the body's, where it was then."""
+    """Whether points (N, 3) lie on an arm, (N,). vertices: the body's at that time."""
     return np.asarray((body.arms_share > MOSTLY)[cKDTree(vertices).query(points)[1]])
 
 
 def _tapes(measured: Measurements) -> dict[int, float]:
-    """Around the trunk below the armpits, where it was measured."""
+    """Tape girths of the trunk below the armpits, where it was measured."""
     below = [one for one in measured.slices if one.height_mm < ARMPITS * measured.stature_mm]
     trunks = {number: one.of("trunk") for number, one in enumerate(below)}
     return {
@@ -136,7 +141,7 @@ def _row(people: str, found: Sequence[Found]) -> str:
 
 
 def _over_sigmas(found: Sequence[Found]) -> str:
-    """As `evaluate` has them."""
+    """Errors over sigmas as `evaluate` reports them."""
     spread, beyond = normalized_errors(
         np.concatenate([one.over_sigmas for one in found]), np.ones(())
     )

@@ -23,10 +23,13 @@ def fit_pinhole_opencv(
 ) -> PinholeProjector:
     """`cv2.stereoCalibrate` of camera and projector on board corners.
 
-    boards: (N, 3) corners of each board, mm.  pixels: (N, 2) in the camera, px.  rows: (N,) stripe
-    coordinate at each corner.  Stripes of one direction leave the other projector coordinate
-    unknown: it is imputed from the model found so far (starting with `start`), a few rounds.
-    Source: missing data by alternating imputation and fit, as in expectation maximisation.
+    boards: (N, 3) corners of each board, mm.
+    pixels: (N, 2) in the camera, px.
+    rows: (N,) stripe coordinate at each corner.
+
+    Stripes of one direction leave the other projector coordinate unknown: it is imputed from the
+    current model (starting with `start`) for a few rounds. Source: missing data by alternating
+    imputation and fit, as in expectation maximisation.
     """
     camera_matrix = camera.matrix
     camera_matrix[0, 1] = 0.0
@@ -73,7 +76,7 @@ def fit_pinhole_opencv(
 
 
 def _as_camera(model: PinholeProjector) -> tuple[Array, Array, Array]:
-    """A full pinhole whose rows are the model: same focal length both ways, columns centred."""
+    """A full pinhole whose rows are the model: equal focal lengths, centred columns."""
     axis = model.matrix[1, :3]
     centre = float(model.matrix[0, :3] @ axis)
     down = model.matrix[0, :3] - centre * axis

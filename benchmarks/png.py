@@ -1,4 +1,4 @@
-"""Our reader of grey PNG files beside others, those of them that are installed."""
+"""Our reader of grey PNG files compared with others that are installed."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ each, from memory; milliseconds an image, the fastest of {RUNS} runs. Ours check
 
 
 def _times(reader: Reader, files: list[bytes]) -> tuple[float, float, float]:
-    """Milliseconds an image: with one thread, with two, and of processor."""
+    """Milliseconds per image: with one thread, with two, and of processor time."""
     one, two, processor = [], [], []
     for _ in range(RUNS):
         wall, cpu = time.perf_counter(), time.process_time()

@@ -1,4 +1,4 @@
-"""A real pair: each board held out in turn, measured by planes fitted on the others."""
+"""A real pair: each board held out in turn, measured with planes fitted to the others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rig's solve against the truth and against other programs, on corners found in rendered images."""
+"""The rig's solve against the truth and against other programs, on corners from rendered images."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ CASES = (
 )
 """Rig, board, seeds: one seed takes minutes to render."""
 PLAIN_SQUARE_MM = 45.0
-"""A plain board must be seen whole: one of 9 x 7 squares of 70 mm hardly fits into the pictures."""
+"""A plain board must be seen whole: one of 9 x 7 squares of 70 mm hardly fits into the images."""
 DIVERGED_MM = 20.0
 BODY_RADIUS_MM, BODY_HEIGHT_MM = 200.0, 1800.0
 BODY_STEP_MM = 25.0
 STEEPEST_COSINE = 0.5
-"""A pair measures a surface turned up to 60 degrees away from its camera."""
+"""A pair measures a surface tilted up to 60 degrees away from its camera."""
 
 
 @dataclass(frozen=True)
 class Scored:
-    """Errors of one solve; with `aligned`, after the one motion that brings all centres nearest to
-    the truth, as far as programs without a rig frame can be judged."""
+    """Errors of one solve; with `aligned`, after the rigid motion that brings all centres nearest
+    to the truth, since programs without a rig frame can only be judged up to that."""
 
     centres_mm: float
     rotations_deg: float
@@ -99,7 +99,7 @@ OpenCV and caliscope get each face of a board as a flat board of its own.
 
 
 def with_plain_board(rig: Rig) -> Rig:
-    """The rig with a plain checkerboard in place of its ChArUco board."""
+    """The rig with a plain checkerboard instead of its ChArUco board."""
     board = rig.boards[0]
     plain = Board(
         name=board.name,
@@ -169,7 +169,7 @@ def _solve_row(
 
 
 def _two_pairs(seen: SeenRig, placed: RigSolution) -> Array:
-    """(M,) mm: how far apart two estimated placings put one point of a body-sized cylinder, for
+    """Distance (M,) mm between two cameras' estimates of one point on a body-sized cylinder, for
     every point and any two cameras that see it."""
     angles = np.arange(0.0, 2.0 * np.pi, BODY_STEP_MM / BODY_RADIUS_MM)
     heights = np.arange(0.0, BODY_HEIGHT_MM, BODY_STEP_MM)
@@ -190,7 +190,7 @@ def _two_pairs(seen: SeenRig, placed: RigSolution) -> Array:
 
 
 def _sees(pair: TruePair, points: Array, normals: Array) -> Mask:
-    """Which points (N, 3) with normals (N, 3) face the camera and lie in its picture."""
+    """Which points (N, 3) with normals (N, 3) face the camera and lie in its image."""
     towards = pair.rig_from_camera.translation - points
     cosine = np.sum(towards * normals, axis=1) / np.linalg.norm(towards, axis=1)
     in_camera = pair.rig_from_camera.inverse().apply(points)
@@ -198,7 +198,7 @@ def _sees(pair: TruePair, points: Array, normals: Array) -> Mask:
     pixels = np.full((len(points), 2), np.nan)
     pixels[before] = pair.camera.image(in_camera[before])
     size = [pair.camera.width - 1, pair.camera.height - 1]
-    # A lens's polynomial folds what lies far beside its picture back into it.
+    # A lens's polynomial folds points far outside its image back into it.
     farthest = np.abs(pair.camera.directions(np.array([[0.0, 0.0], size]))).max()
     beside = np.abs(in_camera[:, :2]).max(axis=1) > farthest * in_camera[:, 2]
     within = np.all((pixels >= 0) & (pixels <= size), axis=1)

@@ -1,10 +1,10 @@
 """Other programs on the same corners: `python rig_rivals.py METHOD corners.npz found.npz`.
 
-Run as a script of its own, by whichever Python has the rival installed; needs numpy, scipy and OpenCV.
-corners.npz: pixels (C, F, N, 2), NaN where not seen; points (N, 3) mm; size (2,); grid (squares across,
-down, mm a square); matrices (C, 3, 3) and lenses (C, 4 to 8), each camera calibrated by itself.
-found.npz: `camera_from_first` (C, 4, 4), `matrices` and `lenses` as the rival leaves them, `seconds`
-(wall, CPU).
+Run as a separate script by whichever Python has the rival installed; needs numpy, scipy and OpenCV.
+corners.npz: pixels (C, F, N, 2), NaN where not seen; points (N, 3) mm; size (2,); grid (squares
+across, down, mm per square); matrices (C, 3, 3) and lenses (C, 4 to 8), each camera calibrated by
+itself. found.npz: `camera_from_first` (C, 4, 4), `matrices` and `lenses` as the rival leaves them,
+`seconds` (wall, CPU).
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ Found = tuple[Array, Array, Array]
 
 FEWEST = 8
 RADIAL = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-"""Terms that a lens given without them does not get either."""
+"""Terms fixed for a lens that was given without them."""
 
 
 def opencv_multiview(corners: Corners, *, partly: bool = False) -> Found:
     """OpenCV 5's calibrateMultiview, on boards seen whole.
 
-    partly: boards seen in part too, their other corners marked as its manual says.  Metres: it takes
-    points in millimetres for collinear.
+    partly: also boards seen in part, with their other corners marked as its manual says. Metres: it
+        considers points in millimetres to be collinear.
     """
     pixels, points = _faces_apart(corners)
     seen = np.isfinite(pixels[..., 0])
@@ -67,13 +67,13 @@ def opencv_multiview(corners: Corners, *, partly: bool = False) -> Found:
 
 
 def stereo_chain(corners: Corners) -> Found:
-    """cv2.stereoCalibrate along the tree of the links with most corners in common."""
+    """cv2.stereoCalibrate along the tree of links with most corners in common."""
     pixels, seen = _seen(corners)
     common = np.einsum("afn,bfn->ab", seen.astype(float), seen.astype(float))
     tree = minimum_spanning_tree(-np.triu(common, 1))
     order, before = breadth_first_order(tree, 0, directed=False)
     found = np.tile(np.eye(4), (len(pixels), 1, 1))
-    # Without that flag a lens's terms below the fraction are taken for zero.
+    # Without that flag the terms of a lens's denominator are taken to be zero.
     rational = cv2.CALIB_RATIONAL_MODEL if corners["lenses"][:, 5:].any() else 0
     for name in order[1:]:
         first = before[name]
@@ -98,7 +98,7 @@ def stereo_chain(corners: Corners) -> Found:
 def aniposelib(corners: Corners, *, lenses_kept: bool = False) -> Found:
     """aniposelib: its tree of poses, then its bundle adjustment with the board as constraint.
 
-    It refines one focal length, k1 and k2 (without extra_dist it sets k2 to nothing), or no lens.
+    It refines one focal length, k1 and k2 (without extra_dist it sets k2 to zero), or no lens.
     """
     # Not a dependency of the project: see RIVALS_PYTHON in rig.py.
     from aniposelib.cameras import Camera, CameraGroup  # type: ignore[import-not-found]
@@ -161,7 +161,7 @@ def aniposelib(corners: Corners, *, lenses_kept: bool = False) -> Found:
 
 def caliscope(corners: Corners) -> Found:
     """caliscope's whole pipeline: pairwise poses, bundle adjustment with the board's distances as
-    constraints, outliers out, once more.  Metres; each face of a board is a frame of its own."""
+    constraints, outlier removal, once more. Metres; each face of a board is a separate frame."""
     from caliscope.api import (  # type: ignore[import-not-found]
         CameraArray,
         CameraData,
@@ -226,7 +226,8 @@ METHODS: dict[str, Callable[[Corners], Found]] = {
 
 
 def _faces_apart(corners: Corners) -> tuple[Array, Array]:
-    """Pixels (C, G, M, 2) and points (G, M, 3), z = 0, mm: each face of each frame as a flat board."""
+    """Pixels (C, G, M, 2) and points (G, M, 3), z = 0, mm:
+    each face of each frame as a flat board."""
     pixels, points = np.asarray(corners["pixels"], float), np.asarray(corners["points"], float)
     faces = 1 + int(np.ptp(points[:, 2]) > 0)
     frames = pixels.shape[1]
@@ -240,7 +241,7 @@ def _seen(corners: Corners) -> tuple[Array, Mask]:
 
 
 def _padded(lenses: Any) -> Array:
-    """(C, 8): OpenCV takes missing coefficients for zero."""
+    """Coefficients (C, 8), padded with zeros as OpenCV assumes for missing ones."""
     found = np.zeros((len(lenses), 8))
     for row, lens in zip(found, lenses, strict=True):
         own = np.ravel(np.asarray(lens, float))[:8]

@@ -1,4 +1,4 @@
-"""Other programs given our corners, each in a process of its own (see rig_rivals.py)."""
+"""Other programs run on our corners, each in a separate process (see rig_rivals.py)."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ LIMIT_S = 300
 
 @dataclass(frozen=True, eq=False)
 class RivalFound:
-    """Placings in the frame of the first camera (by name), cameras as the rival leaves them, time
-    taken (s; wall, processor)."""
+    """Poses in the frame of the first camera (by name), cameras as the rival leaves them, and
+    seconds (wall-clock, processor)."""
 
     placings: dict[str, RigidTransform]
     cameras: dict[str, Camera]
@@ -48,7 +48,7 @@ class RivalFound:
 def run_rival(
     method: str, board: Board, views: Sequence[LocatedView], cameras: Mapping[str, Camera]
 ) -> RivalFound | str:
-    """What a rival makes of one board's views, starting from `cameras`, or why it makes nothing.
+    """A rival's result on one board's views, started from `cameras`, or why it has none.
 
     RIVALS_PYTHON: Pythons to try in turn, separated as in PATH; this one if it is not set.
     """
@@ -84,7 +84,7 @@ def run_rival(
 def with_lens(
     lens: Lens, views: Sequence[LocatedView], cameras: Mapping[str, Camera]
 ) -> dict[str, Camera]:
-    """Each camera calibrated by itself from its views, with a lens that rivals know."""
+    """Each camera calibrated by itself from its views, with a lens that rivals have."""
     return {
         name: calibrate_camera(
             [PlanarView(v.shot, v.points, v.pixels) for v in views if v.pair == name],
@@ -97,7 +97,7 @@ def with_lens(
 
 
 def without_skew(views: Sequence[LocatedView], cameras: Mapping[str, Camera]) -> list[LocatedView]:
-    """Views as cameras without skew, such as the rivals', would have seen them."""
+    """Views as seen by cameras without skew, which the rivals assume."""
     return [replace(v, pixels=cameras[v.pair].without_skew(v.pixels)) for v in views]
 
 
@@ -137,7 +137,7 @@ def _corners(
     cameras: Mapping[str, Camera],
     names: Sequence[str],
 ) -> dict[str, Any]:
-    """What rig_rivals.py reads."""
+    """Input of rig_rivals.py."""
     points = corner_points(board)
     number = {tuple(point): k for k, point in enumerate(np.round(points, 4).tolist())}
     shots = sorted({view.shot for view in views})

@@ -1,4 +1,5 @@
-"""What a user waits for: a cold command, a job of a batch, a warm scan; against reading the images."""
+"""What a user waits for: a cold command, a job of a batch, a warm scan; compared with image
+reading."""
 
 from __future__ import annotations
 
@@ -69,7 +70,7 @@ def _row(name: str, times: Sequence[float], opencv: float, own: float) -> str:
 
 
 def _command(arguments: list[str]) -> float:
-    """Seconds that a command takes, from its start in a new process."""
+    """Duration of a command, from its start in a new process."""
     started = time.perf_counter()
     line = [sys.executable, "-m", "bodyscan", *arguments, "--quiet"]
     done = subprocess.run(line, capture_output=True, text=True, cwd=PROJECT, check=False)
@@ -79,7 +80,7 @@ def _command(arguments: list[str]) -> float:
 
 
 def _batch(person: Path, calibration: Path, folder: Path) -> list[float]:
-    """Seconds of each job of a batch over the same scan, as its state says."""
+    """Duration of each job in a batch on the same scan, as its state says."""
     scans = folder / "scans"
     scans.mkdir()
     names = [f"scan-{k}" for k in range(RUNS)]
@@ -99,7 +100,7 @@ def _batch(person: Path, calibration: Path, folder: Path) -> list[float]:
 
 
 def _in_process(workspace: Path, what: str) -> list[float]:
-    """Seconds of each run of `what` in one new process; of a warm scan those after the first."""
+    """Duration of each run of `what` in one new process; for a warm scan, without the first run."""
     line = [sys.executable, "-m", "benchmarks.seconds", what, str(workspace)]
     done = subprocess.run(line, capture_output=True, text=True, cwd=PROJECT, check=False)
     if done.returncode:
@@ -137,7 +138,7 @@ def _work(workspace: Path, what: str) -> Callable[[], Any]:
 
 
 def main(what: str, workspace: Path) -> None:
-    """The last line printed is a JSON list of seconds."""
+    """Time runs of `what`; the last line printed is a JSON list of seconds."""
     work = _work(workspace, what)
     if what == "warm":
         work()

@@ -10,14 +10,14 @@ from bodyscan.mesh.topology import directed_edges
 
 
 def self_intersections(vertices: Array, faces: Indices) -> Indices:
-    """(N, 3) edges that pierce a face: their two vertices, and the face; vertices (V, 3).
+    """Edges that pierce a face, (N, 3): their two vertices, and the face; vertices (V, 3).
 
-    Two triangles meet if and only if an edge of one pierces the other. Every edge is cast as a ray
-    at all faces but those it touches; comparing triangles in pairs would be quadratic. In float32:
-    exact to a ten-thousandth of a millimetre on a body.
+    Two triangles intersect if and only if an edge of one pierces the other. Every edge is cast as a
+    ray at all faces but those it touches; comparing triangles in pairs would be quadratic. In
+    float32: exact to a ten-thousandth of a millimetre on a body.
     """
     edges = np.unique(np.sort(directed_edges(faces), axis=1), axis=0)
-    # The scene computes in float32: coordinates are centred first.
+    # The scene computes in float32, so coordinates are centred first.
     places = (vertices - vertices.mean(axis=0)).astype(np.float32)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(places), o3d.core.Tensor(faces.astype(np.uint32)))

@@ -1,4 +1,4 @@
-"""Errors over their sigmas, over seeds: of the chapter's unit, and of a rig with a body."""
+"""Errors over their sigmas, over seeds: for the chapter's unit, and for a rig with a body."""
 
 from __future__ import annotations
 
@@ -27,11 +27,12 @@ from bodyscan.workflows.evaluate import compare_rig, load_truth
 
 PROJECT = Path(__file__).parents[1]
 SEEDS, RIG_SEEDS = range(10), range(5)
-"""Of units ten: what is open of one is common to all its points, so that five told 0.6 for 0.9."""
+"""Ten units: what is unknown of a unit is common to all its
+points, so that five gave 0.6 for 0.9."""
 PRESETS = ("ideal", "workshop")
 BOARDS = (3, 10)
 SCALE, SHOTS = 0.4, 24
-"""Of the rig: a calibration and a scan at full size take minutes to render, each."""
+"""Of the rig: at full size a calibration and a scan take minutes each to render."""
 
 
 def report() -> str:
@@ -54,7 +55,7 @@ The chapter's unit (`bodyscan reproduce`; depth on spheres and plate), {len(SEED
 
 
 def rigs() -> str:
-    """The section of docs/results.md of whole rigs: four minutes a seed and preset."""
+    """The section of docs/results.md on whole rigs: four minutes per seed and preset."""
     found = [(preset, [_rig(preset, seed) for seed in RIG_SEEDS]) for preset in PRESETS]
     return f"""## Errors over their sigmas, of whole rigs (synthetic)
 
@@ -78,7 +79,7 @@ def _unit(boards: int, real_light: bool, seed: int) -> PointSigma:
 
 @dataclass(frozen=True, eq=False)
 class RigErrors:
-    """centres: (P, 3) errors over sigmas.  cloud: (N,) likewise.  cloud_mm: (N,)."""
+    """centres: (P, 3) errors over sigmas. cloud: (N,) likewise. cloud_mm: (N,) errors."""
 
     centres: Array
     cloud: Array

@@ -1,7 +1,7 @@
-"""What covers a body and what light does under its skin: labels, coverage, oblique light (synthetic).
+"""What covers a body and what light does under skin: labels, coverage, oblique light (synthetic).
 
-At half size, the woman alone, who stands still; the rig is calibrated by `calibration_from_truth`. What
-was rendered in bench/skin stays: two minutes each on an idle core.
+At half size, the woman alone, standing still; the rig is calibrated by `calibration_from_truth`.
+Renderings are kept in bench/skin: two minutes each on an idle core.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from bodyscan.workflows.range_images import reconstruct_range_images
 
 FOLDER = PROJECT / "bench" / "skin"
 LONGER = 6
-"""Times, the second exposure."""
+"""Ratio of the second exposure to the first."""
 LOOKS: dict[str, Sequence[object]] = {
     "matt": ["--look", "matt"],
     "oblique": ["--look", "skin", "--set", "skin.oblique_mm=1"],
@@ -45,13 +45,13 @@ LOOKS: dict[str, Sequence[object]] = {
     + ["--set", "lighting.longest=100"],
 }
 REACH_MM, LIFT_MM = 4.0, 1.0
-"""A place is covered by a point so near; hair is rough by so much, and does not hide itself."""
-FLATTEST = 0.17  # cosine, 80 degrees: flatter is not measured
+"""A place is covered by a point this near; hair is this rough, and does not hide itself."""
+FLATTEST = 0.17  # cosine of 80 degrees: surfaces at a flatter angle are not measured
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A scan and what was true of its subject."""
+    """A scan and the truth about its subject."""
 
     scan: Scan
     truth: Truth
@@ -101,7 +101,7 @@ def _scanned(name: str, *, know_light: bool = True) -> Case:
 
 
 def _with_two_exposures() -> Case:
-    """Of the same moment, as the same images are made but for the exposure."""
+    """A scan with two exposures of the same moment; the images differ only in exposure."""
     folder = FOLDER / "dressed-two"
     shutil.rmtree(folder, ignore_errors=True)
     for name, exposure in (("dressed", "short"), ("dressed-long", "long")):
@@ -120,7 +120,7 @@ def _with_two_exposures() -> Case:
 
 def _scan(calibration: RigCalibration, person: Path, know_light: bool) -> Scan:
     images = reconstruct_range_images(calibration, open_scan(calibration.rig, person))
-    # Without the pairs it is not known where their light comes from.
+    # Without the pairs it is unknown where their light comes from.
     known = calibration if know_light else replace(calibration, pairs={})
     return fuse(known, images, ScanSettings())
 
@@ -167,14 +167,14 @@ def _surface(truth: Truth) -> tuple[Array, Indices]:
 
 
 def _laid(case: Case) -> Array:
-    """The cloud's points as the truth stands."""
+    """The cloud's points moved to where the truth stands."""
     vertices, _ = _surface(case.truth)
     found = sway_residual(case.scan.rig_from_camera, case.truth.facts["pairs"], vertices)
     return found.rig_from_still.inverse().apply(case.scan.cloud.points)
 
 
 def _seen_by_two(vertices: Array, faces: Indices, pairs: Mapping[str, Any]) -> Mask:
-    """(V,) which vertices camera and projector of two pairs at least look at."""
+    """Vertices (V,) that the camera and projector of at least two pairs face."""
     normals = vertex_normals(vertices, faces).astype(float)
     scene, count = o3d.t.geometry.RaycastingScene(), np.zeros(len(vertices), int)
     scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))

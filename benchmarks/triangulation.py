@@ -13,7 +13,7 @@ from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import RigidTransform
 
 STEPS = 5
-LEAST_PX = 1e-4  # no corner is seen more finely
+LEAST_PX = 1e-4  # no corner is found more precisely
 
 
 def triangulate(
@@ -46,7 +46,7 @@ def _equations(
     seen: Mask,
     points: Array,
 ) -> StackedEquations:
-    """Of points (N, 3), camera by camera: most points are seen by few of them."""
+    """Equations of points (N, 3), one camera at a time: most points are seen by few of them."""
     normal, gradient = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
     cost = np.zeros(len(points))
     for camera, transform, seen_at, here in zip(

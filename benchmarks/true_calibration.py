@@ -1,7 +1,7 @@
-"""A simulated rig's calibration made from its truth, off by what boards leave open.
+"""A simulated rig's calibration made from its truth, with the errors that boards would leave.
 
-Boards are most of what there is to render; where a benchmark is about what comes after them, this
-stands for a calibration: true cameras and light planes, each pair's place drawn about the true one.
+Boards take most of the rendering time; a benchmark of what comes after them uses this as its
+calibration: true cameras and light planes, each pair's pose drawn around the true one.
 """
 
 from __future__ import annotations
@@ -26,14 +26,17 @@ from bodyscan.workflows.evaluate import load_truth
 MIDDLE = RigidTransform(np.eye(3), np.array([0.0, 0.0, 900.0]))
 """Boards are held where people stand: there a pair's points are known best."""
 SHIFT_MM, TURN_DEG = 0.1, 0.01
-"""For each axis: what forty boards leave open of the workshop's rig (docs/results.md)."""
+"""Per axis: what forty boards leave open of the workshop's rig (docs/results.md)."""
 PLANES_MM = 0.03
-"""All planes of a pair together; 0.15 mm in depth."""
+"""Common error of all planes of a pair; 0.15 mm in depth."""
 
 
 def calibration_from_truth(workspace: Path, seed: int = 0) -> RigCalibration:
-    """workspace: what `simulate` wrote with projectors of kind `mirror` without smile.  The same
-    seed gives the same errors; all workspaces of a rig have the same truth."""
+    """A calibration from the truth of a workspace.
+
+    workspace: what `simulate` wrote with projectors of kind `mirror` without smile. The same seed
+        gives the same errors; all workspaces of a rig have the same truth.
+    """
     rig, truth = load_rig(workspace / "rig.yaml"), load_truth(workspace / "truth")
     return calibration_from_facts(rig, truth.facts["pairs"], seed)
 
@@ -46,7 +49,7 @@ def calibration_from_facts(
     shift_mm: float = SHIFT_MM,
     turn_deg: float = TURN_DEG,
 ) -> RigCalibration:
-    """truth: `pairs` of truth.json.  shift_mm, turn_deg: of each place, for each axis."""
+    """A calibration from `pairs` of truth.json. shift_mm, turn_deg: pose errors, per axis."""
     rng = np.random.default_rng(seed)
     sigmas = np.repeat([np.radians(turn_deg), shift_mm], 3)
     pairs, placed, covariances = {}, {}, []

@@ -1,7 +1,7 @@
 """Calibrate a rig and scan a person: `python examples/calibrate_and_scan.py [FOLDER [OUT]]`.
 
-FOLDER holds rig.yaml, the board images that it names, and one person's in captures/person. Without
-one, twelve small pairs, a board and a person are simulated, which takes some minutes.
+FOLDER holds rig.yaml, the board images that it names, and one person's images in captures/person.
+Without FOLDER, twelve small pairs, a board and a person are simulated, which takes some minutes.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import bodyscan
 
 PROJECT = Path(__file__).parents[1]
-# Half as fine as the default, which takes the mesh four times as long.
+# Half the default resolution, whose mesh takes four times as long.
 QUICK = bodyscan.ScanSettings(
     fusion=bodyscan.FusionSettings(points=100_000), mesh=bodyscan.MeshSettings(depth=8, reach_mm=8)
 )
@@ -45,7 +45,7 @@ def main(folder: Path, out: Path) -> None:
 
 
 def simulate(folder: Path) -> None:
-    """A rig with everything around it, a quarter of the real size in pixels."""
+    """Simulate a rig with everything around it, at a quarter of the real image size."""
     from bodyscan.simulation import simulate as run
 
     subject = PROJECT / "data" / "subjects" / "woman_average.ply"

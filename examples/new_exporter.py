@@ -1,7 +1,7 @@
-"""A new export format, OFF, as one file: `python examples/new_exporter.py SCAN OUT`.
+"""A new export format, OFF, in one file: `python examples/new_exporter.py SCAN OUT`.
 
-Put into bodyscan/export/formats as off.py it is a format from then on: for `bodyscan export --format
-off`, for pipelines and for Python. Here it is registered from outside.
+Put into bodyscan/export/formats as off.py it becomes a format for `bodyscan export --format off`,
+for pipelines and for Python. Here it is registered from outside.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bodyscan.files.atomic import write_text
 
 
 def write_off(path: Path, mesh: bodyscan.BodyMesh) -> None:
-    """Geomview's Object File Format: counts, vertices (mm), then the corners of each face."""
+    """Write Geomview's Object File Format: counts, vertices (mm), then the corners of each face."""
     corners = np.insert(mesh.faces, 0, 3, axis=1)
     lines = [
         "OFF",
@@ -32,7 +32,7 @@ FORMAT = BodyFormat(write_off, holds=frozenset({"mesh"}))
 
 
 def main(scan: Path, out: Path) -> None:
-    """A stored scan in the new format, and a JSON beside it as beside every export."""
+    """Export a stored scan in the new format, with a JSON beside it as with every export."""
     BODY_FORMATS.register("off", FORMAT)
     chosen = bodyscan.ExportSettings(formats=("off",), versions=("full",))
     for path in bodyscan.export_scan(bodyscan.load_scan(scan), out, chosen):

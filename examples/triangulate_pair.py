@@ -1,7 +1,7 @@
 """One pair, step by step, as in a notebook: how flat does it measure a flat board?
 
-With BODYSCAN_CAPTURES, the folder of real captures, a real camera and projector; else simulated ones.
-Beyond `bodyscan.api` this looks into the rooms themselves, whose names may change.
+With BODYSCAN_CAPTURES, the folder of real captures, it uses a real camera and projector; otherwise
+simulated ones. Beyond `bodyscan.api` it uses inner modules, whose names may change.
 """
 
 # %% A rig of one pair, and its captures of a board
@@ -31,21 +31,21 @@ else:
     rig = bodyscan.load_rig(rig_file)
 captures = open_captures(rig, rig_file)
 
-# %% Calibrated: the camera, and the light of every stripe
+# %% Calibrate: the camera, and the light of every stripe
 calibration = bodyscan.calibrate_rig(rig, folder=rig_file.parent)
 ((name, pair),) = calibration.pairs.items()
 print(f"corners {pair.quality.corners_rms_px:.3f} px RMS, light: {pair.quality.light_model}")
 
-# %% Decoded: which stripe lit each pixel, a real number
+# %% Decode: which stripe lit each pixel, as a real number
 sequence = next(sequence for sequence in captures.sequences if sequence.has_stripes)
 stripes = decode_sequence(sequence, rig.pair(name))
 print(f"{np.isfinite(stripes.s).mean():.0%} of the pixels have a stripe")
 
-# %% Triangulated: where a pixel's ray meets its stripe's sheet of light; (N, 3) mm, camera frame
+# %% Triangulate: where a pixel's ray meets its stripe's light sheet; (N, 3) mm, camera frame
 image = reconstruct_range_image(pair, stripes)
 points = image.points[image.valid].astype(float)
 
-# %% Held against the board: its corners say where it lies
+# %% Compare with the board: its corners give its pose
 board = rig.boards[0]
 rig_from_board = calibration.rig_from_board[sequence.shot, board.name]
 board_from_camera = rig_from_board.inverse() @ calibration.rig_from_camera[name]

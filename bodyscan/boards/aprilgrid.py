@@ -1,8 +1,9 @@
-"""Grids of AprilTags, as Kalibr prints them: tags say roughly where corners are, saddles exactly.
+"""Grids of AprilTags as Kalibr prints them: tags give rough corner positions, saddles exact ones.
 
-Small black squares between the tags touch their corners: so each corner is a saddle, as on a
-checkerboard. The same squares join neighbouring tags for a detector of black quadrilaterals; it is
-asked at several scales, and with white grown a little, and a few tags are enough to place the grid.
+Small black squares between the tags touch their corners, so that each corner is a saddle, as on a
+checkerboard. For a detector of black quadrilaterals the same squares join neighbouring tags;
+therefore it is run at several scales and with the white areas slightly grown, and a few tags are
+enough to place the grid.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from bodyscan.boards.corners import WINDOW_SQUARES, SightedCorners, refine_corne
 from bodyscan.rig.board import Board
 
 TRIES = ((1.0, 1), (2.0, 3), (1.0, 3), (0.5, 1), (2.0, 1))
-"""Scale, and width in px by which white is grown there."""
+"""Scale of the image, and the width in px by which white is grown there."""
 BORDER_BITS = (2, 1)
 """Kalibr's tags have a black rim two bits wide, others one bit."""
 ENOUGH_TAGS = 0.5
@@ -34,7 +35,7 @@ ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class PlacedTags:
-    """board_map of the print; how many tags agree on it; and how wide their rims are."""
+    """The print's board map, how many tags agree on it, and the width of their rims."""
 
     board_map: BoardMap
     agreeing: int
@@ -42,7 +43,7 @@ class PlacedTags:
 
 
 def find_aprilgrid(image: Bytes, board: Board, *, thorough: bool = True) -> SightedCorners | None:
-    """The grid's corners, as many as show: it may be seen in part. Not thorough: one scale only."""
+    """Find the grid's visible corners; it may be seen in part. Not thorough: one scale only."""
     best: PlacedTags | None = None
     for placed in _placings(image, board, TRIES if thorough else TRIES[:1]):
         if best is None or placed.agreeing > best.agreeing:
@@ -76,8 +77,8 @@ def _placings(
 
 
 def place_tags(board: Board, tags: Markers, border_bits: int = 2) -> PlacedTags | None:
-    """Where tags say the grid is: whichever way each is turned in its place, and whether they count
-    from the lowest row (Kalibr) or the highest."""
+    """Locate the grid by its tags, whichever way each is rotated in its place, and whether they
+    count from the lowest row (Kalibr) or from the highest."""
     ids, printed = board_layout.marker_corners(board)
     rows = printed.reshape(board.rows, board.columns, 4, 2)
     best: PlacedTags | None = None
@@ -99,8 +100,8 @@ def place_tags(board: Board, tags: Markers, border_bits: int = 2) -> PlacedTags 
 
 
 def _refine(image: Bytes, board: Board, placed: PlacedTags) -> tuple[Array, Mask]:
-    """All corners of the grid where the tags say they are; then, those not found, where the corners
-    found say so."""
+    """Refine all corners of the grid at the places that the tags predict; then those not found, at
+    the places that the corners found predict."""
     printed = board_layout.corner_points(board.model_copy(update={"faces": 1}))[:, :2]
     reach = _clear_of_edges(board, placed.border_bits) / WINDOW_SQUARES
     bright_diagonal = _bright_diagonal(board, len(printed))
@@ -118,7 +119,7 @@ def _refine(image: Bytes, board: Board, placed: PlacedTags) -> tuple[Array, Mask
 
 
 def _clear_of_edges(board: Board, border_bits: int) -> float:
-    """How far around a corner, mm, there are only its four squares: rim, gap, and small squares."""
+    """Radius around a corner, mm, free of all edges but its own: of rim, gap and small squares."""
     marker_mm = board.marker_mm or 0.0
     bits = board_layout.marker_dictionary(board).markerSize + 2 * border_bits
     rim = border_bits * marker_mm / bits
@@ -126,6 +127,7 @@ def _clear_of_edges(board: Board, border_bits: int) -> float:
 
 
 def _bright_diagonal(board: Board, count: int) -> Mask:
-    """Tags are black: the white squares at their upper left and lower right corners are the others."""
+    """Tags are black, so at their upper left and lower right
+    corners the other two squares are white."""
     row, column = np.divmod(np.arange(count), 2 * board.columns)
     return np.asarray((row + column) % 2 == 1)

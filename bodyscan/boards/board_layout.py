@@ -1,10 +1,10 @@
-"""What a calibration board looks like: where its corners and its markers lie.
+"""The layout of a calibration board: where its corners and its markers lie.
 
 Board frame (mm): origin at the outer corner of the checkered area's first square, x along the
 columns, y along the rows (down, as printed), z away from whoever looks at the front.
 
-A back is a print of its own, turned over about the board's vertical axis: whoever walks round
-the board sees it upright. A point (xb, yb) of the back print lies at
+The back is a separate print, turned over about the board's vertical axis, so that it looks upright
+to whoever walks around the board. A point (xb, yb) of the back print lies at
 (columns * square - xb, yb, thickness) in the board frame.
 """
 
@@ -19,7 +19,8 @@ from bodyscan.rig.board import Board
 
 
 def corner_grid(board: Board) -> tuple[int, int]:
-    """Columns and rows of corners of one face: between squares, or, of an aprilgrid, those of tags."""
+    """Columns and rows of corners on one face: those between
+    squares, or those of an aprilgrid's tags."""
     if board.kind == "aprilgrid":
         return 2 * board.columns, 2 * board.rows
     return board.columns - 1, board.rows - 1
@@ -32,10 +33,10 @@ def corners_per_face(board: Board) -> int:
 
 
 def corner_points(board: Board) -> Array:
-    """Inner corners in the board frame, (N, 3) mm, or (2N, 3) for a board with two faces.
+    """Corners in the board frame, (N, 3) mm, or (2N, 3) for a board with two faces.
 
     Corner id r * (columns - 1) + c is the crossing of column line c + 1 and row line r + 1; the
-    back's corners, numbered likewise on its own print, follow the front's.  Of an aprilgrid the
+    back's corners, numbered likewise on its own print, follow the front's. An aprilgrid has the
     corners of all tags, row by row: id r * 2 * columns + c.
     """
     x, y = np.meshgrid(*(_lines(board, count) for count in (board.columns, board.rows)))
@@ -44,7 +45,7 @@ def corner_points(board: Board) -> Array:
 
 
 def _lines(board: Board, count: int) -> Array:
-    """Where corners lie along one side of so many squares or tags, mm."""
+    """Positions of corners along one side of `count` squares or tags, mm."""
     if board.kind != "aprilgrid":
         return board.square_mm * np.arange(1.0, count)
     gap = (board.square_mm - (board.marker_mm or 0.0)) / 2.0
@@ -53,7 +54,8 @@ def _lines(board: Board, count: int) -> Array:
 
 
 def points_from_print(board: Board, printed: Array, face: int) -> Array:
-    """Points (..., 2) mm of a face's print (0 front, 1 back) in the board frame, (..., 3) mm."""
+    """Map points (..., 2) mm of a face's print (0 front, 1
+    back) to the board frame, (..., 3) mm."""
     x, y = printed[..., 0], printed[..., 1]
     if face == 0:
         return np.stack([x, y, np.zeros_like(x)], axis=-1)
@@ -63,9 +65,9 @@ def points_from_print(board: Board, printed: Array, face: int) -> Array:
 
 
 def outline(board: Board, face: int = 0) -> Array:
-    """The face's rim, margin included, (4, 3) mm in the board frame.
+    """The face's outline, margin included, (4, 3) mm in the board frame.
 
-    Clockwise for whoever looks at that face, from its first square on.
+    Clockwise for whoever looks at that face, starting at its first square.
     """
     low = -board.margin_mm
     right = board.columns * board.square_mm + board.margin_mm
@@ -75,7 +77,7 @@ def outline(board: Board, face: int = 0) -> Array:
 
 
 def marker_dictionary(board: Board) -> cv2.aruco.Dictionary:
-    """The ArUco dictionary of a ChArUco board. Raises BadInput for an unknown name."""
+    """The marker dictionary of a board. Raises BadInput for an unknown name."""
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or not isinstance(number, int):
         raise BadInput(
@@ -112,15 +114,15 @@ def charuco_face(board: Board, face: int = 0) -> cv2.aruco.CharucoBoard:
 
 
 def markers_per_face(board: Board) -> int:
-    """Number of markers of one face: one in each white square, or all tags of an aprilgrid."""
+    """Number of markers on one face: one per white square, or all tags of an aprilgrid."""
     return board.marker_count // board.faces
 
 
 def marker_corners(board: Board, face: int = 0) -> tuple[Indices, Array]:
     """Marker ids (M,) and their four corners on the face's print, (M, 4, 2) mm.
 
-    Corners clockwise as printed, from the marker's own top left, as OpenCV's detector gives them;
-    of an aprilgrid from the print's top left.  Its tags count from the lower left, row by row
+    Corners run clockwise as printed, from the marker's own top left, as OpenCV's detector gives
+    them; for an aprilgrid from the print's top left. Its tags count from the lower left, row by row
     upwards, as Kalibr prints them.
     """
     if board.kind == "aprilgrid":

@@ -1,4 +1,4 @@
-"""Where a flat print appears in an image: a homography, and a gentle lens on top of it."""
+"""Where a flat print appears in an image: a homography with a mild lens distortion on top."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from bodyscan.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class BoardMap:
-    """Printed points (mm) to image points (px): homography plus a polynomial for the lens.
+    """Map from printed points (mm) to image points (px): homography plus a polynomial for the lens.
 
-    homography: (3, 3).  coefficients: (T, 2) px, of the monomials of `printed` brought to about
-    [-1, 1] by `middle` (2,) mm and `size` mm.  degree: of the polynomial; 0 for none.
+    homography: (3, 3).
+    coefficients: (T, 2) px, of the monomials of printed points scaled to about [-1, 1].
+    middle, size: (2,) mm and mm, of that scaling.
+    degree: of the polynomial; 0 for none.
     """
 
     homography: Array
@@ -25,14 +27,15 @@ class BoardMap:
     degree: int
 
     def apply(self, printed: Array) -> Array:
-        """Printed points (..., 2) mm -> image points (..., 2) px."""
+        """Map printed points (..., 2) mm to image points (..., 2) px."""
         scaled = (printed - self.middle) / self.size
         return _project(self.homography, printed) + _monomials(scaled, self.degree) @ (
             self.coefficients
         )
 
     def jacobian(self, printed: Array) -> Array:
-        """d pixel / d printed at points (..., 2), (..., 2, 2) px/mm: columns along x, along y."""
+        """d(pixel)/d(printed) at points (..., 2): (..., 2, 2)
+        px/mm, columns along x and along y."""
         step = 1e-3 * self.size
         columns = [
             (self.apply(printed + offset) - self.apply(printed - offset)) / (2 * step)
@@ -42,10 +45,10 @@ class BoardMap:
 
 
 def fit_board_map(printed: Array, pixels: Array) -> BoardMap:
-    """Least squares fit to printed points (N, 2) mm and their image points (N, 2) px, N >= 4.
+    """Least-squares fit to printed points (N, 2) mm and their image points (N, 2) px, N >= 4.
 
-    The polynomial is cubic or quadratic, or missing, as the number of points allows; a slight
-    ridge keeps it from running away where points are few.
+    The polynomial is cubic, quadratic or absent, as the number of points allows; a slight ridge
+    keeps it from running away where points are few.
     """
     middle = (printed.min(axis=0) + printed.max(axis=0)) / 2
     size = float(np.ptp(printed, axis=0).max()) / 2

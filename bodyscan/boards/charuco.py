@@ -1,4 +1,4 @@
-"""ChArUco boards: their markers say roughly where corners are, the corners' saddles say exactly."""
+"""ChArUco boards: markers give rough corner positions, the corners' saddles exact ones."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ MIN_CORNERS_FOR_LENS = 12
 RANSAC_SHARE_OF_SQUARE = 0.15
 ROUNDS = 4
 QUICK_WINDOW_PX = 13
-"""Of the threshold that markers are sought with: the middle one of OpenCV's three. By itself it shows
-all markers of nine pictures in ten in less than half the time."""
+"""Window of the threshold for markers: the middle one of OpenCV's three. Alone it finds all markers
+of nine images in ten in less than half the time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Markers:
-    """ids: (M,) int64.  corners: (M, 4, 2) float64 px, from each marker's top left, clockwise."""
+    """ids: (M,) int64. corners: (M, 4, 2) float64 px, from each marker's top left, clockwise."""
 
     ids: Indices
     corners: Array
@@ -41,11 +41,12 @@ def detect_markers(
     first: int | None = None,
     quick: bool = False,
 ) -> Markers:
-    """Markers of the board's dictionary in the image (H, W), their black rim so many bits wide.
+    """Detect markers of the board's dictionary in the image (H, W).
 
-    first: only the dictionary's first ones are looked for. Telling which of a thousand markers a
-    square shows takes most of the time.  quick: with one threshold (`QUICK_WINDOW_PX`), which may miss
-    some.
+    border_bits: width of their black rim in bits.
+    first: look only for so many, from the dictionary's first. Telling which of a thousand markers a
+        square shows takes most of the time.
+    quick: use one threshold (`QUICK_WINDOW_PX`), which may miss some.
     """
     parameters = _parameters()
     if quick:
@@ -64,8 +65,8 @@ def detect_markers(
 
 
 def markers_concerned(board: Board) -> int:
-    """How many of its dictionary's first markers a board has, and those that it would go on with; of
-    one with two faces, whose back has these, only its own."""
+    """How many of its dictionary's first markers to look for: a board's own and those with which it
+    would go on; of a board with two faces, whose back has the next ones, only its own."""
     if board.faces == 2:
         return board.first_marker + board.marker_count
     longer = board.model_copy(update={"rows": board.rows + 2})
@@ -82,7 +83,8 @@ def _parameters() -> cv2.aruco.DetectorParameters:
 class PlacedMarkers:
     """Markers that agree on where one face of a board, as described here, appears.
 
-    printed: (K, 4, 2) mm, of those that agree.  seen: how many of the face's markers were seen.
+    printed: (K, 4, 2) mm, of those that agree.
+    seen: how many of the face's markers were seen.
     """
 
     board: Board
@@ -97,11 +99,12 @@ class PlacedMarkers:
 
     @property
     def believed(self) -> bool:
-        """Most markers agree: on a board with other columns or rows only some rows seem to."""
+        """Whether most markers agree: on a board with other
+        columns or rows only some rows seem to."""
         return self.agreeing > LEAST_AGREEING * self.seen
 
     def all_seen(self, shape: tuple[int, ...]) -> bool:
-        """Whether none is missing of those that a picture (H, W) shows whole."""
+        """Whether all markers that lie wholly within an image (H, W) were seen."""
         _, printed = board_layout.marker_corners(self.board, self.face)
         pixels, last = self.board_map.apply(printed), np.array(shape[::-1]) - 1
         inside = np.all((pixels >= 0.0) & (pixels <= last), axis=(1, 2))
@@ -111,8 +114,8 @@ class PlacedMarkers:
 def locate_charuco(
     image: Bytes, board: Board, markers: Markers, placed: PlacedMarkers | None
 ) -> SightedCorners | None:
-    """The board's corners beside the markers seen, of the face and layout that more of them fit
-    (`place_markers`); `other_layout` says which layout that is."""
+    """The board's corners beside the markers seen, for the face and layout on which most markers
+    agree (`place_markers`); `other_layout` says which layout that is."""
     if placed is None or not placed.believed:
         return None
     nearby = _corners_beside(board, placed.printed.mean(axis=1))
@@ -144,7 +147,7 @@ def _goes_on(placed: PlacedMarkers, markers: Markers) -> bool:
 
 
 def place_markers(board: Board, markers: Markers) -> PlacedMarkers | None:
-    """Where markers say that a board appears: the face and the layout on which most agree."""
+    """Place the board by its markers: the face and the layout on which most agree."""
     found = [
         _place_face(described, face, markers)
         for described in _layouts(board)
@@ -154,7 +157,8 @@ def place_markers(board: Board, markers: Markers) -> PlacedMarkers | None:
 
 
 def _layouts(board: Board) -> list[Board]:
-    """The board as described and, where OpenCV before 4.6 printed it otherwise, as it did."""
+    """The board as described and, where OpenCV before 4.6
+    printed it differently, in that layout."""
     if board.rows % 2:
         return [board]
     return [board, board.model_copy(update={"legacy_layout": not board.legacy_layout})]
@@ -179,8 +183,8 @@ def _refine(
     corner_ids: Indices,
     markers: Array,
 ) -> tuple[Array, Mask]:
-    """Corners fitted where the markers say they are; then, as corners say it better than
-    markers, once more where the corners found say that those not found must be."""
+    """Refine corners where the markers predict them; then those not found where the corners found,
+    which are more accurate than markers, predict them."""
     points = board_layout.corner_points(board.model_copy(update={"faces": 1}))[corner_ids, :2]
     gap = (1.0 - (board.marker_mm or 0.0) / board.square_mm) / 2.0
     marked = np.floor(markers[0].mean(axis=0) / board.square_mm).astype(int).sum()
@@ -202,8 +206,8 @@ def _refine(
 def fit_markers(printed: Array, corners: Array, board: Board) -> tuple[BoardMap, Mask] | None:
     """Where the print appears, and which markers (M,) agree on it; None if no two do.
 
-    A homography picks those that agree; a lens that bends the board's far parts away from it is
-    followed in a few rounds.
+    A homography selects those that agree; a few rounds follow a lens that bends the board's far
+    parts away from it.
     """
     size = np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
     tolerance = max(2.0, RANSAC_SHARE_OF_SQUARE * size * board.square_mm / (board.marker_mm or 1))

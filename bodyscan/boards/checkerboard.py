@@ -1,7 +1,7 @@
-"""Plain checkerboards: several detectors in turn, each judged by whether its corners make a board.
+"""Plain checkerboards: several detectors in turn, each judged by whether its corners form a board.
 
-Convention: where columns and rows differ in parity the print looks different from its two ends,
-and its first square (0, 0) is BLACK, as OpenCV prints it; that settles the numbering.
+Convention: if the numbers of columns and rows differ in parity the print looks different from its
+two ends, and its first square (0, 0) is BLACK, as OpenCV prints it; that fixes the numbering.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 
 SAME_CORNER_SQUARES = 0.15
-"""A corner this far from where the others put it is another one: a bent board and a lens leave a few
-hundredths of a square, corners that are mixed up a whole one."""
+"""A corner this far from where the others predict it is a different one: a bent board and a lens
+leave a few hundredths of a square, mixed-up corners a whole one."""
 MIN_SHARE_OF_CORNERS = 0.8
 MIN_SHARE_TO_GO_ON = 0.4
 LEAST_BEYOND = 0.5
-"""Share of the corners, and of the contrast, that a board which goes on shows beyond its last ones."""
+"""Share of the corners, and of the contrast, that a larger board shows beyond the last ones."""
 ROUNDS = 3
 
 
@@ -40,7 +40,7 @@ def find_checkerboard(image: Bytes, board: Board) -> SightedCorners | None:
 
 
 def find_quickly(image: Bytes, board: Board) -> SightedCorners | None:
-    """As `find_checkerboard`, by the two quickest detectors only."""
+    """As `find_checkerboard`, but with the two quickest detectors only."""
     size = (board.columns - 1, board.rows - 1)
     whole = Region(0, 0, image.shape[1], image.shape[0])
     for detect in (_classic, _adaptive):
@@ -62,10 +62,10 @@ def _refuse_square(board: Board) -> None:
 
 
 def _refined(image: Bytes, board: Board, candidate: Array) -> SightedCorners | None:
-    """A detector's corners (N, 2) px brought to where they are, and only then judged.
+    """Refine a detector's corners (N, 2) px first, and only then judge them.
 
-    Detectors are off by a pixel or two at times; corners not found where they say are looked for
-    where the corners found say they must be. None unless most are found and make this board.
+    Detectors are sometimes off by a pixel or two; corners not found where they say are looked for
+    where the corners found predict them. None unless most are found and form this board.
     """
     printed = board_layout.corner_points(board.model_copy(update={"faces": 1}))[:, :2]
     row, column = np.divmod(np.arange(len(printed)), board.columns - 1)
@@ -92,7 +92,8 @@ def _refined(image: Bytes, board: Board, candidate: Array) -> SightedCorners | N
 
 
 def _goes_on(image: Bytes, board: Board, board_map: BoardMap, first_is_black: bool) -> bool:
-    """Whether corners and squares go on beyond the last ones of a side: a part of a larger board."""
+    """Whether corners and squares continue beyond a side:
+    the image shows part of a larger board."""
     inside = _greys(image, board, board_map, _inner_squares(board))
     contrast = abs(inside[0].mean() - inside[1].mean())
     for lines, squares in _beyond(board):
@@ -122,13 +123,13 @@ def _beyond(board: Board) -> Iterator[tuple[Indices, Indices]]:
 
 
 def _candidates(image: Bytes, board: Board) -> Iterator[Array]:
-    """Corner sets (N, 2) px that the detectors offer, quickest and most often right first.
+    """Corner sets (N, 2) px from the detectors, in order of speed and success.
 
-    The plain threshold of the whole picture finds most boards in hundredths of a second. Where it
-    finds none, and there is no lattice of saddles either, there is no board. Else: adaptive
-    thresholds those in uneven light or before a busy background; crops, enlarged, fine and slanted
-    boards; the sector-based detector, a fifth of a second for a megapixel, blurred and noisy ones
-    (its CALIB_CB_NORMALIZE_IMAGE shifts corners by 0.25 px), and enlarged, in a second, fine ones.
+    The plain threshold of the whole image finds most boards in hundredths of a second. If it finds
+    none and there is no lattice of saddles either, there is no board. Then: adaptive thresholds for
+    uneven light or a busy background; enlarged crops for fine and slanted boards; the sector-based
+    detector, a fifth of a second per megapixel, for blurred and noisy ones (its
+    CALIB_CB_NORMALIZE_IMAGE shifts corners by 0.25 px), and enlarged, in a second, for fine ones.
     """
     size = (board.columns - 1, board.rows - 1)
     whole = Region(0, 0, image.shape[1], image.shape[0])
@@ -154,7 +155,7 @@ Detector = Callable[[Bytes, tuple[int, int]], tuple[bool, Floats | None]]
 def _found(
     detect: Detector, image: Bytes, size: tuple[int, int], region: Region, scale: float
 ) -> Iterator[Array]:
-    """What a detector sees in a part of the image, enlarged."""
+    """Corners that a detector finds in a part of the image, enlarged."""
     part = region.cut(image)
     if scale != 1.0:
         part = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
@@ -186,7 +187,8 @@ def _numbered_as_printed(
 ) -> tuple[Array, bool]:
     """Corners (N, 2) in the print's order, and whether its first square is black.
 
-    Never mirrored; from the end where the first square is black if the other end has it white.
+    Never mirrored; starts at the end where the first square is black if at the other end it is
+    white.
     """
     grid = corners.reshape(board.rows - 1, board.columns - 1, 2)
     across = (grid[:, -1] - grid[:, 0]).mean(axis=0)
@@ -203,7 +205,7 @@ def _numbered_as_printed(
 def _first_is_black(image: Bytes, board: Board, pixels: Array, printed: Array) -> bool:
     """Whether the squares with an even sum of column and row are darker than the others.
 
-    Judged by all squares between inner corners, so that light across the board does not matter.
+    Judged by all squares between inner corners, so that uneven light does not matter.
     """
     even, odd = _greys(image, board, fit_board_map(printed, pixels), _inner_squares(board))
     return bool(even.mean() < odd.mean())
@@ -218,8 +220,8 @@ def _inner_squares(board: Board) -> Indices:
 def _greys(
     image: Bytes, board: Board, board_map: BoardMap, squares: Indices
 ) -> tuple[Array, Array]:
-    """Grey levels in the middles of squares, (N, 2) column and row: of those whose sum is even, and
-    of the others."""
+    """Grey levels in the middles of squares (N, 2), given by column and row: of those with an even
+    sum, and of the others."""
     where = board_map.apply(board.square_mm * (squares.astype(float) + 0.5)).astype(np.float32)
     grey = cv2.remap(image, where[:, None], None, cv2.INTER_LINEAR).ravel().astype(float)
     even = squares.sum(axis=1) % 2 == 0

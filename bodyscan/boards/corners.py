@@ -1,4 +1,4 @@
-"""Board corners to a small fraction of a pixel: the image of a corner is fitted around each.
+"""Board corners to a small fraction of a pixel: a model of the image is fitted around each.
 
 Four squares meet in a corner; blurred, that is an offset plus the product of two edges, under light
 that may fall off to one side:
@@ -6,9 +6,9 @@ that may fall off to one side:
     I(p) = (a + b E(n1 . (p - c)) E(n2 . (p - c))) (1 + g . (p - c) / a),
     E(d) = erf(d / (sqrt(2) sigma)),
 
-with c the corner, n1 and n2 the normals of the two edge lines. Light multiplies: a slope added to the
-squares instead moves all corners of a tilted board alike, by 0.01 px at 70 degrees. All corners of a
-board are fitted at once.
+with c the corner, n1 and n2 the normals of the two edge lines. Light multiplies: a slope added to
+the squares instead shifts all corners of a tilted board alike, by 0.01 px at 70 degrees. All
+corners of a board are fitted at once.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from bodyscan.geometry.scaled_systems import solve_scaled
 MAX_MOVE_PX = 1.5
 RADIUS_PX = 9.0
 NOISY_PX, NOISY_RADIUS_PX = 0.04, 16.0
-"""Where corners of a picture are worse than that, wider windows are worth their time."""
+"""If corners of an image are less accurate than this, wider windows are worth their time."""
 WINDOW_SQUARES = 0.42
 BLUR_PX = 0.9
 CLEAR_OF_MARKER_PX = 1.4
@@ -40,19 +40,22 @@ MIN_CONTRAST = 4.0
 USUAL_RESIDUAL, MAX_RESIDUAL = 0.25, 0.7
 USUAL_SIGMA_PX, MAX_SIGMA_PX = 0.06, 0.35
 TIMES_MEDIAN = 2.0
+"""Residuals (shares of the contrast) and sigmas of good corners in a clear image, and in any. If
+all are worse, in noise or blur, a corner may be twice as bad as the median of its board."""
 LEAST_OF_SEEN = 0.02
-"""Residuals (shares of the contrast) and sigmas of good corners of a clear picture, and of any: where
-all are worse, in noise or blur, a corner may be twice as bad as the usual one of its board."""
+"""Share of the seen variance of light between corners that is real, at least."""
 STEPS = 12
 UNSEEN = 1e-9  # share of a diagonal: what a window without pixels leaves open stays as it is
-SETTLED = 1e-2  # a tenth of a corner's own sigma, before a last step that makes it far less
+SETTLED = 1e-2  # a tenth of a corner's own sigma; one more step then makes it far less
 
 
 @dataclass(frozen=True, eq=False)
 class SightedCorners:
     """Corners of one board face found in an image.
 
-    ids: (N,) int64.  pixels: (N, 2) px.  printed_count: how many corners the face has.
+    ids: (N,) int64.
+    pixels: (N, 2) px.
+    printed_count: how many corners the face has.
     """
 
     ids: Indices
@@ -63,7 +66,7 @@ class SightedCorners:
 
 @dataclass(frozen=True, eq=False)
 class _Patches:
-    """Pixels around N corners, P each: place (N, P, 2) px, grey (N, P), weight (N, P): 0 or 1."""
+    """P pixels around each of N corners: place (N, P, 2) px, grey (N, P), weight (N, P): 0 or 1."""
 
     place: Array
     grey: Array
@@ -78,12 +81,14 @@ def refine_corners(
     *,
     marker_gap: float | None = None,
 ) -> tuple[Array, Mask]:
-    """Corners (N, 2) px from starts about a pixel off, and which of them can be trusted (N,).
+    """Refine corners (N, 2) px from starts about a pixel off; returns them and which to trust (N,).
 
-    along: (N, 2, 2) px, columns: one square along the print's x, one along its y, so that no
-    neighbouring edge enters.  bright_diagonal: (N,) whether the white squares at a corner are the
-    one before it in x and y and the one behind it in both, or the other two.  marker_gap: on a
-    ChArUco board the white rim around a marker, in squares; markers stay out of the windows.
+    along: (N, 2, 2) px, columns: one square along the print's x, one along its y; keeps
+        neighbouring edges out of the windows.
+    bright_diagonal: (N,) whether the white squares at a corner are the one before it in x and y and
+        the one after it in both, or the other two.
+    marker_gap: on a ChArUco board the white rim around a marker, in squares; keeps markers out of
+        the windows.
     """
     if not len(start):
         return start, np.zeros(0, bool)
@@ -96,7 +101,7 @@ def refine_corners(
     if np.median(fit.sigma) > NOISY_PX:
         fit = _fit(patches(NOISY_RADIUS_PX), start, along, _common_light(fit))
     fitted, sigma = fit.state, fit.sigma
-    # b is the brightness of the squares where one edge distance is negative: not the diagonal.
+    # b is the brightness of squares where one edge distance is negative: not those on the diagonal.
     pixels, contrast = fitted[:, :2], np.where(bright_diagonal, -fitted[:, 5], fitted[:, 5])
     good = usual.weight.sum(axis=1) >= MIN_PIXELS
     good &= np.linalg.norm(pixels - start, axis=1) < MAX_MOVE_PX
@@ -104,14 +109,14 @@ def refine_corners(
     share = fit.residual / np.maximum(contrast, MIN_CONTRAST)
     good &= share < _limit(share[good], USUAL_RESIDUAL, MAX_RESIDUAL)
     good &= sigma < _limit(sigma[good], USUAL_SIGMA_PX, MAX_SIGMA_PX)
-    # At the picture's rim a corner seen on one side only is fitted well, but in the wrong place.
+    # At the image's rim a corner seen on one side only is fitted well, but in the wrong place.
     size = np.array(image.shape[::-1])
     good &= np.all((pixels >= MIN_BORDER_PX) & (pixels <= size - 1 - MIN_BORDER_PX), axis=1)
     return pixels, good
 
 
 def _limit(values: Array, usual: float, most: float) -> float:
-    """What a corner may have, by those that are good otherwise: (N,)."""
+    """Upper limit for a corner, given the values (N,) of those that are good otherwise."""
     median = float(np.median(values)) if len(values) else 0.0
     return float(np.clip(TIMES_MEDIAN * median, usual, most))
 
@@ -148,9 +153,12 @@ def _patches(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """state: (N, 9): corner (2), the angles of both edges' normals (2), blur, b, a, g (2).
+    """Fitted corners.
 
-    residual: (N,) RMS in grey levels.  variance: (N,) of a pixel.  covariance: (N, 9, 9).
+    state: (N, 9): corner (2), the angles of both edges' normals (2), blur, b, a, g (2).
+    residual: (N,) RMS in grey levels.
+    variance: (N,) of a pixel.
+    covariance: (N, 9, 9).
     """
 
     state: Array
@@ -160,14 +168,14 @@ class _Fit:
 
     @property
     def sigma(self) -> Array:
-        """(N,) px, of the corners' worse coordinates, from what the fit leaves over."""
+        """Sigma (N,) px of each corner's worse coordinate, estimated from the residuals."""
         corner = np.einsum("nii->ni", self.covariance)[:, :2]
         return np.asarray(np.sqrt(np.maximum(corner.max(axis=1), 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Light:
-    """What is known of g beforehand: mean (2,), and information (N, 2) in squared grey levels."""
+    """Prior knowledge of g: mean (2,), and information (N, 2) in squared grey levels."""
 
     mean: Array
     information: Array
@@ -182,8 +190,9 @@ class _Light:
 
 
 def _common_light(fit: _Fit) -> _Light:
-    """Light changes over a board much alike at all corners; in noise each by itself says little of
-    it, and what it says wrongly moves the corner. How much it does differ the corners tell."""
+    """A prior for g from all corners: light varies over a board much alike at all of them, while in
+    noise each alone says little of it, and a wrong g moves the corner. Its variation between
+    corners sets the prior's width."""
     slope = fit.state[:, 7:]
     mean = np.median(slope, axis=0)
     told = np.median(np.einsum("nii->ni", fit.covariance)[:, 7:], axis=0)
@@ -193,7 +202,7 @@ def _common_light(fit: _Fit) -> _Light:
 
 
 def _fit(patches: _Patches, start: Array, along: Array, light: _Light | None = None) -> _Fit:
-    """Every corner's image fitted to its patch."""
+    """Fit the image model to every corner's patch."""
     angles = np.arctan2(along[:, 1], along[:, 0]) + np.pi / 2.0
     state = np.column_stack(
         [start, angles, np.full(len(start), BLUR_PX), np.zeros((len(start), 4))]
@@ -221,8 +230,8 @@ def _fit(patches: _Patches, start: Array, along: Array, light: _Light | None = N
 
 
 def _linear(patches: _Patches, state: Array) -> Array:
-    """b, a and g (N, 4) by least squares for given edges: where no square differs yet and no light
-    falls off, the image is linear in them."""
+    """b, a and g (N, 4) by least squares for given edges: in a state without contrast and without
+    falling light, the image is linear in them."""
     even = np.column_stack([state[:, :5], np.tile([0.0, MIN_CONTRAST, 0.0, 0.0], (len(state), 1))])
     at = _equations(patches, even)
     step = solve_scaled(at.normal[:, 5:, 5:], at.gradient[:, 5:], np.full(len(state), UNSEEN))
@@ -238,9 +247,9 @@ def _equations(patches: _Patches, state: Array) -> StackedEquations:
 def sum_equations(
     place: Array, grey: Array, weight: Array, state: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """What `StackedEquations` holds, of pixels and weights as in `_Patches` at states (N, 9).
+    """The fields of `StackedEquations` for pixels and weights as in `_Patches` at states (N, 9).
 
-    Compiled, for it is most of the time in which boards are found: pixels without weight cost
+    Compiled, because it takes most of the time of finding boards: pixels without weight cost
     nothing, and no derivative is stored.
     """
     count, pixels = grey.shape
@@ -262,7 +271,7 @@ def sum_equations(
             squares = a + b * edge1 * edge2
             light = 1.0 + (x * state[n, 7] + y * state[n, 8]) / a
             residual = squares * light - grey[n, p]
-            # b times the other edge's value: what a change of one edge's value is worth.
+            # The effect of a change of one edge's value: b times the other edge's value.
             worth1 = b * light * edge2 * steep * math.exp(-0.5 * (across1 / blur) ** 2)
             worth2 = b * light * edge1 * steep * math.exp(-0.5 * (across2 / blur) ** 2)
             by[0] = -squares / a * state[n, 7] - worth1 * cos1 - worth2 * cos2

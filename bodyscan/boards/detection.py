@@ -24,7 +24,7 @@ from bodyscan.rig.board import Board
 
 MIN_CORNERS = 6
 Seen = dict[tuple[str, Appearance, bool], Markers]
-"""Markers found once a dictionary, at a quick look or a thorough one."""
+"""Markers found, once per dictionary, appearance, and quick or thorough search."""
 
 
 def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) -> list[BoardView]:
@@ -33,9 +33,11 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
     ChArUco boards and grids of AprilTags may be seen in part (at least 6 corners, not on one line),
     from either face, and be printed white on black, mirrored, or in OpenCV's other layout: the
     view's appearance says so.
-    A plain checkerboard must be seen whole; its views are `turnable` where the print looks the
-    same from both ends, and where it has two faces, which cannot be told apart (its corners are
-    then numbered as if it showed its front). Raises BadInput for a board that cannot be found.
+    A plain checkerboard must be seen whole. Its views are `turnable` if the print looks the same
+    from both ends, and if it has two faces, which cannot be told apart (its corners are then
+    numbered as if it showed its front).
+
+    Raises BadInput for a board that cannot be found.
     """
     views = []
     seen: Seen = {}
@@ -63,8 +65,10 @@ def _find_marked(
     seen: Seen,
     first: dict[str, int],
 ) -> SightedCorners | None:
-    """The board as printed, or else white on black, or mirrored; of a dictionary only the first so many
-    markers are printed."""
+    """Find a board as printed, or else white on black, or mirrored.
+
+    first: number of the markers, by dictionary, that are printed at all.
+    """
     for appearance in (AS_PRINTED, *OTHERWISE):
         picture = appearance.as_printed(image)
         if board.kind == "aprilgrid":
@@ -83,7 +87,7 @@ def _find_marked(
 def _find_charuco(
     picture: Bytes, board: Board, appearance: Appearance, seen: Seen, first: int
 ) -> SightedCorners | None:
-    """At a quick look, and where markers are missing at a thorough one."""
+    """Find a board by a quick search, followed by a thorough one if markers are missing."""
 
     def look(quick: bool) -> Markers:
         key = board.dictionary, appearance, quick
@@ -91,7 +95,7 @@ def _find_charuco(
             seen[key] = detect_markers(picture, board, first=first, quick=quick)
         return seen[key]
 
-    if appearance == AS_PRINTED:  # which nearly all are
+    if appearance == AS_PRINTED:  # true of nearly all
         markers = look(quick=True)
         placed = place_markers(board, markers)
         if placed is not None and placed.believed and placed.all_seen(picture.shape):
@@ -101,7 +105,7 @@ def _find_charuco(
 
 
 def _determines_plane(found: SightedCorners) -> bool:
-    """At least six corners (four on a board that has no more), not all on one line."""
+    """Whether there are six corners (four on a board that has no more), not all on one line."""
     if len(found.ids) < min(MIN_CORNERS, found.printed_count):
         return False
     spread = np.linalg.svd(found.pixels - found.pixels.mean(axis=0), compute_uv=False)

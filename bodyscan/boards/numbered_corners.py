@@ -1,4 +1,4 @@
-"""Corners that another program found on a board, numbered as ours are."""
+"""Corners of a board found by another program, numbered as ours are."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from bodyscan.rig.board import Board
 def number_corners(
     pixels: Array, board: Board, size: tuple[int, int], *, pair: str, shot: str, where: str
 ) -> BoardView | None:
-    """The view of a board with all its corners, row by row, (N, 2) px, NaN where one was not found;
-    None for no corner at all.
+    """The view of a board given all its corners row by row, (N, 2) px, NaN where one was not found.
 
-    Rows may run from either side: a board is seen from its front. From which end a plain board is
-    numbered is left open where its print looks the same turned.  size: of the picture, px.
+    Rows may run from either side: a board is seen from its front. If a plain board's print looks
+    the same turned, the end from which it is numbered is left open. None if there is no corner at
+    all.
+    size: of the image, px.
 
-    Raises CaptureError when there are not as many as the board has, or one lies outside the picture.
+    Raises CaptureError if the number of corners differs from the board's, or one is outside the
+    image.
     """
     grid_width = board.columns - 1 if board.kind != "aprilgrid" else 2 * board.columns
     count = len(corner_points(board))
@@ -50,7 +52,7 @@ def number_corners(
 
 
 def _turns_left(grid: Array) -> bool:
-    """Whether (R, C, 2) px of a grid run the other way round than columns and rows of a print do."""
+    """Whether (R, C, 2) px of a grid have the opposite handedness to a print's columns and rows."""
     along = np.diff(grid, axis=1)[:-1]
     across = np.diff(grid, axis=0)[:, :-1]
     return bool(np.nansum(along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]) < 0.0)

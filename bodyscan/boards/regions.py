@@ -1,7 +1,7 @@
-"""Where in an image a checkerboard may be: where saddles of grey crowd together.
+"""Where in an image a checkerboard may be: where saddles of grey levels cluster.
 
-OpenCV's quick detector finds fine, slanted or dim boards more readily in a picture of the board
-alone; and where saddles are missing no detector need be asked.
+OpenCV's quick detector finds fine, slanted or dim boards more readily in an image of the board
+alone; and where there are no saddles no detector need be run.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ MARGIN = 0.15
 SCALES = (1.0, 0.5, 0.25)  # fine boards, blurred ones, large ones out of focus
 NEIGHBOURS = 8
 ASTRAY = 0.25  # of a step: opposite neighbours of a slanted board at its worst, and noise
-LEAST_ANGLE = 0.3  # sine, between the two directions
-FEWEST_WITHIN = 4  # corners with neighbours all round; with fewer a lattice proves nothing
-LEAST_WITHIN = 0.3  # of these are found lattice-like on the poorest boards that a detector finds
+LEAST_ANGLE = 0.3  # sine of the angle between the two directions
+FEWEST_WITHIN = 4  # corners with neighbours all around; with fewer a lattice proves nothing
+LEAST_WITHIN = 0.3  # of these look like a lattice on the poorest boards that a detector finds
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Region:
 
     @property
     def area(self) -> int:
-        """px^2."""
+        """Area in px^2."""
         return (self.right - self.left) * (self.bottom - self.top)
 
     def cut(self, image: Bytes) -> Bytes:
@@ -50,9 +50,9 @@ class Region:
 
 
 def board_regions(image: Bytes, corners: int) -> list[Region]:
-    """Parts of the image (H, W) that hold saddles enough for a board of that many corners.
+    """Parts of the image (H, W) with enough saddles for a board of that many corners.
 
-    Clusters of saddles nearer to each other than one of `REACHES_PX`; the largest first.
+    Clusters of saddles closer together than one of `REACHES_PX`; the largest first.
     """
     points, _ = _strongest_saddles(image, 4 * corners + 100)
     height, width = image.shape
@@ -79,10 +79,11 @@ def board_regions(image: Bytes, corners: int) -> list[Region]:
 
 def shows_lattice(image: Bytes, size: tuple[int, int]) -> bool:
     """Whether the image (H, W) may show size[0] x size[1] corners of a checkerboard, at one of
-    `SCALES`: a tenth of a second, where asking every detector takes seconds.
+    `SCALES`.
 
-    A corner of a board is a saddle whose neighbours lie opposite each other in two directions, and
-    fall where it rises. Skin, cloth, markers and noise have saddles enough, but few like that.
+    It takes a tenth of a second, all detectors take seconds. A corner of a board is a saddle whose
+    neighbours lie opposite each other in two directions and fall where it rises. Skin, cloth,
+    markers and noise have enough saddles, but few like that.
     """
     within = (size[0] - 2) * (size[1] - 2)
     if within < FEWEST_WITHIN:
@@ -98,8 +99,11 @@ def shows_lattice(image: Bytes, size: tuple[int, int]) -> bool:
 
 
 def _like_a_lattice(points: NDArray[np.intp], angles: Array) -> int:
-    """How many saddles have neighbours as a board's corner has; points (N, 2) px, angles (N,) rad of
-    the direction in which each rises."""
+    """How many saddles have neighbours as a board's corner has.
+
+    points: (N, 2) px.
+    angles: (N,) rad, direction in which each saddle rises.
+    """
     if len(points) <= NEIGHBOURS:
         return 0
     near = np.asarray(cKDTree(points).query(points, NEIGHBOURS + 1)[1])[:, 1:]
@@ -118,8 +122,8 @@ def _like_a_lattice(points: NDArray[np.intp], angles: Array) -> int:
 
 
 def _strongest_saddles(image: Bytes, count: int) -> tuple[NDArray[np.intp], Array]:
-    """The (at most) `count` strongest saddles, (N, 2) px, by the Hessian's determinant measured
-    against the contrast around, and the direction (N,) rad in which each rises most."""
+    """The strongest saddles, at most `count`, (N, 2) px, by the Hessian's determinant relative to
+    the contrast around, and the direction (N,) rad in which each rises most."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR_PX)
     xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0)
     yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2)

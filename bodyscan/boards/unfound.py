@@ -1,6 +1,7 @@
-"""What an image shows where a board was not found: markers, grids, and how near they come to it.
+"""What an image shows if a board was not found: markers, grids, and how close they are to the
+board.
 
-Slow, a second or more an image: for images that ought to show a board.
+Slow, a second or more per image: meant for images that ought to show a board.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from bodyscan.boards.checkerboard import find_quickly
 from bodyscan.rig.board import LARGEST_DICTIONARIES, MARKERS_IN, Board
 
 FEW_MARKERS = 4
-"""Fewer may be chance: quadrilaterals whose insides happen to read as a marker."""
+"""Fewer may be chance: quadrilaterals that happen to read as a marker."""
 ENOUGH_MARKERS, ENOUGH_SHARE = 8, 0.8
 OTHER_SIDE = 0.2
-"""Of a marker's side; unrefined outlines lie up to a tenth within it."""
+"""Share of a marker's side; unrefined outlines are too small by up to a tenth."""
 OTHER_SIZES = (-2, -1, 1, 2)
 
 
 def describe_unfound(image: Bytes, board: Board) -> str:
-    """In words that follow the board's name: what the image (H, W) shows instead."""
+    """What the image (H, W) shows instead of the board, in words that follow the board's name."""
     if board.kind == "checkerboard":
         return _describe_grids(image, board)
     return _describe_markers(image, board)
@@ -79,7 +80,7 @@ def _markers(image: Bytes, board: Board, appearance: Appearance) -> Markers:
 
 
 def _agreeing(board: Board, markers: Markers) -> int:
-    """How many markers lie as on this board; 0 if too few do for it to be this one."""
+    """How many markers lie as on this board; 0 if too few to be this board."""
     if board.kind == "aprilgrid":
         tags = place_tags(board, markers)
         return tags.agreeing if tags else 0
@@ -90,7 +91,8 @@ def _agreeing(board: Board, markers: Markers) -> int:
 
 
 def _marker_side(board: Board, markers: Markers) -> float | None:
-    """mm, by where the markers' middles lie, whatever `marker_mm` says; None where they do not tell."""
+    """Side of a marker, mm, from the markers' spacing whatever `marker_mm` says; None if
+    unclear."""
     layouts = (board, board.model_copy(update={"legacy_layout": not board.legacy_layout}))
     for described in layouts if board.kind == "charuco" else (board,):
         ids, printed = marker_corners(described)
@@ -110,7 +112,7 @@ def _marker_side(board: Board, markers: Markers) -> float | None:
 
 
 def _other_dictionaries(image: Bytes, board: Board) -> str:
-    """Of which other dictionary there are more, if there are."""
+    """Words on another dictionary with more markers in the image, if there is one."""
     found = {
         name: len(detect_markers(image, board.model_copy(update={"dictionary": name})).ids)
         for name in LARGEST_DICTIONARIES
@@ -121,7 +123,8 @@ def _other_dictionaries(image: Bytes, board: Board) -> str:
 
 
 def _resized(board: Board, markers: Markers) -> Iterator[tuple[int, int, int]]:
-    """Other numbers of columns and rows that most markers fit: how many, minus the rows, columns."""
+    """Other numbers of columns and rows that most markers fit: how many, minus the rows,
+    columns."""
     sizes = [
         (board.columns + more, board.rows + taller)
         for more, taller in product((0, *OTHER_SIZES), repeat=2)
@@ -132,7 +135,7 @@ def _resized(board: Board, markers: Markers) -> Iterator[tuple[int, int, int]]:
         other = board.model_copy(update={"columns": columns, "rows": rows})
         agreeing = _agreeing(other, markers)
         if agreeing:
-            # The fewest rows that hold them all: rows below the last marker change nothing.
+            # The fewest rows that hold them all: rows below the last marker make no difference.
             yield agreeing, -rows, columns
 
 

@@ -8,17 +8,18 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.boards.appearance import AS_PRINTED, Appearance
 
 ViewKey = tuple[str, str, str]
-"""Pair, shot and board: which view."""
+"""Key of a view: pair, shot and board."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
     """A board as one camera saw it in one shot.
 
-    corner_ids: (N,) int, index into `board_layout.corner_points(board)` (front face first, then back).
+    corner_ids: (N,) int, index into `board_layout.corner_points(board)` (front face first, then
+        back).
     pixels: (N, 2) float64, real image coordinates, px.
     turnable: the detector may have numbered this board from its other end.
-    appearance: how a board with markers was printed or seen, where it was not as described.
+    appearance: how a board with markers was printed or seen, if not as described.
     """
 
     pair: str

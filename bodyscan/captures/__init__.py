@@ -1,7 +1,7 @@
 """Captures on disk: folders, the images in them, and what is wrong with either.
 
-Read in this order: folder (which image of which pair and shot lies where; listing, captures_file;
-timing: when), images (read and checked; image_header, image_faults, grey_png, grey_levels,
-exposures), check (a look at all of it before any work; unlisted_images), pattern_files (images for
-projectors).
+Read in this order: folder (where each image of each pair and shot lies; listing, captures_file;
+timing: when), images (reading and checking; image_header, image_faults, grey_png, grey_levels,
+exposures), check (a quick look at everything before any work; unlisted_images), pattern_files
+(images for projectors).
 """

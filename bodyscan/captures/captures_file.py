@@ -20,9 +20,12 @@ _REMEDY = "Correct captures.yaml; docs/formats.md explains every key."
 
 
 class ShotEntry(Model):
-    """One shot. `stripes`: pairs that took the whole stripe sequence; `lit`: the lit image alone.
+    """One shot.
 
-    With neither, the files that are there tell.
+    stripes: the pairs that took the whole stripe sequence.
+    lit: the pairs that took the lit image alone.
+
+    If both are missing, the files in the folder decide.
     """
 
     name: ShotName
@@ -42,7 +45,7 @@ class ShotEntry(Model):
 class CapturesFile(Model):
     """The whole captures.yaml.
 
-    simulated: what the simulator says of its images, and reports then say too.
+    simulated: set by the simulator; reports repeat it.
     timing: when each frame was taken, if that is known.
     """
 
@@ -64,7 +67,7 @@ class CapturesFile(Model):
 def load_captures_file(folder: Path, rig: Rig) -> CapturesFile:
     """Read the folder's captures.yaml and check it against the rig.
 
-    Raises CaptureError that lists every problem by line.
+    Raises CaptureError, which lists every problem by line.
     """
     path = folder / FILE_NAME
     return load_model(
@@ -77,7 +80,7 @@ def load_captures_file(folder: Path, rig: Rig) -> CapturesFile:
 
 
 def write_captures_file(folder: Path, captures: CapturesFile) -> None:
-    """Write captures.yaml into a folder; `load_captures_file` reads it as the same."""
+    """Write captures.yaml into a folder; `load_captures_file` reads back the same."""
     data = captures.model_dump(mode="json", exclude_none=True)
     write_text(folder / FILE_NAME, dump_yaml(data))
 

@@ -1,4 +1,4 @@
-"""Look a rig file and its captures over in a moment: nothing is decoded, nothing heavy imported."""
+"""A quick check of a rig file and its captures: nothing is decoded, nothing heavy imported."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from bodyscan.rig.sizes import odd_sizes
 FEWEST_SHOTS = 3
 ENOUGH_SHOTS = 6
 MANY_SHOTS = 3
-"""Where more shots than this have the same fault, they share a line."""
+"""If more shots than this have the same fault, they share a line."""
 COARSE = 4.0
-"""Grey levels: boundaries and corners rise by some 40 a pixel, so that they are off by 0.1 px, several
-times what a camera's own noise makes of them."""
-_READERS = 8  # waiting for a disk or a server, not computing
+"""Grey levels of rounding. Boundaries and corners rise by some 40 per pixel, so this moves them by
+0.1 px, several times the effect of a camera's own noise."""
+_READERS = 8  # threads that wait for a disk or a server, not for a processor
 
 
 @dataclass(frozen=True)
 class BadImage:
-    """An image that is missing or cannot be used, and why."""
+    """An image that is missing or unusable, and why."""
 
     path: Path
     pair: str
@@ -42,7 +42,7 @@ class BadImage:
 
 @dataclass(frozen=True)
 class PairCount:
-    """How many shots of the calibration captures a pair took part in, all images being right."""
+    """How many shots of the calibration captures a pair took part in, if all images are good."""
 
     pair: str
     pole: str | None
@@ -53,9 +53,12 @@ class PairCount:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What `check` found. `errors`: what must be mended besides images; `warnings`: what may be.
+    """What `check` found.
 
-    bad_images: missing or unusable, by pair, then shot. images: how many were looked at.
+    errors: what must be mended, besides images.
+    warnings: what should be looked at.
+    bad_images: missing or unusable, by pair, then shot.
+    images: how many were examined.
     """
 
     rig_path: Path
@@ -79,9 +82,9 @@ def check(
 ) -> CheckReport:
     """Check a rig file, the calibration captures it names, and scan folders if any are given.
 
-    known_errors: what is wrong with the files that it names as `known`.
+    known_errors: what is wrong with the files that the rig file names as `known`.
 
-    Raises RigFileError when the rig file is wrong: then nothing else can be looked at.
+    Raises RigFileError if the rig file is wrong: then nothing else can be checked.
     """
     rig = load_rig(rig_path)
     errors = list(known_errors)
@@ -114,7 +117,7 @@ def check(
     warnings += [NO_INVERSES] if any(map(_lacks_inverses, sequences)) else []
     warnings += _coarse_images(sequences)
     warnings += filter(None, map(describe_unlisted_images, captures))
-    if len(rig.pairs) > 1:  # one camera alone agrees with itself
+    if len(rig.pairs) > 1:  # a single camera cannot disagree
         warnings += [_turned(board) for board in rig.boards if board.looks_same_turned]
     warnings += (
         filter(None, map(_few, rig.pairs, counts)) if calibration and not rig.is_known else ()
@@ -133,7 +136,7 @@ def check(
 
 
 def report_lines(report: CheckReport) -> list[str]:
-    """The report as lines of text; bad images grouped by pair, shot and what is wrong."""
+    """The report as lines of text, with bad images grouped by pair, shot and fault."""
     rig = report.rig
     lines = [
         f"{report.rig_path}: rig {rig.name}: {_several(len(rig.pairs), 'pair')},"
@@ -157,7 +160,7 @@ def report_lines(report: CheckReport) -> list[str]:
 
 
 def _attempt(errors: list[str], work: Callable[..., Captures], *args: object) -> Captures | None:
-    """What `work` returns; if the captures cannot be opened the reason goes to `errors`."""
+    """Call `work`; if the captures cannot be opened, add the reason to `errors`."""
     try:
         return work(*args)
     except CaptureError as error:
@@ -166,7 +169,7 @@ def _attempt(errors: list[str], work: Callable[..., Captures], *args: object) ->
 
 
 def _bad_images(rig: Rig, sequence: ImageSequence, known: set[Path]) -> tuple[BadImage, ...]:
-    """Of those in which corners are `known` none is needed."""
+    """The unusable images of a sequence; none is needed if its corners are `known`."""
     camera = rig.pair(sequence.pair).camera
     missing = set(sequence.missing)
     faults = (
@@ -190,7 +193,8 @@ def _count(pair: Pair, good: list[ImageSequence]) -> PairCount:
 
 
 def _too_few(pair: Pair, count: PairCount) -> str | None:
-    """A pair needs three board poses with stripes, a camera alone three lit ones (Zhang 2000)."""
+    """Why a pair has too few shots, or None. It needs three board poses with stripes, a camera
+    alone three lit ones (Zhang 2000)."""
     have = count.stripe_shots + (0 if pair.projector else count.lit_shots)
     if have >= FEWEST_SHOTS:
         return None
@@ -202,7 +206,8 @@ def _too_few(pair: Pair, count: PairCount) -> str | None:
 
 
 def _few(pair: Pair, count: PairCount) -> str | None:
-    """Enough to calibrate, hardly enough to trust it."""
+    """A warning if there are enough shots to calibrate but
+    hardly enough to trust the result, or None."""
     have = count.stripe_shots + (0 if pair.projector else count.lit_shots)
     if not FEWEST_SHOTS <= have < ENOUGH_SHOTS:
         return None
@@ -220,7 +225,7 @@ def _empty_shots(captures: Captures) -> list[str]:
 
 
 def _coarse_images(sequences: list[ImageSequence]) -> list[str]:
-    """JPEG of low quality, by the first image of each pair."""
+    """Warn of low-quality JPEG, judged by the first image of each pair."""
     firsts = {s.pair: path for s in reversed(sequences) for path in s.paths[:1]}
     with ThreadPoolExecutor(_READERS) as pool:
         rounded = dict(zip(firsts, pool.map(_rounding, firsts.values()), strict=True))
@@ -235,7 +240,7 @@ def _coarse_images(sequences: list[ImageSequence]) -> list[str]:
 
 
 def _rounding(path: Path) -> float:
-    """Grey levels; 0 of what cannot be read, which is told elsewhere."""
+    """Rounding in grey levels; 0 if the file cannot be read, which is reported elsewhere."""
     try:
         return read_header(path).rounded
     except (NoImage, BadInput, OSError):
@@ -252,7 +257,7 @@ def _turned(board: Board) -> str:
 
 
 def _untied(rig: Rig, good: list[ImageSequence]) -> list[str]:
-    """Groups of pairs that took no shot in common: nothing can join them in one frame."""
+    """Groups of pairs without a common shot: nothing can join them in one frame."""
     groups: list[tuple[set[str], set[str]]] = []  # pairs and their shots
     for pair in rig.pairs:
         pairs, shots = {pair.name}, {s.shot for s in good if s.pair == pair.name}
@@ -285,8 +290,8 @@ def _frame_errors(calibration: Captures, good: list[ImageSequence]) -> list[str]
 
 
 def _bad_lines(bad: tuple[BadImage, ...]) -> list[str]:
-    """One line a pair, shot and fault, with the first file of each; one a pair and fault where many
-    shots have it."""
+    """One line per pair, shot and fault, with the first file of each; one per pair and fault if
+    many shots have it."""
     shots_of: dict[tuple[str, str], set[str]] = {}
     for image in bad:
         shots_of.setdefault((image.pair, image.what), set()).add(image.shot)

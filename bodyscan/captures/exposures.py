@@ -1,9 +1,10 @@
-"""Several exposures of one stripe sequence as one: the best of each pixel.
+"""Several exposures of one stripe sequence merged into one.
 
-A pixel that is not too bright in a longer exposure is less noisy there. Each image of the longer ones
-is brought to the unit of the shortest, short = a + b long, and averaged with it; b is found from
-the images. What nears white in an exposure counts for less and less of it, so that there is no seam.
-Source: Debevec and Malik, Recovering high dynamic range radiance maps (1997), for a linear camera.
+A pixel that is not too bright in a longer exposure is less noisy there. Each image of a longer
+exposure is brought to the unit of the shortest, short = a + b long, and averaged with it; a and b
+are found from the images. Near white an exposure's weight falls gradually, so that there is no
+seam. Source: Debevec and Malik, Recovering high dynamic range radiance maps (1997), for a linear
+camera.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from bodyscan.errors import ImageError
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 
 FULL, NONE = 215.0, 245.0
-"""Grey levels between which an exposure's weight falls to nothing: sensors bend before white."""
+"""Grey levels between which an exposure's weight falls to zero: sensors become non-linear below
+white."""
 
 DARKEST = 12.0
 FEWEST = 1000
@@ -25,15 +27,17 @@ MOST_SAMPLED = 200_000
 ROUNDS = 4
 OUTLYING = 4.0
 SHORTER = 0.95
-"""Times the brightness of the exposure before, below which it is no rounding but a shorter one."""
+"""Brightness relative to the exposure before, below which the difference is no rounding: the
+exposure is the shorter one."""
 
 
 def merge_exposures(stacks: Sequence[Greys], names: Sequence[str], where: str) -> Floats:
-    """(F, H, W) float32, in grey levels of the shortest exposure.
+    """Merge exposures into images (F, H, W) float32, in grey levels of the shortest.
 
-    stacks: (F, H, W) grey levels of each exposure, the shortest first, in which the same image has
-    the same place.  names: of the exposures.  Raises ImageError for exposures that are not in
-    their order, or that cannot be compared.
+    stacks: (F, H, W) grey levels of each exposure, the shortest first, images in equal order.
+    names: of the exposures.
+
+    Raises ImageError for exposures that are out of order or cannot be compared.
     """
     lines = [(0.0, 1.0)]
     for place in range(1, len(stacks)):
@@ -49,12 +53,13 @@ def merge_exposures(stacks: Sequence[Greys], names: Sequence[str], where: str) -
 
 
 def _merged(images: Sequence[Greys], lines: Sequence[tuple[float, float]]) -> Floats:
-    """One image (H, W) from its exposures; lines: what makes each the shortest's unit."""
+    """One image (H, W) from its exposures; lines: offset and slope that bring each to the
+    shortest."""
     total = images[0].astype(np.float32)
     weights = np.ones_like(total)
     for image, (offset, slope) in zip(images[1:], lines[1:], strict=True):
         level = image.astype(np.float32)
-        # Noise of the sensor shrinks with the unit: the weight is one over its variance.
+        # The sensor's noise shrinks with the unit: the weight is its inverse variance.
         weight = np.clip((NONE - level) / (NONE - FULL), 0.0, 1.0) / np.float32(slope * slope)
         total += weight * (np.float32(offset) + np.float32(slope) * level)
         weights += weight
@@ -64,7 +69,7 @@ def _merged(images: Sequence[Greys], lines: Sequence[tuple[float, float]]) -> Fl
 def _to_before(
     shorter: Greys, longer: Greys, names: Sequence[str], where: str
 ) -> tuple[float, float]:
-    """offset and slope: shorter = offset + slope * longer."""
+    """Offset and slope in shorter = offset + slope * longer."""
     step = max(1, shorter.size // MOST_SAMPLED // 8)
     one, other = (stack.reshape(-1)[::step].astype(float) for stack in (shorter, longer))
     seen = (np.maximum(one, other) > DARKEST) & (np.maximum(one, other) < FULL)
@@ -87,7 +92,7 @@ def _to_before(
 
 
 def _line(x: Array, y: Array) -> tuple[float, float]:
-    """offset and slope of y against x without what lies far off."""
+    """Offset and slope of y against x, without outliers."""
     near = np.ones(len(x), bool)
     slope, offset = 1.0, 0.0
     for _ in range(ROUNDS):

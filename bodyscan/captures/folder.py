@@ -1,4 +1,4 @@
-"""Capture folders: which image of which pair in which shot lies where, and what is missing."""
+"""Capture folders: where each image of each pair and shot lies, and which are missing."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import fill, has_field, shot_pattern, with_exposure
 
 SUFFIXES = {".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
-"""Of images, whatever takes them."""
+"""Suffixes of image files, whatever program wrote them."""
 
 Kind = Literal["calibration", "scan"]
 
@@ -33,11 +33,14 @@ Kind = Literal["calibration", "scan"]
 class ImageSequence:
     """The images that one pair took, or should have taken, in one shot.
 
-    coded: the images of the stripe code, in the order of `FrameNames.of_code`; () where only the
-    lit image, or that of the board, was taken. lit, dark, board: None where there is no such image.
-    missing: those of the paths that are not there.  inverses: those of `coded`.
-    exposure: its name, where the rig file names several; longer: the same images of the
-    longer ones, in their order.  crossing: those of `coded` that show the stripes which cross.
+    lit, dark, board: None if there is no such image.
+    coded: the images of the stripe code, in the order of `FrameNames.of_code`; () if only the lit
+        or the board image was taken.
+    missing: the paths that do not exist.
+    inverses: those among `coded`.
+    exposure: its name, if the rig file names several.
+    longer: the same images with the longer exposures, in their order.
+    crossing: those among `coded` that show the crossing stripes.
     """
 
     pair: str
@@ -54,13 +57,13 @@ class ImageSequence:
 
     @property
     def lacks_crossing(self) -> bool:
-        """Whether images of the stripes that cross are missing, and no others: it can do without."""
+        """Whether images are missing, all of them of crossing stripes, which can be spared."""
         crossing = {path for one in (self, *self.longer) for path in one.crossing}
         return bool(self.missing) and crossing.issuperset(self.missing)
 
     @property
     def without_crossing(self) -> ImageSequence:
-        """The same with the stripes of the first direction alone."""
+        """The same sequence without its crossing stripes."""
         own = {path for one in (self, *self.longer) for path in one.crossing}
 
         def rest(paths: tuple[Path, ...]) -> tuple[Path, ...]:
@@ -82,21 +85,22 @@ class ImageSequence:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Lit, dark and that of the board, if there are such, then those of the code; then those of
-        longer exposures."""
+        """Lit, dark and board image, as far as they exist, then the code's, then those of longer
+        exposures."""
         single = (self.lit, self.dark, self.board)
         own = (*(path for path in single if path is not None), *self.coded)
         return own + tuple(path for longer in self.longer for path in longer.paths)
 
     @property
     def seen_in(self) -> Path:
-        """The image in which boards are looked for; the first of the code if it has to be made."""
+        """The image in which boards are looked for; the code's
+        first if that image has to be made."""
         return self.board or self.lit or self.coded[0]
 
 
 @dataclass(frozen=True)
 class MissingImage:
-    """An image that should be there."""
+    """An image that should exist and does not."""
 
     path: Path
     pair: str
@@ -108,12 +112,15 @@ class MissingImage:
 
 @dataclass(frozen=True)
 class Captures:
-    """What one or more capture folders hold. `shots` in order; `sequences` by shot, then by pair.
+    """What one or more capture folders hold.
 
-    when, subject, simulated: of a scan, as its captures.yaml says.  corners: of the board in images in
-    which it was found elsewhere, px, () where it is not.  base: the folder that kept messages
-    are relative to; that of the rig file, or of the scan.  times: when frames were taken, where the
-    captures say so; described_in: the files in which they say that and all else.
+    shots: in order.
+    sequences: by shot, then by pair.
+    when, subject, simulated: of a scan, from its captures.yaml.
+    corners: of the board, px, for images in which another program found it; () where it did not.
+    base: the folder to which stored messages are relative: the rig file's, or the scan's.
+    times: when frames were taken, if the captures say so.
+    described_in: the files that say that and the rest.
     """
 
     rig: Rig
@@ -133,7 +140,7 @@ class Captures:
         return {(sequence.pair, sequence.shot): sequence for sequence in self.sequences}
 
     def sequence(self, pair: str, shot: str) -> ImageSequence | None:
-        """What that pair took in that shot, None if it took no part."""
+        """What that pair took in that shot, or None."""
         return self._by_pair_and_shot.get((pair, shot))
 
     def of_pair(self, pair: str) -> tuple[ImageSequence, ...]:
@@ -145,17 +152,19 @@ class Captures:
         return tuple(sequence for sequence in self.sequences if sequence.shot == shot)
 
     def frame_ms(self, shot: str, pair: str) -> dict[str, float] | None:
-        """When the pair took each frame of that shot, by the frame's name, in the order taken: ms from
-        when the first pair began to the middle of the exposure. None where nothing says so."""
+        """When the pair took each frame of that shot, by the frame's name, in the order taken.
+
+        In ms from the moment the first pair began to the middle of the exposure; None if unknown.
+        """
         times = self.times.get((shot, pair))
         return None if times is None else dict(times)
 
     def relative(self, text: str) -> str:
-        """A message with its paths relative to `base`, as it may be kept."""
+        """A message with its paths relative to `base`, fit to be stored."""
         return relative_text(text, self.base, self.folders)
 
     def missing(self) -> tuple[MissingImage, ...]:
-        """Every image that should be there and is not."""
+        """Every image that should exist and does not."""
         return tuple(
             MissingImage(path, sequence.pair, sequence.shot)
             for sequence in self.sequences
@@ -166,7 +175,7 @@ class Captures:
 def open_captures(rig: Rig, rig_path: Path) -> Captures:
     """The calibration captures that a rig file names, its folders joined.
 
-    Raises CaptureError when it names none, and as `open_folder` and `join_captures` do.
+    Raises CaptureError if it names none, and as `open_folder` and `join_captures` do.
     """
     if not rig.calibration:
         raise CaptureError(
@@ -181,7 +190,7 @@ def open_captures(rig: Rig, rig_path: Path) -> Captures:
 
 
 def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
-    """The captures of one folder of the rig file's `calibration` list. Raises as `open_scan`."""
+    """The captures in one folder of the rig file's `calibration` list. Raises as `open_scan`."""
     folder, template = capture_path(rig_path, entry), entry.files or rig.files
     if entry.corners is None:
         return _open(rig, folder, "calibration", template, entry.shots)
@@ -192,32 +201,35 @@ def open_folder(rig: Rig, rig_path: Path, entry: CaptureFolder) -> Captures:
 
 
 def _corners_by_path(corners: Mapping[str, Corners], template: str) -> dict[str, Corners]:
-    """By paths as the template makes them: wherever the images lay when corners were found in them,
-    their last parts are the same."""
+    """Corners by path as the template makes it: wherever the images were when another program found
+    the corners, the last parts of their paths are the same."""
     parts = template.count("/") + 1
     return {"/".join(name.split("/")[-parts:]): own for name, own in corners.items()}
 
 
 def capture_path(rig_path: Path, entry: CaptureFolder) -> Path:
-    """Where a folder of the rig file lies, without .. in its middle where that is the same."""
+    """Path of a folder in the rig file, with .. resolved where that leads to the same folder."""
     path = Path(rig_path).parent / entry.folder
-    short = os.path.normpath(path)  # not the same where a symbolic link comes before ..
+    short = os.path.normpath(path)  # differs if a symbolic link comes before ..
     return Path(short) if os.path.realpath(short) == os.path.realpath(path) else path
 
 
 def open_scan(rig: Rig, folder: Path) -> Captures:
     """The captures of one scan.
 
-    Raises CaptureError when the folder is not there, its captures.yaml is wrong or says that it is
-    no scan, no image of this rig lies in it, or a symbolic link leads out of it, where the rig does
-    not follow such.
+    Raises CaptureError if the folder does not exist, if its captures.yaml is wrong or says that
+    this is no scan, if it holds no image of this rig, or if a symbolic link leads out of it and the
+    rig does not follow links.
     """
     return _open(rig, Path(folder), "scan", rig.files, None)
 
 
 def open_check(rig: Rig, folder: Path) -> tuple[Kind, Captures]:
-    """Captures of either kind, for a check: what its captures.yaml says; without one a scan, unless
-    more than one shot lies in it. Raises as `open_scan`."""
+    """Captures of either kind, for a check. Raises as `open_scan`.
+
+    The kind is that of the folder's captures.yaml; without one, a scan unless it holds several
+    shots.
+    """
     listing = Listing(Path(folder), follow_links=rig.follow_links)
     file = load_captures_file(Path(folder), rig) if listing.has(FILE_NAME) else None
     kind: Kind = file.kind if file is not None else "scan"
@@ -228,9 +240,9 @@ def open_check(rig: Rig, folder: Path) -> tuple[Kind, Captures]:
 
 
 def join_captures(parts: tuple[Captures, ...]) -> Captures:
-    """Captures of several folders as one; a shot of the same name in two is the same moment.
+    """Join captures of several folders; shots with the same name are the same moment.
 
-    Raises CaptureError when two folders hold the same shot of the same pair.
+    Raises CaptureError if two folders hold the same shot of the same pair.
     """
     seen: dict[tuple[str, str], Path] = {}
     for part in parts:
@@ -320,7 +332,7 @@ def _open(
 def _times(
     captures: Captures, listing: Listing, timing: Timing | None
 ) -> tuple[FrameTimes, tuple[Path, ...]]:
-    """When frames were taken, and the file that says so if it is one of its own."""
+    """When frames were taken, and the file that says so if it is a separate one."""
     if timing is None:
         return {}, ()
     if timing.times is not None and not listing.has(timing.times):
@@ -341,7 +353,7 @@ def _times(
 
 
 def _folder_above(rig: Rig, folder: Path, template: str) -> Path | None:
-    """The folder that holds this one, if the template fits there and this one is a shot of it."""
+    """The parent folder, if the template fits there and this folder is one of its shots."""
     here = Path(os.path.abspath(folder))
     if not (template.startswith("{shot}/") and re.fullmatch(SHOT, here.name)):
         return None
@@ -350,7 +362,7 @@ def _folder_above(rig: Rig, folder: Path, template: str) -> Path | None:
 
 
 def _some_image(folder: Path) -> str:
-    """What an image there is named, to be compared with what it should be."""
+    """The name of some image in the folder, to compare with what was expected."""
     for place, _, names in os.walk(folder):
         for name in sorted(names):
             if Path(name).suffix.lower() in SUFFIXES:
@@ -359,13 +371,13 @@ def _some_image(folder: Path) -> str:
 
 
 def _some_frame(rig: Rig) -> str:
-    """The name of an image that there should be of every pair."""
+    """The name of an image that every pair should have."""
     code = rig.pairs[0].projector
     return rig.frames.board_image or (rig.frames.of_code(code)[0] if code else "")
 
 
 def _discover(rig: Rig, listing: Listing, template: str) -> tuple[str, ...]:
-    """Shots told from the names of the files: those with a lit image or the first of a code."""
+    """Shots found in the names of files: those with a lit image or a code's first image."""
     if not has_field(template, "shot"):
         name = listing.root.resolve().name
         if re.fullmatch(SHOT, name) and len(name) <= LONGEST_SHOT:
@@ -405,7 +417,7 @@ def _shots_matching(
 
 
 def _natural(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sorts b2 before b10."""
+    """Sort key that puts b2 before b10."""
     pieces = re.findall(r"\d+|\D+", name)
     return tuple((0, int(p), p) if p.isdecimal() else (1, 0, p) for p in pieces)
 
@@ -447,7 +459,7 @@ def _sequences(
 
 
 def _sequence(rig: Rig, listing: Listing, template: str, shot: str, pair: Pair) -> ImageSequence:
-    """The whole sequence; of a camera without projector, nothing."""
+    """The whole sequence; empty for a camera without a projector."""
     frames = rig.frames
     code = pair.projector if has_field(template, "frame") else None
     if code is None:
@@ -476,7 +488,7 @@ def _sequence(rig: Rig, listing: Listing, template: str, shot: str, pair: Pair) 
 def _exposed(
     whole: ImageSequence, rig: Rig, listing: Listing, templates: list[str]
 ) -> ImageSequence:
-    """The sequence with those of its longer exposures."""
+    """The sequence with its longer exposures added."""
     first, *others = zip(rig.exposures, templates, strict=True)
     longer = tuple(
         replace(_sequence(rig, listing, template, whole.shot, rig.pair(whole.pair)), exposure=name)
@@ -489,7 +501,7 @@ def _exposed(
 def _view_alone(
     rig: Rig, listing: Listing, template: str, shot: str, pair: Pair
 ) -> ImageSequence | None:
-    """The image of the board by itself; None if none is taken."""
+    """The board image alone; None if none is taken."""
     frames, files = rig.frames, _Files(listing, template, shot, pair.name)
     path = files.path(frames.board_image if has_field(template, "frame") else "")
     if path is None:
@@ -498,14 +510,14 @@ def _view_alone(
 
 
 class _Files:
-    """Paths of one pair's images in one shot; `missing` grows by those that are not there."""
+    """Paths of one pair's images in one shot; collects those that do not exist in `missing`."""
 
     def __init__(self, listing: Listing, template: str, shot: str, pair: str) -> None:
         self.listing, self.template, self.shot, self.pair = listing, template, shot, pair
         self.missing: list[Path] = []
 
     def path(self, frame: str | None) -> Path | None:
-        """None for no frame."""
+        """Path of a frame; None for no frame."""
         if frame is None:
             return None
         wanted = fill(self.template, shot=self.shot, pair=self.pair, frame=frame)

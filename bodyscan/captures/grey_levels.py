@@ -1,7 +1,8 @@
-"""What the numbers of an image file mean as grey levels, 0 to 255.
+"""What the numbers in an image file mean as grey levels, 0 to 255.
 
-A file of 16 bits a sample holds what the camera told: 16 bits, or 10, 12 or 14, at the low end of the
-number or at its high end. Nothing in the file says which; the numbers of a whole sequence do.
+A file with 16 bits per sample holds what the camera measured: 16 bits, or 10, 12 or 14 at the low
+or at the high end of the number. Nothing in the file says which; the numbers of a whole sequence
+do.
 """
 
 from __future__ import annotations
@@ -18,16 +19,17 @@ from bodyscan.errors import ImageError
 Raw = NDArray[np.uint8] | NDArray[np.uint16]
 USUAL_BITS = (10, 12, 14, 16)
 MOST_SAMPLED = 1 << 20
-"""Numbers that are looked at in one image: a file with 8 bits shows it in the first thousand."""
+"""Numbers examined per image: a file with 8 bits shows it within the first thousand."""
 
 
 def full_scale(images: Sequence[Raw], bits: int | None) -> float:
-    """The number that white has, of one sequence's images; 255 for 8-bit files.
+    """The number that stands for white in one sequence's images; 255 for 8-bit files.
 
-    bits: how many the camera tells; None: what the numbers look like. Too few are of no harm: a dim
-    sequence is taken for one of fewer bits, and only its unit of brightness is another.
-    Raises ImageError for numbers of 16 bits in which there are only 8, unless bits says so, and for
-    files of 8 bits if bits says more.
+    bits: how many the camera measures; None: judged by the numbers. Too few do no harm: a dim
+        sequence is taken for one of fewer bits, which changes only its unit of brightness.
+
+    Raises ImageError for 16-bit files that hold only 8 bits, unless `bits` says so, and for 8-bit
+    files if `bits` says more.
     """
     if images[0].dtype == np.uint8:
         if bits is not None and bits > 8:
@@ -54,8 +56,8 @@ def full_scale(images: Sequence[Raw], bits: int | None) -> float:
 
 
 def as_greys(image: Raw, scale: float) -> Greys:
-    """Grey levels of an image whose white is `scale`: as they are if that is 255 (whole ones), else
-    float32."""
+    """Grey levels of an image whose white is `scale`: unchanged if that is 255 (whole numbers),
+    else float32."""
     if image.dtype == np.uint8:
         return image.astype(np.uint8, copy=False)
     return np.minimum(image * np.float32(255.0 / scale), np.float32(255.0))

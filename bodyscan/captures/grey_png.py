@@ -1,7 +1,7 @@
-"""Grey PNG files, which is what cameras of a scanner write, in a third of OpenCV's time.
+"""Grey PNG files, the usual output of a scanner's cameras, decoded in a third of OpenCV's time.
 
-Reading is a large part of a scan's work. ISA-L inflates; the rows are put together here. Only
-8-bit grey that is not interlaced: all else is left to OpenCV. Source: PNG, ISO/IEC 15948:2004.
+Reading is a large part of a scan's work. ISA-L inflates; the rows are reconstructed here. Only
+8-bit grey without interlacing; the rest is left to OpenCV. Source: PNG, ISO/IEC 15948:2004.
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ SUB, UP, AVERAGE, PAETH = 1, 2, 3, 4
 
 
 def decode_grey_png(data: bytes, width: int, height: int, rows: int | None = None) -> Bytes | None:
-    """(height, width) uint8, or its first rows; None if the file, whose chunks are sound, shows
-    something else than a grey image of that size, or nothing."""
+    """Decode an image, or its first rows: (height, width) uint8; the chunks must be sound.
+
+    None if the file is not a grey image of that size, or does not decode.
+    """
     if data[16:29] != struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0):
         return None
     packed = b"".join(content for kind, content, _ in png_chunks(data) if kind == b"IDAT")
-    # No more is inflated than is wanted, whatever the file holds.
+    # Inflate no more than is wanted, whatever the file holds.
     wanted = height if rows is None else min(rows, height)
     try:
         filtered = isal_zlib.decompressobj().decompress(packed, wanted * (width + 1))
@@ -41,8 +43,8 @@ def decode_grey_png(data: bytes, width: int, height: int, rows: int | None = Non
 
 @compiled
 def _unfilter(rows: Bytes, image: Bytes) -> bool:
-    """Fills in the image (H, W) from its rows (H, W + 1), each behind the number of its filter;
-    false if there is no such filter."""
+    """Fill the image (H, W) from its rows (H, W + 1), each preceded by its filter number; False if
+    there is no such filter."""
     above = np.zeros(image.shape[1], np.uint8)
     for v in range(len(rows)):
         kind, row = rows[v, 0], rows[v, 1:]

@@ -1,4 +1,4 @@
-"""What is wrong with an image file as far as its header tells, in words, without decoding it."""
+"""What is wrong with an image file, in words, as far as its header tells."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NO_INVERSES = (
 
 
 def header_fault(path: Path, width: int, height: int) -> str | None:
-    """Why the file cannot be an image of that size, of 16 bits a sample or fewer, or None."""
+    """Why the file cannot be an image of that size with at most 16 bits per sample, or None."""
     try:
         header = read_header(path)
     except FileNotFoundError:
@@ -36,7 +36,7 @@ def header_fault(path: Path, width: int, height: int) -> str | None:
 
 
 def absence(path: Path) -> str:
-    """Why there is no such file: it is missing, or `*` in its name fits several."""
+    """Why a file was not found: it is missing, or `*` in its name matches several."""
     fitting = sorted(found.name for found in path.parent.glob(_plain(path.name)))
     if ANYTHING in path.name and len(fitting) > 1:
         return f"fits {len(fitting)} files, {fitting[0]} and {fitting[1]} among them"
@@ -44,13 +44,13 @@ def absence(path: Path) -> str:
 
 
 def _spelt_otherwise(path: Path) -> bool:
-    """Whether a name beside it is the same but for capitals, such as `.PNG` for `.png`."""
+    """Whether a neighbouring file differs only in capitals, such as `.PNG` for `.png`."""
     beside = path.parent.iterdir() if path.parent.is_dir() else ()
     return any(other.name.casefold() == path.name.casefold() for other in beside)
 
 
 def _plain(name: str) -> str:
-    """A pattern for glob, in which `*` alone has a meaning."""
+    """A glob pattern in which only `*` is special."""
     return name.replace("[", "[[]").replace("?", "[?]")
 
 
@@ -64,7 +64,7 @@ def image_error(what: str, path: Path, pair: str, shot: str, *, remedy: str = ""
 def missing_error(
     missing: Sequence[Path], inverses: Sequence[Path], pair: str, shot: str
 ) -> ImageError:
-    """An ImageError for one image or more that are not there, the first of them named.
+    """An ImageError for missing images, which names the first of them.
 
     inverses: those of the sequence, missing or not.
     """

@@ -1,7 +1,7 @@
-"""What an image file says of itself in its first bytes, and whether it is all there.
+"""What the first bytes of an image file say, and whether the file is complete.
 
-So that a wrong image is refused before it is decoded: an image of 60000 x 60000 pixels fits into a
-few kilobytes of file and fills the memory.
+A wrong image is thus refused before it is decoded: an image of 60000 x 60000 pixels fits into a few
+kilobytes of file and fills the memory.
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ _JPEG_END = b"\xff\xd9"
 _BMP = b"BM"
 _TIFF = (b"II*\0", b"MM\0*")
 _MOST_TAGS, _MOST_STRIPS = 1000, 1 << 20
-_TAIL = 65536  # some writers add a few bytes behind the end
+_TAIL = 65536  # some writers add a few bytes after the end
 
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Width and height in pixels, bits a sample, and whether the end of the image is there.
+    """Width and height in pixels, bits per sample, and whether the end of the image is there.
 
-    rounded: grey levels, RMS, by which JPEG's rounding may be off, where an image has sharp edges
-    everywhere, as stripes are."""
+    rounded: RMS error of JPEG's rounding, in grey levels, for an image with sharp edges everywhere,
+        such as stripes.
+    """
 
     width: int
     height: int
@@ -42,12 +43,15 @@ class ImageHeader:
 
 
 class NoImage(Exception):
-    """Not the start of a PNG, JPEG, BMP or TIFF file; says why."""
+    """Raised for what is not the start of a PNG, JPEG, BMP or TIFF file; says why."""
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Raises NoImage when `path` is no file of these kinds, BadInput when it is
-    not a regular file, OSError when it cannot be read."""
+    """Read the header of an image file.
+
+    Raises NoImage if `path` is not of a known kind, BadInput if it is not a regular file, OSError
+    if it cannot be read.
+    """
     with open_regular(path) as stream:
         start = stream.read(33)
         if not start:
@@ -66,7 +70,7 @@ def read_header(path: Path) -> ImageHeader:
 
 
 def png_damage(data: bytes) -> str | None:
-    """What is wrong with the chunks of a whole PNG file (ends early, checksum wrong), or None.
+    """What is wrong with the chunks of a whole PNG file (ends early, wrong checksum), or None.
 
     libpng decodes such a file as far as it gets and leaves the rest of the image as it is.
     """
@@ -81,8 +85,8 @@ def png_damage(data: bytes) -> str | None:
 
 
 def png_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview, int]]:
-    """Kind, content and checksum of every chunk of a whole PNG file. Raises NoImage where it ends
-    before its last chunk does."""
+    """Kind, content and checksum of every chunk of a whole PNG file. Raises NoImage if the file
+    ends before its last chunk does."""
     place, kind = len(_PNG), b""
     while kind != b"IEND":
         if place + 12 > len(data):
@@ -107,7 +111,7 @@ def _png_header(start: bytes) -> tuple[int, int, int]:
 
 
 def _jpeg_header(stream: BinaryIO) -> tuple[int, int, int, float, int]:
-    """Width, height, bits, what rounding leaves, and where the frame header ends. Source: ITU-T T.81,
+    """Width, height, bits, rounding error, and where the frame header ends. Source: ITU-T T.81,
     Annex B."""
     rounded = 0.0
     stream.seek(2)
@@ -140,9 +144,9 @@ def _jpeg_header(stream: BinaryIO) -> tuple[int, int, int, float, int]:
 
 
 def _rounding(tables: bytes) -> float:
-    """Of the first table, that of brightness; 0.0 if it is not among these.
+    """RMS rounding error of the first table, that of brightness; 0.0 if it is not among these.
 
-    A coefficient rounded to multiples of q errs by q / sqrt(12); the transform keeps squares.
+    A coefficient rounded to multiples of q errs by q / sqrt(12); the transform preserves squares.
     """
     while len(tables) > 64:
         wide, which = divmod(tables[0], 16)
@@ -155,8 +159,10 @@ def _rounding(tables: bytes) -> float:
 
 
 def _bmp_header(start: bytes, size: int) -> ImageHeader:
-    """Source: BITMAPINFOHEADER, Windows GDI. Rows are padded to four bytes; a negative height means
-    that the first row is on top."""
+    """Header of a BMP file. Rows are padded to four bytes; a negative height means top row first.
+
+    Source: BITMAPINFOHEADER, Windows GDI.
+    """
     if len(start) < 30:
         raise NoImage("is cut short")
     offset, kind, width, height, _, bits = struct.unpack_from("<IIiiHH", start, 10)
@@ -169,7 +175,7 @@ def _bmp_header(start: bytes, size: int) -> ImageHeader:
 
 
 def _tiff_header(stream: BinaryIO) -> ImageHeader:
-    """Of the first image of the file. Source: TIFF 6.0, sections 2 and 8."""
+    """Header of the file's first image. Source: TIFF 6.0, sections 2 and 8."""
     size = stream.seek(0, 2)
     stream.seek(0)
     order = "<" if stream.read(4)[:1] == b"I" else ">"
@@ -202,14 +208,14 @@ _TAGS = (_WIDTH, _HEIGHT, _BITS, _STRIPS, _STRIP_BYTES, _TILES, _TILE_BYTES)
 
 
 def _lengths(tags: dict[int, tuple[int, ...]]) -> tuple[int, ...]:
-    """Bytes of each strip or tile."""
+    """Length of each strip or tile in bytes."""
     return tags.get(_STRIP_BYTES, tags.get(_TILE_BYTES, ()))
 
 
 def _tiff_values(
     stream: BinaryIO, order: str, kind: int, count: int, content: bytes
 ) -> tuple[int, ...]:
-    """Of one entry: short or long whole numbers, in the entry itself if they fit."""
+    """Values of one entry: short or long whole numbers, in the entry itself if they fit."""
     form = {3: "H", 4: "I"}.get(kind)
     if form is None or not 0 < count <= _MOST_STRIPS:
         raise NoImage("is damaged (its TIFF header is wrong)")
@@ -222,7 +228,7 @@ def _tiff_values(
 
 
 def _read(stream: BinaryIO, form: str) -> tuple[Any, ...]:
-    """What comes next in the file. Raises NoImage where it ends."""
+    """Unpack the next bytes of the file. Raises NoImage if it ends."""
     content = stream.read(struct.calcsize(form))
     if len(content) < struct.calcsize(form):
         raise NoImage("is cut short")
@@ -230,7 +236,7 @@ def _read(stream: BinaryIO, form: str) -> tuple[Any, ...]:
 
 
 def _ends_with(stream: BinaryIO, start: int, mark: bytes) -> bool:
-    """Whether `mark` stands near the end of the file, behind `start`."""
+    """Whether `mark` occurs near the end of the file, after `start`."""
     size = stream.seek(0, 2)
     stream.seek(max(start, size - _TAIL))
     return mark in stream.read()

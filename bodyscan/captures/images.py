@@ -35,8 +35,10 @@ BLUE_GREEN_RED = ("blue", "green", "red")
 class StripeImages:
     """The images of one stripe sequence, grey levels 0 to 255.
 
-    lit, dark: (H, W), None where none was taken. coded: (F, H, W), the images of the code in the
-    order of `FrameNames.of_code`. All uint8, or float32 where files or exposures tell more.
+    lit, dark: (H, W), None if not taken.
+    coded: (F, H, W), the code's images in the order of `FrameNames.of_code`.
+
+    All uint8, or float32 if files or exposures resolve more.
     """
 
     pair: str
@@ -49,8 +51,12 @@ class StripeImages:
 def read_image(
     path: Path, camera: CameraSpec, *, pair: str = "", shot: str = "", lit: bool = False
 ) -> Bytes:
-    """One image as whole grey levels, (height, width) uint8. Raises ImageError as `_read_raw`, and
-    as `full_scale`; `lit`: the image should show something, and is refused if it is black."""
+    """One image as whole grey levels, (height, width) uint8.
+
+    lit: the image should show something, and is refused if it is black.
+
+    Raises ImageError as `_read_raw` and `full_scale`.
+    """
     raw = _read_raw(path, camera, pair, shot)
     image = whole_grey(as_greys(raw, _scale([raw], camera, path, pair, shot)))
     if lit:
@@ -59,11 +65,10 @@ def read_image(
 
 
 def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
-    """The image of a sequence in which boards are looked for, (H, W) uint8: that of the board, the
-    lit one, or where neither was taken, one made from the images of the code. Of several exposures it
-    is the shortest.
+    """The image in which boards are looked for, (H, W) uint8.
 
-    Raises ImageError as `read_image`.
+    This is the board image, the lit one, or if neither was taken one made from the code's images.
+    Of several exposures it is the shortest. Raises ImageError as `read_image`.
     """
     path = sequence.board or sequence.lit
     if path is not None or pair.projector is None:
@@ -79,11 +84,10 @@ def read_board_image(sequence: ImageSequence, pair: Pair) -> Bytes:
 def read_sequence(
     sequence: ImageSequence, camera: CameraSpec, *, crop: Crop = WHOLE, workers: int = THREADS
 ) -> StripeImages:
-    """All images of a stripe sequence, of these rows and columns; of several exposures, the best of
-    each pixel.
+    """All images of a stripe sequence, cut to `crop`; several exposures are merged.
 
-    Raises ImageError as `read_image`, where exposures are not in their order, and where the sequence
-    is an image of the board alone.
+    Raises ImageError as `read_image`, if exposures are out of order, and if the sequence is a board
+    image alone.
     """
     if not sequence.has_stripes:
         raise ImageError(
@@ -106,7 +110,8 @@ def read_sequence(
 
 
 def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers: int) -> Greys:
-    """(F, H, W) grey levels of one exposure: lit and dark, if there are such, and those of the code."""
+    """Grey levels (F, H, W) of one exposure: lit and dark,
+    if they exist, then the code's images."""
     taken = [path for path in (sequence.lit, sequence.dark) if path is not None]
     paths = (*taken, *sequence.coded)
     missing = [path for path in paths if path in sequence.missing]
@@ -116,7 +121,7 @@ def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers
         _read_raw, camera=camera, pair=sequence.pair, shot=sequence.shot, rows=crop[0].stop
     )
     first = read(paths[0])
-    # What white is in files of 16 bits, all of their numbers tell.
+    # In 16-bit files white is found from all numbers, so these are cropped afterwards.
     early, late = (crop, WHOLE) if first.dtype == np.uint8 else (WHOLE, crop)
     stack = np.empty((len(paths), *first[early].shape), first.dtype)
     stack[0] = first[early]
@@ -137,7 +142,7 @@ def _read_stack(sequence: ImageSequence, camera: CameraSpec, crop: Crop, workers
 
 
 def _scale(images: list[Raw], camera: CameraSpec, path: Path, pair: str, shot: str) -> float:
-    """See `full_scale`."""
+    """See `full_scale`; its errors name the file."""
     try:
         return full_scale(images, camera.bits)
     except ImageError as error:
@@ -145,12 +150,14 @@ def _scale(images: list[Raw], camera: CameraSpec, path: Path, pair: str, shot: s
 
 
 def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str, rows: int | None = None) -> Raw:
-    """The numbers of an image file, (height, width) uint8 or uint16; of a colour image those of the
-    camera's channel, grey being luma.  rows: no more than the first need be read.
+    """The numbers in an image file, (height, width) uint8 or uint16; of a colour image those of the
+    camera's channel, where grey is luma.
 
-    The size is compared with the header before anything is decoded. A turn noted in EXIF is not
-    applied, since it would swap the camera's axes. Raises ImageError: missing, no image, of the wrong
-    size or depth, cut short, damaged, without the channel.
+    rows: only so many rows, from the first, need be read.
+
+    The size is checked in the header before anything is decoded. A rotation noted in EXIF is not
+    applied, since it would swap the camera's axes. Raises ImageError for a file that is missing, no
+    image, of the wrong size or depth, cut short, damaged, or without the channel.
     """
     width, height = camera.width, camera.height
     fault = header_fault(path, width, height)
@@ -181,7 +188,7 @@ def _read_raw(path: Path, camera: CameraSpec, pair: str, shot: str, rows: int | 
 
 
 def _decoded(data: bytes, channel: str) -> Raw | None:
-    """(H, W) of a grey image and of channel grey, else (H, W, 3); None if it cannot be decoded."""
+    """(H, W) if the image or the channel is grey, else (H, W, 3); None if it cannot be decoded."""
     colour = cv2.IMREAD_GRAYSCALE if channel == "grey" else cv2.IMREAD_ANYCOLOR
     flags = colour | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

@@ -1,4 +1,4 @@
-"""What lies in a capture folder, looked up without ever leaving it."""
+"""Look-ups in a capture folder that never leave it."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from bodyscan.rig.templates import ANYTHING, names_pattern
 
 
 class Listing:
-    """Reads each folder once; refuses symbolic links that lead out of the capture folder, unless they
-    are meant."""
+    """Reads each folder once; refuses symbolic links that lead out of the capture folder unless
+    `follow_links`."""
 
     def __init__(
         self, root: Path, *, follow_links: bool = False, named: Iterable[str] = ()
     ) -> None:
-        """named: files that count as being there, such as images whose corners are known.
+        """named: files that count as present, such as images whose corners are known.
 
-        Raises CaptureError when `root` is no folder, unless there are such.
+        Raises CaptureError if `root` is not a folder and `named` is empty.
         """
         self._named: dict[str, dict[str, bool]] = {}
         for path in named:
@@ -36,7 +36,7 @@ class Listing:
         self._entries: dict[str, dict[str, bool]] = {}
 
     def has(self, relative: str) -> bool:
-        """Whether a file or folder of that relative path (parts joined by /) is there."""
+        """Whether a file or folder with that relative path (parts joined by /) exists."""
         parent, _, name = relative.rpartition("/")
         is_link = self._read(parent).get(name)
         if is_link is None:
@@ -49,7 +49,8 @@ class Listing:
         return path.exists()
 
     def find(self, relative: str) -> str:
-        """The path itself; of one with `*` in it the only one that fits, if there is just one."""
+        """The path itself; if it contains `*`, the only file
+        that matches, provided there is just one."""
         if ANYTHING not in relative:
             return relative
         fitting = [""]
@@ -65,11 +66,11 @@ class Listing:
         return there[0] if len(there) == 1 else relative
 
     def names(self, relative: str) -> tuple[str, ...]:
-        """Names of what a folder holds, () if there is no such folder. "" is the root."""
+        """Names in a folder, () if it does not exist. "" is the root."""
         return tuple(self._read(relative))
 
     def _read(self, relative: str) -> dict[str, bool]:
-        """Name -> whether it is a symbolic link, for what a folder holds."""
+        """Names in a folder, and whether each is a symbolic link."""
         if relative not in self._entries:
             there = relative == "" or self.has(relative)
             found = self._scan(self.root / relative) if there else {}

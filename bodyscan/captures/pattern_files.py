@@ -1,4 +1,4 @@
-"""The images a rig's projectors show, as PNG files with a list of their order."""
+"""The images that a rig's projectors show, as PNG files with a list of their order."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ LIST_NAME = "patterns.json"
 
 
 def uneven_stripes(rig: Rig, width: int, height: int) -> tuple[str, ...]:
-    """A note on each kind of projector whose stripes cannot all be equally wide.
+    """A note on each kind of projector whose stripes cannot all have the same width.
 
-    Their boundaries lie up to half a projector pixel from where even stripes would have them: free
-    planes take that as it is, models that are smooth in s do not. Waves of light need no whole
-    pixels.
+    Their boundaries lie up to half a projector pixel from those of even stripes: free planes absorb
+    that, models that are smooth in s do not. Waves of light need no whole pixels.
     """
     kinds = {way for pair in rig.pairs if pair.projector for way in pair.projector.directions}
     counts = {
@@ -41,10 +40,12 @@ def uneven_stripes(rig: Rig, width: int, height: int) -> tuple[str, ...]:
 
 
 def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, ...]:
-    """A folder of images for each kind of projector in the rig; its list is written last.
+    """Write a folder of images for each kind of projector in the rig, and last its list.
 
-    width, height: of the projector's image, px. Returns the lists. Raises BadInput for a rig whose
-    projectors show no images, and as `pattern_frames`.
+    width, height: of the projector's image, px.
+
+    Returns the lists. Raises BadInput for a rig whose projectors show no images, and as
+    `pattern_frames`.
     """
     kinds: dict[StripeCode, list[Pair]] = {}
     for pair in rig.pairs:
@@ -57,7 +58,7 @@ def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, 
             remedy="an instrument with code: stripe-index projects stripes of its own",
         )
     names = _folder_names(tuple(kinds))
-    # Every kind is made before the first is written: one that does not fit writes nothing.
+    # Make every kind before writing the first: if one does not fit, nothing is written.
     made = {kind: pattern_frames(kind, width, height) for kind in kinds}
     return tuple(
         _write_kind(Path(out) / names[kind], rig.frames, kind, pairs, made[kind])
@@ -66,7 +67,7 @@ def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, 
 
 
 def _folder_names(kinds: tuple[StripeCode, ...]) -> dict[StripeCode, str]:
-    """Such as gray-640-horizontal, with a number where that is not enough."""
+    """Names such as gray-640-horizontal, numbered if they would be equal."""
     names: dict[StripeCode, str] = {}
     for kind in kinds:
         ways = "-".join(f"{way.stripes}-{way.direction}" for way in kind.directions)
@@ -102,8 +103,8 @@ def _write_kind(
 
 
 def _in_order(frames: FrameNames, kind: StripeCode, coded: Bytes) -> Iterator[tuple[str, Bytes]]:
-    """Name and image (H, W): lit and dark if they are taken, then those of the code as they are best
-    shown."""
+    """Name and image (H, W) in the best order to show: lit and dark if they are taken, then the
+    code's."""
     blank = np.zeros(coded.shape[1:], np.uint8)
     if frames.lit is not None:
         yield frames.lit, blank + 255

@@ -1,7 +1,7 @@
-"""When each frame was taken: `timing` of captures.yaml, and the file of times that it may name.
+"""When each frame was taken: `timing` in captures.yaml, and the file of times that it may name.
 
-Times are of the middle of a frame's exposure (of several exposures, of the middle of all), in ms
-since the first pair began with that shot.
+A time is the middle of a frame's exposure (of several exposures, the middle of all), in ms since
+the first pair began with that shot.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import path_fault
 
 Sequences: TypeAlias = Mapping[tuple[str, str], tuple[str, ...]]
-"""Names of the frames that were taken, by shot and pair, in the rig's order of pairs."""
+"""Names of the frames taken, by shot and pair, in the rig's order of pairs."""
 
 FrameTimes: TypeAlias = Mapping[tuple[str, str], Mapping[str, float]]
-"""By shot and pair, then by frame: ms."""
+"""Times in ms, by shot and pair, then by frame."""
 
 LATEST_MS = 1e13
-"""Since 1970 it is 2e12: who gives that is understood."""
+"""Upper limit of a time. Milliseconds since 1970 are 2e12, and are accepted."""
 QUICKEST_MS, SLOWEST_MS = 0.01, 6e5
-"""Of a frame: a tenth of what the quickest projectors take, so that seconds are not taken for ms;
-ten minutes."""
+"""Limits of a frame's duration: a tenth of the quickest projectors', so that seconds are not
+mistaken for ms; ten minutes."""
 Milliseconds = Annotated[float, Field(ge=0.0, le=LATEST_MS)]
 FrameMilliseconds = Annotated[float, Field(ge=QUICKEST_MS, le=SLOWEST_MS)]
 Start = Literal["one-after-another", "together", "poles"] | dict[Name, Milliseconds]
 
 COLUMNS = ("shot", "pair", "frame", "ms")
 MOST_BYTES = 50_000_000
-"""A million frames."""
+"""Enough for a million frames."""
 
 _REMEDY = "Correct the file of times; docs/formats.md explains its columns."
 
@@ -46,9 +46,10 @@ _REMEDY = "Correct the file of times; docs/formats.md explains its columns."
 class Timing(Model):
     """The key `timing`: a steady rate, or a file of times.
 
-    frame_ms: from one frame to the next.  order: names of frames as they were taken; None: as
-    `FrameNames.of_sequence` lists them.  start: of each pair in every shot; one-after-another: in the
-    rig's order; together: all at once; poles: pairs of a pole one after another, all poles at once.
+    frame_ms: from one frame to the next.
+    order: names of frames in the order taken; None: as `FrameNames.of_sequence` lists them.
+    start: when pairs begin in each shot; one-after-another: in the rig's order; together: all at
+        once; poles: pairs of one pole one after another, all poles at once.
     times: a CSV file, relative to the capture folder.
     """
 
@@ -71,7 +72,8 @@ class Timing(Model):
 
 
 def timing_problems(timing: Timing, rig: Rig) -> Iterator[Problem]:
-    """What does not fit the rig: frames or pairs that it does not have, and those left out."""
+    """Find what does not fit the rig: frames or pairs that
+    it does not have, or that are left out."""
     known = [name for pair in rig.pairs for name in rig.frames.of_sequence(pair.projector)]
     order = known if timing.order is None else timing.order
     for index, name in enumerate(order):
@@ -108,14 +110,14 @@ def times_of_frames(timing: Timing, rig: Rig, sequences: Sequences, folder: Path
 
 
 def _steady(timing: Timing, names: Sequence[str], start: float) -> dict[str, float]:
-    """Times of one pair's frames, by the order they were taken in."""
+    """Times of one pair's frames, in the order in which they were taken."""
     ordered = [name for name in timing.order if name in names] if timing.order else names
     step = timing.frame_ms or 0.0
     return {name: start + (place + 0.5) * step for place, name in enumerate(ordered)}
 
 
 def _starts(timing: Timing, rig: Rig, counts: Mapping[str, int]) -> dict[str, float]:
-    """ms at which each pair began, by how many frames each took."""
+    """When each pair began, ms, given how many frames each took."""
     if isinstance(timing.start, dict):
         return dict(timing.start)
     starts: dict[str, float] = {}
@@ -159,7 +161,7 @@ def _rows(
     sequences: Sequences,
     found: dict[tuple[str, str], dict[str, float]],
 ) -> Iterator[tuple[int, str]]:
-    """Fills `found` from the rows of a file; line and words of what is wrong."""
+    """Fill `found` from the rows of a file; yields line and words for what is wrong."""
     rows = csv.reader(lines)
     header = tuple(word.strip() for word in next(rows, []))
     if header != COLUMNS:
@@ -189,7 +191,7 @@ def _row_fault(
     sequences: Sequences,
     found: Mapping[tuple[str, str], Mapping[str, float]],
 ) -> str | None:
-    """What is wrong with one row, None if nothing is."""
+    """What is wrong with one row, or None."""
     if len(words) != len(COLUMNS):
         return f"has {len(words)} columns, not {len(COLUMNS)}"
     shot, pair, frame, ms = words

@@ -1,4 +1,4 @@
-"""Images in a capture folder that the rig file names nowhere: often a folder that was renamed."""
+"""Images in a capture folder that the rig file does not name: often a folder was renamed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bodyscan.captures.folder import SUFFIXES, Captures
 
 
 def describe_unlisted_images(captures: Captures) -> str | None:
-    """How many there are, and one of them; None if there are none."""
+    """Say how many there are and name one; None if there are none."""
     found = find_unlisted_images(captures)
     if not found:
         return None
@@ -22,9 +22,9 @@ def describe_unlisted_images(captures: Captures) -> str | None:
 
 
 def find_unlisted_images(captures: Captures) -> list[Path]:
-    """Images beside those of the captures' shots that belong to no pair and frame of the rig file.
+    """Images next to those of the captures' shots that belong to no pair and frame of the rig file.
 
-    Shots that are not wanted are left alone.
+    Shots that are not wanted are ignored.
     """
     wanted = {path for sequence in captures.sequences for path in sequence.paths}
     beside = {path.parent.parent for path in wanted} | {path.parent for path in wanted}
@@ -37,7 +37,7 @@ def find_unlisted_images(captures: Captures) -> list[Path]:
         if path not in wanted
         and (
             _belongs(path.relative_to(folder), captures, path.parent in beside)
-            # of another shot, named alike but for the suffix
+            # of another shot whose name differs only in its suffix
             or (path.suffix not in suffixes and (len(path.parts), path.stem) in named)
         )
     )

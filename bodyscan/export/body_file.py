@@ -1,4 +1,4 @@
-"""One body to one file, with a JSON beside it that says what the file holds."""
+"""One body in one file, with a JSON beside it that says what the file holds."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ from bodyscan.version import __version__
 class Provenance:
     """What a body was made from: the subject's pseudonym (if any) and the calibration.
 
-    defaced: the head was replaced by a plain one.  found: what the scan says of itself (verdict,
-    sway, pairs left out).  rig_from_body: where the body's own frame lies, if the body is in that.
+    defaced: the head was replaced by a plain one.
+    found: the scan's own findings (verdict, sway, pairs left out).
+    rig_from_body: the pose of the body's own frame, if the body is given in that.
     """
 
     subject: str | None
@@ -36,10 +37,10 @@ class Provenance:
 
 
 def write_body(path: Path, body: BodyCloud | BodyMesh, origin: Provenance) -> None:
-    """Write `body` in the format that `path`'s suffix names, and `<path>.json` beside it; of a mesh
-    no faces without area.
+    """Write `body` in the format that `path`'s suffix names, and `<path>.json` beside it.
 
-    Raises BadInput for a suffix that is no format of ours, or none for a cloud.
+    A mesh is written without its faces of zero area. Raises BadInput for a suffix that is not one
+    of our formats, or one that cannot hold a cloud.
     """
     path = Path(path)
     format_ = _format_for(path, body)
@@ -61,7 +62,7 @@ def _format_for(path: Path, body: BodyCloud | BodyMesh) -> BodyFormat:
 def description(
     name: str, format_: BodyFormat, body: BodyCloud | BodyMesh, origin: Provenance
 ) -> dict[str, Any]:
-    """What the JSON beside an exported file of that name says."""
+    """Content of the JSON beside an exported file of that name."""
     in_body = origin.rig_from_body
     said: dict[str, Any] = dict(origin.found) | {
         "file": name,
@@ -93,6 +94,6 @@ def description(
 
 
 def _middle(sigma_mm: np.ndarray[Any, Any]) -> float | None:
-    """The median, None if nothing was measured."""
+    """The median; None if nothing was measured."""
     known = sigma_mm[np.isfinite(sigma_mm)]
     return float(np.median(known)) if known.size else None

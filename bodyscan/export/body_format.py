@@ -14,9 +14,13 @@ Content = Literal["mesh", "cloud", "colours", "normals", "sigma", "filled", "reg
 
 @dataclass(frozen=True)
 class BodyFormat:
-    """write: takes a path and a body, mm, z up.  holds: which bodies it takes (mesh, cloud or both)
-    and what a reader of the file learns of them.  unit: of the file.  axes: where its x, y and z
-    point, as the subject sees it.
+    """One file format.
+
+    write: writes a body, mm, z up, to a path.
+    holds: which bodies it takes (mesh, cloud or both) and what a reader of the file learns about
+        them.
+    unit: of the file.
+    axes: where its x, y and z point, as the subject sees it.
     """
 
     write: Callable[[Path, Any], None]

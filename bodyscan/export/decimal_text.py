@@ -1,4 +1,4 @@
-"""Numbers to decimal text, many at a time."""
+"""Numbers as decimal text, many at a time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bodyscan.arrays import Bytes, Indices
 
 
 def format_decimals(values: NDArray[np.floating], decimals: int) -> Bytes:
-    """Numbers (N,) as rows of text (N, width), filled up in front with zero bytes.
+    """Numbers (N,) as rows of text (N, width), padded in front with zero bytes.
 
     Rounded to `decimals` places; no number is written as -0.
     """
@@ -24,12 +24,12 @@ def format_decimals(values: NDArray[np.floating], decimals: int) -> Bytes:
 
 
 def format_integers(values: NDArray[np.integer]) -> Bytes:
-    """Whole numbers (N,), not negative, as rows of text (N, width)."""
+    """Non-negative integers (N,) as rows of text (N, width)."""
     return _digits(values.astype(np.int64), 1)
 
 
 def join_columns(columns: Sequence[Bytes | str]) -> bytes:
-    """Rows of text from columns, strings standing in every row; zero bytes left out."""
+    """Rows of text from columns; a string is repeated in every row, zero bytes are left out."""
     count = next(len(column) for column in columns if not isinstance(column, str))
     parts = []
     for column in columns:
@@ -42,7 +42,7 @@ def join_columns(columns: Sequence[Bytes | str]) -> bytes:
 
 
 def _digits(values: Indices, fewest: int) -> Bytes:
-    """(N, width) digits; zero bytes instead of leading zeros, but at least `fewest` digits."""
+    """Digits (N, width); zero bytes instead of leading zeros, but at least `fewest` digits."""
     width = max(fewest, len(str(int(values.max(initial=0)))))
     digits = np.empty((len(values), width), np.uint8)
     rest = values

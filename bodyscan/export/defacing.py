@@ -1,8 +1,8 @@
 """A body without a recognisable face: the head above the neck is replaced, not smoothed.
 
-Smoothing leaves the triangles of the head as they were, and from how dense they lie what the face
-looked like can still be guessed.  So everything above the neck goes, and a plain ellipsoid of usual
-proportions, which knows of the head only how high it stood, is put on the neck.
+Smoothing keeps the triangles of the head, and their density still hints at the face. So everything
+above the neck is removed, and a plain ellipsoid of usual proportions, for which only the height of
+the head is known, is put on the neck.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from bodyscan.mesh.topology import (
 
 GREY = 150
 RINGS = 40
-# Of the height from neck to crown: half the head's length and breadth, where it is widest, and
-# where the neck's own shape ends.
+# Shares of the height from neck to crown: half the head's length and breadth, where it is widest,
+# and where the neck's own shape ends.
 HALF_LENGTH, HALF_BREADTH, WIDEST, NECK_ENDS = 0.36, 0.28, 0.52, 0.45
-HARMONICS = 4  # of the neck's outline, which the head goes on from
+HARMONICS = 4  # of the neck's outline, from which the head continues
 ROUNDED_MM = 10.0  # the head's height is kept no more exactly than this
 _MENDINGS = 50
 
@@ -36,9 +36,9 @@ _MENDINGS = 50
 def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
     """`mesh` with a plain grey head, whose vertices have no sigma and whose faces are `filled`.
 
-    Vertices and faces below the neck keep their order and every bit.  A closed mesh stays closed;
-    an open one (only what was measured) ends at the neck.  Raises FailedWork when nothing stands
-    above the neck, or its rim is no simple line.
+    Vertices and faces below the neck keep their order and every bit. A closed mesh stays closed; an
+    open one (only what was measured) ends at the neck. Raises FailedWork if there is nothing above
+    the neck, or its rim is not a simple line.
     """
     head = _head_faces(mesh, neck)
     closed = not len(_free_edges(mesh.faces))
@@ -49,7 +49,7 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
     vertices, faces, used = drop_unused_vertices(mesh.vertices, mesh.faces[~head])
     number_of = np.full(len(mesh.vertices), -1, np.int64)
     number_of[used] = np.arange(len(used))
-    # What is free in the head runs the other way along what was kept.
+    # Free edges of the head run opposite to those of what was kept.
     rims = _loops(number_of[_free_edges(mesh.faces[head])[:, ::-1]]) if closed else []
     all_vertices, all_faces = [vertices], [faces]
     for number, rim in enumerate(sorted(rims, key=len, reverse=True)):
@@ -65,7 +65,7 @@ def deface(mesh: BodyMesh, neck: Neck) -> BodyMesh:
 def _attach_attributes(
     mesh: BodyMesh, head: Mask, used: Indices, vertices: Array, faces: Indices
 ) -> BodyMesh:
-    """What was kept as it was, what was added grey, filled and without sigma."""
+    """The mesh with what was kept unchanged, and what was added grey, filled and without sigma."""
     added = len(vertices) - len(used)
     filled = mesh.filled[~head]
     return BodyMesh(
@@ -80,7 +80,7 @@ def _attach_attributes(
 
 
 def _head_faces(mesh: BodyMesh, neck: Neck) -> Mask:
-    """(F,) faces that reach above the neck, in pieces that come near the head's axis.
+    """Faces (F,) that reach above the neck, in pieces that come near the head's axis.
 
     Hands held up beside the head are other pieces, and stay.
     """
@@ -98,7 +98,7 @@ def _head_faces(mesh: BodyMesh, neck: Neck) -> Mask:
 
 
 def _with_simple_rim(faces: Indices, head: Mask) -> Mask:
-    """Less of the head where its rim touches itself, until each point of the rim has one next."""
+    """Remove faces from the head where its rim touches itself, until the rim is a simple line."""
     for _ in range(_MENDINGS):
         points, times = np.unique(_free_edges(faces[head])[:, 0], return_counts=True)
         if not (times > 1).any():
@@ -108,7 +108,7 @@ def _with_simple_rim(faces: Indices, head: Mask) -> Mask:
 
 
 def _free_edges(faces: Indices) -> Indices:
-    """(E, 2) directed edges that no face runs along the other way."""
+    """Directed edges (E, 2) that no face runs along in the opposite direction."""
     edges = directed_edges(faces)
     count = int(faces.max(initial=-1)) + 1
     twins = np.isin(edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0])
@@ -116,7 +116,7 @@ def _free_edges(faces: Indices) -> Indices:
 
 
 def _loops(edges: Indices) -> list[Indices]:
-    """Closed lines of vertices, each point of which has one next."""
+    """Closed lines of vertices; each point has exactly one successor."""
     following = dict(edges.tolist())
     loops = []
     while following:
@@ -130,7 +130,8 @@ def _loops(edges: Indices) -> list[Indices]:
 
 
 def _dome(rim: Array, crown_mm: float) -> Array:
-    """(RINGS * N + 1, 3): rings over a rim (N, 3), from its shape to an ellipsoid's, and the top."""
+    """Rings over a rim (N, 3), from its shape to an
+    ellipsoid's, and the top: (RINGS * N + 1, 3)."""
     line = _smooth(rim)  # the rim itself zigzags from face to face
     centre = line[:, :2].mean(axis=0)
     arm, ahead = line[:, :2] - centre, np.roll(line, -1, axis=0)[:, :2] - line[:, :2]
@@ -153,14 +154,15 @@ def _dome(rim: Array, crown_mm: float) -> Array:
 
 
 def _smooth(line: Array) -> Array:
-    """A closed line (N, 3) by its first few harmonics."""
+    """A closed line (N, 3) reduced to its first few harmonics."""
     waves = np.fft.rfft(line, axis=0)
     waves[HARMONICS + 1 :] = 0.0
     return np.fft.irfft(waves, len(line), axis=0)
 
 
 def _stitched(rim: Indices, start: int, count: int) -> Indices:
-    """Faces over a rim (its vertices in the kept faces' sense): rings from `start`, then one top."""
+    """Faces over a rim (in the kept faces' direction): rings
+    of vertices from `start`, then a top."""
     size = len(rim)
     rings = [rim, *(start + np.arange(count - 1)).reshape(-1, size)]
     faces = []

@@ -20,12 +20,11 @@ from bodyscan.version import __version__
 def write_e57(
     path: Path, images: Sequence[RangeImage], rig_from_camera: Mapping[str, RigidTransform]
 ) -> dict[str, int]:
-    """Every range image as a scan named after its pair; returns how many points each has.
+    """Write every range image as a scan named after its pair; returns how many points each has.
 
-    Metres, as the standard says; points in the camera frame, its pose in the rig frame beside them;
-    grey levels as colour; row and column of each point's pixel. E57 wants a random number in
-    every file, so that two files of the same scan differ in that.
-    Raises BadInput without the package pye57.
+    Metres, as the standard requires; points in the camera frame, with its pose in the rig frame;
+    grey levels as colour; row and column of each point's pixel. E57 wants a random number in every
+    file, so two files of the same scan differ in that. Raises BadInput without the package pye57.
     """
     try:
         import pye57

@@ -1,4 +1,4 @@
-"""Where a body's neck is: the narrowest horizontal slice between its head and its shoulders."""
+"""A body's neck: the narrowest horizontal slice between its head and its shoulders."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.errors import FailedWork
 from bodyscan.mesh.topology import directed_edges
 
-# Crown to neck over stature, from a small child's head (a quarter of it) to a tall adult's.
+# Distance from crown to neck over stature: a tall adult's, and a small child's (a quarter).
 HIGHEST, LOWEST = 0.09, 0.24
 REACH_MM = 160.0  # from the head's axis; arms and shoulders farther out do not count
 STEP_MM = 4.0
-SHOULDERS = 0.07  # of the stature, below the neck
+SHOULDERS = 0.07  # share of the stature, below the neck
 LEAST_GIRTH_MM, MOST_GIRTH_MM, LEAST_HEAD_MM = 180.0, 700.0, 400.0
 
 
 @dataclass(frozen=True, eq=False)
 class Neck:
-    """height_mm: over the floor (z).  axis: (2,) x and y of the head over it.  Rig frame, mm."""
+    """height_mm: above the floor (z). axis: (2,) x and y of the head over it. Rig frame, mm."""
 
     height_mm: float
     axis: Array
@@ -31,8 +31,8 @@ def find_neck(vertices: Array, faces: Indices) -> Neck:
     """The narrowest slice below the head of a standing body, vertices (V, 3), faces (F, 3).
 
     A slice's size is the girth of its convex hull, within REACH_MM of the head's axis; the head is
-    what stands highest over the body's middle, so that a raised hand is not taken for it.
-    Raises FailedWork when there is no such slice.
+    what stands highest over the body's middle, so that a raised hand is not mistaken for it. Raises
+    FailedWork if there is no such slice.
     """
     axis, top = _crown(vertices)
     stature = top - float(vertices[:, 2].min())
@@ -46,7 +46,7 @@ def find_neck(vertices: Array, faces: Indices) -> Neck:
     head = max(girths[narrowest:].max(), girth(vertices, faces, top - 0.06 * stature, axis))
     shoulders = girth(vertices, faces, heights[narrowest] - SHOULDERS * stature, axis)
     inside = 0 < narrowest < len(girths) - 1 and LEAST_GIRTH_MM < neck < MOST_GIRTH_MM
-    # Wrists of arms held overhead are narrow too, but no head is above them, no shoulders below.
+    # Wrists of arms held overhead are narrow too, but have no head above and no shoulders below.
     if not (inside and head > LEAST_HEAD_MM and head > 1.1 * neck and shoulders > 1.5 * neck):
         raise FailedWork(
             "no neck was found, so the face cannot be taken away",
@@ -56,7 +56,8 @@ def find_neck(vertices: Array, faces: Indices) -> Neck:
 
 
 def girth(vertices: Array, faces: Indices, height: float, axis: Array) -> float:
-    """Of the convex hull of the slice at `height` near `axis` (x, y), mm; infinite if empty."""
+    """Girth of the convex hull of the slice at `height` near
+    `axis` (x, y), mm; infinite if empty."""
     edges = directed_edges(faces)
     low, high = vertices[edges[:, 0]], vertices[edges[:, 1]]
     across = (low[:, 2] < height) & (high[:, 2] >= height)

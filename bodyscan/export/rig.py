@@ -20,11 +20,11 @@ from bodyscan.stripes.codes.gray import PATTERN
 def export_rig(
     calibration: RigCalibration, folder: Path, formats: Sequence[str]
 ) -> Outcome[list[Path]]:
-    """Write the rig in each format: its cameras, and as further cameras its projectors.
+    """Write the rig in each format: its cameras, and its projectors as further cameras.
 
-    A projector that is not one with a lens, or whose lens a format cannot express, is left out, and
-    a note says why.  Raises BadInput for a format that there is not, before anything is written, and
-    for a camera's lens that a format cannot express.
+    A projector that has no model with a lens, or whose lens a format cannot express, is left out
+    with a note that says why. Raises BadInput for an unknown format, before anything is written,
+    and for a camera's lens that a format cannot express.
     """
     chosen = [RIG_FORMATS.find(name.strip().lower()) for name in dict.fromkeys(formats)]
     cameras = cameras_of(calibration)
@@ -43,7 +43,7 @@ def cameras_of(calibration: RigCalibration) -> RigCameras:
 
 
 def projectors_of(calibration: RigCalibration) -> Outcome[RigCameras]:
-    """Every projector that has a centre and a lens, as a camera, and how far that is from the sheets
+    """Every projector with a centre and a lens as a camera, and how far that is from the sheets
     that were measured."""
     found: dict[str, tuple[Camera, RigidTransform]] = {}
     notes: list[str] = []
@@ -66,7 +66,7 @@ def projectors_of(calibration: RigCalibration) -> Outcome[RigCameras]:
 
 
 def _first_codes(rig: Rig, written: Sequence[str]) -> Iterator[str]:
-    """That another first code would move the pictures: nothing that is scanned shows it."""
+    """A note that another first code would shift the images: nothing in a scan shows it."""
     alike: dict[str, list[str]] = {}
     for name in written:
         code = rig.pair(name).projector

@@ -42,10 +42,12 @@ def export_scan(
 ) -> list[Path]:
     """Write the mesh in each format (see `BODY_FORMATS`) and version; returns what was written.
 
-    Versions: full, light (50,000 faces), open (without filled faces). Each file has a JSON beside
-    it. deface: with a plain head instead of the subject's, below the neck as without. frame: rig, or
-    body (origin under the body, x the way it faces). Raises BadInput for a format, version or frame
-    that there is not, FailedWork where no neck is found.
+    versions: full, light (50,000 faces), open (without filled faces). Each file has a JSON beside
+        it.
+    deface: replace the subject's head by a plain one; below the neck nothing changes.
+    frame: rig, or body (origin under the body, x the way it faces).
+
+    Raises BadInput for an unknown format, version or frame, FailedWork if no neck is found.
     """
     names = [name.strip().lower().removeprefix(".") for name in formats]
     for name in names:
@@ -78,7 +80,8 @@ def export_scan(
 
 
 def scan_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """What an export repeats of scan.json: the verdict, pairs left out, the subject's sway (mm)."""
+    """What an export repeats from scan.json: the verdict,
+    pairs left out, the subject's sway (mm)."""
     alignment = facts.get("alignment")
     return {
         "when": facts.get("when"),
@@ -89,7 +92,7 @@ def scan_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def transform_mesh(mesh: BodyMesh, a_from_b: RigidTransform) -> BodyMesh:
-    """A mesh given in b, in a."""
+    """Transform a mesh from frame b to frame a."""
     return replace(
         mesh,
         vertices=a_from_b.apply(mesh.vertices),

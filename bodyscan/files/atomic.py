@@ -1,4 +1,4 @@
-"""Files that are wholly there or not at all, and the same bytes for the same content."""
+"""Files that are written completely or not at all, with the same bytes for the same content."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip file can hold; any
 
 @contextmanager
 def atomic_replacement(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; when the block ends well it takes `path`'s place.
+    """Yield a temporary path beside `path`, which replaces `path` if the block succeeds.
 
     The temporary path keeps the suffix, because writers such as Open3D's choose the format by it.
-    When the block raises, the temporary file goes and `path` is as it was before. The folder is
-    made if need be. A block that writes nothing raises FileNotFoundError.
+    If the block raises, the temporary file is removed and `path` is left as it was. The folder is
+    created if necessary. A block that writes nothing raises FileNotFoundError.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -56,17 +56,17 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def json_text(content: Any) -> str:
-    """JSON that is exact on reading back (every float64 to the last bit) and good to diff.
+    """JSON that is exact when read back (every float64 to the last bit) and easy to diff.
 
-    Keys are sorted, two spaces an indent, a list of numbers on one line (so a matrix takes a line a
-    row). numpy arrays and scalars are taken as lists and numbers. Raises ValueError for NaN and
-    infinity, which JSON does not have, and TypeError for what is no JSON value.
+    Keys are sorted, indents are two spaces, a list of numbers takes one line (so a matrix takes one
+    line per row). numpy arrays and scalars are written as lists and numbers. Raises ValueError for
+    NaN and infinity, which JSON does not have, and TypeError for what JSON cannot hold.
     """
     return _json(content, "") + "\n"
 
 
 def write_npz(path: Path, /, **arrays: Any) -> None:
-    """Write arrays as a compressed .npz whose bytes depend on the arrays alone (no time stamps).
+    """Write arrays as a compressed .npz whose bytes depend only on the arrays (no time stamps).
 
     Read back with `numpy.load(path, allow_pickle=False)`. Raises ValueError for object arrays.
     """
@@ -83,7 +83,7 @@ def write_npz(path: Path, /, **arrays: Any) -> None:
 
 
 def flush(path: Path, flags: int = os.O_RDONLY) -> None:
-    """A file, or the names in a folder, to the disk itself."""
+    """Flush a file, or the names in a folder, to the disk itself."""
     handle = os.open(path, flags)
     try:
         os.fsync(handle)

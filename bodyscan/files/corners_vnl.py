@@ -1,8 +1,8 @@
 """corners.vnl: board corners as mrgingham writes and mrcal reads them.
 
-A text table (vnlog) of `filename x y level`: for every image all corners of its grid, row by row; `-`
-for x and y where no board was found; `-` or a negative number for the level of a corner that is not
-to be used. Levels above 0 were found on a picture reduced by 2**level.
+A text table (vnlog) of `filename x y level`: for every image all corners of its grid, row by row;
+`-` for x and y if no board was found; `-` or a negative number for the level of a corner that is
+not to be used. Levels above 0 were found in an image reduced by 2**level.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bodyscan.files.atomic import write_text
 from bodyscan.files.regular import read_regular
 
 Corners: TypeAlias = tuple[tuple[float, float], ...]
-"""Of one image, px; NaN for what is not to be used. Plain numbers, since `check` loads no NumPy."""
+"""Corners of one image, px; NaN if not to be used. Plain numbers, since `check` loads no NumPy."""
 
 COLUMNS = ("filename", "x", "y", "level")
 MOST_BYTES = 200_000_000
@@ -25,9 +25,9 @@ MOST_BYTES = 200_000_000
 
 
 def read_corners(path: Path) -> dict[str, Corners]:
-    """By an image's name, as the file has it; () where there is no board.
+    """Corners by image name, as in the file; () for an image without a board.
 
-    Raises CaptureError, with the line, for what is no such table.
+    Raises CaptureError, with the line, if the file is not such a table.
     """
     try:
         lines = read_regular(path, MOST_BYTES).decode("utf-8").splitlines()
@@ -57,7 +57,7 @@ def read_corners(path: Path) -> dict[str, Corners]:
 
 
 def write_corners(path: Path, corners: Iterable[tuple[str, Corners]]) -> None:
-    """By an image's name. The file appears whole or not at all."""
+    """Write corners by image name; the file appears complete or not at all."""
     lines = ["# " + " ".join(COLUMNS)]
     for name, pixels in corners:
         if any(letter.isspace() for letter in name):
@@ -74,7 +74,7 @@ def write_corners(path: Path, corners: Iterable[tuple[str, Corners]]) -> None:
 
 
 def _columns(names: list[str], where: str) -> list[int]:
-    """The places of COLUMNS in a row; -1 for a level that the table does not have."""
+    """Positions of COLUMNS in a row; -1 for a level that the table does not have."""
     if any(name not in names for name in COLUMNS[:3]):
         raise CaptureError(f"has the columns {' '.join(names)}", where=where, remedy=_remedy())
     return [names.index(name) if name in names else -1 for name in COLUMNS]
@@ -83,7 +83,7 @@ def _columns(names: list[str], where: str) -> list[int]:
 def _corner(
     words: list[str], order: list[int], where: str
 ) -> tuple[str, tuple[float, float] | None]:
-    """An image's name and its next corner; None for one without a board."""
+    """An image's name and its next corner; None for an image without a board."""
     name, x, y, level = (words[place] if 0 <= place < len(words) else None for place in order)
     if name is None or x is None or y is None:
         raise CaptureError(f"has {len(words)} columns, too few", where=where, remedy=_remedy())

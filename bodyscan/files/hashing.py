@@ -1,4 +1,5 @@
-"""What files and settings are, by SHA-256 of their content: names, times and places do not count."""
+"""Identity of files and settings: SHA-256 of their content,
+regardless of names, times and places."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ _BLOCK = 1 << 20
 def file_hash(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal.
 
-    Raises BadInput for what is not a regular file (a pipe would be waited on for ever), OSError when it
+    Raises BadInput if it is not a regular file (reading a pipe might never end), OSError if it
     cannot be read.
     """
     with open_regular(path) as stream:
@@ -29,14 +30,14 @@ def file_hash(path: Path) -> str:
 
 
 def file_hashes(files: Mapping[str, Path]) -> dict[str, str]:
-    """Name -> SHA-256 of each file, sorted by name."""
+    """SHA-256 of each file by name, sorted by name."""
     names = sorted(files)
     hashes = threaded(lambda name: file_hash(files[name]), names, stage="hashing")
     return dict(zip(names, hashes, strict=True))
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """Every file below `folder` in a fixed order; symbolic links are named, never followed."""
+    """Every file below `folder` in a fixed order; symbolic links are listed, never followed."""
     for root, folders, files in os.walk(folder):
         links = [name for name in folders if os.path.islink(os.path.join(root, name))]
         folders[:] = sorted(set(folders) - set(links))

@@ -1,4 +1,4 @@
-"""JSON as this program writes it, read from files that anyone may have touched."""
+"""JSON as this program writes it, read from files that anyone may have edited."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ MOST_BYTES = 100_000_000  # a calibration of sixteen pairs and two hundred shots
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
-    """The one mapping that a JSON file holds, every number in it finite.
+    """The single mapping in a JSON file, with every number finite.
 
-    Raises ValueError for anything else (a key given twice, NaN, 1e999, halves of characters, too long,
-    nested too deep),
-    BadInput for what is no regular file, OSError when it cannot be read.
+    Raises ValueError for anything else (duplicate keys, NaN, 1e999, half surrogates, too long,
+    nested too deeply), BadInput if it is not a regular file, OSError if it cannot be read.
     """
     data = read_regular(path, MOST_BYTES)
     if len(data) > MOST_BYTES:
@@ -32,7 +31,7 @@ def read_json_object(path: Path) -> dict[str, Any]:
     except RecursionError:
         raise ValueError("is nested too deep") from None
     if b"\\ud" in data.lower():
-        # Half of a character: it could be read, but never printed or written again.
+        # Half of a surrogate pair could be read, but never printed or written again.
         json.dumps(content, ensure_ascii=False).encode("utf-8")
     if not isinstance(content, dict):
         raise ValueError("does not hold a mapping")

@@ -1,4 +1,4 @@
-"""A lock that goes when its process does, however it ends; and files for their owner alone."""
+"""A lock that ends with its process, however that ends; and files only their owner can read."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from bodyscan.errors import BadInput
 
 @contextmanager
 def file_lock(path: Path, *, wait: bool) -> Iterator[None]:
-    """Hold the lock on `path` (flock: the kernel lets it go, also after `kill -9`).
+    """Hold the lock on `path` (flock: the kernel releases it, even after `kill -9`).
 
-    wait: for whoever holds it; otherwise raises BadInput that says who does.
+    wait: wait for the present holder; otherwise raise BadInput, which names the holder.
     """
     try:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
@@ -32,7 +32,7 @@ def file_lock(path: Path, *, wait: bool) -> Iterator[None]:
                 where=str(path.parent),
                 remedy="wait until it has ended, or give another --out",
             ) from None
-        with suppress(OSError):  # who holds it is good to know, but a full disk is no obstacle
+        with suppress(OSError):  # good to know who holds it, but a full disk is no obstacle
             os.ftruncate(handle, 0)
             os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
         yield
@@ -42,7 +42,7 @@ def file_lock(path: Path, *, wait: bool) -> Iterator[None]:
 
 @contextmanager
 def for_owner_only() -> Iterator[None]:
-    """Files made inside are readable by their owner alone (0600), folders too (0700)."""
+    """Make files created inside readable only by their owner (0600), folders too (0700)."""
     before = os.umask(0o077)
     try:
         yield

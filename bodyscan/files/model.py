@@ -13,9 +13,9 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 Name = Annotated[str, Field(pattern=r"^[\w][\w.-]*$", max_length=64)]
 
 SHOT = r"\w(?:[^/\\*\x00-\x1f\x7f]*[^/\\*\x00-\x1f\x7f\s])?"
-"""What a shot may be called, as a regular expression: it is a part of other people's file names."""
+"""Names of shots, as a regular expression: they are part of other people's file names."""
 LONGEST_SHOT = 255
-"""Of a file's name on most disks."""
+"""The limit for a file's name on most disks."""
 
 
 def _as_shot(name: str) -> str:
@@ -36,16 +36,16 @@ def _as_shot(name: str) -> str:
 ShotName = Annotated[str, AfterValidator(_as_shot)]
 
 Problem: TypeAlias = tuple[tuple[str | int, ...], str]
-"""Where in the model (keys and indices from its root) and what, in words that follow the path."""
+"""Where in the model (keys and indices from its root), and what, in words that follow the path."""
 
 
 class Model(BaseModel):
-    """Frozen, and strangers to it are refused; `problems` says what single fields cannot say."""
+    """A frozen model without unknown keys; `problems` finds what single fields cannot."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def problems(self) -> Iterator[Problem]:
-        """What is wrong with this model as a whole, though each field by itself is right."""
+        """What is wrong with this model as a whole, though each field is valid by itself."""
         return iter(())
 
     @model_validator(mode="after")
@@ -57,20 +57,20 @@ class Model(BaseModel):
 
 
 def problem_error(problem: Problem) -> InitErrorDetails:
-    """A problem as pydantic takes it."""
+    """A problem in the form that pydantic takes."""
     where, text = problem
     said = PydanticCustomError("problem", "{text}", {"text": text})
     return InitErrorDetails(type=said, loc=where, input=None)
 
 
 def unknown_key_error(key: str, known: Iterable[str]) -> InitErrorDetails:
-    """As pydantic refuses a key; with those that it may have been meant for."""
+    """The error with which pydantic refuses a key, with the keys that may have been meant."""
     said = PydanticCustomError("extra_forbidden", "is not a key known here", {"known": list(known)})
     return InitErrorDetails(type=said, loc=(key,), input=None)
 
 
 def choice_error(key: str, value: str, choices: Iterable[str]) -> InitErrorDetails:
-    """As pydantic refuses a value that is none of the choices."""
+    """The error with which pydantic refuses a value that is none of the choices."""
     choices = list(choices)
     wanted = alternatives(choices) + did_you_mean(value, choices)
     said = PydanticCustomError("literal_error", "{expected}", {"expected": wanted})
@@ -90,7 +90,7 @@ def repeated_errors(refused: ValidationError) -> list[InitErrorDetails]:
 
 
 def duplicates(names: list[str | None] | tuple[str | None, ...]) -> Iterator[tuple[int, str]]:
-    """Index and name of each name that stood earlier in the list already (None never does)."""
+    """Index and name of each name that occurred earlier in the list (None never counts)."""
     seen: set[str] = set()
     for index, name in enumerate(names):
         if name is not None and name in seen:

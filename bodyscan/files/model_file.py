@@ -1,4 +1,5 @@
-"""A YAML file read into a model; all that is wrong said at once, by line and in plain words."""
+"""A YAML file read into a model, with all its errors
+reported at once, by line and in plain words."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ M = TypeVar("M", bound=Model)
 _MOST_SHOWN = 30
 
 _UNION_MEMBERS = ("tuple[", "dict[", "literal[")
-"""How pydantic's names of the members of a union begin."""
+"""Beginnings of pydantic's names for the members of a union."""
 
 _MUST_BE = {
     "string_type": "text",
@@ -65,10 +66,10 @@ def load_model(
     also: Callable[[M], Iterable[Problem]] = lambda _: (),
     salvage: Callable[[Any], Iterable[Problem]] = lambda _: (),
 ) -> M:
-    """Read `path` as `model`; raise `error` with every problem of the file, one a line.
+    """Read `path` as `model`; raise `error` with every problem of the file, one per line.
 
-    also: checks of a model that is right in itself, against something outside the file.
-    salvage: checks across the plain data of a file that is not right, so that all is said at once.
+    also: checks of a valid model against something outside the file.
+    salvage: checks of the plain data of an invalid file, so that everything is reported at once.
     """
     try:
         document = read_yaml(path)
@@ -93,17 +94,18 @@ def load_model(
 
 
 def apply_settings(model: M, changes: Iterable[str], error: type[BadInput]) -> M:
-    """`model` with `--set` changes such as `fusion.points=2000000`, checked anew; `a,b` is a list.
+    """`model` with `--set` changes such as `fusion.points=2000000`, validated again; `a,b` is a
+    list.
 
-    Raises `error` that names every change that is wrong by its path.
+    Raises `error`, which names every wrong change by its path.
     """
     return apply_changes(model, dict(_change(text, error) for text in changes), error)
 
 
 def apply_changes(model: M, changes: Mapping[Where, Any], error: type[BadInput]) -> M:
-    """`model` with the values at some paths replaced, checked anew.
+    """`model` with the values at some paths replaced, validated again.
 
-    Raises `error` that names every change that is wrong by its path.
+    Raises `error`, which names every wrong change by its path.
     """
     data: dict[Any, Any] = model.model_dump(mode="json", exclude_unset=True)
     for where, value in changes.items():
@@ -143,7 +145,7 @@ def _change(text: str, error: type[BadInput]) -> tuple[tuple[str, ...], Any]:
 def report(
     path: Path, problems: Iterable[YamlProblem], error: type[BadInput], remedy: str
 ) -> BadInput:
-    """All problems as one error, in the order of the file; one behind an alias is told once."""
+    """All problems as one error, in the order of the file; one behind an alias is reported once."""
     paths: dict[tuple[int, int, str], set[str]] = {}
     for problem in problems:
         place = problem.place
@@ -160,7 +162,7 @@ def report(
 
 
 def validate(model: type[M], data: Any) -> M | None:
-    """`data` as a model if it is right, else None."""
+    """`data` as a model if it is valid, else None."""
     try:
         return model.model_validate_json(json.dumps(data), strict=True)
     except ValidationError:
@@ -175,7 +177,7 @@ def _placed(problem: Problem, document: Document) -> YamlProblem:
 def _translated(
     refused: ValidationError, document: Document, model: type[BaseModel]
 ) -> list[YamlProblem]:
-    """pydantic's errors in plain words, those of one value joined, at their places in the file."""
+    """pydantic's errors in plain words at their places in the file, those of one value joined."""
     wrong: dict[Where, list[str]] = {}
     other: list[YamlProblem] = []
     guessed: set[Where] = set()
@@ -202,10 +204,10 @@ def _translated(
 
 
 def _located(refused: ValidationError, document: Document) -> Iterator[tuple[Where, ErrorDetails]]:
-    """Errors with their true locations, less those that follow from others.
+    """Errors with their true locations, without those that follow from others.
 
-    For a value that may be text or a list pydantic reports both ways in which it is wrong, with
-    the way's name in the location; a wrong item of a list says more than "is not text".
+    For a value that may be text or a list pydantic reports both, with the name of the alternative
+    in the location; a wrong item of a list says more than "is not text".
     """
     errors = []
     for e in refused.errors(include_url=False):
@@ -213,7 +215,7 @@ def _located(refused: ValidationError, document: Document) -> Iterator[tuple[Whe
         counted = e.get("ctx", {}).get("min_length", 0)
         value = document.at(where)
         if e["type"] == "too_short" and isinstance(value, list) and len(value) >= counted:
-            continue  # pydantic counts only the items that are right
+            continue  # pydantic counts only the valid items
         errors.append((where, where != e["loc"], e))
     unions = [where for where, of_union, _ in errors if of_union]
     for where, of_union, e in errors:

@@ -1,4 +1,4 @@
-"""Arrays read from an .npz that anyone may have made: no more memory is taken than a limit."""
+"""Arrays read from an .npz that anyone may have made, within a limit of memory."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from bodyscan.files.regular import open_regular
 
 MOST_BYTES = 1 << 28  # of all arrays unpacked; those of sixteen pairs take a fiftieth of it
 _DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OverflowError)
-_STRANGE = (NotImplementedError, RuntimeError)  # a compression we have not, an encrypted archive
+_STRANGE = (NotImplementedError, RuntimeError)  # an unsupported compression, an encrypted archive
 
 
 def read_npz(path: Path, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
-    """Name -> array. What the archive says of sizes is looked at before anything is unpacked.
+    """Arrays by name. The sizes that the archive states are checked before anything is unpacked.
 
-    Raises ValueError for what is damaged, too large, or no plain array (never unpickled), BadInput
-    for what is no regular file, OSError when it cannot be read.
+    Raises ValueError for what is damaged, too large, or not a plain array (nothing is ever
+    unpickled), BadInput if the file is not a regular one, OSError if it cannot be read.
     """
     with open_regular(path) as stream:
         try:
@@ -54,7 +54,7 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Any:
         raise ValueError(f"{entry.filename} is an array file of version {version}")
     shape, _, kind = header[version](stream)
     count = 1
-    for length in shape:  # in whole numbers of any size: a shape may lie
+    for length in shape:  # as Python integers of any size: a shape may lie
         count *= length
     if kind.hasobject or count * kind.itemsize != len(data) - stream.tell():
         raise ValueError(f"{entry.filename} does not hold what it says")

@@ -1,4 +1,4 @@
-"""What the operating system refuses, in words: one place for every command and job."""
+"""Errors of the operating system in words, in one place for every command and job."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from bodyscan.errors import BadInput, BodyscanError, FailedWork
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 ABSENT = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP)
-PROBE = bytes(65536)  # that much room at least: less than any result takes, and written in no time
+PROBE = bytes(65536)  # room for at least this: less than any result takes, and written in no time
 
 
 def in_words(error: OSError) -> BodyscanError:
-    """BadInput where another file or folder would do, FailedWork where the machine has to change."""
+    """BadInput if another file or folder would do, FailedWork if the machine has to change."""
     where = "" if error.filename is None else os.fsdecode(error.filename)
     said = error.strerror or str(error)
     if error.errno in FULL:
@@ -36,9 +36,9 @@ def in_words(error: OSError) -> BodyscanError:
 
 
 def require_writable(folder: Path) -> None:
-    """Raises BadInput or FailedWork if nothing can be written into `folder`, which need not exist.
+    """Raise BadInput or FailedWork if nothing can be written into `folder`, which need not exist.
 
-    Said before the work, not after it: the nearest folder above that is there is written to.
+    It is tested before the work, not after: by writing to the nearest existing folder above.
     """
     if folder.exists() and not folder.is_dir():
         raise BadInput(

@@ -1,4 +1,4 @@
-"""Formats by name: each is one file of a folder, imported when it is asked for."""
+"""Formats by name: each is one file in a folder, imported when it is asked for."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ Format = TypeVar("Format")
 
 @dataclass(frozen=True)
 class Registry(Generic[Format]):
-    """The modules of a package, of which each has a FORMAT, and what was registered besides.
+    """The modules of a package, each with a FORMAT, and the formats registered besides.
 
-    package: its dotted name.  what: what its formats hold, such as "a mesh".
+    package: its dotted name.
+    what: what its formats hold, such as "a mesh".
     """
 
     package: str
@@ -26,7 +27,7 @@ class Registry(Generic[Format]):
     registered: dict[str, Format] = field(default_factory=dict)
 
     def names(self) -> tuple[str, ...]:
-        """Of all formats; nothing is imported for that."""
+        """Names of all formats, found without importing them."""
         modules = pkgutil.iter_modules(import_module(self.package).__path__)
         return (*(module.name for module in modules), *self.registered)
 
@@ -39,7 +40,7 @@ class Registry(Generic[Format]):
         return cast(Format, import_module(f"{self.package}.{name}").FORMAT)
 
     def register(self, name: str, format_: Format) -> None:
-        """Make a format known that lives elsewhere. Raises ValueError if the name is taken."""
+        """Add a format defined elsewhere. Raises ValueError if the name is taken."""
         if name in self.names():
             raise ValueError(f"there is a format {name!r} already")
         self.registered[name] = format_

@@ -1,4 +1,4 @@
-"""Files opened only if they are files: a pipe or a device would be waited on for ever."""
+"""Files opened only if they are regular: reading a pipe or a device might never end."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from bodyscan.errors import BadInput
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """A file for reading, as bytes.
+    """Open a file for reading bytes.
 
-    Raises BadInput for what is there and no regular file, OSError when it cannot be opened.
+    Raises BadInput if it exists but is not a regular file, OSError if it cannot be opened.
     """
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     mode = os.fstat(handle).st_mode
@@ -27,6 +27,6 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_regular(path: Path, most_bytes: int | None = None) -> bytes:
-    """All of a file; of a longer one `most_bytes` + 1. Raises as `open_regular`."""
+    """The whole file; of a longer one, `most_bytes` + 1. Raises as `open_regular`."""
     with open_regular(path) as stream:
         return stream.read(-1 if most_bytes is None else most_bytes + 1)

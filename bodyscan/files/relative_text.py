@@ -1,6 +1,6 @@
-"""Messages that are kept name files by where they lie in a folder, not by where that folder lies.
+"""Stored messages name files relative to a folder, not by where that folder is.
 
-Folders are called after people, and the same work elsewhere is to give the same bytes.
+Folders are named after people, and the same work elsewhere must give the same bytes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def relative_text(text: str, base: Path, below: Iterable[Path] = ()) -> str:
-    """`text` with the paths in it that begin with `base`, or with one of the folders `below`,
+    """`text` with every path that begins with `base`, or with one of the folders `below`, made
     relative to `base`."""
     for folder in (*below, base):
         short = os.path.relpath(folder, base)

@@ -1,6 +1,6 @@
 """YAML 1.2 (core schema) read safely, with the line and column of every key and value.
 
-Plain YAML readers forget where a value stood, let a second key of the same name win silently, read
+Plain YAML readers forget where a value was, let a second key of the same name win silently, read
 `no` as false and `010` as 8, and can be made to fill the memory by a few nested aliases. This one
 takes mappings, lists, text, numbers, true/false and null, with anchors, aliases and merge keys.
 """
@@ -17,7 +17,7 @@ import yaml
 from bodyscan.files.regular import read_regular
 
 MOST_BYTES = 1_000_000
-MOST_NODES = 100_000  # counted after aliases are followed, so that alias bombs end here
+MOST_NODES = 100_000  # counted after aliases are followed, which stops alias bombs
 MOST_DEPTH = 40
 
 Where: TypeAlias = tuple[str | int, ...]
@@ -34,7 +34,7 @@ _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _PlainLoader(_Loader):  # type: ignore[misc]  # the stubs know no CSafeLoader
-    """Resolves nothing by itself: what a plain scalar means is decided in `_scalar`."""
+    """Resolves nothing by itself: `_scalar` decides what a plain scalar means."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 (PyYAML's own name and type)
 
@@ -49,7 +49,8 @@ class Place:
 
 @dataclass(frozen=True)
 class YamlProblem:
-    """What is wrong with a file, and where; `path` is such as `pairs[2].camera.width`, or empty."""
+    """What is wrong with a file, and where; `path`, such as
+    `pairs[2].camera.width`, may be empty."""
 
     place: Place
     path: str
@@ -66,10 +67,11 @@ class YamlError(Exception):
 
 @dataclass
 class Document:
-    """Plain data (dict, list, str, int, float, bool, None), and where each of it stands.
+    """Plain data (dict, list, str, int, float, bool, None), and where each part of it is.
 
     values, keys: place of the value, and of the key, at a path of keys and indices.
-    raw: the text of plain scalars as written. problems: what is wrong short of unreadable.
+    raw: the text of plain scalars as written.
+    problems: what is wrong but does not make the file unreadable.
     """
 
     data: Any = None
@@ -98,8 +100,11 @@ class Document:
 
 
 def read_yaml(path: Path) -> Document:
-    """Read one YAML document. Raises YamlError when unreadable, BadInput when not a regular
-    file, OSError when not there."""
+    """Read one YAML document.
+
+    Raises YamlError if it is unreadable, BadInput if it is not a regular file, OSError if it does
+    not exist.
+    """
     content = read_regular(path, MOST_BYTES)
     if len(content) > MOST_BYTES:
         raise _error(Place(1, 1), f"is longer than {MOST_BYTES:,} bytes: this cannot be right")
@@ -130,14 +135,14 @@ def dotted_path(where: Where) -> str:
 
 
 def dump_yaml(data: Any) -> str:
-    """Plain data as YAML that `read_yaml` reads back as it was; keys in the order given."""
+    """Plain data as YAML that `read_yaml` reads back unchanged; keys in the order given."""
     return str(
         yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100, indent=2)
     )
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes whatever text would be read as something else."""
+    """Quotes any text that would be read as something else."""
 
 
 def _represent_text(dumper: _Dumper, text: str) -> yaml.Node:
@@ -149,7 +154,7 @@ _Dumper.add_representer(str, _represent_text)
 
 
 class _Builder:
-    """Turns nodes into plain data and notes where they stood."""
+    """Turns nodes into plain data and records their places."""
 
     def __init__(self, document: Document) -> None:
         self.document, self.nodes = document, 0
@@ -205,7 +210,7 @@ class _Builder:
     def _merge_entries(
         self, node: yaml.MappingNode, depth: int
     ) -> dict[str, tuple[yaml.Node, yaml.Node]]:
-        """Keys and values of a mapping that another one merges, with what it merges itself."""
+        """Keys and values of a mapping that another one merges, including what it merges itself."""
         self.nodes += 1 + len(node.value)
         if depth > MOST_DEPTH or self.nodes > MOST_NODES:
             raise _error(_mark(node.start_mark), "merges (<<) too much")
@@ -228,7 +233,7 @@ def _is_text(node: yaml.Node) -> bool:
 
 
 def _scalar(text: str) -> Any:
-    """A plain scalar by the core schema of YAML 1.2."""
+    """The value of a plain scalar by the core schema of YAML 1.2."""
     if _NULL.fullmatch(text):
         return None
     if _TRUE.fullmatch(text) or _FALSE.fullmatch(text):
@@ -245,7 +250,8 @@ def _scalar(text: str) -> Any:
 
 
 def _refuse_deep(text: str) -> None:
-    """Look at the events first: composing is recursive, and a deep file would exhaust the stack."""
+    """Check depth by events first: composing is recursive,
+    and a deep file would exhaust the stack."""
     depth = 0
     for event in yaml.parse(text, Loader=_PlainLoader):
         depth += isinstance(event, yaml.CollectionStartEvent)
@@ -255,11 +261,11 @@ def _refuse_deep(text: str) -> None:
 
 
 def _refuse_many(node: yaml.Node, sizes: dict[int, int]) -> int:
-    """How many values a node stands for once aliases are followed, each counted once: to build what an
-    alias bomb holds until there are too many takes half a second, of every file of a batch."""
+    """How many values a node stands for once aliases are followed, each counted once: building an
+    alias bomb until it is too large would take half a second, for every file of a batch."""
     if id(node) in sizes:
         return sizes[id(node)]
-    sizes[id(node)] = 1  # one that holds itself is too deep, which is said when it is built
+    sizes[id(node)] = 1  # one that contains itself is too deep, which is reported when it is built
     parts: list[yaml.Node] = []
     if isinstance(node, yaml.MappingNode):
         parts = [value for key, value in node.value if key.value != "<<"]

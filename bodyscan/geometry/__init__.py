@@ -1,8 +1,9 @@
-"""Mathematics that knows of no file and no image: poses, cameras, sheets of light, fitting.
+"""Mathematics without files or images: poses, cameras, light sheets, fitting.
 
 Poses: transforms, velocity, pose_covariance. Cameras: camera, lenses (one file each), camera_tables
-(as compiled loops see them), camera_fields, pixel_rays, quadratic_table, ray_uncertainty, visibility,
-crop. Sheets of light: light_planes (one plane a stripe, Eq. 6), smooth_sheets with bowed_sheets,
-lens_sheets with lens_points, projector_sheets; sheet_table and sheet_arrays (as loops and files hold
-them), ray_depths (where a ray meets them). Fitting: least_squares, robust, scaled_systems.
+(for compiled loops), camera_fields (for files), pixel_rays, quadratic_table, ray_uncertainty,
+visibility, crop. Light sheets: light_planes (one plane per stripe, Eq. 6), smooth_sheets with
+bowed_sheets, lens_sheets with lens_points, projector_sheets; sheet_table and sheet_arrays (for
+compiled loops and for files), ray_depths (where a ray meets a sheet). Fitting: least_squares,
+robust, scaled_systems.
 """

@@ -1,13 +1,13 @@
-"""Sheets that may bow across their width, smooth over s; without the bow, smooth planes.
+"""Sheets that vary smoothly with s and may bow across their width; without bow, smooth planes.
 
 In a frame roughly at the projector let y' = Y/Z across the stripes, x' = (X + x0)/Z along them and
 w = D/Z - 1. The sheet at s is
 
     y' = p(s) + q(s) x' + r(s) w + b2(s) x'^2 + b3(s) x'^3 + ...
 
-Without b this is a plane, any plane; p, q, r, b are Chebyshev polynomials over [0, S]. Where the
-projector's centre lies is not assumed: r(s) moves each sheet on its own. Only the bow, which is
-small, is carried straight on from the frame's origin, moved along the stripes by x0.
+Without the b terms this can represent any plane; p, q, r, b are Chebyshev polynomials over [0, S].
+The projector's centre is not assumed to be known: r(s) moves each sheet independently. Only the
+bow, which is small, is extended radially from the frame's origin, shifted along the stripes by x0.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ PLANE_DEGREE, BOW_DEGREE = 7, 3
 FALL = 0.3
 PLANE_SPREAD = (1.0, 0.03, 0.03)
 BOW_SPREAD = (0.1, 0.03, 0.03)
-"""Standard deviations before any data, of p, q, r and of b2, b3, ...: coefficient m of a
-polynomial is expected FALL times as large as m - 1."""
+"""Standard deviations, before any data, of p, q, r and of b2, b3, ...: coefficient m of a
+polynomial is expected to be FALL times as large as coefficient m - 1."""
 ASIDE = 0.3
-"""Standard deviation of where the boards' middle lies along the stripes, in distances."""
+"""Standard deviation of the boards' middle along the stripes, as a share of its distance."""
 
 
 @dataclass(frozen=True, eq=False)
 class SheetsAtStripe:
-    """Coefficients (..., K) at s and their derivatives by s; Chebyshev polynomials (..., M)."""
+    """Coefficients (..., K) at s, their derivatives by s, and the Chebyshev polynomials (...,
+    M)."""
 
     value: Array
     slope: Array
@@ -42,17 +43,19 @@ class SheetsAtStripe:
 
 @dataclass(frozen=True, eq=False)
 class BowedSheets(SmoothSheets):
-    """parameters: the polynomials p, q, r (PLANE_DEGREE), then b2, b3, ... (BOW_DEGREE), lowest
-    degree first; with a bow, x0 (mm) is the last.
+    """Smooth planes, or sheets with a bow of `bow_terms` terms.
 
-    bow_terms: how many of b2, b3, ... there are; 0 for planes.
+    parameters: coefficients of p, q, r (PLANE_DEGREE), then of b2, b3, ... (BOW_DEGREE), lowest
+    degree
+        first; with a bow, x0 (mm) is the last.
+    bow_terms: number of terms b2, b3, ...; 0 for planes.
     """
 
     bow_terms: int
 
     @staticmethod
     def of_pinhole(pinhole: LensSheets, bow_terms: int) -> BowedSheets:
-        """The planes of a projector without lens, y' = (s - c) / f: where a fit starts."""
+        """The planes of a projector without a lens, y' = (s - c) / f: the start of a fit."""
         size = 3 * (PLANE_DEGREE + 1) + bow_terms * (BOW_DEGREE + 1) + (bow_terms > 0)
         parameters, half = np.zeros(size), pinhole.stripes / 2.0
         focal, centre = pinhole.parameters[:2]
@@ -73,7 +76,7 @@ class BowedSheets(SmoothSheets):
 
     def prior(self) -> tuple[Array, Array]:
         fall = FALL ** np.arange(PLANE_DEGREE + 1)
-        # A lens bows the sheets above and below its axis opposite ways: b2 grows with s.
+        # A lens bows the sheets above and below its axis in opposite directions: b2 grows with s.
         late = FALL ** np.maximum(np.arange(BOW_DEGREE + 1) - 1, 0)
         spread = [size * fall for size in PLANE_SPREAD]
         spread += [size * late for size in BOW_SPREAD[: self.bow_terms]]
@@ -125,7 +128,7 @@ class BowedSheets(SmoothSheets):
         return np.concatenate(columns, axis=-1)
 
     def _polynomials(self) -> Array:
-        """(3 + bow_terms, PLANE_DEGREE + 1): a row for each polynomial."""
+        """Coefficients (3 + bow_terms, PLANE_DEGREE + 1), one row per polynomial."""
         planes = 3 * (PLANE_DEGREE + 1)
         rows = np.zeros((3 + self.bow_terms, PLANE_DEGREE + 1))
         rows[:3] = self.parameters[:planes].reshape(3, -1)

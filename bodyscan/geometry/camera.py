@@ -1,4 +1,4 @@
-"""The chapter's pinhole camera (Eq. 1), its lens acting before the matrix A (Eq. 3-5)."""
+"""The chapter's pinhole camera (Eq. 1), with its lens acting before the matrix A (Eq. 3-5)."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from bodyscan.geometry.lenses.lens import Lens
 
 MATRIX = ("alpha", "beta", "gamma", "u0", "v0")
 MATRIX_PRIOR_PX = (50.0, 50.0, 5.0, 50.0, 50.0)
-"""Standard deviations of A's numbers before a rig's shots say more: what a pair's own few boards
-leave open at worst."""
+"""Standard deviations of A's entries before the rig's own shots: at worst, what the few boards of
+one pair leave open."""
 MATRIX_STEP_PX = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPrior:
-    """What was known of a camera before any board was seen: its parameters (P,), and their standard
-    deviations (P,)."""
+    """Parameters (P,) of a camera and their standard deviations (P,), known before any board was
+    seen."""
 
     parameters: Array
     sigmas: Array
@@ -27,10 +27,10 @@ class CameraPrior:
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels, (u, v) = (column, row), whole numbers at pixel centres.
+    """Intrinsics in pixels: (u, v) = (column, row), whole numbers at pixel centres.
 
-    Camera frame: x right, y down, z forward, mm.  prior: of a camera that was calibrated elsewhere;
-    what it does to a point has nothing to do with it.
+    Camera frame: x right, y down, z forward, mm.
+    prior: given for a camera that was calibrated elsewhere; it has no effect on projection.
     """
 
     alpha: float
@@ -45,35 +45,35 @@ class Camera:
 
     @property
     def matrix(self) -> Array:
-        """A of Eq. 1, (3, 3)."""
+        """The matrix A of Eq. 1, (3, 3)."""
         return np.array(
             [[self.alpha, self.gamma, self.u0], [0.0, self.beta, self.v0], [0.0, 0.0, 1.0]]
         )
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Of the P unknowns of a calibration: A's five, then the lens's coefficients."""
+        """Names of the P unknowns of a calibration: A's five, then the lens coefficients."""
         return (*MATRIX, *self.lens.names)
 
     @property
     def parameters(self) -> Array:
-        """(P,) by `parameter_names`."""
+        """Values (P,) in the order of `parameter_names`."""
         return np.array([*(getattr(self, name) for name in MATRIX), *self.lens.coefficients])
 
     @property
     def prior_sigmas(self) -> Array:
-        """(P,) standard deviations of the parameters before any shot of the rig was seen."""
+        """Standard deviations (P,) of the parameters before any shot of the rig is used."""
         if self.prior is not None:
             return self.prior.sigmas
         return np.array([*MATRIX_PRIOR_PX, *self.lens.prior_sigmas])
 
     @property
     def difference_steps(self) -> Array:
-        """(P,) steps of the parameters for derivatives by differences."""
+        """Parameter steps (P,) for numerical derivatives."""
         return np.array([*[MATRIX_STEP_PX] * len(MATRIX), *self.lens.difference_steps])
 
     def moved(self, step: Array) -> Camera:
-        """The camera with a step (P,) added to its parameters."""
+        """The camera after a step (P,) is added to its parameters."""
         own = {
             name: getattr(self, name) + float(change)
             for name, change in zip(MATRIX, step[: len(MATRIX)], strict=True)
@@ -82,29 +82,30 @@ class Camera:
         return replace(self, **own, lens=lens)
 
     def project(self, points: Array) -> Array:
-        """Points (..., 3) in the camera frame, z > 0 -> real image coordinates (..., 2), px."""
+        """Project points (..., 3), camera frame, z > 0, to real image coordinates (..., 2), px."""
         normalized = points[..., :2] / points[..., 2:3]
         return self.pixels_from_normalized(self.lens.distort(normalized))
 
     def rays(self, pixels: Array) -> Array:
-        """Real image coordinates (..., 2) -> directions (..., 3) in the camera frame with z = 1."""
+        """Directions (..., 3) with z = 1, camera frame, of real image coordinates (..., 2), px."""
         normalized = self.lens.undistort(self.normalized_from_pixels(pixels))
         return np.concatenate([normalized, np.ones_like(normalized[..., :1])], axis=-1)
 
     def rays_by_pixels(self, rays: Array) -> Array:
-        """Derivatives (..., 2, 2) of the (x, y) of rays (..., 3), whose z is 1, by their pixels."""
+        """Derivatives (..., 2, 2), by pixel, of the (x, y) of rays (..., 3) whose z is 1."""
         by_ray = self.matrix[:2, :2] @ self.lens.by_point(rays[..., :2])
         (a, b), (c, d) = np.moveaxis(by_ray, (-2, -1), (0, 1))
         inverse = np.stack([d, -b, -c, a], axis=-1) / (a * d - b * c)[..., None]
         return inverse.reshape(*rays.shape[:-1], 2, 2)
 
     def pixel_rays(self) -> Array:
-        """Rays through every pixel's centre, (height, width, 3)."""
+        """Rays (height, width, 3) through the pixel centres."""
         u, v = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))
         return self.rays(np.stack([u, v], axis=-1))
 
     def jacobians(self, points: Array) -> tuple[Array, Array]:
-        """d(pixels)/d(parameters) (N, 2, P) and d(pixels)/d(points) (N, 2, 3), points (N, 3) mm."""
+        """d(pixels)/d(parameters) (N, 2, P) and d(pixels)/d(points) (N, 2, 3) at points (N, 3),
+        mm."""
         z = points[:, 2]
         ideal = points[:, :2] / z[:, None]
         real, a = self.lens.distort(ideal), self.matrix[:2, :2]
@@ -123,23 +124,24 @@ class Camera:
         return by_parameter, a @ self.lens.by_point(ideal) @ perspective
 
     def pixels_from_normalized(self, normalized: Array) -> Array:
-        """Eq. 1 with A: normalized (..., 2) -> px (..., 2)."""
+        """Apply A (Eq. 1): normalised coordinates (..., 2) to px (..., 2)."""
         x, y = normalized[..., 0], normalized[..., 1]
         u = self.alpha * x + self.gamma * y + self.u0
         return np.stack([u, self.beta * y + self.v0], axis=-1)
 
     def normalized_from_pixels(self, pixels: Array) -> Array:
-        """Eq. 5 (and Eq. 11, 12 divided by z): px (..., 2) -> normalized (..., 2)."""
+        """Invert A (Eq. 5; Eq. 11 and 12 divided by z): px (..., 2) to normalised coordinates (...,
+        2)."""
         y = (pixels[..., 1] - self.v0) / self.beta
         x = (pixels[..., 0] - self.u0 - self.gamma * y) / self.alpha
         return np.stack([x, y], axis=-1)
 
     def without_lens(self, pixels: Array) -> Array:
-        """Real to ideal px (..., 2): where the same camera would see them without its lens."""
+        """Ideal px (..., 2) of real ones: where the same camera without its lens would see them."""
         return self.pixels_from_normalized(self.rays(pixels)[..., :2])
 
     def without_skew(self, pixels: Array) -> Array:
-        """Shear px (..., 2) by -gamma/beta, so that a camera without skew would have seen them."""
+        """Shear px (..., 2) by -gamma/beta to what a camera without skew would see."""
         sheared = pixels.copy()
         sheared[..., 0] -= self.gamma / self.beta * (pixels[..., 1] - self.v0)
         return sheared

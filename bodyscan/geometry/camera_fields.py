@@ -1,6 +1,6 @@
-"""A camera as names and numbers, as files hold it: A's, the lens's, the image's size.
+"""A camera as named numbers, the form in which files hold it: A, the lens, the image size.
 
-`lens` names the kind of the lens; left out it is the chapter's.
+`lens` names the kind of lens; if it is missing, the lens is the chapter's.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ SIZE = ("width", "height")
 
 
 def to_fields(camera: Camera) -> dict[str, Any]:
-    """alpha, beta, gamma, u0, v0, the lens's kind and coefficients by name, width, height."""
+    """alpha, beta, gamma, u0, v0, the kind of lens, its coefficients by name, width and height."""
     own = {name: getattr(camera, name) for name in (*MATRIX, *SIZE)}
     lens = {name: getattr(camera.lens, name) for name in camera.lens.names}
     kind = {} if camera.lens.kind == Radial.kind else {"lens": camera.lens.kind}
@@ -25,9 +25,9 @@ def to_fields(camera: Camera) -> dict[str, Any]:
 
 
 def from_fields(content: Mapping[str, Any]) -> Camera:
-    """The camera that `to_fields` wrote down.
+    """The camera whose fields `to_fields` returned.
 
-    Raises ValueError for an unknown lens, a name too many or too few, or what is no finite number.
+    Raises ValueError for an unknown lens, a missing or surplus name, or a value that is not finite.
     """
     numbers = dict(content)
     kind = numbers.pop("lens", Radial.kind)

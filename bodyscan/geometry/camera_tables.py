@@ -1,4 +1,4 @@
-"""A camera as compiled loops see it: two tables, whatever its lens."""
+"""A camera as two lookup tables, independent of its lens, for compiled loops."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.quadratic_table import QuadraticTable, Table
 
 TOLERANCE_PX = 1e-4
-"""A five-hundredth of what corners and boundaries are found to."""
+"""A five-hundredth of the precision to which corners and boundaries are found."""
 CELLS_PX = (32, 16, 8)
-"""Widths of a cell, the widest first that keeps the tolerance: a scanner's lens does with the
-first; one that nearly folds within its image is held to about 1e-3 px by the last."""
+"""Cell widths; the widest that keeps the tolerance is used. The first is enough for a scanner's
+lens; the last holds one that nearly folds within its image to about 1e-3 px."""
 MARGIN_PX = 1.5
-"""Beyond the image's outermost pixel centres, so that what is outside the table is outside the
+"""Extent of the table beyond the outermost pixel centres: outside the table is outside the
 image."""
 OUTSIDE = -2.0
-"""Both values of the first table where it has none: no pixel has such a place."""
-CAMERAS = 64  # kept: those of a few rigs
+"""Both values of the projection table where it has none: no pixel has these coordinates."""
+CAMERAS = 64  # cached: enough for a few rigs
 
 
 @lru_cache(CAMERAS)
 def projection_table(camera: Camera) -> Table:
     """From ideal normalised (x, y) to the pixel (u, v); OUTSIDE where no ray of the image goes.
 
-    Far outside its image a lens may fold back: such points have no pixel here, though
+    Far outside its image a lens may fold back: such points have no pixel here, although
     `Camera.project` gives them one.
     """
     u, v = (np.linspace(-MARGIN_PX, n - 1.0 + MARGIN_PX, 33) for n in (camera.width, camera.height))

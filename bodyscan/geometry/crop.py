@@ -1,4 +1,4 @@
-"""The part of a picture that shows something."""
+"""The part of an image that shows something."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import numpy as np
 from bodyscan.arrays import Mask
 
 Crop = tuple[slice, slice]
-"""Rows and columns."""
+"""Slices of rows and columns."""
 WHOLE: Crop = (slice(None), slice(None))
 
 
 def crop_of(shown: Mask) -> Crop | None:
-    """Slices (rows, columns) of the smallest box around what is true; None if nothing is."""
+    """The smallest box (rows, columns) around the true pixels; None if there are none."""
     rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
     if not rows.size:
         return None
@@ -26,6 +26,6 @@ def ends_of(crop: Crop) -> tuple[int, int, int, int]:
 
 
 def widened(crop: Crop, margin: int) -> Crop:
-    """With so many more rows and columns on every side, as far as there are any before the first."""
+    """The crop with `margin` more rows and columns on each side, stopping at row and column 0."""
     rows, columns = (slice(max(side.start - margin, 0), side.stop + margin) for side in crop)
     return rows, columns

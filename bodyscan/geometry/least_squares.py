@@ -1,16 +1,16 @@
-"""Non-linear least squares, damped and robust: the one solver under all fits of the package.
+"""Non-linear least squares, damped and robust: the solver under every fit in the package.
 
-`minimize` takes one problem of any kind of unknowns, its residuals in blocks that each touch a few
-columns; `minimize_each` takes many small problems of one kind at once (the corners of a board, points
-to triangulate), their normal equations stacked.
+`minimize` solves one problem with unknowns of any kind, its residuals in blocks that each involve a
+few columns. `minimize_each` solves many small problems of one kind at once (the corners of a board,
+points to triangulate) with stacked normal equations.
 
-Both stop by one rule. Costs are counted in variances of a residual, so a problem is SETTLED when the
-last step lowered its cost, or the next one can lower it, by less than `settled` variances: no
-combination of unknowns is then farther from the minimum than about the square root of `settled` of
-its own standard deviations.
+Both use the same stopping rule. Costs are in units of a residual's variance; a problem has settled
+when the last step lowered its cost, or the next one can lower it, by less than `settled` variances.
+Then no combination of unknowns is farther from the minimum than about sqrt(`settled`) of its own
+standard deviation.
 
-Source: Madsen, Nielsen, Tingleff, Methods for Non-Linear Least Squares Problems, 2004; the robust
-weights: Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, 3.
+Source: Madsen, Nielsen, Tingleff, Methods for Non-Linear Least Squares Problems, 2004; robust
+weights: Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 3.
 """
 
 from __future__ import annotations
@@ -30,23 +30,25 @@ Columns = Indices | slice
 State = TypeVar("State")
 
 TRIES = 10
-"""Damping grows so often before a step is given up; it then stops all motion."""
+"""How often the damping is raised before a step is given up; by then nothing moves any more."""
 FASTER, SLOWER = 10.0, 10.0
-"""A step that lowers the cost divides the damping, one that does not multiplies it."""
+"""A step that lowers the cost divides the damping by the first; one that does not multiplies it by
+the second."""
 LEAST_DAMPING, FELT = 1e-12, 1e-4
-"""Share of a scaled diagonal: below the first rounding rules; below the second none is felt, so a
-step refused raises it there at once."""
+"""Shares of the scaled diagonal: below the first, rounding dominates; below the second, damping has
+no effect, so a refused step raises it there at once."""
 
 Ending = Literal["settled", "out of steps", "stuck"]
 
 
 @dataclass(frozen=True)
 class Noise:
-    """How residuals of one kind err; blocks of equal `Noise` share one spread.
+    """The error model of one kind of residual; blocks with equal `Noise` share one spread.
 
-    group: so many neighbouring residuals (u and v of a corner) share one weight.  cauchy: beyond so
-    many spreads they count less and less (Cauchy loss); None: all count alike.  least: the spread
-    is never taken to be smaller.  known: the spread, where it need not be estimated.
+    group: how many neighbouring residuals (u and v of a corner) share one weight.
+    cauchy: spreads beyond which residuals count less and less (Cauchy loss); None: all count alike.
+    least: lower limit of the spread.
+    known: the spread, where it need not be estimated.
     """
 
     kind: str
@@ -59,31 +61,33 @@ class Noise:
         return spread(residuals, self.least) if self.known is None else self.known
 
     def cost(self, residuals: Array) -> float:
-        """Of residuals (N,) over their spread."""
+        """Cost of residuals (N,) given in units of their spread."""
         if self.cauchy is None:
             return float(residuals @ residuals)
         return cauchy_cost(residuals, self.group, self.cauchy)
 
     def weights(self, residuals: Array) -> Array:
-        """(N,) in [0, 1] of residuals (N,) over their spread."""
+        """Weights (N,) in [0, 1] of residuals (N,) given in units of their spread."""
         if self.cauchy is None:
             return np.ones(len(residuals))
         return cauchy_weights(residuals, self.group, self.cauchy)
 
 
 EXACT = Noise("in standard deviations", known=1.0)
-"""Of priors, and of all that is given in its own standard deviations."""
+"""For priors, and for everything already expressed in its own standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Residuals (N,) that depend on the unknowns `columns` (C,) alone.
+    """Residuals (N,) that depend only on the unknowns `columns` (C,).
 
-    runs: (G,) where residuals come in runs of so many, each with `columns` of its own, a row of (G, C).
-    As boards of one camera, each with its pose: with a block for each, calls take longer than sums.
-    linearize: gives the Jacobian (N, C); asked once, and never at a step that is tried and refused.
-    sigma: of each residual (N,), or of all; held while steps from here are tried.
-    A prior is a block too: of what is known, in standard deviations (`EXACT`).
+    linearize: returns the Jacobian (N, C); called once, and never for a step that is refused.
+    sigma: of each residual (N,), or of all; held fixed while steps from here are tried.
+    runs: (G,) lengths of runs of residuals, each with its own row of `columns` (G, C), such as the
+        boards of one camera, each with its pose. With one block each, calls would cost more than
+        sums.
+
+    A prior is a block too: its residuals are in standard deviations (`EXACT`).
     """
 
     residuals: Array
@@ -100,10 +104,12 @@ class Block:
 
 @dataclass(frozen=True)
 class Report:
-    """steps: taken.  cost_before, cost_after: variances, both by the noise found at the end.
+    """How a solve went.
 
-    ending: `settled` (see above), `out of steps`: cut short, or `stuck`: no step lowers the cost
-    although the equations promise one (a wrong Jacobian, a kink).
+    steps: how many were taken.
+    cost_before, cost_after: in variances, both with the noise estimated at the end.
+    ending: `settled` (see above); `out of steps`; or `stuck`: no step lowers the cost although the
+        equations predict one (a wrong Jacobian, a kink).
     """
 
     steps: int
@@ -118,8 +124,13 @@ class Report:
 
 @dataclass(frozen=True, eq=False)
 class Solution(Generic[State]):
-    """state: the minimum.  blocks: there.  weights: (N,) of each block, robust, in [0, 1].
-    spreads: of each block, in its residuals' sigmas.  unknowns: P.
+    """The minimum and what is needed for its covariance.
+
+    state: the minimum.
+    blocks: evaluated there.
+    weights: robust weights (N,) in [0, 1] of each block.
+    spreads: of each block, in its residuals' sigmas.
+    unknowns: P.
     """
 
     state: State
@@ -131,12 +142,13 @@ class Solution(Generic[State]):
 
     @cached_property
     def covariance(self) -> Array:
-        """(P, P) of the unknowns, the residuals' spread taken for their noise."""
+        """Covariance (P, P) of the unknowns, with the residuals' spread as their noise."""
         normal, _ = _equations(self.blocks, self.weights, self.spreads, self.unknowns)
         return invert_scaled(normal)
 
     def normal(self, kinds: Collection[Noise]) -> Array:
-        """(P, P) of the unknowns, J^T W J over variances, of the blocks of these kinds alone."""
+        """Normal matrix (P, P), J^T W J over variances, of the blocks with these kinds of noise
+        alone."""
         own = [k for k, block in enumerate(self.blocks) if block.noise in kinds]
         return _equations(
             [self.blocks[k] for k in own],
@@ -147,8 +159,8 @@ class Solution(Generic[State]):
 
     @property
     def variance(self) -> float:
-        """Weighted mean square of what is left over, per degree of freedom, in squared spreads: the
-        factor for a covariance that takes the residuals' own size instead of their spread's."""
+        """Weighted mean square residual per degree of freedom, in squared spreads: the factor for a
+        covariance based on the residuals' own size instead of their spread."""
         squares, total = 0.0, 0.0
         for block, weights, size in zip(self.blocks, self.weights, self.spreads, strict=True):
             squares += float(weights @ (block.residuals / (block.sigma * size)) ** 2)
@@ -166,10 +178,12 @@ def minimize(
     settled: float = 1e-6,
     damping: float = 1e-3,
 ) -> Solution[State]:
-    """Levenberg-Marquardt; each step's robust weights are those of the residuals before it.
+    """Levenberg-Marquardt; each step uses robust weights from the residuals before it.
 
-    blocks_at: the same blocks in the same order at any state; residuals that are not finite refuse
-    a state.  moved: applies a step (P,).  damping: of the first step, share of a unit diagonal.
+    blocks_at: returns the same blocks in the same order at any state; residuals that are not finite
+        reject the state.
+    moved: applies a step (P,) to a state.
+    damping: of the first step, as a share of a unit diagonal.
     """
     state, blocks = start, tuple(blocks_at(start))
     first, taken = blocks, 0
@@ -204,8 +218,13 @@ def minimize(
 
 @dataclass(frozen=True, eq=False)
 class StackedEquations:
-    """Normal equations of N small problems: normal (N, P, P) = J^T W J, gradient (N, P) = J^T W r,
-    cost (N,) = r^T W r, freedoms (N,): residuals less unknowns, at least 1."""
+    """Normal equations of N small problems.
+
+    normal: (N, P, P), J^T W J.
+    gradient: (N, P), J^T W r.
+    cost: (N,), r^T W r.
+    freedoms: (N,), sum of the weights less the number of unknowns, at least 1.
+    """
 
     normal: Array
     gradient: Array
@@ -214,7 +233,7 @@ class StackedEquations:
 
     @staticmethod
     def of(residuals: Array, jacobian: Array, weights: Array) -> StackedEquations:
-        """From residuals (N, M), their Jacobian (N, M, P) and weights (N, M)."""
+        """Equations of residuals (N, M), their Jacobian (N, M, P) and weights (N, M)."""
         weighted = np.swapaxes(jacobian * weights[..., None], 1, 2)
         return StackedEquations(
             weighted @ jacobian,
@@ -224,7 +243,7 @@ class StackedEquations:
         )
 
     def where(self, chosen: Mask, others: StackedEquations) -> StackedEquations:
-        """Problems chosen (N,) as they are here, the rest as in `others`."""
+        """Take the `chosen` (N,) problems from here and the rest from `others`."""
         return StackedEquations(
             np.where(chosen[:, None, None], self.normal, others.normal),
             np.where(chosen[:, None], self.gradient, others.gradient),
@@ -234,13 +253,19 @@ class StackedEquations:
 
     @property
     def variance(self) -> Array:
-        """(N,) of a residual, from what is left over."""
+        """Variance (N,) of a residual, estimated from the cost that remains."""
         return np.asarray(self.cost / self.freedoms, np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class StackedSolution:
-    """state: (N, P).  equations: there.  converged: (N,) those that settled.  steps: taken."""
+    """The minima of N problems.
+
+    state: (N, P).
+    equations: evaluated there.
+    converged: (N,), which problems settled.
+    steps: how many were taken.
+    """
 
     state: Array
     equations: StackedEquations
@@ -248,7 +273,7 @@ class StackedSolution:
     steps: int
 
     def covariance(self) -> Array:
-        """(N, P, P), noise taken from what each problem leaves over."""
+        """Covariance (N, P, P), with each problem's noise estimated from its remaining cost."""
         return invert_scaled(self.equations.normal) * self.equations.variance[:, None, None]
 
 
@@ -262,10 +287,10 @@ def minimize_each(
     damping: float = 1e-3,
     least: float = 1e-12,
 ) -> StackedSolution:
-    """Levenberg-Marquardt on N problems (N, P) of a few unknowns each, every one damped by itself.
+    """Levenberg-Marquardt on N problems (N, P) of a few unknowns, each with its own damping.
 
-    within: brings a state back to where it may be.  least: a residual's standard deviation is never
-    taken to be smaller, so that residuals of nearly 0 settle too.
+    within: brings a state back into its allowed range.
+    least: lower limit of a residual's standard deviation, so that residuals of nearly 0 settle too.
     """
     state, at = start, equations_at(start)
     strength, converged = np.full(len(start), damping), np.zeros(len(start), bool)
@@ -277,7 +302,7 @@ def minimize_each(
         tried = equations_at(trial)
         better = tried.cost < at.cost
         gained = at.cost - tried.cost
-        # A promise made small by damping alone says nothing.
+        # A small predicted gain that is due to damping says nothing.
         converged |= (better & (gained < enough)) | ((promised < enough) & (strength <= FELT))
         state = np.where(better[:, None], trial, state)
         at = tried.where(better, at)
@@ -289,7 +314,7 @@ def minimize_each(
 
 
 def _weigh(blocks: Sequence[Block]) -> tuple[tuple[Array, ...], tuple[float, ...]]:
-    """Robust weights and spread of each block, one spread for all residuals of a kind."""
+    """Robust weights and spread of each block; all residuals of a kind share one spread."""
     weights: list[Array] = [np.empty(0)] * len(blocks)
     spreads = [0.0] * len(blocks)
     for noise, numbers in _kinds(blocks).items():
@@ -303,7 +328,7 @@ def _weigh(blocks: Sequence[Block]) -> tuple[tuple[Array, ...], tuple[float, ...
 
 
 def _cost(blocks: Sequence[Block], there: Sequence[Block], spreads: Sequence[float]) -> float:
-    """Of blocks, with sigmas and spreads as they were `there`."""
+    """Total cost of blocks, with sigmas and spreads as they were `there`."""
     total = 0.0
     with np.errstate(all="ignore"):
         for noise, numbers in _kinds(blocks).items():
@@ -341,7 +366,7 @@ def _equations(
 
 
 def _add_runs(block: Block, weighted: Array, normal: Array, gradient: Array) -> None:
-    """To the equations, what a block of several runs gives; weighted: (N, C) its weighted Jacobian."""
+    """Add a block of several runs to the equations; weighted: its weighted Jacobian (N, C)."""
     assert block.runs is not None
     assert not isinstance(block.columns, slice)
     turned = _stacked(weighted, block.runs).transpose(0, 2, 1)
@@ -354,7 +379,7 @@ def _add_runs(block: Block, weighted: Array, normal: Array, gradient: Array) -> 
 
 
 def _stacked(rows: Array, runs: Indices) -> Array:
-    """Runs of rows (N, C), one after another -> (G, M, C), short ones filled up with zeros."""
+    """Consecutive runs of rows (N, C) as (G, M, C), short ones padded with zeros."""
     longest = int(runs.max())
     stacked = np.zeros((len(runs), longest, rows.shape[1]))
     stacked[np.arange(longest) < runs[:, None]] = rows

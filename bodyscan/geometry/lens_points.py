@@ -1,7 +1,7 @@
-"""A projector with a lens, point by point: what `LensSheets` does for arrays of them.
+"""A projector with a lens, one point at a time, for compiled loops: see `LensSheets`.
 
-frame: (3, 4) of projector_from_camera.  lens: (10,) f, c, k1, k2, p1, p2, k3, k4, k5, k6, as in
-`LensSheets`.
+frame: projector_from_camera, (3, 4).
+lens: (10,) f, c, k1, k2, p1, p2, k3, k4, k5, k6, as in `LensSheets`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from bodyscan.compiled import compiled
 Vector = tuple[float, float, float]
 
 NEWTON_STEPS = 5
-EXACT, CONVERGED = 1e-7, 1e-6  # the next step would be the square of the last, relatively
+EXACT, CONVERGED = 1e-7, 1e-6  # relative: the next step would be about the square of the last
 
 
 @compiled
@@ -27,9 +27,13 @@ def stripes_of_points(
     reach: Array,
     by_freedom: Array,
 ) -> None:
-    """Fills, for points (N, 3) of the camera frame: stripe (N,), its derivatives by_point (N, 3), the
-    distance along the projector's axis, reach (N,), and, if by_freedom (N, P) has columns, the
-    stripe's derivatives by the freedoms of a fit."""
+    """Fill stripe coordinates and their derivatives at points (N, 3), camera frame.
+
+    stripe: (N,).
+    by_point: (N, 3), derivatives of the stripe coordinate by the point.
+    reach: (N,) mm, distance along the projector's axis.
+    by_freedom: (N, P), derivatives by the freedoms of a fit; skipped if it has no columns.
+    """
     for n in range(len(points)):
         seen = _seen(frame, points[n, 0], points[n, 1], points[n, 2])
         bent = _bent(lens, seen[0], seen[1])
@@ -53,9 +57,11 @@ def measure_rays(
     s: Array,
     found: Array,
 ) -> None:
-    """found (3, N): depth z, dz/ds and the variance of z, for rays (N, 3) at s (N,); NaN where none.
+    """Fill `found` (3, N) with depth z, dz/ds and the variance of z for rays (N, 3) at s (N,).
 
-    covariance: (P, P) of the freedoms of a fit.  distance: of the boards, mm.
+    NaN where a ray meets no sheet.
+    covariance: (P, P) of the freedoms of a fit.
+    distance: of the boards, mm.
     """
     jacobian = np.empty(len(covariance))
     for n in range(len(s)):
@@ -79,11 +85,11 @@ def measure_rays(
 
 @compiled
 def _depth(frame: Array, lens: Array, distance: float, x: float, y: float, s: float) -> float:
-    """z where the ray (x, y, 1) meets the sheet at s, by Newton's method on the offset times the
-    reach, which without a lens is linear along a ray; NaN where there is none, or only where the
-    lens folds back, far outside of its picture.
+    """Depth z where the ray (x, y, 1) meets the sheet at s; NaN where there is none.
 
-    It starts where the ray met the sheet if there were no lens, or at the distance (mm) if nowhere.
+    Newton's method on the offset times the reach, which without a lens is linear along a ray. It
+    starts where the ray would meet the sheet without the lens, or at `distance` (mm) if nowhere.
+    Also NaN where the only solution lies beyond the fold of the lens, far outside its image.
     """
     forward = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2]
     across, slope = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2], (s - lens[1]) / lens[0]
@@ -104,7 +110,7 @@ def _depth(frame: Array, lens: Array, distance: float, x: float, y: float, s: fl
 
 @compiled
 def _seen(frame: Array, x: float, y: float, z: float) -> Vector:
-    """X/Z, Y/Z and Z in the projector's frame of a point of the camera's."""
+    """X/Z, Y/Z and Z, in the projector's frame, of a point in the camera's."""
     reach = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z + frame[2, 3]
     return (
         (frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z + frame[0, 3]) / reach,
@@ -126,12 +132,12 @@ def _bent(lens: Array, x: float, y: float) -> Vector:
 
 @compiled
 def _radial(lens: Array, r2: float) -> Vector:
-    """By what the lens multiplies a distance from its axis of which r2 is the square; the derivative
-    of that by r2; and 1 / (1 + k4 r2 + ...)."""
+    """The lens's radial factor at squared radius r2, its derivative by r2, and 1 / (1 + k4 r2 +
+    ...)."""
     k1, k2, k3 = lens[2], lens[3], lens[6]
     above, rise = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3)
     k4, k5, k6 = lens[7], lens[8], lens[9]
-    if k4 == 0.0 and k5 == 0.0 and k6 == 0.0:  # as with nearly all: no division
+    if k4 == 0.0 and k5 == 0.0 and k6 == 0.0:  # true of nearly all: no division
         return above, rise, 1.0
     share = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     radial = above * share
@@ -149,7 +155,7 @@ def _slope_times_reach(frame: Array, seen: Vector, bent: Vector, x: float, y: fl
 
 @compiled
 def _by_freedom(lens: Array, seen: Vector, bent: Vector, jacobian: Array) -> None:
-    """ds (P,) by a small motion of the frame, f, c, and as many of k1, k2, p1, ... as there are."""
+    """Fill ds (P,) by a small motion of the frame, f, c, and as many of k1, k2, p1, ... as fit."""
     (x, y, reach), (slide, by_x, by_y) = seen, bent
     by_z, r2 = -(by_x * x + by_y * y), x * x + y * y
     jacobian[0], jacobian[1] = y * by_z - by_y, by_x - x * by_z

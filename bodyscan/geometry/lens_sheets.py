@@ -1,13 +1,13 @@
-"""A projector with a centre and a lens: the chapter's pinhole rival, grown up.
+"""A projector with a centre and a lens: the chapter's pinhole rival, extended by distortion.
 
 In the projector's frame x = X/Z along the stripes, y = Y/Z across them, r^2 = x^2 + y^2 and
 
     s = c + f (y (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
                + p1 (r^2 + 2 y^2) + 2 p2 x y),
 
-OpenCV's lens (Brown 1966; its rational one) for the one coordinate that stripes carry. Our fits use
-k1, k2, p1, p2; the others are those of projectors calibrated elsewhere. Without k and p this is the
-2 x 4 matrix of Bolles 1981, and where the centre lies along the stripes is then unknown.
+which is OpenCV's lens (Brown 1966, or rational) for the one coordinate that stripes carry. Our fits
+use k1, k2, p1, p2; the others occur in projectors calibrated elsewhere. Without k and p this is the
+2 x 4 matrix of Bolles 1981, which leaves the centre's place along the stripes unknown.
 """
 
 from __future__ import annotations
@@ -24,25 +24,28 @@ from bodyscan.geometry.transforms import RigidTransform, cross_matrix
 
 FRAME, SCALE = 6, 2
 CENTRE = FRAME + 1
-"""Of the freedoms: c."""
+"""Index of c among the freedoms."""
 LENS_SPREAD = (0.3, 0.3, 0.03, 0.03, 0.3, 0.3, 0.3, 0.3)
 """Standard deviations of k1, k2, p1, p2, k3, k4, k5, k6 before any data."""
 ASIDE = 0.3
-"""Standard deviation of where the boards' middle lies along the stripes, in distances."""
+"""Standard deviation of the boards' middle along the stripes, as a share of its distance."""
 
 
 @dataclass(frozen=True, eq=False)
 class LensSheets(SmoothSheets):
-    """parameters: f, c (stripes), then as many of k1, k2, p1, p2, k3, k4, k5, k6 as the lens has.
+    """A projector's light sheets.
 
-    The freedoms of a fit: a small motion of the projector's frame (rotation vector, translation in
-    mm, put before it), then the parameters.
+    parameters: f, c (stripes), then as many of k1, k2, p1, p2, k3, k4, k5, k6 as the lens has.
+
+    The freedoms of a fit are a small motion of the projector's frame (rotation vector, translation
+    in mm, applied on its left), then the parameters.
     """
 
     @staticmethod
     def pinhole(matrix: Array, middle: Array, stripes: int, direction: Axis) -> LensSheets:
-        """Without a lens, s = (row 0 . X) / (row 1 . X) with matrix (2, 4), X homogeneous, camera
-        frame. Where the centre lies along the stripes it does not say: opposite the middle."""
+        """A projector without a lens: s = (row 0 . X) / (row 1 . X), matrix (2, 4), X homogeneous,
+        camera frame. The matrix leaves the centre's place along the stripes open: it is put
+        opposite `middle`."""
         frame, scale = _frame_and_scale(matrix[0], matrix[1], 0.0)
         opposite = frame.translation - [frame.apply(middle)[0], 0.0, 0.0]
         frame, size = RigidTransform(frame.rotation, opposite), FRAME + SCALE
@@ -55,13 +58,14 @@ class LensSheets(SmoothSheets):
 
     @property
     def uncertain_alike(self) -> bool:
-        """Whether all that is uncertain is c, which moves all sheets together: those of a projector
-        that was calibrated elsewhere and not fitted to boards, beyond which it would be a guess."""
+        """Whether only c is uncertain, which moves all sheets together: true of a projector
+        calibrated elsewhere and not fitted to boards, so that no place far from boards would be a
+        guess."""
         others = np.delete(np.delete(self.covariance, CENTRE, 0), CENTRE, 1)
         return not others.any()
 
     def with_lens(self, terms: int) -> LensSheets:
-        """With that many of k1, k2, p1, p2, ...; those that are new start at 0."""
+        """The same projector with that many of k1, k2, p1, p2, ...; new ones start at 0."""
         parameters = np.zeros(SCALE + terms)
         kept = min(len(parameters), len(self.parameters))
         parameters[:kept] = self.parameters[:kept]
@@ -69,7 +73,7 @@ class LensSheets(SmoothSheets):
         return replace(self, parameters=parameters, covariance=np.full((size, size), np.nan))
 
     def turned(self, centre: float) -> LensSheets:
-        """Turned about the line along its stripes, so that its axis passes through s = centre."""
+        """Rotate about the line along its stripes so that its axis passes through s = centre."""
         focal, now = self.parameters[:SCALE]
         turn = np.array([np.arctan((centre - now) / focal), 0.0, 0.0])
         frame = RigidTransform.from_rotation_vector(turn, np.zeros(3)) @ self.projector_from_camera
@@ -86,8 +90,8 @@ class LensSheets(SmoothSheets):
         return np.append(x / (ASIDE * z), lens / spread), jacobian
 
     def retract(self, step: Array) -> LensSheets:
-        """The step is taken in the 2 x 4 matrix of the projector without its lens: there the
-        valley in which frame, f and c make up for one another is straight."""
+        """Apply a step in the 2 x 4 matrix of the projector without its lens: there the valley in
+        which frame, f and c compensate for one another is straight."""
         rows = self.projector_from_camera.matrix[:3]
         turn = cross_matrix(step[:3]) @ rows
         turn[:, 3] += step[3:FRAME]
@@ -120,7 +124,8 @@ class LensSheets(SmoothSheets):
         )
 
     def measure(self, rays: Array, s: Array) -> tuple[Array, Array, Array]:
-        """`depth`, `depth_per_stripe` and `variance_mm2` (N,) of rays (N, 3) at s (N,) in one go."""
+        """`depth`, `depth_per_stripe` and `variance_mm2` (N,) of rays (N, 3) at s (N,) in one
+        pass."""
         found = np.empty((3, len(s)))
         flat, covariance = np.ascontiguousarray(rays), np.ascontiguousarray(self.covariance)
         frame, lens = self._frame_and_lens()
@@ -128,7 +133,8 @@ class LensSheets(SmoothSheets):
         return found[0], found[1], found[2]
 
     def _frame_and_lens(self) -> tuple[Array, Array]:
-        """projector_from_camera (3, 4), and f, c, k1, ..., k6 (10,); 0 for what the lens lacks."""
+        """projector_from_camera (3, 4), and f, c, k1, ..., k6 (10,) with 0 for missing
+        coefficients."""
         lens = np.zeros(SCALE + len(LENS_SPREAD))
         lens[: len(self.parameters)] = self.parameters
         return np.ascontiguousarray(self.projector_from_camera.matrix[:3]), lens
@@ -142,7 +148,7 @@ def _frame_and_scale(above: Array, below: Array, x: float) -> tuple[RigidTransfo
     focal = float(np.linalg.norm(down))
     down = down / focal
     (a, b, c), (p, q, r) = down, axis
-    along = [b * r - c * q, c * p - a * r, a * q - b * p]  # a product of two: np.cross is slow
+    along = [b * r - c * q, c * p - a * r, a * q - b * p]  # np.cross is slow on single vectors
     rotation = np.array([along, down, axis])
     translation = np.array([x, (above[3] - centre * below[3]) / focal, below[3]])
     return RigidTransform(rotation, translation), np.array([focal, centre])

@@ -1,4 +1,4 @@
-"""Sheets of light as triangulation sees them; the chapter's: one free plane a stripe (Eq. 6)."""
+"""The interface of light sheets, and the chapter's model: one free plane per stripe (Eq. 6)."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ Axis = Literal["horizontal", "vertical"]
 
 
 class LightSheets(Protocol):
-    """What triangulation needs of a projector, whatever its model.
+    """What triangulation needs from a projector, whatever its model.
 
-    rays (..., 3) have z = 1, camera frame; s (...) is real. `depth` of the two latter is z (...)
-    where it is known already. All are NaN where a ray meets no sheet.
-    direction: the way the stripes run in the image.
+    In all methods rays (..., 3), camera frame, have z = 1, s (...) is real, and `depth`, where it
+    is already known, is z (...) mm. Results are NaN where a ray meets no sheet.
+    direction: which way the stripes run in the image.
     """
 
     @property
@@ -36,25 +36,27 @@ class LightSheets(Protocol):
         ...
 
     def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        """dz/ds (...), mm a stripe."""
+        """dz/ds (...), mm per stripe."""
         ...
 
     def variance_mm2(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        """Variance of z (...) that comes from how well the sheets themselves are known, mm^2."""
+        """Variance (...) mm^2 of z due to the uncertainty of the sheets themselves."""
         ...
 
     def tangent_planes(self, s: Array) -> Array:
-        """(..., 4): a, b, c (unit), d >= 0 of Eq. 6 that touch the sheets at s (...)."""
+        """Planes (..., 4) of Eq. 6 that touch the sheets at s (...): a, b, c (unit vector), d >=
+        0."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class LightPlanes:
-    """coefficients: (S + 1, 4), row i is (a, b, c, d) of the plane at s = i: ax + by + cz + d = 0.
+    """One plane per boundary, each independent of its neighbours.
 
-    Camera frame, mm, (a, b, c) a unit vector, d >= 0.  A row of NaN: stripe not calibrated.
+    coefficients: (S + 1, 4), row i is (a, b, c, d) of the plane at s = i: ax + by + cz + d = 0,
+        camera frame, mm, (a, b, c) a unit vector, d >= 0. A row of NaN: the stripe is not calibrated.
     covariance: (S + 1, 4, 4) of the coefficients.
-    direction: the way the stripes run in the image.
+    direction: which way the stripes run in the image.
     """
 
     coefficients: Array
@@ -71,14 +73,14 @@ class LightPlanes:
 
     @property
     def calibrated(self) -> Mask:
-        """(S + 1,): which boundaries have a plane."""
+        """Which boundaries have a plane, (S + 1,)."""
         return np.isfinite(self.coefficients[:, 0])
 
     def at(self, s: Array) -> Array:
-        """Planes (..., 4) at real s (...,), linear between neighbours; NaN beside a missing one."""
+        """Planes (..., 4) at real s (...), interpolated linearly; NaN beside a missing one."""
         below, share = self._between(s)
         share = share[..., None]
-        # A whole s needs only its own plane, not the neighbour's.
+        # At a whole s only its own plane is needed, not the neighbour's.
         lower = np.where(share < 1.0, self.coefficients[below], 0.0)
         upper = np.where(share > 0.0, self.coefficients[below + 1], 0.0)
         return (1.0 - share) * lower + share * upper
@@ -88,14 +90,14 @@ class LightPlanes:
         return self.at(s)
 
     def depth(self, rays: Array, s: Array) -> Array:
-        """Eq. 13: z = -d / (a x/z + b y/z + c)."""
+        """z (...) by Eq. 13: z = -d / (a x/z + b y/z + c)."""
         planes = self.at(s)
         facing = np.sum(planes[..., :3] * rays, axis=-1)
         depth = -planes[..., 3] / np.where(facing == 0.0, np.nan, facing)
         return np.where(depth > 0.0, depth, np.nan)
 
     def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        """dz/ds (...) between the two planes around s; at the last plane, those before it."""
+        """dz/ds (...) from the two planes around s; at the last plane, from the two before it."""
         depth = self.depth(rays, s) if depth is None else depth
         below, share = self._between(s)
         step = self.coefficients[below + 1] - self.coefficients[below]
@@ -106,7 +108,7 @@ class LightPlanes:
         return -(depth * np.sum(step[..., :3] * rays, axis=-1) + step[..., 3]) / facing
 
     def variance_mm2(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        """Neighbouring planes come from the same boards: their errors are taken as one."""
+        """Neighbouring planes come from the same boards, so their errors are treated as one."""
         depth = self.depth(rays, s) if depth is None else depth
         below, share = self._between(s)
         facing = np.sum(self.at(s)[..., :3] * rays, axis=-1)
@@ -119,7 +121,7 @@ class LightPlanes:
         return (((1.0 - share) * lower + share * upper) / facing) ** 2
 
     def _between(self, s: Array) -> tuple[Indices, Array]:
-        """The plane below s, and how far s is on its way to the next."""
+        """Index of the plane below s, and the fraction of the interval from it to s."""
         last = len(self.coefficients) - 2
         below = np.clip(np.nan_to_num(np.floor(s), nan=0.0).astype(np.int64), 0, last)
         return below, np.where(np.isfinite(s), s - below, np.nan)
@@ -128,8 +130,8 @@ class LightPlanes:
 def baseline_angle_tilt(planes: Array, direction: Axis) -> tuple[Array, Array, Array]:
     """Eq. 7-9: baseline (mm), projection angle and tilt angle (radians) of planes (N, 4).
 
-    They divide by a, which is 0 for horizontal stripes; those are reported about the other axis,
-    x and y exchanged.
+    The equations divide by a, which is 0 for horizontal stripes; for those the roles of x and y are
+    exchanged.
     """
     a, b, c, d = np.moveaxis(planes, -1, 0)
     if direction == "horizontal":

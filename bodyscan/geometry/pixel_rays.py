@@ -10,8 +10,11 @@ from bodyscan.geometry.quadratic_table import Table
 
 
 def rays_through(rays: Table, wanted: Mask, first_row: int = 0) -> Array:
-    """`Camera.rays` (N, 3) of the N pixels that are `wanted` (rows, width), row by row; the first
-    row given is the image's `first_row`.  rays: the camera's `ray_table`."""
+    """Rays (N, 3) through the N pixels that are `wanted` (rows, width), row by row.
+
+    rays: the camera's `ray_table`.
+    first_row: the image row of the first row of `wanted`.
+    """
     found = np.empty((np.count_nonzero(wanted), 3))
     _rays_through(rays, first_row, wanted, found)
     return found
@@ -19,9 +22,9 @@ def rays_through(rays: Table, wanted: Mask, first_row: int = 0) -> Array:
 
 @compiled
 def _rays_through(table: Table, first_row: int, wanted: Mask, rays: Array) -> None:
-    """rays (N, 3) of the N pixels `wanted` (rows, width).
+    """Fill rays (N, 3) of the N pixels `wanted` (rows, width).
 
-    As `look_up`, but in a row a cell's quadratics have one variable left until the next begins.
+    As `look_up`, but within a row each cell's quadratics are reduced to one variable once.
     """
     c, frame = table
     n = 0

@@ -1,4 +1,4 @@
-"""How well the joint solve knows each pose: the covariance of all pairs in the rig frame."""
+"""How well the joint solve knows each pose: joint covariance of all pairs in the rig frame."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ class PoseCovariance:
     matrix: Array
 
     def of(self, name: str) -> Array:
-        """(6, 6) of one pair's motion."""
+        """Covariance (6, 6) of one pair's motion."""
         k = 6 * self.names.index(name)
         return self.matrix[k : k + 6, k : k + 6]
 
     def among(self, names: Sequence[str]) -> Array:
-        """(6N, 6N) of these pairs' motions, in their order."""
+        """Covariance (6N, 6N) of these pairs' motions, in their order."""
         rows = np.concatenate([6 * self.names.index(name) + np.arange(6) for name in names])
         return self.matrix[np.ix_(rows, rows)]
 
     def between(self, a: str, b: str) -> Array:
-        """(6, 6) of the motion of b relative to a."""
+        """Covariance (6, 6) of the motion of b relative to a."""
         i, j = 6 * self.names.index(a), 6 * self.names.index(b)
         m = self.matrix
         rows_i, rows_j = slice(i, i + 6), slice(j, j + 6)
@@ -41,12 +41,14 @@ class PoseCovariance:
 
 
 def point_covariance(motion_covariance: Array, point: Array) -> Array:
-    """(3, 3) mm2: how a rig point (3,) carried by such a motion (6, 6) is spread."""
+    """Covariance (3, 3) mm^2 of a rig point (3,) due to a motion with covariance (6, 6)."""
     jacobian = twist_jacobian(point[None])[0]
     return jacobian @ motion_covariance @ jacobian.T
 
 
 def position_sigma(covariance: PoseCovariance, name: str, position: Array) -> Array:
-    """(3,) mm: standard deviation, along the rig's axes, of what the pair puts at `position` (3,), such
-    as its camera's centre."""
+    """Standard deviations (3,) mm, along the rig's axes, of a point attached to the pair.
+
+    position: (3,) mm, rig frame, such as the centre of the pair's camera.
+    """
     return np.sqrt(np.diag(point_covariance(covariance.of(name), position)))

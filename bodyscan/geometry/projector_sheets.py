@@ -1,7 +1,7 @@
-"""A projector that is described as a camera (as OpenCV's users calibrate it) as sheets of light.
+"""Light sheets of a projector that is described as a camera, as OpenCV's users calibrate it.
 
-A camera's pixel (u, v) has its centre at whole numbers, a stripe begins at them: the projector's
-column u is s = (u + 1/2) / w, w its pixels a stripe, and its row v likewise.
+A camera's pixel (u, v) has its centre at whole numbers, while a stripe begins at them: the
+projector's column u is s = (u + 1/2) / w with w its pixels per stripe, and likewise its row v.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from bodyscan.geometry.light_planes import Axis
 from bodyscan.geometry.transforms import RigidTransform
 
 DISTANCE = 5.0
-"""In baselines, where a camera and a projector whose axes do not meet are taken to look."""
+"""Where a camera and a projector whose axes do not meet are assumed to look, in baselines."""
 
 
 def sheets_of_projector(
@@ -27,15 +27,17 @@ def sheets_of_projector(
     direction: Axis,
     sigma_px: float = 0.0,
 ) -> LensSheets:
-    """The sheets of `stripes` that divide the projector's picture, as a camera sees them.
+    """The sheets of `stripes` stripes that divide the projector's image, in the camera's frame.
 
-    projector: its picture's size is that of all stripes together.  middle: (3,) mm, camera frame,
-    about what is looked at.  sigma_px: by how many of its pixels all sheets may be off together.
+    projector: its image size is that of all stripes together.
+    middle: (3,) mm, camera frame, roughly what is looked at.
+    sigma_px: by how many projector pixels all sheets may be off together.
+
     Raises BadInput for a lens that OpenCV does not have.
 
-    The stripes' coordinate needs one row of the matrix A, (fx, skew) or (0, fy): turned about its
-    axis, so that this row is its y, a projector with OpenCV's lens is one with such a lens again.
-    Its tangential part is r^2 q + 2 (q . x) x with q = (p2, p1), and q turns as x does.
+    The stripe coordinate needs one row of A, (fx, skew) or (0, fy). Rotated about its axis so that
+    this row becomes y, a projector with OpenCV's lens again has such a lens: its tangential part is
+    r^2 q + 2 (q . x) x with q = (p2, p1), and q rotates as x does.
     """
     row, centre, size = _across(projector, direction)
     focal = float(np.linalg.norm(row))
@@ -58,10 +60,11 @@ def sheets_of_projector(
 
 
 def projector_of_sheets(sheets: LensSheets) -> tuple[Camera, RigidTransform]:
-    """The way back: the projector as a camera with a pixel a stripe, and `projector_from_camera`.
+    """The inverse: the projector as a camera with one pixel per stripe, and
+    `projector_from_camera`.
 
-    Across the stripes it is exact. Along them its picture is square, of square pixels, its axis in
-    the middle: one direction of stripes says nothing of that.
+    Exact across the stripes. Along them one direction of stripes says nothing, so the image is
+    assumed to be square, with square pixels and its axis in the middle.
     """
     focal, centre = sheets.parameters[:SCALE].tolist()
     terms = sheets.parameters[SCALE:]
@@ -80,13 +83,13 @@ def projector_of_sheets(sheets: LensSheets) -> tuple[Camera, RigidTransform]:
 
 
 def looked_at(camera: Camera, projector: Camera, projector_from_camera: RigidTransform) -> Array:
-    """(3,) mm, camera frame: on the ray through the middle of the camera's picture, where that of
-    the projector's comes nearest to it."""
+    """The point (3,) mm, camera frame, on the ray through the middle of the camera's image that is
+    nearest to the ray through the middle of the projector's."""
     camera_from_projector = projector_from_camera.inverse()
     ray = _middle_ray(camera)
     light = camera_from_projector.rotate(_middle_ray(projector))
     start = camera_from_projector.translation
-    # depth * ray - (start + reach * light) is at right angles to both
+    # depth * ray - (start + reach * light) is perpendicular to both
     normal = np.array([[ray @ ray, -ray @ light], [ray @ light, -light @ light]])
     baseline = float(np.linalg.norm(start))
     depth, reach = np.full(2, np.nan)
@@ -97,7 +100,8 @@ def looked_at(camera: Camera, projector: Camera, projector_from_camera: RigidTra
 
 
 def _across(projector: Camera, direction: Axis) -> tuple[Array, float, int]:
-    """What of A makes the coordinate across the stripes, and the picture's size along it."""
+    """The row of A that gives the coordinate across the stripes, its centre, and the image size
+    there."""
     if direction == "vertical":
         return np.array([projector.alpha, projector.gamma]), projector.u0, projector.width
     return np.array([0.0, projector.beta]), projector.v0, projector.height

@@ -1,6 +1,6 @@
-"""A smooth map from the plane to the plane, tabulated as quadratics of cells.
+"""A smooth map from the plane to the plane, tabulated as one quadratic per cell.
 
-What compiled loops see of a camera: from pixels to rays and from rays to pixels, whatever the lens.
+Compiled loops use it in place of a camera: pixels to rays and rays to pixels, whatever the lens.
 """
 
 from __future__ import annotations
@@ -14,21 +14,22 @@ from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
 
 Table = tuple[Array, Array]
-"""For compiled functions, as `QuadraticTable` has them: coefficients, frame."""
+"""Coefficients and frame of a `QuadraticTable`, for compiled functions."""
 
 POWERS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0))
-"""Of x and y, by a cell's six coefficients."""
+"""Powers of x and y that belong to a cell's six coefficients."""
 NODES = 0.5 + 0.5 * np.cos(np.pi * (np.arange(3) + 0.5) / 3.0)
-"""Chebyshev's, across a cell of width 1: what is fitted there is wrong about evenly everywhere."""
+"""Chebyshev nodes across a cell of width 1: a fit there has about the same error everywhere."""
 
 
 @dataclass(frozen=True, eq=False)
 class QuadraticTable:
-    """coefficients: (rows, columns, 2, 6) of x^i y^j, both from 0 to 1 across a cell.
+    """A tabulated map with two values.
 
-    The outermost cells form a ring round the tabulated rectangle and say that a place is outside.
-    frame: (4,) the ring's least x and y, cells per unit of x and of y.
-    error: the farthest that a quadratic passes by a value it was fitted to, in the values' unit.
+    coefficients: (rows, columns, 2, 6) of x^i y^j, both from 0 to 1 across a cell. The outermost
+        cells form a ring around the tabulated rectangle that means "outside".
+    frame: (4,) the ring's least x and y, then cells per unit of x and of y.
+    error: the largest deviation of a quadratic from a fitted value, in the values' unit.
     """
 
     coefficients: Array
@@ -47,9 +48,13 @@ class QuadraticTable:
         cells: tuple[int, int],
         outside: float,
     ) -> QuadraticTable:
-        """`function` takes places (..., 2) to values (..., 2); tabulated from `low` to `high` (2,)
-        in cells (columns, rows), by least squares at 3 x 3 nodes of each.  Elsewhere, and in cells
-        where the function has no value (NaN) at some node, both values are `outside`."""
+        """Tabulate a function by least squares at 3 x 3 nodes of each cell.
+
+        function: takes places (..., 2) to values (..., 2).
+        low, high: (2,) limits of the tabulated rectangle.
+        cells: number of columns and rows.
+        outside: both values elsewhere, and in cells where the function is NaN at some node.
+        """
         size = (high - low) / cells
         x, y = (grid.ravel() for grid in np.meshgrid(NODES, NODES))
         corner = np.stack(np.meshgrid(np.arange(cells[0]), np.arange(cells[1])), axis=-1)

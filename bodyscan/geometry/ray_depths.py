@@ -21,19 +21,23 @@ from bodyscan.geometry.smooth_sheets import SmoothSheets
 Way = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 MOST_SIGMA = 1e-3
-"""A sheet that leaves a depth uncertain by more than this share of it is as good as none: so far
-from all boards a smooth model only guesses."""
+"""A sheet that leaves a larger share of the depth uncertain counts as missing: that far from all
+boards a smooth model only guesses."""
 GUESSED = 3.0
-"""Times as uncertain as amid the boards: what a few boards leave open of all depths alike is in their
-sigma, and no guess."""
+"""A depth is a guess if it is this many times as uncertain as amid the boards. What a few boards
+leave open of all depths alike is in their sigma and is no guess."""
 SAMPLES = 400
 BAND = 16  # rows at a time: what fits into a processor's cache
 
 
 @dataclass(frozen=True, eq=False)
 class RayDepths:
-    """depth: z (...) mm.  per_stripe: dz/ds (...), mm.  variance_mm2: of the depth, from the sheets
-    alone.  All NaN where there is no depth that can be trusted."""
+    """Depths along rays; NaN where no depth can be trusted.
+
+    depth: z (...) mm.
+    per_stripe: dz/ds (...), mm per stripe.
+    variance_mm2: (...) of the depth, due to the sheets alone.
+    """
 
     depth: Array
     per_stripe: Array
@@ -41,22 +45,23 @@ class RayDepths:
 
 
 def intersect_rays(sheets: LightSheets, rays: Array, s: Array) -> RayDepths:
-    """Rays (..., 3) with z = 1, camera frame, at real stripe coordinates s (...)."""
+    """Intersect rays (..., 3) with z = 1, camera frame, with the sheets at real s (...)."""
     found = _way_to_measure(sheets)(rays.reshape(-1, 3), np.ravel(s))
     unsure = found[2] > (_most_sigma(sheets) * found[0]) ** 2
     return RayDepths(*(np.where(unsure, np.nan, some).reshape(np.shape(s)) for some in found))
 
 
 def stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
-    """How far s changes, at one depth, from a pixel to the next across the stripes: median over some
-    of the pixels that have an s (height, width); 0 where none has."""
+    """Change of s, at constant depth, from one pixel to the next across the stripes: median over a
+    sample of the pixels that have an s (height, width); 0 if none has."""
     wanted = np.flatnonzero(np.isfinite(s))
     some = wanted[:: max(len(wanted) // SAMPLES, 1)]
     rows, columns = np.unravel_index(some, s.shape)
     pixels, own = np.column_stack([columns, rows]).astype(float), s.ravel()[some].astype(float)
     here = intersect_rays(sheets, camera.rays(pixels), own)
     beside = [intersect_rays(sheets, camera.rays(pixels + step), own) for step in np.eye(2)]
-    # Along its own sheet a ray beside meets another depth: as if s had changed by so much here.
+    # Along its own sheet a neighbouring ray meets another depth: as if s had changed by this much
+    # here.
     changes = [(one.depth - here.depth) / here.per_stripe for one in beside]
     found = np.hypot(*changes)
     found = found[np.isfinite(found)]
@@ -64,8 +69,8 @@ def stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
 
 
 def stripes_apart(sheets: LightSheets, camera: Camera, s: Floats, points: Floats) -> float:
-    """How far s (height, width) is from the sheets in which points (height, width, 3) lie, stripes:
-    median over some of the pixels that have both; NaN where none has."""
+    """Distance in stripes between s (height, width) and the sheets through points (height, width,
+    3): median over a sample of the pixels that have both; NaN if none has."""
     wanted = np.flatnonzero(np.isfinite(s) & np.isfinite(points[..., 2]))
     some = wanted[:: max(len(wanted) // SAMPLES, 1)]
     rows, columns = np.unravel_index(some, s.shape)
@@ -79,10 +84,14 @@ def stripes_apart(sheets: LightSheets, camera: Camera, s: Floats, points: Floats
 def triangulate_image(
     sheets: LightSheets, camera: Camera, s: Floats, sigma: Floats, shared: Floats | None = None
 ) -> tuple[Floats, Floats, Floats]:
-    """Points (height, width, 3), camera frame, mm, and along the viewing rays their sigma_mm and of
-    that common_mm (height, width), the part that neighbours share; of stripe coordinates s with
-    standard deviations sigma, which pixels have by themselves, and `shared`, if any (height, width).
-    NaN where no depth can be trusted.
+    """Triangulate an image of stripe coordinates; NaN where no depth can be trusted.
+
+    s: (height, width).
+    sigma: its standard deviations (height, width), independent between pixels.
+    shared: the part of the error that neighbours share (height, width), if any.
+
+    Returns points (height, width, 3), camera frame, mm, and their standard deviations along the
+    viewing rays (height, width): sigma_mm, and common_mm, the part that neighbours share.
     """
     way, pixels = _way_to_measure(sheets), ray_table(camera)
     points, sigma_mm = np.empty((*s.shape, 3), np.float32), np.empty(s.shape, np.float32)
@@ -102,8 +111,8 @@ def triangulate_image(
 
 
 def _most_sigma(sheets: LightSheets) -> float:
-    """MOST_SIGMA, or GUESSED times what boards leave open where they were; a projector that was
-    calibrated elsewhere is nowhere a guess, however roughly it may be known."""
+    """MOST_SIGMA, or GUESSED times what the boards leave open where they were. A projector that was
+    calibrated elsewhere is a guess nowhere, however roughly it may be known."""
     if isinstance(sheets, LensSheets) and sheets.uncertain_alike:
         return np.inf
     if not isinstance(sheets, SmoothSheets):
@@ -119,7 +128,7 @@ def _most_sigma(sheets: LightSheets) -> float:
 
 
 def _way_to_measure(sheets: LightSheets) -> Way:
-    """Of rays (N, 3) at s (N,): depth, its change with s and its variance, each (N,)."""
+    """A function from rays (N, 3) at s (N,) to depth, dz/ds and variance, each (N,)."""
     if isinstance(sheets, BowedSheets):
         return SheetTable.of(sheets).measure
     if isinstance(sheets, LensSheets):
@@ -141,11 +150,13 @@ def _place(
     most_sigma: float,
     made: tuple[Floats, Floats, Floats],
 ) -> None:
-    """Fills in points (rows, W, 3), sigma_mm and common_mm (rows, W) of the N pixels `wanted`
-    (rows, W), NaN elsewhere.
+    """Fill points (rows, W, 3), sigma_mm and common_mm (rows, W) of the N pixels `wanted` (rows,
+    W).
 
-    rays: (N, 3).  found: depth, dz/ds and variance, each (N,).  uncertain: sigma and what neighbours
-    share of s (rows, W).
+    NaN elsewhere.
+    rays: (N, 3).
+    found: depth, dz/ds and variance, each (N,).
+    uncertain: sigma of s, and the part of it that neighbours share, each (rows, W).
     """
     depths, slopes, variances = found
     sigma, shared = uncertain

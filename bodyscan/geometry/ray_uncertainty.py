@@ -1,4 +1,4 @@
-"""How well the ray of each pixel is known, beyond what a motion of the whole camera makes up for."""
+"""How well each pixel's ray is known, beyond what a motion of the whole camera would absorb."""
 
 from __future__ import annotations
 
@@ -10,24 +10,28 @@ import numpy as np
 from bodyscan.arrays import Array, Floats
 
 ROWS, COLUMNS = 17, 21
-"""Nodes across a picture; between them it changes smoothly."""
+"""Nodes across an image; the uncertainty is smooth between them."""
 
 
 @dataclass(frozen=True, eq=False)
 class RayUncertainty:
-    """Standard deviations of a coordinate, px, at ROWS x COLUMNS nodes from a picture's first pixel
-    to its last: noise_px from the corners' noise, lens_px from which lens is the right one."""
+    """Standard deviations of a coordinate, px, at ROWS x COLUMNS nodes from the first pixel to the
+    last.
+
+    noise_px: due to the corners' noise.
+    lens_px: due to the choice of lens model.
+    """
 
     noise_px: Array
     lens_px: Array
 
     @property
     def sigma_px(self) -> Array:
-        """(ROWS, COLUMNS), of both."""
+        """Both combined, (ROWS, COLUMNS)."""
         return np.hypot(self.noise_px, self.lens_px)
 
     def with_excess(self, variances: float) -> RayUncertainty:
-        """The noise that many times larger, in variances."""
+        """The same with the noise that many times larger, in variances."""
         return replace(self, noise_px=np.sqrt(variances) * self.noise_px)
 
     def image(self, width: int, height: int) -> Floats:
@@ -40,6 +44,6 @@ class RayUncertainty:
 
 
 def nodes(width: int, height: int) -> Array:
-    """(ROWS, COLUMNS, 2): the nodes' pixels."""
+    """Pixels (ROWS, COLUMNS, 2) of the nodes."""
     u, v = np.linspace(0.0, width - 1.0, COLUMNS), np.linspace(0.0, height - 1.0, ROWS)
     return np.stack(np.meshgrid(u, v), axis=-1)

@@ -1,4 +1,4 @@
-"""How far residuals spread, also where some are wrong, and how little the wrong ones then count."""
+"""Robust spread of residuals, and weights that let wrong ones count for little."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from bodyscan.arrays import Array
 
 SIGMAS_PER_MEDIAN = 1.4826
-"""Standard deviation over median absolute value of normally distributed residuals, 1 / 0.6745."""
+"""Standard deviation over median absolute value of normal residuals, 1 / 0.6745."""
 
 
 def rms(values: Array) -> float:
@@ -15,12 +15,12 @@ def rms(values: Array) -> float:
 
 
 def rms_length(vectors: Array) -> float:
-    """Of vectors (N, D)."""
+    """Root mean square length of vectors (N, D)."""
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
 def spread(residuals: Array, least: float = 1e-12) -> float:
-    """Robust standard deviation, from the median absolute value; at least `least`."""
+    """Robust standard deviation from the median absolute value; at least `least`."""
     return max(SIGMAS_PER_MEDIAN * float(np.median(np.abs(residuals))), least)
 
 
@@ -31,7 +31,7 @@ def cauchy_weights(residuals: Array, group: int, scale: float) -> Array:
 
 
 def cauchy_cost(residuals: Array, group: int, scale: float) -> float:
-    """Sum of the Cauchy loss over the groups; of small residuals, the sum of their squares."""
+    """Sum of the Cauchy loss over the groups; for small residuals, the sum of their squares."""
     return float(np.sum(np.log1p(_squared(residuals, group) / scale**2)) * scale**2)
 
 

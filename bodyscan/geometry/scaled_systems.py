@@ -1,7 +1,7 @@
-"""Normal equations solved and inverted whose unknowns differ in unit: px, radians, mm, stripes.
+"""Normal equations whose unknowns differ in unit (px, radians, mm, stripes), solved and inverted.
 
-Rows and columns are scaled to a unit diagonal first; without it a covariance in mm and one in radians
-differ by so many powers of ten that the smaller is lost.
+Rows and columns are scaled to a unit diagonal first. Otherwise a covariance in mm and one in
+radians differ by so many powers of ten that the smaller is lost.
 """
 
 from __future__ import annotations
@@ -11,15 +11,18 @@ import numpy as np
 from bodyscan.arrays import Array
 
 RANK = 1e-14
-"""Directions of a scaled matrix that hold less than this share of the largest are left open."""
+"""Directions of a scaled matrix with less than this share of the largest are left open."""
 BLOCK = 128
 
 
 def solve_scaled(matrix: Array, right: Array, damping: Array | float = 0.0) -> Array:
-    """x of matrix x = right, for one symmetric system or many.
+    """Solve matrix x = right for one symmetric system or many.
 
-    matrix: (..., P, P).  right: (..., P).  damping: (...) is added to the scaled diagonal
-    (Marquardt).  Of a singular system the shortest scaled solution.
+    matrix: (..., P, P).
+    right: (..., P).
+    damping: (...), added to the scaled diagonal (Marquardt).
+
+    A singular system gives the shortest scaled solution.
     """
     size = _size(matrix)
     scaled = matrix / (size[..., :, None] * size[..., None, :])
@@ -34,7 +37,7 @@ def solve_scaled(matrix: Array, right: Array, damping: Array | float = 0.0) -> A
 
 
 def invert_scaled(matrix: Array) -> Array:
-    """Pseudo-inverse (..., P, P) of symmetric matrices (..., P, P); NaN of those not finite."""
+    """Pseudo-inverse (..., P, P) of symmetric matrices (..., P, P); NaN for those not finite."""
     size = _size(matrix)
     outer = size[..., :, None] * size[..., None, :]
     scaled = matrix / outer
@@ -43,7 +46,7 @@ def invert_scaled(matrix: Array) -> Array:
         regular = bool(np.einsum("...ii->...i", factor).min(initial=1.0) ** 2 > RANK)
     except np.linalg.LinAlgError:
         regular = False
-    # Eigenvalues take ten times as long, and are asked only where the rank is in doubt.
+    # Eigenvalues take ten times as long and are needed only where the rank is in doubt.
     inverse = np.linalg.inv(scaled) if regular else _pseudo_inverse(scaled)
     return np.asarray(0.5 * (inverse + np.swapaxes(inverse, -1, -2)) / outer, np.float64)
 
@@ -56,8 +59,8 @@ def _pseudo_inverse(scaled: Array) -> Array:
 
 
 def gram(left: Array, right: Array) -> Array:
-    """left.T @ right for tall matrices, in blocks too small for BLAS to start threads for: pairs
-    are fitted side by side, and threads that wait for a core cost several times what they save."""
+    """left.T @ right for tall matrices, in blocks too small for BLAS to start threads: pairs are
+    fitted side by side, and threads waiting for a core cost several times what they save."""
     blocks = len(left) // BLOCK
     if not blocks:
         return np.asarray(left.T @ right, np.float64)
@@ -67,5 +70,5 @@ def gram(left: Array, right: Array) -> Array:
 
 
 def _size(matrix: Array) -> Array:
-    """Square roots (..., P) of the diagonal; an unknown without influence keeps a tiny one."""
+    """Square roots (..., P) of the diagonal; tiny but positive for an unknown without influence."""
     return np.sqrt(np.maximum(np.einsum("...ii->...i", matrix), 1e-300))

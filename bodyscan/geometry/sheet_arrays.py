@@ -1,4 +1,4 @@
-"""Sheets of light of any kind as plain arrays and back, to the last bit."""
+"""Light sheets of any kind as plain arrays and back, exact to the last bit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ KINDS = ("planes", "smooth-planes", "bowed", "lens")
 
 
 def to_arrays(sheets: LightSheets) -> dict[str, Array]:
-    """Arrays that, with `sheets.kind` and `sheets.direction`, hold all of the sheets."""
+    """Arrays that, with `sheets.kind` and `sheets.direction`, describe the sheets completely."""
     if isinstance(sheets, LightPlanes):
         return {"planes": sheets.coefficients, "covariance": sheets.covariance}
     if isinstance(sheets, SmoothSheets):
@@ -33,8 +33,10 @@ def to_arrays(sheets: LightSheets) -> dict[str, Array]:
 
 
 def from_arrays(kind: str, arrays: Mapping[str, Any], direction: Axis) -> LightSheets:
-    """The sheets that `to_arrays` took apart. Raises ValueError for an unknown kind or arrays of
-    the wrong size, KeyError for a missing one."""
+    """Rebuild the sheets from what `to_arrays` returned.
+
+    Raises ValueError for an unknown kind or arrays of the wrong size, KeyError for a missing one.
+    """
     if kind not in KINDS:
         raise ValueError(f"sheets of light of an unknown kind, {kind!r}")
     if kind == "planes":

@@ -1,12 +1,12 @@
-"""Bowed sheets and smooth planes, tabulated over s: triangulation of millions of pixels at once.
+"""Bowed sheets and smooth planes, tabulated over s to triangulate millions of pixels at once.
 
-With X = X_p + x0, Y, Z of a point in the sheets' frame, x = X/Z and w = D/Z the sheet at s is
+With X = X_p + x0, Y, Z of a point in the sheets' frame, x = X/Z and w = D/Z, the sheet at s is
 
     G = (p(s) + q(s) x + r(s) (w - 1) + b2(s) x^2 + ...) Z - Y = 0.
 
-All of s is in the coefficients, in their derivatives and in their covariance, which are smooth in s:
-linear between nodes an eighth of a stripe apart they are good to less than a micrometre.  Along a ray
-G is linear but for the small bow, so that Newton's method is done in a step or two.
+s enters only through the coefficients, their derivatives and their covariance, which are smooth in
+s: interpolated linearly between nodes an eighth of a stripe apart they are good to less than a
+micrometre. Along a ray G is linear but for the small bow, so Newton's method needs a step or two.
 """
 
 from __future__ import annotations
@@ -22,14 +22,18 @@ from bodyscan.geometry.bowed_sheets import BOW_DEGREE, PLANE_DEGREE, BowedSheets
 
 NODES_PER_STRIPE = 8
 NEWTON_STEPS = 5
-EXACT, CONVERGED = 1e-7, 1e-6  # the next step would be the square of the last, relatively
+EXACT, CONVERGED = 1e-7, 1e-6  # relative: the next step would be about the square of the last
 
 
 @dataclass(frozen=True, eq=False)
 class SheetTable:
-    """rows: (K, 2 T + U) at s = 0, 1/8, 2/8, ...: the T coefficients p, q, r, b2, ..., their
-    derivatives by s, and the upper triangle of the covariance of the coefficients and, with a bow, of
-    x0, row by row.  frame: (14,) projector_from_camera's three rows, x0 and D.
+    """The tabulated sheets.
+
+    rows: (K, 2 T + U) at s = 0, 1/8, 2/8, ...: the T coefficients p, q, r, b2, ..., their
+        derivatives by s, and row by row the upper triangle of the covariance of the coefficients
+        and, with a bow, x0.
+    terms: T.
+    frame: (14,) the three rows of projector_from_camera, then x0 and D.
     """
 
     rows: Array
@@ -42,7 +46,7 @@ class SheetTable:
         at = sheets.at(np.arange(NODES_PER_STRIPE * sheets.stripes + 1.0) / NODES_PER_STRIPE)
         terms, aside = 3 + sheets.bow_terms, sheets.bow_terms > 0
         by_parameter = _by_parameter(at, terms, len(sheets.parameters))
-        # Node by node a small matrix, all nodes in one product of large ones.
+        # A small matrix per node: two large products do all nodes.
         spread = (by_parameter.reshape(-1, len(sheets.covariance)) @ sheets.covariance).reshape(
             by_parameter.shape
         ) @ by_parameter.transpose(0, 2, 1)
@@ -53,15 +57,16 @@ class SheetTable:
         return SheetTable(rows, terms, np.append(frame, [shift, sheets.distance_mm]))
 
     def measure(self, rays: Array, s: Array) -> tuple[Array, Array, Array]:
-        """Depth z (N,) mm, dz/ds and the variance of z, for rays (N, 3) at s (N,); NaN where none."""
+        """Depth z (N,) mm, dz/ds and the variance of z, for rays (N, 3) at s (N,); NaN where
+        none."""
         found = np.empty((3, len(s)))
         _measure(self.frame, self.rows, self.terms, np.ascontiguousarray(rays), s, found)
         return found[0], found[1], found[2]
 
 
 def _by_parameter(at: SheetsAtStripe, terms: int, parameters: int) -> Array:
-    """(K, T, P): derivatives of the coefficients by the parameters at the nodes; with a bow x0 is one
-    coefficient more."""
+    """Derivatives (K, T, P) of the coefficients by the parameters at the nodes; with a bow, x0 is
+    one more coefficient."""
     aside = terms > 3
     found = np.zeros((len(at.basis), terms + aside, parameters))
     first = 0
@@ -76,7 +81,7 @@ def _by_parameter(at: SheetsAtStripe, terms: int, parameters: int) -> Array:
 
 @compiled
 def _measure(frame: Array, rows: Array, terms: int, rays: Array, s: Array, found: Array) -> None:
-    """found (3, N): depth, dz/ds and variance of rays (N, 3) at s (N,)."""
+    """Fill `found` (3, N) with depth, dz/ds and variance of rays (N, 3) at s (N,)."""
     last, row, by = len(rows) - 1, np.empty(rows.shape[1]), np.empty(terms + 1)
     for n in range(len(s)):
         found[0, n] = found[1, n] = found[2, n] = np.nan
@@ -107,8 +112,8 @@ def _measure(frame: Array, rows: Array, terms: int, rays: Array, s: Array, found
 
 @compiled
 def _depth(frame: Array, row: Array, terms: int, x: float, y: float) -> tuple[float, float]:
-    """z where the ray (x, y, 1) meets the sheet with the coefficients that begin the row, and dG/dz
-    there; NaN where Newton's method does not settle."""
+    """z where the ray (x, y, 1) meets the sheet whose coefficients begin the row, and dG/dz there;
+    NaN where Newton's method does not settle."""
     along, across, forward = (
         _turned(frame, 0, x, y),
         _turned(frame, 1, x, y),
@@ -138,19 +143,19 @@ def _depth(frame: Array, row: Array, terms: int, x: float, y: float) -> tuple[fl
 
 @compiled
 def _turned(frame: Array, axis: int, x: float, y: float) -> float:
-    """A coordinate, in the sheets' frame, of the direction (x, y, 1)."""
+    """One coordinate, in the sheets' frame, of the direction (x, y, 1)."""
     return frame[4 * axis] * x + frame[4 * axis + 1] * y + frame[4 * axis + 2]
 
 
 @compiled
 def _at(frame: Array, axis: int, x: float, y: float, depth: float) -> float:
-    """A coordinate, in the sheets' frame, of the ray's point at the depth."""
+    """One coordinate, in the sheets' frame, of the ray's point at the depth."""
     return depth * _turned(frame, axis, x, y) + frame[4 * axis + 3]
 
 
 @compiled
 def _variance(upper: Array, by: Array) -> float:
-    """by^T C by, of the upper triangle of C, row by row, as far as it reaches."""
+    """by^T C by, given the upper triangle of C row by row, as far as `by` reaches."""
     total, first, size = 0.0, 0, len(by)
     if len(upper) < size * (size + 1) // 2:
         size -= 1

@@ -1,8 +1,8 @@
-"""Sheets of light that change smoothly with s: what bowed sheets and a projector's lens share.
+"""Light sheets that change smoothly with s: what bowed sheets and a projector's lens share.
 
-A model says by how much a point lies off the sheet of stripe coordinate s, as a smooth function
-of both. All else follows from that function's derivatives: the depth along a ray by Newton's
-method, its change with s, its variance, and the fit itself.
+A model says how far a point lies off the sheet at s, as a smooth function of both. Everything else
+follows from that function's derivatives: the depth along a ray (by Newton's method), its change
+with s, its variance, and the fit itself.
 """
 
 from __future__ import annotations
@@ -26,11 +26,13 @@ CHUNK = 1 << 17
 
 @dataclass(frozen=True, eq=False)
 class Offset:
-    """How far points (..., 3) lie off their sheets, in a unit of the model's own.
+    """How far points (..., 3) lie off their sheets, in the model's own unit.
 
-    value: (...).  by_point: (..., 3), its derivatives, camera frame.  by_stripe: (...), by s.
+    value: (...).
+    by_point: (..., 3), derivatives by the point, camera frame.
+    by_stripe: (...), derivatives by s.
     reach: (...), the points' distance from the projector along its axis, mm.
-    by_parameter: (..., P), only when asked for.
+    by_parameter: (..., P), only when requested.
     """
 
     value: Array
@@ -42,11 +44,14 @@ class Offset:
 
 @dataclass(frozen=True, eq=False)
 class SmoothSheets(ABC):
-    """projector_from_camera: a frame that stands roughly at the projector: z the way it shines,
-    x along the stripes, y across them.
+    """Light sheets that are smooth in s.
 
-    middle: (3,) mm, camera frame, the middle of the boards: the search for a depth starts at its
-    distance.  parameters: (Q,), see the model.  covariance: (P, P) of what `retract` takes.
+    projector_from_camera: a frame roughly at the projector: z the way it shines, x along the
+    stripes,
+        y across them.
+    middle: (3,) mm, camera frame, the middle of the boards; the search for a depth starts there.
+    parameters: (Q,), see the model.
+    covariance: (P, P) of the freedoms that `retract` takes.
     """
 
     projector_from_camera: RigidTransform
@@ -59,29 +64,28 @@ class SmoothSheets(ABC):
     @property
     @abstractmethod
     def kind(self) -> str:
-        """Its name in files."""
+        """Name of the model in files."""
 
     @abstractmethod
     def prior(self) -> tuple[Array, Array]:
-        """What is known before any data: residuals (R,) in standard deviations, and their
-        Jacobian (R, P)."""
+        """Prior knowledge: residuals (R,) in standard deviations, and their Jacobian (R, P)."""
 
     @abstractmethod
     def retract(self: Sheets, step: Array) -> Sheets:
-        """Moved by a step (P,)."""
+        """The sheets after a step (P,)."""
 
     @property
     def distance_mm(self) -> float:
-        """The boards' distance along the projector's z."""
+        """Distance of the boards along the projector's z axis."""
         return float(self.projector_from_camera.apply(self.middle)[2])
 
     @abstractmethod
     def at(self, s: Array) -> Any:
-        """What the sheets at s (...) are like: all that `offset` needs to know of s."""
+        """Everything about the sheets at s (...) that `offset` needs."""
 
     @abstractmethod
     def offset(self, points: Array, sheet: Any, *, parameters: bool = False) -> Offset:
-        """points (..., 3), camera frame, against the sheets `at(s)`."""
+        """How far points (..., 3), camera frame, lie off the sheets `at(s)`."""
 
     def depth(self, rays: Array, s: Array) -> Array:
         """z (...) mm where rays (..., 3) with z = 1 meet the sheets at s (...); else NaN.
@@ -96,7 +100,7 @@ class SmoothSheets(ABC):
         return depth.reshape(rays.shape[:-1])
 
     def depth_per_stripe(self, rays: Array, s: Array, depth: Array | None = None) -> Array:
-        """dz/ds (...), mm a stripe."""
+        """dz/ds (...), mm per stripe."""
         depth = self.depth(rays, s) if depth is None else depth
         offset = self.offset(rays * depth[..., None], self.at(s))
         return -offset.by_stripe / np.sum(offset.by_point * rays, axis=-1)
@@ -117,8 +121,8 @@ class SmoothSheets(ABC):
         return variance.reshape(shape)
 
     def tangent_planes(self, s: Array) -> Array:
-        """Planes (..., 4) of Eq. 6 that touch the sheets at s (...) in the projector's middle, at
-        the boards' distance; (a, b, c) a unit vector, d >= 0."""
+        """Planes (..., 4) of Eq. 6 that touch the sheets at s (...) in the middle of the
+        projector's image, at the boards' distance; (a, b, c) a unit vector, d >= 0."""
         camera_from_projector = self.projector_from_camera.inverse()
         s = np.asarray(s, float)
         place = np.zeros((*s.shape, 3))
@@ -135,7 +139,7 @@ class SmoothSheets(ABC):
         return planes * np.where(planes[..., 3:] < 0.0, -1.0, 1.0)
 
     def with_covariance(self: Sheets, covariance: Array) -> Sheets:
-        """The same sheets, known that well."""
+        """The same sheets with another covariance (P, P)."""
         return replace(self, covariance=covariance)
 
     def _depth(self, rays: Array, s: Array) -> Array:

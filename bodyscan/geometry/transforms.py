@@ -1,4 +1,4 @@
-"""Rigid transforms that read aloud: `rig_from_camera @ camera_from_board`."""
+"""Rigid transforms whose names chain: `rig_from_camera @ camera_from_board`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from bodyscan.arrays import Array
 class RigidTransform:
     """`a_from_b`: takes coordinates in frame b to coordinates in frame a.
 
-    rotation: (3, 3) orthonormal, determinant +1.  translation: (3,) mm, b's origin seen in a.
+    rotation: (3, 3) orthonormal, determinant +1.
+    translation: (3,) mm, b's origin in a.
     """
 
     rotation: Array
@@ -28,13 +29,14 @@ class RigidTransform:
 
     @staticmethod
     def from_rotation_vector(rotation_vector: ArrayLike, translation: ArrayLike) -> RigidTransform:
-        """Axis times angle, (3,) radians, and a (3,) translation in mm."""
+        """From axis times angle (3,), radians, and a translation (3,), mm."""
         rotation = cv2.Rodrigues(np.asarray(rotation_vector, float))[0]  # a tenth of scipy's time
         return RigidTransform(rotation, np.asarray(translation, float))
 
     @staticmethod
     def from_matrix(matrix: ArrayLike) -> RigidTransform:
-        """(4, 4) or (3, 4); the rotation part is brought to the nearest rotation."""
+        """From a (4, 4) or (3, 4) matrix, whose rotation part is replaced by the nearest
+        rotation."""
         matrix = np.asarray(matrix, float)
         u, _, vt = np.linalg.svd(matrix[:3, :3])
         rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
@@ -42,25 +44,25 @@ class RigidTransform:
 
     @property
     def matrix(self) -> Array:
-        """(4, 4) homogeneous matrix."""
+        """Homogeneous matrix (4, 4)."""
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
         return matrix
 
     @property
     def rotation_vector(self) -> Array:
-        """(3,) axis times angle, radians."""
+        """Axis times angle (3,), radians."""
         return Rotation.from_matrix(self.rotation).as_rotvec()
 
     @property
     def twist(self) -> Array:
-        """(6,) rotation vector (radians), then translation (mm): what `moved` takes."""
+        """Rotation vector (radians), then translation (mm), (6,): what `moved` takes."""
         return np.concatenate([self.rotation_vector, self.translation])
 
     @property
     def angle(self) -> float:
-        """Size of the rotation, radians."""
-        # |R - 1| = 2 sqrt(2) sin(angle / 2), exact for small angles too.
+        """Angle of the rotation, radians."""
+        # |R - 1| = 2 sqrt(2) sin(angle / 2): accurate for small angles too.
         half = np.linalg.norm(self.rotation - np.eye(3)) / np.sqrt(8.0)
         return float(2.0 * np.arcsin(min(half, 1.0)))
 
@@ -73,15 +75,16 @@ class RigidTransform:
         return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
 
     def apply(self, points: Array) -> Array:
-        """Points (..., 3) in b -> (..., 3) in a."""
+        """Points (..., 3) in b to points (..., 3) in a."""
         return points @ self.rotation.T + self.translation
 
     def rotate(self, directions: Array) -> Array:
-        """Directions (..., 3) in b -> (..., 3) in a."""
+        """Directions (..., 3) in b to directions (..., 3) in a."""
         return directions @ self.rotation.T
 
     def moved(self, twist: ArrayLike) -> RigidTransform:
-        """A small motion in frame a put before it: exp(twist) @ self, to first order in coupling.
+        """Apply a small motion in frame a on the left: exp(twist) @ self, to first order in
+        coupling.
 
         twist: (6,) rotation vector (radians), then translation (mm).
         """
@@ -90,7 +93,7 @@ class RigidTransform:
 
 
 def cross_matrix(vectors: Array) -> Array:
-    """Cross-product matrices (..., 3, 3) of vectors (..., 3): skew(a) @ b = a x b."""
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3): cross_matrix(a) @ b = a x b."""
     zero = np.zeros(vectors.shape[:-1])
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     rows = [zero, -z, y, z, zero, -x, -y, x, zero]
@@ -98,7 +101,8 @@ def cross_matrix(vectors: Array) -> Array:
 
 
 def adjoint(a_from_b: RigidTransform) -> Array:
-    """(6, 6): carries a twist (rotation, translation) expressed in b to the same motion in a."""
+    """Matrix (6, 6) that carries a twist (rotation, translation) expressed in b to the same motion
+    in a."""
     rotation = a_from_b.rotation
     matrix = np.zeros((6, 6))
     matrix[:3, :3] = matrix[3:, 3:] = rotation
@@ -118,7 +122,7 @@ def twist_jacobian(points: Array) -> Array:
 
 
 def rigid_fit(source: Array, target: Array) -> RigidTransform:
-    """`target_from_source` that best carries points (N, 3) onto (N, 3), least squares.
+    """`target_from_source` that carries points (N, 3) onto (N, 3) best in least squares.
 
     Source: Arun, Huang, Blostein 1987, with Umeyama's correction against reflections.
     """

@@ -1,4 +1,4 @@
-"""Which points a camera sees, as far as its image reaches."""
+"""Which points lie within a camera's image."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from bodyscan.geometry.camera_tables import CAMERAS
 
 
 def in_image(camera: Camera, points: Array, margin_px: float = 0.0) -> Mask:
-    """Points (..., 3), camera frame -> (...) whether they lie ahead and inside the image.
+    """Whether points (..., 3), camera frame, lie ahead of the camera and inside its image, (...).
 
-    Far outside its image a lens model folds back: such points project inside though
-    the camera cannot see them. They are ruled out by where the lens folds and by the rays of the
-    image's own rim.
+    Far outside its image a lens model may fold back, so that points which the camera cannot see
+    project inside. They are excluded by the lens's fold radius and by the rays of the image's own
+    rim.
     """
     low, high = _reach(camera)
     ahead = points[..., 2] > 0.0
@@ -31,7 +31,7 @@ def in_image(camera: Camera, points: Array, margin_px: float = 0.0) -> Mask:
 
 @lru_cache(CAMERAS)
 def _reach(camera: Camera) -> tuple[Array, Array]:
-    """Least and greatest ideal (x, y) in the image, and a little more."""
+    """Least and greatest ideal (x, y) within the image, with a small margin."""
     u, v = np.linspace(0.0, camera.width - 1.0, 9), np.linspace(0.0, camera.height - 1.0, 9)
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     rim = camera.rays(grid)[:, :2]

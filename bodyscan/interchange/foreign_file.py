@@ -1,4 +1,4 @@
-"""A file of another program: where its words stand, and its numbers checked before they are used."""
+"""A file written by another program: where its words are, and its numbers checked before use."""
 
 from __future__ import annotations
 
@@ -18,23 +18,24 @@ from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.transforms import RigidTransform
 
 MOST_BYTES = 100_000_000
-"""mrcal's files hold all corners of a calibration besides, some megabytes."""
+"""mrcal's files hold all corners of a calibration as well, some megabytes."""
 ROTATION_TOLERANCE = 1e-3
-"""Of R R^T from 1: a rotation written with four digits keeps it; a milliradian is a millimetre at a
-metre. What is within it is brought to the nearest rotation."""
+"""Deviation of R R^T from 1: a rotation written with four digits keeps it; a milliradian is a
+millimetre at a metre. What is within it is replaced by the nearest rotation."""
 SAME_UNIT = "the file as that program wrote it"
 
 
 @dataclass(frozen=True)
 class ForeignFile:
-    """path: of the file.  text: its content, "" where it is none."""
+    """path: of the file. text: its content, "" if it has none."""
 
     path: Path
     text: str = ""
 
     @staticmethod
     def read(path: Path) -> ForeignFile:
-        """Raises CalibrationFileError for what is not a text file, BadInput for a folder or a pipe."""
+        """Read a text file. Raises CalibrationFileError if it is
+        not text, BadInput for a folder or a pipe."""
         empty = ForeignFile(path)
         try:
             data = read_regular(path, MOST_BYTES)
@@ -49,8 +50,8 @@ class ForeignFile:
             raise empty.error(f"cannot be read: {fault.strerror or fault}") from None
 
     def where(self, word: str = "", after: str = "") -> str:
-        """The file and the line in which a word stands first, as a key if it does so anywhere; behind
-        another word if one is given."""
+        """The file and the line in which a word occurs first, as a key if it does so anywhere;
+        after another word if one is given."""
         place = 0
         for part in filter(None, (after, word)):
             alone = rf"(?<![\w.-]){re.escape(part)}(?![\w-])"
@@ -68,7 +69,7 @@ class ForeignFile:
     def error(
         self, what: str, word: str = "", remedy: str = "", *, after: str = ""
     ) -> CalibrationFileError:
-        """What is wrong with the file, or with what a word in it names."""
+        """An error about the file, or about what a word in it names."""
         named = f"{after + '.' if after else ''}{word}: " if word else ""
         return CalibrationFileError(
             named + what,
@@ -77,7 +78,7 @@ class ForeignFile:
         )
 
     def numbers(self, value: Any, word: str, counts: Sequence[int], *, after: str = "") -> Array:
-        """`value` as a flat array of one of these lengths; any length if there are none."""
+        """`value` as a flat array of one of these lengths; of any length if there are none."""
         try:
             array: Array = np.asarray(value, np.float64).ravel()
         except (TypeError, ValueError):
@@ -125,7 +126,7 @@ class ForeignFile:
             ) from None
 
     def size(self, value: Any, word: str, *, after: str = "") -> tuple[int, int]:
-        """Width and height of a picture, px."""
+        """Width and height of an image, px."""
         width, height = self.numbers(value, word, (2,), after=after)
         if width != int(width) or height != int(height) or width < 1 or height < 1:
             raise self.error(
@@ -136,7 +137,7 @@ class ForeignFile:
     def pose(
         self, rotation: Any, translation: Any, words: tuple[str, str], *, after: str = ""
     ) -> RigidTransform:
-        """From a rotation matrix row by row or a rotation vector, and a translation."""
+        """A pose from a rotation matrix row by row, or a rotation vector, and a translation."""
         given = self.numbers(rotation, words[0], (3, 9), after=after)
         shift = self.numbers(translation, words[1], (3,), after=after)
         if len(given) == 3:

@@ -1,4 +1,4 @@
-"""A camera, or a projector described as one, as it stands in another program's file."""
+"""A camera, or a projector described as one, as found in another program's file."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.transforms import RigidTransform
 
 SHIFTED = 0.5
-"""In pictures: how far beside its picture the axis of a camera of known size may lie: a shift lens
-moves it by less."""
+"""How far outside its image the axis of a camera of known size may lie, in image sizes: a shift
+lens moves it by less."""
 STEPS = np.linspace(0.25, 0.75, 5)
 INNER = np.stack(np.meshgrid(STEPS, STEPS), axis=-1)
-"""Where every lens has rays; one that was fitted without boards in the corners may fold there."""
+"""Where every lens has rays; one fitted without boards in the corners may fold there."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
-    """matrix: A of Eq. 1, (3, 3), px, whole numbers at pixel centres.
+    """A camera, or a projector described as one, read from a file.
 
-    size: of its picture, (width, height) px; None where the file does not say.
-    camera_from_world: its pose, lengths in the file's unit; None where the file does not say.
+    matrix: A of Eq. 1, (3, 3), px, whole numbers at pixel centres.
+    size: of its image, (width, height) px; None if the file does not say.
+    camera_from_world: its pose, lengths in the file's unit; None if the file does not say.
     where: the file, and the line if it has lines.
     """
 
@@ -38,10 +39,10 @@ class FoundCamera:
     where: str
 
     def camera(self, width: int, height: int) -> Camera:
-        """With a picture of that size, px.
+        """The camera with an image of that size, px.
 
-        Raises CalibrationFileError if the file says another, its axis is beside such a picture, or
-        its lens folds inside of it.
+        Raises CalibrationFileError if the file gives another size, if its axis is outside such an
+        image, or if its lens folds within it.
         """
         told = "calibrate that camera as it is used now, or correct the size in the rig file"
         if self.size is not None and self.size != (width, height):
@@ -66,9 +67,10 @@ class FoundCamera:
         return self.projector(width, height)
 
     def projector(self, width: int, height: int) -> Camera:
-        """With a picture of that size, px; many projectors shine upwards, their axis beside it.
+        """The projector with an image of that size, px; its axis may be outside it, as many shine
+        upwards.
 
-        Raises CalibrationFileError if the lens folds inside of it.
+        Raises CalibrationFileError if the lens folds within it.
         """
         a = self.matrix
         camera = Camera(
@@ -88,7 +90,7 @@ class FoundCamera:
 
 
 def camera_named(cameras: Mapping[str, FoundCamera], name: str, where: str) -> FoundCamera:
-    """One of a file's cameras. Raises CalibrationFileError, with those there are, if it is none."""
+    """One of a file's cameras. Raises CalibrationFileError, which lists them, if there is none."""
     if name not in cameras:
         raise CalibrationFileError(
             f"has no camera {name!r}{did_you_mean(name, cameras)}",

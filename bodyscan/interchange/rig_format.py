@@ -1,4 +1,4 @@
-"""How the cameras of a calibrated rig are written for another program, and what it wrote is read."""
+"""What a format for the cameras of a calibrated rig provides, and the registry of formats."""
 
 from __future__ import annotations
 
@@ -20,21 +20,23 @@ RigCameras: TypeAlias = "Mapping[str, tuple[Camera, RigidTransform]]"
 """Camera and `rig_from_camera` by the pair's name; projectors, as cameras, by `projector_name`."""
 Unit = Literal["mm", "cm", "m"]
 MILLIMETRES: dict[Unit, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-"""In one of a unit."""
+"""Millimetres per unit."""
 Nodes: TypeAlias = Mapping[str, str]
-"""Names of a file's nodes, by what they hold: matrix, distortion, size or width and height, rotation,
-translation."""
+"""Names of a file's nodes, by what they hold: matrix, distortion, size or width and height,
+rotation, translation."""
 
 
 @dataclass(frozen=True)
 class RigFormat:
-    """path: of what is written, a file or a folder, below the folder that the user chose.
+    """One format.
 
-    unit: of lengths in such files; None where the format leaves it open.
-    write: cameras to that path, which it returns; raises BadInput for a lens that it cannot express.
-    read: every camera of such a file or folder, by name.  read_nodes: one camera of a file whose
-    nodes may be called anything; None where the format says how they are called.  Both raise
-    CalibrationFileError.
+    path: of what is written, a file or a folder, below the folder that the user chose.
+    unit: of lengths in such files; None if the format leaves it open.
+    write: writes cameras to that path, which it returns; raises BadInput for a lens that the format
+        cannot express.
+    read: returns every camera of such a file or folder, by name.
+    read_nodes: reads one camera of a file whose nodes may have any name; None if the format fixes
+        the names. Both raise CalibrationFileError.
     """
 
     path: str
@@ -45,12 +47,12 @@ class RigFormat:
 
 
 def projector_name(pair: str) -> str:
-    """How a pair's projector is called among the cameras."""
+    """The name of a pair's projector among the cameras."""
     return f"{pair}-projector"
 
 
 def opencv_lens(name: str, camera: Camera) -> Array:
-    """Of a pair's camera, OpenCV's coefficients (5,) or more. Raises BadInput that names the pair
+    """OpenCV's coefficients (5,) or more of a pair's camera. Raises BadInput, which names the pair,
     for a lens that OpenCV does not have."""
     try:
         return camera.lens.opencv()

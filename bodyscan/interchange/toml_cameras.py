@@ -1,4 +1,4 @@
-"""What the TOML of caliscope and of aniposelib have in common: a table of OpenCV's numbers a camera."""
+"""What the TOML of caliscope and of aniposelib share: a table of OpenCV's numbers per camera."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NOTE = (
 
 
 def read_toml(file: ForeignFile) -> dict[str, Any]:
-    """Raises CalibrationFileError for what is not TOML, with the line."""
+    """The content of a TOML file. Raises CalibrationFileError, with the line, if it is not TOML."""
     try:
         return tomllib.loads(file.text)
     except tomllib.TOMLDecodeError as error:
@@ -27,7 +27,7 @@ def read_toml(file: ForeignFile) -> dict[str, Any]:
 
 
 def camera_of_table(file: ForeignFile, table: dict[str, Any], key: str) -> FoundCamera:
-    """key: the table's own, as it stands in the file."""
+    """The camera in a table; key: the table's own, as written in the file."""
     for word in ("size", "matrix", "distortions"):
         if word not in table:
             raise file.error(f"has no {word}", key, f"it has {', '.join(table)}")
@@ -52,7 +52,7 @@ def camera_of_table(file: ForeignFile, table: dict[str, Any], key: str) -> Found
 def table_of_camera(
     name: str, camera: Camera, camera_from_rig: RigidTransform, mm_a_unit: float
 ) -> str:
-    """The lines of size, matrix, distortions, rotation and translation.
+    """The lines for size, matrix, distortions, rotation and translation.
 
     Raises BadInput for a lens that OpenCV does not have.
     """

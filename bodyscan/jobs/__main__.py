@@ -1,5 +1,5 @@
-"""A process of jobs: `python -m bodyscan.jobs FOLDER`, or `--resident CALIBRATION`; a batch or `watch`
-starts it, nobody needs to type it."""
+"""A process of jobs: `python -m bodyscan.jobs FOLDER`, or `--resident CALIBRATION`; started by a
+batch or by `watch`, not by hand."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Memory and cores shared out, so that many jobs neither wait for each other nor run short."""
+"""Sharing memory and cores so that many jobs neither wait for each other nor run short."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bodyscan.settings import Resources
 
 @dataclass(frozen=True)
 class Allocation:
-    """workers: jobs at the same time.  threads: of each.  why: what limits them, in words."""
+    """workers: jobs at the same time. threads: per job. why: what limits them, in words."""
 
     workers: int
     threads: int
@@ -22,9 +22,10 @@ class Allocation:
 def allocate(
     resources: Resources, jobs: int, workers: int | None, cores: int, memory_mb: float
 ) -> Allocation:
-    """As many jobs at once as cores and memory allow, no more than there are.
+    """As many jobs at once as cores and memory allow, but no more than there are.
 
-    workers: as asked for; they then get fewer threads each, but never more memory than there is.
+    workers: a number requested by the user; more workers get fewer threads each, but never more
+        memory than there is.
     """
     by_memory = max(1, int(memory_mb // resources.memory_mb))
     most = workers or max(1, cores // resources.threads)
@@ -37,14 +38,14 @@ def allocate(
 
 
 def cores() -> int:
-    """That this process may use."""
+    """Number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def free_memory_mb() -> float:
-    """What the machine has free, or this container may still take, in MB (1e6 bytes)."""
+    """Memory that is free on the machine, or left to this container, in MB (1e6 bytes)."""
     free = [float("inf")]
     with suppress(OSError, ValueError):
         for line in Path("/proc/meminfo").read_text("ascii").splitlines():

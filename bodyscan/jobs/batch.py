@@ -1,4 +1,4 @@
-"""Many jobs: a lock on the output folder, jobs side by side, what is told, and how it ended."""
+"""Many jobs: a lock on the output folder, jobs side by side, events, and the final state."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from bodyscan.jobs.supervision import (
 )
 
 Run = Callable[[Sequence[Job]], Iterator[JobResult]]
-"""Starts jobs and yields how each ended, as soon as it did."""
+"""Starts jobs and yields each result as soon as the job ends."""
 
 Work = Callable[[Job, JobProcess, Listen], JobResult]
-"""What is done with a Job: `supervise_job`, or on its copy from elsewhere (see object_storage)."""
+"""Does a Job: `supervise_job`, or that on a local copy (see object_storage)."""
 
 
 def run_batch(
     jobs: Sequence[Job], out: Path, run: Run, listen: Listen = ignore_events
 ) -> list[JobResult]:
-    """Bring every job up to date; outcomes in the order of the jobs.
+    """Bring every job up to date; returns results in the order of the jobs.
 
-    A job that fails is set aside with its reason, the others go on.  Raises BadInput when another
-    batch works in `out`, or `out` cannot be written.
+    A job that fails is set aside with its reason, and the others go on. Raises BadInput if another
+    batch is working in `out`, or `out` is not writable.
     """
     with for_owner_only():
         try:
@@ -69,10 +69,11 @@ def run_batch(
 def seconds_left(
     ended: Sequence[JobResult], waiting: Collection[str], spent_s: float
 ) -> float | None:
-    """How long a batch will go on, from how long jobs took that had something to do.
+    """Estimated time to the end of a batch, from the durations of jobs that had something to do.
 
-    waiting: jobs that have no result yet; others are found up to date in no time.  None: no job
-    has shown yet how long one takes.
+    waiting: jobs without a result; those up to date take no time.
+
+    None if no job has shown yet how long one takes.
     """
     took = [outcome.seconds for outcome in ended if outcome.state == "done" and outcome.stages]
     if not waiting or not took:
@@ -87,7 +88,7 @@ def run_locally(
     listen: Listen = ignore_events,
     work: Work = supervise_job,
 ) -> Run:
-    """Runs jobs on this machine, `shares.workers` at a time."""
+    """Run jobs on this machine, `shares.workers` at a time."""
 
     def run(jobs: Sequence[Job]) -> Iterator[JobResult]:
         pool = ThreadPoolExecutor(shares.workers)
@@ -103,7 +104,7 @@ def run_locally(
 
 
 def sweep(out: Path) -> None:
-    """Take away what a batch was writing when it was killed."""
+    """Remove files that a batch was writing when it was killed."""
     for path in (*out.glob(".summary.*.tmp.csv"), *out.glob(".manifest.*.tmp.json")):
         path.unlink(missing_ok=True)
 
@@ -115,7 +116,7 @@ def _tell(outcome: JobResult, listen: Listen) -> None:
 def finish(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> dict[str, object]:
     """Write the table and the manifest over all jobs; returns the event that ends a batch.
 
-    Raises FailedWork when they cannot be written.
+    Raises FailedWork if they cannot be written.
     """
     from bodyscan.jobs.summary import (
         drifted,

@@ -1,8 +1,8 @@
 """The same jobs on many machines: a dask.distributed cluster starts the job command on each worker.
 
-Scans and output lie in folders that all machines see under the same path, or in object storage.
-dask sends a job again when its worker is lost; the lost worker's process ends by itself, its
-half-made results are taken away, and a job that was already done is found done.
+Scans and output are in folders that all machines see under the same path, or in object storage.
+dask sends a job again if its worker is lost; the lost worker's process ends by itself, its
+unfinished results are removed, and a job that was already done is found done.
 """
 
 from __future__ import annotations
@@ -26,11 +26,13 @@ def run_on_cluster(
     listen: Listen = ignore_events,
     work: Work = supervision.supervise_job,
 ) -> Run:
-    """Runs jobs on the cluster whose scheduler listens at `address`, such as tcp://host:8786.
+    """Run jobs on the cluster whose scheduler listens at `address`, such as tcp://host:8786.
 
-    threads: of each job.  How many jobs run at once is the cluster's matter: one for each thread of
-    each worker (`dask worker --nthreads`).  Raises BadInput when dask.distributed is not installed,
-    FailedWork when nobody answers or there is no worker.
+    threads: per job. The cluster decides how many jobs run at once: one for each thread of each
+        worker (`dask worker --nthreads`).
+
+    Raises BadInput if dask.distributed is not installed, FailedWork if nobody answers or there is
+    no worker.
     """
     try:
         from distributed import Client, as_completed
@@ -69,7 +71,7 @@ def run_on_cluster(
 
 
 def run_on_worker(work: Work, job: Job, process: JobProcess) -> JobResult:
-    """What a worker does with one job."""
+    """Do one job on a worker."""
     os.umask(0o077)
     if work is supervision.supervise_job and not job.folder.is_dir():
         return JobResult(

@@ -14,7 +14,7 @@ from bodyscan.jobs.pipeline import Pipeline
 
 CALIBRATION = "calibration.json"
 RESULTS = (CALIBRATION, "scan.json")
-"""Folders with one of these hold what bodyscan wrote, not what a camera did."""
+"""Files that mark a folder as written by bodyscan rather than by cameras."""
 RIG_FILE = "rig.yaml"
 
 
@@ -24,7 +24,8 @@ def find_jobs(
     """One job for every scan (or rig) in `scans`, sorted by name.
 
     calibration: None for the nearest `calibration` folder: in `scans`, beside it or above it.
-    Raises BadInput when there is no scan, or no calibration for scans.
+
+    Raises BadInput if there is no scan, or no calibration for scans.
     """
     if not scans.is_dir():
         raise BadInput("there is no such folder", where=str(scans), remedy="check --scans")
@@ -46,9 +47,9 @@ def job_of(path: Path, pipeline: Pipeline, out: Path, calibration: Path | None, 
 
 
 def _scans(scans: Path, out: Path) -> list[Path]:
-    """Every folder but hidden ones, results, and captures that say they are no scan.
+    """Every folder except hidden ones, results, and captures that say they are not a scan.
 
-    A folder that cannot be read as a scan is still a job: it must be said that it failed.
+    A folder that cannot be read as a scan is a job too: its failure must be reported.
     """
     if (scans / CAPTURES).exists():
         return [scans.absolute()]
@@ -76,7 +77,7 @@ def _folders(folder: Path, out: Path) -> list[Path]:
 
 
 def _captures_content(folder: Path) -> dict[str, Any]:
-    """What the folder's captures.yaml says, unchecked; nothing if it cannot be read."""
+    """The folder's captures.yaml, unchecked; empty if it cannot be read."""
     try:
         data = read_yaml(folder / CAPTURES).data
     except (YamlError, OSError, RecursionError):
@@ -85,7 +86,8 @@ def _captures_content(folder: Path) -> dict[str, Any]:
 
 
 def nearest_calibration(scans: Path) -> Path:
-    """The `calibration` folder in that of the scans, beside or above it. Raises BadInput."""
+    """The `calibration` folder in the folder of the scans, beside it or above it. Raises
+    BadInput."""
     absolute = scans.absolute()
     for above in (absolute, *list(absolute.parents)[:2]):
         if (above / "calibration" / CALIBRATION).exists():

@@ -1,4 +1,4 @@
-"""How a batch is shown: bars for people, a JSON object a line for other programs."""
+"""How a batch is shown: bars for people, one JSON object per line for other programs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ _STYLES = {"good": "green", "usable": "yellow", "bad": "red"}
 
 @contextmanager
 def json_lines() -> Iterator[Listen]:
-    """Every event as a line of JSON on standard output, with the time (seconds since 1970)."""
+    """Print every event as a line of JSON on standard
+    output, with the time (seconds since 1970)."""
     lock = threading.Lock()
 
     def listen(event: dict[str, Any]) -> None:
@@ -36,13 +37,13 @@ def json_lines() -> Iterator[Listen]:
 
 @contextmanager
 def silence() -> Iterator[Listen]:
-    """Nothing: errors alone are told."""
+    """Show nothing; only errors are reported."""
     yield lambda event: None
 
 
 @contextmanager
 def screen() -> Iterator[Listen]:
-    """One bar for all jobs with the time left, a line for each that runs, one for each that ended."""
+    """Show one bar for all jobs with the time left, and a line for each that runs or has ended."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=20),
@@ -55,8 +56,8 @@ def screen() -> Iterator[Listen]:
 
 @contextmanager
 def lines() -> Iterator[Listen]:
-    """One line a scan as soon as its points tell how good it is, one for its verdict, one when its job
-    has ended."""
+    """Print a line per scan as soon as its points tell how good it is, one for its verdict, and one
+    when its job has ended."""
     console = Console()
 
     def listen(event: dict[str, Any]) -> None:
@@ -70,7 +71,7 @@ def lines() -> Iterator[Listen]:
 
 
 class _Screen:
-    """Draws events; they come from several threads."""
+    """Draws events, which come from several threads."""
 
     def __init__(self, bars: Progress) -> None:
         self._bars = bars
@@ -139,7 +140,7 @@ def _verdict_text(event: dict[str, Any]) -> Text:
 
 
 def ending(event: dict[str, Any]) -> str:
-    """How a job ended, in a line (or more, when it was set aside)."""
+    """How a job ended, in one line (or more if it was set aside)."""
     if event["state"] != "done":
         tries = f" after {event['attempts']} attempts" if event["attempts"] else ""
         return f"{event['job']}: set aside{tries}: {event['reason']}"
@@ -164,7 +165,7 @@ def _stature_text(median_mm: float | None) -> str:
 
 
 def _drift_text(drifted: dict[str, float]) -> str:
-    """drifted: mm, of pairs by name."""
+    """A warning of drift; drifted: mm, by pair."""
     if not drifted:
         return ""
     name, mm = next(iter(drifted.items()))

@@ -1,8 +1,8 @@
-"""Every file of a subject in a workspace: found by what the files say, never by their names.
+"""Every file of a subject in a workspace, found by the files' content and never by their names.
 
-A folder is a subject's when its captures.yaml, scan.json or job.json says so; with it goes all below
-it that is no other subject's.  Elsewhere an export is told by the JSON beside it.  Rows of summaries
-and entries of manifests that speak of the subject go too.
+A folder is a subject's if its captures.yaml, scan.json or job.json says so, together with
+everything below it that is not another subject's. Elsewhere an export is recognised by the JSON
+beside it. Rows of summaries and entries of manifests about the subject are removed too.
 """
 
 from __future__ import annotations
@@ -25,15 +25,19 @@ from bodyscan.files.yaml_file import YamlError, read_yaml
 from bodyscan.jobs.job import BATCH_LOCK, JOB, MANIFEST, SUMMARY
 from bodyscan.jobs.summary import write_out_manifest
 
-# Removed in this order, so that what says whose a folder is goes last: a removal that was
-# interrupted can be taken up again.
+# Removed in this order, so that the file which names the owner goes last: an interrupted removal
+# can be continued.
 _MARKERS = ("scan.json", JOB, CAPTURES)
 
 
 @dataclass(frozen=True)
 class SubjectFiles:
-    """files: of the subject.  folders: of the subject alone.  tables: summaries and manifests of
-    batches, which are written anew.  unreadable: files that should say whose a folder is, and do not.
+    """What belongs to a subject.
+
+    files: of the subject.
+    folders: of the subject alone.
+    tables: summaries and manifests of batches, which are rewritten.
+    unreadable: files that should name a folder's owner, and do not.
     """
 
     files: tuple[Path, ...]
@@ -43,7 +47,7 @@ class SubjectFiles:
 
 
 def find_subject(subject: str, workspace: Path) -> SubjectFiles:
-    """What `forget_subject` would remove. Raises BadInput when the workspace is no folder."""
+    """What `forget_subject` would remove. Raises BadInput if the workspace is not a folder."""
     if not workspace.is_dir():
         raise BadInput("there is no such folder", where=str(workspace), remedy="check --workspace")
     files: list[Path] = []
@@ -64,7 +68,7 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
 def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
     """Remove every file of a subject in a workspace; links are removed, never followed.
 
-    Raises BadInput when there is nothing of that subject, or a batch is at work in the workspace.
+    Raises BadInput if there is nothing of that subject, or a batch is working in the workspace.
     """
     with ExitStack() as locks:
         locks.enter_context(for_owner_only())
@@ -94,7 +98,7 @@ def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
 def _walk(
     folder: Path, owner: str | None, unreadable: list[Path]
 ) -> Iterator[tuple[Path, list[str], str | None]]:
-    """Every folder with the names of its files (and links), and whose it is."""
+    """Every folder with the names of its files (and links), and its owner."""
     with os.scandir(folder) as entries:
         listed = sorted(entries, key=lambda entry: entry.name)
     names = [entry.name for entry in listed if not entry.is_dir(follow_symlinks=False)]
@@ -111,7 +115,7 @@ def _walk(
 
 
 def _subject(path: Path) -> str | None:
-    """Whose a file says that its folder is."""
+    """The subject that a file names as its folder's owner."""
     is_yaml = path.name == CAPTURES
     content: Any = read_yaml(path).data if is_yaml else json.loads(path.read_text("utf-8"))
     if not isinstance(content, dict):
@@ -121,7 +125,7 @@ def _subject(path: Path) -> str | None:
 
 
 def _exports(folder: Path, names: list[str], subject: str) -> set[str]:
-    """Exports of the subject in a folder that is nobody's or another's, with their JSON files."""
+    """The subject's exports in a folder of no one or another subject, with their JSON files."""
     own: set[str] = set()
     for name in names:
         if name.endswith(".json") and name.removesuffix(".json") in names:

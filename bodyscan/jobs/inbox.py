@@ -1,8 +1,8 @@
-"""An inbox: a folder a scan, whose images are still being written.
+"""An inbox: one folder per scan, whose images are still being written.
 
-An image is whole when it ends as its format does, or when it has not changed for a while; a pair is,
-when all its images are; a scan is complete when all pairs are, or `done` lies in its folder, or
-nothing has come for long. docs/inbox.md is the protocol.
+An image is whole if it ends as its format does, or has not changed for a while; a pair is whole if
+all its images are; a scan is complete if all pairs are whole, or `done` is in its folder, or
+nothing has arrived for long. docs/inbox.md is the protocol.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from bodyscan.rig.templates import ANYTHING, fill
 DONE = "done"
 SHOT = "s01"
 SETTLED_S = 0.5
-"""An image without an end of its own is whole when it has not grown for so long: cameras' drivers
-write a file in one go, in hundredths of a second."""
+"""An image without an end mark is whole when it has not grown for this long: camera drivers write a
+file in one go, in hundredths of a second."""
 
 _ENDS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
-"""The last bytes of a file that is whole."""
+"""The last bytes of a complete file."""
 
 
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp", ".pgm")
@@ -37,8 +37,8 @@ _LOSSLESS = (".png", ".tif", ".tiff", ".bmp", ".pgm")
 
 @dataclass(frozen=True)
 class Arrival:
-    """What has come of a scan. whole: pairs whose images are all there.  complete: nothing more has to
-    be waited for."""
+    """What has arrived of a scan. whole: pairs with all their images. complete: nothing more is
+    expected."""
 
     whole: tuple[str, ...]
     complete: bool
@@ -55,10 +55,11 @@ class _Seen:
 def put_image(
     inbox: Path, rig: Rig, scan: str, pair: str, frame: str, image: Bytes, *, shot: str = SHOT
 ) -> Path:
-    """An image that a program has in memory, put where `watch` takes it for that frame; its path.
+    """Write an image from memory to where `watch` expects that frame; returns its path.
 
-    image: (height, width) uint8 or uint16. It is there whole or not at all. Raises BadInput for a
-    pair or a template of `files` that no image can be named after.
+    image: (height, width) uint8 or uint16. The file appears complete or not at all. Raises BadInput
+        for
+    a pair, or a template of `files`, that yields no image name.
     """
     if pair not in {own.name for own in rig.pairs}:
         raise BadInput(f"rig {rig.name} has no pair {pair}", where=f"scan {scan}, frame {frame}")
@@ -77,7 +78,7 @@ def put_image(
 
 
 class IncomingScan:
-    """One scan's folder, looked at again and again."""
+    """One scan's folder, examined repeatedly."""
 
     def __init__(self, folder: Path, rig: Rig) -> None:
         self.folder, self.rig = folder, rig
@@ -85,16 +86,17 @@ class IncomingScan:
         self._changed_s: float | None = None
 
     def look(self, now_s: float, quiet_s: float) -> Arrival:
-        """What is there now. now_s: of a clock that never goes back.
+        """What is there now.
 
-        quiet_s: a scan to which nothing has been added for so long is taken as it is.
+        now_s: of a monotonic clock.
+        quiet_s: a scan to which nothing was added for this long is taken as it is.
         """
         if self._look_for_changes(now_s) or self._changed_s is None:
             self._changed_s = now_s
         try:
             sequences = open_scan(self.rig, self.folder).sequences
         except CaptureError:
-            sequences = ()  # nothing yet, or what only the scan itself can complain of
+            sequences = ()  # nothing yet, or an error that the scan itself will report
         striped = [sequence for sequence in sequences if sequence.has_stripes]
         whole = {sequence.pair for sequence in striped if self._is_whole(sequence, now_s)}
         all_there = bool(whole) and self._expected(striped) <= whole
@@ -102,7 +104,7 @@ class IncomingScan:
         return Arrival(tuple(sorted(whole)), complete)
 
     def _expected(self, striped: list[ImageSequence]) -> set[str]:
-        """Pairs that have to come: those of captures.yaml, or all that have a projector."""
+        """Pairs to expect: those in captures.yaml, or all that have a projector."""
         if (self.folder / CAPTURES).exists():
             return {sequence.pair for sequence in striped}
         return {pair.name for pair in self.rig.pairs if pair.projector is not None}
@@ -118,7 +120,7 @@ class IncomingScan:
         return len(seen) == len(sequence.paths) and all(settled)
 
     def _look_for_changes(self, now_s: float) -> bool:
-        """Every file of the folder; whether one came, went or changed."""
+        """Check every file in the folder; returns whether one came, went or changed."""
         before, self._files = self._files, {}
         for path in files_below(self.folder):
             try:
@@ -134,7 +136,8 @@ class IncomingScan:
 
 
 def _ends_as_it_should(path: Path, size: int) -> bool:
-    """Whether the file's last bytes say that it is whole; no for formats that do not say."""
+    """Whether the file's last bytes show that it is complete;
+    False for formats without an end mark."""
     end = _ENDS.get(path.suffix.lower())
     if end is None or size < len(end) or not path.is_file():
         return False

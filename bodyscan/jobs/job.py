@@ -1,4 +1,4 @@
-"""One job: a folder that holds what to do (job.json), how it went, its log and its results."""
+"""One job: a folder that holds what to do (job.json), its state, its log and its results."""
 
 from __future__ import annotations
 
@@ -27,9 +27,11 @@ _TAKEN = {MANIFEST, SUMMARY, BATCH_LOCK}
 class Job:
     """One scan to be fused, or one rig to be calibrated.
 
-    folder: where it is worked on.  source: the scan's folder, or the rig file's.
-    calibration: what calibrate-rig wrote; None for a rig.  until: the last stage wanted.
-    subject: the pseudonym that the scan's captures.yaml gives, never told from a name.
+    folder: where it is worked on.
+    source: the scan's folder, or the rig file's.
+    calibration: what calibrate-rig wrote; None for a rig.
+    until: the last stage wanted.
+    subject: the pseudonym in the scan's captures.yaml, never derived from a name.
     """
 
     name: str
@@ -42,9 +44,9 @@ class Job:
 
 
 def job_name(folder_name: str) -> str:
-    """The name of a scan's folder as that of its job: itself, or its plain letters and a hash.
+    """A job's name from that of its scan's folder: unchanged, or its plain letters and a hash.
 
-    So a name with quotes, line breaks or other alphabets is safe in every file system and table.
+    A name with quotes, line breaks or other alphabets thus is safe in every file system and table.
     """
     if _PLAIN.fullmatch(folder_name) and folder_name not in _TAKEN:
         return folder_name
@@ -53,9 +55,9 @@ def job_name(folder_name: str) -> str:
 
 
 def write_job(job: Job) -> None:
-    """Write job.json; paths are relative to the job's folder, so that all may move together.
+    """Write job.json; paths are relative to the job's folder, so that everything may move together.
 
-    Raises BadInput when a link stands where the folder should be: it may lead anywhere.
+    Raises BadInput if there is a link in place of the folder: it may lead anywhere.
     """
     if job.folder.is_symlink() or (job.folder.exists() and not job.folder.is_dir()):
         raise BadInput(
@@ -80,7 +82,7 @@ def write_job(job: Job) -> None:
 
 
 def read_job(folder: Path) -> Job:
-    """Read what `write_job` wrote. Raises ResultError when it cannot be."""
+    """Read what `write_job` wrote. Raises ResultError if it is not readable."""
     try:
         content = json.loads((folder / JOB).read_text("utf-8"))
         calibration = content["calibration"]
@@ -102,7 +104,7 @@ def read_job(folder: Path) -> Job:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """The JSON object in a file; empty if there is none that can be read."""
+    """The JSON object in a file; empty if it is missing or unreadable."""
     try:
         content = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError):
@@ -115,7 +117,7 @@ def _there(folder: Path, relative: str) -> Path:
 
 
 def printable(text: str) -> str:
-    """Text without what would disturb a terminal or a table: control characters are spelt out."""
+    """Text that cannot disturb a terminal or a table: control characters are spelt out."""
     return "".join(
         letter if letter.isprintable() or letter == "\n" else ascii(letter)[1:-1] for letter in text
     )

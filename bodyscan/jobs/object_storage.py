@@ -1,9 +1,9 @@
 """Scans and results in object storage (s3://, gs://, abfs:// and whatever else fsspec opens).
 
-A job's inputs and what there is of its results are fetched into a folder of the machine that works on
-it, the same job command runs there, and what is new goes back: stage.json, which vouches for a stage's
-files by their hashes, after those files.  So an upload that was cut short is never taken for a result.
-There are no locks in object storage: one batch at a time is the user's matter.
+A job's inputs and existing results are fetched into a folder of the machine that works on it, the
+usual job command runs there, and what is new is put back; stage.json, which vouches for a stage's
+files by their hashes, comes last. So an interrupted upload is never mistaken for a result. Object
+storage has no locks: running one batch at a time is up to the user.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class Store:
 
 
 def find_stored_jobs(store: Store, pipeline: Pipeline, until: str, work: Path) -> list[Job]:
-    """The jobs of a store; `work`, an empty folder here, gets an outline of it.
+    """The jobs of a store; `work`, an empty local folder, receives an outline of it.
 
-    Raises BadInput as `find_jobs` does, or when fsspec cannot open the store.
+    Raises BadInput as `find_jobs` does, or if fsspec cannot open the store.
     """
     files = _Files(store.scans)
     for name in files.folders():
@@ -64,7 +64,8 @@ def find_stored_jobs(store: Store, pipeline: Pipeline, until: str, work: Path) -
 def work_on_stored(
     job: Job, process: JobProcess, listen: Listen = ignore_events, *, store: Store
 ) -> JobResult:
-    """Fetch a job, bring it up to date, and put back what is new. Never raises for what it does."""
+    """Fetch a job, bring it up to date, and put back what is
+    new. Returns failures, never raises them."""
     try:
         with tempfile.TemporaryDirectory(prefix="bodyscan-") as folder:
             work = Path(folder)
@@ -89,7 +90,7 @@ def work_on_stored(
 
 
 def fetch_figures(jobs: Sequence[Job], store: Store) -> None:
-    """What the summary needs of every job, into the outline."""
+    """Fetch what the summary needs of every job into the outline."""
     for job in jobs:
         files = _Files(store.job(job.name))
         for name in _FIGURES:
@@ -109,7 +110,7 @@ def _stages(folder: Path) -> dict[str, bytes]:
 
 
 def _put_back(folder: Path, there: _Files, was: dict[str, bytes], ran: tuple[str, ...]) -> None:
-    """was: the stages as they were fetched.  ran: those that were made again, maybe the same."""
+    """Put back results. was: the stages as fetched. ran: those made again, perhaps identical."""
     now = _stages(folder)
     for stage in was.keys() - now.keys():
         there.remove(stage)
@@ -153,13 +154,13 @@ class _Files:
         return sorted(names)
 
     def fetch(self, folder: Path) -> None:
-        """Every file, to its place below `folder`."""
+        """Fetch every file to its place below `folder`."""
         folder.mkdir(parents=True, exist_ok=True)
         for name in self._names():
             self.fetch_one(name, _inside(folder, name))
 
     def fetch_one(self, name: str, path: Path) -> None:
-        """One file, if it is there."""
+        """Fetch one file if it exists."""
         if self._system.isfile(f"{self._root}/{name}"):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._system.get_file(f"{self._root}/{name}", str(path))
@@ -181,7 +182,7 @@ class _Files:
 
 
 def _inside(folder: Path, name: str) -> Path:
-    """Object names are any text; none may lead out of the folder they are fetched into."""
+    """The path of an object; names may be any text, but none may lead out of the folder."""
     parts = PurePosixPath(name).parts
     if not parts or name.startswith("/") or ".." in parts:
         raise BadInput(f"the object's name {name!r} leads out of its folder", where=str(folder))

@@ -36,7 +36,9 @@ SECTIONS = {
 
 
 class Pipeline(Model):
-    """The whole file.  kind: what a job is, one scan (fuse) or one rig file (calibrate).
+    """The whole file.
+
+    kind: what a job is, one scan (fuse) or one rig file (calibrate).
 
     Its sections, with their defaults, are those of bodyscan.settings.
     """
@@ -62,7 +64,7 @@ class Pipeline(Model):
 
     @property
     def scan(self) -> ScanSettings:
-        """What decides what a scan comes out as."""
+        """The settings that determine the result of a scan."""
         return ScanSettings(
             alignment=self.alignment, fusion=self.fusion, mesh=self.mesh, use=self.use
         )
@@ -84,7 +86,7 @@ def _unknown_formats(
 def load_pipeline(path: Path, changes: Sequence[str] = ()) -> Pipeline:
     """Read a pipeline file and apply `--set` changes such as `fusion.points=2000000`.
 
-    Raises PipelineError that lists every problem: those of the file by line and column.
+    Raises PipelineError, which lists every problem, those of the file by line and column.
     """
     pipeline = load_model(Path(path), Pipeline, PipelineError, remedy=_REMEDY)
     return apply_settings(pipeline, changes, PipelineError) if changes else pipeline

@@ -1,4 +1,5 @@
-"""What has to be done again, and why: results are held against what they would be made from now."""
+"""What has to be done again, and why: results are compared
+with what they would be made from now."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ _MOST_NAMED = 3
 
 @dataclass(frozen=True)
 class Origin:
-    """All that a stage's results depend on.  inputs: SHA-256 of every file it reads."""
+    """Everything that a stage's results depend on. inputs: SHA-256 of every file it reads."""
 
     stage: str
     stage_version: int
@@ -27,21 +28,22 @@ class Origin:
     inputs: dict[str, str]
 
     def record(self, outputs: Mapping[str, str]) -> dict[str, Any]:
-        """What stage.json says: no time, no place, so that the same work gives the same bytes."""
+        """Content of stage.json: no time and no place, so that
+        the same work gives the same bytes."""
         heading = {"schema": SCHEMA, "version": VERSION}
         return heading | asdict(self) | {"outputs": dict(outputs)}
 
 
 @dataclass(frozen=True)
 class Step:
-    """A stage, and why it has to run; "" when its results are as they should be."""
+    """A stage, and why it has to run; "" if its results are up to date."""
 
     stage: str
     why: str
 
 
 def origin_of(job: Job, stage: Stage) -> Origin:
-    """Of a stage if it ran now. Raises BodyscanError or OSError when its inputs cannot be read."""
+    """Origin of a stage if it ran now. Raises BodyscanError or OSError for unreadable inputs."""
     settings = {name: job.pipeline.section(name) for name in stage.sections}
     return Origin(stage.name, stage.version, settings, file_hashes(stage.inputs(job)))
 
@@ -62,7 +64,7 @@ def plan(job: Job, stages: Sequence[Stage]) -> list[Step]:
 
 
 def reason_to_run(job: Job, now: Origin) -> str:
-    """Why a stage has to run; "" when what lies there was made from just this, and is whole."""
+    """Why a stage has to run; "" if its results were made from exactly this, and are complete."""
     folder = job.folder / now.stage
     try:
         record = json.loads((folder / STAGE).read_text("utf-8"))
@@ -84,7 +86,7 @@ def reason_to_run(job: Job, now: Origin) -> str:
 
 
 def result_hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file of a stage's folder but stage.json, by relative path."""
+    """SHA-256 of every file in a stage's folder except stage.json, by relative path."""
     paths = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
     paths.pop(STAGE, None)
     return file_hashes(paths)

@@ -1,7 +1,8 @@
-"""The process that stays: `python -m bodyscan.jobs --resident CALIBRATION`; `watch` starts it.
+"""The process that stays: `python -m bodyscan.jobs --resident CALIBRATION`, started by `watch`.
 
-It is asked, a JSON object a line on its standard input, to decode pairs of a scan that is still
-arriving, or to work on a job as a process of its own would; the same stages, locks and manifests.
+Requests, one JSON object per line on its standard input, ask it to decode pairs of a scan that is
+still arriving, or to do a job as a process of its own would, with the same stages, locks and
+manifests.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from bodyscan.workflows.preparation import Preparation
 
 
 def main() -> int:
-    """Answer requests until nobody is left to ask; 2 if the calibration cannot be used."""
+    """Answer requests until there is no one left to ask; 2 if the calibration cannot be used."""
     tell = become_worker()
     requests = _requests()
     try:
@@ -37,7 +38,7 @@ def main() -> int:
         tell(unusable=str(error))
         return error.exit_code
     kinds = _kinds(preparation)
-    # Now, not while the first verdict is waited for.
+    # Now, not while someone waits for the first verdict.
     import_module("bodyscan.workflows.scan_folder")
     tell(ready=True)
     while True:
@@ -52,13 +53,13 @@ def main() -> int:
 
 
 def _kinds(preparation: Preparation) -> Kinds:
-    """Stages as ever, but for the scan, which takes what was prepared."""
+    """The usual stages, except that the scan uses what was prepared."""
     scan, *others = KINDS["fuse"]
     return {"fuse": (replace(scan, run=partial(run_scan, preparation=preparation)), *others)}
 
 
 def _requests() -> SimpleQueue[dict[str, Any]]:
-    """Filled by a thread; when the other end is closed the process ends, whatever it is at."""
+    """Requests, read by a thread; when the other end closes the process exits at once."""
     requests: SimpleQueue[dict[str, Any]] = SimpleQueue()
 
     def read() -> None:
@@ -72,7 +73,7 @@ def _requests() -> SimpleQueue[dict[str, Any]]:
 
 @contextmanager
 def _log_of(folder: Path) -> Iterator[None]:
-    """What is printed meanwhile goes into the job's log."""
+    """Send what is printed meanwhile to the job's log."""
     before = os.dup(2)
     try:
         with open_log(folder / LOG) as log:

@@ -1,4 +1,4 @@
-"""What is done to a scan, or to a rig: stages that read named files and write one folder each."""
+"""The steps for a scan, or for a rig: stages that read named files and write one folder each."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Stage:
-    """One step of a job; its results lie in the folder of its name.
+    """One step of a job; its results are in the folder of its name.
 
     version: raised whenever the same input would give other results than before.
-    sections: of the pipeline file that it obeys.  inputs: the files it reads, each under a name
-    that says what it is for.  run: writes its results into an empty folder, and announces a verdict
-    where it comes to one.
+    sections: of the pipeline file, that it uses.
+    inputs: the files it reads, each under a name that says what it is for.
+    run: writes its results into an empty folder, and announces a verdict if it reaches one.
     """
 
     name: str
@@ -44,7 +44,7 @@ Kinds = Mapping[str, tuple[Stage, ...]]
 
 
 def stages_until(stages: tuple[Stage, ...], until: str) -> tuple[Stage, ...]:
-    """The stages to the one called `until`. Raises BadInput when there is none of that name."""
+    """The stages up to the one called `until`. Raises BadInput if there is none of that name."""
     names = [stage.name for stage in stages]
     if until not in names:
         raise BadInput(f"there is no stage {until!r}", remedy=f"choose from {', '.join(names)}")
@@ -75,9 +75,9 @@ def run_scan(
     announce: Announce,
     preparation: Preparation | None = None,
 ) -> None:
-    """As `bodyscan scan` does: cloud, mesh, what they are, pictures.
+    """Scan as `bodyscan scan` does: cloud, mesh, their facts, pictures.
 
-    preparation: what a process that stays has loaded and decoded before.
+    preparation: what a resident process has already loaded and decoded.
     """
     from bodyscan.workflows.scan_folder import scan_folder
 
@@ -96,7 +96,7 @@ def run_scan(
 
 
 def run_export(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
-    """As `bodyscan export` does."""
+    """Export as `bodyscan export` does."""
     from bodyscan.export.scan import export_scan
     from bodyscan.fusion.storage import load_scan
 
@@ -107,7 +107,7 @@ def run_export(job: Job, out: Path, progress: Progress, announce: Announce) -> N
 
 
 def run_report(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
-    """As `bodyscan report` does."""
+    """Report as `bodyscan report` does."""
     from bodyscan.files.atomic import write_text
     from bodyscan.report.page import render
     from bodyscan.report.result_page import build_page
@@ -125,14 +125,14 @@ def rig_inputs(job: Job) -> dict[str, Path]:
 
 
 def run_calibrate(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
-    """As `bodyscan calibrate-rig` does."""
+    """Calibrate as `bodyscan calibrate-rig` does."""
     from bodyscan.workflows.calibrate_rig import calibrate_folder
 
     calibrate_folder(job.source / RIG_FILE, out, progress)
 
 
 def run_rig_export(job: Job, out: Path, progress: Progress, announce: Announce) -> None:
-    """As `bodyscan export-rig` does."""
+    """Export a rig as `bodyscan export-rig` does."""
     from bodyscan.export.rig import export_rig
     from bodyscan.registration.storage import load_calibration
 
@@ -167,14 +167,14 @@ KINDS: Kinds = {
 
 
 def calibration_of(job: Job) -> Path:
-    """The folder that `calibrate-rig` wrote. Raises BadInput for a job that names none."""
+    """The folder that `calibrate-rig` wrote. Raises BadInput if the job names none."""
     if job.calibration is None:
         raise BadInput("the job names no calibration", where=str(job.folder))
     return job.calibration if job.calibration.is_dir() else job.calibration.parent
 
 
 def rig_of(calibration: Path) -> Rig:
-    """The rig file's content that a calibration keeps; its arrays are not loaded."""
+    """The rig file's content as stored in a calibration; its arrays are not loaded."""
     path = calibration / CALIBRATION
     try:
         return Rig.model_validate(json.loads(path.read_text("utf-8"))["rig"])
@@ -187,7 +187,7 @@ def rig_of(calibration: Path) -> Rig:
 
 
 def _images(captures: Captures, base: Path) -> dict[str, Path]:
-    """Every image that is there, and what is said of them beside them, by path relative to `base`."""
+    """Every existing image, and the files that describe them, by path relative to `base`."""
     paths = [p for s in captures.sequences for p in s.paths if p not in set(s.missing)]
     paths += captures.described_in
     return {f"captures/{Path(os.path.relpath(path, base)).as_posix()}": path for path in paths}

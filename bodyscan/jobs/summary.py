@@ -1,4 +1,4 @@
-"""The table over all jobs of a batch, and how far the rig drifted over the day."""
+"""The table over all jobs of a batch, and the drift of the rig over the day."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from bodyscan.jobs.job import MANIFEST, SUMMARY, Job, read_record
 from bodyscan.jobs.supervision import JobResult
 from bodyscan.settings import BODY_CENTRE_MM
 
-NEIGHBOURS = 2  # scans before and after that tell drift from the sway of one person
+NEIGHBOURS = 2  # scans before and after, which separate drift from the sway of one person
 USUAL_STATURES_MM = (1450.0, 1890.0)
-"""Means of the grown men and women of whole nations are 1490 to 1830 (NCD-RisC, 2016), and a day's may
-be 3 % off besides. Of 1700 mm that tells a size 15 % too small, or 11 % too large: nominal places, if a
-rig file has some, tell 3 %."""
+"""Means for the men and women of whole nations are 1490 to 1830 (NCD-RisC, 2016), and a day's may
+be 3 % off besides. Around 1700 mm this reveals a size 15 % too small, or 11 % too large; nominal
+poses, if the rig file has some, reveal 3 %."""
 FEWEST_PEOPLE = 8
-"""Their median is known to 31 mm: one person's stature is off the mean by 70 mm."""
+"""Their median is known to 31 mm: one person's stature differs from the mean by 70 mm."""
 
 COLUMNS = {
     "fuse": (
@@ -52,7 +52,7 @@ Motions = dict[str, Array]
 
 
 def write_summary(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path) -> Path:
-    """Write summary.csv (one row a job, docs/formats.md says what each column is); its path."""
+    """Write summary.csv (one row per job, columns as in docs/formats.md); returns its path."""
     kind = jobs[0].pipeline.kind
     rows = [_row(job, outcome) for job, outcome in zip(jobs, outcomes, strict=True)]
     if kind == "fuse":
@@ -66,14 +66,14 @@ def write_summary(jobs: Sequence[Job], outcomes: Sequence[JobResult], out: Path)
 
 
 def write_out_manifest(out: Path) -> None:
-    """The manifests of all jobs under one hash each, so that a job that vanished is missed."""
+    """Write the manifests of all jobs under one hash each, so that a vanished job is missed."""
     found = sorted(path for path in out.glob(f"*/{MANIFEST}") if not path.parent.is_symlink())
     jobs = {path.parent.name: file_hash(path) for path in found}
     write_json(out / MANIFEST, {"schema": "bodyscan-batch", "version": 1, "jobs": jobs})
 
 
 def to_repeat(jobs: Sequence[Job]) -> list[str]:
-    """Names of the jobs whose scan was fused, but is no good: its verdict is `repeat`."""
+    """Names of the jobs whose scan was fused but has the verdict `repeat`."""
     verdicts = {
         job.name: read_record(job.folder / "scan" / "scan.json").get("verdict") for job in jobs
     }
@@ -81,7 +81,8 @@ def to_repeat(jobs: Sequence[Job]) -> list[str]:
 
 
 def drifted(jobs: Sequence[Job]) -> list[PairDrift]:
-    """Pairs that the scans of each calibration all move the same way, farthest first: sway does not."""
+    """Pairs that all scans of a calibration move the same way,
+    farthest first: sway does not do that."""
     shifts: dict[tuple[Path | None, str], list[Array]] = {}
     for job in jobs:
         for pair, shift in _motions(job).items():
@@ -91,8 +92,8 @@ def drifted(jobs: Sequence[Job]) -> list[PairDrift]:
 
 
 def odd_stature(jobs: Sequence[Job]) -> float | None:
-    """mm, of the median person, where no nation's grown-ups are so tall or short: children, or a size
-    that is wrong; None where it is usual, or where people are too few to tell."""
+    """Stature of the median person, mm, if no nation's adults are so tall or short: children, or a
+    wrong size. None if it is usual, or there are too few people."""
     statures: dict[str, list[float]] = {}
     for job in jobs:
         facts = read_record(job.folder / "scan" / "scan.json")
@@ -161,10 +162,10 @@ def _rig_figures(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _add_drift(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> None:
-    """Fill in drift_mm and drift_pair of the scans that have neighbours on the day.
+    """Fill in drift_mm and drift_pair of scans that have neighbours on the day.
 
     A person's sway differs from scan to scan; what a pair's motion has in common over a scan and
-    its neighbours in time is the rig's: the median of each coordinate, longest over the pairs.
+    its neighbours in time is the rig's: the median of each coordinate, the largest over the pairs.
     """
     measured = [
         (str(row.get("when") or ""), number, motions)
@@ -185,7 +186,8 @@ def _add_drift(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> None:
 
 
 def _motions(job: Job) -> Motions:
-    """(3,) mm of every pair at the body's centre: from where the calibration put it to this scan."""
+    """Motion (3,) mm of every pair at the body's centre, from
+    the calibration's pose to this scan's."""
     alignment = read_record(job.folder / "scan" / "scan.json").get("alignment")
     if not alignment or job.calibration is None:
         return {}

@@ -27,7 +27,8 @@ _LAST_LINES = 4000
 
 @dataclass(frozen=True)
 class JobResult:
-    """How a job ended.  state: done or set aside.  stages: those that ran; reason: of setting aside."""
+    """How a job ended. state: done or set aside. stages: those
+    that ran. reason: for setting it aside."""
 
     job: str
     state: str
@@ -39,20 +40,23 @@ class JobResult:
 
 @dataclass(frozen=True)
 class JobProcess:
-    """How a job's process is run.  threads: of the libraries in it.  command: what follows the name
-    of this Python."""
+    """How a job's process is run.
+
+    threads: of the libraries in it.
+    command: arguments to this Python.
+    """
 
     threads: int
     command: tuple[str, ...] = COMMAND
 
 
 def ignore_events(event: dict[str, Any]) -> None:
-    """Whoever does not want to know."""
+    """Ignore events, for callers that do not need them."""
 
 
 def supervise_job(job: Job, process: JobProcess, listen: Listen = ignore_events) -> JobResult:
-    """Run a job in its folder in a process of its own, twice if need be. Never raises for what it
-    does."""
+    """Run a job's process in its folder, twice if necessary.
+    Returns failures, never raises them."""
     path, since = job.folder, time.monotonic()
     stages: tuple[str, ...] = ()
     reason = ""
@@ -116,8 +120,8 @@ def _attempt(job: Job, how: JobProcess, listen: Listen) -> tuple[str, tuple[str,
 def _listen_to(
     process: subprocess.Popen[bytes], job: str, listen: Listen
 ) -> tuple[str, tuple[str, ...]]:
-    """Hands on what the process tells; returns the reason it gives for failing, if it gives one, and
-    the stages that it ran."""
+    """Pass on the process's messages; returns its reason for failing, if it gives one, and the
+    stages that it ran."""
     reason, ran = "", []
     assert process.stdout is not None
     with process.stdout as stream:
@@ -138,7 +142,7 @@ def _listen_to(
 
 
 def how_it_died(status: int, log: Path) -> str:
-    """What a process that said nothing died of: its exit status, and the last line of its log."""
+    """Why a process died without saying so: its exit status, and the last line of its log."""
     how = f"its process ended with {status}"
     if status < 0:
         with suppress(ValueError):
@@ -158,7 +162,7 @@ _HEADING = "-- "
 
 
 def open_log(path: Path) -> Any:
-    """To append to; never through a link, which might lead anywhere."""
+    """Open a log to append to; never through a link, which might lead anywhere."""
     handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o600)
     stream = os.fdopen(handle, "ab", buffering=0)
     with suppress(OSError):
@@ -167,7 +171,8 @@ def open_log(path: Path) -> Any:
 
 
 def environment(threads: int) -> dict[str, str]:
-    """Threads of the libraries; BLAS gets one, stages share the rest out themselves."""
+    """Environment with the libraries' threads; BLAS gets one, since stages use the rest
+    themselves."""
     return os.environ | {
         "OMP_NUM_THREADS": str(threads),
         "OPENCV_FOR_THREADS_NUM": str(threads),
@@ -177,6 +182,6 @@ def environment(threads: int) -> dict[str, str]:
 
 
 def note_state(folder: Path, state: dict[str, Any]) -> None:
-    """Write state.json; it is for people and --explain; a full disk must not end the batch for it."""
+    """Write state.json, for people and --explain; a full disk must not end the batch here."""
     with suppress(OSError):
         write_json(folder / STATE, state | {"when": time.strftime("%Y-%m-%dT%H:%M:%S%z")})

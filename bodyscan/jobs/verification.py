@@ -1,4 +1,4 @@
-"""Every byte held against the manifests: images, calibration, cloud, mesh, exports."""
+"""Every byte checked against the manifests: images, calibration, cloud, mesh, exports."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from bodyscan.jobs.stages import KINDS, Kinds
 
 @dataclass(frozen=True)
 class Verification:
-    """files: how many were looked at.  faults: what is not as it was, one line each."""
+    """files: how many were checked. faults: what has changed, one line each."""
 
     files: int
     faults: tuple[str, ...]
 
 
 def verify(folder: Path, kinds: Kinds = KINDS) -> Verification:
-    """Of a batch's output folder, or of one job's folder.
+    """Check a batch's output folder, or one job's folder.
 
-    Raises BadInput when there is not a manifest at all.
+    Raises BadInput if there is no manifest at all.
     """
     if not (folder / MANIFEST).exists():
         raise BadInput(
@@ -73,7 +73,7 @@ def _job(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
 
 
 def _inputs(folder: Path, inputs: Mapping[str, str], kinds: Kinds) -> Iterator[tuple[Path, str]]:
-    """What the job read, where it lies now."""
+    """What the job read, and where it is now."""
     try:
         job = read_job(folder)
         there = kinds[job.pipeline.kind][0].inputs(job)

@@ -1,7 +1,7 @@
-"""Scans fused while they arrive: an inbox looked at, and one process that stays and does the work.
+"""Scans fused while they arrive: an inbox is polled, and one resident process does the work.
 
-The jobs are those of a batch: the same folders, stages, states and manifests, so that a batch, or
-`verify`, takes them for its own, and what is done is never done twice.
+The jobs are those of a batch, with the same folders, stages, states and manifests, so that a batch
+or `verify` accepts them as its own, and nothing is done twice.
 """
 
 from __future__ import annotations
@@ -46,14 +46,15 @@ from bodyscan.jobs.supervision import (
 )
 
 POLL_S = 0.1
-"""An image is found so long after it was written, at most: a twentieth of the time to a verdict."""
+"""Greatest delay until an image is found after it was written: a twentieth of the time to a
+verdict."""
 
 
 @dataclass(frozen=True)
 class Watched:
-    """What is watched and what becomes of it.
+    """What is watched and what to do with it.
 
-    quiet_s: a scan with images missing is taken as it is when nothing has come for so long.
+    quiet_s: a scan with missing images is taken as it is if nothing has arrived for this long.
     """
 
     inbox: Path
@@ -67,11 +68,12 @@ class Watched:
 def watch(
     watched: Watched, listen: Listen = ignore_events, *, once: bool = False
 ) -> dict[str, Any]:
-    """Fuse every scan of the inbox as its images arrive; until interrupted, or, with `once`, until
-    all that lies there is done. Returns the event that ends a batch.
+    """Fuse every scan of the inbox as its images arrive, until interrupted, or, with `once`, until
+    everything there is done. Returns the event that ends a batch.
 
-    A job that fails twice is set aside with its reason, the others go on. Raises BadInput when the
-    inbox is no folder, a batch or another watch works in `out`, or the calibration cannot be used.
+    A job that fails twice is set aside with its reason, and the others go on. Raises BadInput if
+    the inbox is not a folder, if a batch or another watch is working in `out`, or if the
+    calibration is unusable.
     """
     if not watched.inbox.is_dir():
         raise BadInput("there is no such folder", where=str(watched.inbox), remedy="make it first")
@@ -96,7 +98,8 @@ def watch(
 
 @dataclass
 class _Watching:
-    """scans: not ended yet.  running: jobs handed over, in order, with when and how often."""
+    """scans: not ended yet. running: jobs handed over, in order, each with its number of
+    attempts."""
 
     watched: Watched
     listen: Listen
@@ -114,7 +117,7 @@ class _Watching:
         self.process = ResidentProcess(own.calibration, own.pipeline.resources.threads, own.command)
 
     def folders(self) -> list[Path]:
-        """Of scans that are not done: what an earlier watch or batch did stays done."""
+        """Folders of scans that are not done: what an earlier watch or batch did stays done."""
         own = self.watched
         found = []
         for path in sorted(own.inbox.absolute().iterdir()):
@@ -129,7 +132,7 @@ class _Watching:
         return found
 
     def look_at(self, scan: IncomingScan) -> None:
-        """Have decoded what has come, and the job done once all has."""
+        """Request decoding of what has arrived, and the job once everything has."""
         path = scan.folder
         if path in self.running:
             return
@@ -143,7 +146,7 @@ class _Watching:
             self._hand_over(path, attempt=1)
 
     def hear(self) -> None:
-        """What the process has to say; waits for it a little."""
+        """Handle messages from the process; waits for them briefly."""
         for told in self.process.told(POLL_S):
             if "unusable" in told:
                 raise BadInput(told["unusable"])
@@ -170,8 +173,9 @@ class _Watching:
             self._begin_again(status)
 
     def _begin_again(self, status: int) -> None:
-        """The process died: of the job that ran, which is tried once more, or of an image; those that
-        are there are decoded by their jobs alone, which count how often they fail."""
+        """Restart the process after it died, either of the running job, which is tried once more,
+        or of an image; scans present are then decoded only by their jobs, which count how often
+        they fail."""
         if not self.is_ready:
             raise FailedWork(
                 f"the process that fuses scans does not start: it ended with {status}",
@@ -224,7 +228,7 @@ class _Watching:
         self.listen(self.summary())
 
     def summary(self) -> dict[str, Any]:
-        """The table and the manifest over all jobs, written anew."""
+        """Rewrite the table and the manifest over all jobs."""
         if not self.ended:
             return {"event": "summary", "jobs": 0, "set_aside": [], "repeat": []}
         jobs = [self.jobs[path] for path in self.ended]
@@ -236,7 +240,7 @@ class _Watching:
         return job_of(path, own.pipeline, own.out, own.calibration.absolute(), last)
 
     def _earlier(self, path: Path) -> JobResult | None:
-        """How the scan's job ended before this watch began, unless its folder was changed since."""
+        """How the scan's job ended before this watch began, unless its folder has changed since."""
         folder = self.watched.out / job_name(path.name)
         state = read_record(folder / STATE)
         if state.get("state") not in ("done", "set aside"):
@@ -250,7 +254,7 @@ class _Watching:
 
 
 class ResidentProcess:
-    """The process that does the work, and what it says."""
+    """The process that does the work, and its messages."""
 
     def __init__(self, calibration: Path, threads: int, command: Sequence[str]) -> None:
         self._line = [sys.executable, *command, "--resident", str(calibration)]
@@ -272,7 +276,7 @@ class ResidentProcess:
         threading.Thread(target=self._read, args=(self._process, self._said), daemon=True).start()
 
     def ask(self, **request: Any) -> None:
-        """One that died while it was asked is noticed by `status`."""
+        """Send a request; if the process has died, `status` notices."""
         assert self._process is not None
         assert self._process.stdin is not None
         try:
@@ -282,7 +286,7 @@ class ResidentProcess:
             pass
 
     def told(self, wait_s: float) -> list[dict[str, Any]]:
-        """What was said since the last time; waits so long for the first word."""
+        """Messages since the last call; waits this long for the first one."""
         found = []
         try:
             found.append(self._said.get(timeout=wait_s))
@@ -292,13 +296,13 @@ class ResidentProcess:
             return found
 
     def status(self) -> int | None:
-        """What it ended with; None while it runs, or still has something to say."""
+        """Exit status; None while it runs, or while messages are left."""
         if self._process is None or not self._said.empty():
             return None
         return self._process.poll()
 
     def kill(self) -> None:
-        """One that is stuck: `status` tells that it has ended."""
+        """Kill a process that is stuck; `status` then reports its end."""
         if self._process is not None:
             self._process.kill()
 

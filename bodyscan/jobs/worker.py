@@ -1,8 +1,8 @@
 """The job's own process: works through the stages, so that a crash in native code costs one job.
 
-Results are made in a folder of another name, flushed to disk, and renamed: whatever has its right
-name is whole. The process tells its parent how far it is on its standard output, a JSON object a
-line, and ends as soon as its parent is gone.
+Results are made in a folder with another name, flushed to disk, and renamed: whatever has its
+proper name is complete. The process reports progress to its parent on standard output, one JSON
+object per line, and ends as soon as its parent is gone.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _BEING_MADE, _TAKEN_AWAY = ".making-", ".old-"
 
 
 def main(kinds: Kinds = KINDS) -> int:
-    """Work on the job of the folder on the command line; 0: done, 2: bad input, 1: failed."""
+    """Do the job in the folder on the command line; 0: done, 2: bad input, 1: failed."""
     tell = become_worker()
     _end_with_parent()
     failure = attempt(Path(sys.argv[1]), kinds, tell)
@@ -50,14 +50,14 @@ def main(kinds: Kinds = KINDS) -> int:
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a job failed, and what its process should end with."""
+    """Why a job failed, and the exit code of its process."""
 
     reason: str
     exit_code: int
 
 
 def attempt(folder: Path, kinds: Kinds, tell: Tell) -> Failure | None:
-    """`work`; None if all went well."""
+    """Do `work`; None if all went well."""
     try:
         with for_owner_only():
             work(folder, kinds, tell)
@@ -66,14 +66,14 @@ def attempt(folder: Path, kinds: Kinds, tell: Tell) -> Failure | None:
     except Exception as error:
         full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
         named = str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
-        with suppress(OSError):  # the log lies on that same disk
+        with suppress(OSError):  # the log is on that same disk
             traceback.print_exc()
         return Failure("the disk is full: make room, then start again" if full else named, 1)
     return None
 
 
 def become_worker() -> Tell:
-    """What every process of jobs begins with; returns what tells its parent."""
+    """Set up a process of jobs; returns the function that reports to its parent."""
     keep_freed_memory()
     logging.basicConfig(format="%(message)s")  # on standard error, which is the job's log
     logging.getLogger("bodyscan").setLevel(logging.DEBUG)
@@ -83,7 +83,7 @@ def become_worker() -> Tell:
 
 
 def work(folder: Path, kinds: Kinds, tell: Tell) -> None:
-    """Bring a job's results up to date. Whoever else works on it is waited for."""
+    """Bring a job's results up to date, waiting for anyone else at work on it."""
     with file_lock(folder / LOCK, wait=True):
         _tidy(folder)
         job = read_job(folder)
@@ -100,7 +100,8 @@ def work(folder: Path, kinds: Kinds, tell: Tell) -> None:
 
 
 def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
-    """Run a stage and put its results in place, if what it read stayed as it was."""
+    """Run a stage and put its results in place, provided that its inputs did not change
+    meanwhile."""
     made = job.folder / f"{_BEING_MADE}{stage.name}-{secrets.token_hex(4)}"
     made.mkdir()
 
@@ -127,7 +128,7 @@ def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
 
 
 def _put_in_place(made: Path, place: Path) -> None:
-    """Rename; a folder cannot be put over another in one step, so the old one steps aside first."""
+    """Rename; a folder cannot replace another in one step, so the old one is moved aside first."""
     old = place.with_name(f"{_TAKEN_AWAY}{place.name}-{secrets.token_hex(4)}")
     with suppress(FileNotFoundError):
         place.rename(old)
@@ -137,7 +138,7 @@ def _put_in_place(made: Path, place: Path) -> None:
 
 
 def _drop_if_stale(job: Job, stage: Stage) -> None:
-    """Results of a later stage that belong to other results than now lie before it go."""
+    """Remove results of a later stage that were made from other results than are there now."""
     folder = job.folder / stage.name
     with suppress(BodyscanError, OSError):
         if folder.exists() and reason_to_run(job, origin_of(job, stage)):
@@ -145,9 +146,9 @@ def _drop_if_stale(job: Job, stage: Stage) -> None:
 
 
 def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
-    """One file that ties inputs and results together; it holds its own hash too.
+    """Write one file that ties inputs and results together, and contains its own hash.
 
-    Results go by their path in the job's folder; what is read from outside by what it is for.
+    Results are listed by their path in the job's folder, inputs from outside by what they are for.
     """
     inputs: dict[str, str] = {}
     outputs: dict[str, str] = {}
@@ -172,7 +173,7 @@ def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
 
 
 def _tidy(folder: Path) -> None:
-    """Take away what was being made when an earlier process was killed."""
+    """Remove what an earlier process was making when it was killed."""
     for path in folder.iterdir():
         if path.name.startswith((_BEING_MADE, _TAKEN_AWAY)) or path.name.endswith(".tmp.json"):
             _remove(path)
@@ -186,13 +187,13 @@ def _remove(path: Path) -> None:
 
 
 def _flush_all(folder: Path) -> None:
-    """To the disk, before a name says that it is there."""
+    """Flush to the disk, before a name says that it is there."""
     for path in (*files_below(folder), folder):
         flush(path)
 
 
 def _take_over_output() -> Tell:
-    """Standard output becomes the parent's alone; what libraries print there goes into the log."""
+    """Reserve standard output for the parent; what libraries print there goes into the log."""
     stream = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
     os.dup2(2, 1)
     lock = threading.Lock()
@@ -205,7 +206,7 @@ def _take_over_output() -> Tell:
 
 
 def _end_with_parent() -> None:
-    """The parent holds the other end of standard input open, and says nothing on it."""
+    """Exit with the parent, which holds the other end of standard input open and sends nothing."""
 
     def watch() -> None:
         while os.read(0, 1024):
@@ -216,6 +217,6 @@ def _end_with_parent() -> None:
 
 
 def _be_the_first_to_go() -> None:
-    """When memory runs out, Linux should end a job, which is tried again, not the batch."""
+    """If memory runs out, Linux should kill a job, which is tried again, and not the batch."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("900")

@@ -1,4 +1,4 @@
-"""The chapter's figures 6 and 7 drawn from what was found. Matplotlib is imported here alone."""
+"""The chapter's figures 6 and 7 drawn from the results. Matplotlib is imported only here."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from matplotlib.axes import Axes
 
 INK, GREY = "#333333", "#999999"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
-"""Okabe and Ito's, told apart by the colour-blind too."""
+"""Okabe and Ito's colours, which the colour-blind can tell apart too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +36,8 @@ class PlaneCurve:
 def draw_projector(
     curves: Sequence[PlaneCurve], true: PlaneCurve, residuals_mm: Array, direction: Axis, path: Path
 ) -> Path:
-    """Fig. 6: baselines, projection angles and tilts against the stripe's number, each model and the
-    truth; and how the boundary points' distances from their planes are distributed."""
+    """Fig. 6: baselines, projection angles and tilts against the stripe's number for each model and
+    the truth; and the distribution of the boundary points' distances from their planes."""
     figure, axes = plt.subplots(2, 2, figsize=(10.0, 7.5), constrained_layout=True)
     baseline, angle, tilt, spread = axes.ravel()
     for axis, part, label in (
@@ -64,7 +64,7 @@ def draw_projector(
 
 @dataclass(frozen=True, eq=False)
 class RangeData:
-    """points: (H, W, 3) mm, normals likewise; off_mm: (H, W), how far they are from the truth."""
+    """normals: (H, W, 3). off_mm: (H, W) mm, distance from the truth."""
 
     name: str
     normals: Array
@@ -72,8 +72,8 @@ class RangeData:
 
 
 def draw_range_data(data: Sequence[RangeData], path: Path) -> Path:
-    """Fig. 7: the five spheres as each approach measures them, and how far that is from the truth
-    along the viewing ray, the whole picture laid on the truth by a rigid motion first."""
+    """Fig. 7: the five spheres as measured by each approach, and their distance from the truth
+    along the viewing ray after a rigid motion brings the whole image onto the truth."""
     figure, axes = plt.subplots(
         2, len(data), figsize=(4.2 * len(data), 6.6), constrained_layout=True, squeeze=False
     )
@@ -98,7 +98,7 @@ def _explicit(curve: PlaneCurve, direction: Axis) -> tuple[Array, Array, Array]:
 
 
 def _distribution(axis: Axes, residuals_mm: Array) -> None:
-    """Of what noise leaves, against a normal curve of the same middle half."""
+    """Distribution of the residuals, and a normal curve with their robust sigma."""
     sigma_mm = spread(residuals_mm)
     edges = np.linspace(-8.0 * sigma_mm, 8.0 * sigma_mm, 161)
     density, _ = np.histogram(residuals_mm, edges)
@@ -120,7 +120,7 @@ def _plain(axis: Axes) -> None:
 
 
 def _save(figure: matplotlib.figure.Figure, path: Path) -> Path:
-    # Without a date and a version in it the same figure gives the same bytes.
+    # Without date and version the same figure gives the same bytes.
     with atomic_replacement(path) as temporary:
         figure.savefig(temporary, dpi=110, metadata={"Software": None})
     plt.close(figure)

@@ -1,4 +1,4 @@
-"""`bodyscan reproduce`: the chapter's own set-up simulated, its Tables 1 and 2, its Fig. 6 and 7."""
+"""`bodyscan reproduce`: simulates the chapter's set-up for its Tables 1 and 2, its Fig. 6 and 7."""
 
 from __future__ import annotations
 
@@ -48,12 +48,13 @@ def reproduce(
     boards: int = apparatus.BOARDS,
     progress: Progress = silent,
 ) -> str:
-    """Simulate, calibrate every approach, measure; the text that is also written into `out`,
-    beside the figures.
+    """Simulate, calibrate every approach, measure; returns the text, which is also written into
+    `out` beside the figures.
 
-    seed: of all noise.  quick: coarser rendering and fewer shots, to try it out.  real_light: a
-    bowed board, speckle and all else that an ideal simulation leaves out.  boards: poses of the board,
-    3 as in the chapter to 10.
+    seed: of all noise.
+    quick: coarser rendering and fewer shots, for a trial.
+    real_light: a bowed board, speckle and everything else that an ideal simulation leaves out.
+    boards: number of board poses, from 3 as in the chapter to 10.
     """
     settings = (apparatus.real_settings if real_light else apparatus.ideal_settings)(
         QUICK_SAMPLES if quick else SAMPLES
@@ -104,7 +105,7 @@ def _measure_all(
         by_stage=results[2],
         by_reference=results[3],
         noise=noise_bound(captures),
-        # Of those whose sheets know their covariance.
+        # Of the approaches whose sheets know their covariance.
         sigmas=tuple(point_sigma(one, captures) for one in shown if one.name in ("(iii)", "ours")),
     )
 
@@ -112,8 +113,8 @@ def _measure_all(
 def draw(
     captures: ChapterCaptures, calibrated: Calibrations, out: Path, names: tuple[str, str]
 ) -> None:
-    """Fig. 6 and Fig. 7 into the folder `out`, in files of these names."""
-    # Matplotlib takes a second to import: only whoever draws waits for it.
+    """Write Fig. 6 and Fig. 7 into the folder `out`, in files of these names."""
+    # Matplotlib takes a second to import; only drawing should wait for it.
     from bodyscan.laboratory.figures import PlaneCurve, draw_projector, draw_range_data
 
     by_name = {approach.name: approach for approach in calibrated.approaches}

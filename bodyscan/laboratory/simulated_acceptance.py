@@ -25,13 +25,13 @@ SPHERES = (
     ("high, left", (0.0, 0.25, 0.65), (1.0, 0.0, 0.0)),
     ("through the middle", (0.0, -0.1, 0.4), (0.5, 0.5, 0.7)),
 )
-"""Name; middle in shares of the volume's radius (x, y) and height (z); the way the bar points."""
+"""Name; middle as shares of the volume's radius (x, y) and height (z); direction of the bar."""
 PLATES = (
     ("middle, facing front", (0.0, 0.0, 0.45), (1.0, 0.0, 0.0)),
     ("left, facing left and back", (-0.1, 0.25, 0.5), (-0.8, 0.6, 0.0)),
     ("low, tilted up", (0.2, -0.1, 0.3), (0.7, -0.4, 0.5)),
 )
-"""Name, middle, and the way the plate faces."""
+"""Name, middle, and the direction the plate faces."""
 
 
 def simulate_readings(
@@ -42,9 +42,10 @@ def simulate_readings(
     places: int | None,
     progress: Progress = silent,
 ) -> Readings:
-    """`repeats` shots of the spheres and one of the plate at each of the first `places` places.
+    """Measure `repeats` shots of the spheres and one of the plate at each of the first `places`
+    places.
 
-    The images of a place are measured and thrown away before the next one's are made.
+    The images of a place are measured and deleted before the next one's are made.
     """
     world = artefact.open_workspace(workspace)
     centres, volume = np.array(file.spheres.centres_mm), calibration.rig.volume
@@ -67,13 +68,14 @@ def simulate_readings(
 
 
 def spheres_at(volume: Volume, centres: Array) -> list[tuple[str, RigidTransform]]:
-    """`rig_from_artefact` of each place, for centres (N, 3): their first axis points along the bar."""
+    """`rig_from_artefact` of each place for centres (N, 3),
+    whose first axis points along the bar."""
     middle = centres.mean(axis=0)
     return [(name, _placed(volume, share, way, middle)) for name, share, way in SPHERES]
 
 
 def plates_at(volume: Volume) -> list[tuple[str, RigidTransform]]:
-    """`rig_from_artefact` of each place, for a plate in the plane x = 0 about the origin."""
+    """`rig_from_artefact` of each place for a plate in the plane x = 0 about the origin."""
     return [(name, _placed(volume, share, way, np.zeros(3))) for name, share, way in PLATES]
 
 
@@ -83,7 +85,8 @@ def _placed(
     way: tuple[float, float, float],
     middle: Array,
 ) -> RigidTransform:
-    """The artefact's x axis along `way`, its y axis level, its `middle` where `share` says."""
+    """A pose with the artefact's x axis along `way`, its y axis level, and its `middle` at
+    `share`."""
     x = np.array(way) / np.linalg.norm(way)
     beside = np.cross([0.0, 0.0, 1.0], x)
     y = beside / np.linalg.norm(beside) if np.linalg.norm(beside) > 1e-9 else np.array([0.0, 1, 0])

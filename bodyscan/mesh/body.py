@@ -1,4 +1,4 @@
-"""The body model: a cloud, and the closed mesh made from it. Rig frame, mm."""
+"""The body model: a cloud, and the closed mesh made from it, in the rig frame, mm."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from bodyscan.mesh.topology import drop_unused_vertices, face_areas
 class BodyCloud:
     """N points of a body.
 
-    points: (N, 3) float64, mm.  normals: (N, 3) float32, unit, outward.
+    points: (N, 3) float64, mm.
+    normals: (N, 3) float32, unit, outward.
     sigma_mm: (N,) float32, standard deviation along the normal.
-    colours: (N, 3) uint8, red, green, blue.  pairs_seen: (N,) uint8, how many pairs measured it.
-    regions: (N,) uint8, what each is of `regions.NAMES`; None where nothing is known of that.
+    colours: (N, 3) uint8, red, green, blue.
+    pairs_seen: (N,) uint8, how many pairs measured it.
+    regions: (N,) uint8, index into `regions.NAMES`; None if unknown.
     """
 
     points: Array
@@ -31,7 +33,7 @@ class BodyCloud:
     regions: Bytes | None = None
 
     def every(self, step: int) -> BodyCloud:
-        """One point in so many."""
+        """Every step-th point."""
         parts: dict[str, Any] = {part.name: getattr(self, part.name) for part in fields(self)}
         some: dict[str, Any] = {
             name: None if part is None else part[::step] for name, part in parts.items()
@@ -41,8 +43,11 @@ class BodyCloud:
 
 @dataclass(frozen=True, eq=False)
 class BreathAt:
-    """mm: (V,) float32, how far each vertex stands inside of its place at mean breath, along its
-    normal.  sigma_mm: (V,) float32, of that."""
+    """How far vertices are from where they would be at mean breath.
+
+    mm: (V,) float32, how far inside that place, along the normal.
+    sigma_mm: (V,) float32, of that.
+    """
 
     mm: Floats
     sigma_mm: Floats
@@ -52,10 +57,13 @@ class BreathAt:
 class BodyMesh:
     """A closed triangle mesh with outward faces.
 
-    vertices: (V, 3) float64, mm.  faces: (F, 3) int64.  normals: (V, 3) float32, unit, outward.
-    colours: (V, 3) uint8.  sigma_mm: (V,) float32, NaN on filled vertices.
+    vertices: (V, 3) float64, mm.
+    faces: (F, 3) int64.
+    normals: (V, 3) float32, unit, outward.
+    colours: (V, 3) uint8.
+    sigma_mm: (V,) float32, NaN on filled vertices.
     filled: (F,) bool, faces that no pair measured and that were filled to close the mesh.
-    breath: of a person who was followed, how to come to mean breath.
+    breath: how to bring the mesh to mean breath, for a person who was followed.
     regions: (V,) uint8, as those of a cloud; unsure on filled vertices.
     """
 
@@ -70,7 +78,7 @@ class BodyMesh:
 
     @cached_property
     def face_regions(self) -> Bytes | None:
-        """(F,) uint8, what two corners at least are; unsure where filled."""
+        """Region (F,) uint8 of at least two of each face's corners; unsure where filled."""
         if self.regions is None:
             return None
         return np.where(self.filled, np.uint8(UNSURE), of_faces(self.regions, self.faces))
@@ -82,7 +90,7 @@ class BodyMesh:
         return float(area[self.filled].sum() / area.sum()) if area.any() else 0.0
 
     def at_mean_breath(self, sigmas: float = 0.0) -> BodyMesh:
-        """As the body is at mean breath; sigmas: everywhere so many standard deviations fuller."""
+        """The body at mean breath; sigmas: everywhere this many standard deviations fuller."""
         if self.breath is None:
             return self
         way = (self.breath.mm + sigmas * self.breath.sigma_mm).astype(np.float64)
@@ -94,7 +102,7 @@ class BodyMesh:
         return self.part(vertices, faces, used, np.zeros(len(faces), bool))
 
     def part(self, vertices: Array, faces: Indices, used: Indices, filled: Mask) -> BodyMesh:
-        """What is left with the vertices `used` (U,) alone, and faces (F, 3) of these."""
+        """The mesh with only the vertices `used` (U,), and faces (F, 3) of these."""
         return BodyMesh(
             vertices,
             faces,

@@ -1,4 +1,4 @@
-"""A sparse grid: bricks of SIDE nodes a side, kept only where something is."""
+"""A sparse grid: bricks with SIDE nodes per side, kept only where there is something."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ SIDE = 8
 
 @dataclass(frozen=True, eq=False)
 class Bricks:
-    """Values of B bricks are arrays (B, SIDE, SIDE, SIDE).
+    """Places of B bricks, whose values are arrays (B, SIDE, SIDE, SIDE).
 
     table: (a, b, c) int32, the number of each brick, -1 where there is none.
-    places: (B, 3) int32, where in the table each brick is.
-    origin: (3,) mm, the grid's first node; cell_mm: from node to node.
+    places: (B, 3) int32, index of each brick in the table.
+    origin: (3,) mm, the grid's first node.
+    cell_mm: distance from node to node.
     """
 
     table: NDArray[np.int32]
@@ -28,7 +29,7 @@ class Bricks:
 
     @staticmethod
     def where(wanted: Mask, origin: Array, cell_mm: float) -> Bricks:
-        """The wanted ones of all bricks (a, b, c) of a grid."""
+        """Keep the wanted bricks (a, b, c) of a grid."""
         places = np.argwhere(wanted).astype(np.int32)
         table = np.full(wanted.shape, -1, np.int32)
         table[wanted] = np.arange(len(places))
@@ -36,7 +37,7 @@ class Bricks:
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Of an array of values."""
+        """Shape of an array of values."""
         return len(self.places), SIDE, SIDE, SIDE
 
 
@@ -48,6 +49,6 @@ def bricks_of(dense: Floats) -> Floats:
 
 
 def dense_of(values: Floats, shape: tuple[int, ...]) -> Floats:
-    """`bricks_of` back again: values of all a x b x c bricks, shape (a, b, c)."""
+    """The inverse of `bricks_of`: dense values of all a x b x c bricks, shape (a, b, c)."""
     split = values.reshape(*shape, SIDE, SIDE, SIDE).transpose(0, 3, 1, 4, 2, 5)
     return np.ascontiguousarray(split).reshape([SIDE * size for size in shape])

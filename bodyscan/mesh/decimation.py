@@ -1,6 +1,4 @@
-"""A smaller version of a body mesh that stays near the full one: decimated, then refined where it
-strays.
-"""
+"""A smaller version of a body mesh: decimated, then refined where it strays from the full one."""
 
 from __future__ import annotations
 
@@ -21,18 +19,19 @@ from bodyscan.mesh.scene import centred_scene
 from bodyscan.mesh.topology import topology, vertex_normals
 from bodyscan.progress import THREADS
 
-SPARE = 0.03  # of the faces are kept for where the decimated mesh strays
+SPARE = 0.03  # share of the faces kept for where the decimated mesh strays
 ROUNDS = 12  # of refinement
 
 
 def decimate(mesh: BodyMesh, *, faces: int = 50_000, within_mm: float = 0.19) -> BodyMesh:
-    """A closed mesh of about `faces` faces, `within_mm` from the full one.
+    """A closed mesh of about `faces` faces, no farther than `within_mm` from the full one.
 
-    Quadric decimation (Garland and Heckbert 1997), which knows no such limit, and a few more faces
+    Quadric decimation (Garland and Heckbert 1997), which has no such limit, plus a few more faces
     where it went too far (some hundred at 50,000; many more where so few faces cannot do). Vertices
     take colour, sigma and region from the nearest one of the full mesh. A mesh that is small enough
-    is returned as it is. The last result is remembered by what the mesh holds: a job exports it and
-    then reports on it, each time read from the file.
+    is returned as it is. The last result is cached by the mesh's content: a job exports it and then
+    reports on it, each time read from the file.
+
     Raises ScanFailed if the surface does not stay closed.
     """
     if len(mesh.faces) <= faces:
@@ -46,7 +45,7 @@ def decimate(mesh: BodyMesh, *, faces: int = 50_000, within_mm: float = 0.19) ->
 
 @dataclass(frozen=True)
 class _Content:
-    """A mesh that equals others by its digest."""
+    """A mesh compared with others by its digest."""
 
     digest: bytes
     mesh: BodyMesh = field(compare=False)
@@ -80,13 +79,13 @@ def _decimated(content: _Content, faces: int, within_mm: float) -> BodyMesh:
 
 
 class NearestSurface:
-    """A triangle mesh that is asked for its nearest points; vertices (V, 3) mm, faces (F, 3)."""
+    """Nearest points on a triangle mesh; vertices (V, 3) mm, faces (F, 3)."""
 
     def __init__(self, vertices: Array, faces: Indices) -> None:
         self.scene, self.centre = centred_scene(vertices, faces)
 
     def nearest(self, points: Array) -> tuple[Array, Array, Indices]:
-        """Of points (N, 3): the nearest places (N, 3), how far they are (N,) and on which face."""
+        """The nearest places (N, 3) to points (N, 3), their distances (N,) and faces (N,)."""
         if not len(points):
             return points, np.empty(0), np.empty(0, np.int64)
         centred = (points - self.centre).astype(np.float32)
@@ -99,12 +98,13 @@ class NearestSurface:
 def refine_to_tolerance(
     vertices: Array, faces: Indices, full_vertices: Array, full_faces: Indices, limit_mm: float
 ) -> tuple[Array, Indices]:
-    """A closed mesh no farther than `limit_mm` from the full one, nor that from it, where ROUNDS
+    """Refine a closed mesh until it and the full one are within `limit_mm` of each other, if ROUNDS
     rounds suffice.
 
-    Looked at are the vertices of both, and the middles of the mesh's edges and faces. Vertices too
-    far off go to the nearest place of the full mesh. Faces that are get a new vertex there: from the
-    middle of the longest edge; or, where a vertex of the full mesh is too far from them, that one.
+    The vertices of both are tested, and the middles of the mesh's edges and faces. Vertices too far
+    off move to the nearest place of the full mesh. Faces too far off get a new vertex there: from
+    the middle of the longest edge; or, where a vertex of the full mesh is too far from them, that
+    one.
     """
     full = NearestSurface(full_vertices, full_faces)
     places, distance, _ = full.nearest(vertices)
@@ -125,7 +125,7 @@ def refine_to_tolerance(
         stray[missed] = True
         if not stray.any():
             break
-        # From now on only what changes, or still has to, is looked at.
+        # From here on only test what changed or is still too far.
         added = 2 * len(edges) + 2 * len(missed)
         concerned = np.concatenate([stray, np.ones(added, bool)])
         faces = _split_edges(faces, edges, across, len(vertices))
@@ -138,7 +138,8 @@ def refine_to_tolerance(
 def _strays(
     vertices: Array, faces: Indices, concerned: Mask, full: NearestSurface, limit_mm: float
 ) -> Mask:
-    """(F,) those of some faces whose middle, or an edge's, lies too far from the full mesh."""
+    """Which of the `concerned` faces (F,) have their middle, or
+    an edge's, too far from the full mesh."""
     corners = vertices[faces[concerned]]
     middles = [corners.mean(axis=1), *(0.5 * (corners[:, k] + corners[:, k - 1]) for k in range(3))]
     stray = concerned.copy()
@@ -147,13 +148,14 @@ def _strays(
 
 
 def _longest_edges(vertices: Array, faces: Indices, stray: Mask) -> tuple[Indices, Indices]:
-    """Half-edges (N,) and their twins: the longest of stray faces, at most one edge to a face."""
+    """Half-edges (N,) and their twins: the longest of stray faces, at most one edge per face."""
     corners = vertices[faces]
     length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
     twin = twins(faces, len(vertices)).ravel()
     edges = 3 * np.flatnonzero(stray) + np.argmax(length[stray], axis=1)
     edges = np.unique(np.minimum(edges, twin[edges]))
-    # An edge is split now if it is the longest of all that want one of its two faces, or waits.
+    # An edge is split now if it ranks longest among the wanted edges of both its faces; others
+    # wait.
     rank = np.empty(len(edges), np.int64)
     rank[np.argsort(length.ravel()[edges], kind="stable")] = np.arange(len(edges))
     highest = np.full(len(faces), -1)
@@ -165,8 +167,8 @@ def _longest_edges(vertices: Array, faces: Indices, stray: Mask) -> tuple[Indice
 
 
 def _split_edges(faces: Indices, edges: Indices, across: Indices, vertex_count: int) -> Indices:
-    """Faces (F + 2 N, 3) with half-edges (N,) and their twins split at new vertices, numbered from
-    `vertex_count` on."""
+    """Split half-edges (N,) and their twins at new vertices, numbered from `vertex_count` on;
+    returns faces (F + 2 N, 3)."""
     both = np.concatenate([edges, across])
     middle = vertex_count + np.tile(np.arange(len(edges)), 2)
     face, corner = both // 3, both % 3
@@ -179,8 +181,8 @@ def _split_edges(faces: Indices, edges: Indices, across: Indices, vertex_count: 
 def _farthest(
     distance: Array, face: Indices, face_count: int, limit_mm: float
 ) -> tuple[Indices, Indices]:
-    """Of points too far from the face that is their nearest: the farthest of each face (N,), and
-    those faces (N,)."""
+    """Of points too far from their nearest face: the farthest for each face (N,), and those faces
+    (N,)."""
     far = np.flatnonzero(distance > limit_mm)
     far = far[np.argsort(distance[far], kind="stable")]
     last = np.full(face_count, -1)
@@ -190,8 +192,8 @@ def _farthest(
 
 
 def _split_faces(faces: Indices, some: Indices, vertex_count: int) -> Indices:
-    """Faces (F + 2 N, 3) with N of them made three each, around a new vertex; these are numbered from
-    `vertex_count` on."""
+    """Split N faces in three around new vertices, numbered from `vertex_count` on; returns faces (F
+    + 2 N, 3)."""
     a, b, c = faces[some].T
     middle = vertex_count + np.arange(len(some))
     faces = faces.copy()

@@ -1,7 +1,7 @@
-"""What hides what in a picture: the nearest face, or the nearest point, at each pixel.
+"""What hides what in an image: the nearest face, or the nearest point, at each pixel.
 
-Two short loops in place of casting a ray for each pixel, for which Open3D would have to be imported:
-longer than all pictures of a scan take.
+Two short loops instead of casting a ray for each pixel, for which Open3D would have to be imported:
+that takes longer than all pictures of a scan.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ Numbers = NDArray[np.int32]
 
 @compiled
 def nearest_faces(places: Floats, faces: Indices, height: int, width: int) -> Numbers:
-    """(height, width) number of the face that is nearest, -1 where there is none.
+    """Number of the nearest face (height, width), -1 where there is none.
 
-    places: (V, 3) of vertices: column, row, depth; NaN for those that cannot be seen.  faces: (F, 3).
-    Faces are flat, and cover the pixels whose centres they hold.
+    places: (V, 3) of vertices: column, row, depth; NaN for those that cannot be seen.
+    faces: (F, 3), flat; a face covers the pixels whose centres it contains.
     """
     number = np.full((height, width), -1, np.int32)
     depth = np.full((height, width), np.inf, np.float32)
     for f in range(len(faces)):
         a, b, c = places[faces[f, 0]], places[faces[f, 1]], places[faces[f, 2]]
         area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
-        if not abs(area) > 0.0:  # seen from its edge, or not at all
+        if not abs(area) > 0.0:  # seen edge-on, or not at all
             continue
         for r in range(
             max(0, int(np.ceil(min(a[1], b[1], c[1])))),
@@ -47,9 +47,10 @@ def nearest_faces(places: Floats, faces: Indices, height: int, width: int) -> Nu
 
 @compiled
 def nearest_points(places: Floats, size: int, height: int, width: int) -> Numbers:
-    """(height, width) number of the point that is nearest, -1 where there is none.
+    """Number of the nearest point (height, width), -1 where there is none.
 
-    places: (N, 3) column, row, depth.  size: each covers so many pixels squared around its own.
+    places: (N, 3) column, row, depth.
+    size: side of the square of pixels that a point covers around its own.
     """
     number = np.full((height, width), -1, np.int32)
     depth = np.full((height, width), np.inf, np.float32)

@@ -1,4 +1,4 @@
-"""Who lies across each edge of a triangle mesh.
+"""Which face lies across each edge of a triangle mesh.
 
 Half-edge 3 f + k runs from corner k of face f to the next one.
 """
@@ -10,19 +10,19 @@ import numpy as np
 from bodyscan.arrays import Indices
 from bodyscan.compiled import compiled
 
-RIM = -1  # nobody lies across
+RIM = -1  # no face lies across
 UNSOUND = -2  # several faces run along the edge the same way, or it has no length
 
 
 def twins(faces: Indices, vertex_count: int) -> Indices:
-    """(F, 3) the half-edge that runs the opposite way along each one, RIM or UNSOUND."""
+    """The half-edge (F, 3) that runs the opposite way along each one, RIM or UNSOUND."""
     return _twins(np.ascontiguousarray(faces, np.int64).ravel(), vertex_count).reshape(-1, 3)
 
 
 def corner_fans(twin: Indices) -> tuple[Indices, int]:
-    """(F, 3) number of the fan that each corner belongs to, and how many there are; twin: (F, 3).
+    """Number of the fan (F, 3) that each corner belongs to, and the number of fans; twin: (F, 3).
 
-    The corners of a fan hang together across edges that two faces share, running opposite ways.
+    The corners of a fan are connected across edges that two faces share in opposite directions.
     """
     labels, count = _fans(np.ascontiguousarray(twin).ravel())
     return labels.reshape(-1, 3), int(count)
@@ -30,7 +30,7 @@ def corner_fans(twin: Indices) -> tuple[Indices, int]:
 
 @compiled
 def _twins(corners: Indices, vertex_count: int) -> Indices:
-    """(3 F,) twins from the faces' corners (3 F,), by the half-edges that leave each vertex."""
+    """Twins (3 F,) from the faces' corners (3 F,), by the half-edges that leave each vertex."""
     size = len(corners)
     start = np.zeros(vertex_count + 1, np.int64)
     for vertex in corners:
@@ -59,7 +59,7 @@ def _twins(corners: Indices, vertex_count: int) -> Indices:
 
 @compiled
 def _fans(twin: Indices) -> tuple[Indices, int]:
-    """(3 F,) fans of the corners, numbered as they come, by turning about each vertex."""
+    """Fans (3 F,) of the corners, numbered as found, by turning about each vertex."""
     labels = np.full(len(twin), -1, np.int64)
     count = 0
     for first in range(len(twin)):
@@ -69,7 +69,7 @@ def _fans(twin: Indices) -> tuple[Indices, int]:
         while corner >= 0 and labels[corner] < 0:
             labels[corner] = count
             corner = twin[corner - 1 if corner % 3 > 0 else corner + 2]
-        # From a rim the other side of the first corner is still to be turned through.
+        # At a rim, turn the other way from the first corner as well.
         across = twin[first]
         while across >= 0:
             corner = across + 1 if across % 3 < 2 else across - 2

@@ -1,4 +1,4 @@
-"""Where a body mesh was filled: the patches, how large, and where they lie."""
+"""Filled patches of a body mesh: how large they are, and where."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ WAYS = {
 
 @dataclass(frozen=True, eq=False)
 class Hole:
-    """area_mm2: of the faces that fill it.  middle: (3,) mm, rig frame.  faces: which way."""
+    """area_mm2: of the faces that fill it. middle: (3,) mm,
+    rig frame. faces: the direction it faces."""
 
     area_mm2: float
     middle: Array
@@ -50,5 +51,5 @@ def holes(mesh: BodyMesh) -> list[Hole]:
 
 
 def _sums(group: NDArray[np.intp], values: Array, count: int) -> Array:
-    """(count, 3) sums of values (N, 3) by group."""
+    """Sums (count, 3) of values (N, 3) by group."""
     return np.stack([np.bincount(group, values[:, k], count) for k in range(3)], axis=1)

@@ -1,4 +1,4 @@
-"""PLY, binary little endian: our own clouds and meshes, exact on reading back."""
+"""PLY, binary little endian: our own clouds and meshes, exact when read back."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Element:
 
 
 def _vertex(*extra: tuple[str, str, str]) -> Element:
-    """Position, normal, colour, sigma, and what is extra: (name, numpy type, PLY type)."""
+    """Position, normal, colour, sigma, and `extra` fields: (name, numpy type, PLY type)."""
     fields = [(axis, "<f8", "double") for axis in ("x", "y", "z")]
     fields += [(axis, "<f4", "float") for axis in ("nx", "ny", "nz")]
     fields += [(colour, "u1", "uchar") for colour in ("red", "green", "blue")]
@@ -58,7 +58,7 @@ def _cloud(*, regions: bool) -> tuple[Element, ...]:
 
 
 def _mesh(*, breathes: bool, regions: bool) -> tuple[Element, ...]:
-    """breathes: it knows the way to mean breath.  regions: what its vertices and faces are."""
+    """breathes: with fields for mean breath. regions: with regions of vertices and faces."""
     breath = [("breath_mm", "<f4", "float"), ("breath_sigma_mm", "<f4", "float")]
     vertex = _vertex(*(breath if breathes else []), *([_REGION] if regions else []))
     fields = [("count", "u1"), ("corners", "<i4", 3), ("filled", "u1")]
@@ -69,8 +69,9 @@ def _mesh(*, breathes: bool, regions: bool) -> tuple[Element, ...]:
 
 
 def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
-    """Write a cloud or a mesh in mm, rig frame. A mesh's faces carry a uchar `filled` (0 or 1), and
-    where it is known points, vertices and faces a uchar `region` (of `regions.NAMES`)."""
+    """Write a cloud or a mesh in mm, rig frame. A mesh's faces carry a uchar `filled` (0 or 1);
+    points, vertices and faces carry a uchar `region` (index into `regions.NAMES`) if it is
+    known."""
     regions = body.regions is not None
     if isinstance(body, BodyCloud):
         elements = _cloud(regions=regions)
@@ -95,7 +96,7 @@ def write_ply(path: Path, body: BodyCloud | BodyMesh) -> None:
 
 
 def read_ply_cloud(path: Path) -> BodyCloud:
-    """A cloud that `write_ply` wrote. Raises ResultError if the file is not one."""
+    """Read a cloud that `write_ply` wrote. Raises ResultError if the file is not one."""
     kinds = [_cloud(regions=regions) for regions in (True, False)]
     (vertices,) = _read(Path(path), kinds, "cloud")
     regions = _regions(vertices, path)
@@ -103,7 +104,7 @@ def read_ply_cloud(path: Path) -> BodyCloud:
 
 
 def read_ply_mesh(path: Path) -> BodyMesh:
-    """A mesh that `write_ply` wrote. Raises ResultError if the file is not one."""
+    """Read a mesh that `write_ply` wrote. Raises ResultError if the file is not one."""
     states = (False, True)
     kinds = [_mesh(breathes=breathes, regions=regions) for breathes in states for regions in states]
     vertices, faces = _read(Path(path), kinds, "mesh")
@@ -119,7 +120,7 @@ def read_ply_mesh(path: Path) -> BodyMesh:
 
 
 def _regions(vertices: Records, path: Path) -> Bytes | None:
-    """None of a file of before there were any."""
+    """Regions; None if the file is older than these."""
     if "region" not in (vertices.dtype.names or ()):
         return None
     regions: Bytes = vertices["region"].copy()
@@ -159,7 +160,7 @@ def _header(elements: Sequence[Element], counts: Sequence[int]) -> bytes:
 
 
 def _read(path: Path, known: Sequence[Sequence[Element]], what: str) -> list[Records]:
-    """The records of a file that `write_ply` wrote with some of these elements."""
+    """The records of a file that `write_ply` wrote with one of these sets of elements."""
     try:
         data = read_regular(path)
     except OSError as error:

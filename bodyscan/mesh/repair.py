@@ -1,4 +1,4 @@
-"""A nearly closed triangle mesh made a closed manifold one."""
+"""Turning a nearly closed triangle mesh into a closed manifold."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from bodyscan.mesh.topology import (
 
 
 def close_mesh(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
-    """Vertices (V, 3) and faces (F, 3) of a closed manifold surface made from nearly one.
+    """Vertices (V, 3) and faces (F, 3) of a closed manifold surface made from a nearly closed one.
 
-    Faces at edges that more than two share go, surfaces that touch in a vertex are parted, holes
-    are closed with fans of triangles. An octree's surface has a few such places; a closed
-    manifold stays as it is, but for the numbers of its vertices.
+    Faces at edges shared by more than two are removed, surfaces that touch in a vertex are
+    separated, holes are closed with fans of triangles. An octree's surface has a few such places; a
+    closed manifold is unchanged, except for the numbers of its vertices.
     """
     twin = twins(faces, len(vertices))
     sound = (twin != UNSOUND).all(axis=1)
@@ -39,7 +39,8 @@ def close_mesh(vertices: Array, faces: Indices) -> tuple[Array, Indices]:
 
 
 def _fill_holes(vertices: Array, faces: Indices, rim: Indices) -> tuple[Array, Indices]:
-    """Every rim, of edges (N, 2), gets a vertex at its middle and a triangle for each of them."""
+    """Close every rim, given by edges (N, 2), with a vertex
+    at its middle and a triangle per edge."""
     if not len(rim):
         return vertices, faces
     corners, ends = np.unique(rim, return_inverse=True)
@@ -58,10 +59,10 @@ def _fill_holes(vertices: Array, faces: Indices, rim: Indices) -> tuple[Array, I
 def largest_piece(
     vertices: Array, faces: Indices, points: Array | None = None
 ) -> tuple[Array, Indices]:
-    """The connected piece with the most faces, closed and turned to look outwards.
+    """The connected piece with the most faces, closed and oriented outwards.
 
-    points: (N, 3), the piece that lies next to most of these instead: what closes the surface behind a
-    wall may have more faces than what was scanned before it.
+    points: (N, 3); choose the piece next to most of these instead: what closes the surface behind a
+        wall may have more faces than what was scanned before it.
     """
     vertices, faces = close_mesh(vertices, faces)
     labels = counted = face_components(faces, len(vertices))

@@ -1,4 +1,4 @@
-"""Rings that a body closes where its parts touch: a hand on the hip, one knee against the other.
+"""Rings that a body forms where its parts touch: a hand on the hip, one knee against the other.
 
 The mesh is cut into layers. The pieces of all layers, joined where they meet, make a graph; on a
 surface without handles that graph is a tree whatever the shape (it is the nerve of the height's
@@ -21,7 +21,8 @@ LAYER_MM = 20.0
 
 @dataclass(frozen=True)
 class Ring:
-    """A closed ring of body parts: its lowest and highest place, its middle's y, rig frame, mm."""
+    """A closed ring of body parts: its lowest and highest
+    point, the y of its middle; rig frame, mm."""
 
     low_mm: float
     high_mm: float
@@ -29,10 +30,10 @@ class Ring:
 
 
 def rings(vertices: Array, faces: Indices, *, smallest_mm: float = 80.0) -> list[Ring]:
-    """Rings at least `smallest_mm` high of a closed mesh, from the lowest up."""
+    """Rings at least `smallest_mm` high in a closed mesh, from the lowest up."""
     edges = directed_edges(faces)
     edges = edges[edges[:, 0] < edges[:, 1]]
-    # An edge that skipped a layer would make a ring where there is none.
+    # An edge that skipped a layer would create a ring where there is none.
     layer_mm = max(LAYER_MM, float(np.abs(np.diff(vertices[edges, 2], axis=1)).max()))
     layer = np.floor(vertices[:, 2] / layer_mm).astype(np.int64)
     within = layer[edges[:, 0]] == layer[edges[:, 1]]
@@ -47,7 +48,7 @@ def rings(vertices: Array, faces: Indices, *, smallest_mm: float = 80.0) -> list
     joined = without_branches(np.unique(piece[edges[~within]], axis=0))
     if not len(joined):
         return []
-    import networkx as nx  # loads for a fifth of a second; few bodies have a ring
+    import networkx as nx  # takes a fifth of a second to load; few bodies have a ring
 
     found = []
     for cycle in nx.minimum_cycle_basis(nx.Graph(joined.tolist())):
@@ -58,7 +59,7 @@ def rings(vertices: Array, faces: Indices, *, smallest_mm: float = 80.0) -> list
 
 
 def without_branches(joined: Indices) -> Indices:
-    """Of what is joined, (N, 2), what is in a ring or between two."""
+    """The links (N, 2) that are in a ring or between two."""
     joined = np.unique(np.sort(joined, axis=1), axis=0)
     while True:
         inside = (np.bincount(joined.ravel())[joined] > 1).all(axis=1)

@@ -9,7 +9,8 @@ from bodyscan.arrays import Array, Indices
 
 
 def centred_scene(vertices: Array, faces: Indices) -> tuple[o3d.t.geometry.RaycastingScene, Array]:
-    """A scene of vertices (V, 3) less their mean, since it computes in float32, and that mean (3,)."""
+    """A scene of vertices (V, 3) less their mean, because it
+    computes in float32; and that mean (3,)."""
     centre = vertices.mean(axis=0)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(

@@ -1,4 +1,4 @@
-"""Where a horizontal plane cuts a mesh: closed loops, their girth, tape girth and area."""
+"""Horizontal slices of a mesh: closed loops, their girth, tape girth and area."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from bodyscan.mesh.regions import regions_at, shares
 class Loop:
     """One closed curve of a slice, mm.
 
-    segments: (N, 2, 2) from (x, y) to (x, y), in no order, each with the body on its left seen
-    from above.  measured: (N,) whether the segment runs across a measured face.  ends: (N, 2), the
-    numbers of the mesh's edges that each starts and ends on; its neighbours have the same.
-    regions: (N,) of the faces, if they are known.
+    segments: (N, 2, 2) from (x, y) to (x, y), unordered, each with the body on its left seen from
+        above.
+    measured: (N,) whether the segment crosses a measured face.
+    ends: (N, 2), numbers of the mesh's edges where each starts and ends; neighbours share them.
+    regions: (N,) of the faces, if known.
     """
 
     segments: Array
@@ -32,28 +33,28 @@ class Loop:
 
     @cached_property
     def lengths(self) -> Array:
-        """(N,) mm."""
+        """Length of each segment (N,) mm."""
         return np.linalg.norm(self.segments[:, 1] - self.segments[:, 0], axis=1)
 
     @property
     def girth_mm(self) -> float:
-        """Along the surface, into every fold."""
+        """Girth along the surface, into every fold."""
         return float(self.lengths.sum())
 
     @property
     def tape_mm(self) -> float:
-        """As a tape runs, straight across hollows: the perimeter of the convex hull."""
+        """Girth as a tape runs, straight across hollows: the perimeter of the convex hull."""
         return hull_mm(self.segments[:, 0])
 
     @cached_property
     def area_mm2(self) -> float:
-        """Enclosed; negative for the rim of a hollow inside the body."""
+        """Enclosed area; negative for the rim of a hollow inside the body."""
         a, b = np.moveaxis(self.segments - self.centre, 1, 0)
         return float(0.5 * np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
 
     @cached_property
     def centre(self) -> Array:
-        """(2,) mean of the curve, mm."""
+        """Mean (2,) of the curve, mm."""
         middles, lengths = self.segments.mean(axis=1), self.lengths
         if not lengths.sum():
             return middles.mean(axis=0)
@@ -61,19 +62,22 @@ class Loop:
 
     @property
     def measured_share(self) -> float:
-        """Of the girth, how much runs across measured faces."""
+        """Share of the girth that crosses measured faces."""
         return float(self.lengths[self.measured].sum() / max(self.girth_mm, 1e-12))
 
     @property
     def region_shares(self) -> dict[str, float] | None:
-        """Of the girth, how much runs across each region."""
+        """Share of the girth that crosses each region, by name."""
         return None if self.regions is None else shares(self.regions, self.lengths)
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A stretch of a loop that was measured, or not.  segments: (N,) which of the loop's, in no order.
-    first, last: those where it begins and where it ends."""
+    """A stretch of a loop that was measured, or was not.
+
+    segments: (N,) which of the loop's, unordered.
+    first, last: the segments where it begins and ends.
+    """
 
     measured: bool
     segments: Indices
@@ -85,13 +89,13 @@ def hull_mm(points: Array) -> float:
     """Perimeter of the convex hull of points (N, 2)."""
     try:
         return float(ConvexHull(points).area)
-    except QhullError:  # a speck: all in one line
+    except QhullError:  # a speck, or points on one line
         return 2.0 * float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 def runs_of(loop: Loop, shortest_gap_mm: float) -> tuple[Run, ...]:
-    """A loop's stretches, one after the other; what was not measured for less than `shortest_gap_mm`
-    counts as measured."""
+    """A loop's stretches in order; unmeasured ones shorter than `shortest_gap_mm` count as
+    measured."""
     nodes, number = np.unique(loop.ends, return_inverse=True)
     ends = number.reshape(-1, 2)
     label = _stretches(ends, loop.measured, len(nodes))
@@ -108,7 +112,7 @@ def runs_of(loop: Loop, shortest_gap_mm: float) -> tuple[Run, ...]:
 
 
 def joined(loop: Loop, runs: Sequence[Run]) -> Loop:
-    """A loop of stretches of another one, closed straight from each to the next."""
+    """A loop made of stretches of another one, with straight connections from each to the next."""
     following = [*runs[1:], runs[0]]
     here = np.array([run.last for run in runs])
     there = np.array([run.first for run in following])
@@ -126,7 +130,7 @@ def joined(loop: Loop, runs: Sequence[Run]) -> Loop:
 
 
 def _run(ends: Indices, own: Indices, measured: Mask) -> Run:
-    """own: its segments.  A whole loop begins and ends anywhere."""
+    """A stretch of the segments `own`. A whole loop begins and ends anywhere."""
     first = own[~np.isin(ends[own, 0], ends[own, 1])]
     last = own[~np.isin(ends[own, 1], ends[own, 0])]
     if not (first.size and last.size):
@@ -135,8 +139,8 @@ def _run(ends: Indices, own: Indices, measured: Mask) -> Run:
 
 
 def _stretches(ends: Indices, measured: Mask, count: int) -> Indices:
-    """(N,) numbers from 0 of the stretches of segments (N, 2) that were measured, or were not."""
-    own = ends + count * ~measured[:, None]  # what was not measured hangs on nodes of its own
+    """Numbers (N,) from 0 of the stretches of segments (N, 2) that were measured, or were not."""
+    own = ends + count * ~measured[:, None]  # unmeasured segments get nodes of their own
     graph = coo_array((np.ones(len(own), np.int8), tuple(own.T)), shape=(2 * count, 2 * count))
     nodes = connected_components(graph, directed=False)[1]
     return np.unique(nodes[own[:, 0]], return_inverse=True)[1]
@@ -149,11 +153,14 @@ def loops_at(
     filled: Mask | None = None,
     regions: Bytes | None = None,
 ) -> tuple[Loop, ...]:
-    """The loops of the slice z = height_mm, largest area first; () where the plane misses the mesh.
+    """The loops of the slice z = height_mm, largest area first; () if the plane misses the mesh.
 
-    vertices (V, 3) mm, faces (F, 3) outward, of a closed mesh; filled (F,) marks made-up faces,
-    regions (F,) what they are. A vertex that lies exactly in the plane counts as above it, so that
-    loops always close.
+    vertices: (V, 3) mm, of a closed mesh.
+    faces: (F, 3), outward.
+    filled: (F,) which faces are filled.
+    regions: (F,) of the faces.
+
+    A vertex exactly in the plane counts as above it, so that loops always close.
     """
     above = (vertices[:, 2] >= height_mm)[faces]
     count = above.sum(axis=1)
@@ -179,7 +186,7 @@ def loops_at(
 
 
 def height_ranges(vertices: Array, faces: Indices) -> tuple[Array, Array]:
-    """(F,) mm, the lowest and the highest place of each face: a slice needs those alone that it passes.
+    """Lowest and highest z of each face, (F,) mm: a slice needs only the faces that it crosses.
 
     Corner by corner: numpy's reduction over rows of three takes ten times as long.
     """
@@ -189,21 +196,22 @@ def height_ranges(vertices: Array, faces: Indices) -> tuple[Array, Array]:
 
 
 def _crossing(vertices: Array, a: Indices, b: Indices, height_mm: float) -> Array:
-    """(N, 2) where edges from a to b pass the height; the same from either face of an edge."""
+    """Points (N, 2) where edges from a to b pass the height;
+    identical from either face of an edge."""
     low, high = vertices[np.minimum(a, b)], vertices[np.maximum(a, b)]
     share = (height_mm - low[:, 2]) / (high[:, 2] - low[:, 2])
     return low[:, :2] + share[:, None] * (high[:, :2] - low[:, :2])
 
 
 def _edge_numbers(corner: Indices, start: Indices, end: Indices, count: int) -> Indices:
-    """(N, 2) from 0: of the mesh's edges on which segments start and end."""
+    """Numbers (N, 2), from 0, of the mesh's edges on which segments start and end."""
     keys = [np.minimum(corner, x) * count + np.maximum(corner, x) for x in (start, end)]
     _, number = np.unique(np.stack(keys, axis=-1), return_inverse=True)
     return number.reshape(-1, 2).astype(np.int64)
 
 
 def _label_loops(ends: Indices) -> Indices:
-    """(N,) number of the loop of each segment: neighbours share the edge that they end on."""
+    """Number (N,) of each segment's loop: neighbours share the edge on which they end."""
     size = int(ends.max()) + 1
     graph = coo_array((np.ones(len(ends), np.int8), tuple(ends.T)), shape=(size, size))
     return connected_components(graph, directed=False)[1][ends[:, 0]].astype(np.int64)

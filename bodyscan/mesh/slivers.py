@@ -1,4 +1,4 @@
-"""Faces without area taken out of a mesh: other programs stumble over them."""
+"""Removing faces without area, which trip up other programs."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ PLACES = 4  # decimals of a millimetre: what text formats write, and far below a
 
 
 def without_slivers(mesh: BodyMesh) -> BodyMesh:
-    """The mesh with every edge drawn together whose ends are one point when written; the faces at it
-    go with it, so that a closed mesh stays closed."""
+    """The mesh with every edge collapsed whose ends are one point when written, and its faces
+    removed, so that a closed mesh stays closed."""
     places, edges = np.round(mesh.vertices, PLACES), directed_edges(mesh.faces)
     edges = edges[(places[edges[:, 0]] == places[edges[:, 1]]).all(axis=1)]
     if not len(edges):

@@ -2,9 +2,9 @@
 
 A vertex lies in every cell that the surface passes through, at the mean of the places where the
 cell's edges cross zero; a quadrilateral joins the vertices of the four cells around each edge that
-crosses. Where several sheets pass through a cell each gets a vertex of its own, so that surfaces
-that come close do not touch. A face of a cell with two corners inside across two outside would leave
-open which sheets meet there: of such two the one nearer to the surface is put outside first.
+crosses. If several sheets pass through a cell each gets its own vertex, so that surfaces that come
+close do not touch. A cell's face whose two corners inside are diagonally opposite would leave open
+which sheets meet there: of the two, the one nearer to the surface is first put outside.
 """
 
 from __future__ import annotations
@@ -22,18 +22,19 @@ from bodyscan.mesh.bricks import SIDE, Bricks
 
 Numbers = NDArray[np.int32]
 
-BARELY = 1e-3  # outside, of how far a node was inside
+BARELY = 1e-3  # outside, as a share of how far the node was inside
 
 
 def surface_nets(bricks: Bricks, values: Floats) -> tuple[Array, Indices]:
-    """Vertices (V, 3) mm and outward faces (F, 3) of where values pass zero, negative inside.
+    """Vertices (V, 3) mm and outward faces (F, 3) of the surface where values cross zero, negative
+    inside.
 
-    values: (bricks, SIDE, SIDE, SIDE) at the nodes. Closed and manifold wherever all nodes around
-    are in bricks.
+    values: (bricks, SIDE, SIDE, SIDE) at the nodes. The surface is closed and manifold wherever all
+        surrounding nodes are in bricks.
     """
     values = values.copy()
     while _part_sheets(bricks.table, bricks.places, values):
-        pass  # ends: nodes only ever leave the inside
+        pass  # terminates: nodes only ever leave the inside
     parts, counts = sheets_of_cases()
     cases, first, total = _number_vertices(bricks.table, bricks.places, values, counts)
     vertices = _place_vertices(bricks.table, bricks.places, values, cases, first, parts, total)
@@ -43,8 +44,8 @@ def surface_nets(bricks: Bricks, values: Floats) -> tuple[Array, Indices]:
 
 @cache
 def sheets_of_cases() -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-    """For each of the 256 ways in which a cell's corners are inside: (256, 12) which sheet crosses
-    each edge, -1 for none; (256,) how many sheets there are.
+    """For each of the 256 combinations of a cell's corners inside: the sheet (256, 12) that crosses
+    each edge, -1 for none; and the number of sheets (256,).
 
     Corner x + 2 y + 4 z; edge 4 a + p + 2 q runs along axis a, at p and q on the two axes after it.
     """
@@ -72,7 +73,7 @@ def _links(case: int, axis: int, side: int) -> list[tuple[int, int]]:
     b, c = (axis + 1) % 3, (axis + 2) % 3
     around = [(0, 0), (1, 0), (1, 1), (0, 1)]
     inside = [case >> ((side << axis) + (p << b) + (q << c)) & 1 for p, q in around]
-    # Of the face's corners k and k + 1: the edge between them. Edges along b lie at (c, axis).
+    # The edge between corners k and k + 1 of the face. Edges along b lie at (c, axis).
     edges = [4 * b + 0 + 2 * side, 4 * c + side + 2, 4 * b + 1 + 2 * side, 4 * c + side]
     crossing = [k for k in range(4) if inside[k] != inside[(k + 1) % 4]]
     return [(edges[crossing[0]], edges[crossing[1]])] if len(crossing) == 2 else []
@@ -80,7 +81,8 @@ def _links(case: int, axis: int, side: int) -> list[tuple[int, int]]:
 
 @compiled
 def _gather(table: Numbers, place: Numbers, values: Floats, block: NDArray[np.float32]) -> None:
-    """Values at a brick's nodes and the next ones (SIDE + 1 a side), NaN where there is no brick."""
+    """Values at a brick's nodes and the next ones (SIDE + 1
+    per side), NaN where there is no brick."""
     for i in range(SIDE + 1):
         for j in range(SIDE + 1):
             for k in range(SIDE + 1):
@@ -94,7 +96,7 @@ def _gather(table: Numbers, place: Numbers, values: Floats, block: NDArray[np.fl
 
 @compiled
 def _part_sheets(table: Numbers, places: Numbers, values: Floats) -> int:
-    """Put one node outside, just so, of each face whose corners alternate; returns how many."""
+    """Put one node just outside on each face whose corners alternate; returns how many."""
     block = np.empty((SIDE + 1, SIDE + 1, SIDE + 1), np.float32)
     steps = np.eye(3, dtype=np.int64)
     found = 0
@@ -130,7 +132,7 @@ def _part_sheets(table: Numbers, places: Numbers, values: Floats) -> int:
 def _number_vertices(
     table: Numbers, places: Numbers, values: Floats, counts: NDArray[np.int8]
 ) -> tuple[NDArray[np.uint8], Numbers, int]:
-    """Of each cell: its case, the number of its first vertex; and how many there are."""
+    """Case and number of the first vertex of each cell, and the number of vertices."""
     cases, first = np.zeros(values.shape, np.uint8), np.zeros(values.shape, np.int32)
     block = np.empty((SIDE + 1, SIDE + 1, SIDE + 1), np.float32)
     total = 0
@@ -160,7 +162,7 @@ def _place_vertices(
     parts: NDArray[np.int8],
     total: int,
 ) -> Array:
-    """(total, 3) vertices, in cells from the grid's first node."""
+    """Vertices (total, 3), in cells from the grid's first node."""
     sums, crossings = np.zeros((total, 3)), np.zeros(total)
     block = np.empty((SIDE + 1, SIDE + 1, SIDE + 1), np.float32)
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -203,7 +205,7 @@ def _join(
     parts: NDArray[np.int8],
     vertices: Array,
 ) -> Indices:
-    """(F, 3) faces: two for each edge that crosses zero, split along the shorter diagonal."""
+    """Faces (F, 3): two for each edge that crosses zero, split along the shorter diagonal."""
     faces, count = np.empty((6 * len(vertices) + 64, 3), np.int64), 0
     corners, cell = np.empty(4, np.int64), np.empty(3, np.int64)
     for brick in range(len(values)):
@@ -211,7 +213,7 @@ def _join(
             i, j, k = number // SIDE**2, number // SIDE % SIDE, number % SIDE
             case = cases[brick, i, j, k]
             for axis in range(3):
-                # The edges at the cell's own first corner: every edge is some cell's.
+                # The edges at the cell's own first corner: every edge belongs to some cell.
                 if case == 0 or (case & 1) == (case >> (1 << axis) & 1):
                     continue
                 whole = True
@@ -251,8 +253,8 @@ def _vertex(
     parts: NDArray[np.int8],
     edge: int,
 ) -> int:
-    """The vertex of the sheet that crosses an edge of a cell, given from a brick's first one; -1 if
-    there is none."""
+    """The vertex of the sheet that crosses an edge of a cell, counted from a brick's first one; -1
+    if there is none."""
     a, b, c = place[0] + cell[0] // SIDE, place[1] + cell[1] // SIDE, place[2] + cell[2] // SIDE
     if a < 0 or b < 0 or c < 0 or table[a, b, c] < 0:
         return -1

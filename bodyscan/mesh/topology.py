@@ -1,7 +1,7 @@
-"""Is a triangle mesh a closed, oriented, manifold surface, and of how many pieces?
+"""Whether a triangle mesh is a closed, oriented, manifold surface, and its number of pieces.
 
-Linear in the number of faces (Open3D's is_watertight looks for self-intersections too
-and is quadratic).
+Linear in the number of faces (Open3D's is_watertight also looks for self-intersections and is
+quadratic).
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from bodyscan.mesh.half_edges import corner_fans, twins
 
 @dataclass(frozen=True)
 class Topology:
-    """What a mesh is, as a surface."""
+    """Properties of a mesh as a surface."""
 
     closed: bool  # every edge lies in exactly two faces, which run along it in opposite directions
     manifold: bool  # closed, and the faces around every vertex form a single fan
     components: int
     euler: int  # 2 for a sphere, less 2 for each handle
-    volume_mm3: float  # signed; positive if the faces look outwards
+    volume_mm3: float  # signed; positive if the faces are oriented outwards
 
 
 def topology(vertices: Array, faces: Indices) -> Topology:
-    """Of a mesh with vertices (V, 3) and faces (F, 3); unused vertices do not count."""
+    """Topology of a mesh with vertices (V, 3) and faces (F, 3); unused vertices do not count."""
     used = used_vertices(faces, len(vertices))
     count = len(vertices)
     closed, manifold = closed_and_manifold(faces, count)
@@ -46,25 +46,25 @@ def topology(vertices: Array, faces: Indices) -> Topology:
 
 
 def closed_and_manifold(faces: Indices, vertex_count: int) -> tuple[bool, bool]:
-    """What `Topology` says of faces (F, 3), without the rest of it."""
+    """The `closed` and `manifold` of `Topology` for faces (F, 3), without the rest."""
     twin = twins(faces, vertex_count)
     closed = bool(faces.size) and bool((twin >= 0).all())
     return closed, closed and corner_fans(twin)[1] == used_vertices(faces, vertex_count).size
 
 
 def _edge_keys(faces: Indices, vertex_count: int) -> Indices:
-    """(3 F,) a number for each edge, whichever way it runs."""
+    """A number (3 F,) for each edge, whichever way it runs."""
     low, high = np.sort(directed_edges(faces), axis=1).T
     return low * vertex_count + high
 
 
 def directed_edges(faces: Indices) -> Indices:
-    """(3 F, 2): edge k of face f, at k * F + f, runs from its corner k to the next."""
+    """Edges (3 F, 2): edge k of face f, at k * F + f, runs from its corner k to the next."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def face_components(faces: Indices, vertex_count: int) -> NDArray[np.int32]:
-    """(F,) number of the connected piece that each face belongs to."""
+    """Number (F,) of the connected piece that each face belongs to."""
     edges = directed_edges(faces)
     graph = coo_array(
         (np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])),
@@ -77,18 +77,18 @@ def face_components(faces: Indices, vertex_count: int) -> NDArray[np.int32]:
 
 
 def signed_volume(vertices: Array, faces: Indices) -> float:
-    """Volume inside a closed mesh; negative if its faces look inwards."""
+    """Volume inside a closed mesh, mm^3; negative if its faces are oriented inwards."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return float(np.einsum("fc,fc->", a, np.cross(b, c)) / 6.0)
 
 
 def face_areas(vertices: Array, faces: Indices) -> Array:
-    """(F,) mm2."""
+    """Areas (F,) mm^2."""
     return 0.5 * np.linalg.norm(face_normals(vertices, faces), axis=1)
 
 
 def face_normals(vertices: Array, faces: Indices) -> Array:
-    """(F, 3) normals of faces (F, 3), as long as twice their areas."""
+    """Normals (F, 3) of faces (F, 3), twice as long as their areas."""
     found = np.empty((len(faces), 3))
     _cross(np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int64), found)
     return found
@@ -105,7 +105,7 @@ def _cross(vertices: Array, faces: Indices, found: Array) -> None:
 
 
 def vertex_normals(vertices: Array, faces: Indices) -> Floats:
-    """(V, 3) unit normals, the mean of the faces around weighted by area."""
+    """Unit normals (V, 3), the area-weighted mean of the faces around each vertex."""
     cross = face_normals(vertices, faces)
     total = np.stack(
         [
@@ -119,7 +119,7 @@ def vertex_normals(vertices: Array, faces: Indices) -> Floats:
 
 
 def drop_unused_vertices(vertices: Array, faces: Indices) -> tuple[Array, Indices, Indices]:
-    """Vertices that faces use, the faces renumbered, and which old vertices stayed."""
+    """Vertices that faces use, the faces renumbered, and the old numbers of those vertices."""
     used = used_vertices(faces, len(vertices))
     number = np.full(len(vertices), -1, np.int64)
     number[used] = np.arange(used.size)
@@ -127,7 +127,7 @@ def drop_unused_vertices(vertices: Array, faces: Indices) -> tuple[Array, Indice
 
 
 def used_vertices(faces: Indices, count: int) -> Indices:
-    """Numbers of the vertices (of `count`) that faces use, rising."""
+    """Numbers of the vertices (of `count`) that faces use, ascending."""
     used = np.zeros(count, bool)
     used[faces] = True
     return np.flatnonzero(used)

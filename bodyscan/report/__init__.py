@@ -2,7 +2,7 @@
 
 page holds what a report is made of, and result_page finds what a folder holds. scan_page (with
 comparison_section), calibration_page (with calibration_verdict and calibration_charts) and
-acceptance_page say what is in theirs. Pictures are drawn by pictures and sigma_map on a canvas,
-charts as SVG; models to turn are packed by model, from body_model and rig_model. measurements: a
-table on screen.
+acceptance_page make their reports. Pictures are drawn by pictures and sigma_map on a canvas, charts
+as SVG; rotatable models are packed by model, from body_model and rig_model. measurements: a table
+on screen.
 """

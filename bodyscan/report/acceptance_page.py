@@ -1,4 +1,4 @@
-"""What an acceptance test's report says, on screen and as a page."""
+"""The report of an acceptance test, on screen and as a page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scan's body as a model to turn: a light mesh, coloured in every way that is known of it."""
+"""A scan's body as a rotatable model: a light mesh, coloured by everything known about it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from bodyscan.report.model import Layer, Shape, css, ramp_legend
 from bodyscan.report.pictures import FILLED_TINT
 
 FACES = (50_000, 44_000, 38_000)
-"""Tried in turn: reduced to one number of faces a mesh may fold, and not to another."""
+"""Tried in turn: a mesh reduced to one number of faces may fold, but not to another."""
 UNKNOWN = (150, 150, 150)
 SKIN = (214, 210, 205)
 REGIONS = (UNKNOWN, SKIN, (120, 70, 30), (40, 70, 130))
-"""As `mesh.regions.NAMES`: unsure (what was filled too), skin, hair, dark cloth."""
+"""In the order of `mesh.regions.NAMES`: unsure (including filled), skin, hair, dark cloth."""
 PAIRS = (
     (70, 50, 125),
     (60, 100, 170),
@@ -31,11 +31,11 @@ PAIRS = (
     (190, 205, 60),
     (250, 210, 50),
 )
-"""Of one pair, two, ... and six or more."""
+"""For one pair, two, ... and six or more."""
 
 
 def light_mesh(mesh: BodyMesh) -> BodyMesh | None:
-    """The mesh with about 50,000 faces; None if it closes with none of the numbers tried."""
+    """The mesh with about 50,000 faces; None if it does not stay closed for any number tried."""
     for faces in FACES:
         try:
             return decimate(mesh, faces=faces)
@@ -51,8 +51,8 @@ def layers(
     comparison: Comparison | None,
     limit_mm: float,
 ) -> list[Layer]:
-    """By photo, plain, number of pairs, sigma, filled; where some of it is covered by regions, and if
-    compared by deviation."""
+    """Layers by photo, plain, number of pairs, sigma, filled; by region if some of it is covered,
+    and by deviation if compared."""
     made_up = np.zeros(len(small.vertices), bool)
     made_up[small.faces[small.filled]] = True
     top = _round_up(float(np.nanpercentile(cloud.sigma_mm, 98)))
@@ -97,7 +97,8 @@ def _deviation(
     made_up: Mask,
     limit_mm: float,
 ) -> Layer:
-    """Of the nearest vertex of the full mesh: the light one is a few tenths of a mm off itself."""
+    """Deviation of the full mesh's nearest vertex: the light
+    mesh itself is off by some tenths of a mm."""
     tree = cKDTree(mesh.vertices[comparison.vertices])
     signed = comparison.signed_mm[np.asarray(tree.query(small.vertices, workers=THREADS)[1])]
     table = blue_white_red()[:, ::-1]
@@ -123,6 +124,6 @@ def _without(colours: Bytes, unknown: Mask) -> Bytes:
 
 
 def _round_up(value: float) -> float:
-    """To two digits."""
+    """Round up to two digits."""
     power = 10.0 ** (np.floor(np.log10(max(value, 1e-6))) - 1)
     return float(np.ceil(value / power) * power)

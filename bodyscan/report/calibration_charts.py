@@ -1,4 +1,4 @@
-"""Charts of a calibration: coverage, residuals, the planes of light, models tried, the view graph."""
+"""Charts of a calibration: coverage, residuals, the light planes, models tried, the view graph."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from bodyscan.report.charts import BLUE, GREY, INK, RED, grid_of, style, svg
 
 COLUMNS = 4
 CELLS = (10, 8)
-"""The picture is divided so for residuals, across and down."""
+"""Cells into which the image is divided for residuals, across and down."""
 FEWEST = 3
 ARROW = 0.08
-"""Long arrows are such a share of a picture's width."""
+"""Length of the longest arrow as a share of the image's width."""
 POLES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
-"""Okabe and Ito's, told apart by the colour-blind too."""
+"""Okabe and Ito's colours, which the colour-blind can tell apart too."""
 DASHES = ("-", "--", "-.", ":")
 
 
 def coverage_chart(calibration: RigCalibration) -> bytes:
-    """Of each camera: its picture, and where each view of a board lay in it."""
+    """For each camera: its image, and where each view of a board lay in it."""
     with style():
         figure, axes = grid_of(len(calibration.seen), COLUMNS, (2.6, 2.3))
         for axis, (name, seen) in zip(axes, calibration.seen.items(), strict=True):
@@ -46,8 +46,8 @@ def coverage_chart(calibration: RigCalibration) -> bytes:
 
 
 def residual_chart(calibration: RigCalibration) -> tuple[bytes, float]:
-    """Of each camera: RMS of the corners' residuals over its picture (colour) and their mean
-    (arrows); also how many times too long the arrows are."""
+    """For each camera: RMS of the corners' residuals over its image (colour) and their mean
+    (arrows). Also returns the factor by which the arrows are magnified."""
     maps = {
         name: _residual_map(seen, calibration.pairs[name].camera)
         for name, seen in calibration.seen.items()
@@ -79,7 +79,7 @@ def residual_chart(calibration: RigCalibration) -> tuple[bytes, float]:
 
 
 def planes_chart(calibration: RigCalibration) -> bytes:
-    """Fig. 6 of every pair: baseline, projection angle, tilt of the light planes over s."""
+    """Fig. 6 for every pair: baseline, projection angle and tilt of the light planes over s."""
     colour, dash = line_styles(calibration)
     with style():
         figure, axes = plt.subplots(3, 1, figsize=(9.6, 8.4), sharex=True, constrained_layout=True)
@@ -137,8 +137,8 @@ def held_out_chart(calibration: RigCalibration) -> bytes:
 
 
 def view_graph_chart(calibration: RigCalibration) -> bytes:
-    """Pairs around a circle, joined where they saw a board at the same moment: the more, the
-    thicker."""
+    """Pairs around a circle, with lines between those that saw a board at the same moment: more
+    boards, thicker lines."""
     names = list(calibration.seen)
     together = shared_boards(calibration)
     turn = 2.0 * np.pi * np.arange(len(names)) / max(len(names), 1)
@@ -165,8 +165,8 @@ def view_graph_chart(calibration: RigCalibration) -> bytes:
 
 
 def shared_boards(calibration: RigCalibration) -> Array:
-    """(P, P) how many boards two pairs saw at the same moment, in the order of `seen`; NaN for one
-    and itself."""
+    """Number of boards (P, P) that two pairs saw at the same moment, in the order of `seen`; the
+    diagonal is NaN."""
     seen = [set(one.target.tolist()) for one in calibration.seen.values()]
     count = np.array([[float(len(a & b)) for b in seen] for a in seen])
     np.fill_diagonal(count, 0.0)
@@ -174,7 +174,7 @@ def shared_boards(calibration: RigCalibration) -> Array:
 
 
 def line_styles(calibration: RigCalibration) -> tuple[dict[str, str], dict[str, str]]:
-    """A colour for each pole's pairs, and a dash for each pair of a pole."""
+    """A colour for the pairs of each pole, and a dash for each pair of a pole."""
     pairs = calibration.rig.pairs
     poles = list(dict.fromkeys(pair.pole or pair.name for pair in pairs))
     colour, dash, used = {}, {}, dict.fromkeys(poles, 0)
@@ -188,7 +188,7 @@ def line_styles(calibration: RigCalibration) -> tuple[dict[str, str], dict[str, 
 
 def _residual_map(seen: SeenCorners, camera: Camera) -> tuple[Array, Array, Array]:
     """RMS (rows, columns) and mean (rows, columns, 2) of residuals, px, and the cells' middles; NaN
-    where there are fewer than three corners."""
+    for fewer than three corners."""
     columns, rows = CELLS
     size = np.array([camera.width, camera.height])
     cell = np.clip(((seen.pixels + 0.5) / size * CELLS).astype(int), 0, np.array(CELLS) - 1)
@@ -215,6 +215,6 @@ def _picture_frame(axis: Axes, camera: Camera) -> None:
 
 
 def _finite(arrays: list[Array]) -> Array:
-    """All known values of some arrays, (1,) of 1 if there are none."""
+    """All known values in some arrays; a single 1 if there are none."""
     known = np.concatenate([array[np.isfinite(array)] for array in arrays])
     return known if known.size else np.ones(1)

@@ -1,4 +1,4 @@
-"""What a calibration's report says: how well each pair and the whole rig are known."""
+"""A calibration's report: how well each pair and the whole rig are known."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _pairs(figures: list[PairFigures], calibration: RigCalibration) -> Section:
 
 
 def _lens_lines(calibration: RigCalibration) -> Iterator[str]:
-    """How each lens that was tried did on boards it was not fitted to."""
+    """How each lens that was tried did on boards to which it was not fitted."""
     for name, pair in calibration.pairs.items():
         tried = pair.quality.lenses
         if not tried:
@@ -169,7 +169,7 @@ def _lens_figure(tried: LensTrial) -> str:
 
 
 def _choice_lines(calibration: RigCalibration) -> Iterator[str]:
-    """What was taken and refused on boards that took no part, and by how much."""
+    """What was chosen and rejected on held-out boards, and by how much."""
     for name, pair in calibration.pairs.items():
         quality = pair.quality
         light = [

@@ -1,4 +1,4 @@
-"""What makes a calibration good, usable, or to be done again."""
+"""What makes a calibration good, usable, or to be repeated."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.verdict import Grade, Verdict
 
 CORNERS_RMS_PX = 0.3
-"""Corners are found to less than a tenth of a pixel in sharp, well lit pictures."""
+"""Corners are found to less than a tenth of a pixel in sharp, well-lit images."""
 SHEETS_RMS_MM, HELD_OUT_MM = 0.3, 0.5
-"""A scan's overlaps are called in doubt from 0.4 mm on (fusion/scan_verdict.py)."""
+"""A scan's overlaps are doubted from 0.4 mm on (fusion/scan_verdict.py)."""
 COVERED_PERCENT = 40.0
-"""Of the picture: a lens is only known where boards were."""
+"""Share of the image: a lens is only known where boards were."""
 POSES, STRIPE_SHOTS = 6, 4
 STRIPES_PERCENT = 50.0
 SIGMA_MM = 0.5
 FAR_BEYOND = 2.0
-"""A limit exceeded so many times asks for a new calibration, by less for care."""
+"""Exceeding a limit by this factor calls for a new calibration, by less for care."""
 
 
 @dataclass(frozen=True)
 class PairFigures:
-    """What a calibrated pair is judged by, in the order of the report's columns; None where it does
-    not apply or was not stored."""
+    """The figures by which a calibrated pair is judged, in the order of the report's columns; None
+    if not applicable or not stored."""
 
     name: str
     corners_rms_px: float | None
@@ -42,7 +42,7 @@ class PairFigures:
     sigma_mm: float | None
 
     def beyond(self) -> Iterator[tuple[float, str]]:
-        """(how many times beyond, in words) of each limit that is not kept."""
+        """Each limit that is exceeded: by what factor, and in words."""
         checks = (
             ("corners are off by", self.corners_rms_px, CORNERS_RMS_PX, "px RMS", False),
             ("was calibrated from", self.poses, POSES, "board poses", True),
@@ -62,7 +62,7 @@ class PairFigures:
 
 
 def figures_of(calibration: RigCalibration) -> list[PairFigures]:
-    """Of every calibrated pair, in the order of the rig."""
+    """Figures of every calibrated pair, in the order of the rig."""
     return [
         _figures(calibration, pair.name)
         for pair in calibration.rig.pairs
@@ -71,7 +71,7 @@ def figures_of(calibration: RigCalibration) -> list[PairFigures]:
 
 
 def grade_calibration(calibration: RigCalibration) -> Verdict:
-    """By how far its pairs are beyond their limits."""
+    """Grade a calibration by how far its pairs are beyond their limits."""
     findings = [
         (np.inf, f"recalibrate: pair {name} failed: {reason}")
         for name, reason in calibration.failed.items()
@@ -81,7 +81,7 @@ def grade_calibration(calibration: RigCalibration) -> Verdict:
             far = times > FAR_BEYOND
             findings.append((times, f"{'recalibrate: ' if far else ''}pair {pair.name}: {words}"))
     size = nominal_size(calibration.rig, calibration.rig_from_camera)
-    if size and size.mark != "good":  # one in use is told; a new one that is far off is not made
+    if size and size.mark != "good":  # one in use is reported; a new one is not made
         findings.append((1.0, f"{size.words}: {size.remedy}"))
     findings.sort(key=lambda finding: -finding[0])
     worst = findings[0][0] if findings else 0.0

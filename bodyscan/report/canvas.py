@@ -1,4 +1,4 @@
-"""What pictures are made of: colour scales, round numbers, panels with text, PNG files."""
+"""Building blocks of pictures: colour scales, round numbers, panels with text, PNG files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Scale:
     table: Bytes  # (256, 3) blue, green, red
 
     def colours(self, values: NDArray[np.floating]) -> Bytes:
-        """(N,) -> (N, 3); beyond the ends the end's colour, not a number: grey."""
+        """Colours (N, 3) of values (N,); clipped to the ends, grey for NaN."""
         share = (np.nan_to_num(values) - self.low) / (self.high - self.low)
         colours = self.table[np.clip(np.rint(255 * share), 0, 255).astype(np.uint8)]
         return np.where(np.isfinite(values)[:, None], colours, 128).astype(np.uint8)
@@ -48,7 +48,7 @@ def colour_bar(scale: Scale, height_px: int) -> Bytes:
 
 
 def round_ticks(low: float, high: float) -> list[float]:
-    """Three to six round numbers from low to high; whole ones where they reach far enough."""
+    """Three to six round numbers from low to high; whole numbers if the range is large enough."""
     rough = (high - low) / 5.0
     unit = 10.0 ** np.floor(np.log10(rough))
     step = next(unit * times for times in (1.0, 2.0, 5.0, 10.0) if unit * times >= rough * 0.999)
@@ -73,7 +73,7 @@ def blue_white_red() -> Bytes:
 
 
 def png(panels: Iterable[Bytes]) -> bytes:
-    """Panels of one height side by side, as a PNG file's bytes."""
+    """Panels of equal height side by side, as a PNG file's bytes."""
     ok, data = cv2.imencode(".png", np.concatenate(list(panels), axis=1))
     if not ok:
         raise ValueError("no PNG could be made")
@@ -81,12 +81,12 @@ def png(panels: Iterable[Bytes]) -> bytes:
 
 
 def round_down(value: float, digits: int) -> float:
-    """A positive number to so many digits."""
+    """Round a positive number down to so many digits."""
     power = 10.0 ** (np.floor(np.log10(value)) - digits + 1)
     return float(np.floor(value / power) * power)
 
 
 def round_up(value: float) -> float:
-    """A positive number to 1, 2 or 5 times a power of ten."""
+    """Round a positive number up to 1, 2 or 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value))

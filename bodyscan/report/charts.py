@@ -1,4 +1,4 @@
-"""Small charts as SVG, all in one style. Matplotlib is imported here and in `figures` alone."""
+"""Small charts as SVG, all in one style. Matplotlib is imported only here and in `figures`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def style() -> Iterator[None]:
 
 
 def svg(figure: Figure) -> bytes:
-    """The same figure gives the same bytes: no date, no random ids."""
+    """A figure as SVG; the same figure gives the same bytes: no date, no random ids."""
     stream = io.BytesIO()
     with style():
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
@@ -47,7 +47,7 @@ def svg(figure: Figure) -> bytes:
 
 
 def histogram(values: Array, limit: float, label: str) -> bytes:
-    """Of signed values; what lies beyond the limits is counted in the outermost bins."""
+    """Histogram of signed values; those beyond the limits are counted in the outermost bins."""
     with style():
         figure, axis = plt.subplots(figsize=(8.2, 2.8), constrained_layout=True)
         edges = np.linspace(-limit, limit, 81)
@@ -62,7 +62,7 @@ def histogram(values: Array, limit: float, label: str) -> bytes:
 
 
 def bars(values: Mapping[str, float], label: str, limits: Sequence[float] = ()) -> bytes:
-    """One bar a name, with limits as lines where they are in reach."""
+    """One bar per name, with limits as lines where they are in range."""
     with style():
         width = min(10.0, 1.6 + 0.55 * len(values))
         figure, axis = plt.subplots(figsize=(max(width, 4.0), 2.6), constrained_layout=True)
@@ -113,7 +113,7 @@ def matrix(names: Sequence[str], values: Array, label: str, form: str = ".2f") -
 
 
 def grid_of(count: int, columns: int, cell: tuple[float, float]) -> tuple[Figure, list[Axes]]:
-    """`count` axes in rows of `columns`, each `cell` inches; those left over are hidden."""
+    """`count` axes in rows of `columns`, each `cell` inches in size; surplus ones are hidden."""
     rows = -(-count // columns)
     figure, axes = plt.subplots(
         rows,

@@ -1,4 +1,4 @@
-"""What a scan's report says of a comparison with another surface."""
+"""The part of a scan's report that compares it with another surface."""
 
 from __future__ import annotations
 
@@ -64,5 +64,5 @@ def _standing(one: Comparison) -> str:
 
 
 def map_limit(one: Comparison) -> float:
-    """The map's end, mm: a round number that most deviations stay below."""
+    """The end of the map's scale, mm: a round number that most deviations stay below."""
     return round_up(max(one.figures.p95_mm, 1e-3))

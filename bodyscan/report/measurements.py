@@ -16,7 +16,7 @@ from bodyscan.version import __version__
 MOSTLY = 0.5
 LITTLE = 0.95
 TAPE_MM = 4.0
-"""What two measurers with a tape differ by (ISO 20685-1)."""
+"""Difference between two measurers with a tape (ISO 20685-1)."""
 
 
 def tables(measured: Measurements) -> Iterator[Table]:
@@ -68,19 +68,19 @@ def tables(measured: Measurements) -> Iterator[Table]:
 
 
 def _covered(regions: Mapping[str, float] | None) -> str:
-    """What it runs over that is no skin, where that is more than a little."""
+    """What a girth crosses that is not skin, if that is more than a little."""
     parts = ((name, (regions or {}).get(name, 0.0)) for name in (NAMES[HAIR], NAMES[DARK_CLOTH]))
     return ", ".join(f"{name} {100.0 * part:.0f} %" for name, part in parts if part > 1.0 - LITTLE)
 
 
 def _told(value: float, between: Range) -> str:
-    """A range where what was not measured leaves more open than a tape does."""
+    """A range if unmeasured parts leave more open than a tape does, else the value."""
     low, high = between
     return f"{low:.0f} to {high:.0f}" if high - low > TAPE_MM else f"{value:.1f}"
 
 
 def measurements_document(measured: Measurements, facts: Mapping[str, Any]) -> dict[str, Any]:
-    """What `measurements.json` says; facts: of the scan, as in its scan.json."""
+    """Content of `measurements.json`; facts: of the scan, as in its scan.json."""
     return {
         "schema": "bodyscan-measurements",
         "version": 1,

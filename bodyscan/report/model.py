@@ -1,4 +1,4 @@
-"""Meshes and lines packed small for the report's viewer (viewer.js): whole numbers, base64."""
+"""Meshes and lines packed compactly for the report's viewer (viewer.js): integers, base64."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ class Strokes:
 
 @dataclass(frozen=True)
 class Standpoint:
-    """Where the viewer stands at first: degrees from x towards y and upwards."""
+    """Where the viewer stands at first: degrees from x towards y, and upwards."""
 
     azimuth_deg: float = 25.0
     elevation_deg: float = 6.0
 
 
 MOST_VERTICES = 65_536
-"""As many as a 16-bit index tells apart."""
+"""The most that a 16-bit index can address."""
 STEPS = 65_535
 
 
@@ -63,8 +63,10 @@ def pack(
     labels: Sequence[tuple[str, Array]] = (),
     standpoint: Standpoint = Standpoint(),
 ) -> dict[str, Any]:
-    """What `viewer.js` reads. A place is `low + step * whole`, to the 65,535th part of the longest
-    side. Raises ValueError for a mesh of more than 65,536 vertices.
+    """Pack a model for `viewer.js`.
+
+    A coordinate is `low + step * integer`, in steps of 1/65,535 of the longest side. Raises
+    ValueError for a mesh of more than 65,536 vertices.
     """
     if shape is not None and len(shape.vertices) > MOST_VERTICES:
         raise ValueError(f"{len(shape.vertices)} vertices; a viewer's mesh has {MOST_VERTICES}")

@@ -20,7 +20,7 @@ from bodyscan.version import __version__
 
 @dataclass(frozen=True)
 class Number:
-    """One figure that explains itself: what it is, its unit, and what it should stay within."""
+    """One figure that explains itself: what it is, its unit, and its limit."""
 
     name: str
     value: float | str | None
@@ -32,7 +32,7 @@ class Number:
 
     @property
     def within_limit(self) -> bool | None:
-        """Whether the limit is kept; None without a limit or without a value."""
+        """Whether the limit is kept; None without a limit or a value."""
         if self.limit is None or not isinstance(self.value, float | int):
             return None
         return self.value >= self.limit if self.at_least else self.value <= self.limit
@@ -56,7 +56,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Column:
-    """A table's column: its heading, unit, and what stands in it."""
+    """A table's column: its heading, unit, and what it holds."""
 
     name: str
     unit: str = ""
@@ -96,7 +96,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Lines:
-    """Sentences, one a line."""
+    """Sentences, one per line."""
 
     lines: tuple[str, ...]
     kind: Literal["lines"] = "lines"
@@ -119,7 +119,7 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Viewer:
-    """A model to turn: see `model.py`."""
+    """A rotatable model: see `model.py`."""
 
     title: str
     caption: str
@@ -128,7 +128,7 @@ class Viewer:
 
     @property
     def json(self) -> Markup:
-        """For a script element: a `<` cannot end it."""
+        """The model for a script element, which no `<` in it can end."""
         text = json.dumps(self.model, separators=(",", ":"), allow_nan=False)
         return Markup(text.replace("<", "\\u003c"))
 
@@ -144,7 +144,8 @@ class Section:
 
 
 def sections_of(parts: Mapping[str, Callable[[], Section]]) -> list[Section]:
-    """Every section of a report, by its title; one that cannot be made says so in its place."""
+    """Every section of a report, by its title; one that
+    cannot be made is replaced by its reason."""
     made: list[Section] = []
     for title, make in parts.items():
         notes: list[str] = []
@@ -156,8 +157,11 @@ def sections_of(parts: Mapping[str, Callable[[], Section]]) -> list[Section]:
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """synthetic: whether what is reported was simulated.  facts: what it is, as (name, value).
-    subject: pseudonym of the person it shows.
+    """A whole report.
+
+    synthetic: whether what is reported was simulated.
+    facts: what it is, as (name, value).
+    subject: pseudonym of the person shown.
     """
 
     title: str
@@ -169,17 +173,18 @@ class Page:
 
 
 LEVELS = 3
-"""So many folders above a result are looked at: a batch's lie deeper than a single scan's."""
+"""How many folders above a result are searched: a batch's
+results are deeper than a single scan's."""
 
 
 def is_synthetic(folder: Path) -> bool:
-    """Whether the simulator's truth lies beside a result."""
+    """Whether the simulator's truth lies beside a result or above it."""
     above = (folder.resolve(), *folder.resolve().parents[:LEVELS])
     return any((place / "truth" / "truth.json").is_file() for place in above)
 
 
 def render(page: Page) -> str:
-    """One HTML document that needs nothing else: style, script, pictures and models are in it."""
+    """One self-contained HTML document, including style, script, pictures and models."""
     here = files("bodyscan.report")
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True

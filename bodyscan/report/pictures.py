@@ -34,7 +34,7 @@ FILLED_TINT = (60, 160, 255)  # blue, green, red: orange
 WRONG_SIDE = (200, 40, 200)
 SLICE_POINTS = 20_000  # of a body's cloud, 40 mm of the trunk: far thicker than a gap
 Pictures = Outcome[dict[str, bytes]]
-"""PNG files by their names; those that could not be drawn are noted."""
+"""PNG files by name; those that could not be drawn are noted."""
 AZIMUTHS_DEG = {"front": 0.0, "side": 90.0, "back": 180.0}
 """Where the viewer of each view stands, from the subject's front towards its left."""
 
@@ -56,7 +56,8 @@ def mesh_pictures(mesh: BodyMesh) -> Pictures:
 
 
 def write_pictures(pictures: Iterable[Pictures], folder: Path) -> Outcome[list[Path]]:
-    """What a scan leaves beside its result. A picture that cannot be drawn or written is noted."""
+    """Write a scan's pictures beside its result. A picture
+    that cannot be drawn or written is noted."""
     written: list[Path] = []
     notes: list[str] = []
     for some in pictures:
@@ -80,7 +81,7 @@ def _drawn(pictures: Mapping[str, Callable[[], bytes]]) -> Pictures:
 def draw_mesh(
     mesh: BodyMesh, views: Sequence[str] = tuple(AZIMUTHS_DEG), *, height_px: int = 900
 ) -> bytes:
-    """Shaded pictures of a mesh: made-up faces orange, faces seen from their inside magenta."""
+    """Shaded pictures of a mesh: filled faces orange, faces seen from their inside magenta."""
     base = np.full((len(mesh.faces), 3), 210, np.uint8)
     base[mesh.filled] = FILLED_TINT
     frames = _frames(mesh.vertices, views, height_px)
@@ -134,7 +135,7 @@ def _draw_points(
     height_px: int,
     scale: Scale | None = None,
 ) -> bytes:
-    """Points (N, 3) with colours (N, 3) blue, green, red; those facing away are left out."""
+    """Draw points (N, 3) with colours (N, 3) blue, green, red; those facing away are left out."""
     dot_mm = _dot_size(points)
     panels = [
         _write_name(_splat_view(points, normals, colours, frame, dot_mm), view)
@@ -145,7 +146,8 @@ def _draw_points(
 
 @dataclass(frozen=True)
 class _Frame:
-    """A view's picture: which part of the picture plane it shows, and how large."""
+    """The frame of a view's picture: which part of the
+    picture plane it shows, and at what scale."""
 
     axes: Array
     left: float
@@ -155,7 +157,7 @@ class _Frame:
     height: int
 
     def places(self, points: Array) -> Floats:
-        """(N, 3) column, row and depth (mm, from the middle) of points (N, 3)."""
+        """Column, row and depth (mm, from the middle) (N, 3) of points (N, 3)."""
         right, up, towards = self.axes
         places = np.empty((len(points), 3), np.float32)
         places[:, 0] = (points @ right - self.left) / self.step_mm - 0.5
@@ -165,7 +167,7 @@ class _Frame:
 
 
 def _frames(points: Array, views: Sequence[str], height_px: int) -> list[_Frame]:
-    """Of the views of a subject, which share one scale: that of its greatest extent."""
+    """Frames of a subject's views, all with the scale of its greatest extent."""
     low, high = points.min(axis=0), points.max(axis=0)
     step = float((high - low).max() + 40.0) / height_px
     middle = 0.5 * (low[2] + high[2])
@@ -180,7 +182,7 @@ def _frames(points: Array, views: Sequence[str], height_px: int) -> list[_Frame]
 
 
 def _axes(view: str) -> Array:
-    """(3, 3) rows: the picture's right, its up, and the way to the viewer, rig frame."""
+    """Rows (3, 3): the picture's right, its up, and the direction to the viewer, rig frame."""
     azimuth = np.radians(AZIMUTHS_DEG[view])
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     towards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
@@ -188,13 +190,13 @@ def _axes(view: str) -> Array:
 
 
 def _write_name(panel: Bytes, view: str) -> Bytes:
-    """The panel with the name of its view in its upper left corner."""
+    """Write the name of the view in the upper left corner of the panel."""
     write_label(panel, view, (6, 16))
     return panel
 
 
 def _draw_faces(mesh: BodyMesh, base: Bytes, frame: _Frame) -> Bytes:
-    """Faces in their colours (F, 3), shaded by how they face the viewer."""
+    """Draw faces in their colours (F, 3), shaded by how they face the viewer."""
     number = nearest_faces(frame.places(mesh.vertices), mesh.faces, frame.height, frame.width)
     hit = number >= 0
     face = number[hit]
@@ -221,12 +223,12 @@ def _splat_view(
 
 
 def _dot_size(points: Array) -> float:
-    """How far to spread a point, mm, so that a surface shows no holes: four times the usual gap."""
+    """Size to draw a point, mm, so that a surface shows no holes: four times the usual gap."""
     if len(points) < 2:
         return 0.0
     height = points[:, 2]
     level = np.abs(height - np.median(height))
-    # A slice tells as much as all, and its tree is made at once.
+    # A slice says as much as the whole cloud, and its tree is built at once.
     count = min(SLICE_POINTS, len(points))
     slice_ = points[np.argpartition(level, count - 1)[:count]]
     gaps = np.asarray(cKDTree(slice_).query(slice_[:: max(1, count // 2000)], k=2)[0])[:, 1]

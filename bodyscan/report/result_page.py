@@ -1,4 +1,4 @@
-"""What a folder holds, by looking: a calibration or a scan; and its report."""
+"""Finds out what a folder holds, a calibration or a scan, and makes its report."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ REMEDY = "give the folder that `bodyscan calibrate-rig` or `bodyscan scan` wrote
 def build_page(result: Path, other: Path | None = None) -> Page:
     """The page for a calibration or scan, given as its folder or as the JSON in it.
 
-    Raises BadInput if it is neither, or if a calibration is to be compared.
+    Raises BadInput if it is neither, or if `other` is given for a calibration.
     """
     if not result.exists():
         raise BadInput("there is no such file or folder", where=str(result), remedy=REMEDY)

@@ -1,4 +1,5 @@
-"""A calibrated rig as a model to turn: cameras, how well their places are known, boards, volume."""
+"""A calibrated rig as a rotatable model: cameras, the
+uncertainty of their positions, boards, volume."""
 
 from __future__ import annotations
 
@@ -12,9 +13,9 @@ from bodyscan.report.canvas import round_down
 from bodyscan.report.model import Layer, Shape, Standpoint, Strokes, pack
 
 SHOWN_MM = 140.0
-"""The largest ellipsoid's longest half axis as it is drawn."""
+"""Longest half axis of the largest ellipsoid as drawn."""
 LEAST_MM = 1e-3
-"""A rig of one pair is known by definition: there is nothing to draw larger."""
+"""A rig of one pair is known by definition: there is nothing to enlarge."""
 FRUSTUM_MM = 220.0
 RINGS, SECTORS = 16, 24
 BOARD, VOLUME = (190, 197, 207), (120, 130, 145)
@@ -22,7 +23,7 @@ AXES = ((200, 40, 40), (30, 140, 60), (40, 80, 200))
 
 
 def rig_model(calibration: RigCalibration) -> tuple[dict[str, object], float]:
-    """What the viewer reads, and how many times too large the ellipsoids of one sigma are."""
+    """The model for the viewer, and the factor by which the one-sigma ellipsoids are enlarged."""
     spread = {
         name: point_covariance(calibration.covariance.of(name), placing.translation)
         for name, placing in calibration.rig_from_camera.items()
@@ -53,7 +54,7 @@ def rig_model(calibration: RigCalibration) -> tuple[dict[str, object], float]:
 
 
 def _ellipsoid(middle: Array, covariance: Array) -> Shape:
-    """Of one sigma: the unit sphere carried by the covariance's root."""
+    """A one-sigma ellipsoid: the unit sphere mapped by the covariance's square root."""
     down = np.linspace(0.0, np.pi, RINGS + 1)[:, None]
     round_ = 2.0 * np.pi * np.arange(SECTORS) / SECTORS
     sphere = np.stack(
@@ -119,7 +120,7 @@ def _strokes(calibration: RigCalibration) -> Strokes:
 
 
 def _close(corners: Array) -> Array:
-    """(N, 2, 3) sides of a polygon (N, 3)."""
+    """Sides (N, 2, 3) of a polygon (N, 3)."""
     return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
 
 

@@ -1,4 +1,4 @@
-"""What a scan's report says: the body, how well it was measured, where it was not."""
+"""A scan's report: the body, how well it was measured, and where it was not."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ NO_VERDICT = (
 
 
 def scan_page(folder: Path, other: Path | None = None) -> Page:
-    """The report of the scan in `folder`, held against `other` if given.
+    """The report of the scan in `folder`, compared with `other` if given.
 
     A scan that gave no model has a report too: its reasons. Raises ResultError, BadInput.
     """
@@ -74,7 +74,7 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
 
 
 def _in_words(when: str | None) -> str:
-    """A date as people write it; what is no date as it stands."""
+    """A date as people write it; text that is no date is returned unchanged."""
     if not when:
         return "not known"
     try:
@@ -201,7 +201,8 @@ def _alignment_numbers(facts: Mapping[str, Any]) -> list[Number]:
 
 
 def _person(person: Mapping[str, Any]) -> Section:
-    """Of one who moved while being scanned: what, how far, and how well that is known."""
+    """The section on a person who moved while being scanned: what moved, how far, and how
+    certainly."""
     columns = (
         Column("part"),
         Column("moved", "mm", "most of it at most, against where it was in the middle.", digits=1),

@@ -1,4 +1,4 @@
-"""How well each place of the scan volume is known by the poses of the pairs, as a picture."""
+"""How well the pairs' poses are known at each place of the scan volume, as a picture."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PLANES = {
     "front: y to the right, z up": (0.0, 1.0, 0.0),
     "side: x to the left, z up": (-1.0, 0.0, 0.0),
 }
-"""Planes through the rig's axis, by what runs to the picture's right."""
+"""Planes through the rig's axis, by the direction to the picture's right."""
 
 
 def sigma_at(
@@ -39,10 +39,10 @@ def sigma_at(
     cameras: Mapping[str, Camera],
     covariance: PoseCovariance,
 ) -> tuple[Array, Indices]:
-    """Rig points (N, 3) -> sigma (N,) mm, all axes together, and how many pairs see each, (N,).
+    """Sigma (N,) mm at rig points (N, 3), all axes together, and how many pairs see each (N,).
 
-    A point is the mean of what the pairs that see it say, so only what they err alike, and their
-    share of what they err apart, is left. Placing alone: no noise of stripes, no swaying subject.
+    A point is the mean of what the pairs that see it measure, so only their common error, and a
+    share of their independent errors, remains. Poses alone: no stripe noise, no swaying subject.
     NaN where no pair sees anything.
     """
     seen = np.stack(
@@ -73,7 +73,7 @@ def draw_sigma_map(
     *,
     height_px: int = 900,
 ) -> bytes:
-    """Maps of `sigma_at` in the planes x = 0 (front) and y = 0 (side), one colour scale, as PNG.
+    """Maps of `sigma_at` in the planes x = 0 (front) and y = 0 (side) on one colour scale, as PNG.
 
     Light grey where no pair sees anything.
     """
@@ -90,8 +90,8 @@ def draw_sigma_map(
 
 
 def plane_points(volume: Volume, right: Array, step_mm: float) -> Array:
-    """(rows, columns, 3) mm: middles of cells about `step_mm` wide in the upright plane through the
-    rig's axis along `right` (3,).  Row 0 is the highest."""
+    """Centres (rows, columns, 3) mm of cells about `step_mm` wide in the upright plane through the
+    rig's axis along `right` (3,). Row 0 is the highest."""
     columns = max(round(2.0 * volume.radius_mm / step_mm), 1)
     rows = max(round((volume.top_mm - volume.bottom_mm) / step_mm), 1)
     along = volume.radius_mm * ((2.0 * np.arange(columns) + 1.0) / columns - 1.0)

@@ -23,7 +23,7 @@ MARKERS_IN = {
     "DICT_APRILTAG_36h11": 587,
     "DICT_ARUCO_MIP_36h12": 250,
 }
-"""How many markers each of OpenCV's dictionaries holds: a rig file is checked without OpenCV."""
+"""Number of markers in each of OpenCV's dictionaries: a rig file is checked without OpenCV."""
 
 LARGEST_DICTIONARIES = (
     "DICT_4X4_1000",
@@ -34,16 +34,20 @@ LARGEST_DICTIONARIES = (
     "DICT_APRILTAG_36h11",
     "DICT_ARUCO_MIP_36h12",
 )
-"""One of each family, for telling which one a board was printed with; those of few bits, whose
-markers are found in any texture, left out."""
+"""One dictionary per family, used to find out which one a board was printed with. Those of few bits
+are
+left out: their markers are found in any texture."""
 
 FLATNESS = 5e-4
-"""Half a millimetre in a metre: a print glued to a sheet of aluminium composite."""
+"""Default flatness as a share of the diagonal: half a millimetre per metre, as of a print glued to
+a sheet of aluminium composite."""
 
 
 class Board(Model):
-    """A flat board. `columns` x `rows` counts squares, not corners; of an aprilgrid, tags, and
-    `square_mm` is from one tag to the next.
+    """A flat board.
+
+    columns, rows: number of squares, not of corners; of an aprilgrid, number of tags.
+    square_mm: side of a square; of an aprilgrid, the distance from one tag to the next.
 
     Board frame: origin at the first square's outer corner (of the checkered area), x along the
     columns, y along the rows (down, as printed), z away from whoever looks at the front.
@@ -65,22 +69,22 @@ class Board(Model):
 
     @property
     def believed_flatness_mm(self) -> float:
-        """By how much its lowest and highest corners may differ, one standard deviation, before any
-        image: `flatness_mm`, or FLATNESS of its diagonal."""
+        """Standard deviation, before any image, of the height difference between the board's lowest
+        and highest corners: `flatness_mm`, or FLATNESS times its diagonal."""
         if self.flatness_mm is not None:
             return self.flatness_mm
         return FLATNESS * self.square_mm * math.hypot(self.columns, self.rows)
 
     @property
     def looks_same_turned(self) -> bool:
-        """Whether a picture does not tell which end, or which face, of the print it shows."""
+        """Whether an image leaves open which end, or which face, of the print it shows."""
         alike = self.faces == 2 or (self.columns + self.rows) % 2 == 0
         return self.kind == "checkerboard" and alike
 
     @property
     def marker_count(self) -> int:
-        """Markers on all faces: of a charuco board every second square carries one, of an aprilgrid
-        every one."""
+        """Number of markers on all faces: one per second square of a charuco board, one per square
+        of an aprilgrid."""
         squares = self.columns * self.rows
         each = {"checkerboard": 0, "charuco": squares // 2, "aprilgrid": squares}[self.kind]
         return self.faces * each
@@ -88,7 +92,7 @@ class Board(Model):
     @model_validator(mode="before")
     @classmethod
     def _kalibrs_tags(cls, keys: Any) -> Any:
-        """An aprilgrid has Kalibr's tags unless it says otherwise."""
+        """Give an aprilgrid Kalibr's tags unless the file says otherwise."""
         if isinstance(keys, dict) and keys.get("kind") == "aprilgrid":
             return {"dictionary": "DICT_APRILTAG_36h11", **keys}
         return keys
@@ -133,6 +137,7 @@ def _problems(board: Board) -> Iterator[Problem]:
 
 
 def family(dictionary: str) -> str:
-    """Dictionaries of one family share their first markers: DICT_4X4_50 begins DICT_4X4_1000."""
+    """The dictionary's family, whose members share their first markers: DICT_4X4_50 begins
+    DICT_4X4_1000."""
     head, _, count = dictionary.rpartition("_")
     return head if count.isdigit() else dictionary

@@ -1,4 +1,4 @@
-"""Where a rig's captures lie."""
+"""A capture folder as the rig file names it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from bodyscan.files.model import Model, Problem, ShotName, duplicates
 
 
 class CaptureFolder(Model):
-    """A folder of captures; relative to the rig file. `shots` overrides its captures.yaml.
+    """A folder of captures, relative to the rig file.
 
-    corners: a corners.vnl, relative to the rig file, whose corners of the rig's only board are taken
-    in place of those in the images that it names; these need not be there.
+    shots: overrides those of its captures.yaml.
+    corners: a corners.vnl, relative to the rig file. Its corners of the rig's only board replace
+        those of the images that it names; the images themselves need not exist.
     """
 
     folder: Annotated[str, Field(min_length=1)]

@@ -1,4 +1,4 @@
-"""What must fit together in a rig file whose parts are right by themselves."""
+"""What must fit together in a rig file whose parts are valid by themselves."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bodyscan.stripes.stripe_code import StripeCode
 
 @dataclass(frozen=True)
 class RigParts:
-    """The parts of a rig file that are right by themselves; None stands for one that is not."""
+    """The parts of a rig file that are valid by themselves; None stands for one that is not."""
 
     board_names: tuple[str | None, ...]
     boards: tuple[Board | None, ...]
@@ -34,7 +34,7 @@ class RigParts:
 
 
 def rig_problems(parts: RigParts) -> Iterator[Problem]:
-    """What does not fit together in a rig file."""
+    """Find the parts of a rig file that do not fit together."""
     for key, names in (("boards", parts.board_names), ("pairs", parts.pair_names)):
         for index, name in duplicates(names):
             yield (key, index, "name"), f"is given to two {key}: every name once (got {name!r})"
@@ -98,7 +98,7 @@ def _wrong_frames(parts: RigParts) -> Iterator[Problem]:
 def _wrong_counts(
     names: ImageNames, where: tuple[str, ...], codes: Sequence[tuple[str, StripeCode]]
 ) -> Iterator[Problem]:
-    """Lists of names that are longer or shorter than what a pair's code takes."""
+    """Find lists of names that are longer or shorter than a pair's code requires."""
     for kind in image_kinds():
         given = names.given(kind)
         if isinstance(given, str):

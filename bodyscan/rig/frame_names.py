@@ -1,4 +1,4 @@
-"""How the images of a stripe sequence are named."""
+"""Names of the images of a stripe sequence."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def _name_faults(kind: ImageKind, names: str | tuple[str, ...]) -> Iterator[Prob
 
 
 class ImageNames(Model):
-    """Names of a code's images, by kind: a template that holds the kind's number (such as `{bit}`, 0
-    the most significant), or a list, one name an image."""
+    """Names of a code's images, by kind: either a template with the kind's number (such as `{bit}`,
+    0 the most significant), or a list with one name per image."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Names] = Field(init=False)
@@ -57,7 +57,7 @@ class ImageNames(Model):
             return handler(keys)
         known = [*cls.model_fields, *(kind.name for kind in image_kinds())]
         errors = [unknown_key_error(key, known) for key in keys if key not in known]
-        # Strict validation, which takes JSON's lists for tuples, no longer sees that it was JSON.
+        # Strict validation accepts JSON's lists as tuples, but no longer knows that this was JSON.
         own = {k: tuple(v) if isinstance(v, list) else v for k, v in keys.items() if k in known}
         try:
             names = handler(own)
@@ -68,20 +68,20 @@ class ImageNames(Model):
         return names
 
     def given(self, kind: ImageKind) -> Names:
-        """Template or list of one kind of image."""
+        """The template or list of names for one kind of image."""
         return (self.model_extra or {}).get(kind.name, self.default(kind))
 
     def default(self, kind: ImageKind) -> str:
-        """How images of a kind are called if nothing else is said."""
+        """The template of a kind of image that the rig file does not name."""
         return kind.template
 
     def of_kind(self, kind: ImageKind, count: int) -> tuple[str, ...]:
-        """Names of so many images of one kind, in the code's order."""
+        """Names of `count` images of one kind, in the code's order."""
         names = self.given(kind)
         return _numbered(names, kind, count) if isinstance(names, str) else names
 
     def of_one_way(self, code: StripeCode) -> tuple[str, ...]:
-        """Names of a code's images in the order of its `image_counts`, those that cross left out."""
+        """Names of a code's images in the order of its `image_counts`, without crossing stripes."""
         counts = code.image_counts.items()
         return tuple(name for kind, count in counts for name in self.of_kind(kind, count))
 
@@ -91,18 +91,19 @@ class ImageNames(Model):
 
 
 class CrossingNames(ImageNames):
-    """Of the stripes that run the other way."""
+    """Names of the images of crossing stripes."""
 
     def default(self, kind: ImageKind) -> str:
         return f"crossing-{kind.template}"
 
 
 class FrameNames(ImageNames):
-    """What `{frame}` becomes in the file-name template, for each kind of image.
+    """What `{frame}` in the file-name template becomes, for each kind of image.
 
-    lit, dark: the projector full on, and off; None where that is not taken.  board: the image in
-    which boards are looked for, if it is not lit.  Besides these there is a key for each kind of
-    image of the stripe codes.
+    lit, dark: the projector fully on, and off; None if there is no such image.
+    board: the image in which boards are looked for, if it is not the lit one.
+
+    Besides these there is one key per kind of image of the stripe codes.
     """
 
     lit: str | None = "lit"
@@ -112,12 +113,13 @@ class FrameNames(ImageNames):
 
     @property
     def board_image(self) -> str | None:
-        """Where boards are looked for; None if that is made from the images of the code."""
+        """Name of the image in which boards are looked for; None if it is made from the code's
+        images."""
         return self.board or self.lit
 
     def of_code(self, code: StripeCode) -> tuple[str, ...]:
-        """Names of a code's images, lit and dark left out, in the order of its `image_counts`, then
-        those of the stripes that cross them."""
+        """Names of a code's images, without lit and dark, in the order of its `image_counts`, then
+        those of the crossing stripes."""
         names = (self, self.crossing)
         return tuple(
             name
@@ -126,13 +128,13 @@ class FrameNames(ImageNames):
         )
 
     def as_shown(self, code: StripeCode) -> tuple[str, ...]:
-        """Names as `of_code`, in the order in which they are best shown (`StripeCode.show_order`)."""
+        """Names as `of_code`, in the best order to show them (`StripeCode.show_order`)."""
         ways = zip((self, self.crossing), code.directions, strict=False)
         return tuple(own.of_one_way(way)[k] for own, way in ways for k in way.show_order)
 
     def of_sequence(self, code: StripeCode | None) -> tuple[str, ...]:
-        """Names of all images of a whole sequence, in the order in which they are taken if nothing
-        else is said; of a camera without projector its board image."""
+        """Names of all images of a sequence in the default order in which they are taken; for a
+        camera without a projector, the board image alone."""
         if code is None:
             return tuple(filter(None, [self.board_image]))
         dark = self.dark if any(way.uses_dark for way in code.directions) else None
@@ -152,5 +154,5 @@ class FrameNames(ImageNames):
             for kind in image_kinds():
                 if kind.name not in refused:
                     names += own.of_kind(kind, kind.most)
-        for _, twice in islice(duplicates(names), 1):  # of one kind, they are all named alike
+        for _, twice in islice(duplicates(names), 1):  # of a kind, all named alike
             yield (), f"gives two images the same name ({twice!r})"

@@ -1,4 +1,4 @@
-"""What another program has calibrated of a pair already, and where its file says so."""
+"""What another program has already calibrated of a pair, and where its file says so."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from bodyscan.interchange.rig_format import RIG_FORMATS, Unit
 
 Text = Annotated[str, Field(min_length=1)]
 WITH_NODES = "opencv"
-"""The format in which things may be called anything."""
+"""The format whose files leave names to the user, so that the rig file must give them."""
 
 
 class KnownCamera(Model):
-    """A camera, or a projector described as one, in a file of another program.
+    """A camera, or a projector described as one, in another program's file.
 
-    file: if it is not that of the pair.  name: the camera's in the file.  matrix, distortion, size
-    (or width and height), rotation, translation: names of OpenCV's nodes.  inverse: rotation and
-    translation take the camera's coordinates to the world's, not the other way.
+    file: if it differs from the pair's.
+    name: the camera's name in the file.
+    matrix, distortion, size (or width and height), rotation, translation: names of OpenCV's nodes.
+    inverse: rotation and translation take the camera's coordinates to the world's, not the reverse.
     """
 
     file: Text | None = None
@@ -36,7 +37,7 @@ class KnownCamera(Model):
 
     @property
     def nodes(self) -> dict[str, str]:
-        """Names of nodes by what they hold."""
+        """Names of nodes, by what they hold."""
         given = {
             "matrix": self.matrix,
             "distortion": self.distortion,
@@ -64,11 +65,14 @@ class KnownCamera(Model):
 
 
 class Known(Model):
-    """file: relative to the rig file.  units: of its lengths, where the format leaves that open.
+    """A calibration by another program.
 
-    camera: left out, the one that is called as the pair is.  projector: left out, nothing is known.
-    sigma_px: by how much pixels may be off because of it, one standard deviation; None: it is taken
-    as it is, and how good it is is not known.
+    file: relative to the rig file.
+    units: of its lengths, where the format leaves that open.
+    camera: if left out, the one named as the pair is.
+    projector: if left out, nothing is known of it.
+    sigma_px: standard deviation of pixels due to this calibration; None: it is used as it is, and
+        its accuracy is unknown.
     """
 
     file: Text

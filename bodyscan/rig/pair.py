@@ -1,4 +1,4 @@
-"""One pair: its camera, its projector, and where both are meant to stand."""
+"""A pair: its camera, its projector, and where both are meant to stand."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Pixels = Annotated[int, Field(gt=0, le=32767)]
 
 
 AUTO = "auto"
-"""Held-out boards choose."""
+"""Lets held-out boards choose the lens."""
 
 
 class CameraSpec(Model):
-    """Image size in pixels, the kind of its lens, and what its files hold.
+    """A camera's image size in pixels, its kind of lens, and what its files hold.
 
     lens: a kind of lens; auto: held-out boards choose.
-    bits: of a grey level, where files of 16 bits a sample hold fewer and their numbers do not show it.
-    channel: which colour of a colour image counts; grey: all of them, as bright as they look.
+    bits: per grey level, where 16-bit files hold fewer and their numbers do not show it.
+    channel: which channel of a colour image is used; grey: all of them, as luma.
     """
 
     width: Pixels
@@ -36,14 +36,14 @@ class CameraSpec(Model):
     def problems(self) -> Iterator[Problem]:
         if self.lens == AUTO:
             return
-        from bodyscan.geometry.lenses import LENSES  # which is heavier than a rig file
+        from bodyscan.geometry.lenses import LENSES  # imported here: heavier than a rig file needs
 
         if self.lens not in LENSES:
             yield ("lens",), f"must be one of {', '.join((AUTO, *LENSES))} (got {self.lens!r})"
 
 
 class NominalPose(Model):
-    """Where something is meant to stand, rig frame: looks from `position_mm` at `look_at_mm`."""
+    """Where something is meant to stand, rig frame: at `position_mm`, looking at `look_at_mm`."""
 
     position_mm: Vector
     look_at_mm: Vector
@@ -54,7 +54,7 @@ class NominalPose(Model):
 
 
 class Pair(Model):
-    """One camera and one projector (or a camera alone).
+    """One camera and one projector, or a camera alone.
 
     known: what another program has calibrated of it.
     """

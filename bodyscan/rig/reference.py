@@ -1,4 +1,4 @@
-"""A certified length that calibration captures show: it fixes the size of the whole rig."""
+"""A certified length seen in calibration captures, which fixes the size of the whole rig."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from bodyscan.files.model import Model, Name
 
 
 class Reference(Model):
-    """One board whose length was certified, or a bar that carries two.
+    """One board whose length was certified, or a bar that carries two boards.
 
-    length_mm: of one board, between the first and the last corner of a row of corners; of two,
-    between their middles.  sigma_mm: its standard deviation, as the certificate has it.
+    length_mm: of one board, between the first and the last corner of a row; of two, between their
+        middles.
+    sigma_mm: standard deviation of the length, from the certificate.
     """
 
     name: Name

@@ -38,9 +38,10 @@ ExposureName = Annotated[str, Field(pattern=r"^[\w.+-]+$", max_length=64)]
 class Rig(Model):
     """The whole rig file.
 
-    exposures: what `{exposure}` becomes in file names, the shortest first; () where every image is
-    taken once.  follow_links: whether symbolic links may lead out of a capture folder.  references:
-    certified lengths that fix the size.
+    exposures: what `{exposure}` in file names becomes, the shortest first; () if every image is
+        taken once.
+    follow_links: whether symbolic links may lead out of a capture folder.
+    references: certified lengths that fix the size.
     """
 
     version: Literal[1] = 1
@@ -66,13 +67,13 @@ class Rig(Model):
 
     @property
     def is_known(self) -> bool:
-        """Whether another program calibrated all of it, projectors too."""
+        """Whether another program calibrated all of it, including the projectors."""
         known = [(pair.known, pair.projector) for pair in self.pairs]
         return all(own and (own.projector or not projector) for own, projector in known)
 
     @property
     def poles(self) -> dict[str, str]:
-        """The pole of each pair that stands on one."""
+        """The pole of each pair that is on one."""
         return {pair.name: pair.pole for pair in self.pairs if pair.pole}
 
     @property

@@ -1,4 +1,4 @@
-"""The rig file, read and checked; see docs/formats.md."""
+"""Reading, checking and writing the rig file; see docs/formats.md."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _REMEDY = "Correct the rig file; docs/formats.md explains every key."
 
 
 def load_rig(path: Path) -> Rig:
-    """Read and check a rig file. Raises RigFileError that lists every problem by line."""
+    """Read and check a rig file. Raises RigFileError, which lists every problem by line."""
     return load_model(Path(path), Rig, RigFileError, remedy=_REMEDY, salvage=_problems_of_parts)
 
 
 def write_rig(path: Path, rig: Rig) -> None:
-    """Write a rig file that `load_rig` reads as the same rig (comments are not kept)."""
+    """Write a rig file that `load_rig` reads back as the same rig (comments are not kept)."""
     data = rig.model_dump(mode="json", exclude_defaults=True)
     write_text(path, dump_yaml({"version": rig.version, **data}))
 
 
 def _problems_of_parts(data: Any) -> Iterator[Problem]:
-    """What does not fit together in a file that cannot be read as a rig, as far as can be told."""
+    """Find what does not fit together in a file that is not a valid rig, as far as can be told."""
     if not isinstance(data, dict):
         return iter(())
     boards, pairs, folders = (_items(data, key) for key in ("boards", "pairs", "calibration"))

@@ -13,13 +13,13 @@ Vector = tuple[float, float, float]
 class RigFrame(Model):
     """How the rig frame is fixed: by a board in one shot, or by one pair at its nominal pose.
 
-    With `pair`: that pair's camera stands exactly at its `nominal` pose (image upright: its y
-    axis points down as far as may be); without a nominal pose the rig frame is the camera frame
-    itself. With neither, the first pair of the file is meant.
+    With `pair`: that pair's camera stands exactly at its `nominal` pose (image upright: its y axis
+    points down as far as possible); without a nominal pose the rig frame is the camera frame
+    itself. With neither `pair` nor `shot`, the first pair of the file is used.
 
     With `shot`: the board's origin lies at `origin_mm`, its x axis points along `x_axis` and its
-    y axis along `y_axis` in the rig frame. The default is a board laid face up on the floor,
-    printed side up, columns running the way the subject faces.
+    y axis along `y_axis` in the rig frame. The default is a board that lies on the floor, printed
+    side up, with its columns running the way the subject faces.
     """
 
     shot: ShotName | None = None

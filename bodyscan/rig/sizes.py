@@ -1,4 +1,4 @@
-"""Sizes that a body scanner hardly has: metres or centimetres where millimetres are meant."""
+"""Sizes that a body scanner is unlikely to have: metres or centimetres instead of millimetres."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 from bodyscan.rig.rig import Rig
 
-# From a board for a hand-held scanner to one as large as a wall; from a hand to a car.
+# From a hand-held scanner's board to one as large as a wall; from a hand to a car.
 SQUARE_MM, VOLUME_MM, AWAY_MM = (2.0, 500.0), (50.0, 5000.0), (50.0, 20_000.0)
 
 
 def odd_sizes(rig: Rig) -> Iterator[str]:
-    """A question about each size in a rig file that is out of the ordinary."""
+    """A question about each unusual size in a rig file."""
     for board in rig.boards:
         yield from _odd(f"board {board.name}: square_mm", board.square_mm, SQUARE_MM)
     volume = rig.volume

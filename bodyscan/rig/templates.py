@@ -1,6 +1,6 @@
 """File-name templates such as `{shot}/{pair}/{frame}.png`: checked, filled in, read backwards.
 
-`*` stands for whatever a name has there, such as the time: a path with it is a pattern of names.
+`*` stands for any part of a name, such as the time: a path with it is a pattern of names.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ _VIDEOS = (".mp4", ".m4v", ".avi", ".mov", ".mkv", ".webm", ".wmv", ".mpg", ".mp
 
 
 def fill(template: str, *, shot: str, pair: str, frame: str) -> str:
-    """The relative path that `template` gives; the template is one without `template_faults`."""
+    """Fill in a template without `template_faults`; returns a relative path."""
     return template.format(shot=shot, pair=pair, frame=frame)
 
 
 def with_exposure(template: str, exposure: str) -> str:
-    """The template of one exposure's images."""
+    """The template for images of one exposure."""
     return template.replace("{exposure}", exposure)
 
 
@@ -35,13 +35,14 @@ ANYTHING = "*"
 
 
 def names_pattern(name: str) -> re.Pattern[str]:
-    """Which names a part of a path, with ANYTHING in it, stands for."""
+    """A pattern for the names that one part of a path, with ANYTHING in it, stands for."""
     return re.compile(_anything(re.escape(name)))
 
 
 @lru_cache(maxsize=4096)
 def shot_pattern(template: str, pair: str, frame: str) -> tuple[re.Pattern[str], ...]:
-    """One pattern a path part, that together tell the shot (group `shot`) from a file's path."""
+    """One pattern per part of a path; together they find the shot (group `shot`) in a file's
+    path."""
     marked = re.escape(fill(template, shot="\0", pair=pair, frame=frame)).split("/")
     return tuple(_shot_group(part) for part in marked)
 
@@ -49,7 +50,7 @@ def shot_pattern(template: str, pair: str, frame: str) -> tuple[re.Pattern[str],
 def template_faults(
     template: str, *, many_pairs: bool, needs_frame: bool, exposures: bool = False
 ) -> Iterator[str]:
-    """What is wrong with a file-name template, in words that follow its key."""
+    """Find what is wrong with a file-name template, in words that follow its key."""
     try:
         fields = _fields(template)
     except ValueError as error:
@@ -78,7 +79,7 @@ def template_faults(
 
 
 def frame_name_faults(name: str, number: str) -> Iterator[str]:
-    """What is wrong with a name such as that of `frames.pattern`, which holds `{bit}` (`number`)."""
+    """Find what is wrong with a name such as `frames.pattern`, which holds `{bit}` (`number`)."""
     try:
         parts = list(Formatter().parse(name))
     except ValueError as error:
@@ -93,7 +94,7 @@ def frame_name_faults(name: str, number: str) -> Iterator[str]:
 
 
 def path_fault(path: str) -> str | None:
-    """Why a relative path might lead out of the folder it starts in, or None."""
+    """Why a relative path might lead out of its starting folder, or None."""
     if "\\" in path or "\0" in path or re.match(r"[A-Za-z]:", path):
         return "must use / between folders, and neither \\ nor a drive letter"
     if path.startswith("/"):

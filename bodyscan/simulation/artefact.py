@@ -1,4 +1,4 @@
-"""Captures of a measured artefact, spheres or a flat plate, by the rig of a simulated workspace."""
+"""Captures of a known artefact, spheres or a flat plate, by the rig of a simulated workspace."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from bodyscan.simulation.view import View
 
 ALBEDO = 0.7
 RINGS = 200
-"""Facets of a sphere of 60 mm then lie less than 0.002 mm inside it."""
+"""Facets of a 60 mm sphere are then less than 0.002 mm inside it."""
 GREY = 225.0
 _RAYS, _NOISE = 11, 12
 
@@ -43,7 +43,8 @@ class SimulatedRig:
 
 
 def open_workspace(workspace: Path) -> SimulatedRig:
-    """The rig that `bodyscan simulate` built there. Raises BadInput if it is none of this version."""
+    """The rig that `bodyscan simulate` built there. Raises BadInput if it is not of this
+    version."""
     remedy = "give a folder that this version of `bodyscan simulate` wrote"
     try:
         truth = json.loads((workspace / "truth" / "truth.json").read_text("utf-8"))
@@ -77,7 +78,7 @@ def sphere_surfaces(centres: Array, radius_mm: float) -> tuple[Surface, ...]:
 
 
 def plate_surface(width_mm: float, height_mm: float) -> tuple[Surface, ...]:
-    """A white plate in the plane x = 0 about the origin, seen from either side."""
+    """A white plate in the plane x = 0, centred on the origin, visible from either side."""
     across, up = np.array([0.0, width_mm, 0.0]), np.array([0.0, 0.0, height_mm])
     return (grid_surface(-0.5 * (across + up), across, up, albedo=ALBEDO),)
 
@@ -92,10 +93,10 @@ def capture_artefact(
     number: int = 0,
     progress: Progress = silent,
 ) -> Path:
-    """Write a scan folder `out` of the artefact at one place, taken `shots` times over.
+    """Write a scan folder `out` of the artefact at one place, taken `shots` times.
 
-    number: of the place; every place and shot has noise of its own.  Pairs in whose picture nothing
-    of it lies take no part.
+    number: of the place; every place and shot has its own noise. Pairs that do not see the artefact
+        take no part.
     """
     rig, settings = simulated.rig, simulated.settings
     room = build_room(simulated.pairs.values(), settings.room)

@@ -1,4 +1,4 @@
-"""A board as it was made: its print, square by square, and the sheet it is glued to."""
+"""A board as made: its print, square by square, and the sheet to which it is glued."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from bodyscan.simulation.scene import Surface, grid_surface, grid_triangles
 from bodyscan.simulation.settings import BoardMaking
 
 _STEPS = 4
-"""Mesh cells a square, when the board is not flat."""
+"""Mesh cells per square, if the board is not flat."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoardPrint:
     """Squares (and markers in them) evaluated where a ray hits, so that edges are exact.
 
-    cells: (rows + 2, columns + 2, k, k) albedo; a rim of blank squares all round. A square's
-    middle `inner_mm` is cut into (k - 2)^2 modules; entries 0 and k - 1 are what surrounds them.
+    cells: (rows + 2, columns + 2, k, k) albedo, with a rim of blank squares all around. The middle
+        of a square, `inner_mm` wide, is divided into (k - 2)^2 modules; entries 0 and k - 1
+        surround them.
     """
 
     square_mm: float
@@ -32,7 +33,7 @@ class BoardPrint:
     cells: Floats
 
     def albedo(self, places: Floats) -> Floats:
-        """(N, 2) mm on the print, from the first square's outer corner -> (N,)."""
+        """Albedo (N,) at places (N, 2) mm on the print, from the first square's outer corner."""
         rows, columns, modules, _ = self.cells.shape
         column, i = self._cell(places[:, 0], columns, modules)
         row, j = self._cell(places[:, 1], rows, modules)
@@ -41,7 +42,7 @@ class BoardPrint:
     def _cell(
         self, place: Floats, squares: int, modules: int
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """The square's number along one side, and the module's inside it."""
+        """The number of the square along one side, and of the module inside it."""
         number = np.floor(place / np.float32(self.square_mm))
         inside = place - number * np.float32(self.square_mm)
         start = (self.square_mm - self.inner_mm) / 2.0
@@ -75,7 +76,7 @@ def _dark_squares(board: Board) -> Mask:
 
 
 def _markers(board: Board, face: int, count: int) -> Mask:
-    """(count, m, m): dark modules of the markers of one face, their border included."""
+    """Dark modules (count, m, m) of the markers on one face, including their border."""
     if not hasattr(cv2.aruco, board.dictionary):
         raise BadInput(f"OpenCV has no marker dictionary {board.dictionary}", where=board.name)
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
@@ -93,15 +94,19 @@ def _markers(board: Board, face: int, count: int) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class MadeBoard:
-    """surfaces: in the board frame.  corners: (faces * N, 3) where the printed inner corners
-    really are, board frame, numbered as the rig file's boards are (front, then back)."""
+    """A board with its errors.
+
+    surfaces: in the board frame.
+    corners: (faces * N, 3), the true positions of the printed inner corners, board frame, numbered
+        as in the rig file's board (front, then back).
+    """
 
     surfaces: tuple[Surface, ...]
     corners: Array
 
 
 def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> MadeBoard:
-    """The board of the rig file, with what went wrong in making it."""
+    """The board of the rig file, with errors of manufacture."""
     width, height = board.columns * board.square_mm, board.rows * board.square_mm
     surfaces, corners = [], []
     sheet = _draw_sheet(making, rng)
@@ -128,7 +133,7 @@ def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> M
 
 
 def _places(board: Board, flat: bool) -> Array:
-    """Mesh vertices on the print, (rows, columns, 2) mm, with the margin round it."""
+    """Mesh vertices on the print, (rows, columns, 2) mm, including the margin."""
 
     def line(squares: int) -> Array:
         size = squares * board.square_mm
@@ -143,8 +148,8 @@ def _places(board: Board, flat: bool) -> Array:
 
 @dataclass(frozen=True)
 class _Sheet:
-    """How far what a board is glued to is from a plane, mm: a bowl, bent along each side,
-    twisted."""
+    """Deviation from a plane, mm, of the sheet to which a print is glued: a bowl, a bend along each
+    side, and a twist."""
 
     bowl: float
     across: float = 0.0
@@ -156,7 +161,7 @@ class _Sheet:
         return not any((self.bowl, self.across, self.down, self.twist))
 
     def height(self, across: Array, down: Array) -> Array:
-        """Towards the front, at places from -1/2 to 1/2 along each side."""
+        """Height towards the front, at places from -1/2 to 1/2 along each side."""
         bowl = self.bowl * (1.0 - 2.0 * (across**2 + down**2))
         if not any((self.across, self.down, self.twist)):
             return bowl
@@ -175,7 +180,8 @@ def _draw_sheet(making: BoardMaking, rng: np.random.Generator) -> _Sheet:
 
 
 def _on_sheet(places: Array, board: Board, face: int, error: Array, sheet: _Sheet) -> Array:
-    """Places on the print (N, 2) -> board frame (N, 3): printing error, turning over, bow."""
+    """Map places on the print (N, 2) to the board frame (N,
+    3): printing error, turning over, bow."""
     square = board.square_mm
     grid = np.clip(places / square, 0.0, [board.columns, board.rows])[:, ::-1].T
     moved = places + np.stack([map_coordinates(e, grid, order=1) for e in error], axis=1)
@@ -188,7 +194,7 @@ def _on_sheet(places: Array, board: Board, face: int, error: Array, sheet: _Shee
 
 
 def _print_error(board: Board, making: BoardMaking, rng: np.random.Generator) -> Array:
-    """(2, rows + 1, columns + 1): how far each corner of a square is printed off, mm."""
+    """Printing error (2, rows + 1, columns + 1), mm, of each corner of a square."""
     shape = (2, board.rows + 1, board.columns + 1)
     if making.print_error_mm == 0:
         return np.zeros(shape)

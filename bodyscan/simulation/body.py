@@ -1,4 +1,4 @@
-"""The person: a subject's mesh brought to the rig frame, with skin, and the sway between pairs."""
+"""The person: a subject's mesh in the rig frame, with skin, and the sway between pairs."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def load_subject(
 ) -> Surface:
     """A subject's PLY (metres, z up, facing -y) as a smooth surface in the rig frame, mm.
 
-    The mesh is subdivided by Loop's rule, turned to face +x and put with its middle over the
-    rig's centre. The surface returned is itself the truth.  covered_by: skin, hair and cloth; matt
-    skin all over if not given.
+    The mesh is subdivided by Loop's rule, turned to face +x and centred over the rig's origin. The
+    surface returned is itself the truth.
+    covered_by: skin, hair and cloth; matt skin all over if not given.
     """
     mesh = o3d.io.read_triangle_mesh(str(path)) if path.is_file() else o3d.geometry.TriangleMesh()
     if not mesh.has_triangles():
@@ -48,7 +48,7 @@ def load_subject(
 
 
 def skin(vertices: Array, person: Person, rng: np.random.Generator) -> Array:
-    """(N,) albedo at vertices (N, 3): a sum of waves 60 to 400 mm long."""
+    """Albedo (N,) at vertices (N, 3): a sum of waves 60 to 400 mm long."""
     waves = np.zeros(len(vertices))
     for length in np.geomspace(60.0, 400.0, 8):
         way = rng.standard_normal(3)
@@ -60,10 +60,11 @@ def skin(vertices: Array, person: Person, rng: np.random.Generator) -> Array:
 def draw_sways(
     person: Person, height_mm: float, count: int, rng: np.random.Generator
 ) -> list[RigidTransform]:
-    """`swayed_from_still` at `count` moments one after another: a smooth walk from standing still.
+    """`swayed_from_still` at `count` successive moments: a smooth walk that starts from standing
+    still.
 
-    At each moment a lean about the feet and a shift the same way, which together come to sway_mm at
-    the head at the farthest, and a little turn. Seven tenths come from leaning, as a standing person
+    At each moment a lean about the feet and a shift in the same direction, together at most sway_mm
+    at the head, and a slight rotation. Seven tenths come from leaning, because a standing person
     sways like a pole on its ankles.
     """
     if person.sway_mm == 0:
@@ -84,7 +85,7 @@ def draw_sways(
 
 
 def save_truth(surface: Surface, path: Path) -> None:
-    """Binary PLY, mm, rig frame, with vertex normals."""
+    """Write a binary PLY, mm, rig frame, with vertex normals."""
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(surface.vertices),
         o3d.utility.Vector3iVector(surface.triangles.astype(np.int32)),

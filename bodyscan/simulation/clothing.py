@@ -13,17 +13,17 @@ from bodyscan.simulation.settings import Skin
 MOLE_MM = (1.5, 5.0)
 """Radii; the surface's vertices are 3 mm apart."""
 MOLE_ALBEDO = 0.45
-"""Against the skin around."""
+"""Relative to the skin around."""
 
-# In statures.
+# As shares of the stature.
 HAIRLINE, NAPE, SLANT = 0.945, 0.885, 0.5
-"""Above the head's middle; at the back; rising towards the face."""
+"""Height of the hairline above the head's middle, height at the nape, rise towards the face."""
 KNEE_END, WAIST, HIPS = 0.41, 0.565, 0.15
-"""Of shorts; hands hang farther out than the hips."""
+"""Of shorts; the hands hang farther out than the hips."""
 
 
 def dress(bare: Surface, skin: Skin, rng: np.random.Generator) -> Surface:
-    """The surface with what `skin` says. Hair is rough: its surface is the truth as well."""
+    """The surface covered as `skin` says. Hair is rough: its surface is the truth as well."""
     vertices, albedo = bare.vertices.copy(), np.array(bare.albedo, float)
     if skin.mottling > 0:
         albedo *= 1.0 + skin.mottling * _mottles(vertices, rng)
@@ -44,7 +44,7 @@ def dress(bare: Surface, skin: Skin, rng: np.random.Generator) -> Surface:
 
 
 def _mottles(vertices: Array, rng: np.random.Generator) -> Array:
-    """(N,) waves 8 to 40 mm long, standard deviation 1."""
+    """Waves (N,) 8 to 40 mm long, standard deviation 1."""
     waves = np.zeros(len(vertices))
     for length in np.geomspace(8.0, 40.0, 8):
         way = rng.standard_normal(3)
@@ -54,7 +54,7 @@ def _mottles(vertices: Array, rng: np.random.Generator) -> Array:
 
 
 def grows_hair(vertices: Array) -> Mask:
-    """(N,) on the scalp: above a line that runs from the nape up to the forehead."""
+    """Vertices (N,) on the scalp: above a line that rises from the nape to the forehead."""
     height = float(vertices[:, 2].max())
     head = vertices[:, 2] > NAPE * height
     middle = 0.5 * (vertices[head, 0].min() + vertices[head, 0].max())
@@ -63,6 +63,6 @@ def grows_hair(vertices: Array) -> Mask:
 
 
 def wears_shorts(vertices: Array) -> Mask:
-    """(N,) from above the knees to the waist."""
+    """Vertices (N,) from above the knees to the waist."""
     z, y = vertices[:, 2] / vertices[:, 2].max(), vertices[:, 1] / vertices[:, 2].max()
     return (z > KNEE_END) & (z < WAIST) & (np.abs(y) < HIPS)

@@ -21,7 +21,7 @@ from bodyscan.simulation.settings import Pace
 WHEN = datetime(2026, 11, 21, 10, 0, 0)
 """The date written into captures.yaml: always the same, so that the bytes are too."""
 
-# Noise leaves nothing to find twice: Huffman coding of differences alone is quickest and smallest.
+# Noise has no repetitions: Huffman coding of differences alone is quickest and smallest.
 _PNG = [
     cv2.IMWRITE_PNG_COMPRESSION,
     1,
@@ -32,7 +32,7 @@ _PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
 
 
 def scale_rig(rig: Rig, scale: float, calibration: str) -> Rig:
-    """The rig with image size and number of stripes scaled, its captures in one folder."""
+    """The rig with its image size and number of stripes scaled, and its captures in one folder."""
 
     def scaled(value: int) -> int:
         return max(2, round(value * scale))
@@ -59,8 +59,8 @@ def write_captures(
     subject: str | None = None,
     pace: Pace | None = None,
 ) -> None:
-    """captures.yaml: each shot's name, the pairs that took stripes, the pairs that took lit; when,
-    if a pace is given."""
+    """Write captures.yaml: each shot's name, the pairs that took stripes, those that took only the
+    lit image, and the timing if a pace is given."""
     entries = tuple(
         ShotEntry(name=name, stripes=tuple(stripes) or None, lit=tuple(lit) or None)
         for name, stripes, lit in shots
@@ -77,21 +77,21 @@ def write_captures(
 
 
 def timing_of(pace: Pace) -> Timing:
-    """As captures.yaml says it."""
+    """The timing for captures.yaml."""
     return Timing(frame_ms=pace.frame_ms, order=pace.order or None, start=pace.start)
 
 
 def times_of_person(rig: Rig, shot: str, pace: Pace) -> dict[str, dict[str, float]]:
-    """By pair, then by frame, ms since the first pair began."""
+    """Times by pair, then by frame, ms since the first pair began."""
     taken = {(shot, pair.name): rig.frames.of_sequence(pair.projector) for pair in rig.pairs}
     times = times_of_frames(timing_of(pace), rig, taken, Path())
     return {pair: dict(times[shot, pair]) for shot, pair in taken}
 
 
 def write_image(path: Path, image: Bytes) -> None:
-    """An image, PNG packed quickly; whole or not at all.
+    """Write an image, complete or not at all; PNG is packed quickly.
 
-    It is not flushed to the disk one by one: there are thousands, and they can be made again.
+    Images are not flushed to the disk one by one: there are thousands, and they can be made again.
     """
     options = _PNG if path.suffix.lower() == ".png" else []
     _, packed = cv2.imencode(path.suffix, image, options)

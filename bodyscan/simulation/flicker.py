@@ -1,4 +1,5 @@
-"""What changes from frame to frame: the projector's brightness, the camera's gain, lamps on mains."""
+"""What varies from frame to frame: the projector's
+brightness, the camera's gain, lamps on mains."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from bodyscan.simulation.settings import SimulationSettings
 
 @dataclass(frozen=True)
 class Brightness:
-    """Of one frame, 1 where nothing flickers."""
+    """Relative brightness of one frame, 1 if nothing flickers."""
 
     laser: float = 1.0
     room: float = 1.0
@@ -22,10 +23,11 @@ class Brightness:
 def draw_flicker(
     frames: Iterable[str], settings: SimulationSettings, rng: np.random.Generator
 ) -> Mapping[str, Brightness]:
-    """By frame; the frames in the order in which they are taken, at the person's pace.
+    """Brightness by frame; the frames are in the order in which they are taken, at the person's
+    pace.
 
-    A lamp pulses; of it a frame sees the mean over its exposure, which is as long as the frame. None
-    where nothing flickers.
+    A lamp pulses; a frame sees its mean over the exposure, which is as long as the frame. None if
+    nothing flickers.
     """
     light, pace = settings.lighting, settings.pace.frame_ms / 1000.0
     if not any((light.mains_depth, settings.projection.flicker, settings.noise.gain_flicker)):

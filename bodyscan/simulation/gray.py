@@ -1,6 +1,6 @@
-"""What the projector throws: reflected binary code, most significant bit first, and its light.
+"""What the projector shows: reflected binary code, most significant bit first, and its light.
 
-Written for the simulator alone; it shares nothing with `bodyscan.capture`.
+Written for the simulator alone; it shares nothing with `bodyscan.stripes`.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from scipy.signal import oaconvolve
 from bodyscan.arrays import Array, Floats, Mask
 
 PAD = 4
-"""Stripes by which a table of light reaches beyond the sweep."""
+"""Stripes by which a table of light extends beyond the sweep."""
 
 FINE = 128
-"""Entries of a table of light for each stripe."""
+"""Entries of a table of light per stripe."""
 
 
 def bit_count(stripes: int) -> int:
-    """Patterns needed to tell the stripes apart."""
+    """Number of patterns needed to tell the stripes apart."""
     return int(np.ceil(np.log2(stripes)))
 
 
 def code_bits(stripes: int, first: int = 0) -> Mask:
-    """(bits, stripes): whether stripe i is lit in pattern k, 0 the most significant.
+    """Whether stripe i is lit in pattern k, (bits, stripes), 0 the most significant.
 
-    first: what stripe 0 counts as.
+    first: the number of stripe 0.
     """
     index = np.arange(first, first + stripes)
     code = index ^ (index >> 1)
@@ -40,7 +40,7 @@ def code_bits(stripes: int, first: int = 0) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class LightTable:
-    """Light against the stripe coordinate, one row for each of several blurs.
+    """Light as a function of the stripe coordinate, one row for each of several blurs.
 
     values: (blurs, entries) float32 in 0..1.
     """
@@ -55,7 +55,8 @@ class LightTable:
 def table_index(
     s: NDArray[np.floating], stripes: int, blur: NDArray[np.integer] | None = None
 ) -> NDArray[np.int32]:
-    """Entry of a stripe coordinate (NaN: beyond the sweep), and of its row of blur if several."""
+    """Table entry of a stripe coordinate (NaN: outside the sweep), in the row of its blur if
+    several."""
     entries = (stripes + 2 * PAD) * FINE
     place = np.nan_to_num((s + PAD) * FINE, nan=0.0, posinf=0.0, neginf=0.0)
     index = np.clip(place, 0, entries - 1).astype(np.int32)
@@ -68,10 +69,11 @@ def light_table(
     jitter: Array | None = None,
     parts: int = 1,
 ) -> LightTable:
-    """Light of one frame: the stripes that are lit, smeared by Gaussians.
+    """Light of one frame: the lit stripes, blurred by Gaussians.
 
-    lit: (S,), or (S * parts,) where light changes inside stripes.  blurs: (B,) standard deviations
-    in stripes.  jitter: (S + 1,) how far each boundary strays, in stripes.
+    lit: (S,), or (S * parts,) if light changes inside stripes.
+    blurs: (B,) standard deviations in stripes.
+    jitter: (S + 1,) displacement of each boundary, in stripes.
     """
     stripes = len(lit) // parts
     boundaries = np.arange(stripes + 1, dtype=float)
@@ -87,7 +89,8 @@ def light_table(
 
 
 def _smeared(values: Floats, blurs: tuple[float, ...]) -> Floats:
-    """(B, N) values (N,) smeared by each blur; by blocks of Fourier transforms, ten times quicker."""
+    """Values (N,) blurred by each blur, (B, N); block-wise Fourier transforms are ten times
+    quicker."""
     if max(blurs) <= 0:
         return np.repeat(values[None], len(blurs), axis=0)
     padded = np.pad(values, PAD * FINE, mode="edge")
@@ -96,7 +99,7 @@ def _smeared(values: Floats, blurs: tuple[float, ...]) -> Floats:
 
 @lru_cache(maxsize=8)
 def _kernels(blurs: tuple[float, ...]) -> Floats:
-    """(B, k) Gaussians of these standard deviations in stripes, cut at four of them or at PAD."""
+    """Gaussians (B, k) with these standard deviations in stripes, cut at four of them or at PAD."""
     place = np.arange(-PAD * FINE, PAD * FINE + 1) / FINE
     reached = np.minimum(4.0 * np.array(blurs), PAD)[:, None]
     spread = np.maximum(blurs, 1e-3 / FINE)[:, None]

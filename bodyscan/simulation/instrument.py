@@ -1,4 +1,5 @@
-"""An instrument that hands out one image of stripe numbers (the chapter's 4.1), not what it saw."""
+"""An instrument that outputs one image of stripe numbers
+(the chapter's 4.1) instead of what it saw."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
-"""Light that surfaces throw on each other: one diffuse bounce of the projector's light.
+"""Light between surfaces: one diffuse bounce of the projector's light.
 
-Samples spread evenly over the surfaces are gathered in facets. A facet of area A sends on what the
-projector gives it, its radiosity B (albedo times irradiance), and a place at distance r gets
+Samples spread evenly over the surfaces are grouped into facets. A facet of area A re-emits the
+projector's light with radiosity B (albedo times irradiance), and a place at distance r receives
 
     E' = sum over facets of B V cos cos' A / (pi r^2 + A),
 
-the form factor of a disc of that area, exact on its axis. V says whether the place sees the facet:
-cast once for each two facets, since a place sees nearly what the facet around it sees.
+the form factor of a disc of that area, exact on its axis. V says whether the place sees the facet;
+it is computed once per pair of facets, since a place sees nearly what the facet around it sees.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from bodyscan.simulation.projector import Projector
 from bodyscan.simulation.scene import Hits, Scene, dot
 
 _SAMPLES = 32
-"""Of a facet: a stripe is much narrower than a facet, which shall throw back their mean."""
+"""Samples per facet: a stripe is much narrower than a facet, whose mean light is wanted."""
 
 _ROOM_FACETS = 100
-"""Of a surface that encloses all else, at most: far away, large facets do."""
+"""Most facets of a surface that encloses everything else: far away, large facets suffice."""
 
 _SPREAD = (0.7548776662466927, 0.5698402909980532)
 """Steps of the additive sequence that fills a square most evenly (Roberts, 2018)."""
@@ -38,10 +38,14 @@ _AT_ONCE = 2_000_000
 class LitFacets:
     """Facets that the projector lights, L of all K; camera frame.
 
-    samples: the N places on surfaces that were looked at.  facet: (N,) to which of all each belongs.
-    weight, s: (N,) grey level that a lit stripe would make there, and the stripe coordinate.
-    lit: (L,) numbers of those lit.  middles: (L, 3) mm.  normals: (L, 3) unit, on the side of the
-    light.  area: (L,) mm^2.  seen: (K, L), whether nothing stands between two facets.
+    samples: the N places on surfaces that were sampled.
+    facet: (N,) number, among all facets, of the one to which each belongs.
+    weight, s: (N,) grey level that a lit stripe would cause there, and the stripe coordinate.
+    lit: (L,) numbers of the lit facets.
+    middles: (L, 3) mm.
+    normals: (L, 3) unit, on the side of the light.
+    area: (L,) mm^2.
+    seen: (K, L), whether two facets see each other.
     """
 
     samples: Hits
@@ -55,12 +59,12 @@ class LitFacets:
     seen: Mask
 
     def radiosity(self, light: Floats) -> Floats:
-        """(L,) grey levels, where light (N,), 0 to 1, falls on the samples."""
+        """Radiosity (L,) in grey levels if light (N,), 0 to 1, falls on the samples."""
         total = np.bincount(self.facet, self.weight * light) / np.bincount(self.facet)
         return total[self.lit].astype(np.float32)
 
     def irradiance(self, hits: Hits, radiosity: Floats) -> Floats:
-        """(F, N) grey levels that hits (N) would have if they were white, from radiosities (F, L)
+        """Grey levels (F, N) that hits (N) would have if they were white, due to radiosities (F, L)
         alone, on the side that the camera sees."""
         result = np.zeros((len(radiosity), len(hits.depth)), np.float32)
         known = np.flatnonzero(np.isfinite(hits.depth))
@@ -76,7 +80,7 @@ class LitFacets:
         return result
 
     def _factors(self, hits: Hits, places: Indices) -> Floats:
-        """(P, L) form factors from places (P,) to facets that nothing hides."""
+        """Form factors (P, L) from places (P,) to the facets that they see."""
         points, normals = hits.points[places], hits.normals[places]
         towards = np.where(dot(points, normals) < 0.0, np.float32(1.0), np.float32(-1.0))
         normals = np.multiply(normals, (towards / np.sqrt(dot(normals, normals)))[:, None])
@@ -119,7 +123,7 @@ def light_facets(scene: Scene, projector: Projector, lamps: Lamps, facet_mm: flo
 
 
 def _samples(scene: Scene, facet_mm: float) -> tuple[Hits, Array]:
-    """Places spread evenly over all surfaces, and the area (mm^2) that each stands for."""
+    """Places spread evenly over all surfaces, and the area (mm^2) that each represents."""
     parts, shares = [], []
     for number, surface in enumerate(scene.surfaces):
         a, b, c = (surface.vertices[surface.triangles[:, k]] for k in range(3))
@@ -140,12 +144,13 @@ def _samples(scene: Scene, facet_mm: float) -> tuple[Hits, Array]:
 
 
 def _sums(group: Indices, values: NDArray[np.floating]) -> Array:
-    """(K, 3) of values (N, 3) in K groups."""
+    """Sums (K, 3) of values (N, 3) in K groups."""
     return np.stack([np.bincount(group, column) for column in values.T], axis=1)
 
 
 def _nearest_to_mean(group: Indices, points: Floats) -> Indices:
-    """(K,) numbers of the points (N, 3) nearest to the mean of each group: they lie on a surface."""
+    """Numbers (K,) of the points (N, 3) nearest to each group's mean: unlike it, they lie on a
+    surface."""
     count = np.bincount(group)
     off = points - (_sums(group, points) / count[:, None])[group]
     order = np.lexsort((np.sum(off**2, axis=1), group))
@@ -153,6 +158,6 @@ def _nearest_to_mean(group: Indices, points: Floats) -> Indices:
 
 
 def _seen(scene: Scene, middles: Floats, lit: Indices) -> Mask:
-    """(K, L) whether nothing stands between the middles (K, 3) and those that are lit."""
+    """Whether the middles (K, 3) see those that are lit, (K, L)."""
     rows = [scene.joined(middles, np.broadcast_to(middles[i], middles.shape)) for i in lit]
     return np.stack(rows, axis=1) if rows else np.zeros((len(middles), 0), bool)

@@ -1,4 +1,4 @@
-"""How bright the projector makes a surface."""
+"""How brightly the projector and the room light a surface."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from bodyscan.simulation.skin import came_in_at, highlight
 
 @dataclass(frozen=True)
 class Lamps:
-    """How bright, and where it is sharp.
+    """Brightness of the light, and the distance of focus.
 
     laser_grey: grey level of a white surface that faces the projector at reach_mm.
-    ambient_grey: what the room's own light makes of a white surface.
+    ambient_grey: grey level that the room's own light gives a white surface.
     focus_mm: distance at which the projector and the camera are focused.
-    window_grey: what a large window makes of a white surface that faces it.  window_way: (3,) unit,
-    where it is, camera frame.
+    window_grey: grey level that a large window gives a white surface that faces it.
+    window_way: (3,) unit, direction to the window, camera frame.
     skin: what skin does with light.
     """
 
@@ -36,11 +36,11 @@ class Lamps:
 
 
 def room_light(hits: Hits, lamps: Lamps) -> Floats:
-    """(N,) grey level that a white surface would get of the room's own light at each hit."""
+    """Grey level (N,) of a white surface at each hit, due to the room's own light."""
     light = np.full(len(hits.depth), lamps.ambient_grey, np.float32)
     if lamps.window_grey <= 0:
         return light
-    # The side that the camera sees; of a window half the sky wide, light comes round the side.
+    # The side that the camera sees; a window half the sky wide lights around the edge.
     towards = np.asarray(lamps.window_way, np.float32)
     length = np.sqrt(np.maximum(dot(hits.normals, hits.normals), np.float32(1e-12)))
     seen = -np.sign(dot(hits.normals, hits.points))
@@ -52,10 +52,11 @@ def room_light(hits: Hits, lamps: Lamps) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class LaserLight:
-    """What each hit (N,) would get from a lit stripe.
+    """What each hit (N,) would receive from a lit stripe.
 
-    weight: grey level of the light that it scatters.  s: where the projector's light is from, NaN where
-    none arrives.  gloss: grey level of what its skin mirrors; None where nothing is glossy.
+    weight: grey level of the light that it scatters.
+    s: stripe coordinate of the projector's light, NaN where none arrives.
+    gloss: grey level of what its skin mirrors; None if nothing is glossy.
     """
 
     weight: Floats
@@ -66,7 +67,7 @@ class LaserLight:
 def laser_light(
     scene: Scene, hits: Hits, projector: Projector, lamps: Lamps, *, seen: bool = True
 ) -> LaserLight:
-    """By cosine, 1/r^2 and shadow.
+    """Light by cosine, 1/r^2 and shadow.
 
     seen: only where the light falls on the side that the camera sees.
     """

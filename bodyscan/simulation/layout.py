@@ -1,4 +1,4 @@
-"""The rig as it was really built: nominal poses, off by what hands and tape measures are off."""
+"""The rig as it was really built: nominal poses with the errors of hands and tape measures."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _LAMP_STRIPES = 2
 
 @dataclass(frozen=True, eq=False)
 class TruePair:
-    """name; its camera, where it stands; its projector in the camera's frame.
+    """A pair: its name, its camera and that camera's pose, its projector in the camera's frame.
 
-    reach_mm: the working distance, from the nominal pose. has_stripes: False for a camera
-    alone, which a plain lamp lights.
+    reach_mm: the working distance, from the nominal pose.
+    has_stripes: False for a camera alone, which a plain lamp lights.
     """
 
     name: str
@@ -43,8 +43,8 @@ def build_pairs(
 ) -> dict[str, TruePair]:
     """Every pair's true parameters, each drawn from its own `stream(number)`.
 
-    The pair that fixes the rig frame, if the rig file has one do so, stands where it should.
-    Raises BadInput for a pair without nominal pose.
+    A pair that fixes the rig frame stands exactly where it should. Raises BadInput for a pair
+    without a nominal pose.
     """
     fixed = None if rig.rig_frame.shot else (rig.rig_frame.pair or rig.pairs[0].name)
     return {
@@ -87,7 +87,7 @@ def _build(
 
 
 def draw_camera(width: int, height: int, optics: Optics, rng: np.random.Generator) -> TrueCamera:
-    """A lens drawn around the nominal one; pixel values scale with the image's width."""
+    """Draw a camera around the nominal one; pixel values scale with the image's width."""
     pixel = width / 1280.0
     alpha = optics.focal_widths * width * (1.0 + optics.focal_spread * rng.standard_normal())
     beta = alpha * (1.0 + optics.aspect_spread * (1.0 + 0.5 * rng.standard_normal()))
@@ -105,7 +105,7 @@ def draw_camera(width: int, height: int, optics: Optics, rng: np.random.Generato
 
 
 def rig_from_view(placing: NominalPose) -> RigidTransform:
-    """From a device that looks along its z, y down, upright in the rig."""
+    """Pose of a device that looks along its z axis, y down, upright in the rig."""
     position, target = _ends(placing)
     forward = target - position
     forward = forward / np.linalg.norm(forward)
@@ -121,7 +121,7 @@ def _ends(placing: NominalPose) -> tuple[Array, Array]:
 
 
 def _beside(nominal: RigidTransform, reach: float, horizontal: bool) -> NominalPose:
-    """Where a projector without a pose stands: above the camera, or to its right."""
+    """Pose of a projector that has none in the rig file: above the camera, or to its right."""
     axis = -nominal.rotation[:, 1] if horizontal else nominal.rotation[:, 0]
     position = nominal.translation + 0.22 * reach * axis
     target = nominal.translation + reach * nominal.rotation[:, 2]
@@ -131,7 +131,7 @@ def _beside(nominal: RigidTransform, reach: float, horizontal: bool) -> NominalP
 def _perturbed(
     rig_from_device: RigidTransform, optics: Optics, reach: float, rng: np.random.Generator
 ) -> RigidTransform:
-    """A pose off by hand; less so where all is nearer than in a body scanner."""
+    """A pose with manual placing errors; smaller if everything is nearer than in a body scanner."""
     turn = np.radians(optics.angle_deg) * rng.standard_normal(3)
     shift = optics.position_mm * min(1.0, reach / 1300.0) * rng.standard_normal(3)
     turned = RigidTransform.from_rotation_vector(turn, np.zeros(3)).rotation
@@ -139,7 +139,7 @@ def _perturbed(
 
 
 def seen_points(camera: TrueCamera, depths: Sequence[float] | Array) -> Array:
-    """Points (N, 3) at some depths, all over what the camera sees, its corners among them."""
+    """Points (N, 3) at some depths, all over the camera's field of view including its corners."""
     u, v = np.linspace(-0.5, camera.width - 0.5, 9), np.linspace(-0.5, camera.height - 0.5, 9)
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     return (camera.directions(grid)[:, None, :] * np.reshape(depths, (-1, 1))).reshape(-1, 3)
@@ -153,9 +153,10 @@ def build_mirror(
     projection: Projection,
     rng: np.random.Generator,
 ) -> MirrorProjector:
-    """A laser and mirror at the projector's place, sweeping over all points seen.
+    """A laser and mirror in the projector's position, sweeping over all points seen.
 
-    The laser's apex lies at a right angle to the way out; stripes run along the mirror's axis.
+    The laser's apex lies at a right angle to the outgoing direction; stripes run along the mirror's
+    axis.
     """
     axes = camera_from_projector.rotation.T
     axis = axes[0] if horizontal else -axes[1]
@@ -194,7 +195,7 @@ def build_pinhole(
     projection: Projection,
     rng: np.random.Generator,
 ) -> PinholeProjector:
-    """A projector with a lens at the projector's place; its sheets bend with k1 and k2."""
+    """A projector with a lens in the projector's position; its sheets bend with k1 and k2."""
     x, y, z = camera_from_projector.rotation.T
     rows = np.stack([x, y, z] if horizontal else [-y, x, z])
     k1 = projection.k1 * (1.0 + 0.2 * rng.standard_normal())
@@ -209,8 +210,8 @@ def build_pinhole(
 
 
 def _sweep(seen: Array, values: Array, horizontal: bool, margin: float) -> tuple[float, float]:
-    """First and last of a sweep over values (N,) at points seen (N, 3), down the image or to its
-    right."""
+    """First and last value of a sweep over values (N,) at points seen (N, 3), in the order down the
+    image or to its right."""
     low, high = float(values.min()), float(values.max())
     low, high = low - margin * (high - low), high + margin * (high - low)
     image = seen[:, 1 if horizontal else 0] / seen[:, 2]

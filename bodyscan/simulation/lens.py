@@ -15,14 +15,14 @@ from bodyscan.compiled import compiled
 
 _TABLE = 1 << 15
 _NEWTON = 6
-"""Steps: a lens bends by a tenth; each step squares what is left."""
+"""Newton steps: a lens bends by a tenth, and each step squares the remaining error."""
 
 
 @dataclass(frozen=True)
 class TrueCamera:
-    """Intrinsics in px, (u, v) = (column, row), whole numbers at pixel centres; camera frame mm.
+    """Intrinsics in px, (u, v) = (column, row), whole numbers at pixel centres; camera frame, mm.
 
-    p1, p2, k3: what the chapter's lens does not have: an axis off centre, and the next power.
+    p1, p2, k3: what the chapter's lens lacks: an axis off centre, and the next power.
     """
 
     alpha: float
@@ -39,7 +39,7 @@ class TrueCamera:
     k3: float = 0.0
 
     def image(self, points: Array) -> Array:
-        """Points (..., 3) in front of the camera -> where the lens images them, (..., 2) px.
+        """Image points (..., 3) in front of the camera: (..., 2) px.
 
         Eq. 3 and 4 as they stand: the ideal point is pushed away from [u0, v0].
         """
@@ -56,10 +56,10 @@ class TrueCamera:
         return np.stack([u + (u - self.u0) * push, v + (v - self.v0) * push], axis=-1)
 
     def directions(self, pixels: Array) -> Array:
-        """px (..., 2) -> ray directions (..., 3) in the camera frame, z = 1.
+        """Ray directions (..., 3), camera frame, z = 1, of px (..., 2).
 
-        The lens is inverted by a dense table of real radius against ideal radius (accurate to
-        about 1e-9 of the focal length).
+        The lens is inverted by a dense table of real radius against ideal radius (accurate to about
+        1e-9 of the focal length).
         """
         y = (pixels[..., 1] - self.v0) / self.beta
         x = (pixels[..., 0] - self.u0 - self.gamma * y) / self.alpha
@@ -82,7 +82,7 @@ class TrueCamera:
         return bool(self.p1 or self.p2 or self.k3)
 
     def _unbent(self, real: Array) -> Array:
-        """What the lens bends to `real` (..., 2)."""
+        """The ideal points that the lens maps to `real` (..., 2)."""
         ideal = real.reshape(-1, 2).copy()
         if not unbend(ideal, np.array([self.k1, self.k2, self.k3, self.p1, self.p2])):
             raise ValueError("the lens folds the image over: no ray belongs to its corners")
@@ -96,7 +96,7 @@ class TrueCamera:
 
 
 def bend(x: Any, y: Any, k1: float, k2: float, k3: float, p1: float, p2: float) -> tuple[Any, Any]:
-    """Normalized coordinates, numbers or arrays, behind the lens (Brown 1966)."""
+    """Normalised coordinates, numbers or arrays, after the lens (Brown 1966)."""
     square = x * x + y * y
     grown = 1.0 + square * (k1 + square * (k2 + square * k3))
     aside = 2.0 * p1 * x * y + p2 * (square + 2.0 * (x * x))
@@ -109,8 +109,11 @@ _bend = compiled(bend)
 
 @compiled
 def unbend(places: Array, lens: Array) -> bool:
-    """Put in for places (N, 2) what the lens (k1, k2, k3, p1, p2) bends to them, by Newton's method,
-    slopes by differences; False, and nothing of use, where it folds the image over."""
+    """Replace places (N, 2) by what the lens (k1, k2, k3, p1, p2) maps to them.
+
+    By Newton's method with numerical slopes. Returns False, with places undefined, if the lens
+    folds the image over.
+    """
     k1, k2, k3, p1, p2 = lens
     step = 1e-6
     for i in range(len(places)):
@@ -137,7 +140,7 @@ def unbend(places: Array, lens: Array) -> bool:
 def sample_offsets(count: int) -> Array:
     """count^2 places inside a pixel, (count^2, 2) in [0, 1): no two share a column or a row.
 
-    A square grid would see an edge along a pixel row only in `count` steps.
+    A square grid would resolve an edge along a row of pixels in only `count` steps.
     """
     total = count * count
     step = next(k for k in range(count - 1 or 1, total + 1) if np.gcd(k, total) == 1)

@@ -19,28 +19,30 @@ from bodyscan.simulation.scene import Surface
 from bodyscan.simulation.settings import Person
 
 SLOWEST_HZ, FASTEST_HZ, WAVES = 0.15, 1.2, 6
-"""Of sway and of limbs held still: postural sway has nearly all its power below 1 Hz
-(Winter 1995, Gait and Posture 3)."""
+"""Of sway and of limbs held still: nearly all power of postural sway is below 1 Hz (Winter 1995,
+Gait and Posture 3)."""
 
-# In statures; of adults, ANSUR II.
+# As shares of the stature; for adults, ANSUR II.
 ANKLE, FOOT = 0.055, 0.035
-"""The whole body turns above the ankle, nothing below the foot's back."""
+"""The whole body rotates about the ankle, except for what is below the top of the foot."""
 NECK, CHIN = 0.835, 0.885
 ELBOW_SIDE, SHOULDER = 0.36, 0.46
-"""Along the skin from the fingertips: all arm, and no arm any more."""
+"""Distances from the fingertips along the skin: all arm up
+to the first, no arm beyond the second."""
 CHEST, BELLY, BREATHING = 0.72, 0.60, 0.065
-"""Heights of the two, and the standard deviation of what rises with each."""
+"""Heights of the two, and the standard deviation of the part that moves with each."""
 SIDEWAYS = 0.25
-"""Of how far the front comes forward, how far each side goes out."""
+"""How far each side moves out, relative to how far the front comes forward."""
 BELLY_LATE = 0.6
-"""Radians of a breath by which the belly follows the chest."""
+"""Phase by which the belly follows the chest, radians of a breath."""
 
 
 @dataclass(frozen=True, eq=False)
 class Wander:
-    """A smooth random function of time of several components: sums of cosines.
+    """A smooth random function of time with several components: sums of cosines.
 
-    hz: (K,).  sizes, phases: (K, n), of n components.
+    hz: (K,).
+    sizes, phases: (K, n), of n components.
     """
 
     hz: Array
@@ -48,15 +50,16 @@ class Wander:
     phases: Array
 
     def at(self, ms: float) -> Array:
-        """(n,)"""
+        """Values (n,) at a time."""
         turns = 2.0 * np.pi * self.hz[:, None] * (ms / 1000.0)
         return np.sum(self.sizes * np.cos(turns + self.phases), axis=0)
 
 
 def draw_wander(rms: float, components: int, rng: np.random.Generator, *, speed: bool) -> Wander:
-    """All components together are `rms` in the long run; or with `speed`, change by that a second.
+    """Draw a function whose components together, or with `speed` their changes per second, are
+    `rms`.
 
-    Sizes fall with frequency, so that slow ones lead.
+    Sizes fall with frequency, so that slow motion dominates.
     """
     hz = np.geomspace(SLOWEST_HZ, FASTEST_HZ, WAVES) * rng.uniform(0.9, 1.1, WAVES)
     sizes = rng.standard_normal((WAVES, components)) / hz[:, None] ** 1.5
@@ -67,34 +70,39 @@ def draw_wander(rms: float, components: int, rng: np.random.Generator, *, speed:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """Part of a body that turns. weights: (N,) 1 for what turns with it.  pivot: (3,) mm.
-    turn: rotation vector, radians."""
+    """A part of a body that rotates.
+
+    weights: (N,) 1 for vertices that fully rotate with it.
+    pivot: (3,) mm.
+    turn: rotation vector, radians.
+    """
 
     weights: Array
     pivot: Array
     turn: Wander
 
     def carry(self, vertices: Array, ms: float) -> Array:
-        """Where it takes vertices (N, 3)."""
+        """Vertices (N, 3) after its rotation."""
         moved = self.motion(ms).apply(vertices)
         return vertices + self.weights[:, None] * (moved - vertices)
 
     def motion(self, ms: float) -> RigidTransform:
-        """Of all that turns with it."""
+        """The motion of what fully rotates with it."""
         turn = RigidTransform.from_rotation_vector(self.turn.at(ms), np.zeros(3)).rotation
         return RigidTransform(turn, self.pivot - turn @ self.pivot)
 
 
 @dataclass(frozen=True)
 class Breath:
-    """mm: from breathed out to breathed in.  period_s; phases: of chest and belly at 0, radians."""
+    """mm: from breathed out to breathed in. period_s. phases: of chest and belly at time 0,
+    radians."""
 
     mm: float
     period_s: float
     phases: tuple[float, float]
 
     def at(self, ms: float) -> Array:
-        """(2,) how far chest and belly stand out, mm; 0 in the mean over a breath."""
+        """How far chest and belly stand out (2,), mm; mean 0 over a breath."""
         turns = 2.0 * np.pi * ms / 1000.0 / self.period_s
         return 0.5 * self.mm * np.sin(turns + np.array(self.phases))
 
@@ -103,8 +111,10 @@ class Breath:
 class LivingBody:
     """A person who stands as people do.
 
-    rest: at mean breath, upright.  limbs: both arms, then the head, against the trunk.  swells:
-    (N, 3, 2) where chest and belly go, for each mm of breath.  ankles: the whole body's sway.
+    rest: at mean breath, upright.
+    limbs: both arms, then the head, relative to the trunk.
+    swells: (N, 3, 2) motion of each vertex with chest and belly, per mm of breath.
+    ankles: the whole body's sway.
     """
 
     rest: Surface
@@ -115,12 +125,13 @@ class LivingBody:
 
     @property
     def arms_share(self) -> Array:
-        """(N,) how far each vertex goes with an arm: 1 beyond the shoulders, 0 on the trunk."""
+        """How far each vertex moves with an arm (N,): 1 beyond the shoulders, 0 on the trunk."""
         left, right = (limb.weights for limb in self.limbs[:2])
         return np.maximum(left, right)
 
     def vertices(self, ms: float, *, breathing: bool = True) -> Array:
-        """(N, 3) mm, rig frame, at a moment since the scan began; without breathing, at mean breath."""
+        """Vertices (N, 3) mm, rig frame, at a time since the scan
+        began; without breathing, at mean breath."""
         placed = self.rest.vertices
         for limb in self.limbs:
             placed = limb.carry(placed, ms)
@@ -129,11 +140,12 @@ class LivingBody:
         return self.ankles.carry(placed, ms)
 
     def surface(self, ms: float, *, breathing: bool = True) -> Surface:
-        """Its skin then. Normals are those at rest: nothing turns by more than a degree or so."""
+        """The skin at that time. Normals are those at rest:
+        nothing rotates more than a degree or so."""
         return replace(self.rest, vertices=self.vertices(ms, breathing=breathing))
 
     def farthest(self, from_ms: float, moments_ms: Iterable[float]) -> float:
-        """How far any vertex is at some moments from where it is at another, mm."""
+        """Largest distance, mm, of any vertex at some moments from where it is at another."""
         start = self.vertices(from_ms)
         away = [np.linalg.norm(self.vertices(ms) - start, axis=1).max() for ms in moments_ms]
         return float(max(away))
@@ -144,12 +156,12 @@ class LivingBody:
 
 
 def moves(person: Person) -> bool:
-    """Whether anything of the person moves while frames are taken."""
+    """Whether any part of the person moves while frames are taken."""
     return any((person.sway_mm_s, person.breath_mm, person.arms_deg, person.head_deg))
 
 
 def bring_to_life(still: Surface, person: Person, rng: np.random.Generator) -> LivingBody:
-    """The person who stands as `still` in the mean."""
+    """A living person whose mean pose is `still`."""
     vertices = still.vertices
     height = float(vertices[:, 2].max())
     z = vertices[:, 2] / height
@@ -161,7 +173,7 @@ def bring_to_life(still: Surface, person: Person, rng: np.random.Generator) -> L
         Joint(own, _border(vertices, own), draw_wander(rms, 3, rng, speed=False))
         for own, rms in limbs
     )
-    # A lean to the front is a turn about y, one to the left a turn about -x; none about z.
+    # Leaning forward is a rotation about y, leaning left one about -x; there is none about z.
     pivot = np.array([0.0, 0.0, ANKLE * height])
     lean = draw_wander(person.sway_mm_s / (height - pivot[2]), 2, rng, speed=True)
     flat = np.zeros((WAVES, 1))
@@ -184,15 +196,16 @@ def _rising(values: Array, low: float, high: float) -> Array:
 
 
 def _arm_weights(still: Surface, side: float, height: float) -> Array:
-    """(N,) 1 on the arm that reaches out farthest to y's positive (side 1) or negative side."""
+    """Weights (N,), 1 on the arm that reaches farthest to
+    positive y (side 1) or negative y (-1)."""
     fingertip = int(np.argmax(side * still.vertices[:, 1]))
     along = dijkstra(_edges(still), indices=[fingertip], limit=0.6 * height)[0]
     return 1.0 - _rising(along / height, ELBOW_SIDE, SHOULDER)
 
 
 def _edges(surface: Surface) -> csr_matrix:
-    """(N, N) lengths of the edges between vertices, mm; on a closed surface each is there both ways,
-    from the triangle on either side."""
+    """Lengths (N, N) of the edges between vertices, mm; on a closed surface each is present in both
+    directions, from the triangle on either side."""
     ends = surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     lengths = np.linalg.norm(np.diff(surface.vertices[ends], axis=1)[:, 0], axis=1)
     count = len(surface.vertices)
@@ -200,13 +213,13 @@ def _edges(surface: Surface) -> csr_matrix:
 
 
 def _border(vertices: Array, weights: Array) -> Array:
-    """(3,) the middle of where a limb ends: its joint."""
+    """The middle (3,) of where a limb ends: its joint."""
     return vertices[(weights > 0.3) & (weights < 0.7)].mean(axis=0)
 
 
 def _swells(vertices: Array, trunk: Array, height: float) -> Array:
-    """(N, 3, 2) where chest and belly go, for each mm that the farthest of them stands out: the front
-    forward, the sides outward, the back nowhere."""
+    """Motion (N, 3, 2) with chest and belly, per mm by which the farthest vertex of each stands
+    out: the front forward, the sides outward, the back not at all."""
     heights = np.array([CHEST, BELLY]) * height
     spread = BREATHING * height
     rises = np.exp(-0.5 * ((vertices[:, 2:] - heights) / spread) ** 2)
@@ -222,7 +235,7 @@ def _swells(vertices: Array, trunk: Array, height: float) -> Array:
 
 
 def describe_motion(body: LivingBody, moment_ms: float) -> dict[str, Any]:
-    """For truth.json: which moment the truth's surface shows, and the motion's own numbers."""
+    """For truth.json: which moment the truth's surface shows, and the parameters of the motion."""
 
     def wander(one: Wander) -> dict[str, Any]:
         return {"hz": one.hz, "sizes": one.sizes, "phases": one.phases}
@@ -237,7 +250,7 @@ def describe_motion(body: LivingBody, moment_ms: float) -> dict[str, Any]:
 
 
 def save_body(body: LivingBody, path: Path) -> None:
-    """What does not fit truth.json, for `load_body`; float32 but for places."""
+    """Save what does not fit truth.json, for `load_body`; float32 except for positions."""
     weights = [joint.weights for joint in (*body.limbs, body.ankles)]
     with atomic_replacement(path) as temporary, temporary.open("wb") as stream:
         np.savez(
@@ -250,8 +263,8 @@ def save_body(body: LivingBody, path: Path) -> None:
 
 
 def load_body(motion: dict[str, Any], path: Path) -> LivingBody:
-    """The body of a simulated workspace from `motion` of its truth.json and truth/body.npz: where each
-    vertex of truth/subject.ply was at any time."""
+    """The body of a simulated workspace from `motion` in its truth.json and truth/body.npz: where
+    each vertex of truth/subject.ply was at any time."""
     with np.load(path) as stored:
         kept = {name: stored[name] for name in stored.files}
     joints = [
@@ -268,8 +281,8 @@ def _wander(fields: dict[str, Any]) -> Wander:
 
 
 def body_of(truth: Path) -> LivingBody | None:
-    """That of a workspace's folder `truth`; None for a subject that did not move, or that cannot be
-    read."""
+    """The body in a workspace's folder `truth`; None if the subject did not move, or is
+    unreadable."""
     try:
         motion = json.loads((truth / "truth.json").read_text("utf-8"))["motion"]
         return load_body(motion, truth / "body.npz")

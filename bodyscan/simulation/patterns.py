@@ -1,7 +1,7 @@
 """The light of every image of every code, for the simulator alone: its own formulas.
 
 Only names, numbers and counts are taken from the codes' descriptions, never their `intensity`: a
-mistake in that would be made again here, and cancel out when the images are decoded.
+mistake in that would be repeated here, and cancel out when the images are decoded.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from bodyscan.stripes.stripe_code import ImageKind, StripeCode
 from bodyscan.stripes.wave import Wave
 
 PARTS = 16
-"""Values of light in a stripe, where it changes inside stripes."""
+"""Values of light per stripe, if light changes inside stripes."""
 
 KNOWN = (Gray, Binary, LightSection, PhaseShift, StripeIndex)
 
 
 def refuse_unknown_code(code: StripeCode, pair: str) -> None:
-    """Raises BadInput for a code for which there are no formulas here."""
+    """Raises BadInput for a code that has no formulas here."""
     if type(code) not in KNOWN:
         raise BadInput(
             f"its code {code.code} is none that the simulator knows how to project",
@@ -38,7 +38,7 @@ def refuse_unknown_code(code: StripeCode, pair: str) -> None:
 
 
 def refuse_unknown_frames(rig: Rig) -> None:
-    """Raises BadInput for images of kinds that are not rendered here."""
+    """Raises BadInput for kinds of images that are not rendered here."""
     crossed = next((p.name for p in rig.pairs if p.projector and p.projector.crossing), None)
     wrong = {
         "it projects stripes one way only": crossed is not None,
@@ -56,9 +56,9 @@ def refuse_unknown_frames(rig: Rig) -> None:
 
 
 def projected_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]:
-    """By name of the image, its light (stripes * k,), 0 to 1, at evenly spaced places of the sweep.
+    """Light (stripes * k,), 0 to 1, at evenly spaced places of the sweep, by name of the image.
 
-    Of a stripe-index rig, what its instrument projects for itself: Gray code (see `instrument`).
+    For a stripe-index rig, what its instrument projects: Gray code (see `instrument`).
     """
     if isinstance(code, LightSection):
         return _named(frames, STRIPE, np.eye(code.stripes))
@@ -81,7 +81,8 @@ def projected_patterns(code: StripeCode, frames: FrameNames) -> dict[str, Array]
 
 
 def _wave_images(wave: Wave, place: Array) -> Array:
-    """(steps, N): at each step the wave's crests lie a part of its period farther on, or back."""
+    """Images (steps, N): at each step the wave is shifted by
+    a part of its period, forward or back."""
     step = wave.period / wave.steps * (1.0 if wave.shift == "forward" else -1.0)
     crest = wave.origin - wave.start * wave.period / (2.0 * np.pi)
     return np.stack(

@@ -1,4 +1,4 @@
-"""Where the board is held, shot by shot, and which pairs take what of it."""
+"""Where the board is held, shot by shot, and which pairs capture it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bodyscan.simulation.layout import TruePair
 
 @dataclass(frozen=True, eq=False)
 class BoardShot:
-    """One board pose, and the pairs that take the whole stripe sequence, or the lit image alone."""
+    """One board pose, and the pairs that take the whole stripe sequence, or only the lit image."""
 
     name: str
     board: str
@@ -29,11 +29,13 @@ class BoardShot:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What one pair sees of boards, N poses at once.
+    """What one pair sees of boards in N poses.
 
-    angle_deg: (N,) between the face it sees and the way to the camera.  back: (N,) bool.
-    inside: (N,) share of the board in the image.  cells: (N, cells) bool, image cells it covers,
-    near and far apart.  lean: (N,) which way the board is turned, 0..7.
+    angle_deg: (N,) between the normal of the face it sees and the direction to the camera.
+    back: (N,) bool.
+    inside: (N,) share of the board in the image.
+    cells: (N, cells) bool, image cells it covers, near and far ones separate.
+    lean: (N,) direction in which the board is tilted, 0..7.
     """
 
     angle_deg: Array
@@ -45,8 +47,12 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Merits:
-    """What poses are good for. offered: (poses, merits) bool.  worth: (merits,) of each time it is
-    had, up to `needed` (merits,) times; it fades quickly from there."""
+    """What poses contribute.
+
+    offered: (poses, merits) bool.
+    worth: (merits,) of each time a merit is had, up to `needed` times; it fades quickly from there.
+    needed: (merits,).
+    """
 
     offered: Mask
     worth: Array
@@ -54,17 +60,17 @@ class Merits:
 
 
 STRIPES_WITHIN_DEG, LIT_WITHIN_DEG = 50.0, 70.0
-"""A face is seen well enough for stripes, and at all, up to these angles from straight ahead."""
+"""Angles from straight ahead up to which a face is seen well enough for stripes, and at all."""
 STRIPES_INSIDE, LIT_INSIDE = 0.5, 0.25
-"""Shares of a board that must lie in the image for either."""
+"""Shares of a board that must be in the image for either."""
 GRAZING_DEG = 12.0
-"""A pair takes the board that lies on the floor from this angle above it."""
+"""From this angle above the floor on, a pair captures the board that lies there."""
 
-_CELLS = (6, 8)  # rows and columns of an image that boards are to cover
+_CELLS = (6, 8)  # rows and columns of image cells that boards should cover
 _CANDIDATES = 3000  # poses, of which the best are chosen
 _NEAR, _FAR = 0.73, 1.12  # working distances at which boards are held
 _ASIDE = 0.22  # working distances off the axis, at most
-_TILT_DEG = 35.0  # of a board against the way to the camera, at most
+_TILT_DEG = 35.0  # of a board against the direction to the camera, at most
 _OFF_FLOOR_MM = 5.0
 _FADE = 0.35  # how quickly a merit loses its worth once it is had often enough
 
@@ -79,8 +85,8 @@ def plan_boards(
 ) -> list[BoardShot]:
     """The floor shot if the rig file names one, then `shots` poses.
 
-    Poses are drawn in front of pairs chosen in turn; of many, those are taken that add most:
-    image area not yet covered near and far, new tilts, pairs tied that share no board yet.
+    Poses are drawn in front of pairs chosen in turn; of many, those are taken that add most: image
+    area not yet covered near and far, new tilts, links between pairs that share no board yet.
     """
     board = rig.boards[0]
     plan = [_floor_shot(rig, pairs)] if rig.rig_frame.shot else []
@@ -139,7 +145,7 @@ def _grid(board: Board) -> Array:
 
 
 def _can(board: Board, sight: Sight, stripes: bool) -> Mask:
-    """(N,) poses in which a pair takes stripes (or at least the lit image).
+    """Poses (N,) in which a pair takes stripes (or at least the lit image).
 
     A plain board is found only if it is seen whole; a board's back only if it is printed.
     """
@@ -184,7 +190,7 @@ def _floor_shot(rig: Rig, pairs: Mapping[str, TruePair]) -> BoardShot:
 def _candidates(
     board: Board, pairs: Sequence[TruePair], rng: np.random.Generator
 ) -> list[RigidTransform]:
-    """Poses near the middle of what pairs look at, faced by them or turned between two poles."""
+    """Poses near the middle of what pairs look at, facing them or turned between two poles."""
     poses: list[RigidTransform] = []
     count = -(-_CANDIDATES // len(pairs))
     for pair in pairs:
@@ -200,7 +206,7 @@ def _candidates(
 
 
 def _off_floor(rig_from_board: RigidTransform, board: Board) -> RigidTransform:
-    """The pose, lifted if need be until the board only just does not touch the floor."""
+    """The pose, raised if necessary so that the board just clears the floor."""
     margin = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]) * board.margin_mm
     low, high = margin + [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]] * _extent(board)
     x, y = np.meshgrid([low[0], high[0]], [low[1], high[1]])
@@ -211,16 +217,16 @@ def _off_floor(rig_from_board: RigidTransform, board: Board) -> RigidTransform:
 
 
 def _extent(board: Board) -> Array:
-    """(3,) width and height of the checkered area, mm."""
+    """Width and height of the checkered area, and 0, (3,) mm."""
     return np.array([board.columns, board.rows, 0.0]) * board.square_mm
 
 
 def _draw_pose(
     board: Board, middle: Array, turned: bool, rng: np.random.Generator
 ) -> RigidTransform:
-    """A pose with its middle there: which way it faces, how it is turned in itself.
+    """A pose of a board with its middle there, its facing and its rotation drawn at random.
 
-    turned: two poses in five look past the camera, to where other poles stand.
+    turned: two poses in five face away from the camera, towards other poles.
     """
     tilt, way = np.radians(rng.uniform(0.0, _TILT_DEG)), rng.uniform(0.0, 2.0 * np.pi)
     yaw = 0.0
@@ -238,7 +244,7 @@ def _rotation(vector: ArrayLike) -> Array:
 
 
 def _chosen(merits: Merits, shots: int) -> list[int]:
-    """Greedily, the poses that add most to what is not yet covered and tied."""
+    """Choose greedily the poses that add most to what is not yet covered and linked."""
     free = np.ones(len(merits.offered), bool)
     had = np.zeros(len(merits.worth))
     offered = merits.offered.astype(np.float32)
@@ -254,8 +260,8 @@ def _chosen(merits: Merits, shots: int) -> list[int]:
 
 
 def _merits(sights: Mapping[str, Sight], pairs: Mapping[str, TruePair], board: Board) -> Merits:
-    """Every cell of every image three times, once near and once far; tilts to all sides; six
-    boards a pair; two pairs on one face of a board, or on both, three times."""
+    """Every cell of every image three times, near and far; tilts to all sides; six boards per pair;
+    two pairs on one face of a board, or on both, three times."""
     parts: list[tuple[Mask, float, float]] = []
     striped = {n: _can(board, s, True) & pairs[n].has_stripes for n, s in sights.items()}
     seen = {name: _can(board, sight, False) for name, sight in sights.items()}

@@ -1,4 +1,4 @@
-"""Settings by name: whom to scan, and by which devices; and every number by itself."""
+"""Named settings: whom to scan, and with which devices; and changes of single numbers."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from bodyscan.simulation.settings import SimulationSettings
 SUBJECTS: Mapping[str, Mapping[str, Any]] = {
     # Nobody stands like that.
     "mannequin": {},
-    # Quiet standing: a head's speed of 7 mm/s, as force plates and markers have it (Winter 1995),
-    # breath that moves the chest by 4 mm, arms that hang free.
+    # Quiet standing: the head moves at 7 mm/s, as measured with force plates and markers (Winter
+    # 1995), breath moves the chest by 4 mm, arms hang free.
     "standing": {"sway_mm_s": 7.0, "breath_mm": 4.0, "arms_deg": 0.5, "head_deg": 0.3},
-    # Twice all of it, and a quicker breath.
+    # Twice all of it, and quicker breath.
     "restless": {
         "sway_mm_s": 14.0,
         "breath_mm": 8.0,
@@ -27,7 +27,7 @@ SUBJECTS: Mapping[str, Mapping[str, Any]] = {
         "arms_deg": 1.0,
         "head_deg": 0.6,
     },
-    # Of six years: 0.72 as tall, breathes 20 times a minute, looks about.
+    # Six years old: 0.72 as tall, breathes 20 times a minute, looks about.
     "child": {
         "size": 0.72,
         "sway_mm_s": 12.0,
@@ -40,7 +40,7 @@ SUBJECTS: Mapping[str, Mapping[str, Any]] = {
 
 
 _SKIN: Mapping[str, Any] = {
-    # Light comes out 1.8 mm RMS from where it went in, a little oil shines, as on a dry back.
+    # Light leaves skin 1.8 mm RMS from where it entered; a little oil shines, as on a dry back.
     "spread_mm": 0.67,
     "gloss": 0.3,
     "mottling": 0.03,
@@ -57,17 +57,17 @@ IDEAL, WORKSHOP = "ideal", "workshop"
 
 _WORKSHOP: Mapping[str, Mapping[str, Any]] = {
     "optics": {
-        # 8 mm at f/2.8 and 1.3 m: the circle of confusion at half the distance is 3 px wide, as
-        # wide as a Gaussian of a quarter of that.
+        # 8 mm at f/2.8 and 1.3 m: the circle of confusion at half the distance is 3 px wide, which
+        # equals the width of a Gaussian with a quarter of that.
         "defocus_px": 0.8,
-        # Natural light loss of a lens, a little of it corrected.
+        # Natural light loss of a lens, slightly corrected.
         "vignetting": 0.8,
-        # Half a pixel in the corners, as calibrations of machine-vision lenses find.
+        # Half a pixel in the corners, typical of calibrated machine-vision lenses.
         "p_spread": 3e-4,
         "k3_spread": 0.01,
     },
     "lighting": {
-        # A window, and lamps with ballasts at 50 Hz mains.
+        # A window, and lamps with ballasts on 50 Hz mains.
         "window_grey": 6.0,
         "mains_depth": 0.2,
     },
@@ -84,10 +84,10 @@ _WORKSHOP: Mapping[str, Mapping[str, Any]] = {
         "print_error_mm": 0.02,
     },
 }
-"""A scanner as people build it: what the laboratory's real light has, and more."""
+"""A scanner as people build it: the laboratory's real light, and more."""
 
 _WORKSHOP_LIGHT: Mapping[str, Mapping[str, Any]] = {
-    # The laboratory's real light: a galvanometer's jitter, the bow of a laser's line, speckle
+    # The laboratory's real light: a galvanometer's jitter, the bow of a laser line, speckle
     # averaged over a pixel, a sheet that is sharp at one distance.
     "mirror": {
         "jitter_stripes": 0.01,
@@ -110,10 +110,15 @@ def settings_for(
     sway_mm: float = 0.0,
     changes: Iterable[str] = (),
 ) -> SimulationSettings:
-    """Settings with one kind of projector, `mirror` or `pinhole`, the devices of a preset (`ideal` or
-    `workshop`), a person of `SUBJECTS` and of `LOOKS`, and `changes` such as `person.breath_mm=5`.
+    """Settings from one kind of projector, a preset of devices, a person, and single changes.
 
-    sway_mm: of a mannequin. Raises BadInput for names and values that there are not.
+    projector: `mirror` or `pinhole`.
+    preset: `ideal` or `workshop`.
+    subject, look: names in `SUBJECTS` and `LOOKS`.
+    sway_mm: of a mannequin.
+    changes: such as `person.breath_mm=5`.
+
+    Raises BadInput for unknown names and invalid values.
     """
     for what, name, known in (
         ("projector of kind", projector, _WORKSHOP_LIGHT),
@@ -144,7 +149,7 @@ def settings_for(
 def with_changes(settings: SimulationSettings, changes: Iterable[str]) -> SimulationSettings:
     """Settings with single numbers changed, such as `person.breath_mm=5`.
 
-    Raises BadInput for a setting that there is not, or a value that it cannot have.
+    Raises BadInput for an unknown setting, or a value that it cannot have.
     """
     values = asdict(settings)
     for text in changes:
@@ -166,8 +171,11 @@ def with_changes(settings: SimulationSettings, changes: Iterable[str]) -> Simula
 
 
 def settings_of(values: Mapping[str, Any]) -> SimulationSettings:
-    """What `dataclasses.asdict` made of settings, read back; parts that are missing are as they are
-    by default. Raises BadInput for a value that a setting cannot have."""
+    """Read back settings from what `dataclasses.asdict` made of them; missing parts get their
+    defaults.
+
+    Raises BadInput for a value that a setting cannot have.
+    """
     known = {field.name for field in fields(SimulationSettings)}
     own = {name: part for name, part in values.items() if name in known}
     try:

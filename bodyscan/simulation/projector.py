@@ -1,7 +1,7 @@
 """Projectors as they are built: a laser sheet on a rotating mirror, or a lens.
 
-Written for the simulator alone: calibration never sees these models, only the light they throw.
-All vectors are in the frame of the pair's camera, mm.
+Written for the simulator alone: calibration never sees these models, only their light. All vectors
+are in the frame of the pair's camera, mm.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Reals = NDArray[Any]
 
 
 class Projector(Protocol):
-    """What the renderer asks of a projector. Points (..., 3) keep their float type."""
+    """What the renderer needs from a projector. Points (..., 3) keep their float type."""
 
     @property
     def stripes(self) -> int: ...
@@ -27,19 +27,21 @@ class Projector(Protocol):
         """Stripe coordinate s (...) of the light that reaches points; NaN where none does."""
 
     def source(self, s: Reals) -> Reals:
-        """(..., 3): the point from which the light of stripe coordinate s seems to come."""
+        """The point (..., 3) from which the light of stripe coordinate s seems to come."""
 
 
 @dataclass(frozen=True, eq=False)
 class MirrorProjector:
     """A laser's fan of light, reflected by a mirror whose surface lies off its rotation axis.
 
-    The fan's plane contains `laser` (its apex), is normal to `sheet` and its middle ray runs along
+    The fan's plane contains `laser` (its apex), is normal to `sheet`, and its middle ray runs along
     `aim`. The mirror's normal at angle theta is cos(theta) zero + sin(theta) (axis x zero); its
-    surface lies `offset_mm` from `centre` along that normal. Stripe coordinate s is swept at
-    mirror angle first_angle + s / stripes * sweep_angle. Each stripe is a plane; with an offset, or
-    a sheet tilted against the axis, the planes have no line in common.
-    fan: tangent of half the fan's opening.  smile_stripes: s strays by this much at a fan's ends.
+    surface lies `offset_mm` from `centre` along that normal. Stripe coordinate s is swept at mirror
+    angle first_angle + s / stripes * sweep_angle. Each stripe is a plane; with an offset, or a
+    sheet tilted against the axis, the planes have no line in common.
+
+    fan: tangent of half the fan's opening.
+    smile_stripes: deviation of s at a fan's ends.
     """
 
     stripes: int
@@ -56,12 +58,12 @@ class MirrorProjector:
     smile_stripes: float = 0.0
 
     def angle(self, points: Reals) -> Reals:
-        """Mirror angle at which the sheet passes through points (...,), radians.
+        """Mirror angle at which the sheet passes through points (..., 3), radians.
 
-        Mirrored point P' = P - 2 (n.q - e) n, q = P - centre, lies on the laser's own sheet:
+        The mirrored point P' = P - 2 (n.q - e) n, q = P - centre, lies on the laser's own sheet:
         m.(P' - laser) = 0. With n.q and n.m in cos and sin of theta this reads
-        A cos 2theta + B sin 2theta = K + 2 e n.m, solved for theta with the small last term held
-        back one step (it shrinks by offset / distance each time).
+        A cos 2theta + B sin 2theta = K + 2 e n.m, solved for theta with the small last term taken
+        from the step before (its error shrinks by offset / distance each time).
         """
         zero, side = self._normals
         m1, m2, m3 = (float(self.sheet @ v) for v in (zero, side, self.axis))
@@ -88,7 +90,7 @@ class MirrorProjector:
     def across(self, points: Reals, theta: Reals) -> Reals:
         """Tangent of the angle, inside the fan, between a point's ray and the middle ray.
 
-        It is taken after the point is mirrored back to the laser's side: (P' - laser) against
+        It is computed after the point is mirrored back to the laser's side: (P' - laser) against
         `aim` and the sheet's other direction. Infinite behind the projector.
         """
         cos, sin = np.cos(theta), np.sin(theta)
@@ -116,7 +118,8 @@ class MirrorProjector:
         return np.stack(parts, axis=-1)
 
     def plane(self, s: Reals) -> Reals:
-        """(..., 4): a, b, c (unit normal), d of Eq. 6 for stripe coordinates s, without smile."""
+        """Planes (..., 4) of Eq. 6 at stripe coordinates s,
+        without smile: a, b, c (unit normal), d."""
         theta = self.first_angle + np.asarray(s, float) * (self.sweep_angle / self.stripes)
         zero, side = self._normals
         normal = np.cos(theta)[..., None] * zero + np.sin(theta)[..., None] * side
@@ -126,17 +129,19 @@ class MirrorProjector:
 
     @property
     def _normals(self) -> tuple[Array, Array]:
-        """The mirror's normal at angle 0, and a quarter turn on."""
+        """The mirror's normal at angle 0, and a quarter turn further."""
         return self.zero, np.cross(self.axis, self.zero)
 
 
 @dataclass(frozen=True, eq=False)
 class PinholeProjector:
-    """A projector with a lens: all light from one point, its stripes straight on the slide only.
+    """A projector with a lens: all light from one point, its stripes straight only on the slide.
 
-    rotation: (3, 3), projector axes as rows; `across` the stripes is its row 1, along them row 0.
-    The slide's coordinates are normalized, moved by the lens as in Eq. 3-4; stripe coordinate 0
-    lies at `first` and S at `last` across, and the slide ends at +-`half` along.
+    rotation: (3, 3), projector axes as rows; row 0 runs along the stripes, row 1 across them.
+    first, last: stripe coordinates 0 and S, across the slide.
+    half: the slide ends at +-`half` along the stripes.
+
+    The slide's coordinates are normalised, and moved by the lens as in Eq. 3-4.
     """
 
     stripes: int
@@ -169,12 +174,12 @@ class PinholeProjector:
 
 
 def _along(points: Reals, vector: Array, origin: Array) -> Reals:
-    """How far points (..., 3) lie from the origin along a vector."""
+    """Distance of points (..., 3) from the origin along a vector."""
     x, y, z = (points[..., i] * float(vector[i]) for i in range(3))
     return x + y + z - float(vector @ origin)
 
 
 def _wrapped(angle: Reals) -> Reals:
-    """To (-pi, pi]."""
+    """Angles brought to (-pi, pi]."""
     turn = angle.dtype.type(2.0 * np.pi)
     return angle - turn * np.round(angle / turn)

@@ -19,17 +19,21 @@ from bodyscan.simulation.scene import Hits, Scene
 from bodyscan.simulation.view import Band
 
 FLAT_MM = 0.04
-"""A corner may lie so far off the facet at the opposite one. Between them the surface is then within a
-quarter of it, a tenth of what a scan errs by."""
+"""How far a corner may be off the facet at the opposite one. Between them the surface is then
+within a quarter of it, a tenth of a scan's error."""
 
 
 @dataclass(frozen=True, eq=False)
 class RayEnds:
-    """Of each ray (R, C, K) of a band.
+    """What the rays (R, C, K) of a band meet.
 
-    white, gloss: grey level of the projector's full light, as a white surface scatters it, and as skin
-    mirrors it.  s: stripe coordinate, NaN where none of it arrives.  room: grey level of the room's
-    light on a white surface.  albedo, skin: as in `Hits`.  depth: mm.  surface: its number.
+    white, gloss: grey level of the projector's full light, as scattered by a white surface, and as
+        mirrored by skin.
+    s: stripe coordinate, NaN where none of that light arrives.
+    room: grey level of the room's light on a white surface.
+    albedo, skin: as in `Hits`.
+    depth: mm.
+    surface: its number.
     across, down: place on a print.
     """
 
@@ -46,7 +50,7 @@ class RayEnds:
 
 
 def ends_of_rays(scene: Scene, band: Band, projector: Projector, lamps: Lamps) -> RayEnds:
-    """What the band sees of the scene."""
+    """Cast the band's rays, or interpolate them, and light their ends."""
     rows, columns, samples, _ = band.rays.shape
     hits = scene.cast(band.corners.reshape(-1, 3))
     corners = _lit(scene, hits, projector, lamps).reshape(-1, rows + 1, columns + 1)
@@ -62,7 +66,7 @@ def ends_of_rays(scene: Scene, band: Band, projector: Projector, lamps: Lamps) -
 
 
 def _lit(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> Floats:
-    """(F, N) in the order of `RayEnds`."""
+    """Fields (F, N) in the order of `RayEnds`."""
     white = replace(hits, albedo=np.ones_like(hits.albedo))
     light = laser_light(scene, white, projector, lamps)
     gloss = np.zeros_like(light.weight) if light.gloss is None else light.gloss
@@ -82,7 +86,7 @@ def _lit(scene: Scene, hits: Hits, projector: Projector, lamps: Lamps) -> Floats
 
 
 def _even(hits: Hits, corners: RayEnds) -> Mask:
-    """(R, C) pixels whose corners lie on one smooth piece of a surface, all lit or none."""
+    """Pixels (R, C) whose corners lie on one smooth piece of a surface, all lit or none."""
     shape = corners.depth.shape
     points, facets = hits.points.reshape(*shape, 3), hits.facets.reshape(*shape, 3)
     facets = facets / np.maximum(np.linalg.norm(facets, axis=-1, keepdims=True), 1e-12)
@@ -106,8 +110,8 @@ def _even(hits: Hits, corners: RayEnds) -> Mask:
 def interpolate(
     corners: Floats, shift: Floats, offsets: Floats, even: Mask, values: Floats
 ) -> None:
-    """Fill `values` (F, R, C, K) of even pixels (R, C) from their corners (F, R + 1, C + 1), bilinearly
-    at offsets (K, 2) + shift (R, C, 2), modulo 1."""
+    """Fill `values` (F, R, C, K) of even pixels (R, C) from their corners (F, R + 1, C + 1),
+    bilinearly at offsets (K, 2) + shift (R, C, 2), modulo 1."""
     count, rows, columns, samples = values.shape
     x, y = np.empty(samples, np.float32), np.empty(samples, np.float32)
     for r in range(rows):
@@ -129,7 +133,8 @@ def interpolate(
 def mean_light(
     weight: Floats, index: np.ndarray[tuple[int, ...], np.dtype[np.int32]], table: Floats
 ) -> Floats:
-    """(R, C) mean over samples of weight (R, C, K) times the light at entries (R, C, K) of a table."""
+    """Mean (R, C) over samples of weight (R, C, K) times the
+    light at entries (R, C, K) of a table."""
     rows, columns, samples = weight.shape
     mean = np.empty((rows, columns), np.float32)
     for r in range(rows):
@@ -143,7 +148,7 @@ def mean_light(
 
 @compiled
 def least(samples: Floats) -> Floats:
-    """(R, C) the least of samples (R, C, K)."""
+    """The least (R, C) of samples (R, C, K)."""
     rows, columns, count = samples.shape
     result = np.empty((rows, columns), np.float32)
     for r in range(rows):

@@ -1,4 +1,4 @@
-"""From a scene, a camera and a projector to images: rays, light, and what the lens makes of it."""
+"""From a scene, a camera and a projector to images: rays, light, and the effect of the lens."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ _DEFOCUS_STEPS = 12
 class Moving:
     """What moves while a sequence is taken.
 
-    surfaces: so many do, the first of the scene's.  at: the scene when a frame of that name is
-    taken.  reach_mm: how far anything goes from where it is in the scene that all else is seen in.
+    surfaces: how many move, the first of the scene's.
+    at: the scene when a frame of that name is taken.
+    reach_mm: how far anything moves from its place in the scene in which everything else is seen.
     """
 
     surfaces: int
@@ -46,8 +47,9 @@ class Moving:
 
 @dataclass(frozen=True, eq=False)
 class PixelTruth:
-    """What lies at each pixel's centre. depth: (height, width) mm along z, NaN where nothing is.
+    """What lies at each pixel's centre.
 
+    depth: (height, width) mm along z, NaN where there is nothing.
     s: stripe coordinate, NaN where no light of the projector arrives.
     """
 
@@ -73,14 +75,17 @@ def render_pair(
 ) -> dict[str, Floats]:
     """Images without sensor noise, (height, width) float32 grey levels, by frame name.
 
-    scene: in the camera's frame.  rng: for the laser's jitter and speckle.  moving: pixels near it are
-    cast anew for every frame; shadows that it throws on what is still stay where they are.  flicker:
-    of frames that are not as bright as the others (its gain is left to `sensor.expose`).  empty: the
-    room that the scene's last surfaces are, seen by the same view in the same light before anything
-    stood in it: then only what else changes is cast; the images are the same.
-    With `sequence` the whole stripe sequence (lit, dark and those of the code: Gray with inverses
-    if none is given), else lit alone. The dark image of a stripe-index rig, which its instrument
-    keeps to itself, is named "". `sensor.expose` makes 8-bit images of them.
+    scene: in the camera's frame.
+    rng: for the laser's jitter and speckle.
+    code: Gray with inverses if not given.
+    sequence: the whole stripe sequence (lit, dark and the code's images), or lit alone. The dark
+        image of a stripe-index rig, which its instrument keeps to itself, is named "".
+    moving: pixels near it are cast anew for every frame; its shadows on what is still do not move.
+    flicker: of frames that differ in brightness (its gain is left to `sensor.expose`).
+    empty: the room formed by the scene's last surfaces, seen by the same view in the same light
+        before anything stood in it: only what else changes is cast then; the images are the same.
+
+    `sensor.expose` turns the result into 8-bit images.
     """
     frames = frames or FrameNames()
     code = code or Gray(stripes=projector.stripes, direction="vertical")
@@ -126,9 +131,12 @@ class _Source:
 class _Seen:
     """What a camera sees before its lens blurs it: grey levels (H, W).
 
-    laser, ambient: by frame, of the projector's light and of the room's.  depth: (H, W) mm, the least
-    in each pixel.  near: (H, W) where something shows that moves.  gloss: by frame, of the projector's
-    light what skin mirrors; none where nothing is glossy.  skin: (H, W) the share that is skin.
+    laser, ambient: by frame, of the projector's light and of the room's.
+    depth: (H, W) mm, the least in each pixel.
+    near: (H, W) where something that moves shows.
+    gloss: by frame, the part of the projector's light that skin mirrors; empty if nothing is
+        glossy.
+    skin: (H, W) the share that is skin.
     albedo: (H, W), the mean.
     """
 
@@ -149,7 +157,8 @@ def _see(
     unlit: tuple[str, ...],
     moving_surfaces: int,
 ) -> _Seen:
-    """Every frame of a scene in which nothing moves; its first surfaces will.  every: its bands."""
+    """See every frame of a scene that stands still, whose
+    first surfaces will move. every: its bands."""
     shape = (view.camera.height, view.camera.width)
     laser = {name: np.zeros(shape, np.float32) for name in (*lit, *unlit)}
     ambient, albedo, depth = (np.zeros(shape, np.float32) for _ in range(3))
@@ -170,7 +179,7 @@ def _see(
 def _see_again(
     seen: _Seen, view: View, source: _Source, lit: Mapping[str, LightTable], moving: Moving
 ) -> None:
-    """What moves, and what it covers and uncovers, as it is when each frame is taken."""
+    """Update what moves, and what it covers and uncovers, for the moment of each frame."""
     near = _reached(seen.near, seen.depth, moving.reach_mm, view.camera)
     bands = list(view.around(near))
     for name in seen.laser:
@@ -189,9 +198,11 @@ def _see_again(
 class _LitRays:
     """A band's rays, with the projector's light where they end.
 
-    weight, gloss: (R, C, K) grey level under full light, scattered and mirrored.  index: (R, C, K)
-    into a table of light.  ambient: (R, C) grey level by the room's own light.  albedo, skin: (R, C)
-    means.  depth, surface: (R, C) the least.
+    weight, gloss: (R, C, K) grey level under full light, scattered and mirrored.
+    index: (R, C, K) into a table of light.
+    ambient: (R, C) grey level due to the room's own light.
+    albedo, skin: (R, C) means.
+    depth, surface: (R, C) the least.
     """
 
     weight: Floats
@@ -219,15 +230,15 @@ class _LitRays:
         )
 
     def light(self, table: LightTable) -> Floats:
-        """(R, C) grey level of one frame."""
+        """Grey level (R, C) of one frame."""
         return mean_light(self.weight, self.index, table.values.ravel())
 
     def mirrored(self, table: LightTable) -> Floats:
-        """(R, C) the part of one frame that glossy skin mirrors."""
+        """The part (R, C) of one frame that glossy skin mirrors."""
         return mean_light(self.gloss, self.index, table.values.ravel())
 
     def with_columns(self, columns: slice, part: _LitRays) -> _LitRays:
-        """These, with others in some columns."""
+        """These rays, with others in some columns."""
         whole = {field.name: getattr(self, field.name).copy() for field in fields(self)}
         for name, values in whole.items():
             values[:, columns] = getattr(part, name)
@@ -240,11 +251,12 @@ def _rays(scene: Scene, view: View, source: _Source) -> Iterator[tuple[Band, _Li
 
 @dataclass(frozen=True, eq=False)
 class EmptyRoom:
-    """What a view sees of a room that nothing stands in: most of it is the same in every shot.
+    """What a view sees of a room in which nothing stands: most of it is the same in every shot.
 
-    rays: of each band, surfaces numbered beyond those of any scene.  corners, towards: of each band,
-    (R + 1, C + 1, 3), where the rays between its pixels end, and the way from there to their light,
-    NaN where none arrives.  steps: of each band, between two rays at most, along x and y at z = 1.
+    rays: of each band, surfaces numbered beyond those of any scene.
+    corners, towards: of each band, (R + 1, C + 1, 3), where the rays between its pixels end, and
+        the direction from there to their light, NaN where none arrives.
+    steps: of each band, the largest distance between two rays along x and y at z = 1.
     """
 
     source: _Source
@@ -275,7 +287,8 @@ class EmptyRoom:
         return EmptyRoom(source, view, tuple(rays), tuple(corners), tuple(towards), tuple(steps))
 
     def with_what_stands_in(self, scene: Scene) -> Iterator[tuple[Band, _LitRays]]:
-        """Each band's rays, cast anew between the columns where something shows or throws shadow."""
+        """Each band's rays, cast anew between the columns
+        where something shows or casts a shadow."""
         known = (self.view.bands, self.rays, self.corners, self.towards, self.steps)
         for band, rays, ends, towards, step in zip(*known, strict=True):
             changed = scene.may_change(band.corners, ends, towards, step)
@@ -290,7 +303,7 @@ class EmptyRoom:
 
 
 def _reached(near: Mask, depth: Floats, reach_mm: float, camera: TrueCamera) -> Mask:
-    """Pixels that something may come to which shows at those `near` (H, W), at most so far away."""
+    """Pixels that something shown at `near` (H, W) may reach if it moves by `reach_mm`."""
     if not near.any():
         return near
     pixels = int(np.ceil(reach_mm * camera.alpha / float(depth[near].min()))) + 2
@@ -321,7 +334,8 @@ class _Between:
         return _Between(tuple(tables), facets, light)
 
     def add_to(self, seen: _Seen, scene: Scene, view: View) -> None:
-        """What pixels get of it, to every frame: it changes slowly, one sample of each tells."""
+        """Add its light to the pixels of every frame: it varies slowly, so one sample per pixel
+        suffices."""
         for band in view.bands:
             hits = scene.cast(band.rays[:, :, band.rays.shape[2] // 2].reshape(-1, 3))
             found = self.facets.irradiance(hits, self.radiosity)
@@ -367,7 +381,7 @@ def _tables(
 def _steady_tables(
     code: StripeCode, frames: FrameNames, projection: Projection
 ) -> tuple[tuple[str, LightTable], ...]:
-    """Of lit and the code's images, when no boundary strays."""
+    """Tables of lit and the code's images, without jitter."""
     blurs = _blurs(projection)
     return tuple(
         (name, light_table(light, blurs, parts=len(light) // code.stripes))
@@ -376,7 +390,7 @@ def _steady_tables(
 
 
 def _lights(code: StripeCode, frames: FrameNames, gamma: float) -> list[tuple[str, Array]]:
-    """Lit and the code's images: name, and light along the sweep."""
+    """Name, and light along the sweep, of lit and the code's images."""
     coded = projected_patterns(code, frames)
     if gamma != 1.0:
         coded = {name: light**gamma for name, light in coded.items()}
@@ -392,7 +406,7 @@ def _blurs(projection: Projection) -> Array:
 
 
 def _blur_rows(depth: Floats, projection: Projection, lamps: Lamps) -> NDArray[np.int32] | None:
-    """Which of `_blurs` holds at each depth: the distance to the projector is about that."""
+    """Which of `_blurs` applies at each depth, taken for the distance to the projector."""
     if projection.defocus_stripes <= 0:
         return None
     off = off_focus(depth, lamps.focus_mm)

@@ -16,29 +16,31 @@ from bodyscan.geometry.transforms import RigidTransform
 Tensor = o3d.core.Tensor
 
 _THREADS = 2
-"""Open3D keeps Python's lock while it casts, so Python's threads alone would take turns."""
+"""Open3D holds Python's lock while it casts, so Python's threads alone would take turns."""
 
 _LIFT_MM = 0.3
-"""What lies nearer than this to a surface throws no shadow on it."""
+"""What is nearer than this to a surface casts no shadow on it."""
 
 
 class Print(Protocol):
     """Something printed on a surface."""
 
     def albedo(self, places: Floats) -> Floats:
-        """(N, 2) places on the print -> (N,) albedo."""
+        """Albedo (N,) at places (N, 2) on the print."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A triangle mesh that scatters light evenly (Lambert), seen from either side.
+    """A triangle mesh that scatters light evenly (Lambert), visible from either side.
 
-    vertices: (N, 3) mm.  triangles: (T, 3) int.  albedo: one, or (N,) one for each vertex.
+    vertices: (N, 3) mm.
+    triangles: (T, 3) int.
+    albedo: one, or (N,) one for each vertex.
     printed, places: a print, and where on it each vertex lies, (N, 2); it overrides the albedo.
     normals: (N, 3) unit, if the surface is to be shaded smoothly.
-    open_to_light: nothing can stand between it and the projector, so no shadow is looked for.
-    encloses: everything stands on one side of it, so it throws no shadow.
-    skin: (N,) how far each vertex is skin that lets light in, 0 to 1; None where nothing is.
+    open_to_light: nothing can come between it and the projector, so shadows need not be tested.
+    encloses: everything is on one side of it, so it casts no shadow.
+    skin: (N,) how far each vertex is skin that lets light in, 0 to 1; None if nothing is.
     """
 
     vertices: Array
@@ -61,9 +63,9 @@ class Surface:
 class Hits:
     """Where rays met the scene.
 
-    depth: (N,), infinite where nothing.  normals: (N, 3), of any length, to either side.
-
-    surface: (N,) number of the surface, one past the last where nothing.
+    depth: (N,), infinite where they met nothing.
+    normals: (N, 3), of any length, to either side.
+    surface: (N,) number of the surface, one past the last if none.
     skin: (N,) as `Surface.skin`.
     facets: (N, 3) normals of the triangles, of any length.
     places: (N, 2) on the surface's print, if it has one.
@@ -97,7 +99,7 @@ class Scene:
             )
 
     def cast(self, directions: Floats) -> Hits:
-        """Rays from the origin along directions (N, 3) with z = 1."""
+        """Cast rays from the origin along directions (N, 3) with z = 1."""
         rays = np.zeros((len(directions), 6), np.float32)
         rays[:, 3:] = directions
         answer = self._rays.cast_rays(Tensor.from_numpy(rays), nthreads=_THREADS)
@@ -123,15 +125,15 @@ class Scene:
         return Hits(depth, points, normals, albedo, surface, skin, facets, places)
 
     def print_on(self, surface: Floats, across: Floats, down: Floats, albedo: Floats) -> None:
-        """Write the prints' albedo where the number of the surface is that of a printed one."""
+        """Write the prints' albedo wherever the surface is a printed one."""
         for number, finish in enumerate(self._finish):
             if finish.printed is not None:
                 on = surface == number
                 albedo[on] = finish.printed.albedo(np.stack([across[on], down[on]], axis=1))
 
     def places(self, number: int, triangles: NDArray[np.integer], uv: Floats) -> Hits:
-        """Places on one surface as if rays had met it there: its triangles (N,), and barycentric
-        coordinates (N, 2) on them."""
+        """Places on one surface as if rays had met it there, given its triangles (N,) and
+        barycentric coordinates (N, 2) on them."""
         surface, finish = self.surfaces[number], self._finish[number]
         corners = surface.vertices[surface.triangles[triangles]]
         first, sides = corners[:, 0], corners[:, 1:] - corners[:, :1]
@@ -152,7 +154,7 @@ class Scene:
         )
 
     def joined(self, starts: Floats, ends: Floats) -> Mask:
-        """(N,) whether nothing stands between two places (N, 3) each that lie on surfaces."""
+        """Whether two places (N, 3) each on surfaces see each other, (N,)."""
         way = ends - starts
         reach = np.maximum(np.sqrt(dot(way, way)), np.float32(3.0 * _LIFT_MM))
         lift = (np.float32(_LIFT_MM) / reach)[:, None] * way
@@ -166,11 +168,12 @@ class Scene:
         return np.asarray(~hidden.numpy())
 
     def may_change(self, directions: Floats, ends: Floats, towards: Floats, step: float) -> Mask:
-        """(R, C) where what stands here may show, or throw its shadow, in an empty room.
+        """Where what stands here may show, or cast its shadow, in an empty room, (R, C).
 
-        directions: (R, C, 3) neighbouring rays from the origin, z = 1.  ends, towards: (R, C, 3) where
-        they end in the empty room, and the way from there to the light's source, NaN without light.
-        step: between two of the rays at most; nothing shows or is dark between two that are not told.
+        directions: (R, C, 3) neighbouring rays from the origin, z = 1.
+        ends, towards: (R, C, 3) where they end in the empty room, and the direction from there to
+            the light's source, NaN without light.
+        step: largest distance between two of the rays, so that nothing between two is missed.
         """
         (left, top), (right, bottom) = self._outline
         x, y = directions[..., 0], directions[..., 1]
@@ -180,7 +183,7 @@ class Scene:
         return shows | (aside.reshape(shows.shape) < (radius + step * ends[..., 2]) ** 2)
 
     def is_shadowed(self, points: Floats, towards: Floats, surface: NDArray[np.uint32]) -> Mask:
-        """Whether something stands between points (N, 3) on surfaces and their light's source.
+        """Whether something is between points (N, 3) on surfaces and the source of their light.
 
         towards: (N, 3) from each point to the source.
         """
@@ -201,7 +204,7 @@ class Scene:
 
 
 def _ball(surfaces: Iterable[Surface]) -> tuple[Array, float]:
-    """A ball (middle, radius) round whatever can throw a shadow."""
+    """A ball (middle, radius) around everything that can cast a shadow."""
     corners = [[one.vertices.min(axis=0), one.vertices.max(axis=0)] for one in surfaces]
     if not corners:
         return np.zeros(3), 0.0
@@ -219,22 +222,21 @@ def _outline(surfaces: Iterable[Surface]) -> tuple[Array, Array]:
 
 
 def _distance_squared(points: Floats, ways: Floats, middle: Array) -> Floats:
-    """(N,) squared distance of one place from lines through points (N, 3) along ways (N, 3)."""
+    """Squared distance (N,) of one place from lines through points (N, 3) along ways (N, 3)."""
     arm = points - middle.astype(np.float32)
     along = dot(arm, ways)
     return dot(arm, arm) - along**2 / dot(ways, ways)
 
 
 def dot(a: Floats, b: Floats) -> Floats:
-    """(N,) scalar products of rows of (N, 3); several times faster than einsum on so short rows."""
+    """Dot products (N,) of rows (N, 3); several times faster than einsum on such short rows."""
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
 @dataclass(frozen=True, eq=False)
 class _Finish:
-    """A surface's albedo, print and normals at its triangles' corners, as the renderer needs them:
-    (T, 3, k) the value at the first corner, and the way from it to the other two.
-    """
+    """A surface's albedo, print and normals at its triangles' corners, in the form for rendering:
+    (T, 3, k) the value at the first corner, and the differences of the other two from it."""
 
     albedo: float
     albedos: Floats | None
@@ -284,7 +286,7 @@ def _spread(corners: Floats, triangles: NDArray[np.integer], uv: Floats) -> Floa
 def grid_surface(
     corner: Array, across: Array, down: Array, steps: tuple[int, int] = (1, 1), **more: Any
 ) -> Surface:
-    """A flat patch: corner, its two sides (3,) each, cut in steps; places are (0..1, 0..1)."""
+    """A flat patch from a corner and its two sides (3,), cut in steps; places are (0..1, 0..1)."""
     columns, rows = steps
     x, y = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     places = np.stack([x.ravel(), y.ravel()], axis=1)

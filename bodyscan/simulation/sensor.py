@@ -25,7 +25,7 @@ def exposure(lit: Floats, grey: float, lighting: Lighting) -> float:
 
 @dataclass(frozen=True, eq=False)
 class FixedPattern:
-    """What each pixel of a sensor does in every image. gain: (H, W), 1 on the mean.  grey: (H, W)."""
+    """Errors of each pixel common to all images. gain: (H, W), mean 1. grey: (H, W)."""
 
     gain: Floats
     grey: Floats
@@ -34,7 +34,7 @@ class FixedPattern:
 def fixed_pattern(
     camera: TrueCamera, noise: Noise, rng: np.random.Generator
 ) -> FixedPattern | None:
-    """Of a camera's sensor; None for one whose pixels are all alike."""
+    """Fixed pattern of a camera's sensor; None if its pixels are all alike."""
     if noise.pixel_gain <= 0 and noise.pixel_grey <= 0:
         return None
     gain, grey = rng.standard_normal((2, camera.height, camera.width), dtype=np.float32)
@@ -47,7 +47,8 @@ def fixed_pattern(
 def expose(
     image: Floats, noise: Noise, rng: np.random.Generator, fixed: FixedPattern | None = None
 ) -> Bytes:
-    """What the sensor makes of a noiseless image: shot and read noise, its pixels' own, 8 bits."""
+    """The sensor's image of a noiseless one: shot and read
+    noise, its pixels' own errors, 8 bits."""
     if fixed is not None:
         image = image * fixed.gain + fixed.grey
     electrons = noise.electrons_per_grey * noise.photons
@@ -62,8 +63,12 @@ def expose(
 def digitise(
     image: Floats, draws: Floats, electrons: np.float32, read: np.float32, grey: Bytes
 ) -> None:
-    """Fill in 8 bits (H, W) of an image (H, W) with noise: normal draws (H, W) times its spread, of
-    `electrons` for each grey level, and the square of read noise."""
+    """Fill 8 bits (H, W) of an image (H, W) with noise.
+
+    draws: (H, W) standard normal.
+    electrons: per grey level.
+    read: square of the read noise.
+    """
     low, high = np.float32(0.0), np.float32(255.0)
     for v in range(image.shape[0]):
         for u in range(image.shape[1]):
@@ -74,8 +79,8 @@ def digitise(
 
 
 def add_speckle(image: Floats, size: float, rng: np.random.Generator) -> Floats:
-    """Laser light with speckle of relative standard deviation `size` and mean 1: a gamma
-    distribution, as that of speckle averaged over a pixel (Goodman, Speckle Phenomena, 2007)."""
+    """Add laser speckle of relative standard deviation `size` and mean 1: a gamma distribution, as
+    for speckle averaged over a pixel (Goodman, Speckle Phenomena, 2007)."""
     if size <= 0:
         return image
     return image * (
@@ -93,14 +98,14 @@ def shade(camera: TrueCamera, optics: Optics) -> Floats | float:
 
 
 def off_focus(depth: Floats, focus_mm: float) -> Floats:
-    """How far out of focus depths (mm, > 0) are: |focus / depth - 1|, as the circle of confusion
-    grows; 0 at focus_mm, 1 at half of it and at most."""
+    """How far depths (mm, > 0) are out of focus: |focus / depth - 1|, proportional to the circle of
+    confusion; 0 at focus_mm, 1 at half of it, and never more."""
     return np.minimum(np.abs(np.float32(focus_mm) / depth - 1.0), 1.0)
 
 
 def blurs_of(optics: Optics, out_of_focus: Floats) -> list[tuple[float, Floats | None]]:
-    """The lens's Gaussian blurs, px, and the share (H, W) that each has in a pixel, None for all of
-    it: the blur is wider where the scene is out of focus (0..1)."""
+    """The lens's Gaussian blurs, px, and the share (H, W) of each in a pixel, None for all of it:
+    the blur is wider where the scene is out of focus (0..1)."""
     if optics.defocus_px <= 0:
         return [(optics.blur_px, None)]
     place = out_of_focus * (_FOCUS_STEPS - 1)

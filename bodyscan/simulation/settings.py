@@ -1,4 +1,4 @@
-"""Everything about a simulated scanner that can be chosen; each number with its unit."""
+"""Every setting of a simulated scanner; each number with its unit."""
 
 from __future__ import annotations
 
@@ -8,22 +8,25 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Optics:
-    """The cameras. Each pair's true lens is drawn around these values; pixels are those of an
-    image 1280 px wide and shrink with the image.
+    """The cameras.
+
+    Each pair's true lens is drawn around these values; pixels are those of an image 1280 px wide
+    and scale with the image.
 
     focal_widths: focal length in image widths; 1.18 sees 1.1 m at 1.3 m.
     focal_spread, aspect_spread: relative standard deviations of alpha, and of beta / alpha.
-    skew_px: gamma.  centre_px: standard deviation of the principal point about the middle.
-    k1, k2 and their standard deviations: Eq. 3-4, in normalized coordinates.
+    skew_px: gamma.
+    centre_px: standard deviation of the principal point about the middle.
+    k1, k2 and their standard deviations: Eq. 3-4, in normalised coordinates.
     p_spread, k3_spread: standard deviations of what a real lens has besides, p1 and p2 (an axis off
-    centre) and k3, as OpenCV numbers them.
-    blur_px: standard deviation of the lens's point spread, px of the image as it is (not scaled).
-    defocus_px: what is added to it (in quadrature) at half the working distance; it
-    grows as |working distance / distance - 1|.
+        centre) and k3, as OpenCV numbers them.
+    blur_px: standard deviation of the lens's point spread, px of the actual image (not scaled).
+    defocus_px: added to it (in quadrature) at half the working distance; grows as
+        |working distance / distance - 1|.
     vignetting: 0 none, 1 the full cos^4 law.
-    samples: the image is sampled at samples x samples points a pixel.
-    position_mm, angle_deg: standard deviation, for each axis, of the true pose about the
-    nominal one (projectors too).
+    samples: the image is sampled at samples x samples points per pixel.
+    position_mm, angle_deg: standard deviation, per axis, of the true pose about the nominal one
+        (projectors too).
     """
 
     focal_widths: float = 1.18
@@ -50,20 +53,21 @@ class Projection:
     """The projectors.
 
     kind: `mirror`, a laser sheet swept by a rotating mirror whose surface lies off its axis, or
-    `pinhole`, a projector with a lens (k1, k2 bend its sheets).
-    mirror_offset_mm: the mirror's surface lies this far off its axis (lowest, highest).
-    laser_mm: from the axis to the laser's apex.  sheet_tilt_deg: the laser sheet's angle
-    against the axis, give or take 30 %.  aim_mm: standard deviation of how far it misses the axis.
+        `pinhole`, a projector with a lens (k1, k2 bend its sheets).
+    mirror_offset_mm: how far the mirror's surface lies off its axis (lowest, highest).
+    laser_mm: from the axis to the laser's apex.
+    sheet_tilt_deg: the laser sheet's angle against the axis, give or take 30 %.
+    aim_mm: standard deviation of how far it misses the axis.
     near, far: the sweep covers the image between these distances, in working distances.
     margin: share of the sweep added at each end.
     blur_stripes: standard deviation of the light's spread across the stripes, in stripes.
-    defocus_stripes: what is added to it (in quadrature) at half the working distance; it
-    grows as |working distance / distance - 1|.
+    defocus_stripes: added to it (in quadrature) at half the working distance; grows as
+        |working distance / distance - 1|.
     jitter_stripes: standard deviation of each stripe boundary's place, drawn anew for each frame.
     smile_stripes: how far a stripe's ends are bowed from its middle.
     speckle: standard deviation of the laser's brightness, relative, drawn anew for each frame.
     flicker: standard deviation of each frame's brightness, relative.
-    gamma: of the light that a grey value becomes; what is black and white it leaves alone.
+    gamma: exponent from grey value to light; black and white do not change.
     k1, k2: lens of the pinhole kind.
     """
 
@@ -88,15 +92,16 @@ class Projection:
 
 @dataclass(frozen=True)
 class Lighting:
-    """Brightness. Grey levels are those at exposure 1 unless said otherwise.
+    """Brightness. Grey levels are those at exposure 1 unless stated otherwise.
 
     laser_grey: of a perfectly white surface that faces the projector at 0.85 working distances.
-    ambient_grey: what the room's own light adds to a perfectly white surface.
-    window_grey: what a large window adds where a white surface faces it, so large that it throws no
-    shadows with edges.  window_from: where it is, seen from the rig's centre.
+    ambient_grey: added by the room's own light to a perfectly white surface.
+    window_grey: added by a large window if a white surface faces it; it is so large that its
+        shadows have no edges.
+    window_from: direction to the window from the rig's centre.
     mains_hz, mains_depth: how often lamps pulse, and how far, relative (that of `ambient_grey`).
     board_grey, person_grey: each pair sets its exposure for each shot, so that the brightest
-    thousandth of the lit image begins at this grey level.
+        thousandth of the lit image begins at this grey level.
     shortest, longest: exposures it can set.
     """
 
@@ -114,12 +119,16 @@ class Lighting:
 
 @dataclass(frozen=True)
 class Noise:
-    """The sensor. electrons_per_grey: photo-electrons that make a grey level (shot noise at grey
-    200 is then sqrt(200 / 140) = 1.2).  photons: scales the number of photons, not the brightness.
-    read_grey: read noise, grey levels. Grey levels are rounded to 0..255.
-    pixel_gain, pixel_grey: standard deviations of each pixel's own gain, relative, and of what it
-    shows in the dark: the same in all of a camera's images.
-    gain_flicker: standard deviation of each frame's gain, relative."""
+    """The sensor. Grey levels are rounded to 0..255.
+
+    electrons_per_grey: photo-electrons per grey level (shot noise at grey 200 is then
+        sqrt(200 / 140) = 1.2).
+    photons: scales the number of photons, not the brightness.
+    read_grey: read noise, grey levels.
+    pixel_gain, pixel_grey: standard deviations of each pixel's own gain, relative, and of its dark
+        level: the same in all of a camera's images.
+    gain_flicker: standard deviation of each frame's gain, relative.
+    """
 
     electrons_per_grey: float = 140.0
     photons: float = 1.0
@@ -133,11 +142,12 @@ class Noise:
 class BoardMaking:
     """How well the board is made.
 
-    white, black, side: albedo.  bow_mm: its middle stands out by this much, towards the front.
-    warp_mm: besides, each board is bent and twisted, by between the lower and the higher, from its
-    highest to its lowest place.
-    print_error_mm: standard deviation, for each axis, of where a corner of a square was printed.
-    print_error: `smooth` (a slow wave over the board) or `corner` (each corner on its own).
+    white, black, side: albedo.
+    bow_mm: how far its middle stands out towards the front.
+    warp_mm: each board is also bent and twisted by between these two, from its highest to its
+        lowest place.
+    print_error_mm: standard deviation, per axis, of where a corner of a square was printed.
+    print_error: `smooth` (a slow wave over the board) or `corner` (each corner independently).
     """
 
     white: float = 0.8
@@ -151,17 +161,21 @@ class BoardMaking:
 
 @dataclass(frozen=True)
 class Person:
-    """skin: mean albedo.  skin_variation: how much it varies over the body, relative.
-    sway_mm: while the pairs capture one after another, in the rig file's order, the person moves
-    as a whole, by this much at the farthest and at head height.
+    """The subject, and how it moves.
+
+    skin: mean albedo.
+    skin_variation: how much it varies over the body, relative.
+    sway_mm: while the pairs capture one after another, in the rig file's order, the person moves as
+        a whole, by at most this much at head height.
     subdivisions: Loop subdivisions of the subject's mesh.
     size: factor on the subject's mesh.
-    All that follows happens while frames are taken, each at its own moment, and is smooth and random;
-    `presets.SUBJECTS` has what people do.
-    sway_mm_s: an upside-down pendulum on the ankles; speed of the top of the head, RMS.
-    breath_mm, breath_s: how far chest and belly come forward from breathed out to breathed in, and
-    how long a breath takes.
-    arms_deg, head_deg: each arm about its shoulder and the head about the neck turn by so much, RMS.
+
+    The rest happens while frames are taken, each at its own moment, and is smooth and random;
+    `presets.SUBJECTS` has values for people.
+    sway_mm_s: as an inverted pendulum on the ankles; RMS speed of the top of the head.
+    breath_mm, breath_s: how far chest and belly move from breathed out to breathed in, and the
+        duration of a breath.
+    arms_deg, head_deg: RMS rotation of each arm about its shoulder and of the head about the neck.
     """
 
     skin: float = 0.62
@@ -180,12 +194,16 @@ class Person:
 class Skin:
     """What covers the subject, besides its mean albedo (`Person.skin`).
 
-    spread_mm: light's mean free path under the skin; 0: none enters.  stays: share that does not
-    enter.  albedo: of the way inside.
+    spread_mm: light's mean free path under the skin; 0: none enters.
+    stays: share that does not enter.
+    albedo: of the path inside.
     oblique_mm: light comes out farther along, by this times the tangent of the refracted angle.
-    gloss: brightness of a highlight's middle, against white paper; gloss_power: how small it is.
-    mottling: standard deviation of the albedo over millimetres, relative.  moles: their number.
-    hair: albedo of the scalp's hair, and hair_mm how rough it is, standard deviation; 0: bald.
+    gloss: brightness of a highlight's middle, relative to white paper.
+    gloss_power: the larger, the smaller the highlight.
+    mottling: standard deviation of the albedo over millimetres, relative.
+    moles: their number.
+    hair: albedo of the scalp's hair; 0: bald.
+    hair_mm: its roughness, standard deviation.
     shorts: albedo of a pair of shorts; 0: none.
     """
 
@@ -204,10 +222,11 @@ class Skin:
 
 @dataclass(frozen=True)
 class Pace:
-    """When frames of a person are taken. Each is as short as nothing moves in it.
+    """When frames of a person are taken. Each is so short that nothing moves in it.
 
-    frame_ms: from one frame to the next; 120 a second.  start: of the pairs; as `timing` of
-    captures.yaml.  order: names of frames as they are taken, () as `bodyscan patterns` lists them.
+    frame_ms: from one frame to the next; by default 120 per second.
+    start: of the pairs; as `timing` of captures.yaml.
+    order: names of frames as they are taken, () as `bodyscan patterns` lists them.
     """
 
     frame_ms: float = 1000.0 / 120.0
@@ -219,7 +238,8 @@ class Pace:
 class Room:
     """Floor at z = 0 and four walls, so that stripes fall behind the board too.
 
-    wall_mm: from the rig's centre to the walls, but at least twice as far as the cameras."""
+    wall_mm: from the rig's centre to the walls, but at least twice as far as the cameras.
+    """
 
     floor: float = 0.22
     wall: float = 0.25
@@ -228,10 +248,10 @@ class Room:
 
 @dataclass(frozen=True)
 class InterReflection:
-    """Laser light that surfaces throw on each other, once (see `inter_reflection`).
+    """Laser light that surfaces cast on each other, one bounce (see `inter_reflection`).
 
-    facet_mm: it comes from facets of about this size, a few times smaller than what is hollow; 0:
-    there is none.  It costs time: a form factor for each pixel and lit facet.
+    facet_mm: size of the facets that emit it, a few times smaller than any hollow; 0: none. It
+        costs time: a form factor for each pixel and lit facet.
     """
 
     facet_mm: float = 0.0
@@ -239,7 +259,7 @@ class InterReflection:
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """All of them."""
+    """All settings of a simulated scanner."""
 
     optics: Optics = field(default_factory=Optics)
     projection: Projection = field(default_factory=Projection)

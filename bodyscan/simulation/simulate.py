@@ -40,15 +40,15 @@ _BRIGHT_AT = 0.85
 """Where a surface is as bright as `Lighting.laser_grey` says, in working distances."""
 
 _PAIRS, _BOARDS, _PLAN, _SKIN, _SWAY, _RAYS, _NOISE, _LIFE, _PIXELS = range(1, 10)
-"""What a random number is drawn for: each has a stream of its own, whatever the others draw."""
+"""Purposes of random numbers: each has its own stream, whatever the others draw."""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One pair's images of one shot: what stands there besides the room, and where.
+    """One pair's images of one shot: what is there besides the room, and where.
 
-    frames_ms: of what does not stand still, when each frame is taken; it is then `body`, which
-    surfaces show at the middle of that time.
+    frames_ms: when each frame is taken, for a subject that moves; it is then `body`, and the
+        surfaces show it at the middle of that time.
     """
 
     number: int
@@ -77,11 +77,13 @@ def simulate(
     """Write captures of the rig in `rig_file`, with known truth, into the folder `out`.
 
     subject: a body mesh (see `body.load_subject`); without one only boards are captured.
-    scale: of image size and number of stripes.  board_shots: besides the one that fixes the rig
-    frame; 40 for twelve pairs if not given; 0 for the subject alone, in front of a rig that was
-    calibrated before.  workers: pairs at the same time.
+    scale: of image size and number of stripes.
+    board_shots: not counting the one that fixes the rig frame; by default 40 for twelve pairs; 0
+        for the subject alone, in front of a rig that was calibrated before.
+    workers: pairs at the same time.
+
     The same arguments give the same bytes. Raises RigFileError, and BadInput for a rig without
-    nominal poses, a stripe code that only its decoder knows, or a subject that cannot be read.
+    nominal poses, a stripe code that the simulator does not know, or a subject that cannot be read.
     """
     settings = settings or SimulationSettings()
     rig = files.scale_rig(load_rig(rig_file), scale, CALIBRATION)
@@ -145,7 +147,7 @@ def _decide(
 
 
 def true_pairs(rig: Rig, settings: SimulationSettings, seed: int) -> dict[str, TruePair]:
-    """The pairs of a data set made with these settings and seed, wherever they are asked for."""
+    """The pairs of a data set with these settings and seed, wherever they are needed."""
     return build_pairs(rig, settings, lambda number: np.random.default_rng([seed, _PAIRS, number]))
 
 
@@ -180,7 +182,7 @@ def _tasks(truth: Truth, pair: str) -> list[Task]:
 
 
 def _at_their_times(task: Task, motion: Motion, pair: str) -> Task:
-    """The task with the person as that pair finds him, frame by frame."""
+    """The task with the person as that pair finds them, frame by frame."""
     return replace(
         task,
         surfaces=(motion.body.surface(motion.middle_ms(pair)),),
@@ -191,7 +193,7 @@ def _at_their_times(task: Task, motion: Motion, pair: str) -> Task:
 
 
 def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progress) -> None:
-    """Every image of every pair; each thread has a pair at a time."""
+    """Render every image of every pair; each thread has one pair at a time."""
     tasks = {name: _tasks(truth, name) for name in truth.pairs}
     tell = _counter("simulate", sum(map(len, tasks.values())), progress)
     room = build_room(truth.pairs.values(), truth.settings.room)
@@ -213,12 +215,12 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
 def sensor_of(
     camera: TrueCamera, settings: SimulationSettings, seed: int, number: int
 ) -> FixedPattern | None:
-    """What the pixels of the camera of that number do in every image, wherever they are asked for."""
+    """Fixed pattern of the camera with that number, wherever it is needed."""
     return fixed_pattern(camera, settings.noise, np.random.default_rng([seed, _PIXELS, number]))
 
 
 def _counter(stage: str, total: int, progress: Progress) -> Callable[[], None]:
-    """A function that counts its calls, from any thread, and tells how far things are."""
+    """A function that counts its calls, from any thread, and reports progress."""
     lock, done = Lock(), 0
     progress(stage, 0, total)
 
@@ -243,8 +245,11 @@ def render_task(
     fixed: FixedPattern | None = None,
     empty: EmptyRoom | None = None,
 ) -> None:
-    """One pair, one shot: cast, expose, write. fixed: of the camera's sensor.  empty: the room as
-    `see_empty` saw it, for pairs that take more than one shot."""
+    """Cast, expose and write one pair's images of one shot.
+
+    fixed: of the camera's sensor.
+    empty: the room as `see_empty` saw it, for pairs that take more than one shot.
+    """
     camera_from_rig = pair.rig_from_camera.inverse()
     camera_from_surfaces = camera_from_rig @ task.rig_from_surfaces
     around = _around(pair, room)
@@ -327,7 +332,7 @@ def _lamps(pair: TruePair, settings: SimulationSettings) -> Lamps:
 
 
 def _reach(body: LivingBody, moments_ms: Sequence[float]) -> float:
-    """How far anything goes meanwhile from where it is in the middle, mm. Motion is smooth: a few
-    moments tell, with something added."""
+    """Largest distance, mm, that anything moves meanwhile from its place at the middle of the time.
+    Motion is smooth: a few moments suffice, with a margin."""
     first, last = min(moments_ms), max(moments_ms)
     return 1.3 * body.farthest((first + last) / 2.0, np.linspace(first, last, 5))

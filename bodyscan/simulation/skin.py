@@ -1,4 +1,5 @@
-"""Skin lets light in and out again elsewhere: it spreads, and what enters obliquely comes out aside."""
+"""Skin as light sees it: light enters, spreads and leaves elsewhere, displaced if it came
+obliquely."""
 
 from __future__ import annotations
 
@@ -15,26 +16,28 @@ from bodyscan.simulation.settings import Skin
 Reals = NDArray[Any]
 
 REFRACTION = 1.4
-"""Index of skin."""
+"""Refractive index of skin."""
 
 _STEPS = 3
-"""Scales (pixels a millimetre) between which the spread is interpolated, from near to far."""
+"""Scales (pixels per mm) between which the spread is interpolated, from near to far."""
 _FINE = 9
-"""Points a pixel, each way, at which the profile is added up: it is steep in the middle."""
+"""Points per pixel, along each axis, at which the profile is summed: it is steep in the middle."""
 _REACH = 18.0
-"""Of a profile, in its shape parameter: beyond is a five-hundredth of the light."""
+"""Reach of a profile, in its shape parameter: a five-hundredth of the light lies beyond."""
 
 
 def shape_mm(skin: Skin) -> float:
-    """Burley's d, from the mean free path at the surface and its albedo (Christensen and Burley 2015,
-    Approximate Reflectance Profiles, Eq. 5)."""
+    """Burley's d, from the mean free path at the surface and its albedo (Christensen and Burley
+    2015, Approximate Reflectance Profiles, Eq. 5)."""
     return skin.spread_mm / (1.9 - skin.albedo + 3.5 * (skin.albedo - 0.8) ** 2)
 
 
 def spread_light(light: Floats, share: Floats, depth: Floats, alpha: float, skin: Skin) -> Floats:
     """Light (H, W) as it leaves: what enters skin comes out around there, and only from skin.
 
-    share: (H, W) of each pixel that is skin.  depth: (H, W) mm.  alpha: focal length, px.
+    share: (H, W) of each pixel that is skin.
+    depth: (H, W) mm.
+    alpha: focal length, px.
     """
     lit = share > 0
     if skin.spread_mm <= 0 or not lit.any():
@@ -55,7 +58,7 @@ def spread_light(light: Floats, share: Floats, depth: Floats, alpha: float, skin
 
 @lru_cache(maxsize=64)
 def _kernel(shape_px: float) -> Floats:
-    """(k, k) of Burley's profile (exp(-r / d) + exp(-r / 3 d)) / (8 pi d r), its sum 1."""
+    """Burley's profile (exp(-r / d) + exp(-r / 3 d)) / (8 pi d r), (k, k), normalised to sum 1."""
     half = max(1, int(np.ceil(_REACH * shape_px)))
     size = 2 * half + 1
     fine = (np.arange(size * _FINE) + 0.5) / _FINE - size / 2.0
@@ -67,23 +70,24 @@ def _kernel(shape_px: float) -> Floats:
 
 
 def came_in_at(points: Reals, towards: Reals, normals: Reals, oblique_mm: float) -> Reals:
-    """Where the light went in that comes out at points (N, 3): it travels on under the surface, by
+    """Where the light entered that leaves at points (N, 3): it continues under the surface, by
     `oblique_mm` times the tangent of the refracted angle.
 
-    towards: (N, 3) to where the light is from.  normals: (N, 3) of any length, to either side.
+    towards: (N, 3) to the source of the light.
+    normals: (N, 3) of any length, to either side.
     """
     away = -towards / np.linalg.norm(towards, axis=1, keepdims=True)
     unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     along = away - np.sum(away * unit, axis=1, keepdims=True) * unit
-    # Snell: along has the sine of the angle of incidence as its length.
+    # Snell: the length of `along` is the sine of the angle of incidence.
     inside = along / REFRACTION
     tangent = inside / np.sqrt(1.0 - np.sum(inside**2, axis=1, keepdims=True))
     return np.asarray(points - oblique_mm * tangent, points.dtype)
 
 
 def highlight(points: Reals, towards: Reals, normals: Reals, skin: Skin) -> Floats:
-    """(N,) brightness of the gloss at points, camera at the origin, 1 for a white matt surface that
-    faces the light (Blinn 1977)."""
+    """Brightness (N,) of the gloss at points, camera at the origin, relative to a white matt
+    surface that faces the light (Blinn 1977)."""
     view = -points / np.linalg.norm(points, axis=1, keepdims=True)
     light = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     half = view + light

@@ -1,4 +1,4 @@
-"""What was true: a JSON document that explains its own keys."""
+"""The truth: a JSON document that explains its own keys."""
 
 from __future__ import annotations
 
@@ -44,8 +44,9 @@ KEYS = {
 class Motion:
     """A living person and when each frame is taken.
 
-    times: by pair, then by frame, ms.  moment_ms: the middle of all, which the truth's surface shows.
-    stances: by pair, where the person stands besides (`body.draw_sways`).
+    times: by pair, then by frame, ms.
+    moment_ms: the middle of all times, which the truth's surface shows.
+    stances: by pair, additional displacement of the person (`body.draw_sways`).
     """
 
     body: LivingBody
@@ -54,7 +55,7 @@ class Motion:
     stances: Mapping[str, RigidTransform]
 
     def middle_ms(self, pair: str) -> float:
-        """Of the time in which a pair takes its frames."""
+        """Middle of the time in which a pair takes its frames."""
         return (min(self.times[pair].values()) + max(self.times[pair].values())) / 2.0
 
     def trunk(self, pair: str) -> RigidTransform:
@@ -64,11 +65,11 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """All that is decided before an image is made.
+    """Everything that is decided before an image is made.
 
     person: the subject's surface in the rig frame, standing still.
     sways: by pair, `swayed_from_still` of the person when that pair captures.
-    motion: what the person does meanwhile, None for one who does nothing.
+    motion: what the person does meanwhile; None if they do not move.
     """
 
     rig: str
@@ -84,7 +85,7 @@ class Truth:
 
 
 def describe(truth: Truth) -> dict[str, Any]:
-    """The truth as JSON values, but for the subject's surface."""
+    """The truth as JSON values, without the subject's surface."""
     making, motion = truth.settings.board, truth.motion
     perfect = not any((making.bow_mm, making.warp_mm[1], making.print_error_mm))
     return {
@@ -120,7 +121,7 @@ def _pair(pair: TruePair, sway: RigidTransform | None) -> dict[str, Any]:
 
 
 def describe_camera(camera: TrueCamera) -> dict[str, Any]:
-    """As calibrations have it: the lens's kind is left out where it is the chapter's."""
+    """A camera as in calibration files: the kind of lens is left out if it is the chapter's."""
     values, more = asdict(camera), ("p1", "p2", "k3")
     if any(values[name] for name in more):
         return {"lens": "brown"} | values

@@ -18,8 +18,9 @@ _BAND = 250_000
 class Band:
     """Part of an image, R rows and C columns, and its rays, z = 1.
 
-    rays: (R, C, K, 3) through places inside pixels.  shift: (R, C, 2) that moved these places, of
-    `lens.sample_offsets`.  corners: (R + 1, C + 1, 3) through the pixels' corners.
+    rays: (R, C, K, 3) through places inside pixels.
+    shift: (R, C, 2) by which these places were moved from `lens.sample_offsets`.
+    corners: (R + 1, C + 1, 3) through the pixels' corners.
     """
 
     rows: slice
@@ -55,7 +56,7 @@ class Band:
 
     @property
     def place(self) -> tuple[slice, slice]:
-        """Of its pixels in an image."""
+        """Slices of its pixels in an image."""
         return self.rows, self.columns
 
 
@@ -69,14 +70,14 @@ class View:
 
     @staticmethod
     def of(camera: TrueCamera, optics: Optics, rng: np.random.Generator) -> View:
-        """Rays through places inside each pixel that `rng` shifts."""
+        """Rays through places inside each pixel, shifted by `rng`."""
         rows = max(1, _BAND // (camera.width * optics.samples**2))
         cuts = [slice(r, min(r + rows, camera.height)) for r in range(0, camera.height, rows)]
         bands = (Band.of(camera, optics.samples, rng, cut) for cut in cuts)
         return View(camera, optics, tuple(bands))
 
     def around(self, chosen: Mask) -> Iterator[Band]:
-        """The bands in which pixels (H, W) are chosen, cut to the columns from first to last."""
+        """The bands that contain chosen pixels (H, W), cut to the columns from first to last."""
         for band in self.bands:
             columns = np.flatnonzero(chosen[band.rows].any(axis=0))
             if columns.size:

@@ -1,9 +1,9 @@
-"""Stripe boundaries that fall on an edge of the surface's own brightness, put right.
+"""Correction of stripe boundaries that fall on an edge of the surface's own brightness.
 
-A pixel gathers light around its middle x with a Gaussian weight of variance blur^2 (lens and
-pixel). On an edge between black and white the white side gives more of it: the light's centre of
-mass is x + blur^2 grad(ln a), a being the picture of the surface, and what a pixel says of the
-stripes holds there. So boundaries are moved by that much: by up to 0.6 px on a printed board.
+A pixel gathers light around its centre x with a Gaussian weight of variance blur^2 (lens and
+pixel). On an edge between black and white the white side contributes more: the light's centroid is
+x + blur^2 grad(ln a), with a the image of the surface, and what a pixel says of the stripes holds
+there. Boundaries are moved by that much, up to 0.6 px on a printed board.
 """
 
 from __future__ import annotations
@@ -27,23 +27,25 @@ UNEXPLAINED = 0.3
 SIGNIFICANCE = 2.5
 MAX_SLOPE = 1.0
 GENTLE_PX = 3
-"""Half the window over which shading is taken to change evenly."""
+"""Half the window over which shading is assumed to vary linearly."""
 WINDOW = 2 * GENTLE_PX + 1
 LEAST_PIXELS = np.float32(11.5)
 LEAST_SPREAD = np.float32(0.5)
 NOTHING, ONE, TWO, THREE, FOUR, NINE = (np.float32(number) for number in (0, 1, 2, 3, 4, 9))
 MAX_SHIFT_PX = 0.6
 LEAST_CONTRAST = 0.02
-"""Grey levels, of images that know parts of them."""
+"""Grey levels, for images with fractions of them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Brightness:
     """How bright the surface is, as scan lines of pixels.
 
-    logarithm: (L, P) of lit minus dark.  noise2: (L, P) its variance.  across: (L, P) its gradient
-    from line to line, 1/px, brought near `shading_across` where noise may explain the difference.
-    shading: (L, P) the gradient along the line of the gentle part, of many pixels around.
+    logarithm: (L, P) of lit minus dark.
+    noise2: (L, P), its variance.
+    across: (L, P) its gradient from line to line, 1/px, pulled towards that of the shading where
+        noise may explain the difference.
+    shading: (L, P) its gradient along the line, smoothed over many pixels.
     """
 
     logarithm: Floats
@@ -53,7 +55,7 @@ class Brightness:
 
     @staticmethod
     def of(images: ScanLines, variance: Floats, usable: Mask) -> Brightness:
-        """variance: (256,) of each grey level.  usable: (L, P) pixels on a lit surface."""
+        """variance: (256,) of each grey level. usable: (L, P) pixels on a lit surface."""
         logarithm, noise2 = np.empty((2, *images.lit.shape), np.float32)
         if images.lit.dtype == np.uint8:
             _measure(images.lit, images.dark, variance, _LOGARITHMS, logarithm, noise2)
@@ -64,7 +66,7 @@ class Brightness:
         return Brightness(logarithm, noise2, across, along)
 
     def at(self, place: Indices) -> BrightnessEdges:
-        """Between the pixels at flat places `place` (N,) and those behind them."""
+        """Brightness between the pixels at flat places `place` (N,) and those after them."""
         logarithm, noise2 = self.logarithm.ravel(), self.noise2.ravel()
         return BrightnessEdges(
             *_between(logarithm, noise2, self.across.ravel(), self.shading.ravel(), place)
@@ -75,9 +77,10 @@ class Brightness:
 class BrightnessEdges:
     """The surface's brightness where N stripe boundaries pass between two pixels of a scan line.
 
-    before, behind: (N,) grey levels (lit minus dark) of both, brought together where noise may
-    explain that they differ.  along, across: (N,) grad(ln a), 1/px, along the line and from line
-    to line, likewise.  sigma: (N,) the noise of `along`.
+    before, behind: (N,) grey levels (lit minus dark) of the two pixels, brought together where
+        noise may explain their difference.
+    along, across: (N,) grad(ln a), 1/px, along the line and from line to line, likewise.
+    sigma: (N,) the noise of `along`.
     """
 
     before: Array
@@ -87,11 +90,12 @@ class BrightnessEdges:
     sigma: Array
 
     def blur2(self, position: Array, joined: Mask) -> float:
-        """blur^2, px^2, that makes boundaries next to edges line up with their neighbours.
+        """blur^2, px^2, that makes boundaries at edges line up with their neighbours.
 
-        position: (N,) px along the scan line.  joined: (N - 1,) whether the next boundary is the
-        next of the same run. Where there are not edges enough to tell, a usual value: that of a
-        lens of 0.6 px and a pixel.
+        position: (N,) px along the scan line.
+        joined: (N - 1,) whether the next boundary is the next of the same run.
+
+        If there are too few edges, a usual value: that of a lens of 0.6 px and a pixel.
         """
         shifts = _shifts_at_edges(self.along, self.sigma, position, joined)
         if shifts.size < ENOUGH:
@@ -106,9 +110,10 @@ class BrightnessEdges:
 def without_edges_across(
     s: Floats, sigma: Floats, brightness: Brightness, blur2: float
 ) -> tuple[Floats, Floats]:
-    """s and sigma (L, P) with the pull of edges that run along the scan lines taken out of s.
+    """Remove from s (L, P) the pull of edges that run along the scan lines; returns s and its
+    sigma.
 
-    A pixel tells s at its light's centre of mass, which lies off the line by blur2 * across.
+    A pixel shows s at its light's centroid, which lies off the line by blur2 * across.
     """
     freed, doubt = np.empty(s.shape, np.float32), np.empty(s.shape, np.float32)
     s, sigma, across = map(np.ascontiguousarray, (s, sigma, brightness.across))
@@ -118,7 +123,7 @@ def without_edges_across(
 
 def gentle_gradient(image: Floats, usable: Mask) -> tuple[Floats, Floats]:
     """Gradient along and across the lines (L, P), 1/px, at usable pixels: least squares over the
-    usable ones of a small window; 0 where there are too few, and elsewhere."""
+    usable ones in a small window; 0 where there are too few, and at other pixels."""
     along, across = np.zeros((2, *image.shape), np.float32)
     shown = crop_of(usable)
     if shown is not None:
@@ -130,10 +135,11 @@ def gentle_gradient(image: Floats, usable: Mask) -> tuple[Floats, Floats]:
 def _gentle(
     image: Floats, usable: Mask, box: tuple[int, int, int, int], along: Floats, across: Floats
 ) -> None:
-    """Writes the gradient (L, P) line by line of a box that holds all usable pixels.
+    """Write the gradient (L, P) line by line within a box that holds all usable pixels.
 
-    inside, values: of the last WINDOW lines, which pixels are usable (1 or 0) and what they show;
-    with zeros on both sides.  columns: see `_sum_columns`, of both.
+    inside, values: for the last WINDOW lines, which pixels are usable (1 or 0) and what they show,
+        with zeros on both sides.
+    columns: see `_sum_columns`, of both.
     """
     first, last, left, right = box
     inner = slice(GENTLE_PX, GENTLE_PX + right - left)
@@ -164,7 +170,7 @@ def _gentle(
 
 @compiled
 def _shown(image: Floats, usable: Mask, inside: Floats, values: Floats) -> None:
-    """Writes of a line (P,) what is usable, as 1 or 0, and what it shows there, else 0."""
+    """Write, for a line (P,), which pixels are usable (1 or 0) and their values, else 0."""
     for u in range(image.size):
         inside[u] = usable[u]
         values[u] = image[u] * inside[u]
@@ -172,8 +178,8 @@ def _shown(image: Floats, usable: Mask, inside: Floats, values: Floats) -> None:
 
 @compiled
 def _sum_columns(rows: Floats, middle: int, sums: Floats) -> None:
-    """Writes sums (3, P) of v, y v and y^2 v over columns of WINDOW lines (line k is in row k mod
-    WINDOW), where y counts from the line in the middle."""
+    """Write sums (3, P) of v, y v and y^2 v over columns of WINDOW lines, y counted from the middle
+    line; line k is in row k mod WINDOW."""
     above3, above2, above = (
         rows[(middle - 3) % WINDOW],
         rows[(middle - 2) % WINDOW],
@@ -191,9 +197,9 @@ def _sum_columns(rows: Floats, middle: int, sums: Floats) -> None:
 
 @compiled
 def _fit_windows(columns: Floats, usable: Mask, along: Floats, across: Floats) -> None:
-    """Writes the gradient of a line (P,) from the sums over its columns, (2, 3, P + 2 GENTLE_PX).
+    """Write the gradient of a line (P,) from the sums over its columns, (2, 3, P + 2 GENTLE_PX).
 
-    What lies between is in arrays of its own: only then does the compiler know that they do not
+    Intermediate results have arrays of their own: only then does the compiler know that they do not
     overlap, and computes eight places at once.
     """
     ones, ones_y, values = columns[0, 0], columns[0, 1], columns[1, 0]
@@ -216,7 +222,7 @@ def _fit_windows(columns: Floats, usable: Mask, along: Floats, across: Floats) -
 
 @compiled
 def _even(row: Floats) -> Floats:
-    """Sums (P,) over WINDOW places of a row (P + 2 GENTLE_PX,)."""
+    """Sums (P,) of v over WINDOW places of a row (P + 2 GENTLE_PX,)."""
     total = np.empty(row.size - 2 * GENTLE_PX, np.float32)
     for u in range(total.size):
         near, far = row[u + 2] + row[u + 4], row[u] + row[u + 6]
@@ -226,7 +232,7 @@ def _even(row: Floats) -> Floats:
 
 @compiled
 def _odd(row: Floats) -> Floats:
-    """The same of x v, where x counts from the window's middle."""
+    """The same sums of x v, with x counted from the window's middle."""
     total = np.empty(row.size - 2 * GENTLE_PX, np.float32)
     for u in range(total.size):
         near, far = row[u + 4] - row[u + 2], row[u + 6] - row[u]
@@ -236,7 +242,7 @@ def _odd(row: Floats) -> Floats:
 
 @compiled
 def _square(row: Floats) -> Floats:
-    """The same of x^2 v."""
+    """The same sums of x^2 v."""
     total = np.empty(row.size - 2 * GENTLE_PX, np.float32)
     for u in range(total.size):
         near, far = row[u + 4] + row[u + 2], row[u + 6] + row[u]
@@ -246,13 +252,13 @@ def _square(row: Floats) -> Floats:
 
 @compiled
 def _significant(gradient: float, variance: float) -> float:
-    """A gradient, brought near zero if noise may explain it."""
+    """A gradient, reduced towards zero if noise may explain it."""
     square = gradient * gradient
     return gradient * square / (square + SIGNIFICANCE**2 * variance + 1e-12)
 
 
 def _measured_finely(lit: Greys, dark: Greys, variance: Floats) -> tuple[Floats, Floats]:
-    """As `_measure`, of images that know parts of grey levels."""
+    """As `_measure`, for images with fractions of grey levels."""
     contrast = np.maximum(lit - dark, LEAST_CONTRAST).astype(np.float32)
     at_lit, at_dark = (variance[grey.astype(np.uint8)] for grey in (lit, dark))
     return np.log(contrast), (at_lit + at_dark) / np.square(contrast)
@@ -267,7 +273,7 @@ def _measure(
     logarithm: Floats,
     noise2: Floats,
 ) -> None:
-    """Writes the logarithm of lit minus dark (L, P), and its variance."""
+    """Write the logarithm of lit minus dark (L, P), and its variance."""
     for line in range(lit.shape[0]):
         for place in range(lit.shape[1]):
             light, black = lit[line, place], dark[line, place]
@@ -279,7 +285,7 @@ def _measure(
 
 @compiled
 def _sharpen(logarithm: Floats, noise2: Floats, across: Floats) -> None:
-    """Adds to the gentle gradient from line to line (L, P) what noise does not explain."""
+    """Add to the smooth gradient from line to line (L, P) what noise does not explain."""
     for line in range(1, logarithm.shape[0] - 1):
         for place in range(logarithm.shape[1]):
             seen = (logarithm[line + 1, place] - logarithm[line - 1, place]) / np.float32(2)
@@ -308,8 +314,8 @@ def _between(
 
 @compiled
 def _shifts_at_edges(along: Array, sigma: Array, position: Array, joined: Mask) -> Array:
-    """Of boundaries within runs that lie on edges: how far they lie off the middle of their
-    neighbours, over how much steeper the brightness is there."""
+    """For boundaries within runs that lie on edges: the distance from the middle of their
+    neighbours, divided by how much steeper the brightness is there."""
     shifts, count = np.empty(along.size), 0
     for k in range(1, along.size - 1):
         if not (joined[k - 1] and joined[k]):

@@ -1,9 +1,10 @@
-"""Which bits of a stripe sequence are seen clearly, pixel by pixel, and what that says of its frames.
+"""Which bits of a stripe sequence are clear at each pixel, and what that says about its frames.
 
-Blur, bent grey levels, other surfaces' light and noise all weaken fine patterns more than coarse
-ones. So where a fine bit is clear, every coarser one is, but for the few pixels at its own boundaries.
-A pattern that is paired with another bit's inverse, or with the lit or the dark frame, is bright in
-both or dark in both over half of the picture, whatever the exposure; that nothing else explains.
+Blur, non-linear grey levels, light from other surfaces and noise all weaken fine patterns more than
+coarse ones. Where a fine bit is clear, so is every coarser one, except for the few pixels at its
+own boundaries. A pattern that is paired with another bit's inverse, or with the lit or the dark
+frame, is bright in both or dark in both over half of the image, whatever the exposure; nothing else
+does that.
 """
 
 from __future__ import annotations
@@ -17,37 +18,38 @@ from bodyscan.arrays import Floats, Greys, Mask
 from bodyscan.errors import DecodingFailed
 
 CLEAR = 4.0
-"""Sigmas of a pattern minus its inverse: noise alone does not get there."""
+"""Sigmas of a pattern minus its inverse: out of reach of noise alone."""
 
 SEEN = 0.02
-"""Of the pixels, those in which a pattern must be clear to be a pattern at all."""
+"""Share of the pixels in which a pattern must be clear to be a pattern at all."""
 
 STRONG, WEAK = 8.0, 0.25
-"""A bit is weak where its difference is less than a quarter of a finer bit's, itself of 8 sigmas."""
+"""A bit is weak if its difference is less than a quarter of a finer bit's of at least 8 sigmas."""
 
 MOST_WEAK, MOST_WEAK_FINE = 0.15, 0.35
-"""Of the pixels where a finer bit is strong. Blurred stripes are as weak as that in a seventh (2 asin
-(1/4) / pi) of their width beside their boundaries if they are the finest, coarser ones in half as
-much; a wrong inverse makes it half."""
+"""Shares of the pixels where a finer bit is strong. Blurred stripes of the finest bit are that weak
+in a seventh (2 asin(1/4) / pi) of their width, next to their boundaries; coarser ones in half as
+much. A wrong inverse makes it half."""
 FINE_BITS = 3
 MOST_BRIGHT = 0.85
-"""Of the pixels; half of them would be bright under stripes that are fine."""
+"""Share of the pixels; under fine stripes half of them would be bright."""
 FEWEST = 200
 ONE_SIDED = 0.25
-"""Of the contrast: a dark or lit frame for an inverse makes half of it, drifting exposure a few
-percent."""
+"""Share of the contrast: a dark or lit frame in place of an inverse gives half of it, drifting
+exposure a few percent."""
 SAME = 0.9
-"""Of the pixels that are equal to the last bit: noise leaves a fifth of them so, a copy all."""
+"""Share of the pixels that are exactly equal: noise leaves a fifth of them so, a copy all."""
 EVEN = 0.3
-"""Between the quartiles of an even grey, in shares of the contrast; of black and white it is nearly 1.
-Half of the light is a level of 0.5, or 0.73 if grey levels are bent."""
+"""Distance between the quartiles of an even grey, as a share of the contrast; for black and white
+it is nearly 1. Half of the light is a level of 0.5, or 0.73 if grey levels are non-linear."""
 
 
 @dataclass(frozen=True, eq=False)
 class LitPairs:
     """Patterns and inverses of pixels that the projector lights well, (bits, ...) each.
 
-    value: pattern minus inverse, grey levels.  sigma: its standard deviation.
+    value: pattern minus inverse, grey levels.
+    sigma: its standard deviation.
     """
 
     patterns: Greys
@@ -57,7 +59,7 @@ class LitPairs:
 
     @staticmethod
     def of(patterns: Greys, inverses: Greys, variance: Floats) -> LitPairs:
-        """Of images (bits, ...).  variance: (256,) of each grey level."""
+        """From images (bits, ...). variance: (256,) of each grey level."""
         value = patterns.astype(np.float32) - inverses
         levels = (images.astype(np.uint8, copy=False) for images in (patterns, inverses))
         sigma = np.sqrt(sum(variance[level] for level in levels))
@@ -65,17 +67,18 @@ class LitPairs:
 
     @property
     def clear(self) -> Mask:
-        """(bits, ...): where noise did not decide."""
+        """Where noise did not decide the bit, (bits, ...)."""
         return np.abs(self.value) >= CLEAR * self.sigma
 
     @property
     def coarse_clear(self) -> Mask:
-        """(...): where noise decided none but the finest bits."""
+        """Where noise decided none but the finest bits, (...)."""
         coarse = self.clear[: max(len(self.value) - FINE_BITS, 1)]
         return np.asarray(coarse.all(axis=0))
 
     def weak(self) -> Iterator[tuple[int, float]]:
-        """Of each bit but the finest, in which share of pixels it is weaker than a finer one."""
+        """For each bit but the finest, the share of pixels in
+        which it is weaker than a finer one."""
         size = np.abs(self.value)
         finer, strong = size[-1], size[-1] >= STRONG * self.sigma[-1]
         found = []
@@ -88,10 +91,12 @@ class LitPairs:
 
 
 def check_seen(pairs: LitPairs) -> None:
-    """Raises DecodingFailed for a bit that shows nowhere, or whose pattern is brighter than its inverse
-    nearly everywhere though its stripes are fine.
+    """Check that every bit shows, and that no fine pattern is brighter than its inverse nearly
+    everywhere.
 
     pairs: (bits, N).
+
+    Raises DecodingFailed.
     """
     clear = pairs.clear
     if clear.shape[1] < FEWEST:
@@ -122,7 +127,7 @@ def _blurred_away(pairs: LitPairs, bit: int) -> bool:
     """Whether a pattern is an even grey between the darkest and the brightest that each pixel sees.
 
     Then projector or lens could not show its stripes, and the pixels are judged one by one; a
-    pattern that was taken for its own inverse is black and white, or the same to the last bit.
+    pattern used as its own inverse is black and white, or exactly equal to it.
     """
     if np.mean(pairs.value[bit] == 0.0) > SAME:
         return False
@@ -134,7 +139,7 @@ def _blurred_away(pairs: LitPairs, bit: int) -> bool:
 
 
 def check_pairs(pairs: LitPairs) -> None:
-    """Raises DecodingFailed where a pattern and an inverse are not of one bit.  pairs: (bits, N)."""
+    """Raises DecodingFailed if a pattern and an inverse are not of one bit. pairs: (bits, N)."""
     bits = len(pairs.value)
     wrong = [
         (bit, share)
@@ -153,7 +158,7 @@ def check_pairs(pairs: LitPairs) -> None:
 
 
 def _partner(pattern: Greys, inverses: Greys, bit: int) -> str:
-    """Which inverse a pattern (N,) differs from most, if that is another bit's."""
+    """The inverse from which a pattern (N,) differs most, in words, if that is another bit's."""
     apart = np.abs(inverses.astype(np.float32) - pattern).mean(axis=1)
     other = int(apart.argmax())
     return f"pattern {bit} goes with inverse {other}" if other != bit else ""

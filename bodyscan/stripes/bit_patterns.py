@@ -1,4 +1,4 @@
-"""Stripes decoded from patterns of bits: Gray or plain binary code, with inverses or without."""
+"""Stripes decoded from patterns of bits: Gray or plain binary code, with or without inverses."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ from bodyscan.stripes.usable_pixels import MIN_CONTRAST, shown_pixels
 
 SAMPLES = 20_000
 COARSE_BITS = 3
-"""Finer ones may be blurred, and bent grey levels then make both frames brighter."""
+"""Finer patterns may be blurred; non-linear grey levels then brighten both pattern and inverse."""
 NOISE_GREY, MAX_OFF = 8, 0.25
-"""Grey levels that noise may put two frames off, and share of the contrast beyond which they were
-not exposed alike: boundaries would move by as much of their blur, a tenth of a pixel."""
+"""Grey levels by which noise may make two frames differ, and the share of the contrast beyond which
+they were not exposed alike: boundaries would move by that share of their blur, a tenth of a
+pixel."""
 
 
 def decode_bits(
@@ -41,10 +42,12 @@ def decode_bits(
     limits: StripeLimits | None,
     moments: Moments | None = None,
 ) -> StripeMap:
-    """The stripe map of `bit_lines`.  lit: (H, W) as the camera has it.  moments: when its images
-    were taken, if boundaries are to be carried to one moment.
+    """The stripe map from `bit_lines`.
 
-    Raises DecodingFailed if the images do not add up.
+    lit: (H, W) in the camera's layout.
+    moments: when its images were taken, if boundaries are to be carried to one moment.
+
+    Raises DecodingFailed if the images are inconsistent.
     """
     variance = noise_variance(images)
     codes = code.stripes(read_words(code, images, stripes, variance))
@@ -71,7 +74,7 @@ def decode_bits(
     if images.bands is not None:
         return boundary_map(images, lit, boundaries, stripes)
     s, sigma = interpolate_stripes(boundaries, codes, usable, carried)
-    if code.single:  # of others, codes at boundaries are misread by any number
+    if code.single:  # in other codes words at boundaries may be wrong by any number
         fill_from_codes(s, sigma, codes, shown)
     s, sigma = without_edges_across(s, sigma, brightness, boundaries.blur2)
     found = stripe_map(images, lit, s, sigma, boundaries, stripes, beyond)
@@ -86,11 +89,11 @@ def bit_lines(
     direction: str,
     bands: LineBands | None = None,
 ) -> ScanLines:
-    """The patterns (bits, H, W), and their inverses if there are any, as scan lines; those near
-    `bands` alone, if any.
+    """Lay out patterns (bits, H, W), and inverses if any, as scan lines, or only those near
+    `bands`.
 
-    Without a dark frame it is taken from the patterns and their inverses: every stripe is dark in
-    one of each two; and both lit and dark, if they were exposed otherwise. Raises DecodingFailed if
+    A missing dark frame is made from the patterns and their inverses: every stripe is dark in one
+    of each two. So are both lit and dark if they were exposed differently. Raises DecodingFailed if
     there are no inverses either.
     """
     turned, chosen = direction == "horizontal", None
@@ -116,8 +119,8 @@ def bit_lines(
 
 
 def _exposed_alike(lit: Greys, dark: Greys, patterns: Greys, inverses: Greys) -> bool:
-    """Whether the brighter of a coarse pattern and its inverse is as bright as the lit frame, and the
-    darker one as dark as the dark one; cameras that expose by themselves make them others."""
+    """Whether the brighter of a coarse pattern and its inverse is as bright as the lit frame, and
+    the darker as dark as the dark one; a camera with automatic exposure makes them differ."""
     step = max(1, math.isqrt(lit.size // SAMPLES))
     some = (slice(None, None, step), slice(None, None, step))
     light, black = lit[some].astype(np.float32), dark[some].astype(np.float32)
@@ -138,8 +141,12 @@ def _exposed_alike(lit: Greys, dark: Greys, patterns: Greys, inverses: Greys) ->
 def read_words(
     code: WordCode, images: ScanLines, count: int, variance: Floats
 ) -> NDArray[np.uint16]:
-    """(L, P) code words, of which there are `count`. Raises DecodingFailed if the frames do not
-    add up.  variance: (256,) of each grey level."""
+    """Code words (L, P), of which there are `count`.
+
+    variance: (256,) of each grey level.
+
+    Raises DecodingFailed if the frames are inconsistent.
+    """
     check_exposure(images)
     words = images.words()
     check_codes(images, words, code, count, variance)

@@ -1,7 +1,7 @@
-"""Stripes written in bits, most significant first: the reflected binary (Gray) and the plain code.
+"""Stripes as binary words, most significant bit first: reflected (Gray) and plain code.
 
 Gray code writes stripe i as i ^ (i >> 1). From one stripe to the next exactly one bit flips, so a
-pixel at a boundary is never off by more than the stripe next to it. The plain code writes i itself.
+pixel at a boundary is never off by more than one stripe. The plain code writes i itself.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def stripe_from_gray(gray: NDArray[np.uint16]) -> NDArray[np.int32]:
 def bit_that_flips(boundary: Indices, bits: int) -> Indices:
     """Which bit (0 the most significant) flips at boundary i > 0, between numbers i - 1 and i.
 
-    Of the plain code, in which several do, it is the coarsest.
+    In the plain code, where several flip, the coarsest of them.
     """
     lowest_set = np.frexp((boundary & -boundary).astype(np.float64))[1].astype(np.int64) - 1
     return bits - 1 - lowest_set
@@ -40,11 +40,13 @@ def bit_that_flips(boundary: Indices, bits: int) -> Indices:
 
 @dataclass(frozen=True)
 class WordCode:
-    """How stripes are written in words, and words read.
+    """How stripes are written as words, and words read.
 
-    encode, decode: numbers to words and back.  single: neighbours differ in one bit.  doubt_px:
-    added to the sigma of boundaries, where the finest pattern's stripes are one wide and not two,
-    and blur into each other (seen in tests).  first: the number of stripe 0.
+    encode, decode: numbers to words and back.
+    single: whether neighbours differ in one bit.
+    doubt_px: added to the sigma of boundaries if the finest pattern's stripes are one wide instead
+        of two, and blur into each other (found in tests).
+    first: the number of stripe 0.
     """
 
     encode: Callable[[NDArray[Any]], NDArray[Any]]
@@ -54,22 +56,23 @@ class WordCode:
     first: int = 0
 
     def stripes(self, words: NDArray[np.uint16]) -> NDArray[np.int32]:
-        """Stripes of code words; below 0 of words before the first."""
+        """Stripes of code words; negative for words before the first."""
         numbers = self.decode(words)
         return numbers - np.int32(self.first) if self.first else numbers
 
     def bits(self, stripes: Indices, count: int) -> Array:
-        """(count, N): 1 or 0 for each bit of stripes (N,), the most significant first."""
+        """Bits (count, N), 1 or 0, of stripes (N,), the most significant first."""
         shift = np.arange(count)[::-1, None]
         return np.asarray(self.encode(stripes + self.first) >> shift & 1, float)
 
     @property
     def finest_run(self) -> int:
-        """How many stripes wide those of the finest pattern are."""
+        """Width of the finest pattern's stripes, in stripes."""
         return 2 if self.single else 1
 
     def two_wide(self, bits: int) -> int:
-        """The bit whose stripes are two wide: Gray code's finest, and the plain code's next."""
+        """The bit whose stripes are two wide: Gray code's
+        finest, the plain code's next to finest."""
         return bits - 1 if self.single else max(bits - 2, 0)
 
 

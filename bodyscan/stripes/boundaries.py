@@ -19,7 +19,7 @@ from bodyscan.stripes.scan_lines import ScanLines
 MAX_RATIO = 0.98
 TABLE_SIZE = 4096
 LEAST_SIGMA_PX = 0.008
-"""What blur that is not Gaussian and a sensor that is not quite linear leave, seen in tests."""
+"""Error left by blur that is not Gaussian and a sensor that is not quite linear, found in tests."""
 
 MIN_STRIPE_PX = 0.2
 FARTHEST_PX = 1.0
@@ -32,13 +32,16 @@ _STRETCH = np.sqrt(np.pi) / 2.0 * np.exp(_STRAIGHT**2)
 
 @dataclass(frozen=True, eq=False)
 class Boundaries:
-    """Boundaries in the order of scan lines and of places on them.
+    """Boundaries, sorted by scan line and by place along it.
 
-    line: (N,) scan line.  before: (N,) the pixel before the crossing.  position: (N,) px along the
-    line.  line_position: (N,) px, beside the line by a fraction where an edge of brightness pulls
-    it.  sigma_px: (N,) standard deviation across the stripes.  index: (N,) boundary i lies between
-    stripes i - 1 and i.  joined: (N - 1,) whether the next boundary ends the stripe that this one
-    begins.  blur2: px^2, of lens and pixel, see `albedo_edges`.
+    line: (N,) scan line.
+    before: (N,) the pixel before the crossing.
+    position: (N,) px along the line.
+    line_position: (N,) px across lines; a fraction off `line` where an edge of brightness pulls it.
+    sigma_px: (N,) standard deviation across the stripes.
+    index: (N,) boundary i lies between stripes i - 1 and i.
+    joined: (N - 1,) whether the next boundary ends the stripe that this one begins.
+    blur2: px^2, of lens and pixel, see `albedo_edges`.
     """
 
     line: Indices
@@ -62,11 +65,13 @@ def find_boundaries(
 ) -> Boundaries:
     """All places where the code changes by one between two usable pixels of a line.
 
-    Only one bit flips there. Its pattern minus its inverse, divided by lit minus dark (which takes
-    out most of the surface's own black and white) and less its `imbalance`, is an error function of
-    the distance from the boundary whatever the blur; the inverse error function makes it a straight
-    line, whose zero is the boundary. variance: (256,) of each grey level.  finest_run, first: see
-    `WordCode`.
+    Only one bit flips there. Its pattern minus its inverse, divided by lit minus dark (which
+    removes most of the surface's own black and white) and less its `imbalance`, is an error
+    function of the distance from the boundary, whatever the blur; the inverse error function turns
+    it into a straight line, whose zero is the boundary.
+
+    variance: (256,) of each grey level.
+    finest_run, first: see `WordCode`.
     """
     at = _crossings(codes, usable)
     line, before = np.divmod(at, codes.shape[1])
@@ -76,7 +81,7 @@ def find_boundaries(
     edges = brightness.at(at)
     clear = (
         (number & -number) * finest_run // 2
-    )  # stripes: half the way to where the bit flips again
+    )  # stripes: half the distance to where the bit flips again
     middle = imbalance(images, codes, usable, variance, bit, index, at, clear)
     beside = np.stack([at, at + 1], axis=-1)
     fraction, sigma = _zeros(
@@ -103,10 +108,10 @@ def find_boundaries(
 def continues_to_next(
     line: Indices, before: Indices, position: Array, index: Indices, usable: Mask
 ) -> Mask:
-    """(N - 1,) whether the next boundary ends the stripe that this one begins.
+    """Whether the next boundary ends the stripe that this one begins, (N - 1,).
 
-    All pixels between the two must be usable (L, P): where one is not, the surface may end, and
-    another that happens to show the next stripe begin.
+    All pixels between the two must be usable (L, P): at one that is not, the surface may end and
+    another, which happens to show the next stripe, begin.
     """
     return _joined(line, before, position, index, usable)
 
@@ -126,13 +131,13 @@ def _joined(line: Indices, before: Indices, position: Array, index: Indices, usa
 
 @compiled
 def _crossings(codes: NDArray[np.int32], usable: Mask) -> Indices:
-    """(N,) flat pixels, usable as the next of their line is, whose codes differ by one."""
+    """Flat pixels (N,), usable like the next on their line, whose codes differ by one."""
     found, count = np.empty(codes.size, np.int64), 0
     for line in range(codes.shape[0]):
         if not usable[line].any():
             continue
         for place in range(codes.shape[1] - 1):
-            # Without a branch: on a noisy image a processor guesses wrong every other time.
+            # Without a branch: on a noisy image a processor mispredicts every other one.
             found[count] = line * codes.shape[1] + place
             step = abs(codes[line, place + 1] - codes[line, place])
             count += usable[line, place] & usable[line, place + 1] & (step == 1)
@@ -148,9 +153,10 @@ def _zeros(
     middle: Array,
     middle_sigma: Array,
 ) -> tuple[Array, Array]:
-    """Where the difference is the middle one, px behind the pixel before it, and its sigma.
+    """Where the difference takes its middle value, in px after the pixel before it, and its sigma.
 
-    difference, noise: (N, 2) in the pixels before and behind; before, behind: (N,) lit minus dark.
+    difference, noise: (N, 2) in the pixels before and behind.
+    before, behind: (N,) lit minus dark.
     """
     fraction, sigma = np.empty(before.size), np.empty(before.size)
     for k in range(before.size):
@@ -173,7 +179,7 @@ def _zeros(
 def _straightened(
     difference: float, noise: float, contrast: float, middle: float, middle_sigma: float
 ) -> tuple[float, float]:
-    """Distance from the boundary in units of sqrt(2) blurs (with a sign), and its sigma."""
+    """Signed distance from the boundary in units of sqrt(2) blurs, and its sigma."""
     ratio = min(max(difference / contrast - middle, -MAX_RATIO), MAX_RATIO)
     entry = int(np.rint((ratio / MAX_RATIO + 1.0) * (TABLE_SIZE / 2)))
     doubt = math.sqrt((noise / contrast) ** 2 + middle_sigma**2)

@@ -1,8 +1,8 @@
-"""How far boundaries scatter about smooth runs of their neighbours, against what their sigmas claim.
+"""Scatter of boundaries about smooth runs of their neighbours, compared with their sigmas.
 
-Grey noise is measured where two images show the same. JPEG errs with what an image shows, exposures
-wander from a pattern to its inverse, pixels of projector and camera beat: each shifts a boundary
-beside its neighbours, and all of it is seen there.
+Grey noise is measured where two images show the same thing. But JPEG errs with the content of an
+image, exposures vary from a pattern to its inverse, and pixels of projector and camera beat: each
+shifts a boundary relative to its neighbours, and all of it shows here.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from bodyscan.stripes.stripe_coordinates import REACH_PX, SMOOTHERS
 
 FEWEST, ENOUGH = 1000, 20_000
 CLEARLY = 1.2
-"""Sigmas that claim so much too little are put right: less may be the surface."""
+"""Sigmas too small by this factor are corrected; less may be due to the surface."""
 
 
 def scatter(boundaries: Boundaries) -> float:
     """Robust ratio of seen to claimed distances from a parabola through five boundaries of a run; 1
-    where it is not clearly more, or too few tell."""
+    if it is not clearly more, or there are too few."""
     weights = SMOOTHERS[0]
     middle, span = len(weights) // 2, len(weights) - 1
     if len(boundaries.joined) < span:

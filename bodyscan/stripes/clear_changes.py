@@ -1,4 +1,4 @@
-"""Where along a scan line a Gray code changes in one bit, and noise has no part in the others."""
+"""Where a Gray code changes in one bit along a scan line, with noise ruled out in the others."""
 
 from __future__ import annotations
 
@@ -15,23 +15,27 @@ Words = NDArray[np.uint16]
 
 MOST_OF_A_BIT = 2000
 ENOUGH = 600_000
-"""Of the pixels lines are taken until there are so many."""
+"""Lines are added until they hold so many pixels."""
 BESIDE_PX = 4
 RIM = 2.0
-"""Times that one side of a change is as bright as the other: a rim, behind which another surface shows
-any stripe, or the edge of a print; changes there tell nothing of the order of frames."""
+"""Brightness ratio of the two sides of a change that means a rim, behind which another surface may
+show any stripe, or the edge of a print; changes there say nothing of the order of frames."""
 EVERY = 61
-"""Lines are taken so far apart, then those beside them, so that few tell of the whole picture."""
+"""Lines are taken this far apart, then those beside them,
+so that a few represent the whole image."""
 
 
 def clear_changes(
     images: ScanLines, words: Words, good: Mask, variance: Floats
 ) -> tuple[Words, Words, Words]:
-    """Code words (N,) of good neighbours that differ in one bit, and which finer bits to leave out.
+    """Code words (N,) of good neighbours that differ in one bit, and a mask of finer bits to
+    ignore.
 
-    Noise may have turned those; every coarser one is clear in both pixels, and so is the next finer
-    than the one that flips. Of each bit no more than a sample is taken.
-    words, good: (L, P).  variance: (256,) of each grey level.
+    Noise may have flipped those; every coarser one is clear in both pixels, and so is the bit next
+    finer than the one that flips. Only a sample is taken of each bit.
+
+    words, good: (L, P).
+    variance: (256,) of each grey level.
     """
     assert images.inverses is not None
     bits = len(images.patterns)
@@ -63,12 +67,12 @@ def _collect(
             flip = words[line, place] ^ words[line, place + 1]
             if flip == 0 or flip & (flip - 1) or not (good[line, place] and good[line, place + 1]):
                 continue
-            at = 0  # of the bit that flips, from the finest
+            at = 0  # of the bit that flips, counted from the finest
             while flip >> (at + 1):
                 at += 1
             if at == 0 or taken[at] == MOST_OF_A_BIT:
                 continue
-            end = 0  # bits below that one are left out
+            end = 0  # bits below that one are ignored
             for bit in range(bits):
                 height = bits - 1 - bit
                 if height == at or height < end:
@@ -93,7 +97,7 @@ def _collect(
 
 @compiled
 def _is_rim(bright: Greys, place: int) -> bool:
-    """Whether the change from `place` to the next along a line (P,) is where brightness changes too."""
+    """Whether brightness changes too from `place` to the next along a line (P,)."""
     before = np.float32(bright[max(place - BESIDE_PX, 0)])
     after = np.float32(bright[min(place + 1 + BESIDE_PX, len(bright) - 1)])
     return bool(max(before, after) > RIM * min(before, after))
@@ -109,8 +113,8 @@ def _lasts(
     place: int,
     flip: int,
 ) -> bool:
-    """Whether a coarse bit is clear a little off its flip, and still what it was beside it: where it
-    is weak all over, noise turns it to and fro."""
+    """Whether a coarse bit is clear a little off its flip and unchanged since: where it is weak
+    throughout, noise flips it to and fro."""
     for far, near in ((place - BESIDE_PX, place), (place + 1 + BESIDE_PX, place + 1)):
         if not 0 <= far < words.shape[1] or (words[line, far] ^ words[line, near]) & flip:
             return False

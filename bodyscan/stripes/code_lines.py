@@ -1,8 +1,8 @@
-"""s where no boundaries tell it: from the codes of the pixels around, which lie along a line.
+"""s where there are no boundaries: from a line fitted to the codes of the pixels around.
 
-Where stripes are narrower than two pixels, or so blurred that noise turns the finest bits, the code
-leaps by two or three from pixel to pixel, and a run of boundaries breaks at each leap. Codes are
-still right to a stripe or so, and a line through those of some pixels is right to a fraction.
+Where stripes are narrower than two pixels, or so blurred that noise flips the finest bits, the code
+jumps by two or three from pixel to pixel, and a run of boundaries breaks at each jump. Codes are
+still right to about a stripe, and a line through several of them is right to a fraction.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from bodyscan.compiled import compiled
 
 REACH_PX = 4
 FEWEST, FEWEST_BESIDE = 6, 2
-"""Pixels with a code in the window, and on each side of its middle: at a rim it tells nothing."""
+"""Pixels with a code in the window, and on each side of its middle: at a rim a line is
+unreliable."""
 
 LEAST_SLOPE = 0.35
-"""Stripes a pixel: in wider stripes neighbours have the same code, and a line says nothing."""
+"""Stripes per pixel: in wider stripes neighbours have the same code, and a line says nothing."""
 
 WITHIN, MOST_WITHIN = 1.0, 2.0 / 3.0
-"""Stripes from the line, and how many pixels lie so near: codes do within 0.5, and those misread by
-one nearly so; of two surfaces one behind the other half does not."""
+"""Distance from the line in stripes, and the least share of pixels within it: correct codes are
+within 0.5, misread ones hardly farther; of two surfaces one behind the other half are not."""
 
 MAX_RMS = 1.2
 """Stripes: a wrong finest bit is off by one, the next by up to three."""
@@ -34,9 +35,9 @@ ROUNDING = 12.0**-0.5
 
 
 def fill_from_codes(s: Floats, sigma: Floats, codes: NDArray[np.int32], shown: Mask) -> None:
-    """Writes s and its standard deviation (L, P) into pixels that are `shown` and have none.
+    """Write s and its standard deviation (L, P) into pixels that are `shown` and have none.
 
-    A pixel whose own code is a stripe off the line of its neighbours stays without.
+    A pixel whose own code is a stripe off the line of its neighbours gets none.
     """
     _fill(s, sigma, codes, shown)
 
@@ -53,8 +54,9 @@ def _fill(s: Floats, sigma: Floats, codes: NDArray[np.int32], shown: Mask) -> No
 
 @compiled
 def _line_at(codes: NDArray[np.int32], shown: Mask, middle: int) -> tuple[float, float]:
-    """How far the line through the codes (P,) around a pixel passes from its own, and the line's
-    sigma there; a sigma of 0 if there is no line, or no leap that boundaries break at."""
+    """Offset, at a pixel, of the line through the codes (P,) around it from its own code, and the
+    line's sigma there; sigma 0 if there is no line, or no jump that would break a run of
+    boundaries."""
     first, last = max(middle - REACH_PX, 0), min(middle + REACH_PX, codes.size - 1)
     leaps, last_code = False, 0
     count, before, x1, y1, x2, xy, y2 = 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0

@@ -1,9 +1,9 @@
-"""The comb that motion makes of stripe boundaries: what moved while a sequence was taken shows it.
+"""The comb that motion during a sequence makes of stripe boundaries.
 
-In a bit code, boundaries of neighbouring stripes are seen in different images: every other one in the
-finest pattern, a quarter of them in the next, and so on. A boundary's place belongs to the moment of
-its own images, so that on a moving surface neighbours stand out against each other like teeth, by
-the speed times how far apart they were seen. No smooth surface does that.
+In a bit code, boundaries of neighbouring stripes are seen in different images: every other one in
+the finest pattern, a quarter of them in the next, and so on. A boundary's place belongs to the
+moment of its own images, so on a moving surface neighbours stand out against each other like teeth,
+by the speed times the time between them. No smooth surface does that.
 """
 
 from __future__ import annotations
@@ -16,27 +16,29 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.stripes.boundaries import Boundaries
 
 TEETH = 8
-"""Boundaries of a window: half of them of the finest pattern, one at least of the fourth finest."""
+"""Boundaries per window: half of them of the finest pattern, at least one of the fourth finest."""
 DEGREE = 3
-"""Of s along a window of the still surface: what bends more within so little (12 mm) is an edge."""
+"""Degree of s along a window on a still surface: what bends more over 12 mm is an edge."""
 
 ENOUGH = 16_000
-"""Windows, evenly chosen: they tell a rigid speed to some 0.05 mm/s, all of them hardly better."""
+"""Windows, evenly sampled: enough for a rigid speed to about
+0.05 mm/s; all of them hardly do better."""
 LEAST_TOLD = 1e-6
-"""Of the variance of times: what rounding leaves where they are a cubic of the index."""
+"""Share of the variance of times: what rounding leaves if they are a cubic of the index."""
 COMMON_PX = 1e-3
-"""By so much may boundaries of one pattern lie beside those of another though nothing moves, all over
-a picture: on the boards of procam-board, which stood still, 0.0007 to 0.0017."""
+"""By how much boundaries of one pattern may be shifted against another's all over an image, though
+nothing moves: 0.0007 to 0.0017 on the boards of procam-board, which stood still."""
 
 
 @dataclass(frozen=True, eq=False)
 class Comb:
-    """What windows of neighbouring boundaries of one scan line tell of motion.
+    """What windows of neighbouring boundaries on one scan line say about motion.
 
     s, pixels: (N, 2) and (N, 2, 2), stripe coordinates and places, px, of the first and the second
-    half of each window.  speed: (N,) how fast s changes at a pixel that stays where it is, stripes per
-    unit of time.  sigma: (N,) its standard deviation by those of the boundaries.  common: (N,) another
-    one that all windows share.
+        half of each window.
+    speed: (N,) how fast s changes at a fixed pixel, stripes per unit of time.
+    sigma: (N,) standard deviation of the speed due to those of the boundaries.
+    common: (N,) another one, due to an error that all windows share.
     """
 
     s: Array
@@ -47,10 +49,12 @@ class Comb:
 
 
 def find_comb(boundaries: Boundaries, times: Array, *, turned: bool) -> Comb:
-    """times: (N,) when each boundary was seen.  turned: scan lines are the camera image's columns.
+    """Fit each window of boundaries, place against index, by a cubic plus a speed times the time.
 
-    In each window place over index is a cubic and a speed times the time, by least squares. Windows
-    in which time does not differ from a cubic tell nothing and are left out.
+    times: (N,) when each boundary was seen.
+    turned: scan lines are the camera image's columns.
+
+    Windows whose times do not differ from a cubic say nothing and are left out.
     """
     window = _window_starts(boundaries)[:, None] + np.arange(TEETH)
     still = _smooth_part()
@@ -74,11 +78,11 @@ def find_comb(boundaries: Boundaries, times: Array, *, turned: bool) -> Comb:
 
 
 def _window_starts(boundaries: Boundaries) -> Indices:
-    """First boundaries of windows in unbroken runs that count one way.
+    """First boundaries of windows in unbroken runs with the index changing in one direction.
 
-    Every scan line is cut between the same stripes: what strays with its stripe is then in one window
-    of each line, and not in half of two, where it would look like what neighbours have in common. In
-    the middle of a window is the boundary of its coarsest pattern: at an end the cubic would hide it.
+    Every scan line is cut between the same stripes: an error of one stripe is then in one window of
+    each line, and not half in each of two, where it would look common to neighbours. The middle of
+    a window is the boundary of its coarsest pattern: at an end the cubic would hide it.
     """
     count = len(boundaries.line)
     begins = np.flatnonzero(np.append(True, ~boundaries.joined)) if count else np.empty(0, np.int64)
@@ -93,7 +97,7 @@ def _window_starts(boundaries: Boundaries) -> Indices:
 
 
 def _smooth_part() -> Array:
-    """(TEETH, TEETH): takes values of a window to their cubic."""
+    """Projection (TEETH, TEETH) of a window's values onto a cubic."""
     powers = np.vander(np.linspace(-1.0, 1.0, TEETH), DEGREE + 1)
     basis, _ = np.linalg.qr(powers)
     return np.asarray(basis @ basis.T, np.float64)

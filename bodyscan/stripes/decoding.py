@@ -1,4 +1,4 @@
-"""From what a camera saw of a stripe sequence to its stripe map."""
+"""Decoding: from the images of a stripe sequence to its stripe map."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def decode_stripes(
 
     lit, dark: (H, W); None if the code can do without (see docs/formats.md).
     coded: (F, H, W), the images of the code in the order of its `image_counts`, then those of the
-    stripes that cross, which give the map's `crossing`.
+        crossing stripes, which give the map's `crossing`.
     limits: the stripes that matter; others get no s.
-    moments: of the code's images, then of those of the stripes that cross, if what moved meanwhile
-    is to be told and taken out.
+    moments: of the code's images, then of those of the crossing stripes, if motion is to be
+        measured and removed.
     bands: where boundaries are wanted, and no s.
 
-    Raises DecodingFailed, naming the image where it can be told, if they do not add up. Where only
-    those of the stripes that cross do not, the map is that of the others and says why.
+    Raises DecodingFailed, naming the image if it can be identified, for inconsistent images. If
+    only those of the crossing stripes are inconsistent, the map is that of the others and says why.
     """
     try:
         own, *others = images_by_kind(code, coded)
@@ -82,7 +82,7 @@ def _decode(
 
 
 def restrict(found: StripeMap, limits: StripeLimits) -> StripeMap:
-    """The stripe map with s between the limits only."""
+    """The stripe map with s only between the limits."""
     kept, beyond = limits.split(found.s, np.isfinite(found.s))
     nothing = np.float32(np.nan)
     s, sigma = np.where(kept, found.s, nothing), np.where(kept, found.sigma, nothing)
@@ -90,7 +90,7 @@ def restrict(found: StripeMap, limits: StripeLimits) -> StripeMap:
 
 
 def images_by_kind(code: StripeCode, coded: Greys) -> list[dict[ImageKind, Greys]]:
-    """The images (F, H, W) of a code, and of the stripes that cross, by their kinds.
+    """The images (F, H, W) of a code, and of the crossing stripes, by kind.
 
     Raises DecodingFailed if there are too few or too many.
     """

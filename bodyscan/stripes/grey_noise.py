@@ -1,4 +1,4 @@
-"""How noisy grey levels are, measured from the stripe sequence itself."""
+"""Noise of grey levels, measured from the stripe sequence itself."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ ENOUGH_PIXELS = 500
 LARGEST_DIFFERENCE = 24
 BRIGHTEST = 250
 LEAST_VARIANCE = 0.15
-"""Rounding to whole grey levels (1/12), and a little."""
+"""Rounding to whole grey levels (1/12), with a margin."""
 
 LEAST_FINE_VARIANCE = LEAST_VARIANCE / 16.0**2
-"""The same of 12 bits: what has more is noise in any camera."""
+"""The same for 12 bits: anything more is noise in any camera."""
 
 
 def noise_variance(images: ScanLines) -> Floats:
-    """(256,) variance of one frame's grey level, for each grey level.
+    """Variance (256,) of one frame's grey level, for each grey level.
 
-    Away from the few edges of the coarsest pattern, the brighter of it and its inverse shows what
-    the lit frame shows, and the other one what the dark frame shows (without inverses the pattern
-    shows one of the two): what differs is noise. It is
-    measured for each band of grey levels, because light itself is noisy (and a laser's speckle
-    more so), and smoothed by a line a + b grey that is nowhere falling.
+    Away from the few edges of the coarsest pattern, the brighter of it and its inverse shows the
+    same as the lit frame, and the other the same as the dark frame (without inverses the pattern
+    shows one of the two): the difference is noise. It is measured for each band of grey levels,
+    because light itself is noisy (laser speckle more so), and smoothed by a non-decreasing line a +
+    b grey.
     """
     nothing = np.empty((0, 0), images.lit.dtype)
     inverse = nothing if images.inverses is None else images.inverses[0]
@@ -42,14 +42,17 @@ def noise_variance(images: ScanLines) -> Floats:
 
 
 def fitted_variance(grey: Array, variance: Array, count: Array, of: np.dtype[Any]) -> Floats:
-    """(256,) from the variance (N,) seen in N bands about grey levels `grey`, of `count` pixels each:
-    a line that is nowhere falling, and nowhere below the rounding of images of type `of`."""
+    """Variance (256,) of each grey level, from bands of them: a line that nowhere decreases and
+    stays above the rounding of images of type `of`.
+
+    grey, variance, count: (N,) mean grey level, variance and number of pixels of N bands.
+    """
     least = LEAST_VARIANCE if of == np.uint8 else LEAST_FINE_VARIANCE
     if not len(grey):
         return np.ones(256, np.float32)
     rise, base = 0.0, float(np.average(variance, weights=count))
     if len(grey) >= 3:
-        # Each band's variance is known to the same relative precision for the same count.
+        # Bands with equal counts know their variances to the same relative precision.
         weight = np.sqrt(count) / np.maximum(variance, least)
         slope, start = np.polyfit(grey, variance, 1, w=weight)
         if slope > 0:
@@ -59,10 +62,11 @@ def fitted_variance(grey: Array, variance: Array, count: Array, of: np.dtype[Any
 
 @compiled
 def _sums(lit: Greys, dark: Greys, pattern: Greys, inverse: Greys, bright: Mask) -> Array:
-    """How many, sum and sum of squares (LEVELS,) of what differs between two frames that show the
-    same, by bands of grey levels; of every other pixel of every other line.
+    """Number, sum and sum of squares (LEVELS,) of differences between two frames that show the
+    same.
 
-    Without an inverse (0, 0), `bright` (L, P) says where the pattern shows what the lit frame does.
+    By bands of grey levels; of every other pixel on every other line. Without an inverse (0, 0),
+    `bright` (L, P) says where the pattern shows the same as the lit frame.
     """
     sums = np.zeros((3, LEVELS))
     for line in range(0, lit.shape[0], 2):

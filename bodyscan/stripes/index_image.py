@@ -1,6 +1,6 @@
-"""One image of stripe numbers: luminance 1 to 254 is the number, 0 and 255 are none.
+"""One image of stripe numbers: luminance 1 to 254 is the number, 0 and 255 mean none.
 
-Luminance n is stripe n - 1 of this program, which counts from 0: s lies between n - 1 and n.
+Luminance n is stripe n - 1 here, since stripes count from 0: s lies between n - 1 and n.
 """
 
 from __future__ import annotations
@@ -19,19 +19,22 @@ from bodyscan.stripes.stripe_order import check_order
 from bodyscan.stripes.usable_pixels import beside_jumps
 
 SIGMA = 12.0**-0.5
-"""Of a place known to lie within one pixel, or of s within one stripe."""
+"""Standard deviation of a place known to be within one pixel, or of s within one stripe."""
 
 MAX_SHARE_BEYOND = 0.01
 NONE = (0, 255)
 
 
 def decode_index(lit: Greys, numbers: Greys, direction: str, stripes: int) -> StripeMap:
-    """The stripe map.  lit: (H, W).  numbers: (1, H, W).
+    """The stripe map.
 
-    A boundary is known to lie between two pixels, no better. Along a line of boundaries s is
-    interpolated all the same: it is nearer to the truth than the middle of the stripe, which
-    remains for pixels that lie between no two boundaries. Raises DecodingFailed if neighbours do
-    not lie in neighbouring stripes.
+    lit: (H, W).
+    numbers: (1, H, W).
+
+    A boundary is only known to lie between two pixels. Along a line of boundaries s is interpolated
+    nevertheless: it is closer to the truth than the middle of the stripe, which is used for pixels
+    that lie between no two boundaries. Raises DecodingFailed if neighbours are not in neighbouring
+    stripes.
     """
     black = np.zeros_like(lit)
     images = ScanLines.along_lines(lit, black, numbers, None, direction)
@@ -57,7 +60,7 @@ def decode_index(lit: Greys, numbers: Greys, direction: str, stripes: int) -> St
 
 
 def _boundaries(codes: NDArray[np.int32], usable: Mask) -> Boundaries:
-    """Halfway between neighbours of a line whose numbers differ by one."""
+    """Boundaries halfway between neighbours on a line whose numbers differ by one."""
     change = np.abs(np.diff(codes, axis=1)) == 1
     line, before = np.nonzero(change & usable[:, 1:] & usable[:, :-1])
     index = np.maximum(codes[line, before], codes[line, before + 1]).astype(np.int64)

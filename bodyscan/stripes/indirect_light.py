@@ -1,10 +1,10 @@
-"""Light that reached a pixel by way of another surface: in armpits, between legs, in shadows.
+"""Light that reaches a pixel by way of another surface: in armpits, between legs, in shadows.
 
-A pixel's lit minus dark is D + I: what comes to it straight, and what other surfaces throw there. A
-pattern minus its inverse is +-D + J; J is what the pattern and its inverse do not share of the
-indirect light: little where stripes are fine, anything up to I where they are broad (Nayar et al.
-2006). So a bit is certain where D > I (Xu and Aliaga 2007), which the finest patterns tell; and a
-boundary lies where the difference is J, not 0: in the middle between the values on its two sides.
+A pixel's lit minus dark is D + I: direct light, and light from other surfaces. A pattern minus its
+inverse is +-D + J; J is the part of the indirect light that differs between pattern and inverse:
+little if stripes are fine, anything up to I if they are broad (Nayar et al. 2006). So a bit is
+certain where D > I (Xu and Aliaga 2007), which the finest patterns show; and a boundary lies where
+the difference is J, not 0: midway between the values on its two sides.
 """
 
 from __future__ import annotations
@@ -23,27 +23,30 @@ LEAST_DIRECT = 0.5
 WIDEST_DIP_PX = 7
 FINE_BITS = 3
 BEST, SHARP = 90, 0.8
-"""A pattern is sharp if this percentile of the pixels' shares is at least so much."""
+"""A pattern is sharp if this percentile of the pixels' shares is at least this much."""
 
 BESIDE_PX = (3, 4, 5, 6)
-"""From the two pixels around a boundary to those that lie clear of it."""
+"""Distances from the two pixels around a boundary to those that are clear of it."""
 FEWEST_STRIPES = 2
-"""Reach at least that is of use."""
+"""Least reach that is of use."""
 AT_A_TIME = 1 << 14  # boundaries: their pixels' values fit into a processor's cache
 LEAST_CONTRAST = 0.02
-"""Grey levels: below any that a usable pixel has."""
+"""Grey levels: below that of any usable pixel."""
 
 SIGNIFICANCE = 4.0
 UNEXPLAINED = 0.3
 
 
 def mostly_direct(images: ScanLines, usable: Mask, bit: int, variance: Floats) -> Mask:
-    """(L, P): pixels that get more light from the projector than from other surfaces.
+    """Pixels (L, P) that get more light from the projector than from other surfaces.
 
-    bit: of the patterns, the one of stripes two wide. It tells, or the next coarser one that the
-    projector shows sharply (in procam-board its lens leaves a fifth of the finest). Where a bit
-    flips its difference is small whatever the light; such dips along the lines are filled.
-    usable: (L, P) that are looked at.  variance: (256,) of each grey level.
+    usable: (L, P) pixels to examine.
+    bit: the pattern with stripes two wide.
+    variance: (256,) of each grey level.
+
+    That bit decides, or the next coarser one that the projector shows sharply (in procam-board its
+    lens leaves a fifth of the finest). Where a bit flips its difference is small whatever the
+    light; such dips along the lines are filled.
     """
     dips = np.ones((1, WIDEST_DIP_PX), np.uint8)
     for fine in range(bit, max(bit - FINE_BITS, -1), -1):
@@ -65,11 +68,13 @@ def imbalance(
     at: Indices,
     reach: Indices,
 ) -> tuple[Array, Array]:
-    """J / (D + I) at boundaries `index` (N,) of `bit` (N,), and how far it may be off.
+    """J / (D + I) at boundaries `index` (N,) of `bit` (N,), and its uncertainty.
 
-    at: (N,) flat pixels before the boundaries.  reach: (N,) stripes beside them for which the bit
-    surely keeps its value. It is 0 where noise may explain it, and for the finest bit, which has
-    no room beside its boundaries and whose J is least.
+    at: (N,) flat pixels before the boundaries.
+    reach: (N,) number of stripes on either side in which the bit surely keeps its value.
+
+    It is 0 where noise may explain it, and for the finest bit, which has no room beside its
+    boundaries and whose J is least.
     """
     mean, doubt = np.zeros(len(at)), np.zeros(len(at))
     roomy = np.flatnonzero(reach >= FEWEST_STRIPES)
@@ -86,8 +91,8 @@ def imbalance(
 def _beside(
     codes: NDArray[np.int32], usable: Mask, at: Indices, index: Indices, reach: Indices
 ) -> Indices:
-    """(N, 2 * len(BESIDE_PX)) flat pixels on both sides of boundaries, clear of this one and of where
-    the bit flips again; -1 instead of both where one is not."""
+    """Flat pixels (N, 2 * len(BESIDE_PX)) on both sides of boundaries, clear of this one and of
+    where the bit flips again; -1 in place of both if one is not."""
     width = codes.shape[1]
     found = np.full((at.size, 2 * len(BESIDE_PX)), -1)
     for k in range(at.size):
@@ -106,7 +111,7 @@ def _beside(
 def _mean_imbalance(
     lit: Greys, dark: Greys, pixels: Indices, difference: Floats, noise: Floats
 ) -> tuple[Array, Array]:
-    """See `imbalance`: (N,) from the differences (N, K) at pixels beside each boundary."""
+    """Mean and uncertainty (N,) for `imbalance`, from differences (N, K) beside each boundary."""
     result, doubt = np.zeros(len(pixels)), np.zeros(len(pixels))
     for k in range(len(pixels)):
         total, size, noise2, count = 0.0, 0.0, 0.0, 0

@@ -1,14 +1,14 @@
-"""A line of light swept over the scene, one image a stripe: s from when it comes and goes.
+"""A line of light swept over the scene, one image per stripe: s from when it comes and goes.
 
-At a pixel whose stripe coordinate is s the light comes and goes over the images. The part of it
-that comes in images i and later is, whatever the line's width and blur sigma,
+At a pixel with stripe coordinate s the light comes and goes over the images. The part of it that
+comes in images i and later is, whatever the line's width and blur sigma,
 
-    (1 + erf((s - i) / (sqrt(2) sigma))) / 2,
+    (1 + erf((s - i) / (sqrt(2) sigma))) / 2.
 
-so with z_i = (s - i) / sigma from the inverse of that, for the boundaries k and k + 1 on both sides
-of the brightest image k: s = k + z_k / (z_k - z_(k+1)). Sigma drops out; a parabola through
-the logarithms of three images would need the line to be a Gaussian. Where stripes are much wider
-than the blur, that says little in their middle, and s comes from the boundaries on both sides.
+With z_i = (s - i) / sigma from the inverse of that, for the boundaries k and k + 1 on both sides of
+the brightest image k, s = k + z_k / (z_k - z_(k+1)). Sigma drops out; a parabola through the
+logarithms of three images would require a Gaussian line. If stripes are much wider than the blur,
+that says little in their middle, and s comes from the boundaries on both sides.
 """
 
 from __future__ import annotations
@@ -32,26 +32,29 @@ from bodyscan.stripes.usable_pixels import (
 )
 
 REACH = 3
-"""Bytes before and behind the brightest in which its light may be seen."""
+"""Images before and after the brightest in which its light may be seen."""
 
 SAMPLES = 15
 MAX_SECOND = 0.3
-"""How bright another peak may be: brighter, the light may have come by way of another surface, or
-the pixel sees two."""
+"""Relative brightness of another peak; above it the light may have come by way of another surface,
+or the pixel sees two."""
 
 MAX_SHARE = 0.99
 LEAST_SIGMA = 0.003
 SIGMA_WITHIN = 12.0**-0.5
-"""Of s anywhere in a stripe."""
+"""Standard deviation of s anywhere in a stripe."""
 
 BANDS = 8
 ENOUGH_PIXELS = 200
 
 
 def decode_sweep(lit: Greys, frames: Greys, direction: str) -> StripeMap:
-    """The stripe map.  lit: (H, W).  frames: (stripes, H, W), most of them dark at any one pixel.
+    """The stripe map.
 
-    Raises DecodingFailed if the images do not add up.
+    lit: (H, W).
+    frames: (stripes, H, W), most of them dark at any one pixel.
+
+    Raises DecodingFailed if the images are inconsistent.
     """
     stripes = len(frames)
     lines = ScanLines.along_lines(lit, lit, frames, None, direction)
@@ -80,8 +83,12 @@ def decode_sweep(lit: Greys, frames: Greys, direction: str) -> StripeMap:
 class _Sweep:
     """What each pixel (L, P) saw of the sweep, grey levels.
 
-    base: without the line.  peak: the brightest image.  window: (2 REACH + 1, L, P) above the base
-    around it.  height: its own.  total: of the whole window.  second: the brightest of the others.
+    base: without the line.
+    peak: number of the brightest image.
+    window: (2 REACH + 1, L, P) the images around it, above the base.
+    height: of the brightest image.
+    total: of the whole window.
+    second: the brightest of the other images.
     """
 
     def __init__(self, base: Floats, peak: NDArray[np.int32], window: Floats, second: Floats):
@@ -90,7 +97,7 @@ class _Sweep:
 
     @staticmethod
     def of(frames: Greys) -> _Sweep:
-        """frames: (F, L, P)."""
+        """From frames (F, L, P)."""
         base = np.median(frames[:: max(1, len(frames) // SAMPLES)], axis=0).astype(np.float32)
         peak = frames.argmax(axis=0).astype(np.int32)
         image = peak + np.arange(-REACH, REACH + 1)[:, None, None]
@@ -115,27 +122,27 @@ class _Sweep:
         width = np.maximum(z[0] - z[1], 1e-3)
         share = z[0] / width
         sigma = np.hypot((1.0 - share) * dz[0], share * dz[1]) / width
-        # All the light in one image says that s is in that stripe, and not where.
+        # If all light is in one image, s is known to be in that stripe, and not where.
         sharp = np.minimum(z[0], -z[1]) > 0.999 * ndtri(MAX_SHARE)
         sigma = np.hypot(sigma, np.where(sharp, SIGMA_WITHIN, LEAST_SIGMA)).astype(np.float32)
         s = (self.peak + share).astype(np.float32)
         return s, sigma
 
     def base_noise2(self, frames: Greys) -> float:
-        """Variance of an image where the line is not."""
+        """Variance of an image away from the line."""
         every = max(1, len(frames) // SAMPLES)
         apart = [
             (frames[number].astype(np.float32) - self.base)[np.abs(self.peak - number) > REACH]
             for number in range(0, len(frames), every)
         ]
         stray = np.abs(np.concatenate(apart))
-        # Grey levels are whole numbers, so their median would be one too; the mean is not.
+        # Grey levels are whole numbers, and so would be their median; the mean is not.
         return float(max(np.mean(np.minimum(stray, 8.0)) ** 2 * np.pi / 2.0, 0.15))
 
     def noise_rise(self, lit: Greys, base_noise2: float) -> float:
-        """By how much the variance grows with each grey level of light.
+        """Increase of the variance with each grey level of light.
 
-        The window adds up to what the lit image shows, but for the noise of both.
+        The window adds up to what the lit image shows, except for the noise of both.
         """
         above = lit - self.base
         bright = (above > 20) & (lit < SATURATED) & (self.total > 20)

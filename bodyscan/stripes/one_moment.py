@@ -14,28 +14,33 @@ from bodyscan.geometry.velocity import Velocity
 from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.comb import Comb, find_comb
 
-SEEN_MM = 0.25  # of motion while the patterns were taken: with less none can have leapt
+SEEN_MM = 0.25  # of motion while the patterns were taken; with less none can have jumped
 LEAPT = 0.25
-"""Of the least leap that is named, on the average of windows: with less it is not looked for. A part of
-the body that leapt alone leaves as much."""
+"""Share, on the average of windows, of the least jump that is reported; below it none is looked
+for. A part of the body that jumped alone leaves as much."""
 TORN = 4.0
-"""Times what steady motion explains: motion back and forth is not steady either, and shorter."""
+"""Ratio to what steady motion explains: motion back and
+forth is not steady either, but gives less."""
 SUDDEN, LEAP_MM = 30.0, 2.0
-"""A leap that explains so many times as much, 12 at most where people moved, is none of a body, however
-fast those are; from 2 mm on fine stripes are taken for their neighbours, and less is not named."""
+"""A jump that explains this many times as much (at most 12 where people moved) is not a body's,
+however fast it moves; from 2 mm on, fine stripes are mistaken for their neighbours; less is not
+reported."""
 
 
 @dataclass(frozen=True, eq=False)
 class StripeMotion:
-    """How fast s changes at pixels that stay where they are, and the body's motion behind that.
+    """How fast s changes at fixed pixels, and the body's motion behind that.
 
-    speed, doubt: (rows, columns) at the middles of cells of `cell_px` x `cell_px` camera pixels, linear
-    between: stripes per unit of time, and the standard deviation of what is not known of it.
-    velocity: of the body, per the same unit of time.  speed_mm: how fast it moved in depth, RMS.
-    mm_per_stripe: of depth, at a pixel that stays where it is, in the median.
-    doubt_mm: of that, what neither a rigid motion nor the field explains, RMS over the cells.
+    speed, doubt: (rows, columns) at the middles of cells of `cell_px` x `cell_px` camera pixels,
+        linear between: stripes per unit of time, and the standard deviation of what is unknown of
+        it.
+    velocity: of the body, per the same unit of time.
+    speed_mm: how fast it moved in depth, RMS.
+    mm_per_stripe: of depth at a fixed pixel, median.
+    doubt_mm: the part of that which neither a rigid motion nor the field explains, RMS over the
+        cells.
     explained: by how much the rigid motion lowers chi-square.
-    is_significant: whether noise does not explain it.
+    is_significant: whether it is more than noise.
     """
 
     speed: Array
@@ -51,12 +56,12 @@ class StripeMotion:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """When the images of a sequence were taken, the moment at which the body is wanted, and who tells
-    its motion from the comb.
+    """When the images of a sequence were taken, and the moment to which boundaries are carried.
 
-    times: of each image (n,) by the name of its kind, any unit.  told: None where the comb tells
-    nothing.  instead: another order in which they may have come, where nobody says.  most_mm: no
-    subject moves farther in depth meanwhile; infinite where nobody says how long it took.
+    times: of each image (n,) by the name of its kind, in any unit.
+    told: finds the body's motion from the comb; returns None where the comb says nothing.
+    instead: another order in which images may have been taken, if that is unknown.
+    most_mm: no subject moves farther in depth meanwhile; infinite if the duration is unknown.
     """
 
     times: Mapping[str, Array]
@@ -67,10 +72,10 @@ class Moments:
 
     @property
     def of_bits(self) -> Array:
-        """(bits,) when the boundaries of each bit's pattern are seen.
+        """When the boundaries of each bit's pattern are seen, (bits,).
 
-        Where pattern and inverse are equally bright s has passed as far before the boundary in one as
-        behind it in the other: that is the middle of both moments, however far apart they are.
+        Where pattern and inverse are equally bright, s is as far before the boundary in one as it
+        is behind it in the other: that is midway between both moments, however far apart they are.
         """
         patterns = self.times["pattern"]
         return np.asarray((patterns + self.times.get("inverse", patterns)) / 2.0, np.float64)
@@ -79,11 +84,13 @@ class Moments:
 def carry_to_moment(
     boundaries: Boundaries, bit: Indices, moments: Moments, *, turned: bool
 ) -> tuple[Boundaries, StripeMotion | None, float]:
-    """The boundaries as they would have been seen at the moment, what moved them, and the farthest
-    that s had to be carried, stripes.  bit: (N,) in whose images each boundary was seen.
+    """The boundaries as they would have been seen at the moment, the motion, and the greatest
+    shift.
 
-    What noise explains leaves them untouched. Of two orders the one that explains more is believed: in
-    the wrong one teeth may look like stripes that stray.
+    bit: (N,) in whose images each boundary was seen.
+
+    The shift is in stripes of s. Motion that noise explains leaves boundaries unchanged. Of two
+    orders the one that explains more is chosen: in the wrong one teeth may look like stray stripes.
     Raises DecodingFailed for a sequence whose images show the body in two places.
     """
 
@@ -121,8 +128,8 @@ def carry_to_moment(
 def _check_whole(
     boundaries: Boundaries, bit: Indices, moved: tuple[Moments, StripeMotion], *, turned: bool
 ) -> None:
-    """Raises DecodingFailed where one leap explains the teeth far better than the steady motion that
-    was told."""
+    """Raises DecodingFailed if one jump explains the teeth far better than the steady motion that
+    was found."""
     moments, motion = moved
     times = moments.of_bits
     lasted, order = float(np.ptp(times)), np.argsort(times, kind="stable")
@@ -154,7 +161,8 @@ def _mean_size(values: Array) -> float:
 
 @compiled
 def _at_places(grid: Array, cell_px: int, column: Array, row: Array) -> Array:
-    """(2, N): a grid (2, rows, columns) at places (N,), px; beyond its outermost middles as there."""
+    """A grid (2, rows, columns) at places (N,), px, as (2, N); constant beyond the outermost
+    middles."""
     found = np.empty((2, column.size))
     rows, columns = grid.shape[1:]
     for n in range(column.size):
@@ -172,8 +180,8 @@ def _at_places(grid: Array, cell_px: int, column: Array, row: Array) -> Array:
 
 @compiled
 def _stripe_widths(position: Array, index: Indices, joined: Mask) -> Array:
-    """(N,) px a stripe along the scan line, below 0 where s falls; from the neighbours that are
-    joined, 0 where none is."""
+    """Width of a stripe (N,) px along the scan line, negative where s falls, from the neighbours
+    that are joined; 0 if none is."""
     widths = np.zeros(position.size)
     for k in range(position.size):
         first = k - 1 if k > 0 and joined[k - 1] else k

@@ -10,11 +10,11 @@ from bodyscan.stripes.stripe_code import StripeCode
 
 
 def pattern_frames(code: StripeCode, width: int, height: int) -> Bytes:
-    """(F, height, width) uint8, read-only, in the order of the code's `image_counts`, then those of
-    the stripes that cross.
+    """Images (F, height, width) uint8, read-only, in the order of the code's `image_counts`,
+    followed by those of the crossing stripes.
 
     The stripes divide the projector's image evenly. Raises BadInput if they are narrower than one
-    of its pixels, or if the code is one that its instrument projects by itself.
+    of its pixels, or if the instrument projects the code by itself.
     """
     ways = [_frames_one_way(way, width, height) for way in code.directions]
     return ways[0] if len(ways) == 1 else np.concatenate(ways)

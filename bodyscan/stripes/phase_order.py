@@ -1,9 +1,10 @@
 """Which period of the finest wave a pixel shows: the one with which all other waves agree best.
 
-A fine wave tells s exactly, but for whole periods. Of all s that it leaves open, each puts the
-other waves at some phase; how far they are from there, in sigmas, is the likelihood of that s. One
-rule, whether a single period covers all stripes (hierarchical unwrapping) or the waves only beat
-(heterodyne). A pixel whose next best s is nearly as likely has no order: it is not guessed.
+A fine wave gives s exactly, except for whole periods. Each s that it leaves open predicts a phase
+for the other waves; their distance from it, in sigmas, gives the likelihood of that s. The same
+rule applies whether a single period covers all stripes (hierarchical unwrapping) or the waves only
+beat (heterodyne). A pixel whose second-best s is nearly as likely gets no order rather than a
+guess.
 """
 
 from __future__ import annotations
@@ -19,31 +20,32 @@ from bodyscan.compiled import compiled
 from bodyscan.stripes.waves import WaveSeen
 
 CHANCE = 1e-4
-"""Of a wrong order, at most: one flying pixel in ten thousand, which cleaning finds."""
+"""Greatest chance of a wrong order: one flying pixel in ten thousand, which cleaning finds."""
 
 MOST_SIGMAS = 4.5
-"""Between two waves of one pixel: once in 150,000 by noise, else the pixel sees two surfaces."""
+"""Between two waves at one pixel: one in 150,000 by noise; otherwise the pixel sees two
+surfaces."""
 
 TOLD = -2.0 * math.log(CHANCE)
-"""By how much chi squared of the next best order must be greater."""
+"""How much greater chi squared of the second-best order must be."""
 
 EASY = 3.0
-"""Times that, where nothing but noise is amiss: such pixels are told for certain."""
+"""Times that, if only noise is present: the order of such pixels is certain."""
 
 ENOUGH = 100
 MOST_SAMPLED = 100_000
 COMBINED = 2.0
-"""Waves up to so many times as long as the finest help it to tell s; longer ones would bring in
-more of what is wrong with them than they take of its noise."""
+"""Waves up to this many times as long as the finest help to find s; longer ones would add more of
+their own errors than they remove of its noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class PhaseOrder:
-    """s and its standard deviation (L, P), stripes; `certain` where its order is.
+    """s and its standard deviation (L, P), stripes, and where the order is `certain`.
 
-    agreed: the share of pixels whose waves agree, of those that noise lets tell their order.  apart:
-    by how many turns of the finest wave each other one is off on the whole.  misfit: how many sigmas
-    they are off, 1 if noise explains it.
+    agreed: share of the pixels whose waves agree, among those whose order noise leaves decidable.
+    apart: how many turns of the finest wave each other one is off overall.
+    misfit: how many sigmas they are off; 1 if noise explains it.
     """
 
     s: Floats
@@ -57,7 +59,8 @@ class PhaseOrder:
 def phase_order(
     waves: Sequence[WaveSeen], sigmas: Sequence[Floats], usable: Mask, stripes: int
 ) -> PhaseOrder:
-    """waves: the finest first.  sigmas: (L, P) of their turns.  usable: pixels asked for."""
+    """Find s from waves (the finest first), their turns'
+    sigmas (L, P), at `usable` pixels (L, P)."""
     periods = np.array([wave.wave.period for wave in waves])
     turns = np.stack([wave.turn[usable] for wave in waves])
     doubts = np.stack([sigma[usable] for sigma in sigmas])
@@ -84,7 +87,8 @@ def phase_order(
 
 
 def _share(agree: Mask, tellable: Mask) -> float:
-    """Of a dim background's pixels most may be too noisy to tell; they say nothing of the images."""
+    """Share of pixels that agree. On a dim background most may be too noisy to decide; those do not
+    count."""
     judged = agree[tellable] if np.count_nonzero(tellable) >= ENOUGH else agree
     return float(np.mean(judged)) if judged.size else 0.0
 
@@ -95,16 +99,16 @@ def _middle(values: Floats) -> list[float]:
 
 
 def _apart(turns: Floats, sigmas: Floats, periods: Array, orders: Indices) -> tuple[Floats, Floats]:
-    """(W - 1, M) turns that the other waves are off from where the finest puts them, and the
-    standard deviation of that."""
+    """Turns (W - 1, M) by which the other waves are off from where the finest predicts them, and
+    their standard deviation."""
     ratio = (periods[0] / periods[1:, None]).astype(np.float32)
     off = turns[1:] - (turns[0] + orders.astype(np.float32)) * ratio
     return off - np.rint(off), np.hypot(sigmas[1:], sigmas[0] * ratio)
 
 
 def _beyond_noise(turns: Floats, sigmas: Floats, periods: Array, orders: Indices) -> Floats:
-    """(W,) by how much each wave's sigma is to grow so that it explains what is seen: what is left
-    of the projector's response, and light by way of other surfaces, are no noise."""
+    """Factor (W,) by which each wave's sigma must grow to explain what is seen: the remainder of
+    the projector's response, and indirect light, are not noise."""
     growth = np.ones(len(periods), np.float32)
     if turns.shape[1] >= ENOUGH:
         off, off_sigma = _apart(turns, sigmas, periods, orders)
@@ -116,7 +120,8 @@ def _beyond_noise(turns: Floats, sigmas: Floats, periods: Array, orders: Indices
 def _combined(
     turns: Floats, sigmas: Floats, periods: Array, orders: Indices, off: Floats
 ) -> tuple[Floats, Floats]:
-    """s and its standard deviation (M,): the mean of the waves of about the finest's period."""
+    """s and its standard deviation (M,): weighted mean of the
+    waves with about the finest's period."""
     weights = 1.0 / np.square(sigmas * periods[:, None].astype(np.float32))
     weights[periods > COMBINED * periods[0]] = 0.0
     moved = np.sum(weights[1:] * off * periods[1:, None].astype(np.float32), axis=0)
@@ -127,7 +132,7 @@ def _combined(
 
 @compiled
 def _least_gap(sigmas: Floats, periods: Array, stripes: float) -> Array:
-    """(M,) by how much chi squared of any other order is greater where waves have no error."""
+    """How much greater (M,) chi squared of any other order is if waves have no error."""
     count = sigmas.shape[1]
     least = np.full(count, np.inf)
     ratios = periods[0] / periods
@@ -150,7 +155,7 @@ def _best_orders(
     turns: Floats, sigmas: Floats, periods: Array, stripes: float
 ) -> tuple[Indices, Array, Array]:
     """The likeliest whole periods of the finest wave at M pixels, and chi squared of these and of
-    the next best (M,).  turns, sigmas: (W, M)."""
+    the second best (M,). turns, sigmas: (W, M)."""
     count = turns.shape[1]
     orders = np.zeros(count, np.int64)
     best, second = np.full(count, np.inf), np.full(count, np.inf)

@@ -1,7 +1,7 @@
 """One wave of light, and a Gray code of its half periods: s from the phase.
 
-The Gray code's word is off by one near its own boundaries at most, so its middle is never as much
-as half a period from s, and the period whose phase is nearest to it is the right one.
+Near its own boundaries the Gray code's word is off by at most one, so the middle of its half period
+is never half a period from s, and the period whose phase is nearest to it is the right one.
 """
 
 from __future__ import annotations
@@ -30,19 +30,22 @@ ALIKE = 0.1
 MAX_MEAN_ERROR = 0.15
 MAX_SHARE_AMISS = 0.15
 AFAR = 0.3
-"""Of a period, between the phase and the middle of its half period; 1/4 if nothing is amiss."""
+"""Share of a period between the phase and the middle of its half period; normally at most 1/4."""
 
 LEAP = 0.6
-"""Of a period, between neighbouring pixels on both sides of two half periods' boundary."""
+"""Share of a period, between neighbouring pixels on both sides of a boundary of half periods."""
 
 
 def decode_phase(
     images: ScanLines, lit: Greys, phases: Greys, half_periods: int, wave: Wave, stripes: int
 ) -> StripeMap:
-    """The stripe map.  images: scan lines of the Gray code of half periods.  lit: (H, W) as the
-    camera has it.  phases: (steps, H, W), the images of the wave.
+    """The stripe map.
 
-    Raises DecodingFailed if the images do not add up.
+    images: scan lines of the Gray code of half periods.
+    lit: (H, W) in the camera's layout.
+    phases: (steps, H, W), the images of the wave.
+
+    Raises DecodingFailed if the images are inconsistent.
     """
     variance = noise_variance(images)
     halves = GRAY.stripes(read_words(GRAY, images, half_periods, variance))
@@ -68,9 +71,9 @@ def decode_phase(
 
 
 def _check_waves(images: ScanLines, waves: Greys, usable: Mask) -> None:
-    """Raises DecodingFailed if an image is missing, taken twice or exposed otherwise.
+    """Raises DecodingFailed if an image is missing, taken twice or exposed differently.
 
-    Each is, over the picture, half as bright as lit, and so are all together at each pixel.
+    Over the image, each is half as bright as the lit one, and so are all together at each pixel.
     """
     if not usable.any():
         return
@@ -83,7 +86,7 @@ def _check_waves(images: ScanLines, waves: Greys, usable: Mask) -> None:
                 remedy="see whether it is missing or was exposed differently",
             )
     for first, second in combinations(range(len(seen)), 2):
-        # Of N images two neighbours differ by sin(pi / N) in the mean, times how sharp they are.
+        # Of N images two neighbours differ by sin(pi / N) on average, times their sharpness.
         strength = np.percentile(np.abs(seen - 0.5), 90)
         apart = np.mean(np.abs(seen[first] - seen[second]))
         if apart < ALIKE * strength * np.sin(np.pi / len(seen)):
@@ -100,7 +103,7 @@ def _check_waves(images: ScanLines, waves: Greys, usable: Mask) -> None:
 
 
 def _check_phase(waves: Greys, coarse: Floats, usable: Mask, wave: Wave) -> None:
-    """Raises DecodingFailed if phases do not lie in their half periods, or leap between them."""
+    """Raises DecodingFailed if phases are outside their half periods, or jump between them."""
     across = (np.abs(np.diff(coarse, axis=1)) == 0.5) & usable[:, 1:] & usable[:, :-1]
     line, place = np.nonzero(across)
     if not len(line):
@@ -131,7 +134,7 @@ def _check_phase(waves: Greys, coarse: Floats, usable: Mask, wave: Wave) -> None
 
 
 def _mistakes(steps: int) -> Iterator[tuple[str, list[int]]]:
-    """Common mistakes with the order of the images, and the order that undoes them."""
+    """Common mistakes in the order of the images, and the order that undoes them."""
     order = list(range(steps))
     for first, second in combinations(order, 2):
         swapped = order.copy()

@@ -1,5 +1,5 @@
-"""Waves of several periods and nothing else: s from their phases, black and white from their means
-and amplitudes."""
+"""Waves of several periods without another code: s from their phases, black and white from their
+means and amplitudes."""
 
 from __future__ import annotations
 
@@ -38,32 +38,35 @@ from bodyscan.stripes.wave_noise import wave_variance
 from bodyscan.stripes.waves import WaveSeen, in_type, see_wave, split_waves, white_and_black
 
 MOST_DIFFERENT = 0.15
-"""Of the mean brightness, between two waves: lamps and sensors drift by less."""
+"""Share of the mean brightness, between two waves: lamps and sensors drift by less."""
 
 ALIKE = 0.1
 MIN_SHARE_AGREED = 0.6
 MOST_APART = 0.06
-"""Of the finest period, between waves on the whole; the least wrong start, of 30 degrees, makes
-0.083 of it for any whole ratio of their periods but one of 12 k + 1."""
+"""Share of the finest period, between waves overall; the smallest wrong start, 30 degrees, gives
+0.083 of it for any whole ratio of their periods except 12 k + 1."""
 
 LINES_TRIED = 20
-"""Thousands of pixels, of which each of some sixty mistakes is judged by most."""
+"""Thousands of pixels, enough to try each of some sixty mistakes."""
 
 AS_GOOD = 1.3
 MOST_CAUSES = 2
 WHOLE = 1e-6
 NEAREST_TRIED, SHARE_TRIED = 4, 0.1
-"""Periods are tried that differ from one given by so much, or by this share of it."""
+"""Periods are tried that differ from the given one by so much, or by this share of it."""
 STARTS = range(30, 360, 30)
-"""Degrees, of waves that are written as sines, or begin at a step's middle."""
+"""Degrees, for waves that are written as sines, or begin in the middle of a step."""
 
 
 def decode_waves(
     images: Greys, waves: tuple[Wave, ...], lit: Greys, direction: str, stripes: int
 ) -> StripeMap:
-    """The stripe map.  images: (F, H, W), those of each wave in the order of `waves`.  lit: (H, W).
+    """The stripe map.
 
-    Raises DecodingFailed if the images do not add up.
+    images: (F, H, W), those of each wave in the order of `waves`.
+    lit: (H, W).
+
+    Raises DecodingFailed if the images are inconsistent.
     """
     turned = direction == "horizontal"
     lines = transpose(images) if turned else images
@@ -85,10 +88,14 @@ def decode_waves(
 
 @dataclass(frozen=True, eq=False)
 class _Reading:
-    """What waves tell along scan lines (L, P).
+    """What waves show along scan lines (L, P).
 
-    waves: the finest first, their errors taken out.  images: of each.  errors: of each.  shown: lit
-    clearly.  brightest: of all images.  variance: (256,) of each grey level.
+    waves: the finest first, with their errors removed.
+    images: of each wave.
+    errors: of each wave.
+    shown: clearly lit.
+    brightest: of all images.
+    variance: (256,) of each grey level.
     """
 
     waves: list[WaveSeen]
@@ -131,9 +138,9 @@ class _Reading:
 
 
 def _check_images(read: _Reading, stripes: int) -> None:
-    """Raises DecodingFailed if an image is missing, taken twice or exposed otherwise.
+    """Raises DecodingFailed if an image is missing, taken twice or exposed differently.
 
-    All waves have the same mean at each pixel, and no two images of one are the same.
+    All waves have the same mean at each pixel, and no two images of a wave are the same.
     """
     shown = read.shown & (read.brightest < SATURATED)
     if not shown.any():
@@ -147,7 +154,7 @@ def _check_images(read: _Reading, stripes: int) -> None:
                 remedy="see whether one of them is missing, or was exposed differently",
             )
         if one.wave.period * FEWEST_PERIODS > stripes:
-            continue  # a small subject may show such a wave where two of its images are alike
+            continue  # on a small subject two images of such a wave may be alike
         strength = float(np.median(one.amplitude[shown]))
         for first, second in combinations(range(len(images)), 2):
             apart = images[first][shown].astype(np.float32) - images[second][shown]
@@ -167,7 +174,7 @@ def _in_order(order: PhaseOrder) -> bool:
 def _disorder(
     lines: Greys, waves: tuple[Wave, ...], stripes: int, read: _Reading
 ) -> DecodingFailed:
-    """What is wrong where the waves of most pixels do not agree."""
+    """The error to raise if the waves of most pixels do not agree."""
     rows = np.flatnonzero(read.shown.sum(axis=1) > 0)
     some = lines[:, rows[:: max(1, len(rows) // LINES_TRIED)]]
     tried = (
@@ -176,7 +183,7 @@ def _disorder(
     )
     fitting = [(order.misfit, cause) for cause, order in tried if _in_order(order)]
     best = min((misfit for misfit, _ in fitting), default=0.0)
-    # What mirrors all stripes fits as well as what does not: both are told.
+    # A mistake that mirrors all stripes fits as well as one that does not: report both.
     causes = [cause for misfit, cause in fitting if misfit <= AS_GOOD * best][:MOST_CAUSES]
     found = f"the phases of the waves go together at {read.order.agreed:.0%} of the pixels only"
     if read.order.agreed >= MIN_SHARE_AGREED:
@@ -223,8 +230,8 @@ def _mistakes(
 
 
 def _other_periods(period: float, stripes: int) -> Iterator[tuple[str, float]]:
-    """Periods near one, twice and half of it, as people give them: whole numbers over all stripes, or
-    of stripes in one."""
+    """Periods near the given one, twice and half of it, as people write them: whole numbers of
+    periods in all stripes, or of stripes in a period."""
     for key, given in (("periods", stripes / period), ("period", period)):
         whole = round(given)
         if whole < 2 or abs(given - whole) > WHOLE * given:
@@ -240,7 +247,7 @@ def _other_periods(period: float, stripes: int) -> Iterator[tuple[str, float]]:
 
 
 def _orders(steps: int) -> Iterator[tuple[str, list[int]]]:
-    """Common mistakes with the order of one wave's images, and the order that undoes them."""
+    """Common mistakes in the order of one wave's images, and the order that undoes them."""
     order = list(range(steps))
     reverse = [0, *order[:0:-1]]
     yield "the images came in reverse order", reverse

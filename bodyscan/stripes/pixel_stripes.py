@@ -1,4 +1,4 @@
-"""Stripe maps of codes that tell s at each pixel by itself: light section and phase shift."""
+"""Stripe maps of codes that give s at each pixel by itself: light section and phase shift."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bodyscan.stripes.stripe_coordinates import interpolate_stripes
 from bodyscan.stripes.stripe_map import StripeMap, stripe_map
 
 LARGEST_STEP = 1.5
-"""Stripes between neighbouring pixels of one surface, at most."""
+"""Greatest change of s, in stripes, between neighbouring pixels of one surface."""
 
 
 def pixel_stripe_map(
@@ -28,10 +28,12 @@ def pixel_stripe_map(
 ) -> StripeMap:
     """The map of s and its standard deviation (L, P), NaN where a pixel cannot be used.
 
+    variance: (256,) of each grey level.
+    codes: (L, P) stripes; if given, boundaries around a pixel replace its s where they know it
+        better.
+
     Edges of the surface's brightness pull s as they pull boundaries (see `albedo_edges`); that is
-    put right first. Boundaries are where s passes a whole number between two pixels of a line.
-    variance: (256,) of each grey level.  codes: (L, P) stripes; with them, where the boundaries
-    around a pixel tell s better than the pixel itself, they do.
+    corrected first. Boundaries are where s passes a whole number between two pixels of a line.
     """
     brightness = Brightness.of(images, variance, np.isfinite(s))
     raw = whole_numbers(s, sigma, 0.0)
@@ -50,7 +52,8 @@ def pixel_stripe_map(
 
 
 def whole_numbers(s: Floats, sigma: Floats, blur2: float) -> Boundaries:
-    """Where s passes a whole number between two neighbours of a line; linear between them."""
+    """Boundaries where s passes a whole number between two neighbours on a line, interpolated
+    linearly."""
     here, there = s[:, :-1], s[:, 1:]
     step = there - here
     whole = np.rint((here + there) / 2)
@@ -76,7 +79,7 @@ def whole_numbers(s: Floats, sigma: Floats, blur2: float) -> Boundaries:
 def without_edges_along(
     s: Floats, sigma: Floats, brightness: Brightness, blur2: float
 ) -> tuple[Floats, Floats]:
-    """s and sigma (L, P) with the pull of edges that cross the scan lines taken out of s."""
+    """Remove from s (L, P) the pull of edges that cross the scan lines; returns s and its sigma."""
     lines, places = s.shape
     at = np.arange(lines * places - 1)
     step = np.append(brightness.at(at).along, 0.0).reshape(lines, places).astype(np.float32)
@@ -86,7 +89,7 @@ def without_edges_along(
 
 
 def _middle(step: Floats) -> Floats:
-    """Gradient at pixels, from that between each and the next of its line."""
+    """Gradient at pixels, from that between each and the next on its line."""
     gradient = np.zeros_like(step)
     gradient[:, 1:-1] = (step[:, 1:-1] + step[:, :-2]) / 2
     return gradient

@@ -1,11 +1,11 @@
-"""What the projector's response (gamma, and what else bends a wave) does to phases, taken out.
+"""Removal of the phase errors that the projector's response (gamma and the like) causes.
 
-Of a wave that is no pure cosine, N steps read the harmonics jN +- 1 as an error of the phase that
-is a wave itself, of jN times the frequency (Guo, He, Chen 2004 for gamma). It is found from the
-images alone. A surface is smooth where it is not broken, whatever the phase there; so second
-differences of the phase along a line are, but for noise, those of the error: a linear fit. How
-often each phase is seen does not matter, as it does where histograms are made even. A wave too long
-to repeat in the picture is compared with a finer one instead.
+For a wave that is not a pure cosine, N steps turn the harmonics jN +- 1 into a phase error that is
+itself a wave, of jN times the frequency (Guo, He, Chen 2004 for gamma). It is found from the images
+alone. Where a surface is unbroken it is smooth, whatever the phase; so second differences of the
+phase along a line are, apart from noise, those of the error: a linear fit. How often each phase
+occurs does not matter, as it does when histograms are equalised. A wave too long to repeat in the
+image is compared with a finer one instead.
 """
 
 from __future__ import annotations
@@ -20,17 +20,19 @@ from bodyscan.stripes.stripe_map import ResponseShare
 from bodyscan.stripes.waves import WaveSeen
 
 MULTIPLES = (1, 2, 3, 4)
-"""j above: more are far below the noise; with three steps and a gamma of 2.2, two are not enough."""
+"""j above: more are far below the noise; with three steps
+and a gamma of 2.2, two are not enough."""
 
 FEWEST_PERIODS = 4
-"""Of a wave within the stripes; with fewer, the shape of the surface could look like its error."""
+"""Periods of a wave within the stripes; with fewer, the
+surface's shape could look like its error."""
 
 LAG = 0.375
 """Turns of the error's lowest wave between the places of a second difference: both waves show."""
 
 SHORTEST_PX = 1.5
 LEAST_SHOWN = 0.05
-"""Of what the best determined wave of the error shows in second differences."""
+"""Relative to the best-determined wave of the error in second differences."""
 
 MOST_PLACES = 100_000
 FEWEST_PLACES = 3_000
@@ -38,26 +40,26 @@ STEEP_PX = 4
 OUTLYING = 5.0
 ROUNDS = 4
 SIGNIFICANT = 5.0
-"""Sigmas; neighbouring places share their pixels, so that sigmas are too small by about half."""
+"""Sigmas; neighbouring places share their pixels, which makes sigmas too small by about half."""
 
 BINS = 256
 ENOUGH_IN_BIN = 50
 SHARP = 0.3
-"""Length of the mean of a bin's phases as arrows: below it they point anywhere."""
+"""Length of the mean of a bin's phases as unit vectors: below it they point anywhere."""
 
 MOST_WHOLE_TURNS = 2
 MOST_LEFT = 0.1
-"""Turns of the finer wave RMS: an error that leaves more is none, but images in another order."""
+"""Turns of the finer wave, RMS: if an error leaves more, the images are in another order."""
 
 MOST_ERROR = 0.1
-"""Turns: three steps and a gamma of 5 make less."""
+"""Turns: three steps and a gamma of 5 give less."""
 
 
 @dataclass(frozen=True, eq=False)
 class PhaseError:
-    """The error of a wave's turn as a wave of the turn as it was read.
+    """The error of a wave's turn, itself a wave of the turn as read.
 
-    cosines, sines: of 1, 2, ... times `steps` times its frequency, turns.
+    cosines, sines: amplitudes, in turns, at 1, 2, ... times `steps` times its frequency.
     """
 
     steps: int
@@ -65,7 +67,7 @@ class PhaseError:
     sines: Array
 
     def at(self, turn: Floats) -> Floats:
-        """Turns that are too much at turns of any shape."""
+        """Error in turns at turns of any shape."""
         total = np.zeros_like(turn)
         for multiple, cosine, sine in zip(MULTIPLES, self.cosines, self.sines, strict=False):
             angle = np.float32(2.0 * np.pi * multiple * self.steps) * turn
@@ -74,14 +76,15 @@ class PhaseError:
 
 
 def without_error(wave: WaveSeen, error: PhaseError | None) -> WaveSeen:
-    """The wave with its turns put right."""
+    """The wave with its turns corrected."""
     if error is None:
         return wave
     return replace(wave, turn=(wave.turn - error.at(wave.turn)) % np.float32(1.0))
 
 
 def share_of_error(error: PhaseError | None, wave: WaveSeen, sigma: Floats) -> ResponseShare | None:
-    """What the error did to s where there is a sigma of it (stripes), in any layout of the pixels."""
+    """What the error did to s (stripes), over the pixels with
+    a sigma, in any layout of the pixels."""
     known = np.isfinite(sigma)
     if error is None or not known.any():
         return None
@@ -91,7 +94,8 @@ def share_of_error(error: PhaseError | None, wave: WaveSeen, sigma: Floats) -> R
 
 
 def error_of_repeated(wave: WaveSeen, usable: Mask, stripes: int) -> PhaseError | None:
-    """Of a wave that repeats in the picture; None where noise explains all, or it does not repeat.
+    """The error of a wave that repeats in the image; None if noise explains it or it does not
+    repeat.
 
     usable: (L, P); lines cross the wave.
     """
@@ -103,14 +107,15 @@ def error_of_repeated(wave: WaveSeen, usable: Mask, stripes: int) -> PhaseError 
         return None
     before, behind = (_wrapped(turns[k + 1] - turns[k]) for k in (0, 1))
     steps = wave.wave.steps
-    # Pixels do not tell error waves apart that are shorter.
+    # Pixels cannot resolve shorter waves of the error.
     most = max(1, round(lag / LAG / SHORTEST_PX))
     first, middle, last = (_shapes(turn, steps, most) for turn in turns)
     return _fitted(first - 2.0 * middle + last, (behind - before).astype(float), steps)
 
 
 def error_against(wave: WaveSeen, finer: WaveSeen, usable: Mask, stripes: int) -> PhaseError | None:
-    """Of a wave whose one period covers all stripes, from what a finer one says that is right."""
+    """The error of a wave whose one period covers all
+    stripes, against a finer one taken as right."""
     if wave.wave.period < stripes:
         return None
     ratio = np.float32(wave.wave.period / finer.wave.period)
@@ -127,7 +132,7 @@ def error_against(wave: WaveSeen, finer: WaveSeen, usable: Mask, stripes: int) -
     middle = ((np.arange(BINS) + 0.5) / BINS)[clear]
     shapes = ratio * _shapes(middle, wave.wave.steps)
     weight = np.sqrt(count[clear])[:, None]
-    # The curve is known but for whole turns; the error has none on the mean.
+    # The curve is known up to whole turns; the error has mean zero.
     whole = np.arange(-MOST_WHOLE_TURNS, MOST_WHOLE_TURNS + 1)
     wanted = curve[:, None] - np.rint(np.mean(curve)) - whole
     found = np.linalg.lstsq(weight * shapes, weight * wanted, rcond=None)[0]
@@ -147,7 +152,7 @@ def _lag(wave: WaveSeen, usable: Mask) -> int:
 
 
 def _triples(turn: Floats, usable: Mask, lag: int) -> Floats:
-    """(3, M) turns at three places of a line that are usable, as is all between them."""
+    """Turns (3, M) at three places of a line that are usable, as is everything between them."""
     if turn.shape[1] <= 2 * lag:
         return np.empty((3, 0), np.float32)
     total = np.pad(np.cumsum(usable, axis=1, dtype=np.int32), ((0, 0), (1, 0)))
@@ -159,13 +164,13 @@ def _triples(turn: Floats, usable: Mask, lag: int) -> Floats:
 
 
 def _shapes(turn: Floats | Array, steps: int, most: int = len(MULTIPLES)) -> Array:
-    """(M, 2 K): cosines, then sines, of the first K multiples, `most` at most."""
+    """Cosines, then sines, (M, 2 K), of the first K multiples, at most `most`."""
     angle = 2.0 * np.pi * steps * np.multiply.outer(turn, MULTIPLES[:most])
     return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _fitted(shapes: Array, seen: Array, steps: int) -> PhaseError | None:
-    """Least squares without what lies far off: edges of surfaces, and their bends."""
+    """Least squares without outliers: edges of surfaces, and bends."""
     near = np.ones(len(seen), bool)
     for _ in range(ROUNDS):
         found = np.linalg.lstsq(shapes[near], seen[near], rcond=LEAST_SHOWN)[0]
@@ -173,7 +178,7 @@ def _fitted(shapes: Array, seen: Array, steps: int) -> PhaseError | None:
         near = off <= OUTLYING * SIGMAS_PER_MEDIAN * np.median(off)
     variance = np.var(seen[near] - shapes[near] @ found)
     chi2 = np.sum(np.square(shapes[near] @ found)) / variance / len(found)
-    # Where too few different phases are seen to tell a wave of the error, it could be anything.
+    # If too few different phases are seen to determine a wave of the error, it could be anything.
     credible = np.abs(found).max() < MOST_ERROR
     return (
         _phase_error(np.asarray(found, float), steps)

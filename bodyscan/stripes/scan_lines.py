@@ -1,4 +1,4 @@
-"""The frames of a stripe sequence, laid out so that every image row crosses the stripes."""
+"""The frames of a stripe sequence, laid out so that every row crosses the stripes."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from bodyscan.stripes.line_bands import BandLines
 Words = NDArray[np.uint16]
 
 WHOLE_SHARE = 128
-"""All of the light, as images of its shares have it."""
+"""All of the light, in images of its shares."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScanLines:
     """Frames as scan lines: L lines, each of P positions across the stripes.
 
-    lit, dark: (L, P).  patterns: (F, L, P), the images of the code.
-    inverses: (F, L, P), None where none are projected.  All of one type, see `Greys`.
+    lit, dark: (L, P).
+    patterns: (F, L, P), the images of the code.
+    inverses: (F, L, P), None if none are projected. All of one type, see `Greys`.
     turned: the lines are the camera image's columns (its stripes are horizontal).
-    bands: which of its lines they are, where not all.
+    bands: which of its lines they are, if not all.
     """
 
     lit: Greys
@@ -52,7 +53,7 @@ class ScanLines:
         return cv2.subtract(self.lit, self.dark, dtype=cv2.CV_32F)
 
     def words(self) -> NDArray[np.uint16]:
-        """(L, P) code words, the first pattern the most significant bit."""
+        """Code words (L, P), the first pattern being the most significant bit."""
         words = np.zeros(self.lit.shape, np.uint16)
         for bit in range(len(self.patterns)):
             if self.inverses is None:
@@ -63,8 +64,8 @@ class ScanLines:
         return words
 
     def bright(self, bit: int) -> Mask:
-        """(L, P): where a pattern is brighter than its inverse, or than the middle between lit and
-        dark if there is no inverse."""
+        """Where a pattern is brighter (L, P) than its inverse, or without one than the middle
+        between lit and dark."""
         if self.inverses is not None:
             return np.asarray(self.patterns[bit] > self.inverses[bit])
         if self.lit.dtype != np.uint8:
@@ -75,8 +76,8 @@ class ScanLines:
     def difference(self, bit: Indices, at: Indices, variance: Floats) -> tuple[Floats, Floats]:
         """Pattern minus inverse of bits (N,) at flat pixels (N, K), and its noise, grey levels.
 
-        Pixels below 0 get 0. Without inverses, twice what the pattern is above the middle of lit
-        and dark.
+        Pixels below 0 get 0. Without inverses, twice the excess of the pattern over the middle of
+        lit and dark.
         """
         patterns, inverses = self.patterns.reshape(-1), self._inverses.reshape(-1)
         return _differences(
@@ -84,24 +85,24 @@ class ScanLines:
         )
 
     def direct_share(self, bit: int, variance: Floats) -> Bytes:
-        """(L, P): what part of lit minus dark shows in `difference` of one bit, or as much as its
+        """Share (L, P) of lit minus dark that shows in `difference` of one bit, or as much as its
         noise allows, in 1/WHOLE_SHARE; at most 255."""
         share = np.empty(self.lit.size, np.uint8)
         inverse = self._inverses[bit : bit + 1].reshape(-1)
         frames = (self.lit.ravel(), self.dark.ravel(), self.patterns[bit].ravel(), inverse)
-        # Of whole grey levels there is one at least, where there is any light.
+        # With whole grey levels there is at least one wherever there is any light.
         least = np.float32(1.0 if self.lit.dtype == np.uint8 else 0.02)
         _share(*frames, variance, least, share)
         return share.reshape(self.lit.shape)
 
     @property
     def _inverses(self) -> Greys:
-        """(F, L, P), or (0, L, P) where none are projected."""
+        """Inverses (F, L, P), or (0, L, P) if none are projected."""
         return self.patterns[:0] if self.inverses is None else self.inverses
 
 
 def transpose(images: Greys) -> Greys:
-    """Each image of a stack (F, H, W) transpose."""
+    """Transpose each image of a stack (F, H, W)."""
     turned = np.empty((len(images), *images.shape[:0:-1]), images.dtype)
     for image, target in zip(images, turned, strict=True):
         cv2.transpose(image, dst=target)
@@ -110,7 +111,7 @@ def transpose(images: Greys) -> Greys:
 
 @compiled
 def _append_bit(words: Words, pattern: Greys, inverse: Greys) -> None:
-    """Makes room for one bit in code words (N,) and sets it where the pattern is brighter."""
+    """Shift code words (N,) by one bit and set it where the pattern is brighter."""
     for at in range(words.size):
         words[at] = (words[at] << 1) | (pattern[at] > inverse[at])
 
@@ -119,7 +120,7 @@ def _append_bit(words: Words, pattern: Greys, inverse: Greys) -> None:
 def _difference(
     pattern: float, inverse: float, lit: float, dark: float, inverted: bool, variance: Floats
 ) -> tuple[np.float32, np.float32]:
-    """See `ScanLines.difference`; of one pixel."""
+    """See `ScanLines.difference`; for one pixel."""
     seen = np.float32(pattern)
     if inverted:
         return seen - np.float32(inverse), np.sqrt(

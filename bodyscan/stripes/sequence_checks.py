@@ -1,4 +1,4 @@
-"""Whether the frames of a stripe sequence add up, and if not, which frame is to blame."""
+"""Whether the frames of a stripe sequence are consistent, and if not, which frame is to blame."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from bodyscan.stripes.usable_pixels import SATURATED
 Codes = NDArray[np.uint16]
 
 SAMPLES = 50_000
-"""About so many pixels are looked at where the whole picture is meant."""
+"""About how many pixels are examined to represent the whole image."""
 
 MIN_CONTRAST = 4
 MIN_SHARE_LIT = 1e-3
@@ -35,24 +35,25 @@ MAX_SHARE_BEYOND = 0.05
 MIN_FLIPS = 50
 WRONG_WAY = 2.0
 MIN_SHARE_CLEAR = 0.5
-"""Of changes of one bit that noise has no part in. Wrong frames leave hardly any in step; in a right
-sequence light that wandered between frames, and rims, put up to a third of a coarse bit's out of it."""
+"""Least share in step of one-bit changes that are free of noise. Wrong frames leave hardly any in
+step; in a right sequence light that varied between frames, and rims, put up to a third of a coarse
+bit's changes out of it."""
 TREND_PX, TREND = 16, 3
-"""Stripes gained over so many pixels without a leap: more than misread ones make."""
+"""Stripes gained over so many pixels without a jump: more than misread ones give."""
 MIN_SHARE_IN_STEP, MIN_SHARE_WITHOUT_INVERSES = 0.6, 0.75
 MAX_SHARE_FOLDED = 0.15
 MOST_CAUSES = 3
 CONVINCING = 0.8
 ENOUGH = 200_000
-"""Of the pixels lines are taken until there are so many, to look at neighbours along them."""
+"""Lines are added until they hold so many pixels, to compare neighbours along them."""
 
 
 def check_exposure(images: ScanLines) -> None:
     """Raises DecodingFailed for frames that are black or overexposed.
 
-    How bright a pattern and its inverse are together is not asked: cameras and projectors bend grey
-    levels, so that blurred patterns look brighter than sharp ones. Without an inverse, a pattern is
-    nowhere brighter than lit or darker than dark, or its threshold would be wrong.
+    The sum of a pattern and its inverse is not checked: cameras and projectors are non-linear, so
+    blurred patterns look brighter than sharp ones. Without an inverse, a pattern must nowhere be
+    brighter than lit or darker than dark, or its threshold would be wrong.
     """
     step = _step(images)
     lit, dark = (frame[::step, ::step].astype(np.int16) for frame in (images.lit, images.dark))
@@ -76,14 +77,15 @@ def check_exposure(images: ScanLines) -> None:
 
 
 def _step(images: ScanLines) -> int:
-    """From one line or place that is looked at to the next."""
+    """Step from one examined line or place to the next."""
     return max(1, round(math.sqrt(images.lit.size / SAMPLES)))
 
 
 def check_illumination(seen: Mask, lit: NDArray[Any]) -> None:
-    """Raises DecodingFailed where the projector lights next to nothing, or most of it too bright.
+    """Raises DecodingFailed if the projector lights next to nothing, or most of it too brightly.
 
-    seen: pixels that are lit.  lit: how bright they are then, grey levels.
+    seen: pixels that are lit.
+    lit: how bright they are then, grey levels.
     """
     if np.mean(seen) < MIN_SHARE_LIT:
         raise DecodingFailed(
@@ -99,7 +101,7 @@ def check_illumination(seen: Mask, lit: NDArray[Any]) -> None:
 
 
 def _check_range(bit: int, error: float) -> None:
-    """error: see `_out_of_range`."""
+    """Raises DecodingFailed for too large an error. error: see `_out_of_range`."""
     if error > MAX_SUM_ERROR:
         raise DecodingFailed(
             f"the pattern of bit {bit} is brighter than the lit frame or darker than the dark one "
@@ -110,8 +112,8 @@ def _check_range(bit: int, error: float) -> None:
 
 @compiled
 def _out_of_range(lit: Greys, dark: Greys, pattern: Greys, at: Indices) -> float:
-    """At flat pixels (N,): by how much of its contrast a pattern is brighter than the lit frame or
-    darker than the dark one."""
+    """Share of its contrast by which a pattern is brighter than the lit frame or darker than the
+    dark one, at flat pixels (N,)."""
     error = 0.0
     for pixel in at:
         light, black, seen = float(lit[pixel]), float(dark[pixel]), float(pattern[pixel])
@@ -123,22 +125,24 @@ def _out_of_range(lit: Greys, dark: Greys, pattern: Greys, at: Indices) -> float
 def check_codes(
     images: ScanLines, words: Codes, code: WordCode, stripes: int, variance: Floats
 ) -> None:
-    """Raises DecodingFailed if patterns and inverses are not of one bit, or neighbouring pixels do not
-    lie in neighbouring stripes.
+    """Raises DecodingFailed if patterns and inverses are not of one bit, or neighbouring pixels are
+    not in neighbouring stripes.
 
-    words: (L, P) code words as read. Where just one bit of a Gray code differs between two pixels,
-    their stripes must be neighbours, whichever bit it is; bits that noise may have turned are left
-    out of that. A missing pattern may go unnoticed; then stripes count up and down along a line,
-    which they must not. An exchange of the coarsest pattern and its inverse turns the whole order
-    round; it shows only in codes beyond the last stripe, and not at all if all codes are in use.
+    words: (L, P) code words as read.
     variance: (256,) of each grey level.
+
+    If just one bit of a Gray code differs between two pixels, their stripes must be neighbours,
+    whichever bit it is; bits that noise may have flipped are excluded. A missing pattern may go
+    unnoticed; then stripes count up and down along a line, which they must not. Exchanging the
+    coarsest pattern and its inverse reverses the whole order; it shows only in codes beyond the
+    last stripe, and not at all if all codes are in use.
     """
     bits = len(images.patterns)
     contrast = cv2.subtract(images.lit, images.dark)
     step = _step(images)
     some = slice(None, None, step)
     sampled = contrast[some, some]
-    # Darker pixels are misread too often by themselves to tell anything.
+    # Darker pixels are misread too often to say anything.
     good = contrast >= np.median(sampled[sampled >= MIN_CONTRAST])
     some = slice(None, None, 2 * step)
     shown, pairs = good[some, some], None
@@ -148,7 +152,7 @@ def check_codes(
         pairs = LitPairs.of(patterns[:, shown], inverses[:, shown], variance)
         check_seen(pairs)
         seen = seen[pairs.coarse_clear]
-    # Noise turns the finest bits along lines and across them.
+    # Noise flips the finest bits both along and across lines.
     check_direction(words >> max(min(FINE_BITS, bits - FINE_BITS), 0), good, images.turned)
     if images.inverses is None or not code.single:
         lines = slice(None, None, max(1, words.size // ENOUGH))
@@ -184,9 +188,10 @@ def check_codes(
 
 
 def _check_folds(stripes: NDArray[np.int32], good: Mask) -> None:
-    """Raises DecodingFailed if stripes (L, P) count up and down: a pattern shows no stripes then.
+    """Raises DecodingFailed if stripes (L, P) count up and down: some pattern then shows no
+    stripes.
 
-    Along a line of any camera they count one way on all that both camera and projector see.
+    Along a line of any camera they count one way on everything that both camera and projector see.
     """
     leaps = np.cumsum(np.abs(np.diff(stripes, axis=1)) > 1, axis=1)
     step = stripes[:, TREND_PX + 1 :] - stripes[:, 1:-TREND_PX]
@@ -203,7 +208,8 @@ def _check_folds(stripes: NDArray[np.int32], good: Mask) -> None:
 def check_direction(numbers: NDArray[Any], good: Mask, turned: bool) -> None:
     """Raises WrongDirection if stripes change from line to line rather than along lines.
 
-    numbers: (L, P) code words or stripes.  turned: see `ScanLines`.
+    numbers: (L, P) code words or stripes.
+    turned: see `ScanLines`.
     """
     flips = [
         np.count_nonzero((np.diff(numbers, axis=axis) != 0) & _both(good, axis)) for axis in (0, 1)
@@ -223,7 +229,7 @@ def _both(good: Mask, axis: int) -> Mask:
 
 
 def _changes(words: Codes, good: Mask, code: WordCode) -> tuple[Codes, Codes]:
-    """Code words (N,) of neighbours along lines that differ: of a Gray code in just one bit."""
+    """Code words (N,) of neighbours along lines that differ, for a Gray code in just one bit."""
     difference = words[:, 1:] ^ words[:, :-1]
     changes = (difference != 0) & _both(good, 1)
     if code.single:
@@ -233,8 +239,8 @@ def _changes(words: Codes, good: Mask, code: WordCode) -> tuple[Codes, Codes]:
 
 
 def _in_step(one: Codes, other: Codes, code: WordCode, bits: int) -> dict[int, float]:
-    """For each bit that flips often enough (the coarsest, where several do): how often the stripes
-    then are neighbours."""
+    """For each bit that flips often enough (the coarsest, if several do): the share of flips
+    between neighbouring stripes."""
     step = np.abs(code.stripes(one) - code.stripes(other))
     bit = bits - np.frexp((one ^ other).astype(np.float64))[1]
     flips = np.bincount(bit, minlength=bits)
@@ -243,7 +249,7 @@ def _in_step(one: Codes, other: Codes, code: WordCode, bits: int) -> dict[int, f
 
 
 def _beyond(words: Codes, code: WordCode, stripes: int) -> float:
-    """Share of code words that no stripe has."""
+    """Share of code words that belong to no stripe."""
     if not words.size:
         return 0.0
     found = code.stripes(words)
@@ -253,7 +259,7 @@ def _beyond(words: Codes, code: WordCode, stripes: int) -> float:
 def _causes(
     one: Codes, other: Codes, words: Codes, code: WordCode, bits: int, stripes: int
 ) -> Iterator[str]:
-    """What, undone, would make the code whole; the simplest first."""
+    """Mistakes that, undone, would make the code consistent; the simplest first."""
     for cause, undo in _mistakes(bits):
         in_step = _in_step(undo(one), undo(other), code, bits)
         whole = bool(in_step) and min(in_step.values()) > CONVINCING
@@ -262,7 +268,7 @@ def _causes(
 
 
 def _mistakes(bits: int) -> Iterator[tuple[str, Callable[[Codes], Codes]]]:
-    """Common mistakes with the frames, and how code words are changed to undo them."""
+    """Common mistakes with the frames, and how to change code words to undo them."""
     for bit in range(bits):
         mask = np.uint16(1 << (bits - 1 - bit))
         yield f"pattern and inverse of bit {bit} were exchanged", partial(np.bitwise_xor, mask)
@@ -277,7 +283,7 @@ def _mistakes(bits: int) -> Iterator[tuple[str, Callable[[Codes], Codes]]]:
 
 
 def _reordered(order: list[int], words: Codes) -> Codes:
-    """Words whose bit k is bit order[k] of the given ones; 0 the most significant."""
+    """Words whose bit k is bit order[k] of the given ones; 0 is the most significant."""
     bits = len(order)
     result = np.zeros_like(words)
     for target, source in enumerate(order):

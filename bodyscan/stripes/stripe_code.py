@@ -1,7 +1,7 @@
 """What a stripe code is: the images a projector shows one after the other, and how they are read.
 
 Each code is one file of `bodyscan.stripes.codes`. Every rig file needs the codes' descriptions, so
-what is heavy (numpy, numba, OpenCV) is imported inside `intensity` and `decode`.
+anything heavy (numpy, numba, OpenCV) is imported inside `intensity` and `decode`.
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ DEFAULT_CODE = "gray"
 class ImageKind:
     """Images of one purpose in a sequence, such as the patterns of bits.
 
-    name: its key below `frames` in a rig file.  template: how its images are named if the rig file
-    does not say.  number: the field of the template that numbers them from 0, None for a single
-    image.  most: how many there can be.
+    name: its key below `frames` in a rig file.
+    template: the names of its images if the rig file does not say.
+    number: the field of the template that numbers them from 0, None for a single image.
+    most: how many there can be.
     """
 
     name: str
@@ -50,10 +51,12 @@ class ImageKind:
 class SequenceImages:
     """What a camera saw of a sequence, grey levels.
 
-    lit, dark: (H, W); no dark where none was taken.  coded: (n, H, W) of each kind.  All of one type:
-    uint8, or float32 where parts of grey levels are known.  moments: when they were taken, if what
-    moved meanwhile is to be told and taken out by codes that can.  bands: where boundaries alone are
-    wanted; codes that can look there only, and give no s.
+    lit, dark: (H, W); dark is None if not taken.
+    coded: (n, H, W) of each kind.
+    moments: when they were taken, if codes that can are to measure and remove motion.
+    bands: where only boundaries are wanted; codes that can look there alone, and give no s.
+
+    All images are of one type: uint8, or float32 if they hold fractions of grey levels.
     """
 
     lit: Greys
@@ -64,15 +67,17 @@ class SequenceImages:
 
 
 class StripeCode(Model):
-    """The stripes that a projector shows: how many, which way they run, and how they are told apart.
+    """The stripes that a projector shows: how many, which way they run, and how they are told
+    apart.
 
-    A code adds the keys that the rig file may give it as fields, and what follows here.
+    A code adds the keys that it takes in the rig file as fields, and defines the following.
 
-    kinds: of its images, in the order in which they are shown.  uses_dark: whether it has use for an
-    image without the projector's light.  is_projected: False where an instrument projects stripes
-    of its own and hands out what it read.  has_edges: whether its light changes at boundaries of
-    stripes, which then lie best on whole projector pixels.
-    crossing: stripes that the same projector shows the other way after these, if it does.
+    kinds: of its images, in the order in which they are shown.
+    uses_dark: whether it has use for an image without the projector's light.
+    is_projected: False if an instrument projects its own stripes and outputs what it read.
+    has_edges: whether its light changes at boundaries of stripes, which then should lie on whole
+        projector pixels.
+    crossing: stripes that the same projector shows afterwards in the other direction, if any.
     """
 
     kinds: ClassVar[tuple[ImageKind, ...]]
@@ -87,7 +92,7 @@ class StripeCode(Model):
 
     @property
     def directions(self) -> tuple[StripeCode, ...]:
-        """Itself, and the stripes that cross them if there are any."""
+        """This code, and the crossing stripes if there are any."""
         return (self,) if self.crossing is None else (self, self.crossing)
 
     def problems(self) -> Iterator[Problem]:
@@ -113,26 +118,27 @@ class StripeCode(Model):
     @property
     @abstractmethod
     def image_counts(self) -> Mapping[ImageKind, int]:
-        """How many images of each kind are shown, in their order, besides lit and dark; those of
-        `crossing`, which follow, left out."""
+        """How many images of each kind are shown, in order, without lit and dark, and without those
+        of `crossing`, which follow."""
 
     @property
     def show_order(self) -> tuple[int, ...]:
-        """Its images, numbered as in `image_counts`, in the order in which they are best shown."""
+        """Its images, numbered as in `image_counts`, in the best order to show them."""
         return tuple(range(sum(self.image_counts.values())))
 
     def moment(self, times: Mapping[str, Array]) -> float:
-        """The moment for which its stripe map stands, in the unit of the images' times (n,) by kind."""
+        """The moment for which its stripe map stands, in the
+        unit of the images' times (n,) by kind."""
         first = min(float(each.min()) for each in times.values())
         return (first + max(float(each.max()) for each in times.values())) / 2.0
 
     @abstractmethod
     def intensity(self, kind: ImageKind, s: Array) -> Array:
-        """Of the images of one kind at stripe coordinates s (N,): (images, N), 0 to 1."""
+        """Images of one kind at stripe coordinates s (N,): (images, N), 0 to 1."""
 
     def lit_from(self, coded: Mapping[ImageKind, Greys]) -> Greys:
-        """(H, W): the scene under all of the projector's light, from images (n, H, W) that each
-        show a part of it; for a code that does not need a lit image."""
+        """The scene under all of the projector's light, (H, W), from images (n, H, W) that each
+        show part of it; for a code that does not need a lit image."""
         import numpy as np
 
         brightest: list[Greys] = [images.max(axis=0) for images in coded.values()]
@@ -144,14 +150,16 @@ class StripeCode(Model):
         """The stripe coordinate of every pixel.
 
         limits: a code may leave out stripes beyond them, and say so in `beyond`; it need not.
-        Raises DecodingFailed, naming the image where it can be told, if they do not add up.
+
+        Raises DecodingFailed, naming the image if it can be identified, for inconsistent images.
         """
 
     @model_serializer(mode="wrap")
     def _with_its_name(
         self, serialize: SerializerFunctionWrapHandler, info: SerializationInfo
     ) -> dict[str, Any]:
-        """`code` is a default of each class; of a rig file only one of them is."""
+        """Write `code` even if it is a class's default; in a rig
+        file only DEFAULT_CODE may be left out."""
         keys = serialize(self)
         plain = info.exclude_defaults and self.code == DEFAULT_CODE
         return keys if plain else {"code": self.code, **keys}

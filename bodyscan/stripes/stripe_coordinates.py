@@ -22,9 +22,9 @@ REACH_PX = 6.0
 MAX_STRAY = 4.0
 SLACK = 0.15
 BEYOND = 0.4
-"""How far s is continued past the last boundary of a run, stripes."""
+"""How far s is extrapolated past the last boundary of a run, in stripes."""
 BEYOND_DOUBT = 3.0
-"""How much less is known of s there."""
+"""Factor on the sigma of s there."""
 MAX_PULL = 0.05
 """More than blur does to s on any smooth surface."""
 
@@ -32,11 +32,12 @@ MAX_PULL = 0.05
 def interpolate_stripes(
     boundaries: Boundaries, codes: NDArray[np.int32], usable: Mask, carried: float = 0.0
 ) -> tuple[Floats, Floats]:
-    """s and its standard deviation, (L, P) each, NaN where there is none.  carried: how far boundaries
-    may have been carried from where the codes change, stripes.
+    """s and its standard deviation, (L, P) each, NaN where there is none.
 
-    Between two boundaries s is a cubic with the slopes that the boundaries around them tell
-    (Hermite's). Past the last boundary of a run it goes on with the slope there, a little way.
+    carried: how far boundaries may have been carried from where the codes change, stripes.
+
+    Between two boundaries s is a cubic with slopes from the boundaries around them (Hermite). Past
+    the last boundary of a run it continues a little with the slope there.
     """
     s = np.full(codes.shape, np.nan, np.float32)
     sigma = s.copy()
@@ -53,9 +54,13 @@ def interpolate_stripes(
 class _Segments:
     """s on a scan line between boundaries j and j + 1: NaN if they are not joined.
 
-    start: place of boundary j, px.  width: to the next, px.  index: s at boundary j.  rise: what s
-    gains to the next.  slope_in, slope_out: ds per px at both ends.  pull: what blur adds to s
-    where s bends, blur^2 / 2 times its second derivative.  sigma: of s.
+    start: place of boundary j, px.
+    width: distance to the next, px.
+    index: s at boundary j.
+    rise: change of s to the next.
+    slope_in, slope_out: ds per px at both ends.
+    pull: what blur adds to s where s bends, blur^2 / 2 times its second derivative.
+    sigma: of s.
     """
 
     start: Array
@@ -94,11 +99,12 @@ def _fill(
     bends: tuple[Array, ...],
     slack: float,
 ) -> None:
-    """Writes s and sigma (L, P) of usable pixels from the segments they lie in; beyond a run's
-    ends from the run's last one, the one before the pixel rather than the one behind.
+    """Write s and sigma (L, P) of usable pixels from the segments they lie in; beyond a run's ends,
+    from its last segment, the one before the pixel in preference to the one after.
 
-    line, before: (N,) of the boundaries. segments, bends: (N - 1,) each, see `_Segments`.  slack: by
-    how many stripes s may leave the code's stripe.
+    line, before: (N,) of the boundaries.
+    segments, bends: (N - 1,) each, see `_Segments`.
+    slack: by how many stripes s may leave the code's stripe.
     """
     last, count = -1, line.size
     for row in range(codes.shape[0]):
@@ -148,8 +154,8 @@ def _beside(
     bends: tuple[Array, ...],
     slack: float,
 ) -> tuple[float, float]:
-    """s and its standard deviation at a place (px) before or behind segment k, or NaN: its bend
-    goes on, and s is doubted by as much as that adds."""
+    """s and its standard deviation at a place (px) before or after segment k, or NaN: its bend
+    continues, and the doubt grows by what that adds."""
     start, width, index, rise, sigma = segments
     slope_in, slope_out, pull = bends
     x, base, slope = place - start[k], index[k] - pull[k], slope_in[k]
@@ -164,8 +170,8 @@ def _beside(
 def _credible(
     value: float, doubt: float, code: int, middle: float, slack: float
 ) -> tuple[float, float]:
-    """Both, or NaN where the pixel's code says otherwise or the segment (its middle's s is given)
-    is left by more than a part of a stripe."""
+    """Both values, or NaN if the pixel's code disagrees or s leaves the segment (`middle` is s at
+    its middle) by more than a part of a stripe."""
     if abs(value - code - 0.5) < 0.5 + slack and abs(value - middle) < 0.5 + BEYOND:
         return value, doubt
     return np.nan, np.nan
@@ -173,12 +179,12 @@ def _credible(
 
 @compiled
 def end_slopes(secant: Array, width: Array) -> tuple[Array, Array]:
-    """Slopes of s at both ends of every segment from the segments beside it; their own secant where
-    there are none.
+    """Slopes of s at both ends of every segment, from the neighbouring segments; the segment's own
+    secant if there are none.
 
-    Within a run the slope at a boundary is that of the parabola through it and its neighbours; at
-    a run's end the parabola of the one segment goes on. Segments in which s runs the other way
-    tell nothing of this one.
+    Within a run the slope at a boundary is that of the parabola through it and its neighbours; at a
+    run's end the parabola of the one segment is continued. Segments in which s runs the other way
+    say nothing about this one.
     """
     count = secant.size
     slope_in, slope_out = np.full(count, np.nan), np.full(count, np.nan)
@@ -205,8 +211,8 @@ def smooth_runs(boundaries: Boundaries, joined: Mask) -> tuple[Array, Array]:
     """Positions and their sigmas, px, after a local quadratic fit along each unbroken run.
 
     Along a run the index counts evenly, so the fit of place against index is a fixed filter. It
-    reaches no further than about 6 px and not past the run's ends; a boundary that it would move
-    by more than noise explains stays where it was seen.
+    reaches no farther than about 6 px and not past the run's ends; a boundary that it would move by
+    more than noise explains is left in place.
     """
     position, sigma = boundaries.position.copy(), boundaries.sigma_px.copy()
     for weights in SMOOTHERS:
@@ -223,7 +229,7 @@ def _smooth(
     position: Array,
     sigma: Array,
 ) -> None:
-    """One filter of `smooth_runs`; overwrites position and sigma (N,) where it fits."""
+    """Apply one filter of `smooth_runs`; overwrites position and sigma (N,) where it fits."""
     half = weights.size // 2
     share = math.sqrt(np.sum(weights * weights))
     run = 0  # how many boundaries before this one belong to its run

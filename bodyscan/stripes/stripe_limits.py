@@ -1,4 +1,4 @@
-"""Which stripes of a picture are worth decoding: those of what stands in the scan volume."""
+"""Which stripes of an image are worth decoding: those on things in the scan volume."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from numpy.typing import NDArray
 from bodyscan.arrays import Floats, Mask
 from bodyscan.compiled import compiled
 
-TILE_PX = 8  # which is what fits into a word of 64 bits
+TILE_PX = 8  # fits into a word of 64 bits
 
 LEAST_STANDING = 1e-3  # of what is seen in the volume
 
 
 @dataclass(frozen=True, eq=False)
 class StripeLimits:
-    """Between which stripe coordinates a pixel's point lies in the scan volume.
+    """Stripe coordinates between which a pixel's point lies in the scan volume.
 
     near, far: (rows, columns) float32 at the corners of blocks of `block_px` x `block_px` camera
-    pixels, linear between; s where it grows with depth and -s where it falls (`rising`), so that
-    what lies deeper than wanted is beyond `far` either way. Where far is below near, nothing is.
-    standing: likewise, where the volume's lowest layer begins. What lies in that layer, as the
-    floor does, is wanted within `around_px` of something that stands higher; all of it, where next to
-    nothing does: a plate may lie there.
+        pixels, linear between; s if it grows with depth and -s if it falls (`rising`), so that what
+        lies deeper than wanted is beyond `far` either way. Where far is below near, nothing is
+        wanted.
+    standing: likewise, where the volume's lowest layer begins. What lies in that layer, such as the
+        floor, is wanted within `around_px` of something that stands higher; all of it if next to
+        nothing does: a plate may lie there.
     """
 
     near: Floats
@@ -38,10 +39,10 @@ class StripeLimits:
     def split(
         self, s: NDArray[np.int32] | Floats, usable: Mask, *, turned: bool = False
     ) -> tuple[Mask, Mask]:
-        """(L, P) pixels of `usable` that are wanted, and those that lie beyond.
+        """Pixels (L, P) of `usable` that are wanted, and those that lie beyond.
 
-        s: (L, P) stripe coordinates or, as integers, stripes.  turned: the lines are the camera
-        image's columns.
+        s: (L, P) stripe coordinates or, as integers, stripes.
+        turned: the lines are the camera image's columns.
         """
         limits = np.stack([self.near, self.far, self.standing])
         limits = np.ascontiguousarray(limits.transpose(0, 2, 1)) if turned else limits
@@ -72,8 +73,8 @@ def _split(
     deep: Mask,
     standing: Mask,
 ) -> None:
-    """Fills in what lies in the volume (L, P), what lies in its lowest layer or beyond (L, P), and
-    what stands higher than that layer, in a picture of at least that size.
+    """Fill, in arrays of at least the image's size, what lies in the volume (`there`), in its
+    lowest layer or beyond (`deep`), and higher than that layer (`standing`), (L, P) each.
 
     limits: (3, rows, columns), near, far, standing.
     """
@@ -95,7 +96,7 @@ def _split(
         _stand(there[line], deep[line], standing[line])
 
 
-# One line at a time, and one array filled by each loop: only so the compiler takes many at once.
+# One line at a time, one array filled per loop: otherwise the compiler does not vectorise.
 
 
 @compiled
@@ -132,7 +133,7 @@ def _stand(there: Mask, deep: Mask, standing: Mask) -> None:
 
 @compiled
 def _widen(edges: Floats, block_px: int, values: Floats) -> None:
-    """Fills in values (P,) at pixels' middles, linear between those at blocks' edges (columns,)."""
+    """Fill values (P,) at pixel centres, linear between those at the edges of blocks (columns,)."""
     for place in range(values.size):
         column = place // block_px
         share = np.float32((place + 0.5) / block_px - column)
@@ -141,8 +142,8 @@ def _widen(edges: Floats, block_px: int, values: Floats) -> None:
 
 @compiled
 def _keep(tiles: Mask, there: Mask, deep: Mask) -> None:
-    """Leaves `there` (L, P) what lies in one of the tiles (rows, P or more), and `deep` what is not
-    there."""
+    """Keep in `there` (L, P) what lies in one of the tiles (rows, P or more), and in `deep` what is
+    not in `there`."""
     for line in range(there.shape[0]):
         tile = tiles[line // TILE_PX]
         for place in range(there.shape[1]):

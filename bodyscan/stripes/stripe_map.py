@@ -15,7 +15,7 @@ from bodyscan.stripes.scan_lines import ScanLines
 
 @dataclass(frozen=True)
 class ResponseShare:
-    """What the projector's response did to s before it was taken out, and what noise does still.
+    """What the projector's response did to s before it was removed, and what noise still does.
 
     response_rms, noise_rms: stripes, over the pixels that have s.
     """
@@ -36,20 +36,21 @@ class ResponseShare:
 class StripeMap:
     """The stripe coordinate of every lit pixel, and the stripe boundaries between them.
 
-    s: (height, width) float32, in [0, S]; NaN where there is none; (0, 0) where boundaries alone were
-    wanted.
+    s: (height, width) float32, in [0, S]; NaN where there is none; (0, 0) if only boundaries were
+        wanted.
     sigma: (height, width) float32, standard deviation of s, in stripes; NaN likewise.
     lit: (height, width) uint8, the fully lit image (grey).
     boundary_index: (N,) int64: boundary i lies between stripes i - 1 and i, that is s = i.
     boundary_pixels: (N, 2) float64, where it was seen, px, sub-pixel.
     boundary_sigma_px: (N,) float32, standard deviation across the stripe, px.
     stripes: S, the number of stripes projected.
-    beyond: (height, width) bool, lit by a stripe that lies deeper than wanted; None where all stripes
-    were wanted. s is NaN there (see `StripeLimits`).
-    crossing: the map of the stripes that run the other way, where such were projected; crossing_fault:
-    why there is none although they were, "" otherwise.
-    response: what the projector's response did, of codes that tell it; None where noise explains all.
-    motion: what moved while the images were taken, of codes that tell it where their moments are given.
+    beyond: (height, width) bool, lit by a stripe that lies deeper than wanted, where s is NaN (see
+        `StripeLimits`); None if all stripes were wanted.
+    crossing: the map of the stripes that run the other way, if such were projected.
+    crossing_fault: why there is none although they were, else "".
+    response: what the projector's response did, for codes that measure it; None if noise explains
+        it.
+    motion: what moved while the images were taken, for codes that measure it, if moments are given.
     """
 
     s: Floats
@@ -75,7 +76,7 @@ def stripe_map(
     stripes: int,
     beyond: Mask | None = None,
 ) -> StripeMap:
-    """What was read along scan lines, back in the camera's own layout."""
+    """Bring what was read along scan lines back into the camera's own layout."""
     if images.turned:
         s, sigma = cv2.transpose(s), cv2.transpose(sigma)
         beyond = None if beyond is None else beyond.T

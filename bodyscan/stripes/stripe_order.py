@@ -1,4 +1,5 @@
-"""Whether the stripes that pixels show follow each other, for codes that number them directly."""
+"""Whether the stripes of neighbouring pixels are consecutive, for codes that number them
+directly."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ SELDOM = 0.05
 
 
 def check_order(numbers: Numbers, good: Mask, turned: bool, stripes: int) -> None:
-    """Raises DecodingFailed if neighbouring pixels do not lie in neighbouring stripes.
+    """Raises DecodingFailed if neighbouring pixels are not in neighbouring stripes.
 
     numbers: (L, P) stripe of each pixel, 0 to stripes - 1, where it is `good`.
     """
@@ -60,7 +61,7 @@ def _changes(numbers: Numbers, good: Mask) -> tuple[Numbers, Numbers]:
 
 
 def _gone(one: Numbers, other: Numbers, stripes: int) -> NDArray[np.intp]:
-    """Stripes that no pixel shows, while many neighbours show those before and behind."""
+    """Stripes that no pixel shows, while many neighbours show those before and after."""
     shown = np.bincount(one, minlength=stripes) + np.bincount(other, minlength=stripes)
     leaps = np.abs(one - other) == 2
     across = np.bincount((one[leaps] + other[leaps]) // 2, minlength=stripes)

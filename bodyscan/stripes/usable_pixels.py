@@ -20,8 +20,8 @@ WHOLLY_COVERED = 0.7
 
 
 def least_contrast(of: np.dtype[Any]) -> float:
-    """Grey levels of images of type `of`: below it whole grey levels are too few to tell anything;
-    of finer ones, noise alone says what is too little."""
+    """Least contrast in grey levels for images of type `of`: fewer whole grey levels say nothing;
+    with finer ones, noise alone decides."""
     return MIN_CONTRAST if of == np.uint8 else 0.0
 
 
@@ -32,8 +32,8 @@ def usable_pixels(
     stripes: int,
     fine_bit: int,
 ) -> Mask:
-    """(L, P): pixels whose stripes `codes` can be relied on: those of `shown_pixels` but for pixels
-    beside a jump of the code by more than one (a mixed pixel at a depth jump is one)."""
+    """Pixels (L, P) whose stripes `codes` can be relied on: those of `shown_pixels` except for
+    pixels beside a jump of the code by more than one (such as a mixed pixel at a depth jump)."""
     return shown_pixels(images, codes, variance, stripes, fine_bit)[0]
 
 
@@ -44,11 +44,14 @@ def shown_pixels(
     stripes: int,
     fine_bit: int,
 ) -> tuple[Mask, Mask]:
-    """(L, P) the usable pixels, and all that show a code, those beside its jumps among them.
+    """The usable pixels (L, P), and all that show a code, including those beside its jumps.
 
-    Not low contrast, saturation, codes that were not projected, pixels that the surface's rim
-    covers only in part, and pixels that other surfaces light more than the projector does.
-    variance: (256,) of each grey level.  fine_bit: see `mostly_direct`.
+    Excluded are low contrast, saturation, codes that were not projected, pixels that the surface's
+    rim covers only in part, and pixels that get more light from other surfaces than from the
+    projector.
+
+    variance: (256,) of each grey level.
+    fine_bit: see `mostly_direct`.
     """
     contrast = cv2.subtract(images.lit, images.dark)
     least = np.maximum(least_contrast(contrast.dtype), MIN_CONTRAST_TO_NOISE * np.sqrt(variance))
@@ -65,9 +68,9 @@ def shown_pixels(
 
 
 def half_covered_pixels(contrast: NDArray[Any], lit: Mask) -> Mask:
-    """(L, P): pixels beside one that is not lit and much darker than their brightest neighbour.
+    """Pixels (L, P) beside one that is not lit and much darker than their brightest neighbour.
 
-    They straddle the rim of the surface, and tell s of its part of them, not of their middle.
+    They straddle the rim of the surface, and show s of its part of them, not of their centre.
     """
     around = np.ones((3, 3), np.uint8)
     at_rim = cv2.erode(lit.view(np.uint8), around, borderValue=1) == 0
@@ -75,7 +78,7 @@ def half_covered_pixels(contrast: NDArray[Any], lit: Mask) -> Mask:
 
 
 def beside_jumps(codes: NDArray[np.int32], usable: Mask) -> Mask:
-    """(L, P): pixels whose code differs from a usable neighbour's by more than one."""
+    """Pixels (L, P) whose code differs from a usable neighbour's by more than one."""
     jumps = np.zeros(codes.shape, bool)
     _mark_jumps(codes, usable, jumps)
     return jumps
@@ -83,7 +86,7 @@ def beside_jumps(codes: NDArray[np.int32], usable: Mask) -> Mask:
 
 @compiled
 def _mark_jumps(codes: NDArray[np.int32], usable: Mask, jumps: Mask) -> None:
-    # Without a branch inside: on a noisy image a processor guesses wrong every other time.
+    # Without a branch inside: on a noisy image a processor mispredicts every other one.
     lines, places = codes.shape
     for line in range(lines):
         jump = _leaps(codes[line, 1:], codes[line, :-1], usable[line, 1:], usable[line, :-1])
@@ -103,7 +106,7 @@ def _mark_jumps(codes: NDArray[np.int32], usable: Mask, jumps: Mask) -> None:
 def _leaps(
     one: NDArray[np.int32], other: NDArray[np.int32], usable: Mask, usable_too: Mask
 ) -> Mask:
-    """(P,) whether two rows' codes, both usable, differ by more than one."""
+    """Whether two rows' codes, both usable, differ by more than one, (P,)."""
     leap = np.empty(one.size, np.bool_)
     for place in range(one.size):
         leap[place] = (abs(one[place] - other[place]) > 1) & usable[place] & usable_too[place]

@@ -12,8 +12,10 @@ Shift = Literal["forward", "backward"]
 class Wave:
     """Image k of `steps` shows 1/2 + 1/2 cos(2 pi ((s - origin) / period -+ k / steps) + start).
 
-    period, origin: stripes.  start: radians.  shift: forward where the wave moves to larger s from
-    image to image (the sign before k is minus), backward where it moves to smaller s.
+    period, origin: stripes.
+    start: radians.
+    shift: forward if the wave moves to larger s from image to image (the sign before k is minus),
+        backward if it moves to smaller s.
     """
 
     period: float
@@ -24,18 +26,18 @@ class Wave:
 
     @property
     def sign(self) -> float:
-        """Of the shift: 1 forward."""
+        """Sign of the shift: 1 forward."""
         return 1.0 if self.shift == "forward" else -1.0
 
     @property
     def first_turn(self) -> float:
-        """s / period where image 0 is brightest, less a whole number."""
+        """s / period where image 0 is brightest, modulo 1."""
         return (self.origin / self.period - self.start / 6.283185307179586) % 1.0
 
 
 def alike_again(periods: tuple[float, ...], stripes: int, least: float) -> float | None:
-    """By how many stripes s may move (less than `stripes`) so that no wave changes by as much as
-    `least` of its period; None if there is no such move. Then the waves tell s."""
+    """By how many stripes s can move (less than `stripes`) without any wave changing by as much as
+    `least` of its period; None if it cannot, in which case the waves determine s."""
     finest = min(periods)
     for count in range(1, int(stripes / finest) + 1):
         moved = count * finest

@@ -1,7 +1,7 @@
-"""How noisy grey levels are, measured from the waves of a phase-shift sequence themselves.
+"""Noise of grey levels, measured from the waves of a phase-shift sequence themselves.
 
-Several waves, or more than three steps of one, say more than once what the surface's mean
-brightness is and how a wave looks; where these differ is noise.
+Several waves, or more than three steps of one, give the surface's mean brightness and the shape of
+a wave more than once; the differences are noise.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ HARMONICS = (2, 3, 4)
 
 
 def wave_variance(waves: Sequence[WaveSeen], images: Sequence[Greys], usable: Mask) -> Floats:
-    """(256,) variance of one image's grey level, for each grey level.
+    """Variance (256,) of one image's grey level, for each grey level.
 
-    waves, and the images (N, L, P) of each; usable: (L, P) pixels that the projector lights.
+    waves, images: the waves, and the images (N, L, P) of each.
+    usable: (L, P) pixels that the projector lights.
     """
     some = np.flatnonzero(usable)
     some = some[:: max(1, len(some) // MOST_PIXELS)]
-    # Sorted by the mean of all images, which says nothing of how far two waves' means are apart.
+    # Sorted by the mean of all images, which is independent of the difference of two waves' means.
     steps = [wave.wave.steps for wave in waves]
     level = np.average([wave.mean.ravel()[some] for wave in waves], axis=0, weights=steps)
     misfits = list(_misfits(waves, images, some))
@@ -42,7 +43,8 @@ def wave_variance(waves: Sequence[WaveSeen], images: Sequence[Greys], usable: Ma
 
 
 def _misfits(waves: Sequence[WaveSeen], images: Sequence[Greys], some: Indices) -> Iterator[Array]:
-    """What would be zero without noise, at some pixels, each with the variance of one image."""
+    """Quantities that would be zero without noise, at some pixels, each with one image's
+    variance."""
     for one, other in pairwise(waves):
         apart = one.mean.ravel()[some] - other.mean.ravel()[some]
         yield apart / np.sqrt(1.0 / one.wave.steps + 1.0 / other.wave.steps)
@@ -52,7 +54,7 @@ def _misfits(waves: Sequence[WaveSeen], images: Sequence[Greys], some: Indices) 
 
 
 def _beside_the_wave(wave: WaveSeen, images: Greys, some: Indices) -> Array:
-    """What images show beside mean and wave, less the harmonics of the projector's response."""
+    """What images show besides mean and wave, less the harmonics of the projector's response."""
     step = np.arange(wave.wave.steps)
     turn = 2.0 * np.pi * step / wave.wave.steps
     known = np.stack([np.ones(len(step)), np.cos(turn), np.sin(turn)])
@@ -65,7 +67,7 @@ def _beside_the_wave(wave: WaveSeen, images: Greys, some: Indices) -> Array:
 
 
 def _spread2(misfit: Array) -> float:
-    """Variance about the mean, without what lies far off (a surface's edge, where things moved)."""
+    """Variance about the mean, without outliers (a surface's edge, where things moved)."""
     off = np.abs(misfit - np.median(misfit))
     near = misfit[off <= OUTLYING * SIGMAS_PER_MEDIAN * max(float(np.median(off)), 1e-3)]
     return float(np.var(near))

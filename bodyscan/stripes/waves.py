@@ -19,14 +19,15 @@ from bodyscan.arrays import Floats, Greys
 from bodyscan.stripes.wave import Wave
 
 LEAST_SIGMA = 5e-4
-"""Of a period: what light that is not quite a wave, and rounding, leave."""
+"""Share of a period: left by rounding and by light that is not quite a wave."""
 
 
 @dataclass(frozen=True, eq=False)
 class WaveSeen:
     """One wave as the pixels (L, P) saw it.
 
-    turn: s / period less a whole number, 0 to 1.  amplitude, mean: grey levels, at least 1e-3.
+    turn: s / period modulo 1.
+    amplitude, mean: grey levels, at least 1e-3.
     """
 
     wave: Wave
@@ -41,7 +42,7 @@ class WaveSeen:
 
 
 def see_wave(images: Greys, wave: Wave) -> WaveSeen:
-    """From its images (steps, L, P)."""
+    """Measure a wave from its images (steps, L, P)."""
     angle = 2.0 * np.pi * np.arange(len(images)) / len(images)
     if wave.shift == "backward":
         angle = -angle
@@ -63,17 +64,17 @@ def white_and_black(waves: Sequence[WaveSeen]) -> tuple[Floats, Floats]:
 
 
 def white_image(images: Greys, waves: tuple[Wave, ...]) -> Greys:
-    """(H, W): the scene under all of the projector's light, from the images (F, H, W) of waves."""
+    """The scene under all of the projector's light, (H, W), from the images (F, H, W) of waves."""
     parts = zip(split_waves(images, waves), waves, strict=True)
     return in_type(white_and_black([see_wave(part, wave) for part, wave in parts])[0], images)
 
 
 def in_type(grey: Floats, images: Greys) -> Greys:
-    """Grey levels in the type that images have."""
+    """Grey levels in the type of the images."""
     return np.rint(grey).astype(np.uint8) if images.dtype == np.uint8 else grey
 
 
 def split_waves(images: Greys, waves: tuple[Wave, ...]) -> list[Greys]:
-    """The images (F, L, P) of each wave, which follow each other."""
+    """The images (F, L, P) of each wave; those of different waves follow each other."""
     ends = np.cumsum([0, *(wave.steps for wave in waves)])
     return [images[first:end] for first, end in pairwise(ends)]

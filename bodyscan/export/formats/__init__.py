@@ -1,1 +1,1 @@
-"""The formats in which a body is written: one file each, named as the format, that has FORMAT."""
+"""The formats in which a body is written: one file each, named as the format, with its FORMAT."""

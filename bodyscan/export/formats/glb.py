@@ -21,8 +21,8 @@ POINTS, TRIANGLES = 0, 4
 
 
 def write_glb(path: Path, body: BodyCloud | BodyMesh) -> None:
-    """Write a mesh or a cloud; a mesh's vertices carry `_FILLED`, 1 where nothing was measured, and
-    where it is known all carry `_REGION`, of `regions.NAMES`."""
+    """Write a mesh or a cloud. A mesh's vertices carry `_FILLED`, 1 where nothing was measured; all
+    carry `_REGION`, an index into `regions.NAMES`, if it is known."""
     points = body.points if isinstance(body, BodyCloud) else body.vertices
     attributes = {
         "POSITION": _y_up(points) / 1000.0,
@@ -53,7 +53,7 @@ def _y_up(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def _linear(colours: Bytes) -> NDArray[np.uint16]:
-    """(N, 3) sRGB bytes to (N, 4) linear shorts: glTF's vertex colours are linear, with alpha."""
+    """sRGB bytes (N, 3) to linear shorts (N, 4): glTF's vertex colours are linear, with alpha."""
     encoded = np.arange(256) / 255.0
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     table = np.rint(65535.0 * linear).astype(np.uint16)

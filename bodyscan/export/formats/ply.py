@@ -1,4 +1,4 @@
-"""PLY as bodyscan itself stores bodies: exact, and all that is known of them."""
+"""PLY as bodyscan itself stores bodies: exact, with everything known about them."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ HEADER = b"bodyscan: mm, x the way the subject faces, z up, floor at z = 0"
 
 
 def write_stl(path: Path, mesh: BodyMesh) -> None:
-    """Write a mesh in mm, rig frame. STL knows no colours, normals of vertices or filled faces."""
+    """Write a mesh in mm, rig frame. STL has no colours, vertex normals or filled faces."""
     corners = mesh.vertices[mesh.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(cross, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The lenses there are.  A new one is a file in this folder and its name in `LENSES`."""
+"""The lens models. To add one, put a file into this folder and its class into `LENSES`."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.lenses.rational import Rational
 
 LENSES: dict[str, type[Lens]] = {lens.kind: lens for lens in (Radial, Brown, Rational)}
-"""By their names in files, the simplest first; of those that have given coefficients of OpenCV's the
-first is taken."""
+"""By name in files, the simplest first: the first that has all of the given OpenCV coefficients is
+chosen."""
 
 FAMILY: tuple[type[Lens], ...] = (Radial, Brown, Rational)
-"""Those that a camera is tried with, each with all coefficients of the one before it and more."""
+"""The models tried for a camera; each has all coefficients of the one before and more."""
 
 
 def family_up_to(kind: type[Lens]) -> tuple[type[Lens], ...]:
-    """Those of the family up to a kind; it alone if it is not of the family."""
+    """The members of the family up to a kind; that kind alone if it is not of the family."""
     return FAMILY[: FAMILY.index(kind) + 1] if kind in FAMILY else (kind,)
 
 
 def lens_from_opencv(coefficients: Array) -> Lens:
-    """The lens with OpenCV's distortion coefficients k1, k2, p1, p2, k3, ... (5,) or more.
+    """The simplest lens with OpenCV's distortion coefficients k1, k2, p1, p2, k3, ... (5,) or more.
 
     Raises ValueError if there is none.
     """

@@ -1,4 +1,4 @@
-"""Brown's lens as OpenCV has it: three radial coefficients and a decentred axis."""
+"""Brown's lens as OpenCV defines it: three radial coefficients and two of decentring."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ from bodyscan.geometry.lenses.polynomials import (
 
 @dataclass(frozen=True)
 class Brown(Lens):
-    """real = ideal (1 + k1 r^2 + k2 r^4 + k3 r^6) + (2 p1 x y + p2 (r^2 + 2 x^2),
-    p1 (r^2 + 2 y^2) + 2 p2 x y).
+    """Brown's lens:
+
+        real = ideal (1 + k1 r^2 + k2 r^4 + k3 r^6)
+               + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y).
 
     Source: D. C. Brown, Decentering Distortion of Lenses, 1966; p1 and p2 numbered as in OpenCV.
     """

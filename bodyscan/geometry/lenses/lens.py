@@ -1,7 +1,8 @@
-"""What a camera asks of its lens: real from ideal image points and back, before the matrix A.
+"""What a camera needs from its lens: mapping ideal to real image points and back, before the matrix
+A.
 
-Points are normalised: x = X/Z and y = Y/Z of the camera frame.  Ideal ones are where a pinhole would
-show them, real ones where the lens does.
+Points are normalised: x = X/Z and y = Y/Z in the camera frame. Ideal points are where a pinhole
+would image them, real points where the lens does.
 """
 
 from __future__ import annotations
@@ -18,22 +19,23 @@ from bodyscan.errors import BadInput
 from bodyscan.geometry.lenses.polynomials import apart, squared_radius
 
 NEWTON_STEPS = 20
-"""Five or six reach rounding; it takes more close to where a lens folds."""
+"""Five or six reach rounding; close to where a lens folds it takes more."""
 SETTLED, NOT_FOUND = 1e-14, 1e-9
-"""A millionth of a pixel is 1e-9."""
+"""A millionth of a pixel is about 1e-9."""
 NEAREST_STEPS = 3
 NEAREST_HOLD = 1e-5
-"""What the points leave open of the nearest lens stays small: by a hundredth of a pixel a sigma."""
+"""Keeps small what the points leave undetermined of the nearest lens: one sigma costs 0.01 px."""
 FARTHEST, DIRECTIONS = 20.0, 16
-"""A lens is looked at up to 87 degrees from its axis, all around it."""
+"""A lens is examined up to 87 degrees from its axis (radius 20), in 16 directions."""
 
 
 @dataclass(frozen=True)
 class Lens(ABC):
-    """A lens is a frozen value; its fields are its coefficients, all 0 where it bends nothing.
+    """A frozen value whose fields are its coefficients, all 0 for a lens that bends nothing.
 
-    kind: its name in files.  colmap_model: COLMAP's model with one focal length and these very
-    coefficients in this order, if there is one.
+    kind: its name in files.
+    colmap_model: COLMAP's model with one focal length and exactly these coefficients in this order,
+        if there is one.
     """
 
     kind: ClassVar[str]
@@ -41,12 +43,12 @@ class Lens(ABC):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the K coefficients, in files as well."""
+        """Names of the K coefficients, as in files."""
         return tuple(field.name for field in fields(self))
 
     @property
     def coefficients(self) -> Array:
-        """(K,)."""
+        """Coefficients (K,) in the order of `names`."""
         return np.array([getattr(self, name) for name in self.names], np.float64)
 
     def with_coefficients(self, values: Array) -> Self:
@@ -56,16 +58,16 @@ class Lens(ABC):
     @property
     @abstractmethod
     def prior_sigmas(self) -> Array:
-        """(K,) standard deviations of the coefficients before any image was seen."""
+        """Standard deviations (K,) of the coefficients before any image is seen."""
 
     @property
     @abstractmethod
     def difference_steps(self) -> Array:
-        """(K,) for derivatives by differences: about 1e-3 px at the rim of a scanner's image."""
+        """Steps (K,) for numerical derivatives: about 1e-3 px at the rim of a scanner's image."""
 
     @abstractmethod
     def distort(self, ideal: Array) -> Array:
-        """Ideal to real points, (..., 2)."""
+        """Real points (..., 2) of ideal ones (..., 2)."""
 
     @abstractmethod
     def by_coefficients(self, ideal: Array) -> Array:
@@ -76,7 +78,7 @@ class Lens(ABC):
         """Derivatives (..., 2, 2) of real points by the ideal ones (..., 2)."""
 
     def nearest(self, other: Lens, ideal: Array) -> Self:
-        """The lens of this kind that bends the points (N, 2) most as `other` does, from this one on."""
+        """Fit this kind of lens, starting here, to what `other` does to the points (N, 2)."""
         lens, wanted = self, other.distort(ideal)
         for _ in range(NEAREST_STEPS):
             by_coefficient = lens.by_coefficients(ideal).reshape(-1, len(lens.names))
@@ -90,14 +92,16 @@ class Lens(ABC):
 
     @property
     def fold_radius(self) -> float:
-        """Radius round the axis, of ideal points, within which the lens is one to one: where it
-        first folds back in any direction; infinite if it does not."""
+        """Radius around the axis, in ideal points, within which the lens is one to one: where it
+        first folds back in any direction; infinite if it never does."""
         return _fold_radius(self)
 
     def undistort(self, real: Array) -> Array:
-        """Real to ideal points, (..., 2), by Newton's method from the real ones.
+        """Ideal points (..., 2) of real ones (..., 2), by Newton's method started at the real
+        points.
 
-        Good to rounding within `fold_radius`; NaN where no ideal point within it belongs to a real one.
+        Accurate to rounding within `fold_radius`; NaN where no ideal point within it maps to the
+        real one.
         """
         real = apart(real)
         with np.errstate(all="ignore"):
@@ -116,13 +120,14 @@ class Lens(ABC):
             return self.before_fold(ideal, real)
 
     def before_fold(self, ideal: Array, real: Array) -> Array:
-        """Ideal points (..., 2), NaN where they are beyond `fold_radius` or not those of `real`."""
+        """Ideal points (..., 2), NaN where they lie beyond `fold_radius` or do not map to
+        `real`."""
         seen = squared_radius(self.distort(ideal) - real) < NOT_FOUND**2
         seen &= np.sqrt(squared_radius(ideal)) < self.fold_radius
         return np.where(seen[..., None], ideal, np.nan)
 
     def opencv(self) -> Array:
-        """(5,) or more of OpenCV's distortion coefficients k1, k2, p1, p2, k3, ...
+        """OpenCV's distortion coefficients k1, k2, p1, p2, k3, ... (5,) or more.
 
         Raises BadInput for a lens that OpenCV does not have.
         """
@@ -133,12 +138,12 @@ class Lens(ABC):
 
     @classmethod
     def from_opencv(cls, coefficients: Array) -> Self | None:
-        """The lens with OpenCV's coefficients (5,) or more; None if it has not all of them."""
+        """The lens with OpenCV's coefficients (5,) or more; None if it lacks one of them."""
         return None
 
 
 def _at_most(points: Array, radius: Array | float) -> Array:
-    """Points (..., 2), those farther than `radius` (...) from the axis brought there."""
+    """Points (..., 2), with those farther than `radius` (...) from the axis moved in to it."""
     own = np.sqrt(squared_radius(points))
     beyond = own > radius
     if not beyond.any():
@@ -147,7 +152,7 @@ def _at_most(points: Array, radius: Array | float) -> Array:
 
 
 def settled(step: Array) -> bool:
-    """Whether no step of Newton's method moves anything any more; those that ran off do not count."""
+    """Whether no Newton step moves anything any more; diverged (not finite) ones do not count."""
     return bool(np.max(np.abs(step), initial=0.0, where=np.isfinite(step)) < SETTLED)
 
 
@@ -157,7 +162,8 @@ def _fold_radius(lens: Lens) -> float:
     around = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
 
     def first_fold(radii: Array) -> int:
-        """Number of the first radius at which a direction is no longer one to one; N if none is."""
+        """Index of the first radius at which some direction is no longer one to one; N if there is
+        none."""
         with np.errstate(all="ignore"):
             (a, b), (c, d) = np.moveaxis(
                 lens.by_point(radii[:, None, None] * around), (-2, -1), (0, 1)

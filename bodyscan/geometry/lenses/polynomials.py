@@ -1,4 +1,4 @@
-"""What lenses of OpenCV's family are made of: a factor that changes with the radius, and decentring."""
+"""Building blocks of OpenCV's lenses: a factor that changes with the radius, and decentring."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import numpy as np
 from bodyscan.arrays import Array
 
 DECENTRED = 5e-4
-"""Standard deviation of p1 and p2 before any image: lenses have 1e-4 to 1e-3. Few boards hardly tell
-p1 and p2 from the principal point; a prior ten times as wide made Brown's lens worse than k1 and k2
-alone for boards left out."""
+"""Standard deviation of p1 and p2 before any image: real lenses have 1e-4 to 1e-3. A few boards
+hardly separate p1 and p2 from the principal point; with a prior ten times as wide Brown's lens did
+worse on held-out boards than k1 and k2 alone."""
 
 
 def squared_radius(ideal: Array) -> Array:
-    """(...) of points (..., 2); numpy's sum over so short an axis takes ten times as long."""
+    """r^2 (...) of points (..., 2); numpy's sum over so short an axis takes ten times as long."""
     x, y = ideal[..., 0], ideal[..., 1]
     return np.asarray(x * x + y * y, np.float64)
 
@@ -30,9 +30,10 @@ def _matrices(shape: tuple[int, ...]) -> Array:
 
 
 def scaled_by_point(ideal: Array, factor: Array, slope: Array) -> Array:
-    """Derivatives (..., 2, 2) of `ideal` times a factor of r^2, by the ideal points (..., 2).
+    """Derivatives (..., 2, 2), by ideal points (..., 2), of `ideal` times a factor of r^2.
 
-    factor: (...), at each.  slope: (...), its derivative by r^2.
+    factor: its values (...) at the points.
+    slope: its derivatives (...) by r^2.
     """
     x, y = ideal[..., 0], ideal[..., 1]
     derivatives = _matrices(x.shape)
@@ -44,7 +45,7 @@ def scaled_by_point(ideal: Array, factor: Array, slope: Array) -> Array:
 
 
 def decentring(ideal: Array) -> Array:
-    """(..., 2, 2): where p1 and p2 move the points (..., 2), per unit of each (OpenCV's signs)."""
+    """Shifts (..., 2, 2) of points (..., 2) per unit of p1 and of p2 (OpenCV's signs)."""
     x, y = ideal[..., 0], ideal[..., 1]
     derivatives = _matrices(x.shape)
     derivatives[..., 0, 0] = derivatives[..., 1, 1] = 2.0 * x * y

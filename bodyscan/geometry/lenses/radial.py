@@ -14,7 +14,7 @@ from bodyscan.geometry.lenses.polynomials import scaled_by_point, squared_radius
 
 @dataclass(frozen=True)
 class Radial(Lens):
-    """real = ideal (1 + k1 r^2 + k2 r^4), r the ideal point's distance from the axis.
+    """real = ideal (1 + k1 r^2 + k2 r^4), with r the ideal point's distance from the axis.
 
     Eq. 3 and 4 scale (u - u0, v - v0); since A is linear this is the same as scaling (x, y).
     """
@@ -27,7 +27,7 @@ class Radial(Lens):
 
     @property
     def prior_sigmas(self) -> Array:
-        return np.array([0.5, 0.5])  # several times those of any lens that a scanner has
+        return np.array([0.5, 0.5])  # several times those of any lens on a scanner
 
     @property
     def difference_steps(self) -> Array:
@@ -48,13 +48,13 @@ class Radial(Lens):
 
     @property
     def fold_radius(self) -> float:
-        """As `Lens.fold_radius`: the least r > 0 with 1 + 3 k1 r^2 + 5 k2 r^4 = 0."""
+        """See `Lens.fold_radius`: the least r > 0 with 1 + 3 k1 r^2 + 5 k2 r^4 = 0."""
         bend = 9.0 * self.k1**2 - 20.0 * self.k2
         per_r2 = 0.5 * (np.sqrt(bend) - 3.0 * self.k1) if bend >= 0.0 else 0.0
         return float(1.0 / np.sqrt(per_r2)) if per_r2 > 0.0 else np.inf
 
     def undistort(self, real: Array) -> Array:
-        """As `Lens.undistort`, by Newton's method on the radius alone."""
+        """See `Lens.undistort`; Newton's method on the radius alone."""
         radius = np.linalg.norm(real, axis=-1, keepdims=True)
         ideal = radius.copy()
         with np.errstate(all="ignore"):

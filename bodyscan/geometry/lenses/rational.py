@@ -1,4 +1,4 @@
-"""OpenCV's rational lens: Brown's, its radial factor divided by another polynomial of the radius."""
+"""OpenCV's rational lens: Brown's, with its radial factor divided by a second polynomial."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from bodyscan.geometry.lenses.polynomials import decentred, decentring, squared_
 
 @dataclass(frozen=True)
 class Rational(Brown):
-    """As `Brown`, but its radial factor is
-    (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6): it can level out where a
-    polynomial runs away, as wide lenses do.
+    """Brown's lens with the radial factor
+
+        (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
+
+    which, unlike a polynomial, can level out at large radii, as wide lenses do.
 
     Source: Claus and Fitzgibbon, A Rational Function Lens Distortion Model, CVPR 2005; OpenCV's
     CALIB_RATIONAL_MODEL.
@@ -51,7 +53,7 @@ class Rational(Brown):
         return np.concatenate([*parts, turned * powers], axis=-1)
 
     def _below(self, r2: Array) -> Array:
-        """The polynomial that divides Brown's."""
+        """The divisor at squared radii."""
         return 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
 
     def _factor(self, r2: Array) -> tuple[Array, Array]:

@@ -1,2 +1,1 @@
-"""The formats in which calibrated cameras are read and written: one file each, named so, that has
-FORMAT."""
+"""The formats in which calibrated cameras are read and written: one file each, with its FORMAT."""

@@ -1,6 +1,6 @@
 """aniposelib's calibration.toml: tables cam_0, cam_1, ..., each with the camera's name.
 
-Lengths are those of its board's squares, in whatever unit these were given.
+Lengths are in the unit in which its board's squares were given.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from bodyscan.interchange.toml_cameras import NOTE, camera_of_table, read_toml, 
 
 
 def write_aniposelib(cameras: RigCameras, path: Path) -> Path:
-    """Lengths in mm. Returns `path`.  Raises BadInput for a lens that OpenCV does not have."""
+    """Write the cameras in mm; returns `path`. Raises BadInput
+    for a lens that OpenCV does not have."""
     text = "# Lengths in mm.\n" + NOTE
     for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
         text += f"\n[cam_{number}]\nname = {json.dumps(name)}\n"
@@ -26,7 +27,7 @@ def write_aniposelib(cameras: RigCameras, path: Path) -> Path:
 
 
 def read_aniposelib(path: Path) -> dict[str, FoundCamera]:
-    """By the cameras' names, and by those of their tables."""
+    """Cameras by their names, and by those of their tables."""
     file = ForeignFile.read(path)
     tables = {key: own for key, own in read_toml(file).items() if key != "metadata"}
     found: dict[str, FoundCamera] = {}

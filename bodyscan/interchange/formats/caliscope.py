@@ -13,9 +13,10 @@ from bodyscan.interchange.toml_cameras import NOTE, camera_of_table, read_toml, 
 
 
 def write_caliscope(cameras: RigCameras, path: Path) -> Path:
-    """Cameras have numbers there, in the order of the pairs, whose names stand beside them.
+    """Write the cameras, numbered in the order of the pairs, with the pairs' names beside the
+    numbers.
 
-    Returns `path`.  Raises BadInput for a lens that OpenCV does not have.
+    Returns `path`. Raises BadInput for a lens that OpenCV does not have.
     """
     text = "# Lengths in metres.\n" + NOTE
     for number, (name, (camera, rig_from_camera)) in enumerate(cameras.items()):
@@ -27,7 +28,7 @@ def write_caliscope(cameras: RigCameras, path: Path) -> Path:
 
 
 def read_caliscope(path: Path) -> dict[str, FoundCamera]:
-    """By the cameras' numbers, and by the pair's name where bodyscan wrote it."""
+    """Cameras by their numbers, and by the pair's name if bodyscan wrote the file."""
     file = ForeignFile.read(path)
     tables = read_toml(file).get("cameras")
     if not isinstance(tables, dict) or not tables:

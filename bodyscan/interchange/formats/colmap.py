@@ -1,6 +1,6 @@
-"""A COLMAP model: its cameras, and where its images or the sensors of its rig stand.
+"""A COLMAP model: its cameras, and the poses of its images or of the sensors of its rig.
 
-COLMAP's cameras have no skew, so what bodyscan writes says it beside them.
+COLMAP's cameras have no skew, so bodyscan writes it in a file beside them.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from bodyscan.interchange.found_camera import FoundCamera
 from bodyscan.interchange.rig_format import RigCameras, RigFormat, opencv_lens
 
 PIXEL_CENTRE = 0.5
-"""COLMAP's pixels have their centres there, ours at whole numbers."""
+"""COLMAP's pixels have their centres at + 0.5, ours at whole numbers."""
 SKEW_FILE = "bodyscan.json"
 NO_SKEW = (
     "Cameras here have no skew. Shear an image point (u, v) of the pair (pixel centres at whole "
     "numbers, v0 = cy - 0.5) to (u - gamma / beta * (v - v0), v) before using it with them."
 )
-# Where each model has fx, fy, cx, cy, and its lens as k1, k2, p1, p2, ... of OpenCV's.
+# Positions of fx, fy, cx, cy in each model's parameters, then of OpenCV's k1, k2, p1, p2, ...
 LENSES: dict[str, tuple[int, ...]] = {
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
     "PINHOLE": (0, 1, 2, 3),
@@ -42,11 +42,11 @@ LENSES: dict[str, tuple[int, ...]] = {
 
 
 def write_colmap(cameras: RigCameras, folder: Path) -> Path:
-    """COLMAP's text model: one rig whose sensors are the cameras, and one frame of one empty image
-    a pair, which puts them where they stand: COLMAP's world is the rig frame, mm.
+    """Write COLMAP's text model: one rig whose sensors are the cameras, and one frame with one
+    empty image per pair, which gives their poses: COLMAP's world is the rig frame, mm.
 
-    `bodyscan.json` beside it holds what COLMAP has no place for: each camera's gamma.  Returns
-    `folder`.  Raises BadInput for a lens that COLMAP does not have.
+    `bodyscan.json` beside it holds what COLMAP has no place for: each camera's gamma. Returns
+    `folder`. Raises BadInput for a lens that COLMAP does not have.
     """
     model = _colmap_model(cameras)
     folder = Path(folder)
@@ -64,16 +64,16 @@ def write_colmap(cameras: RigCameras, folder: Path) -> Path:
 
 
 def read_colmap(folder: Path) -> dict[str, FoundCamera]:
-    """Every image by its name; and every camera that has several images by the folder that they lie
-    in, or by its number: with its place in its rig, or without a pose if it has none.
+    """Every image by its name; and every camera with several images by the folder that holds them,
+    or by its number, with its pose in its rig, or none.
 
-    The skew comes from `bodyscan.json` where there is one.
+    The skew comes from `bodyscan.json` if there is one.
     """
     folder, model = Path(folder), pycolmap.Reconstruction()
     try:
         model.read(folder)
         images = sorted(model.images.values(), key=lambda image: image.image_id)
-        # Names are decoded when they are asked for.
+        # Names are decoded only when accessed.
         names_of = {image.image_id: image.name for image in images}
     except (OSError, ValueError, RuntimeError, IndexError, MemoryError) as error:
         said = str(error).strip().splitlines() or [type(error).__name__]
@@ -124,7 +124,8 @@ def _common_folder(names: list[str]) -> set[str]:
 
 
 def _place_of(image: Any) -> RigidTransform | None:
-    """None where it has none, or its rig is placed and its camera has no place in that."""
+    """The pose of an image; None if it has none, or its rig
+    has one and its camera none in the rig."""
     try:
         return _transform(image.cam_from_world()) if image.has_pose else None
     except RuntimeError:
@@ -160,7 +161,8 @@ def _found(folder: Path, camera: Any, gamma: float, pose: RigidTransform | None)
 
 
 def _colmap_model(cameras: Mapping[str, tuple[Camera, RigidTransform]]) -> pycolmap.Reconstruction:
-    """The first pair is the reference sensor, whose frame COLMAP takes for the rig's own."""
+    """Build COLMAP's model; the first pair is the reference
+    sensor, whose frame is the rig's own."""
     model, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1)
     frame = pycolmap.Frame(frame_id=1, rig_id=1)
     reference = next(iter(cameras.values()))[1]

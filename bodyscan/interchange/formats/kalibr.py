@@ -1,6 +1,7 @@
-"""Kalibr's camchain.yaml: cameras in a chain, each placed in the frame of the one before it.
+"""Kalibr's camchain.yaml: a chain of cameras, each with its pose in the frame of the one before.
 
-Metres, as Kalibr's targets are. It has no frame of its own: the first camera's is the world.
+Metres, as Kalibr's targets are. The format has no frame of its own: the first camera's is the
+world.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ NOTE = """\
 
 
 def write_kalibr(cameras: RigCameras, path: Path) -> Path:
-    """cam0, cam1, ... in the order of the pairs. Returns `path`.
+    """Write cam0, cam1, ... in the order of the pairs; returns `path`.
 
-    Raises BadInput for a lens with more than k1, k2, p1, p2, which Kalibr's radtan has.
+    Raises BadInput for a lens with more than Kalibr's radtan has, k1, k2, p1, p2.
     """
     content: dict[str, Any] = {}
     before: RigidTransform | None = None
@@ -60,7 +61,7 @@ def write_kalibr(cameras: RigCameras, path: Path) -> Path:
 
 
 def read_kalibr(path: Path) -> dict[str, FoundCamera]:
-    """By cam0, cam1, ..., and by the pair's name where bodyscan wrote it."""
+    """Cameras by cam0, cam1, ..., and by the pair's name if bodyscan wrote the file."""
     file = ForeignFile.read(path)
     try:
         data = read_yaml(path).data
@@ -92,7 +93,7 @@ def read_kalibr(path: Path) -> dict[str, FoundCamera]:
 def _next_pose(
     file: ForeignFile, key: str, own: dict[str, Any], before: RigidTransform | None
 ) -> RigidTransform | None:
-    """A chain that is broken leaves the cameras behind the gap without a pose."""
+    """The next camera's pose; a broken chain leaves the cameras after the gap without one."""
     if "T_cn_cnm1" not in own or before is None:
         return None
     matrix = file.numbers(own["T_cn_cnm1"], "T_cn_cnm1", (16,), after=key).reshape(4, 4)

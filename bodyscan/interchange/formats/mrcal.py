@@ -1,6 +1,6 @@
-"""mrcal's .cameramodel: one file a camera, a Python literal; rt_cam_ref as rotation vector and shift.
+"""mrcal's .cameramodel: one file per camera, a Python literal; rt_cam_ref is rotation and shift.
 
-Lengths are those of its board, in whatever unit these were given.
+Lengths are in the unit in which its board was given.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ SKEW = "bodyscan skew: "
 
 
 def write_mrcal(cameras: RigCameras, folder: Path) -> Path:
-    """A file for each pair, mm; the reference is the rig frame. Returns `folder`.
+    """Write one file per pair, mm; the reference is the rig frame. Returns `folder`.
 
-    Raises BadInput for a lens that mrcal does not have; nothing is written then.
+    Raises BadInput for a lens that mrcal does not have, before anything is written.
     """
     texts = {name: _text(name, *own) for name, own in cameras.items()}
     for name, text in texts.items():
@@ -36,7 +36,7 @@ def write_mrcal(cameras: RigCameras, folder: Path) -> Path:
 
 
 def read_mrcal(path: Path) -> dict[str, FoundCamera]:
-    """Of a file or of all such files of a folder, by the files' names without suffix."""
+    """Cameras of one file, or of all such files in a folder, by the files' names without suffix."""
     files = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
     if not files:
         raise CalibrationFileError(

@@ -1,9 +1,9 @@
 """OpenCV's FileStorage: YAML, XML or JSON.
 
-What bodyscan writes has an entry for each pair. What others wrote has nodes of any name, which the
-rig file says; a node inside of others is named with their names before it: `stereo/K1`.
+bodyscan writes one entry per pair. Files from elsewhere have nodes with any name, given in the rig
+file; a node inside others is named with their names first: `stereo/K1`.
 
-OpenCV's camera functions know no skew, so the file says what to do about it.
+OpenCV's camera functions have no skew, so the file says what to do about it.
 """
 
 from __future__ import annotations
@@ -36,15 +36,17 @@ NOTE = (
     "x_projector = R x_camera + T, as stereoCalibrate has it; the middle of its first column is 0."
 )
 HEADER = "%YAML:1.0\n---\n"
-"""OpenCV reads no YAML without it, such as ROS writes."""
+"""OpenCV reads no YAML without it, such as that of ROS."""
 
 
 def write_opencv(cameras: RigCameras, path: Path) -> Path:
-    """A sequence `pairs` as cv2.FileStorage reads it: name, image size, camera_matrix (with its
-    skew), distortion_coefficients (OpenCV's, in its order), R and T of `camera_from_rig`; and of a
-    pair whose projector is known `projector`, with R and T of `projector_from_camera`.
+    """Write a sequence `pairs` as cv2.FileStorage reads it.
 
-    Returns `path`.  Raises BadInput for a lens that OpenCV does not have.
+    Each entry has name, image size, camera_matrix (with its skew), distortion_coefficients
+    (OpenCV's, in its order), R and T of `camera_from_rig`; and if its projector is known,
+    `projector` with R and T of `projector_from_camera`.
+
+    Returns `path`. Raises BadInput for a lens that OpenCV does not have.
     """
     memory = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
     store = cv2.FileStorage("rig.yaml", memory)
@@ -121,8 +123,8 @@ def _read_camera(file: ForeignFile, entry: Any, name: str, label: str) -> FoundC
 
 
 def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
-    """The camera whose numbers stand in these nodes: matrix; distortion, size (or width and
-    height), rotation and translation if they are given."""
+    """The camera whose numbers are in these nodes: matrix; distortion, size (or width and height),
+    rotation and translation if given."""
     file = ForeignFile.read(path)
     store = _opened(file)
 
@@ -145,7 +147,7 @@ def read_nodes(path: Path, nodes: Nodes) -> FoundCamera:
 
 
 def _opened(file: ForeignFile) -> Any:
-    """The storage; its nodes live only as long as it does."""
+    """The open storage; its nodes live only as long as it does."""
     text = file.text.lstrip()
     if not text.startswith(("%YAML", "<?xml", "{")):
         text = HEADER + text
@@ -180,7 +182,7 @@ def _below(file: ForeignFile, node: Any, name: str, passed: str) -> Any:
 
 
 def _values(file: ForeignFile, node: Any, name: str) -> Any:
-    """A number, or a list of what is in it; of a matrix its numbers row by row."""
+    """A number, or a list of what is in the node; for a matrix its numbers row by row."""
     if node.isMap() and "data" in node.keys():  # noqa: SIM118 (it is no dict)
         return _values(file, node.getNode("data"), name)
     if node.isSeq():

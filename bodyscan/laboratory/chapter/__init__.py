@@ -1,1 +1,1 @@
-"""The chapter's experiments (4) again, on its own set-up simulated."""
+"""The chapter's experiments (section 4) repeated on a simulation of its own set-up."""

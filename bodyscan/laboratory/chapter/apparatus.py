@@ -1,7 +1,7 @@
-"""The chapter's own set-up (4), simulated: its camera, a rotating mirror, a board, five spheres.
+"""The chapter's own set-up (section 4), simulated: camera, rotating mirror, board, five spheres.
 
 The chapter does not say where the projector stood, how the boards were turned or where the spheres
-lay; these are chosen so that all fits into the picture, at about 400 mm.
+lay; these are chosen so that everything fits into the image, at about 400 mm.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ BOARD = Board(name="board", columns=9, rows=7, square_mm=20, margin_mm=15)
 RADIUS_MM = 25.0
 DISTANCE_MM = 400.0
 PROJECTOR_AT = (-150.0, 0.0, -25.0)
-"""Behind the camera's lens, so that baselines reduce when the stripe's number grows (Fig. 6)."""
+"""Behind the camera's lens, so that baselines decrease with the stripe's number (Fig. 6)."""
 SWEPT_MM = (375.0, 400.0, 430.0)
-"""The stripes cover the picture at these distances, and no more."""
+"""The stripes cover the image exactly at these distances."""
 BOARD_TURNS = ((0.0, 0.45, 0.02), (0.42, -0.1, -0.03), (-0.3, -0.38, 0.02))
 BOARD_MIDDLES = ((-11.0, -17.0, 400.0), (-11.0, -17.0, 405.0), (-11.0, -17.0, 400.0))
 MORE_TURNS = (
@@ -50,7 +50,7 @@ MORE_TURNS = (
     (0.0, 0.05, 0.8),
     (-0.25, -0.2, -0.6),
 )
-"""Of further boards, where three are not thought enough."""
+"""For further boards, if three are not considered enough."""
 MORE_MIDDLES = (
     (-20.0, -10.0, 380.0),
     (5.0, -25.0, 420.0),
@@ -81,14 +81,16 @@ PLATE_MM = (160.0, 120.0)
 PLATE_MIDDLE = (-11.0, -17.0, 402.0)
 _PROJECTOR_SEED = 1
 RAYS, BOARD_MAKING, STAGE, NOISE = range(1, 5)
-"""What a random number is drawn for: each has a stream of its own."""
+"""Purposes of random numbers: each has its own stream."""
 
 
 @dataclass(frozen=True, eq=False)
 class ChapterSetup:
-    """projector: a mirror whose surface lies off its axis, camera frame.  board: as it was made.
+    """The simulated set-up, all in the camera's frame.
 
-    seed: of all noise. Everything is in the camera's frame.
+    projector: a mirror whose surface lies off its axis.
+    board: as it was made.
+    seed: of all noise.
     """
 
     settings: SimulationSettings
@@ -101,14 +103,14 @@ class ChapterSetup:
 def ideal_settings(samples: int = 5) -> SimulationSettings:
     """A flat, exact board and the simulator's own noise.
 
-    samples: rays a pixel each way. With 3 their places alone move a boundary by 0.015 px, as much
-    as the noise does; with 5 by 0.005 px.
+    samples: rays per pixel along each axis. With 3 their positions alone move a boundary by 0.015
+        px, as much as the noise does; with 5 by 0.005 px.
     """
     return SimulationSettings(optics=Optics(samples=samples))
 
 
 def real_settings(samples: int = 5) -> SimulationSettings:
-    """Light and a board as they really are: see the numbers."""
+    """Realistic light and a realistic board: see the numbers."""
     return SimulationSettings(
         optics=Optics(samples=samples, defocus_px=2.0),
         projection=Projection(
@@ -141,19 +143,19 @@ def chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
 
 
 def true_planes(setup: ChapterSetup) -> Array:
-    """(S + 1, 4): the planes of the boundaries, before any smile; (a, b, c) unit, d >= 0."""
+    """Planes (S + 1, 4) of the boundaries, before any smile; (a, b, c) unit, d >= 0."""
     planes = setup.projector.plane(np.arange(setup.projector.stripes + 1.0))
     return planes * np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
 
 
 def board_poses(count: int = BOARDS) -> list[RigidTransform]:
-    """camera_from_board of the three poses, or of so many."""
+    """camera_from_board of the three poses, or of `count` poses."""
     middles, turns = (*BOARD_MIDDLES, *MORE_MIDDLES), (*BOARD_TURNS, *MORE_TURNS)
     return [place_about(m, t) for m, t in zip(middles[:count], turns[:count], strict=True)]
 
 
 def stage_readings(count: int = len(STAGE_MM)) -> Array:
-    """Where the slide stage is told to stop, mm; fewer stops span as much."""
+    """Nominal stops of the slide stage, mm; fewer stops span the same range."""
     return np.linspace(STAGE_MM[0], STAGE_MM[-1], count)
 
 
@@ -170,7 +172,7 @@ def stage_poses(readings: Array, seed: int) -> list[RigidTransform]:
 def place_about(
     place: Sequence[float], turn: Sequence[float], middle: Array | None = None
 ) -> RigidTransform:
-    """camera_from_board with the board's middle at a place, turned about it."""
+    """camera_from_board with the board's middle at a place and rotated about it."""
     if middle is None:
         middle = BOARD.square_mm / 2.0 * np.array([BOARD.columns, BOARD.rows, 0.0])
     rotation = RigidTransform.from_rotation_vector(turn, np.zeros(3)).rotation

@@ -1,4 +1,4 @@
-"""The approaches of 4.2 and ours from the same images; and how honest Table 1's sigmas are."""
+"""The approaches of 4.2 and ours from the same images, and the honesty of Table 1's sigmas."""
 
 from __future__ import annotations
 
@@ -38,16 +38,19 @@ from bodyscan.laboratory.rivals.targets import (
 from bodyscan.simulation.truth import describe_camera
 
 CORNER_NOISE_PX = 0.012
-"""What corners found in the rendered images are off, each way."""
+"""Error, per axis, of corners found in the rendered images."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibrations:
-    """reference: Zhang's camera.  planes: the chapter's fit of its free planes.
+    """Everything calibrated from the same images.
 
-    camera, camera_covariance: ours, after the joint solve if held-out boards took it.
-    model, refinement: what ours chose.  approaches: (i), (i) mended, (ii), (ii) with skew, (iii),
-    ours.
+    reference: Zhang's camera.
+    planes: the chapter's fit of its free planes.
+    ours: our approach, with the camera of the joint solve if held-out boards chose it.
+    camera_covariance: of our camera.
+    model, refinement: what ours chose.
+    approaches: (i), (i) mended, (ii), (ii) with skew, (iii), ours.
     by_stage, by_reference: every model of the projector, calibrated either way.
     """
 
@@ -63,7 +66,7 @@ class Calibrations:
 
 
 def calibrate_all(captures: ChapterCaptures) -> Calibrations:
-    """Everything that is to be compared, from the same shots."""
+    """Calibrate everything that is compared, from the same shots."""
     reference, reference_boards = by_reference_plane(TARGET, captures.boards)
     _, stage = by_slide_stage(TARGET, captures.stage, captures.readings)
     _, skewed = by_slide_stage(TARGET, captures.stage, captures.readings, skewed=True)
@@ -94,8 +97,8 @@ def calibrate_all(captures: ChapterCaptures) -> Calibrations:
 def calibrate_ours(
     captures: ChapterCaptures, reference: CameraCalibration, boards: LocatedBoards
 ) -> tuple[Approach, Array, str, str]:
-    """As `bodyscan calibrate-rig` does a pair by itself: the model of the light that held-out boards
-    choose, and one solve for all where they gain by it."""
+    """Calibrate as `bodyscan calibrate-rig` does for a single pair: the light model that held-out
+    boards choose, and a joint solve where they gain by it."""
     projector, board = TARGET.projector, TARGET.board
     bins = locate(
         TARGET, captures.boards, boards.camera, boards.camera_from_board, bin_px=BIN_PX
@@ -117,19 +120,20 @@ def calibrate_ours(
 
 @dataclass(frozen=True, eq=False)
 class SigmaTrial:
-    """Many calibrations from noisy corners: errors over sigmas, (seeds, P) of the `parameters`."""
+    """Errors over sigmas of many calibrations from noisy corners, (seeds, P) for the
+    `parameters`."""
 
     parameters: tuple[str, ...]
     errors: Array
 
     @property
     def spread(self) -> Array:
-        """(P,) root mean square; 1 if the sigmas are honest."""
+        """Root mean square (P,); 1 if the sigmas are honest."""
         return np.sqrt(np.mean(self.errors**2, axis=0))
 
     @property
     def beyond_three(self) -> int:
-        """How many of all parameters were off by more than three sigmas."""
+        """Number of parameters, over all seeds, that were off by more than three sigmas."""
         return int(np.count_nonzero(np.abs(self.errors) > 3.0))
 
 

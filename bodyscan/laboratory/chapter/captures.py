@@ -1,4 +1,4 @@
-"""Everything the simulated camera takes for the experiments: boards, slide stage, spheres, plate."""
+"""All captures of the simulated camera for the experiments: boards, slide stage, spheres, plate."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ _BOARDS, _STAGE, _SPHERES, _PLATE = 0, 100, 200, 300
 
 @dataclass(frozen=True, eq=False)
 class SceneCapture:
-    """One scene: the lit image, its stripes, the same light exposed once more, and the truth."""
+    """One scene: the lit image, its stripes, the same light
+    exposed a second time, and the truth."""
 
     lit: Bytes
     stripes: StripeMap
@@ -39,9 +40,10 @@ class SceneCapture:
 
 @dataclass(frozen=True, eq=False)
 class ChapterCaptures:
-    """boards: the three poses, or as many as were asked for.
-    stage, readings: a board on a slide stage, and its readings (mm).
+    """All captures.
 
+    boards: the three poses, or as many as were asked for.
+    stage, readings: a board on a slide stage, and its readings (mm).
     owner: (H, W) number of the sphere that a pixel's centre sees and the projector lights, or -1.
     on_plate: (H, W) pixels on the plate, clear of its rim.
     """
@@ -63,7 +65,7 @@ def take_captures(
     stage_stops: int = 7,
     progress: Progress = silent,
 ) -> ChapterCaptures:
-    """Render, expose and decode all of it. Raises BoardNotFound if a board is not found."""
+    """Render, expose and decode everything. Raises BoardNotFound if a board is not found."""
     readings = apparatus.stage_readings(stage_stops)
     places, stage = apparatus.board_poses(boards), apparatus.stage_poses(readings, setup.seed)
     total = boards + len(stage) + 2

@@ -1,4 +1,4 @@
-"""What one approach makes of the spheres and of the flat plate."""
+"""How well one approach measures the spheres and the flat plate."""
 
 from __future__ import annotations
 
@@ -32,13 +32,14 @@ SECANT_MM, SECANT_STRIPES, SECANT_STEPS = 0.1, 1e-3, 6
 
 @dataclass(frozen=True, eq=False)
 class ApproachAccuracy:
-    """One approach on the same images.
+    """Accuracy of one approach on the common images.
 
     spheres: No. 1 to 5, from every measured pixel that a sphere covers and the projector lights.
     covered: share of those pixels that were measured, for each sphere.
-    distances: between the spheres' centres (radius held), and what their scale is off.
-    plate: of the flat plate as decoded.  plate_systematic_mm: RMS from flat of the same plate, every
-    pixel's stripe coordinate known exactly: nothing but the calibration is left.
+    distances: between the spheres' centres (radius held), and their scale error.
+    plate: of the flat plate as decoded.
+    plate_systematic_mm: RMS flatness error of the same plate with every pixel's stripe coordinate
+        known exactly, so that only the calibration's error is left.
     """
 
     name: str
@@ -55,8 +56,8 @@ class ApproachAccuracy:
 
 
 def points_of(approach: Approach, s: Stripes, where: Mask | None = None) -> Array:
-    """(N, 3) mm, camera frame, of the pixels `where` (H, W) is true (all by default), row by row,
-    from the stripe coordinate s (H, W) of every pixel; NaN where nothing is measured."""
+    """Points (N, 3) mm, camera frame, of the pixels where `where` (H, W) is true (all by default),
+    row by row, from each pixel's stripe coordinate s (H, W); NaN where nothing is measured."""
     rows, columns = np.nonzero(np.ones(s.shape, bool) if where is None else where)
     rays = approach.camera.rays(np.column_stack([columns, rows]).astype(float))
     wanted = s[rows, columns].astype(float)
@@ -68,14 +69,14 @@ def points_of(approach: Approach, s: Stripes, where: Mask | None = None) -> Arra
 
 
 def whole_stripes(s: Stripes) -> Stripes:
-    """One whole stripe a pixel, as the chapter's instrument gives it: the middle of the stripe."""
+    """One whole stripe per pixel, as from the chapter's instrument: the middle of the stripe."""
     return np.floor(s) + 0.5
 
 
 def measure_artefacts(
     approach: Approach, captures: ChapterCaptures, *, whole: bool = False
 ) -> ApproachAccuracy:
-    """whole: the stripe number of each pixel only, no fraction."""
+    """Measure spheres and plate. whole: use only the stripe number of each pixel, no fraction."""
     maps = [captures.spheres.stripes.s, captures.plate.stripes.s]
     spheres_s, plate_s = (whole_stripes(s) if whole else s for s in maps)
     on_spheres = captures.owner >= 0
@@ -101,7 +102,7 @@ def measure_artefacts(
 
 @dataclass(frozen=True, eq=False)
 class TrueSheets:
-    """The simulator's own light as triangulation sees it, smile and all, known without error."""
+    """The simulator's own light as exactly known sheets for triangulation, including smile."""
 
     setup: ChapterSetup
 
@@ -118,7 +119,7 @@ class TrueSheets:
         return "true"
 
     def depth(self, rays: Array, s: Array) -> Array:
-        """From the planes that there would be without a smile, by the secant method."""
+        """Depths by the secant method, started at the planes that there would be without smile."""
         planes = self.setup.projector.plane(s)
         first = -planes[..., 3] / np.sum(planes[..., :3] * rays, axis=-1)
         light = self.setup.projector.stripe
@@ -140,13 +141,13 @@ class TrueSheets:
         return np.zeros(rays.shape[:-1])
 
     def tangent_planes(self, s: Array) -> Array:
-        """In the middle of the fan, where there is no smile."""
+        """Planes that touch in the middle of the fan, where there is no smile."""
         planes = self.setup.projector.plane(s)
         return planes * np.where(planes[..., 3:] < 0.0, -1.0, 1.0)
 
 
 def true_approach(setup: ChapterSetup) -> Approach:
-    """What no calibration can better: the simulator's own camera and light."""
+    """The simulator's own camera and light, which no calibration can better."""
     return Approach(
         "true calibration", from_fields(describe_camera(apparatus.CAMERA)), TrueSheets(setup)
     )
@@ -154,11 +155,11 @@ def true_approach(setup: ChapterSetup) -> Approach:
 
 @dataclass(frozen=True)
 class NoiseBound:
-    """What the sensor's noise alone does to E, mm^2, for each sphere: true calibration, the same
-    light exposed twice, half the mean square of the difference.
+    """Effect of the sensor's noise alone on E, mm^2, for each sphere: with the true calibration,
+    half the mean square difference of two exposures of the same light.
 
-    everything: over all measured pixels.  best_share: over the 90 % of the lit pixels where the
-    decoder itself expects the least.
+    everything: over all measured pixels.
+    best_share: over the 90 % of the lit pixels where the decoder itself expects the least noise.
     """
 
     everything: tuple[float, ...]

@@ -1,4 +1,4 @@
-"""Whether a point's own sigma says how far off it is: errors of depth over sigma, on known surfaces."""
+"""Whether points' own sigmas are honest: errors of depth over sigma, on known surfaces."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from bodyscan.laboratory.rivals.approaches import Approach
 
 @dataclass(frozen=True)
 class PointSigma:
-    """Errors of depth over their sigma: root mean square on the spheres and on the plate (1 if the
-    sigmas are honest), and the share of all that lies beyond three sigmas (0.0027 if Gaussian).
+    """Errors of depth over their sigma.
 
+    spheres, plate: root mean square on these (1 if the sigmas are honest).
+    beyond_three: share of all errors beyond three sigmas (0.0027 if Gaussian).
     median_mm: of the sigmas themselves.
     """
 
@@ -28,7 +29,8 @@ class PointSigma:
 
 
 def point_sigma(approach: Approach, captures: ChapterCaptures) -> PointSigma:
-    """From decoding noise and the sheets' covariance, against the simulator's true depth."""
+    """Compare sigmas, from decoding noise and the sheets'
+    covariance, with the true depth errors."""
     parts = (
         _errors(approach, captures.spheres, captures.owner >= 0),
         _errors(approach, captures.plate, captures.on_plate),

@@ -1,4 +1,4 @@
-"""What stands before the chapter's camera, and what the camera takes of it."""
+"""What stands before the chapter's camera, and the images that it takes."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.stripe_map import StripeMap
 
 SPHERE_RINGS = 400
-"""Facets of a sphere then lie less than 0.0005 mm inside it."""
+"""Facets of a sphere are then less than 0.0005 mm inside it."""
 LAMP_GREY, AMBIENT_GREY = 255.0, 13.0
 WHITE, GROUND, WALL = 0.8, 0.5, 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """What the camera took: the lit image and the stripes read from the whole sequence."""
+    """What the camera took: the lit image, and the stripes decoded from the whole sequence."""
 
     lit: Bytes
     stripes: StripeMap
@@ -49,7 +49,7 @@ def sphere_scene() -> list[Surface]:
 
 
 def plate_scene() -> list[Surface]:
-    """A flat white plate, somewhat smaller than the board: no calibration reaches beyond that."""
+    """A flat white plate, somewhat smaller than the board: no calibration reaches farther."""
     place = apparatus.place_about(apparatus.PLATE_MIDDLE, apparatus.PLATE_TURN, middle=np.zeros(3))
     width, height = apparatus.PLATE_MM
     across, down = np.array([width, 0.0, 0.0]), np.array([0.0, height, 0.0])
@@ -60,9 +60,9 @@ def plate_scene() -> list[Surface]:
 def expose_scene(
     setup: ChapterSetup, surfaces: Sequence[Surface], number: int, times: int = 1
 ) -> list[Exposure]:
-    """Render the sequence and read its stripes; `number` tells one shot's noise from another's.
+    """Render the sequence and decode its stripes; `number` selects the shot's noise.
 
-    times: the sensor's noise is drawn anew on the same light (jitter and speckle too).
+    times: how often the sensor's noise is drawn anew on the same light (jitter and speckle too).
     """
     rng = np.random.default_rng([setup.seed, apparatus.NOISE, number])
     settings = setup.settings

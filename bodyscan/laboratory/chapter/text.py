@@ -21,10 +21,11 @@ CHAPTER_TABLE_2 = {
 
 @dataclass(frozen=True, eq=False)
 class Reproduction:
-    """All that was found.
+    """Everything that was found.
 
-    whole, fine: the approaches and, last, the true calibration, from one whole stripe a pixel and
-    from sub-pixel boundaries.  by_stage, by_reference: every projector model, sub-pixel.
+    whole, fine: the approaches and, last, the true calibration, from one whole stripe per pixel and
+        from sub-pixel boundaries.
+    by_stage, by_reference: every projector model, sub-pixel.
     sigmas: how honest the points' own sigmas are.
     """
 
@@ -42,7 +43,7 @@ class Reproduction:
 
 
 def reproduction_text(found: Reproduction) -> str:
-    """Everything, as one text."""
+    """The whole report as one text."""
     parts = [
         _heading(found),
         _table_1(found),
@@ -186,7 +187,7 @@ def _point_sigmas(found: Reproduction) -> str:
 
 
 def figure_names(real_light: bool) -> tuple[str, str]:
-    """File names of Fig. 6 and Fig. 7, beside the text."""
+    """File names of Fig. 6 and Fig. 7, which are written beside the text."""
     light = "-real-light" if real_light else ""
     return f"fig6-projector{light}.png", f"fig7-range-data{light}.png"
 
@@ -278,7 +279,7 @@ def _times(all_: Sequence[ApproachAccuracy], one: ApproachAccuracy) -> float:
 
 
 def _table(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Markdown, columns padded so that it reads as it stands."""
+    """A Markdown table whose columns are padded so that its source is readable too."""
     cells = [list(heading), *(list(row) for row in rows)]
     widths = [max(len(row[k]) for row in cells) for k in range(len(heading))]
 

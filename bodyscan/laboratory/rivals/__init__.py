@@ -1,1 +1,1 @@
-"""The models the chapter is compared with (1, 4.2), all as `Camera` and `LightSheets`."""
+"""The models with which the chapter is compared (1, 4.2), all as `Camera` and `LightSheets`."""

@@ -28,7 +28,7 @@ from bodyscan.laboratory.rivals.targets import (
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """A calibrated pair as triangulation needs it, whatever the models."""
+    """A calibrated pair as needed for triangulation, whatever the models."""
 
     name: str
     camera: Camera
@@ -36,8 +36,8 @@ class Approach:
 
 
 def pinhole_by_stage(target: Target, shots: Sequence[StripedShot], readings: Array) -> Approach:
-    """Approach (i) as the chapter has it: a 3 x 4 and a 2 x 4 matrix from a slide stage, no lens,
-    and the index taken for a place on the projector's slide."""
+    """Approach (i) of the chapter: a 3 x 4 and a 2 x 4 matrix from a slide stage, without a lens,
+    and with the index used as a place on the projector's slide."""
     return _fit("(i)", by_matrix(target, shots, readings), target, pinhole_planes)
 
 
@@ -51,7 +51,7 @@ def planes_by_stage_camera(
 ) -> Approach:
     """Approach (ii): Tsai's camera from the slide stage, planes from the reference plane.
 
-    So the chapter's text has it, though it is headed `calibrated by slide stage`.
+    This follows the chapter's text, although its heading says `calibrated by slide stage`.
     """
     return _fit(name, locate_again(target, shots, stage.camera), target, free_planes)
 
@@ -60,23 +60,23 @@ Model = Callable[[BoundaryPoints, int, Axis], LightPlanes]
 
 
 def free_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
-    """One plane a stripe (Eq. 6)."""
+    """One free plane per stripe (Eq. 6)."""
     return fit_light_planes(points, stripes, direction).planes
 
 
 MATRIX_POINTS = 20000
-"""So many points fix the few numbers of a matrix far better than the model fits."""
+"""This many points determine the few numbers of a matrix far better than the model fits."""
 
 
 def pinhole_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
-    """The 2 x 4 matrix of Bolles et al. 1981."""
+    """Planes of the 2 x 4 matrix of Bolles et al. 1981."""
     few = subsample(points, MATRIX_POINTS)
     fitted = fit_pinhole(few.points, few.index.astype(float))
     return fitted.planes(stripes, direction)
 
 
 def remapped_planes(points: BoundaryPoints, stripes: int, direction: Axis) -> LightPlanes:
-    """The 2 x 4 matrix with a re-mapped index."""
+    """Planes of the 2 x 4 matrix with a re-mapped index."""
     few = subsample(points, MATRIX_POINTS)
     return fit_remapped_pinhole(few.points, few.index.astype(float), stripes, direction)
 
@@ -90,8 +90,8 @@ PROJECTORS: dict[str, Model] = {
     "variable baseline, tilted": fit_variable_baseline,
     "free planes": free_planes,
 }
-"""Every model of the projector that the chapter names; `tilted`: the baseline's direction in the
-image is found too, not taken for the camera's x axis."""
+"""Every model of the projector that the chapter names. `tilted`: the baseline's direction in the
+image is estimated too, instead of being assumed to be the camera's x axis."""
 
 
 def rivals(target: Target, where: LocatedBoards) -> list[Approach]:

@@ -1,10 +1,10 @@
-"""Projectors by their baseline (1): stripes square to it, each thrown at an angle of its own.
+"""Projectors by their baseline (section 1): stripes perpendicular to it, each with its own angle.
 
 By Eq. 7-9 a light plane is x - tan(tilt) y - tan(angle) z + l = 0, and by Eq. 14 it measures
 z = l / (tan(angle) - x/z + tan(tilt) y/z). The invariable baseline (Matsuki and Ueda 1989, Sansoni
 et al. 2000) has one l for all stripes, the variable one (Hattori and Sato 1996, Reid 1996) an l for
-each. Both take the stripes as square to the baseline: one tilt for all of them, 0 if the baseline
-is taken to be the camera's own axis.
+each. Both assume stripes perpendicular to the baseline: one tilt for all of them, 0 if the baseline
+is assumed to be the camera's own axis.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ def fit_invariable_baseline(
 ) -> LightPlanes:
     """One baseline for all, an angle for each stripe; least squares over all stripes at once.
 
-    fit_tilt: the baseline's direction in the image is found too; else it is the camera's x axis
-    (y for horizontal stripes). Boundaries seen at fewer than 12 points get no plane.
+    fit_tilt: estimate the baseline's direction in the image too; otherwise it is the camera's x
+        axis (y for horizontal stripes).
+
+    Boundaries seen at fewer than 12 points get no plane.
     """
     return _fit(data, stripes, direction, own_baseline=False, fit_tilt=fit_tilt)
 
@@ -35,15 +37,16 @@ def fit_invariable_baseline(
 def fit_variable_baseline(
     data: BoundaryPoints, stripes: int, direction: Axis, *, fit_tilt: bool = True
 ) -> LightPlanes:
-    """A baseline and an angle for each stripe; all have one tilt, see above."""
+    """A baseline and an angle for each stripe, and one tilt for all; see
+    `fit_invariable_baseline`."""
     return _fit(data, stripes, direction, own_baseline=True, fit_tilt=fit_tilt)
 
 
 def _fit(
     data: BoundaryPoints, stripes: int, direction: Axis, *, own_baseline: bool, fit_tilt: bool
 ) -> LightPlanes:
-    """Linear least squares for x = tan(tilt) y + tan(angle_i) z - l, weighted by what a pixel of
-    error moves x; points that disagree lose their weight (Cauchy)."""
+    """Linear least squares for x = tan(tilt) y + tan(angle_i) z - l, weighted by how far an error
+    of one pixel moves x; points that disagree lose their weight (Cauchy)."""
     x, y, z = _axes(data.points, direction)
     across = np.abs(_axes(data.per_pixel, direction)[0])
     one = np.ones_like(z)
@@ -66,7 +69,7 @@ def _fit(
 
 
 def _axes(vectors: Array, direction: Axis) -> tuple[Array, Array, Array]:
-    """Across the stripes, along them, and forward."""
+    """Coordinates across the stripes, along them, and forward."""
     x, y, z = vectors.T
     return (y, x, z) if direction == "horizontal" else (x, y, z)
 
@@ -74,9 +77,9 @@ def _axes(vectors: Array, direction: Axis) -> tuple[Array, Array, Array]:
 def _solve(
     own: Array, common: Array, right: Array, weights: Array, group: Indices, groups: int
 ) -> tuple[Array, Array]:
-    """Least squares with K unknowns for each group and M for all: (groups, K), (M,).
+    """Least squares with K unknowns for each group and M common ones: (groups, K), (M,).
 
-    The groups' own unknowns are taken out first (Schur complement), so that nothing large is
+    The groups' own unknowns are eliminated first (Schur complement), so that no large system is
     solved.
     """
     k = own.shape[1]
@@ -95,7 +98,7 @@ def _solve(
 
 
 def _planes(slope: Array, baseline: Array, tilt: float, direction: Axis) -> LightPlanes:
-    """slope: tangents of the projection angles (S + 1,), NaN where there is no plane."""
+    """Planes of the projection angles' tangents `slope` (S + 1,), NaN where there is no plane."""
     across, along = np.ones_like(slope), np.full_like(slope, -tilt)
     first, second = (along, across) if direction == "horizontal" else (across, along)
     planes = np.stack([first, second, -slope, baseline], axis=1)

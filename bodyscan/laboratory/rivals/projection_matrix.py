@@ -1,4 +1,4 @@
-"""A camera as a 3 x 4 matrix without a lens, from points of known place (Bolles et al. 1981)."""
+"""A camera as a 3 x 4 matrix without a lens, from points of known position (Bolles et al. 1981)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from bodyscan.geometry.transforms import RigidTransform
 
 
 def projection_matrix(points: Array, pixels: Array) -> Array:
-    """(3, 4) with pixels ~ P X, from points (N, 3) mm not all in one plane and pixels (N, 2).
+    """Matrix (3, 4) with pixels ~ P X, from points (N, 3) mm not all in one plane and pixels (N,
+    2).
 
-    Direct linear transformation with Hartley's scaling (Abdel-Aziz and Karara 1971).
+    Direct linear transformation (Abdel-Aziz and Karara 1971) with Hartley's scaling.
     """
     space, image = _scaling(points), _scaling(pixels)
     x = homogeneous(points) @ space.T
@@ -36,7 +37,7 @@ def projection_matrix(points: Array, pixels: Array) -> Array:
 def split_projection_matrix(
     matrix: Array, width: int, height: int
 ) -> tuple[Camera, RigidTransform]:
-    """The same matrix as a camera without a lens and its place: camera, camera_from_points."""
+    """The matrix as a camera without a lens, and its pose: camera, camera_from_points."""
     inner, rotation = rq(matrix[:, :3])
     sign = np.diag(np.sign(np.diag(inner)))
     inner, rotation = inner @ sign, sign @ rotation
@@ -60,7 +61,7 @@ def split_projection_matrix(
 
 
 def _scaling(places: Array) -> Array:
-    """(D + 1, D + 1): to mean 0 and a mean distance of sqrt(D)."""
+    """Matrix (D + 1, D + 1) that scales places to mean 0 and a mean distance of sqrt(D)."""
     size = places.shape[1]
     mean = places.mean(axis=0)
     scale = np.sqrt(size) / float(np.mean(np.linalg.norm(places - mean, axis=1)))

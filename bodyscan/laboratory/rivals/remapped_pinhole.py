@@ -1,7 +1,8 @@
-"""The 2 x 4 matrix with its index re-mapped: stripes at equal angles made stripes at equal tangents.
+"""The 2 x 4 matrix with its index re-mapped from equal angles to equal tangents.
 
-A rotating mirror throws its stripes at nearly equal angles, a pinhole's slide needs equal tangents.
-A smooth function of the index makes up for that; what is left is that the stripes share no line.
+A rotating mirror projects its stripes at nearly equal angles, a pinhole's slide needs equal
+tangents. A smooth function of the index corrects that; what is left is that the stripes share no
+line.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from bodyscan.geometry.light_planes import Axis, LightPlanes
 from bodyscan.geometry.robust import spread
 
 POWERS = (3, 4, 5)
-"""The matrix has a scale, a shift and a perspective of the index itself: powers 0 to 2."""
+"""The matrix itself has a scale, a shift and a perspective of the index: powers 0 to 2."""
 
 
 def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis) -> LightPlanes:
@@ -25,7 +26,7 @@ def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis)
     """
     start = fit_pinhole(points, s).matrix
     middle, size = points.mean(axis=0), float(points.std())
-    # In units of the cloud of points and of half the stripes all unknowns are about 1.
+    # In units of the point cloud's size and of half the stripes, all unknowns are about 1.
     scale = np.diag([size, size, size, 1.0])
     scale[:3, 3] = middle
     matrix = start @ scale
@@ -52,5 +53,5 @@ def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis)
 
 
 def _powers(u: Array) -> Array:
-    """(N, 3) of the index u in [-1, 1]."""
+    """Powers (N, 3) of the index u in [-1, 1]."""
     return np.stack([u**power for power in POWERS], axis=-1)

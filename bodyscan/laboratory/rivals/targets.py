@@ -1,6 +1,6 @@
-"""What a pair is calibrated with: a reference plane held anywhere, or one on a slide stage (4.2).
+"""Calibration of a pair with a reference plane held anywhere, or on a slide stage (4.2).
 
-Both give the same: a camera, and stripe boundaries at known places in its frame.
+Both give a camera, and stripe boundaries at known places in its frame.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class LocatedBoards:
-    """camera, camera_from_board by shot, and the boundaries on the boards, camera frame."""
+    """A camera, camera_from_board by shot, and the boundaries on the boards, camera frame."""
 
     camera: Camera
     camera_from_board: dict[str, RigidTransform]
@@ -57,7 +57,7 @@ class LocatedBoards:
 def by_reference_plane(
     target: Target, shots: Sequence[StripedShot]
 ) -> tuple[CameraCalibration, LocatedBoards]:
-    """The chapter's way (3): Zhang's camera, which also says where the boards are."""
+    """The chapter's method (section 3): Zhang's camera, which also gives the boards' poses."""
     height, width = shots[0].stripes.s.shape
     views = [planar_view(shot.view, target.board) for shot in shots]
     found = calibrate_camera(views, width, height)
@@ -67,8 +67,10 @@ def by_reference_plane(
 def by_slide_stage(
     target: Target, shots: Sequence[StripedShot], readings: Array, *, skewed: bool = False
 ) -> tuple[TsaiCamera, LocatedBoards]:
-    """Tsai's camera from a board that slid along its normal to `readings` (shots,) mm; with a skew if
-    wanted."""
+    """Tsai's camera, with a skew if wanted, from a board that slid along its normal.
+
+    readings: (shots,) mm, of the stage.
+    """
     height, width = shots[0].stripes.s.shape
     points, pixels = stage_points(target.board, shots, readings)
     middle = np.array([(width - 1) / 2.0, (height - 1) / 2.0])
@@ -83,7 +85,7 @@ def by_slide_stage(
 def by_matrix(target: Target, shots: Sequence[StripedShot], readings: Array) -> LocatedBoards:
     """A 3 x 4 camera from the same stage, without a lens (Bolles et al. 1981).
 
-    Where the stripes fall is read off each board by its own homography, which knows no lens either.
+    The stripes' positions are read off each board by its own homography, which has no lens either.
     """
     height, width = shots[0].stripes.s.shape
     points, pixels = stage_points(target.board, shots, readings)
@@ -99,7 +101,7 @@ def by_matrix(target: Target, shots: Sequence[StripedShot], readings: Array) -> 
 
 
 def locate_again(target: Target, shots: Sequence[StripedShot], camera: Camera) -> LocatedBoards:
-    """Boards anywhere, seen by a camera that is known already."""
+    """Locate boards held anywhere with a camera that is already known."""
     poses = {
         shot.view.shot: locate_board(camera, planar_view(shot.view, target.board))[0]
         for shot in shots
@@ -115,7 +117,8 @@ def locate(
     *,
     bin_px: int = 1,
 ) -> LocatedBoards:
-    """Carry the boundaries onto boards of known place (Eq. 18), one by one or means of pieces."""
+    """Carry boundaries onto boards of known pose (Eq. 18),
+    one by one or as means of short pieces."""
     parts = [
         on_board(
             camera,
@@ -134,7 +137,8 @@ def locate(
 def stage_points(
     board: Board, shots: Sequence[StripedShot], readings: Array
 ) -> tuple[Array, Array]:
-    """All corners in the stage's frame (N, 3) mm: the board's at reading 0; and pixels (N, 2)."""
+    """All corners in the stage's frame (N, 3) mm, which is the
+    board's at reading 0; and pixels (N, 2)."""
     views = [planar_view(shot.view, board) for shot in shots]
     points = [
         view.points + [0.0, 0.0, reading] for view, reading in zip(views, readings, strict=True)
@@ -154,7 +158,7 @@ def _by_homography(
     camera_from_board: RigidTransform,
     number: int,
 ) -> BoundaryPoints:
-    """A board's boundaries, placed on it by the corners around them alone."""
+    """A board's boundaries, located on it only by the corners around them."""
     near = boundaries_near(shot.stripes, box_around(shot.view))
     onto_board = np.linalg.inv(homography(view.points[:, :2], view.pixels))
 
@@ -163,7 +167,7 @@ def _by_homography(
         flat = np.column_stack([image[:, :2] / image[:, 2:], np.zeros(len(image))])
         return camera_from_board.apply(flat)
 
-    # What lies on the checkered area is judged as for every other model.
+    # The same test of what lies on the checkered area as for every other model.
     everything = on_board(
         camera, target.projector, target.board, camera_from_board, near, number, bin_px=1
     )

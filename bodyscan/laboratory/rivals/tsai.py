@@ -1,9 +1,9 @@
-"""Tsai's camera calibration (1987) from points that do not lie in one plane.
+"""Tsai's camera calibration (1987) from points that are not in one plane.
 
 Radial alignment: whatever the focal length, the depth and the radial distortion, a point's image
-lies on the ray from the image centre towards its place across the axis. That gives rotation and
-shift across linearly, then focal length and depth; all are refined together at last. The model has
-one coefficient, from real to ideal: ideal = real (1 + kappa r^2).
+lies on the ray from the image centre in the direction of its offset from the axis. That gives
+rotation and lateral translation linearly, then focal length and depth; finally all are refined
+together. The model has one coefficient, from real to ideal: ideal = real (1 + kappa r^2).
 """
 
 from __future__ import annotations
@@ -21,9 +21,15 @@ from bodyscan.geometry.transforms import RigidTransform
 
 @dataclass(frozen=True, eq=False)
 class TsaiCamera:
-    """focal (px of a row), aspect (px of a column each), centre (2,) px, kappa for places in units
-    of the focal length.  camera_from_points: where the camera stands.  rms_px: of the residuals.
-    skew: px, gamma of Eq. 1, which Tsai's own model has not.
+    """Tsai's camera model.
+
+    focal: px, vertical.
+    aspect: horizontal over vertical focal length.
+    centre: (2,) px.
+    kappa: for coordinates in units of the focal length.
+    camera_from_points: the camera's pose.
+    rms_px: of the residuals.
+    skew: px, gamma of Eq. 1, which Tsai's own model lacks.
     """
 
     focal: float
@@ -35,14 +41,14 @@ class TsaiCamera:
     skew: float = 0.0
 
     def camera(self, width: int, height: int) -> Camera:
-        """As the chapter's camera: the radial lens that undoes kappa best over the image."""
+        """The chapter's camera whose radial lens undoes kappa best over the image."""
         corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
         scale = np.array([self.focal * self.aspect, self.focal])
         real = np.linspace(0.0, 1.0, 201)[1:] * np.linalg.norm(
             (corners - self.centre) / scale, axis=1
         ).max(initial=0.0)
         ideal = real * (1.0 + self.kappa * real**2)
-        # Weighted by the radius: there is more image there.
+        # Weighted by the radius, as more of the image lies there.
         rows = np.stack([ideal**3, ideal**5], axis=1) * np.sqrt(real)[:, None]
         coefficients = np.linalg.lstsq(rows, (real - ideal) * np.sqrt(real), rcond=None)[0]
         return Camera(
@@ -60,11 +66,13 @@ class TsaiCamera:
 def calibrate_tsai(
     points: Array, pixels: Array, centre: Array, *, skewed: bool = False
 ) -> TsaiCamera:
-    """From points (N, 3) mm, not in one plane, their pixels (N, 2) and a rough image centre (2,).
+    """Calibrate from points (N, 3) mm, not in one plane, their pixels (N, 2) and a rough centre
+    (2,).
 
-    skewed: columns may stand askew on rows.
+    skewed: estimate a skew as well.
 
-    The centre is taken where radial alignment is best (Lenz and Tsai 1988), then all is refined.
+    The centre is chosen where radial alignment is best (Lenz and Tsai 1988), then everything is
+    refined.
     """
 
     def misalignment(place: Array) -> Array:
@@ -107,12 +115,12 @@ def _solve_alignment(points: Array, image: Array) -> tuple[Array, Array]:
 
 
 def _align(points: Array, image: Array) -> tuple[Array, Array, float]:
-    """Rotation (3, 3), shift across (2,), aspect."""
+    """Rotation (3, 3), lateral translation (2,), aspect."""
     solved, _ = _solve_alignment(points, image)
     aspect = float(np.linalg.norm(solved[:3]))
     first, second = solved[:4] / aspect, solved[4:]
     whole = np.column_stack([points, np.ones(len(points))])
-    # The sign: points are seen on the side of the axis on which they lie.
+    # The sign: points are imaged on their own side of the axis.
     sign = np.sign(np.sum((whole @ np.stack([first, second]).T) * image))
     first, second = sign * first, sign * second
     rows = np.stack([first[:3], second[:3], np.cross(first[:3], second[:3])])
@@ -123,7 +131,7 @@ def _align(points: Array, image: Array) -> tuple[Array, Array, float]:
 def _focal_and_depth(
     points: Array, image: Array, rotation: Array, across: Array
 ) -> tuple[float, float]:
-    """Focal length (px) and depth (mm) without distortion, linear."""
+    """Focal length (px) and depth (mm) without distortion, by linear least squares."""
     height = points @ rotation[1] + across[1]
     forward = points @ rotation[2]
     rows = np.stack([height, -image[:, 1]], axis=1)
@@ -132,7 +140,7 @@ def _focal_and_depth(
 
 
 def _residuals(values: Array, points: Array, pixels: Array) -> Array:
-    """Px in the ideal image, (2 N,)."""
+    """Residuals (2 N,) px, in the ideal image."""
     focal, aspect, centre, kappa = values[6], values[7], values[8:10], values[10]
     seen = RigidTransform.from_rotation_vector(values[:3], values[3:6]).apply(points)
     scale = np.array([focal * aspect, focal])

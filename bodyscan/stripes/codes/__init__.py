@@ -1,6 +1,6 @@
-"""The stripe codes there are: each is one file of this folder, listed there in CODES.
+"""The stripe codes: each is one file in this folder, listed there in CODES.
 
-A code that lives elsewhere is made known by `register`.
+A code defined elsewhere is added by `register`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ _CODES: dict[str, type[StripeCode]] = {}
 
 
 def register(*codes: type[StripeCode]) -> None:
-    """Make codes known. Raises ValueError for one whose name, or a kind's, means something else."""
+    """Add codes. Raises ValueError for a name, of a code or
+    kind, that already means something else."""
     for code in codes:
         name = code.model_fields["code"].default
         if _CODES.get(name, code) is not code:
@@ -47,7 +48,8 @@ def image_kinds() -> tuple[ImageKind, ...]:
 
 
 def stripe_code(keys: Any) -> Any:
-    """The StripeCode that a rig file's `projector` describes; what is no mapping as it is.
+    """The StripeCode that a rig file's `projector` describes; returns what is not a mapping
+    unchanged.
 
     Keys without a value (null) count as not given. Raises pydantic's ValidationError.
     """
@@ -84,9 +86,9 @@ def stripe_code(keys: Any) -> Any:
 def _with_crossing(
     keys: dict[str, Any],
 ) -> tuple[dict[str, Any], StripeCode | None, list[InitErrorDetails]]:
-    """A projector's keys without `crossing`, what that describes, and what is wrong with it.
+    """A projector's keys without `crossing`, the code it describes, and what is wrong with it.
 
-    Crossing stripes of the same code share its keys, but for those of their own.
+    Crossing stripes of the same code share its keys, except those in NOT_SHARED.
     """
     own = {key: value for key, value in keys.items() if key != "crossing"}
     given = keys.get("crossing")
@@ -104,14 +106,14 @@ def _with_crossing(
     except ValidationError as refused:
         errors = repeated_errors(refused)
         its_own = [error for error in errors if error["loc"][:1] not in [(k,) for k in shared]]
-        told = its_own or errors  # what is wrong with both is told of the first
+        told = its_own or errors  # a mistake in both is reported for the first
         return own, None, [{**error, "loc": ("crossing", *error["loc"])} for error in told]
 
 
 def _key_errors(
     key: str, code: type[StripeCode] | None, fields: dict[str, Any]
 ) -> list[InitErrorDetails]:
-    """Why a key does not belong to a code; nothing of a key that an unknown code may take."""
+    """Why a key does not belong to a code; nothing for a key that an unknown code may take."""
     takers = [name for name, other in _CODES.items() if key in other.model_fields]
     if not takers:
         return [unknown_key_error(key, fields)]
@@ -123,7 +125,7 @@ def _key_errors(
 
 
 AnyStripeCode = Annotated[SerializeAsAny[StripeCode], BeforeValidator(stripe_code)]
-"""A field of a model that holds any of the codes."""
+"""A model field that holds any of the codes."""
 
 for _module in pkgutil.iter_modules(__path__, f"{__name__}."):
     register(*import_module(_module.name).CODES)

@@ -1,7 +1,7 @@
-"""Stripes numbered in bits: one image a bit, and one of each bit's inverse where wanted.
+"""Stripes numbered in bits: one image per bit, and one of each bit's inverse if wanted.
 
-The inverse makes a boundary the crossing of two curves, wherever the surface is black or white;
-without it, black must be known from a dark image.
+With inverses a boundary is the crossing of two curves, whether the surface is black or white;
+without them, black must be known from a dark image.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ def bits_needed(words: int) -> int:
 
 
 class _NumberedStripes(StripeCode):
-    """inverses: whether each pattern is projected inverted as well.  first_code: the number that
-    stripe 0 has; the others count up from it."""
+    """inverses: whether each pattern is also projected inverted.
+    first_code: the number of stripe 0; the others count up from it.
+    """
 
     kinds: ClassVar = (PATTERN, INVERSE)
 
@@ -75,10 +76,11 @@ class _NumberedStripes(StripeCode):
 
     @property
     def show_order(self) -> tuple[int, ...]:
-        """The finest pattern in the middle, coarser ones before and behind it in turn, inverses beside.
+        """The finest pattern in the middle, coarser ones alternately before and after it, inverses
+        adjacent.
 
-        Half of all boundaries are of the finest and a quarter of the next: so what moves meanwhile sets
-        them apart least.
+        Half of all boundaries belong to the finest and a quarter to the next: this order keeps the
+        error from motion smallest.
         """
         finest_first = range(self.bits - 1, -1, -1)
         bits = (*finest_first[2::2][::-1], finest_first[0], *finest_first[1::2])
@@ -87,7 +89,7 @@ class _NumberedStripes(StripeCode):
         return tuple(image for bit in bits for image in (bit, self.bits + bit))
 
     def moment(self, times: Mapping[str, Array]) -> float:
-        """That of the finest pattern and its inverse, which show half of all boundaries."""
+        """The time of the finest pattern and its inverse, which show half of all boundaries."""
         finest = [float(each[-1]) for each in times.values()]
         return sum(finest) / len(finest)
 

@@ -1,4 +1,4 @@
-"""Light section: a line of light swept over the scene, one image a stripe."""
+"""Light section: a line of light swept over the scene, one image per stripe."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STRIPE = ImageKind("stripe", "stripe{stripe:03d}", "stripe", most=1000)
 
 
 class LightSection(StripeCode):
-    """Most images are dark at any one pixel, so that no dark image is needed."""
+    """A swept line; most images are dark at any one pixel, so no dark image is needed."""
 
     kinds: ClassVar = (STRIPE,)
     uses_dark: ClassVar = False
@@ -28,7 +28,7 @@ class LightSection(StripeCode):
         return {STRIPE: self.stripes}
 
     def intensity(self, kind: ImageKind, s: Array) -> Array:
-        """Stripe i is lit in image i."""
+        """Stripe i is lit in image i; see `StripeCode.intensity`."""
         import numpy as np
 
         return np.asarray(np.floor(s) == np.arange(self.stripes)[:, None], float)

@@ -1,7 +1,7 @@
 """Phase shift: waves of light, shifted from image to image.
 
-A wave's phase tells s to a period. Which period it is, other waves tell, or a Gray code of half
-periods where there is one wave alone.
+A wave's phase gives s within a period. Which period it is, the other waves show, or, with a single
+wave, a Gray code of half periods.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ PHASE = ImageKind("phase", "phase{step:02d}", "step", most=256)
 USUAL_PERIOD = 8.0
 
 LEAST_CHANGE = 0.004
-"""Of a period: waves that change less are alike to any camera (8 times the least sigma of a phase,
-so that an order can be told at all)."""
+"""Share of a period: waves that change by less look the same to any camera (8 times the least sigma
+of a phase, so that an order can be found at all)."""
 
 Steps = Annotated[int, Field(ge=3, le=64)]
 Period = Annotated[float, Field(ge=2, le=1e6)]
@@ -35,10 +35,15 @@ Count = Annotated[float, Field(gt=0, le=65535)]
 
 
 class PhaseShift(StripeCode):
-    """period: stripes in a period of the wave, or of each wave; or else periods: how many of them the
-    stripes make.  steps: images of each wave.  shift: which way the waves move from image to image.
-    start_deg: the phase, in degrees, at `origin` in image 0.  origin: s where the waves begin.
-    inverses: of the Gray code, which there is for one wave alone that repeats.
+    """One wave or several, given by their periods.
+
+    period: stripes per period of the wave, or of each wave; alternatively
+    periods: how many periods the stripes make.
+    steps: images of each wave.
+    shift: which way the waves move from image to image.
+    start_deg: the phase, in degrees, at `origin` in image 0.
+    origin: s where the waves begin.
+    inverses: whether to show those of the Gray code, which exists for a single wave that repeats.
     """
 
     kinds: ClassVar = (PATTERN, INVERSE, PHASE)
@@ -83,7 +88,7 @@ class PhaseShift(StripeCode):
 
     @property
     def _lengths(self) -> tuple[float, ...]:
-        """Stripes in a period of each wave."""
+        """Stripes per period of each wave."""
         if self.periods is not None:
             counts = self.periods if isinstance(self.periods, tuple) else (self.periods,)
             return tuple(self.stripes / count for count in counts)
@@ -93,7 +98,7 @@ class PhaseShift(StripeCode):
 
     @property
     def waves(self) -> tuple[Wave, ...]:
-        """In the order of their images."""
+        """The waves in the order of their images."""
         lengths = self._lengths
         steps = self.steps if isinstance(self.steps, tuple) else (self.steps,) * len(lengths)
         start = math.radians(self.start_deg)
@@ -110,7 +115,8 @@ class PhaseShift(StripeCode):
 
     @property
     def half_periods(self) -> int:
-        """How many the stripes make, the last one perhaps in part; of the one wave."""
+        """Number of half periods of the single wave in all stripes, the last one perhaps
+        incomplete."""
         return math.ceil(2.0 * self.stripes / self._lengths[0] - 1e-9)
 
     @property

@@ -1,6 +1,6 @@
-"""The stripe-index image: luminance 1 to 254 is the stripe's number, 0 and 255 are none.
+"""The stripe-index image: luminance 1 to 254 is the stripe's number, 0 and 255 mean none.
 
-It is what instruments of the chapter's kind hand out (4.1, Fig. 5), which project for themselves.
+It is the output of instruments like the chapter's (4.1, Fig. 5), which project their own stripes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ LARGEST_NUMBER = 254
 
 
 class StripeIndex(StripeCode):
-    """Boards are looked for in the lit image, which is as light comes without any stripes."""
+    """Stripe numbers in one image; boards are looked for in the lit image, taken without
+    stripes."""
 
     kinds: ClassVar = (INDEX,)
     uses_dark: ClassVar = False
