@@ -20,6 +20,8 @@ class LightSheets(Protocol):
     direction: which way the stripes run in the image.
     """
 
+    def __hash__(self) -> int: ...
+
     @property
     def direction(self) -> Axis: ...
 

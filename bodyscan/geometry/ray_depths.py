@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -110,6 +111,7 @@ def triangulate_image(
     return points, sigma_mm, common_mm
 
 
+@lru_cache(maxsize=64)
 def _most_sigma(sheets: LightSheets) -> float:
     """MOST_SIGMA, or GUESSED times what the boards leave open where they were. A projector that was
     calibrated elsewhere is a guess nowhere, however roughly it may be known."""
