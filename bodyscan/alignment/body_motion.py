@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_solve
-from scipy.linalg.lapack import dpotrf, dpotri, dtrtri
+from scipy.linalg.lapack import dpotrf, dpotri, dtrtri, dtrtrs
 
 from bodyscan.alignment.body_cells import BodyCells, modulated, rigid_fields
 from bodyscan.alignment.breath import breath_fields, likely_breath
@@ -174,6 +174,13 @@ class BodyMotion:
         lower = np.tril(dpotri(self.factor, lower=True)[0])
         return (lower + np.tril(lower, -1).T) * self.units[:, None] * self.units
 
+    def covariance_of(self, some: slice) -> Array:
+        """Block of `covariance` for some amplitudes, (m, m), without working out the rest."""
+        unit = np.zeros((len(self.units), some.stop - some.start), order="F")
+        unit[some] = np.diag(self.units[some])
+        solved = dtrtrs(self.factor, unit, lower=True, overwrite_b=True)[0]
+        return np.asarray(solved.T @ solved, np.float64)
+
     @property
     def variances(self) -> Array:
         """Variances of the amplitudes, (n,): all a round needs, at half the covariance's cost."""
@@ -294,8 +301,7 @@ class BodyMotion:
     def _settled(self) -> BodyMotion:
         """The motion that solves the normal equations with the prior.
 
-        These grow with the number of pairs: the matrix is laid out for LAPACK, which works in
-            place.
+        They grow with the number of pairs, so the matrix is laid out for LAPACK to work in place.
         """
         normal = self.normal.copy(order="F")
         for kind, own in zip(self.kinds, self.slices, strict=True):
@@ -317,7 +323,7 @@ class BodyMotion:
         """
         breath = self.kind("breath")
         own = self.slices[self.kinds.index(breath)]
-        known = np.linalg.inv(self.covariance[own, own])
+        known = np.linalg.inv(self.covariance_of(own))
         seen = known - breath.prior
         alike = likely_breath(seen, known @ self.amplitudes[own], *self.breaths)
         kinds = (replace(k, alike=alike) if k is breath else k for k in self.kinds)

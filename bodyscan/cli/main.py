@@ -18,7 +18,7 @@ from bodyscan.cli.console import complain
 from bodyscan.cli.interruption import run_interruptibly
 from bodyscan.errors import BodyscanError
 from bodyscan.files.os_errors import in_words
-from bodyscan.memory import keep_freed_memory
+from bodyscan.memory import collect_seldom, keep_freed_memory
 from bodyscan.version import __version__
 
 app = typer.Typer(
@@ -39,6 +39,7 @@ def main() -> None:
     # What OpenCV warns of, we say in our own words, with the place in the rig file.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     keep_freed_memory()
+    collect_seldom()
     os.umask(0o077)  # images and models of people are for their owner alone
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1

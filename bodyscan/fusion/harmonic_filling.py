@@ -7,6 +7,8 @@ neighbours say.
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,14 +19,17 @@ SWEEPS = 16
 COARSEST_SWEEPS = 200
 COARSEST = 16  # nodes along the shortest side of the coarsest grid, at most
 OVERSHOOT = 1.6  # successive over-relaxation
+NEAR = 2  # nodes of a coarser grid, which is off by less than one where it puts the zero set
+
+Values = TypeVar("Values", Floats, Mask)
 
 
 def fill_harmonically(values: Floats, fixed: Mask, least: Floats, sure: float) -> Floats:
     """Fill in the values (a, b, c) that are not fixed; the grid's rim must be fixed.
 
     least: lower bounds (a, b, c) of nodes that are not fixed; -inf for none.
-    sure: nodes that a coarser grid puts farther from 0 keep its value, since only the zero set
-        matters.
+    sure: nodes that a coarser grid puts farther from 0 keep its value, and so do those far from any
+        change of sign, since only the zero set matters.
     """
     if min(values.shape) <= COARSEST or any(size % 2 for size in values.shape):
         found, sweeps = np.where(fixed, values, np.maximum(np.float32(0.0), least)), COARSEST_SWEEPS
@@ -32,7 +37,7 @@ def fill_harmonically(values: Floats, fixed: Mask, least: Floats, sure: float) -
     else:
         coarse = fill_harmonically(*_halved(values, fixed, least), sure)
         found, sweeps = np.where(fixed, values, np.maximum(_doubled(coarse), least)), SWEEPS
-        unsure = ~fixed & (np.abs(found) < sure)
+        unsure = ~fixed & _doubled(_near_zero(coarse)) & (np.abs(found) < sure)
     found = np.ascontiguousarray(found, np.float32)
     nodes = np.flatnonzero(unsure).astype(np.int32)
     _relax(found.ravel(), nodes, found.shape[1:], least.ravel(), sweeps)
@@ -53,7 +58,25 @@ def _halved(values: Floats, fixed: Mask, least: Floats) -> tuple[Floats, Mask, F
     return np.asarray(known, np.float32), count > 0, total(0.125 * least)
 
 
-def _doubled(coarse: Floats) -> Floats:
+def _near_zero(values: Floats) -> Mask:
+    """Nodes (a, b, c) within NEAR nodes of both signs."""
+    negative = values < 0.0
+    return _widened(negative) & _widened(~negative)
+
+
+def _widened(where: Mask) -> Mask:
+    """`where`, and the nodes at most NEAR away along each axis."""
+    wide = where.copy()
+    for axis in range(3):
+        along = np.moveaxis(wide, axis, 0)  # a view: the next axis starts from this one's outcome
+        for _ in range(NEAR):
+            was = along.copy()
+            along[1:] |= was[:-1]
+            along[:-1] |= was[1:]
+    return wide
+
+
+def _doubled(coarse: Values) -> Values:
     return coarse.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
 
 

@@ -83,7 +83,7 @@ class BodyMesh:
             return None
         return np.where(self.filled, np.uint8(UNSURE), of_faces(self.regions, self.faces))
 
-    @property
+    @cached_property
     def filled_share(self) -> float:
         """Share of the surface's area that was filled."""
         area = face_areas(self.vertices, self.faces)
