@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import Any
 
 import numpy as np
 import pytest
 
+from bodyscan.alignment import together
 from bodyscan.alignment.body_motion import ARM_MM
 from bodyscan.alignment.moments import of_stance
-from bodyscan.alignment.pole_steps import PoleStep, Scan, find_steps, motions_between
+from bodyscan.alignment.place_evidence import SizeStep
+from bodyscan.alignment.pole_steps import (
+    PoleStep,
+    Scan,
+    StepSearch,
+    find_steps,
+    motions_between,
+)
 from bodyscan.alignment.sway_prior import BODY_CENTRE, centre_shifts
 from bodyscan.arrays import Array
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 
 NAMES = [f"p{pole}-{k}" for pole in (1, 2, 3) for k in (1, 2, 3, 4)]
@@ -193,3 +203,54 @@ def test_what_pairs_stand_off_each_by_itself_is_told_from_sway() -> None:
     assert found.step is None
     assert found.own_mm == pytest.approx(4.0 * np.sqrt(3 / 12 * 9 / 12 / 6), rel=0.5)
     assert found.sway_mm < 0.4
+
+
+def step(name: str, *pairs: str, all_moved: bool = False) -> PoleStep:
+    return PoleStep(name, frozenset(pairs), 3.0, 0.1, all_moved)
+
+
+@pytest.mark.parametrize(
+    ("followed", "told", "freed"),
+    [
+        # Nobody was followed, or what they did says nothing of places: what stands off by itself.
+        (None, "places", ["pole a"]),
+        ("followed", None, ["pole a"]),
+        # Else what a person's whole motion leaves for poles to explain.
+        ("followed", "places", ["pole b"]),
+    ],
+)
+def test_poles_are_set_free_one_after_the_other(
+    monkeypatch: pytest.MonkeyPatch, followed: Any, told: Any, freed: list[str]
+) -> None:
+    by_search, by_motion = [step("pole a", "a1", "a2")], [step("pole b", "b1"), SizeStep(1.0, 0.1)]
+    if not (followed and told):
+        by_motion = []
+    given: list[Any] = []
+    names = ("a1", "a2", "b1")
+    boards = PoseCovariance(names, np.eye(18))
+
+    def search(*of: Any) -> StepSearch:
+        return StepSearch(by_search.pop(0) if by_search else None, 0.5)
+
+    def aligned(images: Any, placed: Any, loose: PoseCovariance, settings: Any) -> Any:
+        given.append(np.diag(loose.matrix)[3::6] > 1.0)
+        return "aligned anew"
+
+    monkeypatch.setattr(together, "_search", search)
+    monkeypatch.setattr(together, "follow", lambda *of: ("alignment", followed, told))
+    monkeypatch.setattr(together, "find_off", lambda *of: by_motion.pop(0) if by_motion else None)
+    monkeypatch.setattr(together, "align", aligned)
+    monkeypatch.setattr(together, "_tied_motions", lambda *of: dict.fromkeys(names, np.zeros(6)))
+    nothing: Any = None
+    found = together.bring_together(
+        nothing, nothing, nothing, boards, {"a1": "a", "a2": "a"}, nothing
+    )
+    assert [one.name for one in found.shifted] == freed
+    if freed == ["pole a"]:
+        assert found.size is None
+        assert [one.tolist() for one in given] == [[True, True, False]]
+    else:
+        assert found.size == SizeStep(1.0, 0.1)
+        # A pole by itself, then each pole: of a size all stand off.
+        assert [one.tolist() for one in given] == [[False, False, True], [True, True, True]]
+    assert found.followed is followed
