@@ -17,12 +17,14 @@ from bodyscan.alignment.pole_steps import (
     Scan,
     StepSearch,
     find_steps,
+    loosened,
     motions_between,
+    moving_alone,
 )
 from bodyscan.alignment.sway_prior import BODY_CENTRE, centre_shifts
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
-from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 NAMES = [f"p{pole}-{k}" for pole in (1, 2, 3) for k in (1, 2, 3, 4)]
 POLES = {name: name[:2] for name in NAMES}
@@ -254,3 +256,26 @@ def test_poles_are_set_free_one_after_the_other(
         # A pole by itself, then each pole: of a size all stand off.
         assert [one.tolist() for one in given] == [[False, False, True], [True, True, True]]
     assert found.followed is followed
+
+
+def test_what_may_have_moved_by_itself_are_pairs_and_whole_poles() -> None:
+    found = moving_alone(["a1", "a2", "b1", "c"], {"a1": "a", "a2": "a", "b1": "b", "other": "d"})
+    assert found == {
+        "pair a1": {"a1"}, "pair a2": {"a2"}, "pair b1": {"b1"}, "pair c": {"c"},
+        "pole a": {"a1", "a2"}, "pole b": {"b1"},
+    }  # fmt: skip
+
+
+def test_a_pole_is_set_free_by_centimetres_and_degrees_about_the_body_all_its_pairs_alike() -> None:
+    names = ("a1", "b1", "a2")
+    known = np.diag(np.tile([1e-8] * 3 + [1e-2] * 3, 3))
+    free = loosened(PoseCovariance(names, known), ["a1", "a2"]).matrix - known
+    own = free[:6, :6]
+    for i, one in enumerate(names):
+        for j, other in enumerate(names):
+            both = one[0] == other[0] == "a"
+            block = free[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
+            np.testing.assert_allclose(block, own if both else np.zeros((6, 6)), atol=1e-12)
+    np.testing.assert_allclose(np.diag(own)[:3], np.radians(5.0) ** 2)
+    centre = twist_jacobian(BODY_CENTRE[None])[0]
+    np.testing.assert_allclose(centre @ own @ centre.T, 30.0**2 * np.eye(3), atol=1e-6)
