@@ -15,6 +15,7 @@ from verdict_given import verdict_given
 from bodyscan.alignment.icp import Alignment, Overlap
 from bodyscan.alignment.place_evidence import SizeStep
 from bodyscan.alignment.pole_steps import PoleStep, StepSearch
+from bodyscan.fusion import scan as scan_file
 from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.scan import _light_lines, _silent
 from bodyscan.fusion.seams import Seam, SeamReport
@@ -370,3 +371,33 @@ def test_where_light_comes_from_is_known_of_all_pairs_or_of_none() -> None:
     assert lines({"a": PINHOLE, "b": None}) is None
     assert lines({"a": PINHOLE}) is None, "a pair without a calibration"
     assert lines({"a": PINHOLE, "b": PINHOLE}, agreement="of two directions") is None
+
+
+@pytest.mark.parametrize(
+    ("pairs", "matching", "aligned"),
+    [(2, "projected", True), (1, "projected", False), (2, "none", False)],
+)
+def test_two_pairs_are_aligned_where_they_may_be_and_one_has_nothing_to_be_aligned_with(
+    pairs: int, matching: str, aligned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Enough(Exception):
+        pass
+
+    def merge(*of: Any) -> None:
+        raise Enough("merged")
+
+    def align(*of: Any) -> None:
+        raise Enough("aligned")
+
+    seen = [SimpleNamespace(pair=f"p{k}") for k in range(pairs)]
+    monkeypatch.setattr(scan_file, "clean", lambda *of, **more: seen)
+    monkeypatch.setattr(scan_file, "require_subject", lambda images: images)
+    monkeypatch.setattr(scan_file, "merge", merge)
+    monkeypatch.setattr(scan_file, "align", align)
+    calibration: Any = SimpleNamespace(
+        rig_from_camera={}, rig=SimpleNamespace(volume=None), covariance=None
+    )
+    settings: Any = SimpleNamespace(alignment=SimpleNamespace(matching=matching), fusion=None)
+    images: Any = SimpleNamespace(value=seen)
+    with pytest.raises(Enough, match="aligned" if aligned else "merged"):
+        scan_file.fuse(calibration, images, settings)
