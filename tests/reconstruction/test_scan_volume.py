@@ -20,6 +20,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.scan_volume import (
     LAYER_MM,
     MARGIN_MM,
+    _corner_rays,
     stripes_in_volume,
     volume_interval,
 )
@@ -203,3 +204,11 @@ def test_a_level_ray_goes_through_the_wall_or_comes_nearest_to_the_axis_beside_i
     assert (half > 0.0).tolist() == [True, True, False, False]
     np.testing.assert_allclose(enter, nearest - half, rtol=1e-9)
     np.testing.assert_allclose(leave, nearest + half, rtol=1e-9)
+
+
+def test_blocks_begin_at_the_first_pixels_outer_edge_and_cover_the_picture() -> None:
+    plain = Camera(100.0, 100.0, 0.0, 0.0, 0.0, Radial(), 25, 16)
+    rays = _corner_rays(plain, 10)
+    assert rays.shape == (3, 4, 3)
+    np.testing.assert_allclose(100.0 * rays[0, :, 0], [-0.5, 9.5, 19.5, 29.5])
+    np.testing.assert_allclose(100.0 * rays[:, 0, 1], [-0.5, 9.5, 19.5])
