@@ -105,7 +105,7 @@ def test_lenses_are_tried_until_one_is_not_clearly_better(
         monkeypatch.setattr(lens_choice, name, value)
     view: Any = SimpleNamespace(points=np.zeros((2, 3)))
     nothing: Any = None
-    found = choose_lens(FAMILY, nothing, [], [view] * 4)
+    found: Any = choose_lens(FAMILY, nothing, [], [view] * 4)
     assert type(found.fit.camera.lens) is kind
     assert found.rays == (kind, richest)
     assert [trial.gain for trial in found.trials] == [None, *gains]
@@ -132,7 +132,7 @@ def test_of_one_lens_or_three_places_nothing_is_tried(
         lens_choice, "ray_uncertainty", lambda camera, rich, _: (camera, rich.camera)
     )
     nothing: Any = None
-    found = choose_lens(kinds, nothing, [], [])
+    found: Any = choose_lens(kinds, nothing, [], [])
     assert found.trials == ()
     assert found.rays == (kinds[0], richest)
 

@@ -102,3 +102,17 @@ def test_what_is_farther_from_the_axis_than_a_head_reaches_does_not_count() -> N
     assert girth(vertices, faces, 800.0, AXIS + [99.0, 0.0]) == pytest.approx(alone)
     assert girth(vertices, faces, 800.0, AXIS + [110.0, 0.0]) < 0.99 * alone
     assert girth(vertices, faces, 800.0, AXIS + [221.0, 0.0]) == float("inf")
+
+
+@pytest.mark.parametrize(
+    "profile",
+    [
+        # At 1290 mm, where the lowest slice is, and 1560, above the highest at 1544.
+        [(0.0, 150.0), (1180.0, 150.0), (1290.0, 55.0), (1380.0, 80.0), (TALL_MM, 80.0)],
+        [(0.0, 150.0), (1430.0, 150.0), (1560.0, 50.0), (1598.0, 90.0), (TALL_MM, 90.0)],
+    ],
+)
+def test_what_is_narrowest_where_trunks_or_heads_are_is_no_neck(profile: Profile) -> None:
+    """A quarter of the stature below the top, nearly, or a twelfth of it."""
+    with pytest.raises(FailedWork, match="no neck was found"):
+        found(profile)
