@@ -1,16 +1,18 @@
 """Range images of one body from several sides, pushed apart and brought together again."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import open3d as o3d
 import pytest
 from ring import looking_at
 
-from bodyscan.alignment.icp import align
+from bodyscan.alignment import icp
+from bodyscan.alignment.icp import Alignment, Overlap, _gap, _largest_group, align
 from bodyscan.alignment.matching import Matches
 from bodyscan.alignment.object_refinement import refine_on_object
 from bodyscan.alignment.overlap_equations import OverlapEquations
+from bodyscan.alignment.sway_prior import SwayPrior
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
@@ -206,3 +208,63 @@ def test_the_normal_equations_are_those_of_the_distances_jacobian() -> None:
     )
     gradient = jacobian.T @ (weights * matches.distances)
     np.testing.assert_allclose(found.gradient / scale, gradient / scale, atol=1e-4)
+
+
+def test_distances_of_all_overlaps_count_by_their_points() -> None:
+    def of(*overlaps: Overlap) -> Alignment:
+        return Alignment({}, {}, {}, overlaps)
+
+    found = of(Overlap("a", "b", 300, 0.4, 0.2, 0.1), Overlap("b", "c", 100, 0.8, 0.6))
+    assert found.rms_before_mm == pytest.approx(np.sqrt((3 * 0.16 + 0.64) / 4.0))
+    assert found.rms_after_mm == pytest.approx(np.sqrt((3 * 0.04 + 0.36) / 4.0))
+    # What noise would make of the second is not known.
+    assert found.expected_mm == pytest.approx(0.1)
+    assert np.isnan(of().rms_after_mm)
+
+
+def test_matches_lie_as_far_apart_as_a_root_of_squares_says() -> None:
+    distances, sigma = np.array([0.3, -0.4, 0.0, 0.0]), np.array([0.1, 0.1, 0.1, 0.3])
+    points = np.zeros((4, 3))
+    count, apart, expected = _gap(Matches(points, points, distances, sigma, np.arange(4)))
+    assert count == 4
+    assert apart == pytest.approx(0.25)
+    assert expected == pytest.approx(np.sqrt(0.03))
+
+
+def test_the_largest_group_is_that_which_overlaps_tie() -> None:
+    assert _largest_group([(0, 1), (3, 4), (4, 6)]) == {3, 4, 6}
+    assert _largest_group([]) == set()
+
+
+def test_each_round_looks_half_as_far_and_believes_the_sway_that_the_last_one_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The last two rounds take all points; matches are looked for from where the last one ended."""
+    rounds: list[tuple[str, float, float]] = []
+    believed: list[float] = []
+    own = np.zeros((1, 6))
+    own[0, 3] = 1.0
+
+    def each(measure: Any, pool: Any, clouds: Any, moved: Any, reach: float, settings: Any) -> str:
+        rounds.append((clouds, reach, float(moved[0].translation[0])))
+        return "overlaps"
+
+    def covariance(self: Any, names: Any, prior: Any, scale: float) -> float:
+        believed.append(scale)
+        return scale
+
+    monkeypatch.setattr(icp, "_each_overlap", each)
+    monkeypatch.setattr(icp, "solve_motions", lambda overlaps, motion, cov: motion + own)
+    monkeypatch.setattr(SwayPrior, "covariance", covariance)
+    monkeypatch.setattr(SwayPrior, "scale", lambda self, motion: 10.0 * motion[0, 3])
+    settings = AlignmentSettings(reach_mm=20.0, least_reach_mm=3.0, rounds=5)
+    nothing: Any = None
+    clouds: Any = "coarse", "fine"
+    start = [RigidTransform.identity()]
+    motion = icp._register(nothing, clouds, start, ["a"], nothing, settings)
+    assert rounds == [
+        ("coarse", 20.0, 0.0), ("coarse", 10.0, 1.0), ("coarse", 5.0, 2.0), ("fine", 3.0, 3.0),
+        ("fine", 3.0, 4.0),
+    ]  # fmt: skip
+    assert believed == [1.0, 10.0, 20.0, 30.0, 40.0]
+    np.testing.assert_array_equal(motion, 5.0 * own)

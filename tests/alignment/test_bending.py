@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ring import looking_at
 
-from bodyscan.alignment.bending import _one_in_each_block, bend
+from bodyscan.alignment.bending import _bend, _one_in_each_block, bend
 from bodyscan.alignment.body_cells import BodyCells, modulated, normal_field, rigid_fields
 from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.matching import alignment_points, match_projected
@@ -160,3 +160,51 @@ def test_of_each_block_the_measured_pixel_nearest_to_its_middle_is_taken() -> No
     assert found[0, 0] == 13 * 0 + 0
     sigma[2:7, 3:8] = np.nan
     assert _one_in_each_block(sigma, (3, 2), 5)[1, 1] == -1
+
+
+def spread_over_blocks(
+    cell: np.ndarray, depth: np.ndarray, shifts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How far `_bend` carries each of 12 x 13 pixels along x, where blocks of five, counted from a
+    corner at row 3 and column 2, belong to cells with such shifts; and where it lies, in blocks."""
+    points = np.zeros((12, 13, 3), np.float32)
+    points[..., 2] = 1000.0
+    before, normals = points.copy(), np.zeros_like(points)
+    sigma = np.full((12, 13), 0.1, np.float32)
+    fields = np.zeros((len(shifts), 12))
+    fields[:, 0] = shifts
+    blocks = cell.astype(np.int32), depth.astype(np.float32)
+    _bend(points, normals, sigma, (3, 2), 5, blocks, (np.zeros((len(shifts), 3)), fields))
+    y, x = (np.arange(3, 15) + 0.5) / 5.0 - 0.5, (np.arange(2, 15) + 0.5) / 5.0 - 0.5
+    return (points - before)[..., 0], y[:, None], x[None]
+
+
+def test_between_the_middles_of_four_blocks_their_motions_are_mixed_by_nearness() -> None:
+    i, j = np.indices((3, 3))
+    own = 1.0 + 2.0 * i + 4.0 * j + 0.5 * i * j
+    shift, y, x = spread_over_blocks(3 * i + j, np.full((3, 3), 1000.0), own.ravel())
+    y, x = np.clip(y, 0.0, 2.0), np.clip(x, 0.0, 2.0)  # beyond the last middles as there
+    # Single precision.
+    np.testing.assert_allclose(shift, 1.0 + 2.0 * y + 4.0 * x + 0.5 * y * x, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("off_mm", "one_surface"), [(39.0, True), (-39.0, True), (41.0, False), (-41.0, False)]
+)
+def test_what_is_far_before_or_behind_moves_by_itself(off_mm: float, one_surface: bool) -> None:
+    cell, depth = np.array([[0, 0, 1]] * 3), np.full((3, 3), 1000.0)
+    depth[:, 2] += off_mm
+    shift, _, x = spread_over_blocks(cell, depth, np.array([1.0, 3.0]))
+    here = np.arange(2, 15) // 5
+    mixed = 1.0 + 2.0 * np.clip(x[0] - 1.0, 0.0, 1.0)
+    # A pixel goes with its own block whatever its depth, and mixes others in on its own surface only.
+    expected = mixed if one_surface else np.where(here < 2, 1.0, np.where(x[0] >= 2.0, 3.0, mixed))
+    np.testing.assert_allclose(shift[4], expected, rtol=1e-5)  # amid a row of blocks
+
+
+def test_blocks_without_a_cell_are_left_out_of_the_mixture() -> None:
+    cell = np.array([[0, 0, -1]] * 3)
+    cell[2] = 1
+    shift, y, _ = spread_over_blocks(cell, np.full((3, 3), 1000.0), np.array([1.0, 3.0]))
+    expected = 1.0 + 2.0 * np.clip(y - 1.0, 0.0, 1.0)
+    np.testing.assert_allclose(shift[:, :6], np.tile(expected, (1, 6)), rtol=1e-5)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -68,3 +71,39 @@ def test_it_is_told_from_four_sigmas_and_a_twentieth_of_a_millimetre_on() -> Non
     assert ObliqueLight(0.41, 0.1).told
     assert not ObliqueLight(-0.8, 0.1).told
     assert ObliqueLight(-0.2, 0.05).most_mm == pytest.approx(0.25)
+
+
+@dataclass(frozen=True)
+class Fan:
+    """Sheets through a line at x = -220, z = 15 that runs along y, some of them measured."""
+
+    turns: tuple[float, ...]
+    stripes: int = 99
+
+    def tangent_planes(self, s: np.ndarray) -> np.ndarray:
+        # Neither the first boundary nor the last, which are nobody's own.
+        np.testing.assert_allclose(s, 3.0 * np.arange(1, 33))
+        planes = np.full((32, 4), np.nan)
+        for k, turn in enumerate(self.turns):
+            normal = np.array([np.cos(turn), 0.0, np.sin(turn)])
+            planes[5 * k] = *normal, -normal @ [-220.0, 7.0, 15.0]
+        return planes
+
+
+def test_light_comes_from_where_three_sheets_meet() -> None:
+    fan: Any = Fan((0.0, 0.1, -0.1))
+    found = LightLine.of(fan)
+    assert found is not None
+    np.testing.assert_allclose(np.abs(found.along), [0.0, 1.0, 0.0], atol=1e-9)
+    # The place of the line that is nearest to the camera.
+    np.testing.assert_allclose(found.origin, [-220.0, 0.0, 15.0], atol=1e-6)
+    few: Any = Fan((0.0, 0.1))
+    assert LightLine.of(few) is None
+
+
+@pytest.mark.parametrize(("apart", "told"), [(2e-3, True), (1e-3, False), (0.0, False)])
+def test_sheets_that_hardly_turn_meet_nowhere(apart: float, told: bool) -> None:
+    """Turned by so much to either side, the second direction has two thirds of that, as a root of
+    squares, against one of them all."""
+    fan: Any = Fan((-apart, 0.0, apart))
+    assert (LightLine.of(fan) is not None) is told

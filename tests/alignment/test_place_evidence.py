@@ -121,3 +121,16 @@ def test_of_poles_that_are_free_nothing_is_asked() -> None:
     assert other.name == "pole p3"
     assert not isinstance(off(3.0 * OUT, freed=freed), SizeStep)
     assert off(of_pole("p2", [0.0, 5.0, 0.0]), freed=NAMES) is None
+
+
+def test_of_three_pairs_two_that_stand_on_one_pole_and_moved_are_named() -> None:
+    few = [NAMES.index(name) for name in ("p1-1", "p1-3", "p2-1")]
+    places = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in few])
+    whole = evidence(of_pole("p1", [5.0, 0.0, 0.0]))
+    cut = PlaceEvidence(
+        tuple(NAMES[k] for k in few), whole.information[np.ix_(places, places)], whole.pull[places]
+    )
+    found = find_off(cut, PLACED, POLES)
+    assert isinstance(found, PoleStep)
+    assert (found.name, found.all_moved) == ("pole p1", False)
+    assert found.pairs == {"p1-1", "p1-3"}

@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import Any
 
 import numpy as np
 import pytest
 
+from bodyscan.alignment import together
 from bodyscan.alignment.body_motion import ARM_MM
 from bodyscan.alignment.moments import of_stance
-from bodyscan.alignment.pole_steps import PoleStep, Scan, find_steps, motions_between
+from bodyscan.alignment.place_evidence import SizeStep
+from bodyscan.alignment.pole_steps import (
+    PoleStep,
+    Scan,
+    StepSearch,
+    find_steps,
+    loosened,
+    motions_between,
+    moving_alone,
+)
 from bodyscan.alignment.sway_prior import BODY_CENTRE, centre_shifts
 from bodyscan.arrays import Array
-from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 NAMES = [f"p{pole}-{k}" for pole in (1, 2, 3) for k in (1, 2, 3, 4)]
 POLES = {name: name[:2] for name in NAMES}
@@ -193,3 +205,77 @@ def test_what_pairs_stand_off_each_by_itself_is_told_from_sway() -> None:
     assert found.step is None
     assert found.own_mm == pytest.approx(4.0 * np.sqrt(3 / 12 * 9 / 12 / 6), rel=0.5)
     assert found.sway_mm < 0.4
+
+
+def step(name: str, *pairs: str, all_moved: bool = False) -> PoleStep:
+    return PoleStep(name, frozenset(pairs), 3.0, 0.1, all_moved)
+
+
+@pytest.mark.parametrize(
+    ("followed", "told", "freed"),
+    [
+        # Nobody was followed, or what they did says nothing of places: what stands off by itself.
+        (None, "places", ["pole a"]),
+        ("followed", None, ["pole a"]),
+        # Else what a person's whole motion leaves for poles to explain.
+        ("followed", "places", ["pole b"]),
+    ],
+)
+def test_poles_are_set_free_one_after_the_other(
+    monkeypatch: pytest.MonkeyPatch, followed: Any, told: Any, freed: list[str]
+) -> None:
+    by_search, by_motion = [step("pole a", "a1", "a2")], [step("pole b", "b1"), SizeStep(1.0, 0.1)]
+    if not (followed and told):
+        by_motion = []
+    given: list[Any] = []
+    names = ("a1", "a2", "b1")
+    boards = PoseCovariance(names, np.eye(18))
+
+    def search(*of: Any) -> StepSearch:
+        return StepSearch(by_search.pop(0) if by_search else None, 0.5)
+
+    def aligned(images: Any, placed: Any, loose: PoseCovariance, settings: Any) -> Any:
+        given.append(np.diag(loose.matrix)[3::6] > 1.0)
+        return "aligned anew"
+
+    monkeypatch.setattr(together, "_search", search)
+    monkeypatch.setattr(together, "follow", lambda *of: ("alignment", followed, told))
+    monkeypatch.setattr(together, "find_off", lambda *of: by_motion.pop(0) if by_motion else None)
+    monkeypatch.setattr(together, "align", aligned)
+    monkeypatch.setattr(together, "_tied_motions", lambda *of: dict.fromkeys(names, np.zeros(6)))
+    nothing: Any = None
+    found = together.bring_together(
+        nothing, nothing, nothing, boards, {"a1": "a", "a2": "a"}, nothing
+    )
+    assert [one.name for one in found.shifted] == freed
+    if freed == ["pole a"]:
+        assert found.size is None
+        assert [one.tolist() for one in given] == [[True, True, False]]
+    else:
+        assert found.size == SizeStep(1.0, 0.1)
+        # A pole by itself, then each pole: of a size all stand off.
+        assert [one.tolist() for one in given] == [[False, False, True], [True, True, True]]
+    assert found.followed is followed
+
+
+def test_what_may_have_moved_by_itself_are_pairs_and_whole_poles() -> None:
+    found = moving_alone(["a1", "a2", "b1", "c"], {"a1": "a", "a2": "a", "b1": "b", "other": "d"})
+    assert found == {
+        "pair a1": {"a1"}, "pair a2": {"a2"}, "pair b1": {"b1"}, "pair c": {"c"},
+        "pole a": {"a1", "a2"}, "pole b": {"b1"},
+    }  # fmt: skip
+
+
+def test_a_pole_is_set_free_by_centimetres_and_degrees_about_the_body_all_its_pairs_alike() -> None:
+    names = ("a1", "b1", "a2")
+    known = np.diag(np.tile([1e-8] * 3 + [1e-2] * 3, 3))
+    free = loosened(PoseCovariance(names, known), ["a1", "a2"]).matrix - known
+    own = free[:6, :6]
+    for i, one in enumerate(names):
+        for j, other in enumerate(names):
+            both = one[0] == other[0] == "a"
+            block = free[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
+            np.testing.assert_allclose(block, own if both else np.zeros((6, 6)), atol=1e-12)
+    np.testing.assert_allclose(np.diag(own)[:3], np.radians(5.0) ** 2)
+    centre = twist_jacobian(BODY_CENTRE[None])[0]
+    np.testing.assert_allclose(centre @ own @ centre.T, 30.0**2 * np.eye(3), atol=1e-6)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from bodyscan.arrays import Array, Mask
+from bodyscan.boards import charuco
 from bodyscan.boards.appearance import AS_PRINTED, OTHERWISE, Appearance
 from bodyscan.boards.aprilgrid import _clear_of_edges, place_tags
 from bodyscan.boards.board_layout import marker_corners
+from bodyscan.boards.board_map import fit_board_map
 from bodyscan.boards.charuco import (
     Markers,
     PlacedMarkers,
@@ -152,3 +156,36 @@ def test_a_print_seen_in_a_mirror_or_in_white_is_put_right() -> None:
     np.testing.assert_array_equal(AS_PRINTED.in_image(pixels, 4), pixels)
     assert Appearance(False, False, False, False) == AS_PRINTED
     assert len({AS_PRINTED, *OTHERWISE}) == 4  # all that a picture may look like
+
+
+@pytest.mark.parametrize(
+    ("found", "looked"), [(11, 1), (12, 2), (55, 2), (56, 1)], ids=["few", "enough", "most", "all"]
+)
+def test_corners_not_found_are_looked_for_once_more_where_a_dozen_others_say(
+    found: int, looked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Markers 3 px off say where corners are; then corners say it better."""
+    x, y = np.meshgrid(50.0 * np.arange(1, 9), 50.0 * np.arange(1, 8))
+    true = image_of(np.stack([x.ravel(), y.ravel()], axis=-1), 1.0)
+    asked: list[Array] = []
+
+    def refine(image: Any, start: Array, *_: Any, **__: Any) -> tuple[Array, Mask]:
+        asked.append(start)
+        good = np.arange(56) % 56 < found if len(asked) == 1 else np.arange(56) >= 40
+        return np.where(good[:, None], true + 0.1 * (len(asked) - 1), start), good
+
+    monkeypatch.setattr(charuco, "refine_corners", refine)
+    outer = marker_corners(BOARD)[1][..., :2]
+    off = fit_board_map(outer.reshape(-1, 2), image_of(outer.reshape(-1, 2), 1.0) + 3.0)
+    nothing: Any = None
+    pixels, good = charuco._refine(nothing, BOARD, off, np.arange(56), outer)
+    assert len(asked) == looked
+    assert np.abs(asked[0] - true).min() > 2.9
+    again = (np.arange(56) >= 40) if looked == 2 else np.zeros(56, bool)
+    assert good.tolist() == ((np.arange(56) < found) | again).tolist()
+    # What was found at first stays.
+    np.testing.assert_allclose(pixels[:found], true[:found])
+    if looked == 2:
+        # A dozen corners of two rows tell a homography: it is exact.
+        assert np.abs(asked[1] - true).max() < 0.01
+        np.testing.assert_allclose(pixels[max(found, 40) :], true[max(found, 40) :] + 0.1)

@@ -102,3 +102,14 @@ def test_a_pixel_of_the_print_is_found_again_in_the_image(inverted: bool, mirror
     again = image[there[..., 1], there[..., 0]]
     assert np.array_equal(seen, 255 - again if inverted else again)
     assert seen.flags.c_contiguous
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_a_board_seen_aslant_is_numbered_as_it_is(turns: int) -> None:
+    """Columns lean by 22 degrees and rows by as much towards them: a rhombus, not a mirrored one."""
+    quarter = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), turns)
+    x, y = np.meshgrid(np.arange(4), np.arange(3))
+    slanted = np.stack([20 * x + 8 * y, 8 * x + 20 * y], axis=-1).reshape(-1, 2) @ quarter.T + 150.0
+    assert np.array_equal(numbered(slanted).pixels, slanted)
+    mirrored = slanted.reshape(3, 4, 2)[:, ::-1].reshape(-1, 2)
+    assert np.array_equal(numbered(mirrored).pixels, slanted)

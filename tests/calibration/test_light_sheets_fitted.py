@@ -16,6 +16,7 @@ from lit_boards import (
     body_scene,
     chapter_scene,
 )
+from sheet_models import PINHOLE
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate, select
@@ -225,3 +226,16 @@ def test_the_order_of_points_does_not_matter_and_nothing_is_drawn() -> None:
     # Sums in another order round otherwise, by far less than a step that is not worth taking.
     off = shuffled.sheets.parameters - fit.sheets.parameters
     assert np.all(np.abs(off) < 1e-3 * np.sqrt(np.diag(fit.sheets.covariance)))
+
+
+def test_boundaries_between_two_stripes_count_and_not_those_at_the_pictures_ends() -> None:
+    """Of ten stripes: planes are counted by themselves, smooth sheets by where boards were seen."""
+    planes = np.full((11, 4), np.nan)
+    planes[[0, 1, 4, 9, 10]] = [0.0, 1.0, 0.0, -200.0]
+    seen = np.array([3, 0, 1, 2, 0, 0, 3, 0, 0, 1, 2])
+
+    def count(sheets: LightPlanes | LensSheets) -> int:
+        return SheetsFit(sheets, "", (), 0.1, 0.0, seen).stripes_calibrated
+
+    assert count(LightPlanes(planes, np.zeros((11, 4, 4)), "vertical")) == 3
+    assert count(PINHOLE) == 4

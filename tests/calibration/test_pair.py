@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from bodyscan.calibration.board_views import LocatedView
-from bodyscan.calibration.pair import drop_disagreeing
+from bodyscan.calibration.model_selection import HeldOutModel
+from bodyscan.calibration.pair import PairQuality, drop_disagreeing
 from bodyscan.calibration.stripe_agreement import ProjectorMotion
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView
 from bodyscan.errors import PairFailed
@@ -38,3 +39,27 @@ def test_a_projector_that_moved_costs_the_pair_and_the_shots_are_named() -> None
     with pytest.raises(PairFailed, match="moved between shots c and d") as error:
         drop_disagreeing("p1-1", SHOTS, found)
     assert error.value.where == "pair p1-1"
+
+
+def test_light_that_another_program_calibrated_is_called_so_and_other_light_by_its_model() -> None:
+    tried = tuple(
+        HeldOutModel(name, 0.1, 0.1, 0.1, 1.0, name == "lens") for name in ("planes", "lens")
+    )
+    assert PairQuality(0.1, 5, held_out=tried).light_model == "lens"
+    assert PairQuality(0.1, 5, held_out=tried[:1]).light_model is None
+    assert (
+        PairQuality(None, 0, imported="theirs.json", stripes_projected=63).light_model == "imported"
+    )
+    # A camera alone, without light of its own.
+    assert PairQuality(None, 0, imported="theirs.json").light_model is None
+
+
+def test_nothing_is_known_of_what_was_imported_without_a_sigma() -> None:
+    assert PairQuality(None, 0, imported="theirs.json").unjudged
+    assert not PairQuality(None, 0, imported="theirs.json", imported_sigma_px=0.0).unjudged
+    assert not PairQuality(0.1, 5).unjudged
+
+
+def test_a_pair_of_which_no_stripes_were_looked_at_has_none() -> None:
+    quality = PairQuality(0.1, 5)
+    assert quality.stripe_shots == quality.stripes_calibrated == quality.stripes_projected == 0

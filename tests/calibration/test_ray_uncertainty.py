@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from picture_boards import HEIGHT, MIDDLE, NOISE_PX, POINTS, WIDTH
@@ -9,12 +12,13 @@ from picture_boards import HEIGHT, MIDDLE, NOISE_PX, POINTS, WIDTH
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.camera import CameraCalibration
 from bodyscan.calibration.lens_choice import calibrate_with_lenses
+from bodyscan.calibration.ray_uncertainty import ray_uncertainty
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import FAMILY
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.lenses.rational import Rational
-from bodyscan.geometry.ray_uncertainty import nodes
+from bodyscan.geometry.ray_uncertainty import RayUncertainty, nodes
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
 FOCAL = 1400.0  # 30 degrees from the axis to the corner
@@ -94,3 +98,62 @@ def test_the_image_is_the_nodes_between_them() -> None:
         corners, found.rays.sigma_px[[0, 0, -1, -1], [0, -1, 0, -1]], rtol=1e-5
     )
     assert image.min() >= found.rays.sigma_px.min() * 0.9999
+
+
+CHOSEN = Camera(FOCAL, FOCAL + 1.0, -0.5, 645.0, 508.0, Radial(-0.2, 0.08), WIDTH, HEIGHT)
+K1 = CHOSEN.parameter_names.index("k1")
+OFF = 1e-3
+
+
+def told_by(richest: Camera, sigma_k1: float = 0.0) -> RayUncertainty:
+    """Of boards in two places, from a camera with such a lens of which k1 alone is open."""
+    turns = ([0.3, 0.2, 0.0], [-0.2, 0.4, 0.1])
+    poses = tuple(
+        RigidTransform.from_rotation_vector(turn, [-100.0 + 60.0 * k, -80.0, DEPTH_MM])
+        for k, turn in enumerate(turns)
+    )
+    covariance = np.zeros((7, 7))
+    covariance[K1, K1] = sigma_k1**2
+    fit: Any = SimpleNamespace(camera=richest, poses=poses, covariance=covariance)
+    views = [PlanarView(f"s{k}", POINTS, POINTS[:, :2]) for k in range(2)]
+    return ray_uncertainty(CHOSEN, fit, views)
+
+
+def test_how_far_another_lens_shows_rays_elsewhere_is_told_but_for_a_motion_of_the_camera() -> None:
+    """By the pixels themselves: what one camera shows of the other's rays, less the motion that brings
+    the boards' corners together, a coordinate's share of it."""
+    step = OFF * np.eye(7)[K1]
+    found = told_by(CHOSEN.moved(step)).lens_px
+    rays = CHOSEN.rays(nodes(WIDTH, HEIGHT)).reshape(-1, 3)
+    corners = np.concatenate([
+        RigidTransform.from_rotation_vector(turn, [-100.0 + 60.0 * k, -80.0, DEPTH_MM]).apply(POINTS)
+        for k, turn in enumerate(([0.3, 0.2, 0.0], [-0.2, 0.4, 0.1]))
+    ])  # fmt: skip
+    points = rays * np.median(corners[:, 2])
+    other = CHOSEN.moved(step)
+
+    def apart(at: np.ndarray) -> np.ndarray:
+        return other.project(at) - CHOSEN.project(at)
+
+    def by_motion(at: np.ndarray) -> np.ndarray:
+        return other.jacobians(at)[1] @ twist_jacobian(at)
+
+    flat = by_motion(corners).reshape(-1, 6)
+    motion = np.linalg.lstsq(flat, apart(corners).ravel(), rcond=None)[0]
+    left = apart(points) - by_motion(points) @ motion
+    wanted = np.sqrt(np.mean(left**2, axis=1)).reshape(found.shape)
+    np.testing.assert_allclose(found, wanted, rtol=1e-6)
+    # A thousandth of r^3 at 30 degrees is a quarter of a pixel for a focal length of 1400.
+    assert 0.05 < found.max() < 0.4
+    assert found[8, 10] < 0.02 * found.max(), "near the axis a lens changes nothing"
+    assert not told_by(CHOSEN).lens_px.any()
+
+
+def test_a_sigma_of_a_coefficient_is_as_large_as_a_lens_that_differs_by_it() -> None:
+    by_noise, by_lens = told_by(CHOSEN, OFF), told_by(CHOSEN.moved(OFF * np.eye(7)[K1]))
+    # First order in a thousandth.
+    np.testing.assert_allclose(
+        by_noise.noise_px, by_lens.lens_px, atol=1e-3 * by_lens.lens_px.max()
+    )
+    assert not by_lens.noise_px.any()
+    assert not by_noise.lens_px.any()

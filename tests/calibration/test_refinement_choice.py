@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from lit_boards import binned, chapter_scene
+from sheet_models import PINHOLE
 
 from bodyscan.arrays import Array, Indices
+from bodyscan.calibration import refinement_choice
 from bodyscan.calibration.board_form import BoardForm
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import boundary_points, concatenate, subsample
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
+from bodyscan.calibration.held_out import CLEARLY, Compared
 from bodyscan.calibration.joint_refinement import StripedBoard, known_apart, striped_board
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.refinement_choice import (
@@ -188,3 +193,78 @@ def test_what_few_poses_cannot_see_of_a_bow_is_in_the_sigmas(flat: Solved) -> No
     # length's own sigma, however much is believed beforehand.
     assert sigmas[1] > 1.05 * sigmas[0]
     assert sigmas[2] > sigmas[1]
+
+
+def test_whether_camera_and_light_are_others_than_before_is_said(
+    bent: Solved, flat: Solved
+) -> None:
+    assert bent.refinement.taken
+    assert flat.refinement.taken is (chosen(flat) != APART)
+    for one in (bent, flat):
+        assert one.refinement.reason.startswith(chosen(one))
+        first, now = one.refinement.flatness_mm or (0.0, 0.0)
+        assert first == one.refinement.trials[0].rms_mm
+        assert now == next(trial.rms_mm for trial in one.refinement.trials if trial.chosen)
+
+
+@pytest.mark.parametrize(
+    ("gains", "way", "compared"),
+    [
+        ((-0.1, CLEARLY - 0.1), APART, [(0, 1), (0, 2)]),
+        ((-0.1, CLEARLY), BENT, [(0, 1), (0, 2)]),
+        ((0.0, CLEARLY - 0.1), TOGETHER, [(0, 1), (1, 2)]),
+        ((0.3, CLEARLY), BENT, [(0, 1), (1, 2)]),
+    ],
+)
+def test_a_way_is_taken_where_it_is_as_good_and_bent_boards_where_they_are_clearly_better(
+    monkeypatch: pytest.MonkeyPatch,
+    gains: tuple[float, float],
+    way: str,
+    compared: list[tuple[int, int]],
+) -> None:
+    """Each is held against the way that was best until then; a fit that is not the richest gets what
+    that leaves open."""
+    fits = [SimpleNamespace(name=name) for name in (APART, TOGETHER, BENT)]
+    held = [
+        SimpleNamespace(stripes=np.full((6, 1), 1.0 + k), corners=np.full((4, 2), k))
+        for k in range(3)
+    ]
+    left, seen = list(gains), []
+
+    def solve(*_: Any, bent: bool = True, **__: Any) -> Any:
+        if not bent:
+            return fits[1]
+        done = SimpleNamespace(forms={}, camera=None, camera_from_board=None, sheets=None)
+        return vars(fits[2]).update(vars(done)) or fits[2]
+
+    def better(stripes: Compared, corners: Compared) -> float:
+        assert np.array_equal(corners.simple, np.full((4, 2), stripes.simple[0, 0] - 1.0))
+        seen.append((int(stripes.simple[0, 0] - 1.0), int(stripes.rich[0, 0] - 1.0)))
+        return left.pop(0)
+
+    instead: dict[str, Any] = {
+        "refine_jointly": solve,
+        "print_errors": lambda *_: {},
+        "known_apart": lambda *_: fits[0],
+        "_hold_out": lambda *_: held,
+        "parts_of_boards": lambda _: np.repeat([0, 1, 2], 2),
+        "gain": better,
+        "shared_weights": lambda _: np.ones(6),
+        "allowing_for": lambda fit, richest, _: (fit.name, richest.name),
+    }
+    for name, value in instead.items():
+        monkeypatch.setattr(refinement_choice, name, value)
+    camera: Any = SimpleNamespace(camera=None, camera_from_board=None)
+    board: Any = SimpleNamespace(view=SimpleNamespace(points=np.zeros((4, 3))))
+    nothing: Any = None
+    sheets: Any = PINHOLE
+    found: Any = refine_where_better(camera, sheets, [board] * 3, nothing, {})
+    assert seen == compared
+    assert found.taken is (way != APART)
+    assert found.reason.startswith(way)
+    assert found.fit == (fits[2] if way == BENT else (way, BENT))
+    assert [trial.gain for trial in found.trials] == [None, *gains]
+    assert [trial.rms_mm for trial in found.trials] == [1.0, 2.0, 3.0]
+    few: Any = refine_where_better(camera, sheets, [board] * 2, nothing, {})
+    assert (few.fit, few.taken) == (fits[0], False)
+    assert few.reason == "2 boards with stripes are too few"

@@ -1,7 +1,10 @@
 """A projector that moves between the shots of a calibration is noticed, and its shots named."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +20,7 @@ from lit_boards import (
     chapter_scene,
 )
 
+from bodyscan.calibration import stripe_agreement
 from bodyscan.calibration.boundary_points import BoundaryPoints, boundary_points, concatenate
 from bodyscan.calibration.light_sheets import fit_light_sheets
 from bodyscan.calibration.stripe_agreement import (
@@ -169,3 +173,85 @@ def test_disagreement_is_told_in_pixels_whatever_the_unit_of_length() -> None:
     # A camera of pixels half as large is off by twice as many.
     fine = told(replace(data, per_pixel=0.5 * data.per_pixel))
     assert fine.together_px == pytest.approx(2.0 * usual.together_px, rel=0.02)
+
+
+def told_of(
+    lights: Sequence[int],
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    usual_px: float = 0.1,
+    other_px: float = 3.0,
+    width_px: float = 5.0,
+) -> ProjectorMotion | None:
+    """Of boards that saw lights of such numbers: in a group those that saw another than most are
+    `other_px` off, and the rest as usual."""
+
+    def misfit(data: Any, groups: Sequence[Any], stripes: int, direction: str) -> float:
+        squares: list[float] = []
+        for group in groups:
+            most = Counter(lights[board] for board in group).most_common(1)[0][0]
+            off = [usual_px if lights[board] == most else other_px for board in group]
+            squares += [each**2 for each in off]
+        return float(np.sqrt(np.mean(squares)))
+
+    monkeypatch.setattr(stripe_agreement, "subsample", lambda data, count: data)
+    monkeypatch.setattr(stripe_agreement, "_misfit", misfit)
+    monkeypatch.setattr(stripe_agreement, "_stripe_width", lambda data: width_px)
+    data: Any = SimpleNamespace(board=np.arange(len(lights)))
+    return find_projector_motion(data, 64, "vertical")
+
+
+@pytest.mark.parametrize(
+    ("lights", "others", "moved"),
+    [
+        ([1, 1, 1, 1, 2], [4], False),
+        ([2, 1, 1, 2, 1, 1, 1], [0, 3], False),
+        # From the third board on, where three before agree, and three after.
+        ([1, 1, 1, 2, 2, 2], [3, 4, 5], True),
+        ([1, 1, 1, 1, 2, 2], [4, 5], True),
+        # Two before: the projector stands where the others saw it.
+        ([1, 1, 2, 2, 2], [0, 1], False),
+    ],
+)
+def test_boards_are_told_apart_in_the_simplest_way_that_explains_them(
+    lights: list[int], others: list[int], moved: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = told_of(lights, monkeypatch)
+    assert found is not None
+    assert (found.others.tolist(), found.moved) == (others, moved)
+    assert sorted([*found.kept.tolist(), *others]) == list(range(len(lights)))
+    assert found.apart_px == pytest.approx(0.1)
+    assert found.together_px > 1.0
+
+
+@pytest.mark.parametrize(
+    ("usual_px", "other_px", "told"),
+    [
+        # Three boards as usual and one off by 0.76 px are 0.39 px off together: nothing to look at.
+        (0.1, 0.76, False),
+        (0.1, 0.80, True),
+        # Told apart they have to agree three times as well: 0.84 px against 0.3, and 0.94.
+        (0.3, 1.60, False),
+        (0.3, 1.80, True),
+    ],
+)
+def test_one_board_is_another_where_the_rest_agree_three_times_as_well(
+    usual_px: float, other_px: float, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = told_of([1, 1, 1, 2], monkeypatch, usual_px=usual_px, other_px=other_px)
+    assert (found is not None) is told
+
+
+@pytest.mark.parametrize(("width_px", "refused"), [(2.2, True), (2.6, False)])
+def test_boards_that_fit_no_light_are_refused_where_stripes_are_off_by_their_width(
+    width_px: float, refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five boards, each with a light of its own but two."""
+    lights = [1, 2, 3, 4, 1]
+    if not refused:
+        assert told_of(lights, monkeypatch, width_px=width_px) is None
+        return
+    with pytest.raises(
+        PairFailed, match=r"stripes of 5 boards fit no light .* a stripe is 2\.2 px"
+    ):
+        told_of(lights, monkeypatch, width_px=width_px)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bodyscan.evaluation.planes import best_plane, flatness
+from bodyscan.evaluation.planes import best_plane, flatness, smooth_part
 from bodyscan.geometry.transforms import RigidTransform
 
 PLACE = RigidTransform.from_rotation_vector([0.15, 0.1, 0.4], [-10.0, -17.0, 402.0])
@@ -43,3 +43,32 @@ def test_the_plane_faces_away_from_the_camera() -> None:
     normal, offset = best_plane(plate())
     assert offset > 0
     assert normal[2] > 0
+
+
+@pytest.mark.parametrize(
+    "turn", [[0.0, 0.0, 0.0], [0.5, 0.3, 0.0], [-0.5, 0.3, 2.0], [3.0, 0.2, -1.0]]
+)
+@pytest.mark.parametrize(
+    "place", [[40.0, 30.0, 500.0], [-40.0, 30.0, 500.0], [30.0, -40.0, -500.0]]
+)
+def test_wherever_a_plane_lies_its_normal_points_away_from_the_origin(
+    turn: list[float], place: list[float]
+) -> None:
+    placed = RigidTransform.from_rotation_vector(turn, place)
+    x, y = np.meshgrid(np.linspace(-80, 80, 9), np.linspace(-60, 60, 7))
+    points = placed.apply(np.stack([x, y, 0.0 * x], axis=-1).reshape(-1, 3))
+    normal, offset = best_plane(points)
+    # The plane's own normal, either way: exact but for rounding.
+    assert offset == pytest.approx(abs(placed.rotation[:, 2] @ placed.translation), abs=1e-9)
+    np.testing.assert_allclose(points @ normal, offset, atol=1e-9)
+
+
+def test_what_is_smooth_are_terms_of_up_to_the_degree_of_both_together() -> None:
+    points = plate()[::11]
+    x, y = (PLACE.inverse().apply(points)[:, :2] / [80.0, 60.0]).T
+    smooth = 0.3 * x**6 - 0.2 * x**2 * y**4 + 0.1 * y
+    # Solved to rounding, of values up to 0.6.
+    np.testing.assert_allclose(smooth_part(points, smooth), smooth, atol=1e-9)
+    assert np.ptp(smooth_part(points, x**4 * y**3) - x**4 * y**3) > 0.05
+    np.testing.assert_allclose(smooth_part(points, x * y, 2), x * y, atol=1e-9)
+    assert np.ptp(smooth_part(points, x * y, 1)) < 0.05  # of 2

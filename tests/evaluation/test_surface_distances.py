@@ -9,11 +9,14 @@ import open3d as o3d
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_bodies import cylinder, mesh_of
 from surface_coverage import coverage
 
 from bodyscan.errors import BadInput
+from bodyscan.evaluation import comparison
 from bodyscan.evaluation.comparison import _surface
 from bodyscan.evaluation.surface import deviation, sample_surface, signed_distances
+from bodyscan.geometry.transforms import RigidTransform
 
 BOX = o3d.geometry.TriangleMesh.create_box(100.0, 200.0, 300.0)
 VERTICES = np.asarray(BOX.vertices) + np.array([1000.0, -500.0, 2000.0])
@@ -97,3 +100,24 @@ def test_surfaces_are_read_from_files_that_have_faces(tmp_path: Path) -> None:
     for name in ("points.ply", "missing.ply"):
         with pytest.raises(BadInput, match="no surface can be read here"):
             _surface(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("size_mm", "said"), [(81.0, ""), (79.2, "0.198 times"), (1990.0, ""), (2008.0, "5.02 times")]
+)
+def test_what_is_a_fifth_or_five_times_as_large_is_not_the_same_subject(
+    size_mm: float, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Wherever it stands: a body of 400 mm beside a box as high as that, five metres off."""
+    body = mesh_of(*cylinder(50.0, 0.0, 400.0))
+    box = (VERTICES - LOW) / 300.0 * size_mm + [5000.0, 0.0, 0.0]
+    monkeypatch.setattr(comparison, "_surface", lambda other: (box, FACES))
+    monkeypatch.setattr(comparison, "fit_to_surface", lambda *of: RigidTransform.identity())
+    if said:
+        with pytest.raises(BadInput, match=f"{said} as large as the scan"):
+            comparison.compare_surfaces(body, tmp_path / "other.ply")
+        return
+    standing, laid = comparison.compare_surfaces(body, tmp_path / "other.ply")
+    assert (standing.fitted, laid.fitted) == (False, True)
+    assert (standing.is_scan, standing.name) == (False, f"{tmp_path.name}/other.ply")
+    assert standing.signed_mm.min() > 4900.0

@@ -6,9 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import open3d as o3d
+import pytest
 from ray_cast_scan import looking, nominal_camera
 
-from bodyscan.fusion.free_space import Guess, _within, sees_through
+from bodyscan.fusion.free_space import Guess, _within, gaps, sees_through
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.pair import NominalPose
 
@@ -52,3 +56,109 @@ def test_what_lies_to_the_left_is_looked_for_in_its_own_row_and_no_farther() -> 
     assert np.flatnonzero(found[0]).tolist() == [2, 3, 4, 5]
     assert np.flatnonzero(found[1]).tolist() == [0, 1, 2, 3, 6, 7, 8, 9]
     assert not found[2].any()
+
+
+FLAT = Camera(100.0, 100.0, 0.0, 30.0, 10.0, Radial(), 60, 20)
+HERE = RigidTransform.identity()
+
+
+def plates(*parts: tuple[float, float, float, bool]) -> Guess:
+    """Upright rectangles across all rows, from one column to another, at a depth; filled or not."""
+    vertices, faces, filled = [], [], []
+    for k, (left, right, depth, fill) in enumerate(parts):
+        corners = [(left, -1.0), (right, -1.0), (right, 21.0), (left, 21.0)]
+        rays = [((u - 30.0) / 100.0, (v - 10.0) / 100.0, 1.0) for u, v in corners]
+        vertices += [depth * np.array(ray) for ray in rays]
+        faces += [[4 * k, 4 * k + 1, 4 * k + 2], [4 * k, 4 * k + 2, 4 * k + 3]]
+        filled += [fill, fill]
+    return Guess.of(np.array(vertices), np.array(faces), np.array(filled))
+
+
+def shown(columns: np.ndarray) -> RangeImage:
+    """A wall at 1000 mm, measured in some columns (60,)."""
+    depth = np.where(columns, 1000.0, np.nan)[None].repeat(20, axis=0)
+    points = (FLAT.pixel_rays() * depth[..., None]).astype(np.float32)
+    sigma = np.where(np.isfinite(depth), np.float32(0.1), np.float32(np.nan))
+    return RangeImage("p", FLAT, points, points, sigma, np.zeros(depth.shape, np.uint8))
+
+
+COLUMN, COLUMN_OF_160 = np.arange(60), np.arange(160)
+BETWEEN = (0.5, 20.5, 1000.0, False), (20.5, 39.5, 1000.0, True), (39.5, 59.5, 1000.0, False)
+
+
+def open_columns(guess: Guess, columns: np.ndarray, stride: int = 1) -> list[int]:
+    blocks = np.s_[0 : 20 // stride], np.s_[0 : 60 // stride]
+    found = gaps(guess, shown(columns), HERE, stride, blocks)
+    assert (found == found[0]).all(), "all rows are alike"
+    return np.flatnonzero(found[0]).tolist()
+
+
+def test_a_gap_is_what_is_made_up_between_what_was_measured_but_for_its_rims() -> None:
+    measured = (COLUMN < 21) | (COLUMN > 39)
+    assert open_columns(plates(*BETWEEN), measured) == list(range(22, 39))
+    # Blocks of three by their middles 1, 4, ..., and no closer to what was measured than one block.
+    assert open_columns(plates(*BETWEEN), measured, stride=3) == list(range(8, 12))
+    # Of a window the same blocks.
+    some = gaps(plates(*BETWEEN), shown(measured), HERE, 1, np.s_[5:9, 12:45])
+    assert some.shape == (4, 33)
+    assert np.flatnonzero(some[0]).tolist() == list(range(10, 27))
+
+
+def test_what_was_measured_on_one_side_only_leaves_no_gap() -> None:
+    measured = (COLUMN < 21) | (COLUMN > 39)
+    assert open_columns(plates(*BETWEEN[:2]), measured) == []
+    assert open_columns(plates(*BETWEEN[1:]), measured) == []
+
+
+def test_a_single_pixel_that_was_measured_closes_a_gap_around_it() -> None:
+    image = shown((COLUMN < 21) | (COLUMN > 39))
+    image.points[10, 30, 2], image.sigma_mm[10, 30] = 1000.0, 0.1
+    found = gaps(plates(*BETWEEN), image, HERE, 1, np.s_[0:20, 0:60])
+    closed = np.argwhere(~found[:, 22:39]) + [0, 22]
+    assert closed.tolist() == [[row, column] for row in (9, 10, 11) for column in (29, 30, 31)]
+
+
+@pytest.mark.parametrize("depth", [900.0, 1100.0])
+def test_what_lies_before_or_behind_measured_surface_is_a_shadow_and_no_gap(depth: float) -> None:
+    measured = (COLUMN < 21) | (COLUMN > 39)
+    behind = (24.5, 29.5, depth, False)
+    found = open_columns(plates(*BETWEEN, behind), measured)
+    assert found == [22, 23, 24, *range(30, 39)]
+
+
+def test_no_gap_is_wider_than_two_hands() -> None:
+    """200 mm are 66 rays 3 mm apart: from further off nothing is told."""
+    wide = Camera(100.0, 100.0, 0.0, 30.0, 10.0, Radial(), 160, 20)
+    for gap, some in ((100, True), (140, False)):
+        left, right = 79.5 - gap / 2, 79.5 + gap / 2
+        guess = plates(
+            (0.5, left, 1000.0, False), (left, right, 1000.0, True), (right, 159.5, 1000.0, False)
+        )
+        grey = np.zeros((20, 160), np.uint8)
+        nothing = np.full((20, 160, 3), np.nan, np.float32)
+        image = RangeImage("p", wide, nothing, nothing, nothing[..., 0], grey)
+        found = gaps(guess, image, HERE, 1, np.s_[0:20, 0:160])[0]
+        reached = COLUMN_OF_160[found]
+        assert bool(len(reached)) is some
+        if some:  # within 66 of both rims
+            assert (reached.min(), reached.max()) == (right - 0.5 + 1 - 66, left - 0.5 + 66)
+
+
+def test_what_is_beside_or_behind_the_camera_was_not_seen_through() -> None:
+    measured = np.ones(60, bool)
+    guess = plates((0.5, 59.5, 500.0, True))
+    points = np.array(
+        [
+            [0, 0, 500],
+            [0, 0, 985],
+            [0, 0, 995],
+            [0, 0, 0.5],
+            [0, 0, -500],
+            [400, 0, 500],
+            [0, 90, 500],
+        ],
+        np.float32,
+    )
+    with np.errstate(all="raise"):  # nothing is divided by a depth of 0
+        through = sees_through(points, guess, shown(measured), HERE, 10.0)
+    assert through.tolist() == [True, True, False, False, False, False, False]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -103,3 +105,42 @@ def test_two_limbs_close_to_each_other_stay_two() -> None:
     shape = topology(found.vertices, found.faces)
     assert (shape.components, shape.euler) == (1, 2)
     assert np.ptp(found.vertices[:, 1]) == pytest.approx(160.0, abs=1.0)
+
+
+def test_a_grid_of_which_no_half_can_be_halved_is_filled_as_well() -> None:
+    """34 nodes, then 17: as coarse as it gets."""
+    i, j, k = np.indices((34, 34, 34)).astype(np.float32)
+    truth = 0.2 * (i - 15.0) - 0.1 * (j - 20.0) + 0.05 * (k - 30.0)
+    fixed = np.ones(truth.shape, bool)
+    fixed[4:28, 6:28, 8:28] = False
+    nowhere = np.full(truth.shape, -np.inf, np.float32)
+    found = fill_harmonically(np.where(fixed, truth, 99.0), fixed, nowhere, sure=100.0)
+    # As above: a hundredth of the values' range.
+    assert np.abs(found - truth).max() < 0.01 * np.ptp(truth)
+
+
+@pytest.mark.parametrize(("sigmas", "times"), [((0.1, 0.2), 4.0), ((0.01, 1.0), 9.0)])
+def test_a_point_says_the_more_the_better_it_is_known_but_nine_times_the_usual_at_most(
+    sigmas: tuple[float, float], times: float
+) -> None:
+    """A node between two planes, as far before one as it is behind the other; the middle one of three
+    points, far off, is what is usual."""
+    bricks = Bricks.where(np.ones((2, 2, 2), bool), np.zeros(3), 4.0)
+    points = np.array([[20.0, 20.0, 18.0], [20.0, 20.0, 22.0], [40.0, 40.0, 40.0]])
+    usual = sigmas[1] if times == 4.0 else np.sqrt(sigmas[0] * sigmas[1])
+    cloud = replace(
+        cloud_of(points, np.tile([0.0, 0.0, 1.0], (3, 1))),
+        sigma_mm=np.array([*sigmas, usual], np.float32),
+    )
+    values, weights = (dense_of(part, (2, 2, 2)) for part in splat(cloud, bricks))
+    more = times if times == 4.0 else times**2
+    # 2 mm over the first, 2 mm under the other; single precision.
+    assert values[5, 5, 5] == pytest.approx(2.0 * (more - 1.0) / (more + 1.0), rel=1e-5)
+    # Half a cell from a node a point has lost (0.5 / 1.3)^2 of its weight, to the fourth power.
+    near = (1.0 - (0.5 / 1.3) ** 2) ** 4
+    assert weights[5, 5, 5] == pytest.approx(
+        near * (times + (1.0 if times == 4.0 else 1.0 / 9.0)), rel=1e-5
+    )
+    assert weights[10, 10, 10] == pytest.approx(1.0), (
+        "right at the node, and as well known as usual"
+    )

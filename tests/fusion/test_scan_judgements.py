@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 from made_scan import MadeScan, make_scan
+from sheet_models import PINHOLE
 from verdict_given import verdict_given
 
 from bodyscan.alignment.icp import Alignment, Overlap
 from bodyscan.alignment.place_evidence import SizeStep
 from bodyscan.alignment.pole_steps import PoleStep, StepSearch
+from bodyscan.fusion import scan as scan_file
 from bodyscan.fusion.contradictions import Contradictions
-from bodyscan.fusion.scan import _silent
+from bodyscan.fusion.scan import _light_lines, _silent
 from bodyscan.fusion.seams import Seam, SeamReport
 from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.registration.nominal_size import NominalSize
@@ -351,3 +353,51 @@ def test_what_pairs_say_of_each_other_is_counted_by_whose_point_it_is() -> None:
     assert found.beyond_noise == pytest.approx(4.0 / 9.0 - 0.0027, abs=1e-4)
     nothing = Contradictions.of(["a", "b"], [said([], [])] * 2, samples, [surface, surface], 1.5)
     assert (nothing.share, nothing.by_noise) == (0.0, 0.0)
+
+
+def test_where_light_comes_from_is_known_of_all_pairs_or_of_none() -> None:
+    def lines(light: dict[str, Any], agreement: Any = None) -> Any:
+        pairs = {name: SimpleNamespace(name=name, sheets=one) for name, one in light.items()}
+        seen: Any = [SimpleNamespace(pair=name, agreement=agreement) for name in ("a", "b")]
+        calibration: Any = SimpleNamespace(pairs=pairs)
+        return _light_lines(seen, calibration)
+
+    found = lines({"a": PINHOLE, "b": PINHOLE.turned(140.0), "c": None})
+    assert sorted(found) == ["a", "b"]
+    # The projector stands where its frame begins.
+    there = PINHOLE.projector_from_camera.inverse().translation
+    apart = there - found["a"].origin
+    np.testing.assert_allclose(np.cross(apart, found["a"].along), 0.0, atol=1e-6)
+    assert lines({"a": PINHOLE, "b": None}) is None
+    assert lines({"a": PINHOLE}) is None, "a pair without a calibration"
+    assert lines({"a": PINHOLE, "b": PINHOLE}, agreement="of two directions") is None
+
+
+@pytest.mark.parametrize(
+    ("pairs", "matching", "aligned"),
+    [(2, "projected", True), (1, "projected", False), (2, "none", False)],
+)
+def test_two_pairs_are_aligned_where_they_may_be_and_one_has_nothing_to_be_aligned_with(
+    pairs: int, matching: str, aligned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Enough(Exception):
+        pass
+
+    def merge(*of: Any) -> None:
+        raise Enough("merged")
+
+    def align(*of: Any) -> None:
+        raise Enough("aligned")
+
+    seen = [SimpleNamespace(pair=f"p{k}") for k in range(pairs)]
+    monkeypatch.setattr(scan_file, "clean", lambda *of, **more: seen)
+    monkeypatch.setattr(scan_file, "require_subject", lambda images: images)
+    monkeypatch.setattr(scan_file, "merge", merge)
+    monkeypatch.setattr(scan_file, "align", align)
+    calibration: Any = SimpleNamespace(
+        rig_from_camera={}, rig=SimpleNamespace(volume=None), covariance=None
+    )
+    settings: Any = SimpleNamespace(alignment=SimpleNamespace(matching=matching), fusion=None)
+    images: Any = SimpleNamespace(value=seen)
+    with pytest.raises(Enough, match="aligned" if aligned else "merged"):
+        scan_file.fuse(calibration, images, settings)

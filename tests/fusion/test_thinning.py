@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from flat_walls import ASIDE, WALL_MM, wall
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bodyscan.errors import ScanFailed
 from bodyscan.fusion.thinning import one_per_voxel, take_samples, voxel_size_for
 from bodyscan.geometry.transforms import RigidTransform
 
@@ -81,3 +85,50 @@ def test_no_sample_is_of_a_rim_where_another_surface_goes_on() -> None:
         own = np.flatnonzero(beside)
         assert np.all((own >= samples.starts[inner]) & (own < samples.starts[inner + 1]))
         assert len(own) > 20
+
+
+def numbered(*counts: int) -> tuple[list[Any], np.ndarray]:
+    """Surfaces of so many points each, anywhere in a box of their own; their sigma is their number
+    among those of all; and all points."""
+    rng, surfaces, number = np.random.default_rng(0), [], 0
+    for k, count in enumerate(counts):
+        points = rng.uniform([300.0 * k, 0, 0], [300.0 * k + 200.0, 200, 200], (count, 3))
+        own = np.arange(number, number + count)
+        surfaces.append(
+            SimpleNamespace(
+                points=points.astype(np.float32),
+                normals=points[:, ::-1].astype(np.float32),
+                sigma_mm=own.astype(np.float32),
+                weight=-own.astype(np.float32),
+                colours=(own % 256).astype(np.uint8),
+                rim=np.ones(count, np.float32),
+            )
+        )
+        number += count
+    return surfaces, np.concatenate([each.points for each in surfaces])
+
+
+@pytest.mark.parametrize("wanted", [5000, 800])
+def test_a_sample_has_all_that_belongs_to_its_point_surface_by_surface(wanted: int) -> None:
+    """All points where they are no more than wanted, else a part of each surface."""
+    surfaces, points = numbered(700, 500, 900)
+    found = take_samples(surfaces, wanted)
+    number = found.sigma_mm.astype(int)
+    assert len(np.unique(number)) == len(number)
+    assert (len(number) == 2100) is (wanted == 5000)
+    np.testing.assert_array_equal(found.points, points[number])
+    np.testing.assert_array_equal(found.normals, points[number, ::-1])
+    np.testing.assert_array_equal(found.weight, -found.sigma_mm)
+    np.testing.assert_array_equal(found.colours, number % 256)
+    assert (found.starts[0], found.starts[-1], len(found.starts)) == (0, len(number), 4)
+    for k, (first, end) in enumerate(((0, 700), (700, 1200), (1200, 2100))):
+        own = number[found.starts[k] : found.starts[k + 1]]
+        assert len(own) > 0.3 * (end - first) * min(wanted / 2100.0, 1.0)
+        assert (own >= first).all()
+        assert (own < end).all()
+
+
+def test_a_thousand_points_are_a_subject() -> None:
+    assert len(take_samples(numbered(600, 400)[0], 5000).points) == 1000
+    with pytest.raises(ScanFailed, match=r"next to nothing of a subject \(999 points\)"):
+        take_samples(numbered(600, 399)[0], 5000)

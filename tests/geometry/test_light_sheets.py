@@ -233,3 +233,16 @@ def test_a_lens_measures_rays_as_newtons_method_on_its_offset_does(terms: int) -
     np.testing.assert_allclose(found[0], depth, rtol=1e-11)
     np.testing.assert_allclose(found[1], model.depth_per_stripe(rays, s, depth), rtol=1e-8)
     np.testing.assert_allclose(found[2], model.variance_mm2(rays, s, depth), rtol=1e-8)
+
+
+@pytest.mark.parametrize("terms", [0, 4])
+def test_the_first_and_the_last_boundary_are_measured_as_well(terms: int) -> None:
+    model = PINHOLE.with_lens(terms)
+    s = np.array([0.0, float(STRIPES)])
+    first, last = (MIDDLE + [0.0, y, 0.0] for y in (-284.0, 598.0))
+    rays = np.stack([first, last]) / [[first[2]], [last[2]]]
+    for depth in (model.depth(rays, s), model.measure(rays, s)[0]):
+        assert np.isfinite(depth).all()
+        np.testing.assert_allclose(model.stripe(rays * depth[:, None]), s, atol=1e-6)
+    beyond = np.array([-1e-9, STRIPES + 1e-9])
+    assert np.isnan(model.measure(rays, beyond)[0]).all()

@@ -9,7 +9,7 @@ import pytest
 from made_bodies import cylinder, mesh_of
 from ray_cast_scan import ROOT, load_body
 
-from bodyscan.measurement.head import estimate_head_top
+from bodyscan.measurement.head import BRAINCASE_MM, _Ellipsoid, _fit, estimate_head_top
 from bodyscan.measurement.measurements import measure
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.regions import DARK_CLOTH, HAIR, SKIN, UNSURE
@@ -104,3 +104,41 @@ def test_what_was_filled_is_of_no_region() -> None:
     assert found.regions is not None
     assert found.regions["unsure"] == 1.0
     assert UNSURE == 0
+
+
+def test_the_sigma_of_the_top_is_that_of_centre_and_height_together() -> None:
+    """By differences of the top, and cut by what skin and hair leave open, against truncated sums."""
+    turn, down = np.meshgrid(np.linspace(-1.2, 1.2, 7), np.linspace(0.3, 0.75, 3))
+    ways = [np.cos(down) * np.cos(turn), np.cos(down) * np.sin(turn), np.sin(down)]
+    skin = np.stack(ways, axis=-1).reshape(-1, 3) * [99.0, 77.0, 95.0] + [0.0, 0.0, 1600.0]
+    hair = 1705.0
+    case = skin[skin[:, 2] > hair - BRAINCASE_MM]
+    fitted = _fit(case, hair)
+    steps = 1e-4 * np.eye(7)
+    top = [
+        (_Ellipsoid(fitted.state.centre + s[:3], fitted.state.size + s[3:]).top_mm
+         - _Ellipsoid(fitted.state.centre - s[:3], fitted.state.size - s[3:]).top_mm) / 2e-4
+        for s in steps
+    ]  # fmt: skip
+    sigma = float(np.sqrt(top @ fitted.covariance @ top))
+    heights = np.linspace(skin[:, 2].max(), hair, 20_001)
+    weights = np.exp(-0.5 * ((heights - fitted.state.top_mm) / sigma) ** 2)
+    mean = np.average(heights, weights=weights)
+    found = estimate_head_top(skin, hair)
+    assert found is not None
+    # Sums of 20,000 steps; cells of 15 mm hold one place each.
+    assert found.height_mm == pytest.approx(mean, abs=1e-2)
+    spread = np.sqrt(np.average((heights - mean) ** 2, weights=weights))
+    assert found.sigma_mm == pytest.approx(spread, rel=1e-3)
+
+
+def test_a_dozen_places_of_a_forehead_are_enough() -> None:
+    """Fewer say no more than that the head ends between skin and hair."""
+    across = 15.0 * np.arange(4) + 7.5
+    for places, told in ((12, True), (11, False)):
+        y, z = np.meshgrid(across, across[:3])
+        skin = np.stack([np.full(12, 95.0), y.ravel() - 30.0, z.ravel() + 1650.0], axis=-1)[:places]
+        found = estimate_head_top(skin, 1725.0)
+        assert found is not None
+        between = 0.5 * (skin[:, 2].max() + 1725.0)
+        assert bool(abs(found.height_mm - between) > 0.01) is told

@@ -12,8 +12,9 @@ from made_bodies import boxes, cylinder, ellipsoid, mesh_of, together
 
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.measurement.measurements import Slice, measure
+from bodyscan.measurement.measurements import Slice, heights_from, measure
 from bodyscan.mesh.body import BodyMesh, BreathAt
+from bodyscan.mesh.regions import DARK_CLOTH, HAIR, SKIN
 from bodyscan.report.measurements import measurements_document, tables
 
 SUBJECT = Path(__file__).parents[2] / "data" / "subjects" / "woman_average.ply"
@@ -158,8 +159,9 @@ def test_of_a_body_seen_from_the_knees_up_the_slices_there_are_are_given(subject
     heights = [one.height_mm for one in measure(upper).slices]
     assert heights[0] == 500.0
     assert heights[-1] == 1600.0
-    with pytest.raises(BadInput, match="no body at a height of 100 mm"):
+    with pytest.raises(BadInput, match="no body at a height of 100 mm") as error:
         measure(upper, [100.0])
+    assert "Give heights between 430 and 1632 mm" in str(error.value)
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -181,3 +183,24 @@ def test_a_girth_that_goes_round_a_hand_on_the_hip_is_not_the_trunks(side: int) 
     assert tape_mm(below, "trunk") == pytest.approx(1000.0)
     assert tape_mm(beside, "trunk") == pytest.approx(1000.0)
     assert tape_mm(beside, arm_of) == pytest.approx(320.0)
+
+
+def test_heights_are_numbers_with_commas_between() -> None:
+    assert heights_from("800,1050.5") == [800.0, 1050.5]
+    with pytest.raises(BadInput, match="'800;1050' is not a list of heights"):
+        heights_from("800;1050")
+
+
+@pytest.mark.parametrize(
+    ("skin", "crown"), [(1.0, "skin"), (0.6, "skin"), (0.45, "hair"), (0.0, "hair")]
+)
+def test_a_crown_is_what_more_than_half_of_it_is(skin: float, crown: str) -> None:
+    body = mesh_of(*cylinder(100.0, 0.0, 1000.0))
+    across = body.vertices[:, 1]
+    regions = np.where(across < np.quantile(across, skin), SKIN, HAIR).astype(np.uint8)
+    found = measure(replace(body, regions=regions), [500.0])
+    assert found.crown == crown
+    thirds = np.digitize(np.arctan2(body.vertices[:, 1], body.vertices[:, 0]), [-1.05, 1.05])
+    three = np.array([SKIN, HAIR, DARK_CLOTH])[thirds].astype(np.uint8)
+    assert measure(replace(body, regions=three), [500.0]).crown == "unsure"
+    assert measure(body, [500.0]).crown is None, "of what it is nothing is known"

@@ -20,6 +20,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.scan_volume import (
     LAYER_MM,
     MARGIN_MM,
+    _corner_rays,
     stripes_in_volume,
     volume_interval,
 )
@@ -189,3 +190,25 @@ def test_what_lies_flat_is_wanted_where_nothing_stands() -> None:
     np.testing.assert_array_equal(beside & near, flat & near)
     assert beside.sum() < 0.7 * flat.sum()
     assert deep[flat & ~beside].all()
+
+
+def test_a_level_ray_goes_through_the_wall_or_comes_nearest_to_the_axis_beside_it() -> None:
+    """From 500 mm beside the axis; with its room the volume's wall is 150 mm around that."""
+    at = looking_at_the_middle(500.0, 0.7, 0.0)
+    rays = np.array([[0.0, 0.0, 1.0], [0.2, 0.0, 1.0], [0.4, 0.0, 1.0], [-0.4, 0.0, 1.0]])
+    enter, leave = volume_interval(rays, at, VOLUME, raised_mm=0.0)
+    # Nearest where 500 mm are left of 1 + x^2; to either side by what is left of the radius.
+    nearest = 500.0 / (1.0 + rays[:, 0] ** 2)
+    beside = 500.0 * np.abs(rays[:, 0]) / np.hypot(1.0, rays[:, 0])
+    half = np.sqrt(np.maximum(150.0**2 - beside**2, 0.0)) / np.hypot(1.0, rays[:, 0])
+    assert (half > 0.0).tolist() == [True, True, False, False]
+    np.testing.assert_allclose(enter, nearest - half, rtol=1e-9)
+    np.testing.assert_allclose(leave, nearest + half, rtol=1e-9)
+
+
+def test_blocks_begin_at_the_first_pixels_outer_edge_and_cover_the_picture() -> None:
+    plain = Camera(100.0, 100.0, 0.0, 0.0, 0.0, Radial(), 25, 16)
+    rays = _corner_rays(plain, 10)
+    assert rays.shape == (3, 4, 3)
+    np.testing.assert_allclose(100.0 * rays[0, :, 0], [-0.5, 9.5, 19.5, 29.5])
+    np.testing.assert_allclose(100.0 * rays[:, 0, 1], [-0.5, 9.5, 19.5])

@@ -15,10 +15,11 @@ from ray_cast_scan import load_rig
 from bodyscan.arrays import Array
 from bodyscan.reconstruction import sequence_moments as sequence_moments_file
 from bodyscan.reconstruction.sequence_moments import sequence_moments
-from bodyscan.reconstruction.told_motion import CHANCE, _velocity, tell_motion
+from bodyscan.reconstruction.told_motion import CHANCE, _band_share, _velocity, tell_motion
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.codes.gray import Gray
+from bodyscan.stripes.codes.light_section import LightSection
 from bodyscan.stripes.comb import Comb, find_comb
 from bodyscan.stripes.one_moment import Moments, StripeMotion, carry_to_moment
 
@@ -243,3 +244,57 @@ def test_noise_says_of_one_rig_in_a_hundred_that_somebody_moved(
     nothing: Any = None
     sequence_moments(nothing, code, nothing, {"a": 0.0, "b": 100.0}, pairs=16)
     assert 1.0 - (1.0 - asked[0]) ** (16 * crossing) == pytest.approx(CHANCE)
+
+
+@pytest.mark.parametrize("inverses", [True, False])
+def test_without_times_images_came_in_the_codes_order_or_in_that_in_which_it_is_best_shown(
+    inverses: bool,
+) -> None:
+    """A second apart, for want of a better unit."""
+    code = Gray(stripes=16, direction="vertical", inverses=inverses)
+    pair: Any = SimpleNamespace(camera=CAMERA, sheets=sheets(), crossing=None)
+    (usual,) = sequence_moments(pair, code, FrameNames(), None)
+    assert usual.times["pattern"].tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert usual.instead is not None
+    # The finest, bit 3, in the middle: 1, 3, 2, 0, each with its inverse behind it.
+    apart = 2.0 if inverses else 1.0
+    assert usual.instead.times["pattern"].tolist() == [3 * apart, 0.0, 2 * apart, apart]
+
+
+def test_where_both_orders_are_the_same_there_is_no_other_to_try() -> None:
+    code = LightSection(stripes=4, direction="vertical")
+    pair: Any = SimpleNamespace(camera=CAMERA, sheets=sheets(), crossing=None)
+    (moments,) = sequence_moments(pair, code, FrameNames(), None)
+    assert moments.times["stripe"].tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert moments.instead is None
+
+
+@pytest.mark.parametrize("bands", [6, 11])
+def test_windows_of_stripes_that_stray_count_by_what_their_means_are_apart_beyond_noise(
+    bands: int,
+) -> None:
+    """Means of 1 and -1 in turn have a variance of 2 from one to the next, of which a quarter is noise:
+    of a weight of 4 an eighth is left."""
+    band = np.repeat(np.arange(bands), 2)
+    weights = np.tile([1.0, 3.0], bands)
+    left = np.where(band % 2, 1.0, -1.0)
+    share, independent = _band_share(band, left, weights)
+    np.testing.assert_allclose(share, 1.0 / (1.0 + (2.0 - 0.25) * 4.0))
+    # Each mean takes part in two differences: two thirds as many as there are.
+    assert independent == pytest.approx(2.0 / 3.0 * (bands - 1))
+    still, _ = _band_share(band, np.zeros(2 * bands), weights)
+    np.testing.assert_allclose(still, 1.0)
+    # Of the more clearly known ones more is believed.
+    clear = np.where(band < 3, 100.0, 1.0) * weights
+    assert _band_share(band, left, clear)[1] < independent
+
+
+def test_five_bands_beside_another_are_enough_to_tell_that_they_stray() -> None:
+    for bands, told in ((6, True), (5, False)):
+        band = np.arange(bands)
+        share, independent = _band_share(band, np.where(band % 2, 1.0, -1.0), np.full(bands, 4.0))
+        assert bool(share[0] < 0.5) is told
+        assert bool(np.isinf(independent)) is not told
+    # Bands of which the next is missing are beside none.
+    apart = np.arange(0, 20, 2)
+    assert np.isinf(_band_share(apart, np.ones(10), np.full(10, 4.0))[1])

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.advice import Advice, Link, MoreShots, _preference, best_chain
+from bodyscan.registration import advice as advice_file
+from bodyscan.registration.advice import (
+    Advice,
+    Link,
+    MoreShots,
+    _preference,
+    advise,
+    best_chain,
+)
 from bodyscan.registration.more_shots import MOST_SHOTS, BoardPlace, SigmaReduction
 
 
@@ -114,3 +124,42 @@ def test_fewest_shots_are_preferred_and_then_what_gains_most() -> None:
     last = SigmaReduction(1.0, np.array([0.9] * (MOST_SHOTS - 1) + [0.2]))
     order = sorted([hardly, three, last, never, two, sharper], key=_preference)
     assert order == [sharper, two, three, last, never, hardly]
+
+
+def row_of_pairs(last_mm2: float) -> Any:
+    """a, b, c and d, each of which shares shots with the next, two of c and d; shifts are known to a
+    variance of 0.5 along each axis, and d's to another."""
+    names = ("a", "b", "c", "d")
+    shared = (("a", "b", "s1"), ("b", "c", "s2"), ("c", "d", "s3"), ("c", "d", "s4"))
+    views = [
+        SimpleNamespace(pair=pair, shot=shot, target=(shot, "board"))
+        for one, other, shot in shared
+        for pair in (one, other)
+    ]
+    variances = np.zeros((4, 6))
+    variances[:, 3:] = [[0.5], [0.5], [0.5], [last_mm2]]
+    return SimpleNamespace(
+        views=views,
+        rig_from_camera=dict.fromkeys(names, RigidTransform.identity()),
+        covariance=PoseCovariance(names, np.diag(variances.ravel())),
+    )
+
+
+@pytest.mark.parametrize(("last_mm2", "weak"), [(3.4, False), (3.6, True)])
+def test_a_link_is_weak_that_is_known_half_as_well_as_usual(
+    last_mm2: float, weak: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others have a variance of 1 along each axis; this one of 4 is twice as far off."""
+    monkeypatch.setattr(advice_file, "more_shots", lambda *of: None)
+    nothing: Any = None
+    found = advise(nothing, row_of_pairs(last_mm2))
+    assert [(link.first, link.second, link.shots) for link in found.links] == [
+        ("c", "d", 2), ("a", "b", 1), ("b", "c", 1),
+    ]  # fmt: skip
+    assert found.links[0].sigma_mm == pytest.approx(np.sqrt(3.0 * (0.5 + last_mm2)))
+    assert found.links[1].sigma_mm == pytest.approx(np.sqrt(3.0))
+    assert [link.second for link in found.weak] == (["d"] if weak else [])
+    assert found.bridges == found.links, "no link doubles another"
+    assert found.crucial == (("s1", "board"), ("s2", "board"))
+    assert found.worst == "d"
+    assert found.worst_sigma_mm == pytest.approx(np.sqrt(3.0 * last_mm2))

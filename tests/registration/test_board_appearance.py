@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from bodyscan.boards.appearance import Appearance
 from bodyscan.boards.board_layout import corner_grid
 from bodyscan.boards.view import BoardView
-from bodyscan.registration.board_appearance import appearance_notes
+from bodyscan.registration.board_appearance import appearance_notes, without_odd_mirrored
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
 
@@ -68,3 +69,46 @@ def test_every_other_look_is_told_with_how_many_views_had_it() -> None:
         assert words in note
         assert "Other cameras" not in note  # the same camera saw it both ways
     assert not said(view(COLUMNS, ROWS))
+
+
+def test_of_the_line_beside_the_missing_ones_it_counts_how_often_it_was_seen() -> None:
+    """However often those before it were."""
+    for last, before in ((view(COLUMNS - 1, ROWS), view(COLUMNS - 2, ROWS)),
+                         (view(COLUMNS, ROWS - 1), view(COLUMNS, ROWS - 2))):  # fmt: skip
+        assert not said(*[last] * 2, *[before] * 5)
+        (note,) = said(*[last] * 3, *[before] * 5)
+        assert "the last line of corners" in note
+        assert "was in 3 views" in note
+
+
+def test_either_face_of_a_board_may_lack_lines_and_a_plain_board_is_seen_whole_or_not_at_all() -> (
+    None
+):
+    both = MARKED.model_copy(update={"faces": 2})
+    ids = (np.arange(ROWS - 1)[:, None] * COLUMNS + np.arange(COLUMNS)).ravel()
+    for face in (0, 1):
+        of_face = BoardView("p", "s", "m", ids + face * COLUMNS * ROWS, np.zeros((len(ids), 2)))
+        whole = np.arange(COLUMNS * ROWS) + (1 - face) * COLUMNS * ROWS
+        of_other = BoardView("p", "s", "m", whole, np.zeros((len(whole), 2)))
+        rig = RIG.model_copy(update={"boards": (both,)})
+        (note,) = appearance_notes(rig, [of_face] * 3 + [of_other] * 3)
+        assert "fewer than 8 rows" in note
+    plain = MARKED.model_copy(update={"kind": "checkerboard", "marker_mm": None})
+    assert not appearance_notes(
+        RIG.model_copy(update={"boards": (plain,)}), [view(COLUMNS, ROWS - 1)] * 5
+    )
+
+
+def test_where_a_camera_saw_a_board_both_ways_round_the_rarer_is_left_out() -> None:
+    usual, flipped = view(COLUMNS, ROWS), view(COLUMNS, ROWS, Appearance(mirrored=True))
+    for views, odd in (([usual] * 3 + [flipped], True), ([usual] + [flipped] * 3, False),
+                       ([usual] * 2 + [flipped] * 2, True)):  # fmt: skip
+        views = [replace(each) for each in views]  # each an image of its own
+        kept, notes = without_odd_mirrored(views)
+        assert all(one.appearance.mirrored is not odd for one in kept)
+        assert len(kept) + len(notes) == len(views)
+        assert ("is mirrored in shot s" in notes[0]) is odd
+        assert ("is not mirrored in shot s" in notes[0]) is not odd
+    # Another camera may stand behind the glass.
+    elsewhere = replace(flipped, pair="q")
+    assert without_odd_mirrored([usual] * 3 + [elsewhere]) == ([usual] * 3 + [elsewhere], [])

@@ -9,7 +9,7 @@ from bodyscan.arrays import Array
 from bodyscan.errors import RigDisconnected
 from bodyscan.geometry.pose_covariance import position_sigma
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.rig_solve import RigSolution, solve_rig
+from bodyscan.registration.rig_solve import RigSolution, _robust_rms, solve_rig
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import NominalPose
 from bodyscan.rig.rig_frame import RigFrame
@@ -261,3 +261,13 @@ def test_skew_and_aspect_that_were_not_known_neither_harm_nor_stay_unsaid() -> N
     assert np.sqrt(np.mean(np.square(errors))) < 0.3
     # 4 x 6 independent draws at worst: 1 +- 0.15.
     assert 0.6 < np.sqrt(np.mean(np.square(normalized))) < 1.45
+
+
+def test_how_far_corners_are_off_is_a_length_that_outliers_hardly_change() -> None:
+    """0.3 px along either axis are 0.3 sqrt(2) px."""
+    off = 0.3 * np.random.default_rng(0).choice([-1.0, 1.0], (200, 2))
+    assert _robust_rms([off[:80], off[80:]]) == pytest.approx(0.3 * np.sqrt(2.0))
+    off[7] = 30.0
+    # One of 400 numbers, a hundred times as far off, would by itself make 2.2 px of it; a twentieth.
+    assert _robust_rms([off]) == pytest.approx(0.3 * np.sqrt(2.0), rel=0.05)
+    assert np.isnan(_robust_rms([]))

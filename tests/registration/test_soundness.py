@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from sheet_models import PINHOLE, STRIPES
 
+from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.geometry.light_planes import LightPlanes
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.registration.soundness import camera_faults, covariance_faults, pose_faults
+from bodyscan.registration.rig_calibration import SeenCorners
+from bodyscan.registration.soundness import (
+    camera_faults,
+    covariance_faults,
+    find_faults,
+    pose_faults,
+)
 from bodyscan.rig.pair import Pair
 
 PAIR = Pair.model_validate({"name": "p", "camera": {"width": 640, "height": 480}})
@@ -133,3 +144,170 @@ def test_a_covariance_is_symmetric_and_of_no_negative_variance(matrix: Any, mess
     assert found.startswith(message)
     assert bool(found) == bool(message)
     assert said(covariance_faults(np.zeros((0, 0)), 0, "here")) == ""
+
+
+WITH_LIGHT = Pair.model_validate(
+    {
+        "name": "p",
+        "camera": {"width": 640, "height": 480},
+        "projector": {"stripes": STRIPES, "direction": "horizontal"},
+    }
+)
+TARGET = ("s1", "board")
+seen_corners: Any = SeenCorners  # of arrays of any kind
+
+
+def planes(what: str = "coefficients", place: Any = (), value: Any = None) -> LightPlanes:
+    """Of a fan, with some that were never measured.  value: what stands at a place instead."""
+    slope = np.linspace(-0.3, 0.3, STRIPES + 1)
+    coefficients = np.column_stack([slope, np.ones_like(slope), slope, np.full_like(slope, -200.0)])
+    coefficients /= np.linalg.norm(coefficients[:, :3], axis=1)[:, None]
+    coefficients[:3] = np.nan
+    covariance = np.tile(np.diag([1e-8, 1e-8, 1e-8, 1e-2]), (STRIPES + 1, 1, 1))
+    if value is not None:
+        {"coefficients": coefficients, "covariance": covariance}[what][place] = value
+    return LightPlanes(coefficients, covariance, "horizontal")
+
+
+NINTH = planes().coefficients[9]
+
+
+def calibration(**changes: Any) -> Any:
+    """One pair that saw one board.  changes: of the pair's fields, else of the calibration's."""
+    pair = SimpleNamespace(
+        name="p", camera=SOUND, camera_covariance=np.eye(7), sheets=planes(), crossing=None
+    )
+    seen = seen_corners(np.zeros((4, 2)), np.zeros((4, 2)), np.zeros(4, np.int16))
+    known = {
+        "rig": SimpleNamespace(name="r", pairs=[WITH_LIGHT], boards=[SimpleNamespace(name="board")]),
+        "pairs": {"p": pair},
+        "failed": {},
+        "rig_from_camera": {"p": PLACED},
+        "covariance": PoseCovariance(("p",), np.eye(6)),
+        "rig_from_board": {TARGET: PLACED},
+        "seen": {"p": seen},
+    }  # fmt: skip
+    for name, value in changes.items():
+        if hasattr(pair, name):
+            setattr(pair, name, value)
+        else:
+            known[name] = value
+    return SimpleNamespace(**known)
+
+
+def test_a_sound_calibration_has_no_fault_with_either_kind_of_light() -> None:
+    assert said(find_faults(calibration())) == ""
+    for light in (PINHOLE, PINHOLE.with_lens(8), BowedSheets.of_pinhole(PINHOLE, 1)):
+        known = light.with_covariance(np.eye(len(light.covariance)))
+        assert said(find_faults(calibration(sheets=known))) == ""
+
+
+MIRROR = RigidTransform(np.diag([1.0, 1.0, -1.0]), np.zeros(3))
+TWO = Pair.model_validate(WITH_LIGHT.model_dump(mode="json") | {"name": "q"})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pairs": {}, "seen": {}}, "pairs is empty"),
+        ({"failed": {"p": "why"}}, "failed.p is among the calibrated pairs as well"),
+        ({"covariance": PoseCovariance(("q",), np.eye(6))},
+         "placing_covariance_order does not name the pairs (got q)"),
+        ({"covariance": PoseCovariance(("p", "p"), np.eye(12))}, "does not name the pairs (got p, p)"),
+        ({"covariance": PoseCovariance(("p", "q"), np.eye(12))}, "does not name the pairs (got p, q)"),
+        ({"covariance": PoseCovariance(("p",), np.eye(7))},
+         "placing_covariance is of shape (7, 7), but 6 x 6 is wanted"),
+        ({"rig_from_board": {("s1", "other"): PLACED}},
+         "boards names no board of rig r (got 'other' in 's1')"),
+        ({"rig_from_board": {TARGET: MIRROR}}, "boards: board in s1 is not a rotation: it mirrors"),
+        ({"rig_from_camera": {"p": MIRROR}}, "pairs.p.rig_from_camera is not a rotation"),
+        ({"camera": replace(SOUND, width=641)}, "pairs.p.camera is of 641 x 480 pixels"),
+        ({"camera_covariance": np.eye(6)},
+         "p/camera_covariance is of shape (6, 6), but 7 x 7 is wanted"),
+    ],
+)  # fmt: skip
+def test_what_no_calibration_is_is_said_with_its_place(
+    changes: dict[str, Any], message: str
+) -> None:
+    assert message in said(find_faults(calibration(**changes)))
+
+
+def test_pairs_that_failed_may_have_been_placed_and_others_are_no_pairs_of_the_rig() -> None:
+    rig = SimpleNamespace(name="r", pairs=[WITH_LIGHT, TWO], boards=[SimpleNamespace(name="board")])
+    both = PoseCovariance(("p", "q"), np.eye(12))
+    assert said(find_faults(calibration(rig=rig, covariance=both, failed={"q": "why"}))) == ""
+    other = SimpleNamespace(name="r", pairs=[TWO], boards=rig.boards)
+    assert "pairs.p is not a pair of rig r" in said(find_faults(calibration(rig=other)))
+
+
+@pytest.mark.parametrize(
+    ("light", "message"),
+    [
+        (None, "pairs.p.light and the rig's projector do not agree"),
+        (LightPlanes(planes().coefficients, planes().covariance, "vertical"),
+         "pairs.p.light is of 200 vertical stripes, but the rig's projector shows 200 horizontal"),
+        (LightPlanes(planes().coefficients[1:], planes().covariance[1:], "horizontal"),
+         "is of 199 horizontal stripes"),
+        (LightPlanes(planes().coefficients, planes().covariance[1:], "horizontal"),
+         "has arrays of shapes (201, 4) and (200, 4, 4)"),
+        (LightPlanes(planes().coefficients[:, :3], planes().covariance, "horizontal"),
+         "has arrays of shapes (201, 3)"),
+        (planes(value=np.nan), "has no plane at all"),
+        (planes("coefficients", (9, 2), np.nan), "holds what is not a number"),
+        (planes("covariance", (9, 0, 2), np.inf), "holds what is not a number"),
+        (planes("coefficients", 9, (1 + 1.1e-6) * NINTH), "normals are not of length 1"),
+        (planes("covariance", (9, 0, 1), 1.1e-8), "has a covariance that is not symmetric"),
+        (planes("covariance", (9, 0, 0), -1.1e-8), "is not positive semidefinite"),
+        (replace(PINHOLE, parameters=np.ones(11)), "has 11 parameters"),
+        (replace(PINHOLE, parameters=np.ones(1)), "has 1 parameters"),
+        (replace(PINHOLE, middle=np.ones(2)), "has arrays of shapes (2,) and (2,)"),
+        (replace(PINHOLE, middle=np.array([0.0, np.nan, 0.0])), "holds what is not a number"),
+        (replace(PINHOLE, projector_from_camera=MIRROR),
+         "pairs.p.light: projector_from_camera is not a rotation: it mirrors"),
+        (PINHOLE.with_covariance(np.eye(9)), "pairs.p.light: covariance is of shape (9, 9), but 8 x 8"),
+    ],
+)  # fmt: skip
+def test_what_no_light_is_is_named(light: Any, message: str) -> None:
+    assert message in said(find_faults(calibration(sheets=light)))
+
+
+@pytest.mark.parametrize(
+    "light",
+    [
+        planes("coefficients", 9, (1 + 0.9e-6) * NINTH),
+        planes("covariance", (9, 0, 1), 0.9e-8),  # a millionth of the largest, which is 1e-2
+        planes("covariance", (9, 0, 0), -0.9e-8),
+        planes("coefficients", np.s_[:STRIPES], np.nan),  # one is enough
+    ],
+)
+def test_what_rounding_leaves_of_planes_passes(light: LightPlanes) -> None:
+    assert said(find_faults(calibration(sheets=light))) == ""
+
+
+def test_light_that_crosses_is_of_stripes_that_the_projector_shows() -> None:
+    assert "pairs.p.crossing is of stripes that the rig's projector does not show" in said(
+        find_faults(calibration(crossing=planes()))
+    )
+
+
+@pytest.mark.parametrize(
+    ("seen", "message"),
+    [
+        (seen_corners(np.zeros((4, 2)), np.zeros((3, 2)), np.zeros(4, np.int16)),
+         "p/seen has arrays of shapes (4, 2), (3, 2), (4,)"),
+        (seen_corners(np.zeros((4, 2)), np.full((4, 2), np.nan), np.zeros(4, np.int16)),
+         "p/seen holds what is not a number"),
+        (seen_corners(np.full((4, 2), np.inf), np.zeros((4, 2)), np.zeros(4, np.int16)),
+         "p/seen holds what is not a number"),
+        (seen_corners(np.zeros((4, 2)), np.zeros((4, 2)), np.array([0, 0, 1, 0], np.int16)),
+         "p/seen names boards that there are not"),
+        (seen_corners(np.zeros((4, 2)), np.zeros((4, 2)), np.array([0, -1, 0, 0], np.int16)),
+         "p/seen names boards that there are not"),
+        (seen_corners(np.zeros((4, 2)), np.zeros((4, 2)), np.zeros(4)),
+         "p/seen names boards that there are not"),
+    ],
+)  # fmt: skip
+def test_corners_that_were_seen_are_numbers_on_boards_that_there_are(
+    seen: SeenCorners, message: str
+) -> None:
+    assert said(find_faults(calibration(seen={"p": seen}))) == message

@@ -64,6 +64,9 @@ def test_in_how_many_pixels_a_bit_is_weaker_than_a_finer_one() -> None:
     # Only against a finer bit of eight sigmas, in 200 pixels at least.
     noisy = pairs(patterns, inverses, variance=0.5 * 12.6**2)
     assert list(noisy.weak()) == []
+    # Where the finest bit has five sigmas, the next has nothing finer to be held against.
+    assert [bit for bit, _ in pairs(*frames(b5=0.05)).weak()] == [0, 1, 2, 3]
+    assert [bit for bit, _ in pairs(*frames(b5=0.08)).weak()] == [0, 1, 2, 3, 4]
     assert len(list(pairs(patterns[:, ::5][:, :199], inverses[:, ::5][:, :199]).weak())) == 0
     assert len(list(pairs(patterns[:, :200], inverses[:, :200]).weak())) == 5
 

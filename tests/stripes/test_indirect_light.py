@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from stripe_rendering import Sequence, decode_gray, gray_bits, render_sequence
 
+from bodyscan.stripes.indirect_light import _beside, _mean_imbalance
 from bodyscan.stripes.stripe_map import StripeMap
 
 STRIPES, PX = 50, 4.0
@@ -92,3 +93,54 @@ def test_direct_light_is_never_taken_for_indirect(
     everything = decode_gray(*frames, stripes=int(250 / pixels), direction="vertical")
     assert np.isfinite(everything.s).mean() > 0.8
     assert np.isfinite(found.s).sum() >= 0.999 * np.isfinite(everything.s).sum()
+
+
+def beside(
+    at: int, index: int, reach: int, codes: np.ndarray, usable: np.ndarray | None = None
+) -> list[int]:
+    """Pixels on the first side of a boundary behind pixel `at` of the second line of two."""
+    both = np.stack([np.zeros_like(codes), codes]).astype(np.int32)
+    shown = np.ones(both.shape, bool) if usable is None else np.stack([usable, usable])
+    width = codes.size
+    found = _beside(both, shown, np.array([width + at]), np.array([index]), np.array([reach]))[0]
+    one, other = found[::2], found[1::2]
+    assert ((one < 0) == (other < 0)).all(), "both or neither"
+    known = one >= 0
+    assert (one[known] - width + other[known] - width == 2 * at + 1).all(), "as far on either side"
+    return [int(each) - width for each in one[known]]
+
+
+def test_pixels_beside_a_boundary_are_clear_of_it_and_of_the_next_flips() -> None:
+    """Stripes of 4 px: 3 px before the last pixel of stripe 4 is the first of it, and then stripe 3."""
+    codes = np.arange(40) // 4
+    assert beside(19, 5, 2, codes) == [16, 15, 14, 13]
+    assert beside(19, 5, 1, codes) == [16]
+    assert beside(19, 9, 20, codes) == [], "both sides lie before where another boundary is"
+    falling = codes[::-1].copy()
+    assert beside(19, 5, 2, falling) == [16, 15, 14, 13]
+    # The picture ends, or what is on one side is of no use.
+    assert beside(3, 1, 2, codes) == [0]
+    assert beside(35, 9, 2, codes) == [32]
+    hidden = np.ones(40, bool)
+    hidden[24] = False
+    assert beside(19, 5, 2, codes, hidden) == [16, 14, 13]
+
+
+@pytest.mark.parametrize(("shared", "found"), [(0.1, 0.1), (-0.15, -0.15), (0.3, 0.2)])
+def test_what_a_pattern_and_its_inverse_do_not_share_is_the_middle_between_both_sides(
+    shared: float, found: float
+) -> None:
+    """Four fifths come straight: of the rest no more than all is not shared."""
+    lit, dark = np.full(40, 110, np.uint8), np.full(40, 10, np.uint8)
+    pixels = np.array([[16, 23, -1, -1], [-1, -1, -1, -1]])
+    straight = np.array([[0.8, -0.8, 9.9, 9.9]] * 2)
+    difference = (100.0 * (straight + min(abs(shared), 0.2) * np.sign(shared))).astype(np.float32)
+    quiet = np.zeros((2, 4), np.float32)
+    mean, doubt = _mean_imbalance(lit, dark, pixels, difference, quiet)
+    np.testing.assert_allclose(mean, [found, 0.0], rtol=1e-5)
+    np.testing.assert_allclose(doubt, [0.3 * abs(found), 0.0], rtol=1e-5)
+    # Where noise may be all of it, it is half believed at four sigmas.
+    noise = np.full((2, 4), 100.0 * abs(found) / 4.0 * np.sqrt(2.0), np.float32)
+    half, unsure = _mean_imbalance(lit, dark, pixels, difference, noise)
+    assert half[0] == pytest.approx(0.5 * found, rel=1e-4)
+    assert unsure[0] == pytest.approx(abs(found) * np.hypot(0.25, 0.15), rel=1e-4)

@@ -15,6 +15,7 @@ from bodyscan.stripes.usable_pixels import (
     half_covered_pixels,
     least_contrast,
     shown_pixels,
+    usable_pixels,
 )
 
 NAN = np.float32(np.nan)
@@ -199,3 +200,14 @@ def test_stripes_that_run_along_the_lines_are_of_another_direction() -> None:
         check(along)
     with pytest.raises(WrongDirection, match="run vertically in the picture, not horizontally"):
         check(along, turned=True)
+
+
+def test_pixels_beside_a_jump_show_a_code_that_cannot_be_relied_on() -> None:
+    light, black = np.full((5, 9), 200, np.uint8), np.full((5, 9), 20, np.uint8)
+    images = ScanLines(light, black, light[None], black[None], False)
+    codes = np.tile(np.array([3, 3, 3, 3, 3, 6, 6, 6, 6], np.int32), (5, 1))
+    levels = np.ones(256, np.float32)
+    usable, shown = shown_pixels(images, codes, levels, 8, 0)
+    assert shown.all()
+    assert usable.tolist() == [[True] * 4 + [False] * 2 + [True] * 3] * 5
+    assert np.array_equal(usable_pixels(images, codes, levels, 8, 0), usable)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from bodyscan.arrays import Greys, Mask
 from bodyscan.stripes.albedo_edges import (
+    USUAL_BLUR2,
     Brightness,
     BrightnessEdges,
     gentle_gradient,
     without_edges_across,
 )
-from bodyscan.stripes.boundaries import Boundaries
+from bodyscan.stripes.boundaries import Boundaries, find_boundaries
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import end_slopes, interpolate_stripes, smooth_runs
 
@@ -266,3 +268,35 @@ def test_an_edge_from_line_to_line_is_seen_where_noise_does_not_explain_it() -> 
     sharp = Brightness.of(images, np.full(256, 1e-6, np.float32), np.ones(lit.shape, bool))
     np.testing.assert_allclose(sharp.across[[9, 10], 4], np.log(0.4) / 2.0, rtol=1e-3)
     np.testing.assert_allclose(sharp.across[[4, 15], 4], 0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("down", "right"), [(0.08, 0.0), (-0.08, 0.0), (0.0, 0.005), (0.0, -0.005)]
+)
+def test_a_boundary_lies_where_the_light_of_its_pixels_has_its_middle(
+    down: float, right: float
+) -> None:
+    """A surface that gets brighter by so much from pixel to pixel, as a logarithm, shows more of its
+    bright side: by the lens' usual blur squared, towards it."""
+    line, place = np.mgrid[:15, :160].astype(float)
+    bright = 100.0 * np.exp(down * (line - 7.0) + right * (place - 80.0))
+    stripe = np.floor(place / 20.0).astype(int)
+    gray = stripe ^ (stripe >> 1)
+    share = [gaussian_filter1d(((gray >> bit) & 1).astype(float), 1.0, axis=1) for bit in (2, 1, 0)]
+    pattern = np.stack([10.0 + bright * part for part in share]).astype(np.float32)
+    inverse = np.stack([10.0 + bright * (1.0 - part) for part in share]).astype(np.float32)
+    dark = np.full(bright.shape, 10.0, np.float32)
+    lit = (10.0 + bright).astype(np.float32)
+    images = ScanLines.along_lines(lit, dark, pattern, inverse, "vertical")
+    variance, usable = np.full(256, 1e-4, np.float32), np.ones(bright.shape, bool)
+    brightness = Brightness.of(images, variance, usable)
+    found = find_boundaries(images, brightness, stripe.astype(np.int32), usable, variance)
+    assert found.blur2 == USUAL_BLUR2, "no edge tells another"
+    assert found.index.reshape(15, 7).tolist() == [[1, 2, 3, 4, 5, 6, 7]] * 15
+    inner = (found.line > 0) & (found.line < 14)
+    # Pixel 19 is the last of stripe 0: half a pixel behind its middle.  Greys are not rounded.
+    np.testing.assert_allclose(
+        (found.line_position - found.line)[inner], USUAL_BLUR2 * down, atol=1e-3
+    )
+    moved = found.position - (20.0 * found.index - 0.5)
+    np.testing.assert_allclose(moved[inner], USUAL_BLUR2 * right, atol=1e-3)
