@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from pathlib import Path
 from typing import Any, get_args
 
 from typer.models import ArgumentInfo, OptionInfo
+
+# The tree that this file lies in, not another one that is installed.
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from bodyscan.cli.main import app
 from bodyscan.cli.options import SHARED

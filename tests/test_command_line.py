@@ -141,6 +141,17 @@ def test_the_page_of_commands_is_as_the_commands_are() -> None:
     assert page() == (docs / "commands.md").read_text("utf-8"), "run docs/write_commands.py"
 
 
+def test_the_page_of_commands_is_of_the_tree_it_lies_in(tmp_path: Path) -> None:
+    """Whatever `bodyscan` is installed, or comes first."""
+    (tmp_path / "bodyscan").mkdir()
+    (tmp_path / "bodyscan" / "__init__.py").write_text("raise ImportError('another tree')", "utf-8")
+    script = f"import runpy; runpy.run_path({str(RIGS.parent / 'docs' / 'write_commands.py')!r})"
+    line = [sys.executable, "-c", f"{script}; import bodyscan; print(bodyscan.__file__)"]
+    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    ran = subprocess.run(line, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+    assert ran.stdout.strip() == str(RIGS.parent / "bodyscan" / "__init__.py"), ran.stderr
+
+
 def test_json_is_one_document_that_says_what_was_made(tmp_path: Path, bodyscan: Command) -> None:
     done = bodyscan("patterns", RIGS / "one-pair.yaml", "--out", tmp_path, "--width", 300,
                     "--height", 48, "--json")  # fmt: skip

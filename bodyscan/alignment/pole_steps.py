@@ -172,12 +172,7 @@ def _mean(motions: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
 
 def loosened(boards: PoseCovariance, pairs: Collection[str]) -> PoseCovariance:
     """The calibration's covariance with a pole's pairs free to move together."""
-    matrix, own = boards.matrix.copy(), FREE.of_one()
-    places = [6 * boards.names.index(name) for name in pairs]
-    for i in places:
-        for j in places:
-            matrix[i : i + 6, j : j + 6] += own
-    return PoseCovariance(boards.names, matrix)
+    return boards.moved_together(pairs, FREE.of_one())
 
 
 def motions_between(

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.transforms import twist_jacobian
 
 
@@ -28,7 +28,7 @@ class PoseCovariance:
 
     def among(self, names: Sequence[str]) -> Array:
         """Covariance (6N, 6N) of these pairs' motions, in their order."""
-        rows = np.concatenate([6 * self.names.index(name) + np.arange(6) for name in names])
+        rows = self._rows(names)
         return self.matrix[np.ix_(rows, rows)]
 
     def between(self, a: str, b: str) -> Array:
@@ -38,6 +38,18 @@ class PoseCovariance:
         rows_i, rows_j = slice(i, i + 6), slice(j, j + 6)
         cross = m[rows_i, rows_j]
         return m[rows_i, rows_i] + m[rows_j, rows_j] - cross - cross.T
+
+    def moved_together(self, names: Collection[str], covariance: Array) -> PoseCovariance:
+        """After these pairs, such as those of a pole, made one motion of covariance (6, 6).
+
+        What they know of each other stays as it was.
+        """
+        rows, matrix = self._rows(names), self.matrix.copy()
+        matrix[np.ix_(rows, rows)] += np.tile(covariance, (len(names), len(names)))
+        return PoseCovariance(self.names, matrix)
+
+    def _rows(self, names: Collection[str]) -> Indices:
+        return np.concatenate([6 * self.names.index(name) + np.arange(6) for name in names])
 
 
 def point_covariance(motion_covariance: Array, point: Array) -> Array:

@@ -21,8 +21,8 @@ from bodyscan.stripes.stripe_map import StripeMap
 NORMAL_WINDOW_PX = 5
 REACH = NORMAL_WINDOW_PX // 2
 MANY, FEW_MEET = 1000, 0.01
-"""Pixels that saw both directions, and the share of them that must have both depths: with a right
-calibration all of them do, except for wrong codes."""
+"""Pixels whose stripes of both directions have a sheet, and the share of their rays that must meet
+both: with a right calibration all of them do, except for wrong codes."""
 ZERO, ONE = np.float32(0.0), np.float32(1.0)  # one float64 would make it all float64
 
 
@@ -89,29 +89,45 @@ def _apart(
 
 
 def _require_fit(pair: PairCalibration, stripes: StripeMap, agreement: Agreement | None) -> None:
-    """Raise BadInput if no right calibration leaves both directions so far apart.
-
-    An imported calibration knows its sheets wherever there are stripes: if the two meet nowhere, it
-    is wrong.
-    """
+    """Raise BadInput if no right calibration leaves both directions so far apart."""
     assert stripes.crossing is not None
-    decoded = np.count_nonzero(np.isfinite(stripes.s) & np.isfinite(stripes.crossing.s))
-    meet = agreement.pixels if agreement else 0
-    imported = pair.quality.imported is not None
     if agreement is not None and agreement.impossible:
         why = f"both directions are apart by {agreement.words}"
-    elif imported and decoded >= MANY and meet < FEW_MEET * decoded:
-        why = f"{decoded} pixels saw stripes of both directions, and their sheets meet at {meet}"
     else:
-        return
+        decoded = np.isfinite(stripes.s) & np.isfinite(stripes.crossing.s)
+        measured = agreement.pixels if agreement else 0
+        if measured >= FEW_MEET * np.count_nonzero(decoded):
+            return
+        seen, meet = _meeting(pair, stripes, decoded)
+        if seen < MANY or meet >= FEW_MEET * seen:
+            return
+        why = f"{seen} pixels saw stripes of both directions, and their sheets meet at {meet}"
     raise BadInput(
         f"its calibration does not fit these stripes: {why}",
         where=f"pair {pair.name}",
         remedy="are R and T the other way round (`inverse`), is the sign of `shift` or the number of "
         "stripes another?"
-        if imported
+        if pair.quality.imported
         else "calibrate again: camera or projector were moved, or `stripes` was changed",
     )
+
+
+def _meeting(pair: PairCalibration, stripes: StripeMap, decoded: Mask) -> tuple[int, int]:
+    """Number of the pixels (H, W) whose stripes both have a sheet, and of those whose ray meets both.
+
+    An imported calibration has a sheet for every stripe. Our own has none where no board showed the
+    stripe; far from the boards it has one, though the depth there is only a guess.
+    """
+    assert pair.sheets is not None
+    assert pair.crossing is not None
+    assert stripes.crossing is not None
+    rays = pair.camera.rays(np.argwhere(decoded)[:, ::-1].astype(float))
+    have, meet = np.isfinite(rays[:, 0]), np.ones(len(rays), bool)
+    for sheets, own in ((pair.sheets, stripes), (pair.crossing, stripes.crossing)):
+        s = own.s[decoded].astype(np.float64)
+        have &= np.isfinite(sheets.tangent_planes(s)[:, 3])
+        meet &= np.isfinite(sheets.depth(rays, s))
+    return int(np.count_nonzero(have)), int(np.count_nonzero(have & meet))
 
 
 def _triangulated(

@@ -13,7 +13,7 @@ from bodyscan.errors import BadInput
 from bodyscan.fusion.scan_verdict import _directions
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
-from bodyscan.geometry.light_planes import Axis
+from bodyscan.geometry.light_planes import Axis, LightPlanes
 from bodyscan.geometry.projector_sheets import sheets_of_projector
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.range_image import RangeImage
@@ -171,19 +171,51 @@ def test_what_a_calibration_is_off_is_told_in_stripes(off: float, moderate: bool
         assert "disagree by" in reason
 
 
-def test_a_calibration_that_is_wrong_is_refused() -> None:
-    with pytest.raises(BadInput, match="does not fit these stripes"):
-        reconstruct_range_image(pair(), shifted(20.0))
+OURS, THEIRS = PairQuality(0.1, 5), PairQuality(None, 0, imported="its file")
 
 
-def test_sheets_of_an_import_that_meet_nowhere_are_refused() -> None:
+@pytest.mark.parametrize(
+    ("quality", "remedy"), [(OURS, "calibrate again: camera or projector"), (THEIRS, "inverse")]
+)
+def test_a_calibration_that_is_wrong_is_refused(quality: PairQuality, remedy: str) -> None:
+    with pytest.raises(BadInput, match=rf"does not fit these stripes: both.*\n.*{remedy}"):
+        reconstruct_range_image(replace(pair(), quality=quality), shifted(20.0))
+
+
+@pytest.mark.parametrize(
+    ("quality", "remedy"), [(OURS, "calibrate again: camera or projector"), (THEIRS, "inverse")]
+)
+def test_sheets_that_meet_nowhere_are_refused(quality: PairQuality, remedy: str) -> None:
     """Rows' light that shines the other way has no sheet before the camera."""
     light = Camera(FOCAL, FOCAL, 0.0, *CENTRE, Radial(0.0, 0.0), *SIZE)
     away = RigidTransform(PLACE.rotation, np.array([0.0, 0.0, -9000.0]))
     rows = sheets_of_projector(light, away, np.array([0.0, 0.0, 700.0]), SIZE[1], "horizontal")
-    known = PairQuality(None, 0, imported="its file")
-    with pytest.raises(BadInput, match=r"does not fit these stripes.*meet at 0\n.*inverse"):
-        reconstruct_range_image(replace(pair(), crossing=rows, quality=known), stripes())
+    with pytest.raises(BadInput, match=rf"does not fit these stripes.*meet at 0\n.*{remedy}"):
+        reconstruct_range_image(replace(pair(), crossing=rows, quality=quality), stripes())
+
+
+def planes_of_rows(*, d_mm: float = 0.0) -> LightPlanes:
+    """The rows' sheets as the chapter's planes, of which d is known to that many mm."""
+    rows = pair().crossing
+    assert rows is not None
+    coefficients = rows.tangent_planes(np.arange(SIZE[1] + 1.0))
+    covariance = np.tile(np.diag([0.0, 0.0, 0.0, d_mm**2]), (SIZE[1] + 1, 1, 1))
+    return LightPlanes(coefficients, covariance, "horizontal")
+
+
+def test_stripes_that_no_board_has_shown_are_no_contradiction() -> None:
+    """Our own calibration may know no sheet where the other direction's measure, or only guess."""
+    known = planes_of_rows()
+    agreement = reconstruct_range_image(replace(pair(), crossing=known), stripes()).agreement
+    assert agreement is not None
+    assert agreement.apart_sigmas < 1.1
+    elsewhere = known.coefficients.copy()
+    elsewhere[5:] = np.nan
+    for rows in (replace(known, coefficients=elsewhere), planes_of_rows(d_mm=50.0)):
+        image = reconstruct_range_image(replace(pair(), crossing=rows), stripes())
+        assert image.agreement is None
+        assert image.valid.all()
+        assert rms(errors(image) / image.sigma_mm[image.valid]) < 1.03
 
 
 def test_a_way_off_by_five_sigmas_is_dropped_where_most_agree_better_than_they_claim() -> None:

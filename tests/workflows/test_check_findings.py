@@ -6,9 +6,14 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from bodyscan.errors import FailedWork
+from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.drift import Move
+from bodyscan.workflows.check_boards import repaired
 from bodyscan.workflows.check_rig import Findings, _named_apart, _of_boards, _of_scans
 
 CALIBRATION: Any = SimpleNamespace(
@@ -17,6 +22,15 @@ CALIBRATION: Any = SimpleNamespace(
         "q": SimpleNamespace(quality=SimpleNamespace(imported="theirs.json")),
     }
 )
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Of a calibration, what a repair changes."""
+
+    rig_from_camera: dict[str, RigidTransform]
+    covariance: PoseCovariance
+    notes: tuple[str, ...]
 
 
 def offset(pair: str, mm: float, moved: bool = False) -> SimpleNamespace:
@@ -110,3 +124,26 @@ def test_an_undecided_check_asks_for_more_scans(scans: int, asked: str) -> None:
     first = _of_scans(cast(Any, check)).lines[0]
     assert first.startswith(f"undecided: from {scans} scans a pair that moved by less than 1.8 mm")
     assert f"give {asked}, or a shot of the board" in first
+
+
+def test_pairs_of_a_repaired_pole_are_as_well_known_to_each_other_as_before() -> None:
+    """They were carried by one motion: its error is shared by all of them."""
+    names = ("p1-1", "p1-2", "p2-1")
+    mixing = 0.1 * np.random.default_rng(2).standard_normal((18, 18))
+    known = PoseCovariance(names, mixing @ mixing.T)
+    placing = {name: RigidTransform.identity() for name in names}
+    calibration: Any = Placed(placing, known, ("as it was",))
+    motion = RigidTransform(np.eye(3), np.array([3.0, 0.0, 4.0]))
+    move = Move("pole p1", names[:2], motion, np.diag([1e-6] * 3 + [0.25] * 3), 5.0, 0.9, 0.0)
+    mended = repaired(calibration, [move])
+    after = mended.covariance
+    np.testing.assert_allclose(after.between("p1-1", "p1-2"), known.between("p1-1", "p1-2"))
+    for name in move.pairs:
+        np.testing.assert_allclose(after.of(name), known.of(name) + move.covariance)
+        grown = after.between(name, "p2-1") - known.between(name, "p2-1")
+        np.testing.assert_allclose(grown, move.covariance, atol=1e-12)
+        assert mended.rig_from_camera[name].translation.tolist() == [3.0, 0.0, 4.0]
+    np.testing.assert_array_equal(after.of("p2-1"), known.of("p2-1"))
+    assert mended.rig_from_camera["p2-1"] is placing["p2-1"]
+    assert mended.notes[0] == "as it was"
+    assert "pole p1 moved by 5.00 mm" in mended.notes[1]
