@@ -29,6 +29,7 @@ from bodyscan.alignment.sway_prior import BODY_CENTRE, SwayPrior, centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
@@ -89,6 +90,15 @@ class Followed:
     sigma_mm: Array
     moment_ms: float | None
     breath: MeanBreath | None = None
+
+    def breathing(self, surface: BodyMesh) -> BodyMesh:
+        """With the way to mean breath, where it is known."""
+        if self.breath is None:
+            return surface
+        way, sigma = self.breath.along(
+            self.cells, surface.vertices, surface.normals.astype(np.float64)
+        )
+        return replace(surface, breath=BreathAt(way.astype(np.float32), sigma.astype(np.float32)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -133,6 +134,15 @@ class ImageEvidence:
     seams: SeamReport | None = None
     contradictions: Contradictions | None = None
     floor_mm: float | None = None
+
+
+def silent_poles(
+    poles: Mapping[str, str], asked: Sequence[str], seeing: Sequence[str]
+) -> tuple[str, ...]:
+    """Poles of which no pair saw anybody. One pair alone may look over a child's head."""
+    count = Counter(poles[name] for name in asked if name in poles)
+    seen = {poles.get(name) for name in seeing}
+    return tuple(pole for pole, pairs in count.items() if pairs > 1 and pole not in seen)
 
 
 def grade_scan(

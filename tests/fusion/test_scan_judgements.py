@@ -15,7 +15,7 @@ from bodyscan.alignment.icp import Alignment, Overlap
 from bodyscan.alignment.place_evidence import SizeStep
 from bodyscan.alignment.pole_steps import PoleStep, StepSearch
 from bodyscan.fusion.contradictions import Contradictions
-from bodyscan.fusion.scan import _silent
+from bodyscan.fusion.scan_verdict import silent_poles
 from bodyscan.fusion.seams import Seam, SeamReport
 from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.registration.nominal_size import NominalSize
@@ -303,9 +303,9 @@ def test_pairs_that_stand_off_each_by_itself(
 def test_a_pole_of_which_nobody_saw_the_person_is_named() -> None:
     poles = {"a1": "a", "a2": "a", "b1": "b", "b2": "b", "c1": "c"}
     asked = ["a1", "a2", "b1", "b2", "c1", "alone"]
-    assert _silent(poles, asked, ["a1"]) == ("b",)  # one pair may look over a child's head
-    assert _silent(poles, asked, ["a1", "b2"]) == ()
-    assert _silent(poles, asked, []) == ("a", "b")
+    assert silent_poles(poles, asked, ["a1"]) == ("b",)  # one pair may look over a child's head
+    assert silent_poles(poles, asked, ["a1", "b2"]) == ()
+    assert silent_poles(poles, asked, []) == ("a", "b")
 
 
 @pytest.mark.parametrize(("other", "blamed"), [(0.026, "pair a1"), (0.032, "pole a")])
