@@ -28,6 +28,7 @@ from bodyscan.alignment.place_evidence import PlaceEvidence
 from bodyscan.alignment.sway_prior import BODY_CENTRE, SwayPrior, centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.progress import THREADS
@@ -275,12 +276,11 @@ def _is_unswayed(motion: BodyMotion, seen: Mask, settings: AlignmentSettings) ->
 
 def _far(motion: BodyMotion, names: Sequence[str], seen: Mask) -> float:
     """mm RMS."""
-    moved = motion.displacements(names, from_middle=True)[seen][:, :3]
-    return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+    return rms_length(motion.displacements(names, from_middle=True)[seen][:, :3])
 
 
 def _gap(matches: Matches, cell: Indices) -> float:
-    return float(np.sqrt(np.mean(matches.distances**2)))
+    return rms(matches.distances)
 
 
 def _placed(

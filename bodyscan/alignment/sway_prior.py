@@ -13,6 +13,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance, position_sigma
+from bodyscan.geometry.robust import rms
 from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.settings import BODY_CENTRE_MM, AlignmentSettings
@@ -45,7 +46,7 @@ class SwayPrior:
         """
         if not self.shift_mm:
             return 1.0
-        found = float(np.sqrt(np.mean(centre_shifts(motion) ** 2))) / self.shift_mm
+        found = rms(centre_shifts(motion)) / self.shift_mm
         return float(np.clip(SWAY_ROOM * found, self.least, self.most))
 
     def covariance(self, names: Sequence[str], boards: PoseCovariance, scale: float = 1.0) -> Array:

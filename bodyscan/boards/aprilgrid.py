@@ -101,7 +101,7 @@ def place_tags(board: Board, tags: Markers, border_bits: int = 2) -> PlacedTags 
 def _refine(image: Bytes, board: Board, placed: PlacedTags) -> tuple[Array, Mask]:
     """All corners of the grid where the tags say they are; then, those not found, where the corners
     found say so."""
-    printed = board_layout.corner_points(board.model_copy(update={"faces": 1}))[:, :2]
+    printed = board_layout.printed_corners(board)
     reach = _clear_of_edges(board, placed.border_bits) / WINDOW_SQUARES
     bright_diagonal = _bright_diagonal(board, len(printed))
     pixels, good = np.zeros_like(printed), np.zeros(len(printed), bool)

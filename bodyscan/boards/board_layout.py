@@ -43,6 +43,11 @@ def corner_points(board: Board) -> Array:
     return np.concatenate([points_from_print(board, printed, face) for face in range(board.faces)])
 
 
+def printed_corners(board: Board) -> Array:
+    """(N, 2) mm on the print of one face, x along the columns."""
+    return corner_points(board.model_copy(update={"faces": 1}))[:, :2]
+
+
 def _lines(board: Board, count: int) -> Array:
     """Where corners lie along one side of so many squares or tags, mm."""
     if board.kind != "aprilgrid":

@@ -181,7 +181,7 @@ def _refine(
 ) -> tuple[Array, Mask]:
     """Corners fitted where the markers say they are; then, as corners say it better than
     markers, once more where the corners found say that those not found must be."""
-    points = board_layout.corner_points(board.model_copy(update={"faces": 1}))[corner_ids, :2]
+    points = board_layout.printed_corners(board)[corner_ids]
     gap = (1.0 - (board.marker_mm or 0.0) / board.square_mm) / 2.0
     marked = np.floor(markers[0].mean(axis=0) / board.square_mm).astype(int).sum()
     row, column = np.divmod(corner_ids, board.columns - 1)

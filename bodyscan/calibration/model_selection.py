@@ -11,7 +11,7 @@ from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.calibration.boundary_points import BoundaryPoints, select
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, spread
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, rms, spread
 
 MOST_FOLDS = 6
 CAP = 30.0
@@ -224,4 +224,4 @@ def _median(distances: Array) -> float:
 def _rms(distances: Array) -> float:
     limit = OUTLIER * _median(distances)
     kept = distances[distances <= limit]
-    return float(np.sqrt(np.mean(kept**2))) if kept.size else np.inf
+    return rms(kept) if kept.size else np.inf

@@ -20,7 +20,7 @@ from bodyscan.evaluation.surface import Deviation, deviation, normalized_errors,
 from bodyscan.export.scan import transform_mesh
 from bodyscan.files.atomic import write_bytes
 from bodyscan.fusion.storage import StoredScan, load_scan
-from bodyscan.geometry.robust import rms_length
+from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.topology import topology
 from bodyscan.optional import optional
@@ -49,7 +49,7 @@ class RigDeviation:
 
     @property
     def rotations_rms_deg(self) -> float:
-        return float(np.sqrt(np.mean(self.rotations_deg**2)))
+        return rms(self.rotations_deg)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array
+from bodyscan.geometry.light_planes import towards_camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.simulation.board import MadeBoard, make_board
@@ -142,8 +143,7 @@ def chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
 
 def true_planes(setup: ChapterSetup) -> Array:
     """(S + 1, 4): the planes of the boundaries, before any smile; (a, b, c) unit, d >= 0."""
-    planes = setup.projector.plane(np.arange(setup.projector.stripes + 1.0))
-    return planes * np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
+    return towards_camera(setup.projector.plane(np.arange(setup.projector.stripes + 1.0)))
 
 
 def board_poses(count: int = BOARDS) -> list[RigidTransform]:
