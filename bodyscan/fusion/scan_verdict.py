@@ -202,6 +202,10 @@ def grade_scan(
             else _gaps(cloud, surface)
         ),
     }
+    return _worst_of(checks)
+
+
+def _worst_of(checks: Mapping[str, Callable[[], Iterable[Finding]]]) -> Verdict:
     findings: list[Finding] = []
     failures: list[str] = []
     for what, check in checks.items():
