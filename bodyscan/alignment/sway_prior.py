@@ -57,16 +57,12 @@ class SwayPrior:
         """(6, 6): of one pair's sway, rig frame."""
         rotation, translation = scale * np.radians(self.rotation_deg), scale * self.shift_mm
         own = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
-        carry = adjoint(RigidTransform(np.eye(3), BODY_CENTRE))
+        carry = adjoint(RigidTransform.shift(BODY_CENTRE))
         return np.asarray(carry @ own @ carry.T)
 
     def loosen(self, boards: PoseCovariance, untied: Collection[str]) -> PoseCovariance:
         """The calibration's covariance, and the sway of the pairs that no overlap ties."""
-        matrix, own = boards.matrix.copy(), self.of_one()
-        for name in untied:
-            here = slice(6 * boards.names.index(name), 6 * boards.names.index(name) + 6)
-            matrix[here, here] += own
-        return PoseCovariance(boards.names, matrix)
+        return boards.plus(untied, self.of_one())
 
 
 def centre_shifts(motion: Array) -> Array:

@@ -62,9 +62,7 @@ def points_from_print(board: Board, printed: Array, face: int) -> Array:
     x, y = printed[..., 0], printed[..., 1]
     if face == 0:
         return np.stack([x, y, np.zeros_like(x)], axis=-1)
-    return np.stack(
-        [board.columns * board.square_mm - x, y, np.full_like(x, board.thickness_mm)], axis=-1
-    )
+    return np.stack([board.size_mm[0] - x, y, np.full_like(x, board.thickness_mm)], axis=-1)
 
 
 def outline(board: Board, face: int = 0) -> Array:
@@ -73,8 +71,7 @@ def outline(board: Board, face: int = 0) -> Array:
     Clockwise for whoever looks at that face, from its first square on.
     """
     low = -board.margin_mm
-    right = board.columns * board.square_mm + board.margin_mm
-    bottom = board.rows * board.square_mm + board.margin_mm
+    right, bottom = (size + board.margin_mm for size in board.size_mm)
     printed = np.array([[low, low], [right, low], [right, bottom], [low, bottom]])
     return points_from_print(board, printed, face)
 

@@ -49,6 +49,11 @@ class BoardFace:
         return np.asarray(np.polynomial.polynomial.polyval2d(x, y, self.coefficients))
 
 
+def rounded(points: Array) -> Array:
+    """Corners (..., 3) mm as they are told apart, without a -0."""
+    return np.round(points, DIGITS) + 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class BoardForm:
     """points: (N, 3) mm, the corners as the board is described.  heights: (7,) mm, coefficients of
@@ -67,7 +72,7 @@ class BoardForm:
     @staticmethod
     def flat(points: Array, flatness_mm: float, print_mm: float) -> BoardForm:
         """As described, all corners (M, 3) of any views given."""
-        known = np.unique(np.round(points, DIGITS) + 0.0, axis=0)
+        known = np.unique(rounded(points), axis=0)
         return BoardForm(
             known, np.zeros(len(POWERS)), np.zeros((len(known), 2)), flatness_mm, print_mm
         )
@@ -118,8 +123,7 @@ class BoardForm:
     def numbers(self, points: Array) -> Indices:
         """(M,) of corners (M, 3) among `points`."""
         place = {key: k for k, key in enumerate(map(tuple, self.points.tolist()))}
-        rounded = np.round(points, DIGITS) + 0.0
-        return np.array([place[key] for key in map(tuple, rounded.tolist())], np.int64)
+        return np.array([place[key] for key in map(tuple, rounded(points).tolist())], np.int64)
 
     def applied(self, points: Array, numbers: Indices) -> Array:
         """Corners (M, 3) as described -> where they lie."""

@@ -163,7 +163,7 @@ def select_model(
         if not (candidates[i].whole and np.isfinite(medians[i])):
             continue
         rich, simple = (
-            without_motion(_capped(tried[k].distances[known], cap), effects[known], board[known])
+            without_motion(capped(tried[k].distances[known], cap), effects[known], board[known])
             for k in (i, chosen)
         )
         better_by = gain(Compared(simple[:, None], rich[:, None], part[known]))
@@ -172,7 +172,7 @@ def select_model(
     figures = tuple(
         HeldOutModel(
             candidate.name,
-            _mean_of_boards(np.abs(_capped(errors.distances, cap)), board, seen[i]),
+            _mean_of_boards(np.abs(capped(errors.distances, cap)), board, seen[i]),
             medians[i],
             _rms(np.abs(errors.distances)),
             float(np.isfinite(errors.distances).mean()),
@@ -206,7 +206,7 @@ def without_motion(distances: Array, effects: Array, board: Indices) -> Array:
     return left
 
 
-def _capped(distances: Array, cap: float) -> Array:
+def capped(distances: Array, cap: float) -> Array:
     """What was not measured counts as far off."""
     return np.asarray(np.clip(np.nan_to_num(distances, nan=cap), -cap, cap), np.float64)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,8 +28,17 @@ class PoseCovariance:
 
     def among(self, names: Sequence[str]) -> Array:
         """(6N, 6N) of these pairs' motions, in their order."""
-        rows = np.concatenate([6 * self.names.index(name) + np.arange(6) for name in names])
+        first = np.array([6 * self.names.index(name) for name in names], int)
+        rows = (first[:, None] + np.arange(6)).ravel()
         return self.matrix[np.ix_(rows, rows)]
+
+    def plus(self, names: Iterable[str], own: Array) -> PoseCovariance:
+        """With (6, 6) more of each of these pairs, by itself."""
+        matrix = self.matrix.copy()
+        for name in names:
+            k = 6 * self.names.index(name)
+            matrix[k : k + 6, k : k + 6] += own
+        return PoseCovariance(self.names, matrix)
 
     def between(self, a: str, b: str) -> Array:
         """(6, 6) of the motion of b relative to a."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.board_form import BoardFace
+from bodyscan.calibration.board_form import BoardFace, rounded
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain
 from bodyscan.geometry.robust import rms_length
@@ -182,7 +182,7 @@ def _flat(views: Sequence[LocatedView]) -> dict[str, BoardShape]:
     """All corners that any view shows, by board, where they should be."""
     boards = sorted({view.board for view in views})
     seen = (np.concatenate([v.points for v in views if v.board == name]) for name in boards)
-    nominal = (np.unique(np.round(points, DIGITS) + 0.0, axis=0) for points in seen)
+    nominal = (np.unique(rounded(points), axis=0) for points in seen)
     return {n: BoardShape(p, np.zeros_like(p)) for n, p in zip(boards, nominal, strict=True)}
 
 
@@ -311,4 +311,4 @@ def _median(residuals: Array) -> float:
 
 
 def _keys(points: Array) -> list[tuple[float, ...]]:
-    return [tuple(point) for point in (np.round(points, DIGITS) + 0.0).tolist()]
+    return [tuple(point) for point in rounded(points).tolist()]

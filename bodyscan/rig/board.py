@@ -64,6 +64,11 @@ class Board(Model):
     flatness_mm: Annotated[float, Field(ge=0)] | None = None
 
     @property
+    def size_mm(self) -> tuple[float, float]:
+        """Of the checkered area, along its columns and along its rows."""
+        return self.columns * self.square_mm, self.rows * self.square_mm
+
+    @property
     def believed_flatness_mm(self) -> float:
         """By how much its lowest and highest corners may differ, one standard deviation, before any
         image: `flatness_mm`, or FLATNESS of its diagonal."""

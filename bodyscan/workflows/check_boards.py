@@ -16,7 +16,6 @@ from bodyscan.calibration.pair import PairCalibration
 from bodyscan.calibration.striped_view import BoardBoundaries, StripedView, on_board
 from bodyscan.captures.folder import Captures
 from bodyscan.errors import BoardNotFound
-from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.ray_depths import intersect_rays
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, silent
@@ -123,19 +122,15 @@ def repaired(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibrati
 
     Of a moved pair the covariance is that of its move; what tied it to the others is gone.
     """
-    placing = dict(calibration.rig_from_camera)
-    names = calibration.covariance.names
-    matrix = calibration.covariance.matrix.copy()
+    placing, covariance = dict(calibration.rig_from_camera), calibration.covariance
     for move in moves:
-        for pair in move.pairs:
-            placing[pair] = move.motion @ placing[pair]
-            own = 6 * names.index(pair)
-            matrix[own : own + 6, own : own + 6] += move.covariance
+        placing |= {pair: move.motion @ placing[pair] for pair in move.pairs}
+        covariance = covariance.plus(move.pairs, move.covariance)
     said = tuple(f"repaired: {move_line(move)}" for move in moves)
     return replace(
         calibration,
         rig_from_camera=placing,
-        covariance=PoseCovariance(names, matrix),
+        covariance=covariance,
         notes=(*calibration.notes, *said),
     )
 
