@@ -34,7 +34,6 @@ SUSPECT = 1.25
 """Offsets are looked into where they lower the squared residuals by so many variances each: noise
 alone lowers them by one; of 48 corners or more by 1.25 once in 700 times."""
 FEWEST_TARGETS = 6
-DIGITS = 6
 
 
 @dataclass(frozen=True, eq=False)
