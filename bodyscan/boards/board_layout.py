@@ -65,17 +65,6 @@ def points_from_print(board: Board, printed: Array, face: int) -> Array:
     return np.stack([board.size_mm[0] - x, y, np.full_like(x, board.thickness_mm)], axis=-1)
 
 
-def outline(board: Board, face: int = 0) -> Array:
-    """The face's rim, margin included, (4, 3) mm in the board frame.
-
-    Clockwise for whoever looks at that face, from its first square on.
-    """
-    low = -board.margin_mm
-    right, bottom = (size + board.margin_mm for size in board.size_mm)
-    printed = np.array([[low, low], [right, low], [right, bottom], [low, bottom]])
-    return points_from_print(board, printed, face)
-
-
 def marker_dictionary(board: Board) -> cv2.aruco.Dictionary:
     """The ArUco dictionary of a ChArUco board. Raises BadInput for an unknown name."""
     number = getattr(cv2.aruco, board.dictionary, None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 from bodyscan.alignment.bending import at_once
 from bodyscan.alignment.body_parts import PersonMotion
@@ -59,7 +59,7 @@ class _Placed:
     def followed(self) -> Followed | None:
         return self.together.followed if self.together else None
 
-    @property
+    @cached_property
     def person(self) -> PersonMotion | None:
         return PersonMotion.of(self.followed) if self.followed else None
 
