@@ -1,9 +1,9 @@
 """Range images of one person to a body cloud and a closed mesh.
 
-Read in this order: scan (what comes of all of it; `workflows.fuse_range_images` says how), cleaning
-(what is not the subject goes), merging (smoothing, with quadratics and robust_windows; thinning;
-evidence; brightness; averaging), pose_variance (what the rig adds to each point's sigma), regions and
-roughness (skin, hair, cloth), meshing (signed_distances, hole_filling with harmonic_filling and
-free_space, support with point_columns; surface_check), scan_verdict (is it good: contradictions, seams,
-proportions, floor), storage, scan_facts.
+Read in this order: scan (what it gives), cleaning (what is not the subject goes), merging (smoothing,
+with quadratics and robust_windows; thinning; evidence; brightness; averaging), pose_variance (what
+the rig adds to each point's sigma), regions and roughness (skin, hair, cloth), meshing
+(signed_distances, hole_filling with harmonic_filling and free_space, support with point_columns;
+surface_check), scan_verdict (is it good: contradictions, seams, proportions, floor), storage,
+scan_facts.
 """
