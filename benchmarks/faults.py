@@ -25,12 +25,12 @@ from bodyscan.arrays import Array
 from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BodyscanError
 from bodyscan.evaluation.body import compare_girths, true_girths
-from bodyscan.fusion.scan import fuse
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import FusionSettings, MeshSettings, ScanSettings
+from bodyscan.workflows.fuse_range_images import fuse
 from bodyscan.workflows.range_images import reconstruct_range_images
 
 FOLDER = PROJECT / "bench" / "faults"

@@ -15,13 +15,13 @@ from bodyscan.arrays import Array, Mask
 from bodyscan.evaluation.body import WHOLE, true_girths
 from bodyscan.evaluation.comparison import fit_to_surface
 from bodyscan.evaluation.surface import normalized_errors, signed_distances
-from bodyscan.fusion.scan import fuse
 from bodyscan.geometry.robust import rms
 from bodyscan.measurement.measurements import Measurements, measure
 from bodyscan.outcome import Outcome
 from bodyscan.progress import THREADS
 from bodyscan.settings import ScanSettings
 from bodyscan.simulation.living import LivingBody
+from bodyscan.workflows.fuse_range_images import fuse
 
 WOMAN, MAN = "woman_average", "man_average"
 THREE, FOUR = "three-pole-12", "four-pole-16"

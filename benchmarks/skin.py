@@ -22,7 +22,7 @@ from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.captures.folder import open_scan
 from bodyscan.evaluation.body import sway_residual
 from bodyscan.evaluation.surface import signed_distances
-from bodyscan.fusion.scan import Scan, fuse
+from bodyscan.fusion.scan import Scan
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.robust import rms, spread
 from bodyscan.geometry.transforms import RigidTransform
@@ -32,6 +32,7 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
 from bodyscan.simulation.clothing import grows_hair, wears_shorts
 from bodyscan.workflows.evaluate import Truth, load_truth
+from bodyscan.workflows.fuse_range_images import fuse
 from bodyscan.workflows.range_images import reconstruct_range_images
 
 FOLDER = PROJECT / "bench" / "skin"

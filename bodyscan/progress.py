@@ -48,6 +48,11 @@ def threaded(
     return results
 
 
+def parts(count: int) -> list[slice]:
+    """So many things shared out, one part a thread."""
+    return [slice(k * count // THREADS, (k + 1) * count // THREADS) for k in range(THREADS)]
+
+
 def attempt_each(
     work: Callable[[Item], Result],
     items: Iterable[Item],

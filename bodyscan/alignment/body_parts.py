@@ -9,6 +9,7 @@ import numpy as np
 from bodyscan.alignment.breath import breathing
 from bodyscan.alignment.following import Followed
 from bodyscan.alignment.part_names import PARTS, name_parts
+from bodyscan.geometry.robust import rms
 
 MOST = 95.0
 ONE_WAY = 0.6  # this share of a breath's displacements goes outwards together
@@ -119,7 +120,7 @@ def tell_parts(followed: Followed) -> tuple[PartMotion, ...]:
             PartMotion(
                 name,
                 float(np.percentile(moved.max(axis=0), MOST)),
-                float(np.sqrt(np.mean(followed.sigma_mm[here] ** 2))),
+                rms(followed.sigma_mm[here]),
                 float(np.mean(seen.sum(axis=0) == 1)),
             )
         )
@@ -157,4 +158,4 @@ def tell_fullness(followed: Followed) -> tuple[float, float] | None:
     normals = followed.cells.normals[breathes]
     way = np.sum(followed.breath.field[breathes, :3] * normals, axis=1)
     # What is uncertain is the course of the breath, which is common to all of the front.
-    return -float(np.mean(way)), float(np.sqrt(np.mean(followed.breath.sigma_mm[breathes] ** 2)))
+    return -float(np.mean(way)), rms(followed.breath.sigma_mm[breathes])

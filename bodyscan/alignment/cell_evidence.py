@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.alignment.matching import Matches
-from bodyscan.alignment.overlap_equations import LEAST_SPREAD_MM
+from bodyscan.alignment.overlap_equations import match_weights
 from bodyscan.arrays import Array, Indices
 from bodyscan.compiled import compiled
-from bodyscan.geometry.robust import spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +41,7 @@ class CellEvidence:
             number,
             (matches.points - centres[cell], matches.normals),
             distances,
-            matches.sigma_mm,
-            spread(distances, LEAST_SPREAD_MM),
+            match_weights(matches),
             (information, gradient),
         )
         information += np.swapaxes(np.tril(information, -1), 1, 2)
@@ -82,8 +80,7 @@ def _accumulate(
     cell: Indices,
     places: tuple[Array, Array],
     distances: Array,
-    sigma_mm: Array,
-    spread_mm: float,
+    weights: Array,
     equations: tuple[Array, Array],
 ) -> None:
     """Add M distances to the lower triangles and gradients of their cells.
@@ -98,10 +95,8 @@ def _accumulate(
             jacobian[k] = normals[n, k]
             for axis in range(3):
                 jacobian[3 + 3 * axis + k] = off[n, axis] * normals[n, k]
-        variance = sigma_mm[n] ** 2 + spread_mm**2
-        weight = 1.0 / (variance + 0.25 * distances[n] ** 2)
         for i in range(12):
-            weighted = weight * jacobian[i]
+            weighted = weights[n] * jacobian[i]
             gradient[cell[n], i] += weighted * distances[n]
             for j in range(i + 1):
                 information[cell[n], i, j] += weighted * jacobian[j]

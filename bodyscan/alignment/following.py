@@ -28,7 +28,9 @@ from bodyscan.alignment.place_evidence import PlaceEvidence
 from bodyscan.alignment.sway_prior import BODY_CENTRE, SwayPrior, centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyMesh, BreathAt
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
@@ -95,6 +97,15 @@ class Followed:
     moment_ms: float | None
     breath: MeanBreath | None = None
 
+    def breathing(self, surface: BodyMesh) -> BodyMesh:
+        """With the way to mean breath, where it is known."""
+        if self.breath is None:
+            return surface
+        way, sigma = self.breath.along(
+            self.cells, surface.vertices, surface.normals.astype(np.float64)
+        )
+        return replace(surface, breath=BreathAt(way.astype(np.float32), sigma.astype(np.float32)))
+
 
 @dataclass(frozen=True, eq=False)
 class _View:
@@ -151,40 +162,27 @@ def follow(
                 images,
             )
         )
-        both = [(aligned.rig_from_camera[n], v.points) for n, v in zip(names, views, strict=True)]
-        cells, cell = BodyCells.of(
-            np.concatenate([place.apply(cloud.points) for place, cloud in both]),
-            np.concatenate([place.rotate(cloud.normals) for place, cloud in both]),
-        )
-        ends = np.cumsum([len(cloud.points) for _, cloud in both])[:-1]
-        views = [view.among(own) for view, own in zip(views, np.split(cell, ends), strict=True)]
+        there = [aligned.rig_from_camera[name] for name in names]
+        views, cells = _in_cells(views, there)
         seen = np.array(
             [np.bincount(view.cell, minlength=len(cells.centres)) > 0 for view in views]
         )
         usual = np.repeat([np.radians(settings.sway_deg), settings.sway_mm], 3)
         boards = SwayPrior(0.0, 0.0, 0.0, 0.0).covariance(names, prior)
-        motion = BodyMotion.start(cells, seconds, boards, usual)
-        asks = partial(CellEvidence.of, centres=cells.centres, correlated=settings.correlated)
+        start = BodyMotion.start(cells, seconds, boards, usual)
         speeds = {
             k: CellSpeeds.of(image.velocity.seen, place, cells)
-            for k, (image, (place, _)) in enumerate(zip(images, both, strict=True))
+            for k, (image, place) in enumerate(zip(images, there, strict=True))
             if image.velocity is not None and image.time_ms is not None
         }
-        coarse, reach = [view.some(COARSE) for view in views], settings.reach_mm
-        for left in range(ROUNDS, 0, -1):
-            taken = coarse if left > 1 else views
-            said = _each_overlap(asks, pool, taken, (motion, cells), reach, settings)
-            if not said:
-                return aligned, None, None
-            motion = motion.solved(_both_ways(said), speeds)
-            reach = max(reach / 2.0, settings.least_reach_mm)
-            if (
-                left == ROUNDS - 1
-                and _is_unbent(motion, seen)
-                and _is_unswayed(motion, seen, settings)
-            ):
-                return aligned, None, _places(names, motion, seconds)
-        gaps = _each_overlap(_gap, pool, coarse, (motion, cells), reach, settings)
+        solved = _solve(pool, views, (start, cells), seen, speeds, settings)
+        if solved is None:
+            return aligned, None, None
+        motion = solved.motion
+        if solved.still:
+            return aligned, None, _places(names, motion, seconds)
+        coarse = [view.some(COARSE) for view in views]
+        gaps = _each_overlap(_gap, pool, coarse, (motion, cells), solved.reach_mm, settings)
     placed, places = _placed(aligned, names, views, motion, gaps), _places(names, motion, seconds)
     if placed.rms_after_mm > NEARER * aligned.rms_after_mm and _is_unswayed(motion, seen, settings):
         return aligned, None, places
@@ -198,6 +196,54 @@ def follow(
         _mean_breath(motion, cells) if _middle_ms(images) is not None else None,
     )
     return placed, followed, places
+
+
+def _in_cells(
+    views: Sequence[_View], rig_from_camera: Sequence[RigidTransform]
+) -> tuple[list[_View], BodyCells]:
+    """The cells of the body that the views show, aligned; and these with the cell of each point."""
+    both = [(place, view.points) for place, view in zip(rig_from_camera, views, strict=True)]
+    cells, cell = BodyCells.of(
+        np.concatenate([place.apply(cloud.points) for place, cloud in both]),
+        np.concatenate([place.rotate(cloud.normals) for place, cloud in both]),
+    )
+    ends = np.cumsum([len(cloud.points) for _, cloud in both])[:-1]
+    split = np.split(cell, ends)
+    return [view.among(own) for view, own in zip(views, split, strict=True)], cells
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """A motion, the reach that its last matches had halved, and whether it is none to be taken out."""
+
+    motion: BodyMotion
+    reach_mm: float
+    still: bool = False
+
+
+def _solve(
+    pool: ThreadPoolExecutor,
+    views: Sequence[_View],
+    person: tuple[BodyMotion, BodyCells],
+    seen: Mask,
+    speeds: Mapping[int, CellSpeeds],
+    settings: AlignmentSettings,
+) -> _Solved | None:
+    """In each round matches anew, and the motion that explains them; None where nothing overlaps.
+    person: as it starts."""
+    motion, cells = person
+    asks = partial(CellEvidence.of, centres=cells.centres, correlated=settings.correlated)
+    coarse, reach = [view.some(COARSE) for view in views], settings.reach_mm
+    for left in range(ROUNDS, 0, -1):
+        taken = coarse if left > 1 else views
+        said = _each_overlap(asks, pool, taken, (motion, cells), reach, settings)
+        if not said:
+            return None
+        motion = motion.solved(_both_ways(said), speeds)
+        reach = max(reach / 2.0, settings.least_reach_mm)
+        if left == ROUNDS - 1 and _is_unbent(motion, seen) and _is_unswayed(motion, seen, settings):
+            return _Solved(motion, reach, still=True)
+    return _Solved(motion, reach)
 
 
 def _places(
@@ -276,12 +322,11 @@ def _is_unswayed(motion: BodyMotion, seen: Mask, settings: AlignmentSettings) ->
 
 def _far(motion: BodyMotion, names: Sequence[str], seen: Mask) -> float:
     """RMS displacement by those kinds, mm."""
-    moved = motion.displacements(names, from_middle=True)[seen][:, :3]
-    return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+    return rms_length(motion.displacements(names, from_middle=True)[seen][:, :3])
 
 
 def _gap(matches: Matches, cell: Indices) -> float:
-    return float(np.sqrt(np.mean(matches.distances**2)))
+    return rms(matches.distances)
 
 
 def _placed(

@@ -28,6 +28,7 @@ from bodyscan.alignment.overlaps import (
 from bodyscan.alignment.sway_prior import SwayPrior, bound_motions, centre_shifts
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.progress import THREADS
 from bodyscan.reconstruction.range_image import RangeImage
@@ -187,7 +188,7 @@ def _largest_group(overlaps: Iterable[tuple[int, int]]) -> set[int]:
 def _gap(matches: Matches) -> tuple[int, float, float]:
     """Number of matches, their RMS distance, and its expected value by their sigmas, mm."""
     apart, sigma = matches.distances, matches.sigma_mm
-    return len(apart), float(np.sqrt(np.mean(apart**2))), float(np.sqrt(np.mean(sigma**2)))
+    return len(apart), rms(apart), rms(sigma)
 
 
 def _pool_rms(parts: Sequence[tuple[int, float]]) -> float:

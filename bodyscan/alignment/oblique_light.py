@@ -136,6 +136,17 @@ class _Shared:
     gradient: Array
 
 
+def light_lines(
+    images: Sequence[RangeImage], sheets: Mapping[str, LightSheets]
+) -> dict[str, LightLine] | None:
+    """Of each pair; None where one has no sheets of light, or points are of stripes of both
+    directions, which oblique light moves each their own way."""
+    seen = [image.pair for image in images]
+    found = {name: LightLine.of(sheets[name]) for name in seen if name in sheets}
+    lines = {name: line for name, line in found.items() if line is not None}
+    return None if len(lines) < len(images) or any(one.agreement for one in images) else lines
+
+
 def take_out(
     images: Sequence[RangeImage],
     rig_from_camera: Mapping[str, RigidTransform],

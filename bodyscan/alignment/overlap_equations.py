@@ -38,9 +38,17 @@ class OverlapEquations:
         """
         information, gradient = np.zeros((6, 6)), np.zeros(6)
         distances = matches.distances
-        spots = (matches.points, matches.normals, distances, matches.sigma_mm)
-        _accumulate(*spots, spread(distances, LEAST_SPREAD_MM), information, gradient)
+        spots = (matches.points, matches.normals, distances)
+        _accumulate(*spots, match_weights(matches), information, gradient)
         return OverlapEquations(information / correlated, gradient / correlated)
+
+
+def match_weights(matches: Matches) -> Array:
+    """(M,) Cauchy's weights, 1 / (1 + (d / 2 sigma)^2), over sigma^2, which holds what the distances
+    spread by besides."""
+    spread_mm = spread(matches.distances, LEAST_SPREAD_MM)
+    variance = matches.sigma_mm**2 + spread_mm * spread_mm
+    return 1.0 / (variance + 0.25 * matches.distances**2)
 
 
 def solve_motions(
@@ -70,8 +78,7 @@ def _accumulate(
     points: Array,
     normals: Array,
     distances: Array,
-    sigma_mm: Array,
-    spread_mm: float,
+    weights: Array,
     information: Array,
     gradient: Array,
 ) -> None:
@@ -82,11 +89,8 @@ def _accumulate(
         a, b, c = normals[n, 0], normals[n, 1], normals[n, 2]
         jacobian[0], jacobian[1], jacobian[2] = y * c - z * b, z * a - x * c, x * b - y * a
         jacobian[3], jacobian[4], jacobian[5] = a, b, c
-        variance = sigma_mm[n] ** 2 + spread_mm**2
-        # Cauchy's weight, 1 / (1 + (d / 2 sigma)^2), over sigma^2.
-        weight = 1.0 / (variance + 0.25 * distances[n] ** 2)
         for i in range(6):
-            weighted = weight * jacobian[i]
+            weighted = weights[n] * jacobian[i]
             gradient[i] += weighted * distances[n]
             for j in range(6):
                 information[i, j] += weighted * jacobian[j]

@@ -13,6 +13,7 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance, position_sigma
+from bodyscan.geometry.robust import rms
 from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.settings import BODY_CENTRE_MM, AlignmentSettings
@@ -45,7 +46,7 @@ class SwayPrior:
         """
         if not self.shift_mm:
             return 1.0
-        found = float(np.sqrt(np.mean(centre_shifts(motion) ** 2))) / self.shift_mm
+        found = rms(centre_shifts(motion)) / self.shift_mm
         return float(np.clip(SWAY_ROOM * found, self.least, self.most))
 
     def covariance(self, names: Sequence[str], boards: PoseCovariance, scale: float = 1.0) -> Array:
@@ -56,16 +57,12 @@ class SwayPrior:
         """Covariance of one pair's sway, rig frame, (6, 6)."""
         rotation, translation = scale * np.radians(self.rotation_deg), scale * self.shift_mm
         own = np.diag([max(rotation, 1e-7) ** 2] * 3 + [max(translation, 1e-4) ** 2] * 3)
-        carry = adjoint(RigidTransform(np.eye(3), BODY_CENTRE))
+        carry = adjoint(RigidTransform.shift(BODY_CENTRE))
         return np.asarray(carry @ own @ carry.T)
 
     def loosen(self, boards: PoseCovariance, untied: Collection[str]) -> PoseCovariance:
         """The calibration's covariance plus the sway of the pairs that no overlap ties."""
-        matrix, own = boards.matrix.copy(), self.of_one()
-        for name in untied:
-            here = slice(6 * boards.names.index(name), 6 * boards.names.index(name) + 6)
-            matrix[here, here] += own
-        return PoseCovariance(boards.names, matrix)
+        return boards.plus(untied, self.of_one())
 
 
 def centre_shifts(motion: Array) -> Array:

@@ -102,7 +102,7 @@ def place_tags(board: Board, tags: Markers, border_bits: int = 2) -> PlacedTags 
 def _refine(image: Bytes, board: Board, placed: PlacedTags) -> tuple[Array, Mask]:
     """Refine all corners of the grid at the places that the tags predict; then those not found, at
     the places that the corners found predict."""
-    printed = board_layout.corner_points(board.model_copy(update={"faces": 1}))[:, :2]
+    printed = board_layout.printed_corners(board)
     reach = _clear_of_edges(board, placed.border_bits) / WINDOW_SQUARES
     bright_diagonal = _bright_diagonal(board, len(printed))
     pixels, good = np.zeros_like(printed), np.zeros(len(printed), bool)

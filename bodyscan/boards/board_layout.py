@@ -44,6 +44,11 @@ def corner_points(board: Board) -> Array:
     return np.concatenate([points_from_print(board, printed, face) for face in range(board.faces)])
 
 
+def printed_corners(board: Board) -> Array:
+    """(N, 2) mm on the print of one face, x along the columns."""
+    return corner_points(board.model_copy(update={"faces": 1}))[:, :2]
+
+
 def _lines(board: Board, count: int) -> Array:
     """Positions of corners along one side of `count` squares or tags, mm."""
     if board.kind != "aprilgrid":
@@ -59,21 +64,7 @@ def points_from_print(board: Board, printed: Array, face: int) -> Array:
     x, y = printed[..., 0], printed[..., 1]
     if face == 0:
         return np.stack([x, y, np.zeros_like(x)], axis=-1)
-    return np.stack(
-        [board.columns * board.square_mm - x, y, np.full_like(x, board.thickness_mm)], axis=-1
-    )
-
-
-def outline(board: Board, face: int = 0) -> Array:
-    """The face's outline, margin included, (4, 3) mm in the board frame.
-
-    Clockwise for whoever looks at that face, starting at its first square.
-    """
-    low = -board.margin_mm
-    right = board.columns * board.square_mm + board.margin_mm
-    bottom = board.rows * board.square_mm + board.margin_mm
-    printed = np.array([[low, low], [right, low], [right, bottom], [low, bottom]])
-    return points_from_print(board, printed, face)
+    return np.stack([board.size_mm[0] - x, y, np.full_like(x, board.thickness_mm)], axis=-1)
 
 
 def marker_dictionary(board: Board) -> cv2.aruco.Dictionary:

@@ -185,7 +185,7 @@ def _refine(
 ) -> tuple[Array, Mask]:
     """Refine corners where the markers predict them; then those not found where the corners found,
     which are more accurate than markers, predict them."""
-    points = board_layout.corner_points(board.model_copy(update={"faces": 1}))[corner_ids, :2]
+    points = board_layout.printed_corners(board)[corner_ids]
     gap = (1.0 - (board.marker_mm or 0.0) / board.square_mm) / 2.0
     marked = np.floor(markers[0].mean(axis=0) / board.square_mm).astype(int).sum()
     row, column = np.divmod(corner_ids, board.columns - 1)

@@ -67,7 +67,7 @@ def _refined(image: Bytes, board: Board, candidate: Array) -> SightedCorners | N
     Detectors are sometimes off by a pixel or two; corners not found where they say are looked for
     where the corners found predict them. None unless most are found and form this board.
     """
-    printed = board_layout.corner_points(board.model_copy(update={"faces": 1}))[:, :2]
+    printed = board_layout.printed_corners(board)
     row, column = np.divmod(np.arange(len(printed)), board.columns - 1)
     pixels, first_is_black = _numbered_as_printed(image, board, candidate, printed)
     bright_diagonal = ((row + column) % 2 == 0) != first_is_black

@@ -51,6 +51,11 @@ class BoardFace:
         return np.asarray(np.polynomial.polynomial.polyval2d(x, y, self.coefficients))
 
 
+def rounded(points: Array) -> Array:
+    """Corners (..., 3) mm as they are told apart, without a -0."""
+    return np.round(points, DIGITS) + 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class BoardForm:
     """The form of a board as unknowns.
@@ -71,7 +76,7 @@ class BoardForm:
     @staticmethod
     def flat(points: Array, flatness_mm: float, print_mm: float) -> BoardForm:
         """A board as described; points (M, 3) are the corners of any views given."""
-        known = np.unique(np.round(points, DIGITS) + 0.0, axis=0)
+        known = np.unique(rounded(points), axis=0)
         return BoardForm(
             known, np.zeros(len(POWERS)), np.zeros((len(known), 2)), flatness_mm, print_mm
         )
@@ -122,8 +127,7 @@ class BoardForm:
     def numbers(self, points: Array) -> Indices:
         """Indices (M,) of corners (M, 3) in `points`."""
         place = {key: k for k, key in enumerate(map(tuple, self.points.tolist()))}
-        rounded = np.round(points, DIGITS) + 0.0
-        return np.array([place[key] for key in map(tuple, rounded.tolist())], np.int64)
+        return np.array([place[key] for key in map(tuple, rounded(points).tolist())], np.int64)
 
     def applied(self, points: Array, numbers: Indices) -> Array:
         """Where corners (M, 3) lie that are described as `points`."""

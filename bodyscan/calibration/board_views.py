@@ -88,7 +88,7 @@ def board_symmetries(board: Board) -> tuple[RigidTransform, ...]:
     A plain board may be numbered from its other end, unless the colour of its first square shows
     which end it is, or seen from its back.
     """
-    width, height = board.columns * board.square_mm, board.rows * board.square_mm
+    width, height = board.size_mm
     found = [RigidTransform.identity()]
     if (board.columns + board.rows) % 2 == 0:
         found.append(RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.array([width, height, 0.0])))

@@ -22,6 +22,7 @@ from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightPlanes, LightSheets
 from bodyscan.geometry.projector_sheets import projector_of_sheets
+from bodyscan.geometry.robust import rms
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 
@@ -255,7 +256,7 @@ def _judged(found: FittedProjector, both: Sequence[_Samples]) -> FittedProjector
     """The projector with its misfit. Raises BadInput if noise does not explain it."""
     off = np.concatenate([_off(found.camera, found.projector_from_camera, own) for own in both])
     sigma = np.concatenate([own.sigma for own in both])
-    sigmas = float(np.sqrt(np.mean((off / sigma) ** 2)))
+    sigmas = rms(off / sigma)
     predicted = float(np.sqrt(len(sigma) / np.sum(sigma**-2.0)))
     misfit = predicted * sigmas
     if not sigmas < LIKELY:

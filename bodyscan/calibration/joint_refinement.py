@@ -349,7 +349,7 @@ def _on_board(state: _State[Sheets], k: int, board: StripedBoard, rays: Array) -
 
 
 def _face(board: StripedBoard) -> RigidTransform:
-    return RigidTransform(np.eye(3), np.array([0.0, 0.0, board.view.points[0, 2]]))
+    return RigidTransform.shift([0.0, 0.0, board.view.points[0, 2]])
 
 
 def _sigma(board: StripedBoard, points: Array, across: Array, by_point: Array) -> Array:

@@ -11,7 +11,7 @@ from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.calibration.boundary_points import BoundaryPoints, select
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain
 from bodyscan.geometry.light_planes import LightSheets
-from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, spread
+from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN, rms, spread
 
 MOST_FOLDS = 6
 CAP = 30.0
@@ -174,7 +174,7 @@ def select_model(
         if not (candidates[i].whole and np.isfinite(medians[i])):
             continue
         rich, simple = (
-            without_motion(_capped(tried[k].distances[known], cap), effects[known], board[known])
+            without_motion(capped(tried[k].distances[known], cap), effects[known], board[known])
             for k in (i, chosen)
         )
         better_by = gain(Compared(simple[:, None], rich[:, None], part[known]))
@@ -183,7 +183,7 @@ def select_model(
     figures = tuple(
         HeldOutModel(
             candidate.name,
-            _mean_of_boards(np.abs(_capped(errors.distances, cap)), board, seen[i]),
+            _mean_of_boards(np.abs(capped(errors.distances, cap)), board, seen[i]),
             medians[i],
             _rms(np.abs(errors.distances)),
             float(np.isfinite(errors.distances).mean()),
@@ -217,7 +217,7 @@ def without_motion(distances: Array, effects: Array, board: Indices) -> Array:
     return left
 
 
-def _capped(distances: Array, cap: float) -> Array:
+def capped(distances: Array, cap: float) -> Array:
     """Clip distances; points that were not measured count as far off."""
     return np.asarray(np.clip(np.nan_to_num(distances, nan=cap), -cap, cap), np.float64)
 
@@ -235,4 +235,4 @@ def _median(distances: Array) -> float:
 def _rms(distances: Array) -> float:
     limit = OUTLIER * _median(distances)
     kept = distances[distances <= limit]
-    return float(np.sqrt(np.mean(kept**2))) if kept.size else np.inf
+    return rms(kept) if kept.size else np.inf

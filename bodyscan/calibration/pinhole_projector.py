@@ -35,10 +35,7 @@ class PinholeProjector:
     def planes(self, stripes: int, direction: Axis) -> LightPlanes:
         """The same model as light planes, which share one line, through the projector's centre."""
         s = np.arange(stripes + 1.0)[:, None]
-        planes = self.matrix[0] - s * self.matrix[1]
-        planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
-        planes *= np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
-        return LightPlanes(planes, np.full((stripes + 1, 4, 4), np.nan), direction)
+        return LightPlanes.exact(self.matrix[0] - s * self.matrix[1], direction)
 
 
 def fit_pinhole(points: Array, s: Array) -> PinholeProjector:

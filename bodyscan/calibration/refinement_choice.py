@@ -24,6 +24,7 @@ from bodyscan.calibration.joint_refinement import (
 from bodyscan.calibration.model_selection import (
     CAP,
     MOST_FOLDS,
+    capped,
     parts_of_boards,
     without_motion,
 )
@@ -192,8 +193,9 @@ def _hold_out(
                 stripes[way][data.board == k] = off
     effects = data.board_errors.effects
     cap = CAP * min(float(np.nanmedian(np.abs(values))) for values in stripes)
-    capped = (np.clip(np.nan_to_num(values, nan=cap), -cap, cap) for values in stripes)
-    still = [without_motion(values, effects, data.board)[:, None] for values in capped]
+    still = [
+        without_motion(capped(values, cap), effects, data.board)[:, None] for values in stripes
+    ]
     return [_HeldOut(s, np.concatenate(c)) for s, c in zip(still, corners, strict=True)]
 
 

@@ -80,7 +80,7 @@ class StripedView:
     def camera_from_face(self) -> RigidTransform:
         """Transform from the face that was seen; its corners lie at z = 0, or near it if bent."""
         z_mm = self.face.z_mm if self.face else self.view.points[0, 2]
-        return self.view.camera_from_board @ RigidTransform(np.eye(3), np.array([0.0, 0.0, z_mm]))
+        return self.view.camera_from_board @ RigidTransform.shift([0.0, 0.0, z_mm])
 
 
 def boundaries_near(stripes: StripeMap, box: Box, crop: Crop = WHOLE) -> BoardBoundaries:
@@ -216,7 +216,7 @@ def on_print(
     # A homography relates a ray to where it meets the board's plane: x ~ [r1 r2 t] (X, Y, 1).
     plane = np.column_stack([place.rotation[:, :2], place.translation])
     rim = RIM_SQUARES * board.square_mm
-    area = np.array([board.columns * board.square_mm, board.rows * board.square_mm]) - rim
+    area = np.array(board.size_mm) - rim
     inside = np.zeros(len(boundaries.index), np.bool_)
     pixels = np.ascontiguousarray(boundaries.pixels)
     _look_inside(ray_table(camera), np.linalg.inv(plane), np.append(area, rim), pixels, inside)

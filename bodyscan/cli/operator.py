@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from bodyscan.jobs.job import Job
     from bodyscan.jobs.object_storage import Store
     from bodyscan.jobs.stages import Stage
+    from bodyscan.jobs.supervision import Listen
 
 PANEL = "Operator: scan people"
 
@@ -299,28 +301,37 @@ def _run(
         resources, len(jobs), workers, allocation.cores(), allocation.free_memory_mb()
     )
     work = partial(object_storage.work_on_stored, store=store) if store else supervise_job
-    show = (
-        display.json_lines if output.json else display.silence if output.quiet else display.screen
-    )
+    with _listening(output, display.screen) as listen:
+        if cluster:
+            run = run_on_cluster(cluster, resources.threads, listen=listen, work=work)
+        else:
+            listen({"event": "shares", **asdict(shares)})
+            run = run_locally(shares, listen=listen, work=work)
+        outcomes = run_batch(jobs, out, run, listen)
+        if store:
+            object_storage.fetch_figures(jobs, store)
+        summary = finish(jobs, outcomes, out)
+        if store:
+            summary |= {"table": object_storage.put_summary(out, store)}
+        listen(summary)
+    output.exit_code = 1 if summary["set_aside"] or summary["repeat"] else 0
+
+
+@contextmanager
+def _listening(
+    output: Output, usual: Callable[[], AbstractContextManager[Listen]]
+) -> Iterator[Listen]:
+    """What shows how jobs go; the process ends at once when it is interrupted."""
+    from bodyscan.jobs import display
+
+    show = display.json_lines if output.json else display.silence if output.quiet else usual
     try:
         with show() as listen:
-            if cluster:
-                run = run_on_cluster(cluster, resources.threads, listen=listen, work=work)
-            else:
-                listen({"event": "shares", **asdict(shares)})
-                run = run_locally(shares, listen=listen, work=work)
-            outcomes = run_batch(jobs, out, run, listen)
-            if store:
-                object_storage.fetch_figures(jobs, store)
-            summary = finish(jobs, outcomes, out)
-            if store:
-                summary |= {"table": object_storage.put_summary(out, store)}
-            listen(summary)
+            yield listen
     except KeyboardInterrupt:
         sys.stdout.flush()
         typer.secho("stopped; run the same command again to go on", err=True)
         os._exit(130)  # the jobs' processes end with this one
-    output.exit_code = 1 if summary["set_aside"] or summary["repeat"] else 0
 
 
 def watch(
@@ -364,14 +375,8 @@ def watch(
         else apply_settings(Pipeline(name="watch", kind="fuse"), changes or (), BadInput)
     )
     watched = Watched(inbox, out, calibration, settings, quiet_s)
-    show = display.json_lines if output.json else display.silence if output.quiet else display.lines
-    try:
-        with show() as listen:
-            summary = watch_inbox(watched, listen, once=once)
-    except KeyboardInterrupt:
-        sys.stdout.flush()
-        typer.secho("stopped; run the same command again to go on", err=True)
-        os._exit(130)
+    with _listening(output, display.lines) as listen:
+        summary = watch_inbox(watched, listen, once=once)
     output.exit_code = 1 if summary["set_aside"] or summary["repeat"] else 0
 
 

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from bodyscan.fusion.scan import Scan
 from bodyscan.geometry.pose_covariance import position_sigma
-from bodyscan.mesh.regions import covered_shares, shares
+from bodyscan.mesh.regions import covered_shares
 from bodyscan.registration.rig_calibration import RigCalibration
 
 
@@ -123,6 +123,6 @@ def scan_figures(scan: Scan) -> dict[str, Any]:
         "faces": len(scan.mesh.faces),
         "sigma_mm": float(np.nanmedian(scan.cloud.sigma_mm)),
         "filled_share": scan.mesh.filled_share,
-        "regions": None if scan.cloud.regions is None else shares(scan.cloud.regions),
+        "regions": scan.cloud.region_shares,
         "sway_mm": scan.alignment.motion_mm if scan.alignment else None,
     }

@@ -19,6 +19,7 @@ from bodyscan.errors import FailedWork
 from bodyscan.evaluation.planes import best_plane
 from bodyscan.evaluation.sphere_search import find_spheres
 from bodyscan.evaluation.spheres import Sphere, fit_sphere
+from bodyscan.geometry.robust import rms
 
 REJECTED = 0.003
 """Share of the points, the farthest off, that may be left out, as VDI/VDE 2634 allows."""
@@ -132,9 +133,7 @@ def read_plate(points: Array, normals: Array) -> PlateReading:
         raise FailedWork("no plate is among the points")
     normal, offset = best_plane(kept)
     off = kept @ normal - offset
-    return PlateReading(
-        len(kept), float(np.ptp(_drop_farthest(off))), float(np.sqrt(np.mean(off**2))), area
-    )
+    return PlateReading(len(kept), float(np.ptp(_drop_farthest(off))), rms(off), area)
 
 
 def _drop_farthest(off: Array) -> Array:

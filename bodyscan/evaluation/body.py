@@ -12,6 +12,7 @@ import open3d as o3d
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.evaluation.surface import covered_spots, sample_surface
 from bodyscan.geometry.camera_fields import from_fields
+from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform, rigid_fit
 from bodyscan.measurement.measurements import Measurements, Slice, measure
 from bodyscan.mesh.body import BodyMesh
@@ -100,7 +101,7 @@ def compare_girths(mesh: BodyMesh, true: Measurements, *, mean_breath: bool = Fa
     sizes = np.abs(list(errors.values())) if errors else np.array([np.nan])
     return GirthErrors(
         len(errors),
-        float(np.sqrt(np.mean(sizes**2))),
+        rms(sizes),
         float(sizes.max()),
         list(errors)[int(np.argmax(sizes))] if errors else float("nan"),
         ours.stature_mm - true.stature_mm,

@@ -15,6 +15,7 @@ from scipy.spatial.distance import pdist
 from bodyscan.arrays import Array
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.least_squares import Block, Noise, minimize
+from bodyscan.geometry.robust import rms
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +109,7 @@ def centre_distances(measured: Array, true: Array) -> CentreDistances:
     """Compare centres (N, 3) as measured and as they are, each in any frame."""
     found, wanted = pdist(measured), pdist(true)
     scale = float(found @ wanted / (wanted @ wanted)) - 1.0
-    return CentreDistances(float(np.sqrt(np.mean((found - wanted) ** 2))), 1e6 * scale)
+    return CentreDistances(rms(found - wanted), 1e6 * scale)
 
 
 def _fit_algebraically(points: Array) -> Sphere:

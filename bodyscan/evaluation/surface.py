@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.geometry.robust import rms
 from bodyscan.mesh.scene import centred_scene
 from bodyscan.mesh.topology import directed_edges
 
@@ -90,7 +91,7 @@ def deviation(signed_mm: Array) -> Deviation:
         len(signed_mm),
         float(np.mean(signed_mm)),
         float(np.median(size)),
-        float(np.sqrt(np.mean(signed_mm**2))),
+        rms(signed_mm),
         float(np.percentile(size, 95)),
         float(size.max()),
     )

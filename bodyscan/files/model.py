@@ -89,6 +89,12 @@ def repeated_errors(refused: ValidationError) -> list[InitErrorDetails]:
     ]
 
 
+def first_fault(refused: ValidationError) -> str:
+    """Where the first of a model's errors is, and what."""
+    first = refused.errors(include_url=False)[0]
+    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+
+
 def duplicates(names: list[str | None] | tuple[str | None, ...]) -> Iterator[tuple[int, str]]:
     """Index and name of each name that occurred earlier in the list (None never counts)."""
     seen: set[str] = set()

@@ -8,13 +8,12 @@ query half.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.compiled import compiled
-from bodyscan.progress import THREADS, threaded
+from bodyscan.progress import parts, threaded
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,6 @@ class PointColumns:
         """
         distance = np.full((len(places), count), np.inf)
         near = np.full((len(places), count), len(self.points))
-        ends = np.linspace(0, len(places), THREADS + 1).astype(int)
 
         def find(part: slice) -> None:
             some = np.ascontiguousarray(places[part])
@@ -65,7 +63,7 @@ class PointColumns:
                 near[part],
             )
 
-        threaded(find, [slice(*pair) for pair in pairwise(ends)], stage="nearest points")
+        threaded(find, parts(len(places)), stage="nearest points")
         return distance, np.append(self.order, len(self.points))[near]
 
 

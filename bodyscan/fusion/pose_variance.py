@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,7 @@ from bodyscan.compiled import compiled
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
-from bodyscan.progress import THREADS
+from bodyscan.progress import parts, threaded
 
 FACING = 0.2
 """Cosine below which a pair sees a surface too flat to have measured it."""
@@ -34,14 +33,11 @@ def add_pose_variance(
     centres = np.array([placing.translation for placing in rig_from_camera.values()])
     covariances = np.array([prior.of(name) for name in rig_from_camera])
     placing_mm = np.empty(len(cloud.points))
-    ends = np.linspace(0, len(placing_mm), THREADS + 1).astype(int)
 
-    def fill(start: int, end: int) -> None:
-        part = slice(start, end)
+    def fill(part: slice) -> None:
         _placing(cloud.points[part], cloud.normals[part], centres, covariances, placing_mm[part])
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        list(pool.map(fill, ends[:-1], ends[1:]))
+    threaded(fill, parts(len(placing_mm)), stage="sigmas of places")
     return replace(cloud, sigma_mm=np.hypot(cloud.sigma_mm, placing_mm).astype(np.float32))
 
 

@@ -39,10 +39,7 @@ def fit_quadratics(inverse: Floats, noise: Floats, reach: int, pixel_mm: float) 
     reach: windows have 2 reach + 1 pixels a side, of `pixel_mm` on the surface.
     """
     valid = inverse > 0
-    closed, whole = close_holes(inverse, valid)
-    fit = fit_full_windows(closed, noise, reach)
-    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    fitted = valid & (cv2.erode(whole.astype(np.uint8), window, borderValue=0) > 0)
+    fit, fitted = fit_whole_windows(inverse, noise, reach)
     size = _size_of_noise(inverse, noise, fit, fitted)
     noise = noise * size
     np.multiply(fit.sigma, size, out=fit.sigma)
@@ -54,6 +51,7 @@ def fit_quadratics(inverse: Floats, noise: Floats, reach: int, pixel_mm: float) 
     fit_windows(padded, noise, cut, reach, pixel_mm, fits, fitted)
     squares, calm = np.empty_like(inverse), np.empty(inverse.shape, np.uint8)
     _square_misfits(inverse, noise, fit.value, fitted, squares, calm)
+    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     misfit = cv2.boxFilter(squares, -1, (5, 5), borderType=cv2.BORDER_CONSTANT)
     easy = (misfit < WORST_MISFIT) & (cv2.erode(calm, window, borderValue=1) > 0)
     easy.ravel()[cut] = True  # already fitted robustly
@@ -96,6 +94,16 @@ def _square_misfits(
                 squares[row, column] = off * off
                 small = abs(off) < OUTLIER_SIGMAS
                 calm[row, column] = small and fitted[row, column]
+
+
+def fit_whole_windows(inverse: Floats, noise: Floats, reach: int) -> tuple[Fit, Mask]:
+    """The fit without a look at edges, and the pixels around which there are none: all of the window
+    is measured, but for small holes."""
+    valid = inverse > 0
+    closed, whole = close_holes(inverse, valid)
+    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    inside = cv2.erode(whole.astype(np.uint8), window, borderValue=0) > 0
+    return fit_full_windows(closed, noise, reach), valid & inside
 
 
 def close_holes(inverse: Floats, valid: Mask) -> tuple[Floats, Mask]:

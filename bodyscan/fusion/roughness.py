@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from bodyscan.arrays import Array, Floats
-from bodyscan.fusion.quadratics import close_holes, fit_full_windows, window_basis
+from bodyscan.fusion.quadratics import fit_whole_windows, window_basis
 from bodyscan.fusion.smoothing import inverse_depths, pixel_size, window_reach
 from bodyscan.geometry.crop import Crop, ends_of
 from bodyscan.geometry.transforms import RigidTransform
@@ -37,12 +36,9 @@ def misfits(
     common = np.zeros_like(sigma_mm) if image.common_mm is None else image.common_mm[box]
     whole = (slice(0, sigma_mm.shape[0]), slice(0, sigma_mm.shape[1]))
     inverse, noise = inverse_depths(points, sigma_mm, common, ends_of(whole))
-    valid = inverse > 0
     reach = window_reach(pixel_size(inverse, image.camera), window_mm)
-    closed, there = close_holes(inverse, valid)
-    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    full = valid & (cv2.erode(there.astype(np.uint8), window, borderValue=0) > 0)
-    off = (inverse - fit_full_windows(closed, noise, reach).value)[full]
+    fit, full = fit_whole_windows(inverse, noise, reach)
+    off = (inverse - fit.value)[full]
     seen = points[full]
     # Along the ray a point moves by its length over z times dz, and dz is z squared times d(1/z).
     length = np.linalg.norm(seen, axis=1) * seen[:, 2]

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bodyscan.errors import ResultError
 from bodyscan.files.json_file import read_json_object
+from bodyscan.files.model import first_fault
 from bodyscan.verdict import Verdict
 
 SCHEMA = "bodyscan-scan"
@@ -118,6 +119,5 @@ def told_verdict(facts: dict[str, Any]) -> Verdict | None:
 
 def _reason(error: Exception) -> str:
     if isinstance(error, ValidationError):
-        first = error.errors(include_url=False)[0]
-        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        return first_fault(error)
     return str(error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -137,6 +138,15 @@ class ImageEvidence:
     floor_mm: float | None = None
 
 
+def silent_poles(
+    poles: Mapping[str, str], asked: Sequence[str], seeing: Sequence[str]
+) -> tuple[str, ...]:
+    """Poles of which no pair saw anybody. One pair alone may look over a child's head."""
+    count = Counter(poles[name] for name in asked if name in poles)
+    seen = {poles.get(name) for name in seeing}
+    return tuple(pole for pole, pairs in count.items() if pairs > 1 and pole not in seen)
+
+
 def grade_scan(
     cloud: BodyCloud,
     rig: RigEvidence,
@@ -196,6 +206,10 @@ def grade_scan(
             else _gaps(cloud, surface)
         ),
     }
+    return _worst_of(checks)
+
+
+def _worst_of(checks: Mapping[str, Callable[[], Iterable[Finding]]]) -> Verdict:
     findings: list[Finding] = []
     failures: list[str] = []
     for what, check in checks.items():

@@ -26,7 +26,6 @@ from bodyscan.fusion.scan_facts import (
 )
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
-from bodyscan.mesh.regions import shares
 from bodyscan.progress import threaded
 from bodyscan.verdict import Verdict
 from bodyscan.version import __version__
@@ -119,7 +118,7 @@ def save_scan(scan: Scan, folder: Path, origin: Origin) -> Path:
             },
             "stature_mm": _number(float(scan.mesh.vertices[:, 2].max())),
             "median_sigma_mm": _number(float(np.nanmedian(scan.cloud.sigma_mm))),
-            "regions": None if scan.cloud.regions is None else shares(scan.cloud.regions),
+            "regions": scan.cloud.region_shares,
             "verdict": asdict(scan.verdict),
             "measured": scan.measured,
             "failed": scan.failed,

@@ -13,7 +13,7 @@ import numpy as np
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.topology import face_areas
+from bodyscan.mesh.topology import face_normals
 from bodyscan.reconstruction.range_image import RangeImage
 
 SPOTS = 20_000
@@ -53,10 +53,10 @@ def check_surface(
 ) -> SurfaceCheck:
     """Compare the mesh with range images: cleaned, of all pairs that gave some."""
     some = slice(None, None, max(1, len(mesh.faces) // SPOTS))
-    corners = mesh.vertices[mesh.faces[some]]
-    places = corners.mean(axis=1)
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    places = mesh.vertices[mesh.faces[some]].mean(axis=1)
+    across = face_normals(mesh.vertices, mesh.faces[some])
+    doubled = np.linalg.norm(across, axis=1)
+    normals = across / np.maximum(doubled[:, None], 1e-12)
     looks = [_Look.at(places, normals, image, rig_from_camera[image.pair]) for image in images]
     count = np.sum([look.measured for look in looks], axis=0)
     yields, saturated = {}, {}
@@ -66,8 +66,7 @@ def check_surface(
         if np.count_nonzero(asked) >= FEWEST_SPOTS:
             yields[image.pair] = float(np.mean(look.shown[asked]))
             saturated[image.pair] = float(np.mean(look.white[asked]))
-    areas = face_areas(mesh.vertices, mesh.faces)[some]
-    return SurfaceCheck(places[:, 2], areas, count == 0, yields, saturated)
+    return SurfaceCheck(places[:, 2], 0.5 * doubled, count == 0, yields, saturated)
 
 
 @dataclass(frozen=True, eq=False)

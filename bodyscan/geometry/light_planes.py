@@ -51,6 +51,11 @@ class LightSheets(Protocol):
         ...
 
 
+def towards_camera(planes: Array) -> Array:
+    """Planes (..., 4) with the sign that makes d >= 0."""
+    return planes * np.where(planes[..., 3:] < 0.0, -1.0, 1.0)
+
+
 @dataclass(frozen=True, eq=False)
 class LightPlanes:
     """One plane per boundary, each independent of its neighbours.
@@ -64,6 +69,12 @@ class LightPlanes:
     coefficients: Array
     covariance: Array
     direction: Axis
+
+    @staticmethod
+    def exact(planes: Array, direction: Axis) -> LightPlanes:
+        """Of planes (S + 1, 4) of any length and sign; how well they are known is not told."""
+        unit = planes / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+        return LightPlanes(towards_camera(unit), np.full((len(planes), 4, 4), np.nan), direction)
 
     @property
     def kind(self) -> str:

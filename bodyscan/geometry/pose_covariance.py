@@ -31,6 +31,12 @@ class PoseCovariance:
         rows = self._rows(names)
         return self.matrix[np.ix_(rows, rows)]
 
+    def plus(self, names: Collection[str], own: Array) -> PoseCovariance:
+        """After each of these pairs made a motion of its own, of covariance (6, 6)."""
+        rows, matrix = self._rows(names), self.matrix.copy()
+        matrix[np.ix_(rows, rows)] += np.kron(np.eye(len(names)), own)
+        return PoseCovariance(self.names, matrix)
+
     def between(self, a: str, b: str) -> Array:
         """Covariance (6, 6) of the motion of b relative to a."""
         i, j = 6 * self.names.index(a), 6 * self.names.index(b)
@@ -49,7 +55,8 @@ class PoseCovariance:
         return PoseCovariance(self.names, matrix)
 
     def _rows(self, names: Collection[str]) -> Indices:
-        return np.concatenate([6 * self.names.index(name) + np.arange(6) for name in names])
+        first = np.array([6 * self.names.index(name) for name in names], int)
+        return (first[:, None] + np.arange(6)).ravel()
 
 
 def point_covariance(motion_covariance: Array, point: Array) -> Array:

@@ -55,10 +55,7 @@ def intersect_rays(sheets: LightSheets, rays: Array, s: Array) -> RayDepths:
 def stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
     """Change of s, at constant depth, from one pixel to the next across the stripes: median over a
     sample of the pixels that have an s (height, width); 0 if none has."""
-    wanted = np.flatnonzero(np.isfinite(s))
-    some = wanted[:: max(len(wanted) // SAMPLES, 1)]
-    rows, columns = np.unravel_index(some, s.shape)
-    pixels, own = np.column_stack([columns, rows]).astype(float), s.ravel()[some].astype(float)
+    pixels, own = _sampled(s, np.isfinite(s))
     here = intersect_rays(sheets, camera.rays(pixels), own)
     beside = [intersect_rays(sheets, camera.rays(pixels + step), own) for step in np.eye(2)]
     # Along its own sheet a neighbouring ray meets another depth: as if s had changed by this much
@@ -72,14 +69,20 @@ def stripes_per_pixel(sheets: LightSheets, camera: Camera, s: Floats) -> float:
 def stripes_apart(sheets: LightSheets, camera: Camera, s: Floats, points: Floats) -> float:
     """Distance in stripes between s (height, width) and the sheets through points (height, width,
     3): median over a sample of the pixels that have both; NaN if none has."""
-    wanted = np.flatnonzero(np.isfinite(s) & np.isfinite(points[..., 2]))
-    some = wanted[:: max(len(wanted) // SAMPLES, 1)]
-    rows, columns = np.unravel_index(some, s.shape)
-    rays = camera.rays(np.column_stack([columns, rows]).astype(float))
-    found = intersect_rays(sheets, rays, s.ravel()[some].astype(float))
+    pixels, own = _sampled(s, np.isfinite(s) & np.isfinite(points[..., 2]))
+    columns, rows = pixels.astype(np.int64).T
+    found = intersect_rays(sheets, camera.rays(pixels), own)
     off = np.abs((points[rows, columns, 2] - found.depth) / found.per_stripe)
     off = off[np.isfinite(off)]
     return float(np.median(off)) if off.size else np.nan
+
+
+def _sampled(s: Floats, wanted: Mask) -> tuple[Array, Array]:
+    """Some of the pixels wanted, (N, 2), and their s (N,)."""
+    every = np.flatnonzero(wanted)
+    some = every[:: max(len(every) // SAMPLES, 1)]
+    rows, columns = np.unravel_index(some, s.shape)
+    return np.column_stack([columns, rows]).astype(float), s.ravel()[some].astype(float)
 
 
 def triangulate_image(

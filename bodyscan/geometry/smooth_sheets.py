@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.geometry.light_planes import Axis
+from bodyscan.geometry.light_planes import Axis, towards_camera
 from bodyscan.geometry.transforms import RigidTransform
 
 Sheets = TypeVar("Sheets", bound="SmoothSheets")
@@ -136,7 +136,7 @@ class SmoothSheets(ABC):
         normals = self.offset(points, sheet).by_point
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         planes = np.concatenate([normals, -np.sum(normals * points, -1, keepdims=True)], axis=-1)
-        return planes * np.where(planes[..., 3:] < 0.0, -1.0, 1.0)
+        return towards_camera(planes)
 
     def with_covariance(self: Sheets, covariance: Array) -> Sheets:
         """The same sheets with another covariance (P, P)."""

@@ -28,6 +28,11 @@ class RigidTransform:
         return RigidTransform(np.eye(3), np.zeros(3))
 
     @staticmethod
+    def shift(translation: ArrayLike) -> RigidTransform:
+        """By (3,) mm, without a turn."""
+        return RigidTransform(np.eye(3), np.asarray(translation, float))
+
+    @staticmethod
     def from_rotation_vector(rotation_vector: ArrayLike, translation: ArrayLike) -> RigidTransform:
         """From axis times angle (3,), radians, and a translation (3,), mm."""
         rotation = cv2.Rodrigues(np.asarray(rotation_vector, float))[0]  # a tenth of scipy's time

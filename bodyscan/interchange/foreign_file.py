@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,6 +76,12 @@ class ForeignFile:
             where=self.where(word, after),
             remedy=remedy or f"give {SAME_UNIT}",
         )
+
+    def require(self, table: Mapping[str, Any], words: Iterable[str], key: str) -> None:
+        """Raises CalibrationFileError unless the table of that name has all of the words."""
+        for word in words:
+            if word not in table:
+                raise self.error(f"has no {word}", key, f"it has {', '.join(table)}")
 
     def numbers(self, value: Any, word: str, counts: Sequence[int], *, after: str = "") -> Array:
         """`value` as a flat array of one of these lengths; of any length if there are none."""

@@ -28,9 +28,7 @@ def read_toml(file: ForeignFile) -> dict[str, Any]:
 
 def camera_of_table(file: ForeignFile, table: dict[str, Any], key: str) -> FoundCamera:
     """The camera in a table; key: the table's own, as written in the file."""
-    for word in ("size", "matrix", "distortions"):
-        if word not in table:
-            raise file.error(f"has no {word}", key, f"it has {', '.join(table)}")
+    file.require(table, ("size", "matrix", "distortions"), key)
     if table.get("fisheye", False):
         raise file.error(
             "is OpenCV's fisheye lens, which there is not here", "fisheye",

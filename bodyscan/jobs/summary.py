@@ -74,9 +74,7 @@ def write_out_manifest(out: Path) -> None:
 
 def to_repeat(jobs: Sequence[Job]) -> list[str]:
     """Names of the jobs whose scan was fused but has the verdict `repeat`."""
-    verdicts = {
-        job.name: read_record(job.folder / "scan" / "scan.json").get("verdict") for job in jobs
-    }
+    verdicts = {job.name: _facts(job).get("verdict") for job in jobs}
     return [name for name, verdict in verdicts.items() if verdict and verdict["grade"] == "repeat"]
 
 
@@ -96,7 +94,7 @@ def odd_stature(jobs: Sequence[Job]) -> float | None:
     wrong size. None if it is usual, or there are too few people."""
     statures: dict[str, list[float]] = {}
     for job in jobs:
-        facts = read_record(job.folder / "scan" / "scan.json")
+        facts = _facts(job)
         graded = (facts.get("verdict") or {}).get("grade")
         if facts.get("stature_mm") and graded != "repeat":
             statures.setdefault(job.subject or job.name, []).append(facts["stature_mm"])
@@ -117,7 +115,7 @@ def _row(job: Job, outcome: JobResult) -> dict[str, Any]:
         return row
     if job.pipeline.kind == "calibrate":
         return row | _rig_figures(read_record(job.folder / "calibration" / "calibration.json"))
-    return row | _scan_figures(read_record(job.folder / "scan" / "scan.json"))
+    return row | _scan_figures(_facts(job))
 
 
 def _scan_figures(facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -185,10 +183,15 @@ def _add_drift(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> None:
         rows[number].update(drift_mm=_round(drift[pair]), drift_pair=pair)
 
 
+def _facts(job: Job) -> dict[str, Any]:
+    """Of its scan; empty where there is none."""
+    return read_record(job.folder / "scan" / "scan.json")
+
+
 def _motions(job: Job) -> Motions:
     """Motion (3,) mm of every pair at the body's centre, from
     the calibration's pose to this scan's."""
-    alignment = read_record(job.folder / "scan" / "scan.json").get("alignment")
+    alignment = _facts(job).get("alignment")
     if not alignment or job.calibration is None:
         return {}
     calibrated = read_record(job.calibration / "calibration.json").get("pairs", {})

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Floats, Indices, Mask
-from bodyscan.mesh.regions import UNSURE, of_faces, regions_at
+from bodyscan.mesh.regions import UNSURE, of_faces, regions_at, shares
 from bodyscan.mesh.topology import drop_unused_vertices, face_areas
 
 
@@ -31,6 +31,11 @@ class BodyCloud:
     colours: Bytes
     pairs_seen: Bytes
     regions: Bytes | None = None
+
+    @property
+    def region_shares(self) -> dict[str, float] | None:
+        """Of the points, how many are of each region."""
+        return None if self.regions is None else shares(self.regions)
 
     def every(self, step: int) -> BodyCloud:
         """Every step-th point."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.topology import face_areas, face_components
+from bodyscan.mesh.topology import face_areas, face_components, face_normals
 
 WAYS = {
     "front": (1.0, 0.0, 0.0),
@@ -39,8 +39,7 @@ def holes(mesh: BodyMesh) -> list[Hole]:
     patch = np.unique(face_components(filled, len(mesh.vertices)), return_inverse=True)[1].ravel()
     count = int(patch.max()) + 1
     area = face_areas(mesh.vertices, filled)
-    corners = mesh.vertices[filled]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    corners, normal = mesh.vertices[filled], face_normals(mesh.vertices, filled)
     total = np.bincount(patch, area, count)
     middle = _sums(patch, corners.mean(axis=1) * area[:, None], count) / total[:, None]
     facing = np.argmax(_sums(patch, normal, count) @ np.array(list(WAYS.values())).T, axis=1)

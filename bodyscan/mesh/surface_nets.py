@@ -38,7 +38,7 @@ def surface_nets(bricks: Bricks, values: Floats) -> tuple[Array, Indices]:
     parts, counts = sheets_of_cases()
     cases, first, total = _number_vertices(bricks.table, bricks.places, values, counts)
     vertices = _place_vertices(bricks.table, bricks.places, values, cases, first, parts, total)
-    faces = _join(bricks.table, bricks.places, values, cases, first, parts, vertices)
+    faces = _join(bricks.table, bricks.places, cases, first, parts, vertices)
     return bricks.origin + bricks.cell_mm * vertices, faces
 
 
@@ -199,7 +199,6 @@ def _place_vertices(
 def _join(
     table: Numbers,
     places: Numbers,
-    values: Floats,
     cases: NDArray[np.uint8],
     first: Numbers,
     parts: NDArray[np.int8],
@@ -208,7 +207,7 @@ def _join(
     """Faces (F, 3): two for each edge that crosses zero, split along the shorter diagonal."""
     faces, count = np.empty((6 * len(vertices) + 64, 3), np.int64), 0
     corners, cell = np.empty(4, np.int64), np.empty(3, np.int64)
-    for brick in range(len(values)):
+    for brick in range(len(places)):
         for number in range(SIDE**3):
             i, j, k = number // SIDE**2, number // SIDE % SIDE, number % SIDE
             case = cases[brick, i, j, k]

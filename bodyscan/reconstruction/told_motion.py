@@ -239,7 +239,7 @@ def _velocity(fit: FieldFit, teeth: _Teeth, seen: SurfaceSpeeds, share: float) -
 
     What all windows share is a motion along the middle's ray. share: relative error of the speed.
     """
-    about_camera = adjoint(RigidTransform(np.eye(3), teeth.middle))
+    about_camera = adjoint(RigidTransform.shift(teeth.middle))
     shared = np.append(np.zeros(3), teeth.common * teeth.middle / teeth.middle[2])
     twist = about_camera @ fit.twist
     off = share * np.repeat([np.linalg.norm(part) for part in np.split(fit.twist, 2)], 3)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.board_form import BoardFace
+from bodyscan.calibration.board_form import BoardFace, rounded
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain
 from bodyscan.geometry.robust import rms_length
@@ -34,7 +34,6 @@ SUSPECT = 1.25
 """Offsets are examined if they lower the squared residuals by this many variances each: noise alone
 lowers them by one, and with 48 corners or more by 1.25 once in 700 times."""
 FEWEST_TARGETS = 6
-DIGITS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +183,7 @@ def _flat(views: Sequence[LocatedView]) -> dict[str, BoardShape]:
     """Flat shapes of all corners that any view shows, by board."""
     boards = sorted({view.board for view in views})
     seen = (np.concatenate([v.points for v in views if v.board == name]) for name in boards)
-    nominal = (np.unique(np.round(points, DIGITS) + 0.0, axis=0) for points in seen)
+    nominal = (np.unique(rounded(points), axis=0) for points in seen)
     return {n: BoardShape(p, np.zeros_like(p)) for n, p in zip(boards, nominal, strict=True)}
 
 
@@ -320,4 +319,4 @@ def _median(residuals: Array) -> float:
 
 
 def _keys(points: Array) -> list[tuple[float, ...]]:
-    return [tuple(point) for point in (np.round(points, DIGITS) + 0.0).tolist()]
+    return [tuple(point) for point in rounded(points).tolist()]

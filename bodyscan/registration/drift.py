@@ -205,12 +205,10 @@ class _State:
         rig_from_camera: Mapping[str, RigidTransform],
         prior: PoseCovariance,
     ) -> _State:
-        order = np.concatenate(
-            [np.zeros(0, int), *(6 * prior.names.index(name) + np.arange(6) for name in pairs)]
-        )
-        covariance = prior.matrix[np.ix_(order, order)]
         # The pair that fixes the rig frame has zero covariance: give it a micron.
-        covariance = covariance + np.diag(np.tile([1e-6**2] * 3 + [1e-3**2] * 3, len(pairs)))
+        covariance = prior.among(pairs) + np.diag(
+            np.tile([1e-6**2] * 3 + [1e-3**2] * 3, len(pairs))
+        )
         boards = {
             target: _agreed([p for p in poses if p.target == target], rig_from_camera)
             for target in sorted({pose.target for pose in poses})

@@ -6,7 +6,6 @@ corners' noise; together they must fit one.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -19,7 +18,7 @@ from bodyscan.geometry.least_squares import Block, Noise, minimize
 from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.joint_solve import JointSolution
-from bodyscan.registration.view_graph import Target
+from bodyscan.registration.view_graph import by_target
 
 TIMES_OWN = 6.0
 LEAST_BAD_PX = 0.2
@@ -83,12 +82,9 @@ def find_inconsistent_views(
     views: Sequence[LocatedView], solution: JointSolution, limit_px: float
 ) -> InconsistentViews:
     """Find the wrong views among those of each board at each moment."""
-    groups: dict[Target, list[LocatedView]] = defaultdict(list)
-    for view in views:
-        groups[view.target].append(view)
     found = [
         _examine_board(group, solution, limit_px)
-        for _, group in sorted(groups.items())
+        for group in by_target(views).values()
         if max(_error(view, solution, _placing(group, solution)) for view in group) > limit_px
     ]
     sizes = tuple(size for one in found for size in one.sizes)

@@ -131,26 +131,21 @@ def normal_equations(
         strict=True,
     )
     spread = CORNERS.spread_of(np.concatenate(residuals))
-    number_of = {name: number for number, name in enumerate(names)}
-    parts = []
-    for number, target in enumerate(targets):
+
+    def of_target(number: int, target: Target) -> OfTarget:
         seen = [k for k, view in enumerate(views) if view.target == target]
         board = first_board + 6 * number + np.arange(6)
-        pairs = [number_of[views[k].pair] for k in seen]
-        mine = [np.concatenate([6 * n + np.arange(6), board, camera_columns[n]]) for n in pairs]
-        parts.append(
-            _of_target(
-                [residuals[k] for k in seen],
-                [linearized[k]() for k in seen],
-                mine,
-                board,
-                spread,
-            )
+        pairs = [names.index(views[k].pair) for k in seen]
+        return _of_target(
+            [residuals[k] for k in seen],
+            [linearized[k]() for k in seen],
+            [np.concatenate([6 * n + np.arange(6), board, camera_columns[n]]) for n in pairs],
+            board,
+            spread,
         )
-    normal, gradient = np.zeros((size, size)), np.zeros(size)
-    for part in parts:
-        normal[np.ix_(part.columns, part.columns)] += part.matrix
-        gradient[part.columns] += part.gradient
+
+    parts = [of_target(number, target) for number, target in enumerate(targets)]
+    normal, gradient = _total(parts, size)
     everything = np.concatenate(residuals)
     weights = CORNERS.weights(everything / spread)
     held = _held(names, targets, first_board, fixed_pair, fixed_target)
@@ -163,6 +158,15 @@ def normal_equations(
     return NormalEquations(
         names, tuple(targets), parameters, normal, gradient, held, variance, tuple(parts)
     )
+
+
+def _total(parts: Sequence[OfTarget], size: int) -> tuple[Array, Array]:
+    """Normal matrix (size, size) and gradient (size,)."""
+    normal, gradient = np.zeros((size, size)), np.zeros(size)
+    for part in parts:
+        normal[np.ix_(part.columns, part.columns)] += part.matrix
+        gradient[part.columns] += part.gradient
+    return normal, gradient
 
 
 def _of_target(

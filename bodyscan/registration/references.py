@@ -38,6 +38,10 @@ class Size:
     factor: float = 1.0
     sigma: float = 0.0
 
+    @property
+    def words(self) -> str:
+        return f"by its references the rig is {self.factor:.3f} times as large as square_mm says"
+
 
 @dataclass(frozen=True)
 class _Reading:
@@ -88,10 +92,7 @@ def find_size(rig: Rig, placed: RigSolution, views: Sequence[BoardView]) -> Outc
     size = Size(float(weights @ factors / weights.sum()), float(weights.sum() ** -0.5))
     _refuse(rig, found, size)
     if abs(size.factor - 1.0) > OTHER_SIZE:
-        notes.append(
-            f"by its references the rig is {size.factor:.3f} times as large as square_mm says, more "
-            "than prints are off: is square_mm right, and length_mm?"
-        )
+        notes.append(f"{size.words}, more than prints are off: is square_mm right, and length_mm?")
     notes.append(f"size by references: {_words(size)}; every length is as uncertain")
     return Outcome(size, tuple(notes))
 
@@ -122,7 +123,7 @@ def _words(size: Size) -> str:
 def _refuse(rig: Rig, found: dict[str, Size], size: Size) -> None:
     if abs(size.factor - 1.0) > REFUSED_SIZE:
         raise FailedWork(
-            f"by its references the rig is {size.factor:.3f} times as large as square_mm says",
+            size.words,
             where=f"rig {rig.name}",
             remedy="correct square_mm of the boards, or length_mm of the references",
         )
@@ -226,7 +227,7 @@ class _Middle:
     def of(board: Board, ids: Indices, points: Array) -> _Middle:
         own = corner_points(board)[ids]
         rig_from_board = rigid_fit(own, points)
-        width, height = board.columns * board.square_mm, board.rows * board.square_mm
+        width, height = board.size_mm
         middle, spread = np.array([0.5 * width, 0.5 * height, 0.0]), own - own.mean(axis=0)
         lever = np.linalg.norm(middle - own.mean(axis=0)) / np.sqrt(np.mean(spread**2) * 3.0)
         left = rig_from_board.apply(own) - points

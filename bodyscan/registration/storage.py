@@ -21,6 +21,7 @@ from bodyscan.errors import CalibrationFileError
 from bodyscan.files.atomic import json_text, write_bytes, write_json, write_npz
 from bodyscan.files.hashing import content_hash, file_hash
 from bodyscan.files.json_file import read_json_object
+from bodyscan.files.model import first_fault
 from bodyscan.files.npz_file import read_npz
 from bodyscan.files.regular import read_regular
 from bodyscan.geometry.camera_fields import from_fields, to_fields
@@ -206,8 +207,7 @@ def _refuse_changed(content: dict[str, Any], file: Path, arrays_file: Path) -> N
 
 def _reason(error: Exception) -> str:
     if isinstance(error, ValidationError):
-        first = error.errors(include_url=False)[0]
-        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        return first_fault(error)
     if isinstance(error, KeyError):
         return f"{error.args[0]} is missing"
     return str(error)

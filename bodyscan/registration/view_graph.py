@@ -72,7 +72,7 @@ def view_graph(views: Iterable[LocatedView], pairs: Sequence[str]) -> nx.Graph:
     """Nodes: pairs.  Edges: pairs that saw a board at the same moment; attribute `targets`."""
     graph = nx.Graph()
     graph.add_nodes_from(pairs)
-    for target, group in _by_target(views).items():
+    for target, group in by_target(views).items():
         for a, b in combinations(sorted({view.pair for view in group}), 2):
             if not graph.has_edge(a, b):
                 graph.add_edge(a, b, targets=[])
@@ -92,7 +92,7 @@ def initial_poses(
     of which no two agree.
     """
     _refuse_disconnected(view_graph(views, pairs))
-    targets, reach = _by_target(views), _usual_distance(views)
+    targets, reach = by_target(views), _usual_distance(views)
     groups: list[Group] = [{name: RigidTransform.identity()} for name in pairs]
     ties: dict[tuple[int, int], RelativePose | None] = {}
     while len(groups) > 1:
@@ -151,7 +151,7 @@ def place_boards(
     boards: dict[Target, RigidTransform] = {}
     doubtful: set[Target] = set()
     reach = _usual_distance(views)
-    for target, group in _by_target(views).items():
+    for target, group in by_target(views).items():
         placing = _agreed_placing(group, root_from_camera, reach)
         boards[target] = placing
         for view in group:
@@ -202,7 +202,8 @@ def _usual_distance(views: Sequence[LocatedView]) -> float:
     return float(np.median(distances)) if distances else 1.0
 
 
-def _by_target(views: Iterable[LocatedView]) -> dict[Target, list[LocatedView]]:
+def by_target(views: Iterable[LocatedView]) -> dict[Target, list[LocatedView]]:
+    """In the targets' order."""
     groups: dict[Target, list[LocatedView]] = defaultdict(list)
     for view in views:
         groups[view.target].append(view)

@@ -33,7 +33,22 @@ def screen_table(found: Sequence[Figure], synthetic: bool) -> ScreenTable:
 def acceptance_page(
     found: Sequence[Figure], readings: Readings, rig: str, calibration_id: str, synthetic: bool
 ) -> Page:
-    numbers = Numbers(
+    return Page(
+        f"Acceptance of rig {rig}",
+        grade_acceptance(found, readings),
+        synthetic,
+        (("calibration", calibration_id[:12]),),
+        [
+            Section("Figures", [_numbers(found)], NO_STANDARD),
+            Section("Spheres, all pairs merged", [_spheres(readings), _spacings(readings)]),
+            Section("Plate", [_plates(readings)]),
+            Section("Problems", [Lines(readings.problems or ("None.",))]),
+        ],
+    )
+
+
+def _numbers(found: Sequence[Figure]) -> Numbers:
+    return Numbers(
         tuple(
             Number(
                 one.title,
@@ -45,7 +60,10 @@ def acceptance_page(
             for one in found
         )
     )
-    spheres = Table(
+
+
+def _spheres(readings: Readings) -> Table:
+    return Table(
         (
             Column("place, shot, sphere"),
             Column("by"),
@@ -60,11 +78,17 @@ def acceptance_page(
             if r.view == ALL
         ),
     )
-    spacings = Table(
+
+
+def _spacings(readings: Readings) -> Table:
+    return Table(
         (Column("place, shot"), Column("spheres"), Column("spacing error", "mm")),
         tuple((f"{r.place}, {r.shot}", r.between, r.error_mm) for r in readings.spacings),
     )
-    plates = Table(
+
+
+def _plates(readings: Readings) -> Table:
+    return Table(
         (
             Column("place, shot"),
             Column("by"),
@@ -77,16 +101,4 @@ def acceptance_page(
             (f"{r.place}, {r.shot}", r.view, r.points, r.flatness_mm, r.rms_mm, r.measured_percent)
             for r in readings.plates
         ),
-    )
-    return Page(
-        f"Acceptance of rig {rig}",
-        grade_acceptance(found, readings),
-        synthetic,
-        (("calibration", calibration_id[:12]),),
-        [
-            Section("Figures", [numbers], NO_STANDARD),
-            Section("Spheres, all pairs merged", [spheres, spacings]),
-            Section("Plate", [plates]),
-            Section("Problems", [Lines(readings.problems or ("None.",))]),
-        ],
     )

@@ -37,6 +37,56 @@ NOT_STORED = (
     "This calibration was made before corners were kept with it: calibrate again to see where the "
     "boards lay in each picture and how far their corners are off."
 )
+PAIR_COLUMNS = (
+    Column("pair"),
+    Column(
+        "corners",
+        "px RMS",
+        "distance of the boards' corners from where camera and pose put them.",
+        limits.CORNERS_RMS_PX,
+    ),
+    Column("poses", "", "views of a board that were used.", limits.POSES, True, 0),
+    Column(
+        "covered",
+        "% of picture",
+        "by the boards' corners together; beyond, the lens is a guess.",
+        limits.COVERED_PERCENT,
+        True,
+        0,
+    ),
+    Column(
+        "sheets",
+        "mm RMS",
+        "distance of stripe boundaries on the boards from their sheet of light.",
+        limits.SHEETS_RMS_MM,
+    ),
+    Column(
+        "held out",
+        "mm mean",
+        "distance of measured points from boards that the light was not fitted to; outliers "
+        "capped.",
+        limits.HELD_OUT_MM,
+    ),
+    Column("striped", "", "boards on which stripes were decoded.", limits.STRIPE_SHOTS, True, 0),
+    Column(
+        "stripes",
+        "% known",
+        "boundaries between stripes that have a sheet, of those projected; the others fell "
+        "beyond the boards.",
+        limits.STRIPES_PERCENT,
+        True,
+        0,
+    ),
+    Column(
+        "sigma",
+        "mm",
+        "of the camera's place in the rig frame, all axes together, from the covariance of the "
+        "joint solve.",
+        limits.SIGMA_MM,
+    ),
+    Column("light", "", "model of the light sheets, chosen by held-out boards."),
+    Column("lens", "", "chosen by held-out boards, or named in the rig file; see below."),
+)
 
 
 def calibration_page(folder: Path) -> Page:
@@ -86,58 +136,6 @@ def _rig(calibration: RigCalibration) -> Section:
 
 
 def _pairs(figures: list[PairFigures], calibration: RigCalibration) -> Section:
-    columns = (
-        Column("pair"),
-        Column(
-            "corners",
-            "px RMS",
-            "distance of the boards' corners from where camera and pose put them.",
-            limits.CORNERS_RMS_PX,
-        ),
-        Column("poses", "", "views of a board that were used.", limits.POSES, True, 0),
-        Column(
-            "covered",
-            "% of picture",
-            "by the boards' corners together; beyond, the lens is a guess.",
-            limits.COVERED_PERCENT,
-            True,
-            0,
-        ),
-        Column(
-            "sheets",
-            "mm RMS",
-            "distance of stripe boundaries on the boards from their sheet of light.",
-            limits.SHEETS_RMS_MM,
-        ),
-        Column(
-            "held out",
-            "mm mean",
-            "distance of measured points from boards that the light was not fitted to; outliers "
-            "capped.",
-            limits.HELD_OUT_MM,
-        ),
-        Column(
-            "striped", "", "boards on which stripes were decoded.", limits.STRIPE_SHOTS, True, 0
-        ),
-        Column(
-            "stripes",
-            "% known",
-            "boundaries between stripes that have a sheet, of those projected; the others fell "
-            "beyond the boards.",
-            limits.STRIPES_PERCENT,
-            True,
-            0,
-        ),
-        Column(
-            "sigma",
-            "mm",
-            "of the camera's place in the rig frame, all axes together, from the covariance of the "
-            "joint solve.",
-            limits.SIGMA_MM,
-        ),
-        Column("light", "", "model of the light sheets, chosen by held-out boards."),
-        Column("lens", "", "chosen by held-out boards, or named in the rig file; see below."),
-    )
     rows = tuple(
         (
             *astuple(one),
@@ -146,7 +144,7 @@ def _pairs(figures: list[PairFigures], calibration: RigCalibration) -> Section:
         )
         for one in figures
     )
-    return Section("Pairs", [Table(columns, rows), Lines(tuple(_lens_lines(calibration)))])
+    return Section("Pairs", [Table(PAIR_COLUMNS, rows), Lines(tuple(_lens_lines(calibration)))])
 
 
 def _lens_lines(calibration: RigCalibration) -> Iterator[str]:

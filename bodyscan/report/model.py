@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -82,7 +82,7 @@ def pack(
     packed: dict[str, Any] = {
         "low": low.tolist(),
         "step": step,
-        "layers": [],
+        "layers": [{"name": "", "colours": "", "legend": None, "unlit": False}],
         "lines": None,
         "faces": None,
         "labels": [[text, *map(float, np.round(at, 1))] for text, at in labels],
@@ -100,15 +100,8 @@ def pack(
             "normals": encode(normals.astype(np.int8)),
             "faces": encode(shape.faces.astype("<u2")),
         }
-    packed["layers"] = [
-        {
-            "name": layer.name,
-            "colours": encode(layer.colours),
-            "legend": layer.legend,
-            "unlit": layer.unlit,
-        }
-        for layer in layers
-    ] or [{"name": "", "colours": "", "legend": None, "unlit": False}]
+    if layers:
+        packed["layers"] = [asdict(layer) | {"colours": encode(layer.colours)} for layer in layers]
     if strokes is not None:
         packed["lines"] = {
             "positions": whole(strokes.ends.reshape(-1, 3)),

@@ -102,7 +102,7 @@ def _strokes(calibration: RigCalibration) -> Strokes:
         parts.append((np.concatenate([sides, _close(far)]), _rgb(colours[name])))
     for (_, board_name), rig_from_board in calibration.rig_from_board.items():
         board = calibration.rig.board(board_name)
-        x, y = board.columns * board.square_mm, board.rows * board.square_mm
+        x, y = board.size_mm
         outline = np.array([[0.0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]])
         parts.append((_close(rig_from_board.apply(outline)), np.array(BOARD, np.uint8)))
     volume = calibration.rig.volume

@@ -68,6 +68,11 @@ class Board(Model):
     flatness_mm: Annotated[float, Field(ge=0)] | None = None
 
     @property
+    def size_mm(self) -> tuple[float, float]:
+        """Of the checkered area, along its columns and along its rows."""
+        return self.columns * self.square_mm, self.rows * self.square_mm
+
+    @property
     def believed_flatness_mm(self) -> float:
         """Standard deviation, before any image, of the height difference between the board's lowest
         and highest corners: `flatness_mm`, or FLATNESS times its diagonal."""

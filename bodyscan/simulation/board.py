@@ -107,7 +107,7 @@ class MadeBoard:
 
 def make_board(board: Board, making: BoardMaking, rng: np.random.Generator) -> MadeBoard:
     """The board of the rig file, with errors of manufacture."""
-    width, height = board.columns * board.square_mm, board.rows * board.square_mm
+    width, height = board.size_mm
     surfaces, corners = [], []
     sheet = _draw_sheet(making, rng)
     for face in range(board.faces):

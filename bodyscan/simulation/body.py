@@ -11,7 +11,7 @@ from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.simulation.clothing import dress
+from bodyscan.simulation.clothing import dress, waves_through
 from bodyscan.simulation.scene import Surface
 from bodyscan.simulation.settings import Person, Skin
 
@@ -49,11 +49,7 @@ def load_subject(
 
 def skin(vertices: Array, person: Person, rng: np.random.Generator) -> Array:
     """Albedo (N,) at vertices (N, 3): a sum of waves 60 to 400 mm long."""
-    waves = np.zeros(len(vertices))
-    for length in np.geomspace(60.0, 400.0, 8):
-        way = rng.standard_normal(3)
-        phase = vertices @ (way / np.linalg.norm(way)) * (2.0 * np.pi / length)
-        waves += np.cos(phase + rng.uniform(0.0, 2.0 * np.pi))
+    waves = waves_through(vertices, 60.0, 400.0, rng)
     return person.skin * (1.0 + person.skin_variation * waves / 4.0)
 
 

@@ -43,14 +43,21 @@ def dress(bare: Surface, skin: Skin, rng: np.random.Generator) -> Surface:
     return replace(bare, vertices=vertices, albedo=albedo, skin=lets_in if has_effect else None)
 
 
-def _mottles(vertices: Array, rng: np.random.Generator) -> Array:
-    """Waves (N,) 8 to 40 mm long, standard deviation 1."""
+def waves_through(
+    vertices: Array, shortest_mm: float, longest_mm: float, rng: np.random.Generator
+) -> Array:
+    """(N,) at vertices (N, 3): eight waves in random directions, standard deviation 2."""
     waves = np.zeros(len(vertices))
-    for length in np.geomspace(8.0, 40.0, 8):
+    for length in np.geomspace(shortest_mm, longest_mm, 8):
         way = rng.standard_normal(3)
         phase = vertices @ (way / np.linalg.norm(way)) * (2.0 * np.pi / length)
         waves += np.cos(phase + rng.uniform(0.0, 2.0 * np.pi))
-    return waves / 2.0
+    return waves
+
+
+def _mottles(vertices: Array, rng: np.random.Generator) -> Array:
+    """(N,) waves 8 to 40 mm long, standard deviation 1."""
+    return waves_through(vertices, 8.0, 40.0, rng) / 2.0
 
 
 def grows_hair(vertices: Array) -> Mask:

@@ -250,23 +250,7 @@ def render_task(
     fixed: of the camera's sensor.
     empty: the room as `see_empty` saw it, for pairs that take more than one shot.
     """
-    camera_from_rig = pair.rig_from_camera.inverse()
-    camera_from_surfaces = camera_from_rig @ task.rig_from_surfaces
-    around = _around(pair, room)
-
-    def scene_with(surfaces: Sequence[Surface]) -> Scene:
-        return Scene([*(surface.moved(camera_from_surfaces) for surface in surfaces), *around])
-
-    def scene_at(frame: str) -> Scene:
-        # What an instrument takes for itself has no times: it is quick.
-        assert task.body is not None
-        taken = task.frames_ms.get(frame)
-        return scene if taken is None else scene_with((task.body.surface(taken),))
-
-    scene, moving = scene_with(task.surfaces), None
-    if task.body is not None:
-        reach = _reach(task.body, list(task.frames_ms.values()))
-        moving = Moving(len(task.surfaces), scene_at, reach)
+    scene, moving = _scenes(pair, room, task)
     light = settings.lighting
     code = rig.pair(pair.name).projector
     taken = settings.pace.order or rig.frames.of_sequence(code)
@@ -301,6 +285,28 @@ def render_task(
     for frame, image in exposed.items():
         name = fill(rig.files, shot=task.shot, pair=pair.name, frame=frame)
         files.write_image(out / task.folder / name, image)
+
+
+def _scenes(pair: TruePair, room: Sequence[Surface], task: Task) -> tuple[Scene, Moving | None]:
+    """What stands there, in the camera's frame, and how it moves from frame to frame if it does."""
+    camera_from_surfaces = pair.rig_from_camera.inverse() @ task.rig_from_surfaces
+    around, living = _around(pair, room), task.body
+
+    def scene_with(surfaces: Sequence[Surface]) -> Scene:
+        return Scene([*(surface.moved(camera_from_surfaces) for surface in surfaces), *around])
+
+    scene = scene_with(task.surfaces)
+    if living is None:
+        return scene, None
+
+    def scene_at(frame: str) -> Scene:
+        # What an instrument takes for itself has no times: it is quick.
+        taken = task.frames_ms.get(frame)
+        return scene if taken is None else scene_with((living.surface(taken),))
+
+    return scene, Moving(
+        len(task.surfaces), scene_at, _reach(living, list(task.frames_ms.values()))
+    )
 
 
 def see_empty(

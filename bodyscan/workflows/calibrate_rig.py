@@ -101,40 +101,16 @@ def join_rig(
     folder: Path = HERE,
 ) -> JoinedRig:
     """From boards found in images to the calibration, without its optional parts."""
-    cameras = calibrate_cameras(rig, boards.value, progress, folder=folder)
     searched = len(captures.sequences) - len(boards.refused)
-    failures = cameras.failures
-    if searched and not boards.value:
-        # More poses of a board that differs from its description would not help.
-        failures = {name: reason.partition("\n")[0] for name, reason in failures.items()}
-    cameras = replace(cameras, failures=boards.blamed_on_images(failures, captures))
-    if not cameras.value:
-        raise _nothing_calibrated(rig, cameras.failures, _seen_instead(rig, boards, searched))
-    located = locate_views(rig, solving_views(rig, boards.value), cameras.value)
-    # Reading images takes one core and not the interpreter's lock; the other solves, and fits pair
-    # after pair. Fits are many small steps: two at once hand the lock to and fro 70,000 times a
-    # second, which costs more than it gains (12 pairs: 26 s instead of 19).
-    with ThreadPoolExecutor(1) as beside:
-        solving = beside.submit(_solve, rig, boards.value, located, cameras)
-        fits: dict[str, Future[Outcome[PairCalibration]]] = {}
-
-        def fit(name: str, boundaries: Mapping[ViewKey, BoardBoundaries]) -> None:
-            fits[name] = beside.submit(_fit_sheets, solving, cameras.value, name, boundaries)
-
-        decoded = _decode(
-            rig, captures, boards.value, cameras.value, solving, located.value, fit, progress
-        )
-        with step(progress, "joining the pairs"):
-            solved = solving.result()
-        rig, placed = solved.rig, solved.joined.value
-        for name in placed.rig_from_camera:
-            if name not in fits:  # none of its images had to be decoded
-                fit(name, decoded.value)
-        fitted = _fitted(
-            fits, sorted(set(placed.rig_from_camera) - set(decoded.failures)), progress
-        )
-    lost = {**cameras.failures, **decoded.failures, **solved.joined.failures}
-    failed = lost | dict(fitted.failures)
+    cameras = _cameras(rig, captures, boards, searched, progress, folder)
+    solved, decoded, fitted = _solve_and_fit(rig, captures, boards.value, cameras, progress)
+    rig, placed = solved.rig, solved.joined.value
+    failed = {
+        **cameras.failures,
+        **decoded.failures,
+        **solved.joined.failures,
+        **fitted.failures,
+    }
     pairs = fitted.value
     if not pairs:
         raise _nothing_calibrated(rig, failed)
@@ -160,6 +136,61 @@ def join_rig(
             "Leave out the shots in doubt",
         )
     return JoinedRig(calibration, placed, boards.value, searched)
+
+
+def _cameras(
+    rig: Rig,
+    captures: Captures,
+    boards: FoundBoards,
+    searched: int,
+    progress: Progress,
+    folder: Path,
+) -> Outcome[dict[str, CameraCalibration]]:
+    """Calibrate each camera by itself. Raises FailedWork if none can be.
+
+    searched: number of sequences in which boards were looked for.
+    """
+    cameras = calibrate_cameras(rig, boards.value, progress, folder=folder)
+    failures = cameras.failures
+    if searched and not boards.value:
+        # More poses of a board that is not as described would not help.
+        failures = {name: reason.partition("\n")[0] for name, reason in failures.items()}
+    cameras = replace(cameras, failures=boards.blamed_on_images(failures, captures))
+    if not cameras.value:
+        raise _nothing_calibrated(rig, cameras.failures, _seen_instead(rig, boards, searched))
+    return cameras
+
+
+def _solve_and_fit(
+    rig: Rig,
+    captures: Captures,
+    boards: list[BoardView],
+    cameras: Outcome[dict[str, CameraCalibration]],
+    progress: Progress,
+) -> tuple[_Solved, Outcome[dict[ViewKey, BoardBoundaries]], Outcome[dict[str, PairCalibration]]]:
+    """The joint solve, stripes on the boards, and light sheets of the pairs that were joined."""
+    located = locate_views(rig, solving_views(rig, boards), cameras.value)
+    # Reading images takes one core and not the interpreter's lock; the other solves, and fits pair
+    # after pair. Fits are many small steps: two at once hand the lock to and fro 70,000 times a
+    # second, which costs more than it gains (12 pairs: 26 s instead of 19).
+    with ThreadPoolExecutor(1) as beside:
+        solving = beside.submit(_solve, rig, boards, located, cameras)
+        fits: dict[str, Future[Outcome[PairCalibration]]] = {}
+
+        def fit(name: str, boundaries: Mapping[ViewKey, BoardBoundaries]) -> None:
+            fits[name] = beside.submit(_fit_sheets, solving, cameras.value, name, boundaries)
+
+        decoded = _decode(
+            rig, captures, boards, cameras.value, solving, located.value, fit, progress
+        )
+        with step(progress, "joining the pairs"):
+            solved = solving.result()
+        joined = solved.joined.value.rig_from_camera
+        for name in joined:
+            if name not in fits:  # none of its images had to be decoded
+                fit(name, decoded.value)
+        fitted = _fitted(fits, sorted(set(joined) - set(decoded.failures)), progress)
+    return solved, decoded, fitted
 
 
 def _seen_instead(rig: Rig, boards: FoundBoards, searched: int) -> str:

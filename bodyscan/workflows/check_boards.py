@@ -129,8 +129,7 @@ def repaired(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibrati
     """
     placing, covariance = dict(calibration.rig_from_camera), calibration.covariance
     for move in moves:
-        for pair in move.pairs:
-            placing[pair] = move.motion @ placing[pair]
+        placing |= {pair: move.motion @ placing[pair] for pair in move.pairs}
         covariance = covariance.moved_together(move.pairs, move.covariance)
     said = tuple(f"repaired: {move_line(move)}" for move in moves)
     return replace(

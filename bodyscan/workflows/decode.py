@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from threading import Lock
 from types import MappingProxyType
@@ -103,6 +103,16 @@ def _no_use(_pair: str, _found: Mapping[ViewKey, BoardBoundaries]) -> None:
     """A `Through` that does nothing."""
 
 
+@dataclass(frozen=True, eq=False)
+class _OnBoards:
+    """What one sequence gave: boundaries near each view, what the projector's response moved, and why
+    stripes that cross are not used."""
+
+    near: Mapping[ViewKey, BoardBoundaries] = field(default_factory=dict)
+    responses: tuple[ResponseShare, ...] = ()
+    crossing_fault: str = ""
+
+
 def decode_on_boards(
     rig: Rig,
     captures: Captures,
@@ -129,25 +139,8 @@ def decode_on_boards(
     sequences = [s for s in captures.sequences if s.has_stripes and (s.pair, s.shot) in wanted]
 
     turn = {s: captures.of_pair(s.pair).index(s) for s in sequences}
-    responses: dict[str, list[ResponseShare]] = defaultdict(list)
-    one_way: dict[ImageSequence, str] = {}
-    by_pair: dict[str, dict[ViewKey, BoardBoundaries]] = defaultdict(dict)
-    left, counting = Counter(sequence.pair for sequence in sequences), Lock()
 
-    def decode(sequence: ImageSequence) -> dict[ViewKey, BoardBoundaries]:
-        found: dict[ViewKey, BoardBoundaries] = {}
-        try:
-            found = found_in(sequence)
-        finally:
-            with counting:
-                by_pair[sequence.pair] |= found
-                left[sequence.pair] -= 1
-                last = not left[sequence.pair]
-            if last:
-                through(sequence.pair, by_pair.pop(sequence.pair))
-        return found
-
-    def found_in(sequence: ImageSequence) -> dict[ViewKey, BoardBoundaries]:
+    def decode(sequence: ImageSequence) -> _OnBoards:
         own = wanted[sequence.pair, sequence.shot]
         boxes = [box(view) for view in own]
         crop = crop_around(boxes)
@@ -156,28 +149,60 @@ def decode_on_boards(
         corner = crop[0].start, crop[1].start
         bands = LineBands(BIN_PX, apart, turn[sequence], corner)
         stripes = decode_sequence(sequence, pair, crop=crop, bands=bands)
-        responses[sequence.pair] += responses_in(stripes)
-        one_way[sequence] = stripes.crossing_fault
-        return {
-            view.key: keep(view, boundaries_near(stripes, near, crop))
-            for view, near in zip(own, boxes, strict=True)
+        near = {
+            view.key: keep(view, boundaries_near(stripes, around, crop))
+            for view, around in zip(own, boxes, strict=True)
         }
+        return _OnBoards(near, tuple(responses_in(stripes)), stripes.crossing_fault)
 
-    one_after_another = sorted(sequences, key=lambda sequence: sequence.pair)
     decoded, errors = attempt_each(
-        decode, one_after_another, BodyscanError, stage="decoding stripes", progress=progress
+        _telling(decode, sequences, through),
+        sorted(sequences, key=lambda sequence: sequence.pair),
+        BodyscanError,
+        stage="decoding stripes",
+        progress=progress,
     )
-    boundaries = {key: near for s in sequences if s in decoded for key, near in decoded[s].items()}
+    responses: dict[str, list[ResponseShare]] = defaultdict(list)
+    for sequence, found in decoded.items():
+        responses[sequence.pair] += found.responses
+    boundaries = {
+        key: near for s in sequences if s in decoded for key, near in decoded[s].near.items()
+    }
     failures = [(sequence, errors[sequence]) for sequence in sequences if sequence in errors]
     failed = failed_pairs(failures, {pair for pair, _, _ in boundaries})
     failed |= _without_stripes(rig, wanted, {sequence.pair for sequence in sequences})
     kept = [failure for failure in failures if failure[0].pair not in failed]
     notes = (
         *failure_notes(kept),
-        *one_way_notes({s: one_way[s] for s in decoded}),
+        *one_way_notes({s: found.crossing_fault for s, found in decoded.items()}),
         *response_notes(responses),
     )
     return Outcome(boundaries, notes, failed)
+
+
+def _telling(
+    decode: Callable[[ImageSequence], _OnBoards],
+    sequences: Iterable[ImageSequence],
+    through: Through,
+) -> Callable[[ImageSequence], _OnBoards]:
+    """`decode`, which tells of a pair what its sequences gave as soon as the last of them is done."""
+    by_pair: dict[str, dict[ViewKey, BoardBoundaries]] = defaultdict(dict)
+    left, counting = Counter(sequence.pair for sequence in sequences), Lock()
+
+    def telling(sequence: ImageSequence) -> _OnBoards:
+        found = _OnBoards()
+        try:
+            found = decode(sequence)
+        finally:
+            with counting:
+                by_pair[sequence.pair] |= found.near
+                left[sequence.pair] -= 1
+                last = not left[sequence.pair]
+            if last:
+                through(sequence.pair, by_pair.pop(sequence.pair))
+        return found
+
+    return telling
 
 
 def _without_stripes(

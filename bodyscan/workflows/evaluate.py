@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 
-from bodyscan.arrays import Array, Indices
+from bodyscan.arrays import Array, Floats, Indices
 from bodyscan.errors import BadInput
 from bodyscan.evaluation.body import GirthErrors, coverage_of_seen, girth_errors, sway_residual
 from bodyscan.evaluation.comparison import fit_to_surface
@@ -20,8 +20,9 @@ from bodyscan.evaluation.surface import Deviation, deviation, normalized_errors,
 from bodyscan.export.scan import transform_mesh
 from bodyscan.files.atomic import write_bytes
 from bodyscan.fusion.storage import StoredScan, load_scan
-from bodyscan.geometry.robust import rms_length
+from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.topology import topology
 from bodyscan.optional import optional
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -51,7 +52,7 @@ class RigDeviation:
 
     @property
     def rotations_rms_deg(self) -> float:
-        return float(np.sqrt(np.mean(self.rotations_deg**2)))
+        return rms(self.rotations_deg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,21 +175,9 @@ def _scan_lines(
         return optional(what, lambda line: lines.append(f"  {line}"))
 
     with part("cloud"):
-        spread, beyond = normalized_errors(cloud, stored.cloud.sigma_mm)
-        lines += [
-            f"  cloud, {len(points):,} points   {_figures(deviation(cloud))}",
-            f"  error over sigma        {spread:.2f} (robust; 1 is honest), {100.0 * beyond:.2f} % "
-            "of the points beyond three sigmas",
-        ]
+        lines += _cloud_lines(cloud, stored.cloud.sigma_mm)
     with part("mesh"):
-        lines.append(f"  mesh, measured vertices {_figures(deviation(mesh))}")
-        shape = topology(own.vertices, own.faces)
-        lines.append(
-            f"  mesh: {'closed' if shape.closed else 'open'}, "
-            f"{'manifold' if shape.manifold else 'not manifold'}, {shape.components} piece(s), "
-            f"{'outward' if shape.volume_mm3 > 0 else 'inward'} faces, "
-            f"{shape.volume_mm3 / 1e6:.2f} litres"
-        )
+        lines += _mesh_lines(mesh, own)
     with part("torso girths"):
         lines.append(f"  torso girths (tape)     {_girth_figures(girth_errors(body, *surface))}")
     if truth.at_mean_breath is not None:
@@ -196,11 +185,7 @@ def _scan_lines(
             girths = girth_errors(body, truth.at_mean_breath, truth.faces, mean_breath=True)
             lines.append(f"  ... against mean breath {_girth_figures(girths)}")
     with part("coverage"):
-        seen, covered = coverage_of_seen(points, *surface, pairs)
-        lines.append(
-            f"  covered within 1 mm     {100.0 * covered:.1f} % of the {100.0 * seen:.1f} % of the "
-            "surface that a camera and its projector see"
-        )
+        lines.append(_coverage_line(*coverage_of_seen(points, *surface, pairs)))
     lines.append(
         f"  pairs to each other     {place.apart_mm:.3f} mm RMS over the body, along and across"
     )
@@ -211,6 +196,33 @@ def _scan_lines(
         drawn = draw_deviation(own.vertices[measured], own.normals[measured], mesh)
         write_bytes(folder / "mesh-deviation.png", drawn)
     return lines
+
+
+def _cloud_lines(signed_mm: Array, sigma_mm: Floats) -> Iterator[str]:
+    spread, beyond = normalized_errors(signed_mm, sigma_mm)
+    yield f"  cloud, {len(signed_mm):,} points   {_figures(deviation(signed_mm))}"
+    yield (
+        f"  error over sigma        {spread:.2f} (robust; 1 is honest), {100.0 * beyond:.2f} % "
+        "of the points beyond three sigmas"
+    )
+
+
+def _mesh_lines(signed_mm: Array, mesh: BodyMesh) -> Iterator[str]:
+    yield f"  mesh, measured vertices {_figures(deviation(signed_mm))}"
+    shape = topology(mesh.vertices, mesh.faces)
+    yield (
+        f"  mesh: {'closed' if shape.closed else 'open'}, "
+        f"{'manifold' if shape.manifold else 'not manifold'}, {shape.components} piece(s), "
+        f"{'outward' if shape.volume_mm3 > 0 else 'inward'} faces, "
+        f"{shape.volume_mm3 / 1e6:.2f} litres"
+    )
+
+
+def _coverage_line(seen: float, covered: float) -> str:
+    return (
+        f"  covered within 1 mm     {100.0 * covered:.1f} % of the {100.0 * seen:.1f} % of the "
+        "surface that a camera and its projector see"
+    )
 
 
 def _placings(stored: StoredScan, calibration: RigCalibration) -> dict[str, RigidTransform]:

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.fusion.scan import Made, Scan, fuse, no_use
+from bodyscan.fusion.scan import Made, Scan, no_use
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.settings import ScanSettings
 from bodyscan.verdict import Announce, say_nothing
+from bodyscan.workflows.fuse_range_images import fuse
 from bodyscan.workflows.range_images import Reconstructed, reconstruct_range_images
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ball import ball_points
 from ring import looking_at
 
 from bodyscan.alignment.bending import _bend, _one_in_each_block, bend
@@ -27,12 +28,8 @@ PLACE = looking_at([900.0, 700.0, 1000.0], CENTRE)
 
 @pytest.fixture(scope="module")
 def ball() -> tuple[RangeImage, BodyCells]:
-    rays = CAMERA.pixel_rays()
     centre = PLACE.inverse().apply(CENTRE)
-    square = np.sum(rays**2, axis=-1)
-    along = rays @ centre / square
-    gap = along**2 - (centre @ centre - RADIUS**2) / square
-    points = rays * (along - np.sqrt(np.where(gap > 0, gap, np.nan)))[..., None]
+    points = ball_points(CAMERA, centre, RADIUS)
     sigma = np.where(np.isfinite(points[..., 2]), 0.1, np.nan)
     grey = np.full(sigma.shape, 150, np.uint8)
     normals = (points - centre) / RADIUS

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from ball import ball_points
 from ring import looking_at
 
 from bodyscan.alignment.matching import (
@@ -22,12 +23,8 @@ HOLE = np.s_[100:130, 150:190]
 
 def seen(name: str, rig_from_camera: RigidTransform) -> RangeImage:
     """A ball of 250 mm radius, its points and normals exact; a hole in what the camera saw."""
-    rays = CAMERA.pixel_rays()
     centre = rig_from_camera.inverse().apply(CENTRE)
-    square = np.sum(rays**2, axis=-1)
-    along = rays @ centre / square
-    gap = along**2 - (centre @ centre - RADIUS**2) / square
-    points = rays * (along - np.sqrt(np.where(gap > 0, gap, np.nan)))[..., None]
+    points = ball_points(CAMERA, centre, RADIUS)
     points[HOLE] = np.nan
     sigma = np.where(np.isfinite(points[..., 2]), SIGMA_MM, np.nan)
     return RangeImage(

@@ -1,4 +1,4 @@
-"""Where a board's corners, rim and markers lie."""
+"""Where a board's corners and markers lie."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyscan.boards.board_layout import corner_points, corners_per_face, marker_corners, outline
+from bodyscan.boards.board_layout import corner_points, corners_per_face, marker_corners
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 
@@ -31,29 +31,6 @@ def test_corner_ids_count_along_columns_and_back_follows_front(
         back = [(columns - column - 1) * square, (row + 1) * square, thickness]
         np.testing.assert_allclose(points[corner], front, rtol=1e-12)
         np.testing.assert_allclose(points[count + corner], back, rtol=1e-12, atol=1e-9)
-
-
-@given(sizes, sizes, st.floats(0, 50))
-def test_rim_runs_clockwise_for_whoever_looks_at_that_face(
-    columns: int, rows: int, margin: float
-) -> None:
-    board = Board(
-        name="b",
-        columns=columns,
-        rows=rows,
-        square_mm=10,
-        margin_mm=margin,
-        faces=2,
-        thickness_mm=4,
-    )
-    for face, towards_viewer in ((0, -1.0), (1, 1.0)):
-        rim = outline(board, face)
-        # Clockwise with y down means that x cross y points away from the viewer.
-        turn = np.cross(rim[1] - rim[0], rim[2] - rim[1])
-        assert turn[2] * towards_viewer < 0
-        width, height = 10 * columns + 2 * margin, 10 * rows + 2 * margin
-        assert abs(turn[2]) == pytest.approx(width * height)
-        assert np.all(rim[:, 2] == 4 * face)
 
 
 @pytest.mark.parametrize("legacy", [False, True])

@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from lit_boards import Mirror, Scene, binned
+from table_one import CAMERA
 
 from bodyscan.calibration.board_form import BoardForm
 from bodyscan.calibration.board_views import PlanarView
@@ -23,13 +24,9 @@ from bodyscan.calibration.joint_refinement import (
 )
 from bodyscan.calibration.light_sheets import smooth_models
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightSheets
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 
-CAMERA = Camera(
-    1061.71, 1064.09, -0.562002, 350.08, 286.547, Radial(-0.140279, -0.0916363), 640, 480
-)
 MIRROR = Mirror(
     254, np.array([-150.0, 0, 0]), np.array([150.0, 0, 420.0]), np.array([0, 1.0, 0])
 )  # fmt: skip

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from table_one import CAMERA
 
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
@@ -12,14 +13,9 @@ from bodyscan.calibration.boundary_points import (
     select,
 )
 from bodyscan.calibration.light_planes import fit_light_planes
-from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightPlanes, baseline_angle_tilt
 from bodyscan.geometry.transforms import RigidTransform
 
-CAMERA = Camera(
-    1061.71, 1064.09, -0.562002, 350.08, 286.547, Radial(-0.140279, -0.0916363), 640, 480
-)
 STRIPES = 16
 POSES = [
     RigidTransform.from_rotation_vector(turn, [-90.0, -70.0, depth])

@@ -13,16 +13,17 @@ from sheet_models import PINHOLE
 from verdict_given import verdict_given
 
 from bodyscan.alignment.icp import Alignment, Overlap
+from bodyscan.alignment.oblique_light import light_lines
 from bodyscan.alignment.place_evidence import SizeStep
 from bodyscan.alignment.pole_steps import PoleStep, StepSearch
-from bodyscan.fusion import scan as scan_file
 from bodyscan.fusion.contradictions import Contradictions
-from bodyscan.fusion.scan import _light_lines, _silent
+from bodyscan.fusion.scan_verdict import silent_poles
 from bodyscan.fusion.seams import Seam, SeamReport
 from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.registration.nominal_size import NominalSize
 from bodyscan.settings import UseLimits
 from bodyscan.verdict import Verdict
+from bodyscan.workflows import fuse_range_images
 
 GROUPS = {"pair p1": frozenset(["p1"]), "pair p2": frozenset(["p2"])}
 NO_LIMITS = UseLimits(good_girth_mm=100.0, usable_girth_mm=200.0)
@@ -305,9 +306,9 @@ def test_pairs_that_stand_off_each_by_itself(
 def test_a_pole_of_which_nobody_saw_the_person_is_named() -> None:
     poles = {"a1": "a", "a2": "a", "b1": "b", "b2": "b", "c1": "c"}
     asked = ["a1", "a2", "b1", "b2", "c1", "alone"]
-    assert _silent(poles, asked, ["a1"]) == ("b",)  # one pair may look over a child's head
-    assert _silent(poles, asked, ["a1", "b2"]) == ()
-    assert _silent(poles, asked, []) == ("a", "b")
+    assert silent_poles(poles, asked, ["a1"]) == ("b",)  # one pair may look over a child's head
+    assert silent_poles(poles, asked, ["a1", "b2"]) == ()
+    assert silent_poles(poles, asked, []) == ("a", "b")
 
 
 @pytest.mark.parametrize(("other", "blamed"), [(0.026, "pair a1"), (0.032, "pole a")])
@@ -357,19 +358,16 @@ def test_what_pairs_say_of_each_other_is_counted_by_whose_point_it_is() -> None:
 
 def test_where_light_comes_from_is_known_of_all_pairs_or_of_none() -> None:
     def lines(light: dict[str, Any], agreement: Any = None) -> Any:
-        pairs = {name: SimpleNamespace(name=name, sheets=one) for name, one in light.items()}
         seen: Any = [SimpleNamespace(pair=name, agreement=agreement) for name in ("a", "b")]
-        calibration: Any = SimpleNamespace(pairs=pairs)
-        return _light_lines(seen, calibration)
+        return light_lines(seen, light)
 
-    found = lines({"a": PINHOLE, "b": PINHOLE.turned(140.0), "c": None})
+    found = lines({"a": PINHOLE, "b": PINHOLE.turned(140.0)})
     assert sorted(found) == ["a", "b"]
     # The projector stands where its frame begins.
     there = PINHOLE.projector_from_camera.inverse().translation
     apart = there - found["a"].origin
     np.testing.assert_allclose(np.cross(apart, found["a"].along), 0.0, atol=1e-6)
-    assert lines({"a": PINHOLE, "b": None}) is None
-    assert lines({"a": PINHOLE}) is None, "a pair without a calibration"
+    assert lines({"a": PINHOLE}) is None, "a pair without light sheets"
     assert lines({"a": PINHOLE, "b": PINHOLE}, agreement="of two directions") is None
 
 
@@ -383,21 +381,21 @@ def test_two_pairs_are_aligned_where_they_may_be_and_one_has_nothing_to_be_align
     class Enough(Exception):
         pass
 
-    def merge(*of: Any) -> None:
+    def merge(*of: Any, **more: Any) -> None:
         raise Enough("merged")
 
     def align(*of: Any) -> None:
         raise Enough("aligned")
 
     seen = [SimpleNamespace(pair=f"p{k}") for k in range(pairs)]
-    monkeypatch.setattr(scan_file, "clean", lambda *of, **more: seen)
-    monkeypatch.setattr(scan_file, "require_subject", lambda images: images)
-    monkeypatch.setattr(scan_file, "merge", merge)
-    monkeypatch.setattr(scan_file, "align", align)
+    monkeypatch.setattr(fuse_range_images, "clean", lambda *of, **more: seen)
+    monkeypatch.setattr(fuse_range_images, "require_subject", lambda images: images)
+    monkeypatch.setattr(fuse_range_images, "merge", merge)
+    monkeypatch.setattr(fuse_range_images, "align", align)
     calibration: Any = SimpleNamespace(
         rig_from_camera={}, rig=SimpleNamespace(volume=None), covariance=None
     )
     settings: Any = SimpleNamespace(alignment=SimpleNamespace(matching=matching), fusion=None)
     images: Any = SimpleNamespace(value=seen)
     with pytest.raises(Enough, match="aligned" if aligned else "merged"):
-        scan_file.fuse(calibration, images, settings)
+        fuse_range_images.fuse(calibration, images, settings)

@@ -16,7 +16,7 @@ from bodyscan.errors import ScanFailed
 from bodyscan.fusion.cleaning import apply_mask
 from bodyscan.fusion.floor import find_floor
 from bodyscan.fusion.meshing import closed_surface
-from bodyscan.fusion.scan import Scan, fuse
+from bodyscan.fusion.scan import Scan
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
@@ -25,6 +25,7 @@ from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Rig, Volume
 from bodyscan.settings import AlignmentSettings, FusionSettings, MeshSettings, ScanSettings
 from bodyscan.verdict import Announce, Verdict, say_nothing
+from bodyscan.workflows.fuse_range_images import fuse
 
 RIG = load_rig()
 SETTINGS = ScanSettings(
@@ -141,7 +142,7 @@ def test_two_people_are_told_before_there_is_a_mesh(
         assert [verdict.grade for verdict in told] == ["repeat"]
         return closed_surface(*about)
 
-    monkeypatch.setattr("bodyscan.fusion.scan.closed_surface", meshed)
+    monkeypatch.setattr("bodyscan.workflows.fuse_range_images.closed_surface", meshed)
     scan = fused(photographed(both), settings=NOT_FOLLOWED, announce=listen)
     assert scan.verdict.grade == "repeat"
     assert "two bodies" in said(scan)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from table_one import CAMERA
 
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
@@ -14,9 +15,6 @@ from bodyscan.laboratory.rivals.projection_matrix import (
 )
 from bodyscan.laboratory.rivals.tsai import calibrate_tsai
 
-TABLE_1 = Camera(
-    1061.71, 1064.09, -0.562002, 350.08, 286.547, Radial(-0.140279, -0.0916363), 640, 480
-)
 MIDDLE = np.array([319.5, 239.5])
 GRID = np.stack(np.meshgrid(np.arange(20.0, 161, 20), np.arange(20.0, 121, 20)), -1).reshape(-1, 2)
 POINTS = np.concatenate([np.column_stack([GRID, np.full(48, z)]) for z in range(-60, 61, 20)])
@@ -68,18 +66,18 @@ def test_tsai_finds_his_own_camera(kappa: float) -> None:
 
 
 def test_tsai_sees_the_chapters_lens_nearly() -> None:
-    pixels = TABLE_1.project(PLACE.apply(POINTS))
+    pixels = CAMERA.project(PLACE.apply(POINTS))
     found = calibrate_tsai(POINTS, pixels, MIDDLE)
     # One coefficient for two, and no skew (0.5 px over the whole image): a few hundredths of a px.
     assert 0.01 < found.rms_px < 0.08
     camera = found.camera(640, 480)
     error = camera.project(found.camera_from_points.apply(POINTS)) - pixels
     assert np.sqrt(np.mean(error**2)) < 0.08
-    assert camera.alpha == pytest.approx(TABLE_1.alpha, rel=1e-3)
+    assert camera.alpha == pytest.approx(CAMERA.alpha, rel=1e-3)
 
 
 def test_a_matrix_does_not_see_the_lens() -> None:
-    pixels = TABLE_1.project(PLACE.apply(POINTS))
+    pixels = CAMERA.project(PLACE.apply(POINTS))
     camera, place = split_projection_matrix(projection_matrix(POINTS, pixels), 640, 480)
     error = camera.project(place.apply(POINTS)) - pixels
     # Barrel distortion of up to 4 px, most of which scale and centre take up.

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ball import ball_points
 from small_pair import CAMERA, pair, stripe_map
 
 from bodyscan.errors import BadInput
@@ -70,10 +71,7 @@ def test_a_ray_that_is_not_known_moves_its_point_by_its_sigma() -> None:
 def test_normals_of_a_sphere_point_to_the_camera() -> None:
     rays = CAMERA.pixel_rays()
     centre, radius = np.array([0.0, 0.0, 600.0]), 80.0
-    along = rays @ centre / np.sum(rays**2, axis=-1)
-    gap = along**2 - (centre @ centre - radius**2) / np.sum(rays**2, axis=-1)
-    depth = along - np.sqrt(np.where(gap > 0, gap, np.nan))
-    points = (rays * depth[..., None]).astype(np.float32)
+    points = ball_points(CAMERA, centre, radius).astype(np.float32)
     normals = grid_normals(points)
     true = (points - centre) / radius
     facing = -np.sum(true * rays, axis=-1) / np.linalg.norm(rays, axis=-1)

@@ -9,6 +9,7 @@ from functools import cache
 from typing import Protocol
 
 import numpy as np
+from table_one import CAMERA
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import PlanarView
@@ -236,12 +237,9 @@ def _crossings(of: bytes) -> tuple[Indices, Array]:
 
 def chapter_scene(**mirror: float) -> Scene:
     """Table 1's camera, 254 vertical stripes from a rotating mirror, a board of 48 corners."""
-    camera = Camera(
-        1061.71, 1064.09, -0.562002, 350.08, 286.547, Radial(-0.140279, -0.0916363), 640, 480
-    )
     centre, out = np.array([130.0, 5.0, 20.0]), np.array([-130.0, 0.0, 390.0])
     projector = Mirror(254, centre, out, np.array([0.0, 1.0, 0.0]), **mirror)
-    return Scene(camera, projector, "vertical", 20.0, 9, 7)
+    return Scene(CAMERA, projector, "vertical", 20.0, 9, 7)
 
 
 Pose = tuple[Sequence[float], Sequence[float]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from ball import ball_depth
 from scipy.interpolate import CubicSpline
 
 from bodyscan.arrays import Array, Indices
@@ -24,14 +25,6 @@ def sheets() -> LightPlanes:
     normals = np.stack([np.zeros_like(angle), np.cos(angle), -np.sin(angle)], axis=1)
     coefficients = np.column_stack([normals, 200.0 * normals[:, 1]])
     return LightPlanes(coefficients, np.zeros((STRIPES + 1, 4, 4)), "horizontal")
-
-
-def ball_depth(centre: Array) -> Array:
-    """(height, width) z of its front, mm."""
-    rays = CAMERA.pixel_rays()
-    square, along = np.sum(rays**2, axis=-1), rays @ centre
-    root = along**2 - square * (centre @ centre - RADIUS**2)
-    return np.asarray((along - np.sqrt(np.where(root > 0.0, root, np.nan))) / square)
 
 
 def stripe_of(depth: Array) -> Array:
@@ -57,7 +50,7 @@ def seen_boundaries(
     beside = np.zeros((CAMERA.height, CAMERA.width)) if beside is None else beside
     found = []
     for bit, time in enumerate(times):
-        s = stripe_of(ball_depth(CENTRE + time * velocity) + time * beside)
+        s = stripe_of(ball_depth(CAMERA, CENTRE + time * velocity, RADIUS) + time * beside)
         for column in range(CAMERA.width):
             rows = np.flatnonzero(np.isfinite(s[:, column]))
             if len(rows) < 20:

@@ -9,6 +9,7 @@ import numpy as np
 from bodyscan.export.body_format import BodyFormat
 from bodyscan.files.atomic import atomic_replacement
 from bodyscan.mesh.body import BodyMesh
+from bodyscan.mesh.topology import face_normals
 
 TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 HEADER = b"bodyscan: mm, x the way the subject faces, z up, floor at z = 0"
@@ -17,7 +18,7 @@ HEADER = b"bodyscan: mm, x the way the subject faces, z up, floor at z = 0"
 def write_stl(path: Path, mesh: BodyMesh) -> None:
     """Write a mesh in mm, rig frame. STL has no colours, vertex normals or filled faces."""
     corners = mesh.vertices[mesh.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross = face_normals(mesh.vertices, mesh.faces)
     length = np.linalg.norm(cross, axis=1, keepdims=True)
     triangles = np.zeros(len(mesh.faces), TRIANGLE)
     triangles["normal"] = cross / np.where(length > 0, length, 1.0)

@@ -104,9 +104,8 @@ def _next_pose(
 def _camera(
     file: ForeignFile, key: str, own: dict[str, Any], pose: RigidTransform | None
 ) -> FoundCamera:
-    for word in ("camera_model", "intrinsics", "distortion_model", "resolution"):
-        if word not in own:
-            raise file.error(f"has no {word}", key, f"it has {', '.join(own)}")
+    words = ("camera_model", "intrinsics", "distortion_model", "resolution")
+    file.require(own, words, key)
     if own["camera_model"] != "pinhole":
         raise file.error(
             f"{own['camera_model']!r} is a model that there is not here, pinhole is",

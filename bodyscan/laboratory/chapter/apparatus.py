@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array
+from bodyscan.geometry.light_planes import towards_camera
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.board import Board
 from bodyscan.simulation.board import MadeBoard, make_board
@@ -144,8 +145,7 @@ def chapter_setup(settings: SimulationSettings, seed: int = 0) -> ChapterSetup:
 
 def true_planes(setup: ChapterSetup) -> Array:
     """Planes (S + 1, 4) of the boundaries, before any smile; (a, b, c) unit, d >= 0."""
-    planes = setup.projector.plane(np.arange(setup.projector.stripes + 1.0))
-    return planes * np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
+    return towards_camera(setup.projector.plane(np.arange(setup.projector.stripes + 1.0)))
 
 
 def board_poses(count: int = BOARDS) -> list[RigidTransform]:
@@ -165,7 +165,7 @@ def stage_poses(readings: Array, seed: int) -> list[RigidTransform]:
     rng = np.random.default_rng([seed, STAGE])
     stage = place_about(STAGE_MIDDLE, STAGE_TURN)
     stops = readings + STAGE_ERROR_MM * rng.standard_normal(len(readings))
-    slides = [RigidTransform(np.eye(3), np.array([0.0, 0.0, stop])) for stop in stops]
+    slides = [RigidTransform.shift([0.0, 0.0, stop]) for stop in stops]
     return [stage @ slide for slide in slides]
 
 

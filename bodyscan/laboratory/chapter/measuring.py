@@ -17,7 +17,7 @@ from bodyscan.evaluation.spheres import (
     measure_sphere,
 )
 from bodyscan.geometry.camera_fields import from_fields
-from bodyscan.geometry.light_planes import Axis
+from bodyscan.geometry.light_planes import Axis, towards_camera
 from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.apparatus import ChapterSetup
 from bodyscan.laboratory.chapter.captures import ChapterCaptures
@@ -142,8 +142,7 @@ class TrueSheets:
 
     def tangent_planes(self, s: Array) -> Array:
         """Planes that touch in the middle of the fan, where there is no smile."""
-        planes = self.setup.projector.plane(s)
-        return planes * np.where(planes[..., 3:] < 0.0, -1.0, 1.0)
+        return towards_camera(self.setup.projector.plane(s))
 
 
 def true_approach(setup: ChapterSetup) -> Approach:

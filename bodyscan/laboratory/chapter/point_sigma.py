@@ -8,6 +8,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.ray_depths import intersect_rays
+from bodyscan.geometry.robust import rms
 from bodyscan.laboratory.chapter.captures import ChapterCaptures, SceneCapture
 from bodyscan.laboratory.rivals.approaches import Approach
 
@@ -39,8 +40,8 @@ def point_sigma(approach: Approach, captures: ChapterCaptures) -> PointSigma:
     every = np.concatenate([spheres, plate])
     return PointSigma(
         approach.name,
-        float(np.sqrt(np.mean(spheres**2))),
-        float(np.sqrt(np.mean(plate**2))),
+        rms(spheres),
+        rms(plate),
         float(np.mean(np.abs(every) > 3.0)),
         float(np.median(np.concatenate([sigma for _, sigma in parts]))),
     )

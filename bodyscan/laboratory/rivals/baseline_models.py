@@ -103,6 +103,4 @@ def _planes(slope: Array, baseline: Array, tilt: float, direction: Axis) -> Ligh
     first, second = (along, across) if direction == "horizontal" else (across, along)
     planes = np.stack([first, second, -slope, baseline], axis=1)
     planes[~np.isfinite(slope)] = np.nan
-    planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
-    planes *= np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
-    return LightPlanes(planes, np.full((len(planes), 4, 4), np.nan), direction)
+    return LightPlanes.exact(planes, direction)

@@ -46,10 +46,7 @@ def fit_remapped_pinhole(points: Array, s: Array, stripes: int, direction: Axis)
     u = np.arange(stripes + 1.0) / half - 1.0
     remapped = u + _powers(u) @ solved[8:]
     rows = solved[:4] - remapped[:, None] * solved[4:8]
-    planes = rows @ np.linalg.inv(scale)
-    planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
-    planes *= np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
-    return LightPlanes(planes, np.full((stripes + 1, 4, 4), np.nan), direction)
+    return LightPlanes.exact(rows @ np.linalg.inv(scale), direction)
 
 
 def _powers(u: Array) -> Array:

@@ -147,7 +147,7 @@ def stage_points(
 
 
 def _slid(reading: float) -> RigidTransform:
-    return RigidTransform(np.eye(3), np.array([0.0, 0.0, reading]))
+    return RigidTransform.shift([0.0, 0.0, reading])
 
 
 def _by_homography(

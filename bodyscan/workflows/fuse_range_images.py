@@ -1,0 +1,205 @@
+"""Fuse range images of one person to a body model and mesh: clean, align, merge, judge, mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+from bodyscan.alignment.bending import at_once
+from bodyscan.alignment.body_parts import PersonMotion
+from bodyscan.alignment.following import Followed
+from bodyscan.alignment.icp import align
+from bodyscan.alignment.oblique_light import ObliqueLight, light_lines, take_out
+from bodyscan.alignment.sway_prior import SwayPrior
+from bodyscan.alignment.together import Together, bring_together
+from bodyscan.fusion.cleaning import clean, require_subject
+from bodyscan.fusion.contradictions import Contradictions
+from bodyscan.fusion.floor import find_floor
+from bodyscan.fusion.merging import MergedCloud, merge
+from bodyscan.fusion.meshing import attach_attributes, closed_surface
+from bodyscan.fusion.pose_variance import add_motion_variance, add_pose_variance
+from bodyscan.fusion.regions import label_regions
+from bodyscan.fusion.scan import Made, Scan, no_use
+from bodyscan.fusion.scan_verdict import ImageEvidence, RigEvidence, grade_scan, silent_poles
+from bodyscan.fusion.seams import judge_seams
+from bodyscan.fusion.surface_check import SurfaceCheck, check_surface
+from bodyscan.geometry.pose_covariance import PoseCovariance
+from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.outcome import Outcome
+from bodyscan.progress import Progress, silent, step
+from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.settings import AlignmentSettings, FusionSettings, ScanSettings
+from bodyscan.verdict import Announce, say_nothing
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """Range images that show something of the subject, carried to one moment if it moved.
+
+    rig_from_camera: the pairs' poses after alignment; as calibrated for those that saw nothing.
+    known: covariance of these poses.
+    together, oblique_light: what alignment found; None if it took no part.
+    """
+
+    images: Sequence[RangeImage]
+    rig_from_camera: dict[str, RigidTransform]
+    known: PoseCovariance
+    together: Together | None = None
+    oblique_light: ObliqueLight | None = None
+
+    @property
+    def there(self) -> dict[str, RigidTransform]:
+        """Poses of the images' own pairs."""
+        return {image.pair: self.rig_from_camera[image.pair] for image in self.images}
+
+    @property
+    def followed(self) -> Followed | None:
+        return self.together.followed if self.together else None
+
+    @cached_property
+    def person(self) -> PersonMotion | None:
+        return PersonMotion.of(self.followed) if self.followed else None
+
+
+def fuse(
+    calibration: RigCalibration,
+    measured: Outcome[Sequence[RangeImage]],
+    settings: ScanSettings,
+    progress: Progress = silent,
+    *,
+    empty: Sequence[RangeImage] = (),
+    announce: Announce = say_nothing,
+    made: Made = no_use,
+) -> Scan:
+    """Fuse range images of one person, background included, to a body model and mesh.
+
+    measured: with pairs that gave none as failures.
+    empty: as in `clean`.
+    announce: called with the verdict on the points alone, before the mesh is made.
+    made: called with the cloud while the mesh is made, and with the mesh while it is judged.
+
+    Raises ScanFailed if they show no body.
+    """
+    with step(progress, "cleaning"):
+        calibrated, volume = calibration.rig_from_camera, calibration.rig.volume
+        cleaned = clean(measured.value, calibrated, volume, empty=empty)
+        placed = _Placed(require_subject(cleaned), dict(calibrated), calibration.covariance)
+    if settings.alignment.matching != "none" and len(placed.images) > 1:
+        with step(progress, "aligning"):
+            placed = _aligned(placed, calibration, settings.alignment)
+    with step(progress, "merging"):
+        merged = _merged(placed, settings.fusion)
+    with step(progress, "judging"):
+        judged = partial(
+            grade_scan,
+            merged.cloud,
+            RigEvidence.of(calibration),
+            _image_evidence(calibration, measured, cleaned, placed, merged.contradictions),
+            settings.use,
+            together=placed.together,
+            person=placed.person,
+        )
+        announce(judged(), final=False)
+    with step(progress, "meshing"):
+        cloud, mesh = _meshed(merged.cloud, measured.value, placed, settings, made)
+        verdict = judged(mesh=mesh, surface=_surface_check(mesh, cleaned, placed))
+    return Scan(
+        cloud,
+        mesh,
+        placed.together.alignment if placed.together else None,
+        {image.pair: int(image.valid.sum()) for image in cleaned},
+        dict(measured.failures),
+        verdict,
+        tuple(placed.images),
+        placed.rig_from_camera,
+        placed.person,
+        measured.notes,
+        placed.oblique_light,
+    )
+
+
+def _aligned(
+    calibrated: _Placed, calibration: RigCalibration, settings: AlignmentSettings
+) -> _Placed:
+    """Bring the images together and to one moment; take out what oblique light does to skin."""
+    images, start, boards = calibrated.images, calibrated.rig_from_camera, calibrated.known
+    found, oblique = align(images, start, boards, settings), None
+    pairs = calibration.pairs.items()
+    sheets = {name: pair.sheets for name, pair in pairs if pair.sheets is not None}
+    lines = light_lines(images, sheets)
+    if lines:
+        images, found, oblique = take_out(images, start, found, lines, boards, settings)
+    together = bring_together(images, start, found, boards, calibration.rig.poles, settings)
+    rig_from_camera = start | together.alignment.rig_from_camera
+    images = at_once(images, rig_from_camera, together.followed)
+    untied = {image.pair for image in images} - together.alignment.motion_mm.keys()
+    known = SwayPrior.of(settings).loosen(boards, untied)
+    return _Placed(images, rig_from_camera, known, together, oblique)
+
+
+def _merged(placed: _Placed, settings: FusionSettings) -> MergedCloud:
+    """Merge to one cloud; its sigmas include those of the pairs' poses and the person's motion."""
+    merged = merge(placed.images, placed.rig_from_camera, settings)
+    cloud = add_pose_variance(merged.cloud, placed.there, placed.known)
+    if placed.followed:
+        cloud = add_motion_variance(merged.cloud, cloud, placed.followed)
+    return replace(merged, cloud=cloud)
+
+
+def _image_evidence(
+    calibration: RigCalibration,
+    measured: Outcome[Sequence[RangeImage]],
+    cleaned: Sequence[RangeImage],
+    placed: _Placed,
+    contradictions: Contradictions,
+) -> ImageEvidence:
+    poles, asked = calibration.rig.poles, [image.pair for image in cleaned]
+    shifted = placed.together.shifted if placed.together else ()
+    moved = {name for one in shifted for name in one.pairs}
+    unmoved = [image for image in measured.value if image.pair not in moved]
+    return ImageEvidence(
+        measured.failures,
+        silent_poles(poles, [*asked, *measured.failures], [image.pair for image in placed.images]),
+        {image.pair: image.agreement for image in measured.value if image.agreement},
+        judge_seams(placed.images, placed.there, poles),
+        contradictions,
+        find_floor(unmoved, calibration.rig_from_camera, calibration.rig.volume),
+    )
+
+
+def _meshed(
+    cloud: BodyCloud,
+    measured: Sequence[RangeImage],
+    placed: _Placed,
+    settings: ScanSettings,
+    made: Made,
+) -> tuple[BodyCloud, BodyMesh]:
+    """The cloud with its regions, and the mesh with its displacement to mean breath."""
+
+    def named() -> BodyCloud:
+        regions = label_regions(cloud, placed.images, placed.there, settings.fusion.window_mm)
+        known = replace(cloud, regions=regions)
+        made(known)
+        return known
+
+    with ThreadPoolExecutor(1) as beside:
+        # Meshing mostly uses one core, so regions are labelled on the other meanwhile.
+        naming = beside.submit(named)
+        shape = closed_surface(cloud, settings.mesh, measured, placed.rig_from_camera)
+        known = naming.result()
+    mesh = attach_attributes(*shape, known, settings.mesh.reach_mm)
+    if placed.followed:
+        mesh = placed.followed.breathing(mesh)
+    made(mesh)
+    return known, mesh
+
+
+def _surface_check(mesh: BodyMesh, cleaned: Sequence[RangeImage], placed: _Placed) -> SurfaceCheck:
+    """Check the mesh against the images of all pairs, including those that saw nothing."""
+    carried = {image.pair: image for image in placed.images}
+    images = [carried.get(image.pair, image) for image in cleaned]
+    return check_surface(mesh, images, placed.rig_from_camera)
