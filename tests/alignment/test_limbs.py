@@ -229,16 +229,16 @@ def test_how_far_a_part_moved_is_what_all_but_a_twentieth_of_it_did_at_most() ->
     trunk = np.flatnonzero(name_parts(cells) == PARTS.index("trunk"))
     seen = np.zeros((2, len(cells.centres)), bool)
     moved = np.zeros((2, len(cells.centres), 3))
-    half = len(trunk) // 2
-    seen[0, trunk], seen[1, trunk[:half]] = True, True
+    third = len(trunk) // 3
+    seen[0, trunk], seen[1, trunk[:third]] = True, True
     far = np.linspace(0.0, 5.0, len(trunk))
     moved[0, trunk] = 0.1 * far[:, None] * [0.6, 0.0, 0.8]
-    moved[1, trunk] = far[:, None] * [0.0, 0.8, -0.6]  # all of the trunk, but half of it is hidden
+    moved[1, trunk] = far[:, None] * [0.0, 0.8, -0.6]  # all of the trunk, but two thirds are hidden
     (part,) = tell_parts(replace(body, seen=seen, moved=moved))
     assert part.name == "trunk"
-    shown = np.where(np.arange(len(trunk)) < half, far, 0.1 * far)
+    shown = np.where(np.arange(len(trunk)) < third, far, 0.1 * far)
     assert part.moved_mm == pytest.approx(np.percentile(shown, 95.0))
-    assert part.seen_once == pytest.approx(1.0 - half / len(trunk))
+    assert part.seen_once == pytest.approx(1.0 - third / len(trunk))
 
 
 def told_of(*left: tuple[str, float, float]) -> str:
