@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +18,15 @@ from bodyscan.alignment.bending import at_once
 from bodyscan.alignment.body_motion import PARTS_MM, BodyMotion, Kind
 from bodyscan.alignment.body_parts import PartMotion, PersonMotion
 from bodyscan.alignment.breath import breathing
-from bodyscan.alignment.following import UNSEEN, Followed, cell_sigmas, follow, sigmas_around
+from bodyscan.alignment.following import (
+    UNSEEN,
+    Followed,
+    _is_unbent,
+    _is_unswayed,
+    cell_sigmas,
+    follow,
+    sigmas_around,
+)
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.part_names import LEGS, PARTS, name_parts
 from bodyscan.arrays import Array
@@ -287,3 +298,31 @@ def test_a_breath_that_nobody_saw_is_known_to_a_share(
     assert rms(fully[belly]) < 0.4 * rms(partly[belly])
     legs = np.isin(name_parts(cells), [PARTS.index(leg) for leg in LEGS])
     assert rms(partly[legs]) < 0.1 * rms(partly[belly])
+
+
+@pytest.mark.parametrize(
+    ("each_mm", "unbent", "unswayed"),
+    [(0.09, True, True), (0.11, False, True), (0.31, False, False)],
+)
+def test_whether_a_person_moved_is_told_by_how_far_places_were_from_those_in_the_middle(
+    each_mm: float, unbent: bool, unswayed: bool
+) -> None:
+    """RMS over what pairs saw, of displacements alone: a tenth of a millimetre bends, and three tenths
+    of the usual sway are one."""
+    asked: list[tuple[str, ...]] = []
+
+    def displacements(names: Sequence[str], *, from_middle: bool = False) -> Array:
+        asked.append(tuple(names))
+        assert from_middle
+        moved = np.full((2, 5, 12), 7.0)  # how a cell turns and bends beside
+        moved[:, :, :3] = each_mm * np.array([0.6, 0.0, 0.8])
+        moved[1, 4, :3] = 50.0  # nobody saw that
+        return moved
+
+    motion: Any = SimpleNamespace(displacements=displacements)
+    seen = np.ones((2, 5), bool)
+    seen[1, 4] = False
+    assert _is_unbent(motion, seen) is unbent
+    assert _is_unswayed(motion, seen, AlignmentSettings()) is unswayed
+    assert "breath" in asked[0]
+    assert asked[1] == ("lean", "sway")

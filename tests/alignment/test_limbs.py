@@ -9,7 +9,13 @@ import pytest
 from scipy import sparse
 
 from bodyscan.alignment.body_cells import BodyCells
-from bodyscan.alignment.body_parts import tell_breath, tell_fullness, tell_parts
+from bodyscan.alignment.body_parts import (
+    PartMotion,
+    PersonMotion,
+    tell_breath,
+    tell_fullness,
+    tell_parts,
+)
 from bodyscan.alignment.breath import breath_fields, breathing
 from bodyscan.alignment.following import Followed, MeanBreath
 from bodyscan.alignment.limbs import LIMBS, SHIFTS, limb_fields
@@ -214,3 +220,49 @@ def test_over_a_border_what_moves_passes_into_what_does_not_as_a_bell_curve_sums
     for away_mm, share in ((15.0, 0.599), (75.0, 0.894), (105.0, 0.960)):
         here = at(cells, border + away_mm, 1365.0)
         assert arm[here] == pytest.approx(share, abs=0.02)
+
+
+def test_how_far_a_part_moved_is_what_all_but_a_twentieth_of_it_did_at_most() -> None:
+    """Of each of its cells what any pair saw that did see it; and cells that one pair saw alone."""
+    cells = person()
+    body = followed(cells, np.ones(1), np.zeros(2))
+    trunk = np.flatnonzero(name_parts(cells) == PARTS.index("trunk"))
+    seen = np.zeros((2, len(cells.centres)), bool)
+    moved = np.zeros((2, len(cells.centres), 3))
+    third = len(trunk) // 3
+    seen[0, trunk], seen[1, trunk[:third]] = True, True
+    far = np.linspace(0.0, 5.0, len(trunk))
+    moved[0, trunk] = 0.1 * far[:, None] * [0.6, 0.0, 0.8]
+    moved[1, trunk] = far[:, None] * [0.0, 0.8, -0.6]  # all of the trunk, but two thirds are hidden
+    (part,) = tell_parts(replace(body, seen=seen, moved=moved))
+    assert part.name == "trunk"
+    shown = np.where(np.arange(len(trunk)) < third, far, 0.1 * far)
+    assert part.moved_mm == pytest.approx(np.percentile(shown, 95.0))
+    assert part.seen_once == pytest.approx(1.0 - third / len(trunk))
+
+
+def told_of(*left: tuple[str, float, float]) -> str:
+    parts = tuple(PartMotion(name, moved, known, 0.0) for name, moved, known in left)
+    return PersonMotion(parts, None, None).summary
+
+
+def test_who_needs_a_part_better_than_a_girth_of_two_millimetres_is_told_which() -> None:
+    assert told_of() == ""
+    assert told_of(("trunk", 4.4, 0.3), ("head", 11.6, 0.1)) == (
+        "moved 12 mm while being scanned; corrected to 0.22 mm"
+    )
+    assert told_of(("trunk", 4.4, 0.3), ("head", 2.0, 0.31), ("left arm", 2.0, 1.0)).endswith(
+        "; repeat if you need the head (0.3 mm), the left arm (1.0 mm)"
+    )
+
+
+@pytest.mark.parametrize(("fuller_mm", "side"), [(1.24, "before"), (-1.24, "behind")])
+def test_lines_say_which_way_a_breath_stood(fuller_mm: float, side: str) -> None:
+    person = PersonMotion((PartMotion("head", 2.04, 0.1, 0.0),), 4.2, None, fuller_mm, 0.36)
+    assert person.lines == (
+        "head moved by 2.0 mm, known to 0.10",
+        "breathed by 4.2 mm, carried to one moment",
+        f"chest and belly stood 1.2 mm {side} their place at mean breath, known to 0.4: girths are "
+        "given at mean breath",
+    )
+    assert PersonMotion((), None, None).lines == ("breath could not be told from other motion",)

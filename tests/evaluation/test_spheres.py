@@ -82,6 +82,11 @@ def test_outliers_do_not_pull_the_fit_but_count_in_e() -> None:
 def test_too_few_points_are_refused() -> None:
     with pytest.raises(FailedWork, match="too few"):
         fit_sphere(cap(CENTRES[0], 25.0, 20))
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    points *= 30.0 / np.linalg.norm(points, axis=1, keepdims=True)
+    assert fit_sphere(points).radius == pytest.approx(30.0)
+    with pytest.raises(FailedWork, match="49 points are too few for a sphere"):
+        fit_sphere(points[:49])
 
 
 def range_image(noise: float = 0.0) -> np.ndarray:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from sheet_models import MATRIX, MIDDLE, PINHOLE, STRIPES, models, moved
 
 from bodyscan.arrays import Array
+from bodyscan.geometry.bowed_sheets import BowedSheets
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightPlanes, LightSheets
 from bodyscan.geometry.ray_depths import intersect_rays
@@ -246,3 +247,22 @@ def test_the_first_and_the_last_boundary_are_measured_as_well(terms: int) -> Non
         np.testing.assert_allclose(model.stripe(rays * depth[:, None]), s, atol=1e-6)
     beyond = np.array([-1e-9, STRIPES + 1e-9])
     assert np.isnan(model.measure(rays, beyond)[0]).all()
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        *(PINHOLE.with_lens(terms) for terms in (0, 1, 4, 8)),
+        *(BowedSheets.of_pinhole(PINHOLE, terms) for terms in (0, 1, 3)),
+    ],
+    ids=lambda model: f"{model.kind}-{len(model.parameters)}",
+)
+def test_what_is_known_beforehand_has_its_own_derivatives(model: SmoothSheets) -> None:
+    """Where nothing speaks against it: residuals are in standard deviations, of which there are more
+    the more a model can bend."""
+    known, jacobian = model.prior()
+    assert jacobian.shape == (len(known), len(model.covariance))
+    for k, axis in enumerate(np.eye(len(model.covariance))):
+        ahead, behind = (model.retract(step * axis).prior()[0] for step in (1e-6, -1e-6))
+        # Linear in the step but for rounding, of up to 1e5 standard deviations.
+        np.testing.assert_allclose((ahead - behind) / 2e-6, jacobian[:, k], rtol=1e-6, atol=1e-6)

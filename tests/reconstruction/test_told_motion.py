@@ -15,7 +15,14 @@ from ray_cast_scan import load_rig
 from bodyscan.arrays import Array
 from bodyscan.reconstruction import sequence_moments as sequence_moments_file
 from bodyscan.reconstruction.sequence_moments import sequence_moments
-from bodyscan.reconstruction.told_motion import CHANCE, _band_share, _velocity, tell_motion
+from bodyscan.reconstruction.told_motion import (
+    CHANCE,
+    _band_share,
+    _Teeth,
+    _velocity,
+    _weights,
+    tell_motion,
+)
 from bodyscan.rig.frame_names import FrameNames
 from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.codes.gray import Gray
@@ -298,3 +305,24 @@ def test_five_bands_beside_another_are_enough_to_tell_that_they_stray() -> None:
     # Bands of which the next is missing are beside none.
     apart = np.arange(0, 20, 2)
     assert np.isinf(_band_share(apart, np.ones(10), np.full(10, 4.0))[1])
+
+
+def test_windows_count_by_how_they_scatter_and_those_three_times_as_far_off_for_half() -> None:
+    """Speeds of 2 and -2 sigmas, where no twist explains any, and one of 3 times their spread."""
+    count = 21
+    sigma = np.where(np.arange(count) % 2, 0.5, 2.0)
+    spread = 2.0 / 0.6745
+    off = np.where(np.arange(count) % 4 < 2, 2.0, -2.0)
+    off[20] = 3.0 * spread
+    nothing = np.zeros((count, 3))
+    whole = np.zeros(count, np.int64)  # one band of stripes tells nothing of how bands stray
+    teeth = _Teeth(
+        np.arange(count), whole, sigma * off, sigma, sigma, np.zeros((count, 6)), nothing,
+        nothing[0], 0.0,
+    )  # fmt: skip
+    weights, independent = _weights(teeth)
+    assert np.isinf(independent)
+    expected = 1.0 / (1.0 + (off / (3.0 * spread)) ** 2) / (sigma * spread) ** 2
+    # A spread by the median to four digits.
+    np.testing.assert_allclose(weights, expected, rtol=1e-3)
+    assert weights[20] * (sigma[20] * spread) ** 2 == pytest.approx(0.5, rel=1e-3)

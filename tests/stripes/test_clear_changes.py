@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyscan.arrays import Array, Bytes, Indices
-from bodyscan.stripes.clear_changes import clear_changes
+from bodyscan.stripes.clear_changes import _is_rim, clear_changes
 from bodyscan.stripes.scan_lines import ScanLines
 
 BITS = 6
@@ -129,3 +129,17 @@ def test_a_coarse_bit_has_to_be_clear_four_pixels_to_either_side(pixel: int) -> 
         step = np.full((BITS, 1, 20), 100)
         step[BITS - 1 - 3, 0, pixel] = size
         assert bool(changes(flip(3), step=step)) == taken
+
+
+@pytest.mark.parametrize(("bright", "place", "rim"), [
+    ({19: 201}, 16, True), ({19: 200}, 16, False), ({0: 201}, 2, True), ({0: 200}, 2, False),
+    # Four pixels beside the two.
+    ({14: 201}, 9, True), ({13: 201, 15: 201}, 9, False), ({5: 201}, 9, True), ({5: 49}, 9, True),
+    ({5: 50}, 9, False),
+])  # fmt: skip
+def test_brightness_is_compared_four_pixels_off_or_at_the_pictures_ends(
+    bright: dict[int, int], place: int, rim: bool
+) -> None:
+    line = np.full(20, 100, np.uint8)
+    line[list(bright)] = list(bright.values())
+    assert _is_rim(line, place) is rim

@@ -102,3 +102,13 @@ def test_sigma_follows_how_codes_scatter_where_that_is_more_than_rounding() -> N
         rms = np.sqrt(np.sum((around - np.polyval(line, x)) ** 2) / 7.0)
         assert sigma[place] == pytest.approx(max(rms, 12.0**-0.5) / 3.0, rel=1e-5)
         assert found[place] == pytest.approx(line[1] + 0.5, abs=1e-4)
+
+
+def test_every_line_of_a_picture_higher_than_wide_is_filled_by_its_own_codes() -> None:
+    slope = 1.3 + 0.02 * np.arange(80)
+    s = 20.3 + slope[:, None] * PLACES
+    found, sigma = np.full((2, *s.shape), np.nan, np.float32)
+    fill_from_codes(found, sigma, np.floor(s).astype(np.int32), np.ones(s.shape, bool))
+    known = np.isfinite(found)
+    assert known[:, 4:-4].mean(axis=1).min() > 0.8
+    np.testing.assert_allclose(found[known], s[known], atol=0.5)  # as far as codes are known

@@ -195,6 +195,8 @@ def test_words_are_read_as_they_were_written() -> None:
         later = type(code)(code.encode, code.decode, code.single, code.doubt_px, first=5)
         assert np.array_equal(later.stripes(words), numbers - 5)
     assert [GRAY.finest_run, BINARY.finest_run] == [2, 1]
+    # Stripes one wide blur into each other, by a twenty-fifth of a pixel; those two wide do not.
+    assert [GRAY.doubt_px, BINARY.doubt_px] == [0.0, 0.04]
     assert [GRAY.two_wide(6), BINARY.two_wide(6), BINARY.two_wide(1), BINARY.two_wide(2)] == [
         5,
         4,

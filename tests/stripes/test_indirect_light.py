@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from stripe_rendering import Sequence, decode_gray, gray_bits, render_sequence
 
-from bodyscan.stripes.indirect_light import _beside, _mean_imbalance
+from bodyscan.stripes.indirect_light import _beside, _mean_imbalance, mostly_direct
+from bodyscan.stripes.scan_lines import WHOLE_SHARE
 from bodyscan.stripes.stripe_map import StripeMap
 
 STRIPES, PX = 50, 4.0
@@ -144,3 +147,52 @@ def test_what_a_pattern_and_its_inverse_do_not_share_is_the_middle_between_both_
     half, unsure = _mean_imbalance(lit, dark, pixels, difference, noise)
     assert half[0] == pytest.approx(0.5 * found, rel=1e-4)
     assert unsure[0] == pytest.approx(abs(found) * np.hypot(0.25, 0.15), rel=1e-4)
+
+
+class Shares:
+    """Bits of which so much is direct, in the order of their fineness from `finest` down."""
+
+    def __init__(self, finest: int, *shares: np.ndarray) -> None:
+        self.of_bit = {finest - k: share for k, share in enumerate(shares)}
+        self.asked: list[int] = []
+
+    def direct_share(self, bit: int, variance: Any) -> np.ndarray:
+        self.asked.append(bit)
+        return np.rint(WHOLE_SHARE * self.of_bit[bit]).astype(np.uint8)[None].repeat(3, axis=0)
+
+
+def direct(shares: Shares, usable: np.ndarray | None = None) -> list[bool]:
+    images: Any = shares
+    nothing: Any = None
+    every = np.ones(200, bool) if usable is None else usable
+    found = mostly_direct(images, every[None].repeat(3, axis=0), 6, nothing)
+    assert (found == found[0]).all()
+    return list(found[0].tolist())
+
+
+def test_where_half_of_the_light_is_direct_a_pixel_counts_and_where_a_bit_flips_it_is_filled() -> (
+    None
+):
+    share = np.ones(200)
+    share[20:26], share[40:47] = 0.1, 0.1  # six pixels are a flip, seven are not
+    share[60:80], share[100:120] = 0.51, 0.49
+    expected = np.ones(200, bool)
+    expected[40:47] = expected[100:120] = False
+    assert direct(Shares(6, share)) == expected.tolist()
+
+
+def test_the_next_coarser_bit_tells_where_the_finest_is_blurred_for_nine_of_ten_pixels() -> None:
+    place = np.arange(200)
+    for clear, asked in ((20, [6]), (19, [6, 5])):
+        # Sharp is what has four fifths.
+        blurred, coarse = np.where(place < clear, 0.81, 0.4), np.where(place < 150, 1.0, 0.4)
+        shares = Shares(6, blurred, coarse)
+        told = place < (clear if asked == [6] else 150)
+        assert direct(shares) == told.tolist()
+        assert shares.asked == asked
+    # Of those that are looked at alone; and where none is sharp, nothing is told of any.
+    assert direct(Shares(6, np.where(place < 10, 0.81, 0.4)), place < 100) == (place < 10).tolist()
+    dull = np.full(200, 0.79)
+    shares = Shares(6, dull, dull, dull)
+    assert all(direct(shares))
+    assert shares.asked == [6, 5, 4]
