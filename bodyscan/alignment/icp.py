@@ -17,7 +17,7 @@ from typing import TypeVar
 import numpy as np
 
 from bodyscan.alignment.matching import Matches
-from bodyscan.alignment.overlap_equations import OverlapEquations, solve_motions
+from bodyscan.alignment.overlap_equations import OverlapEquations, motion_covariance, solve_motions
 from bodyscan.alignment.overlaps import (
     COARSE,
     OverlapPoints,
@@ -67,12 +67,15 @@ class Alignment:
         far others moved is not observed.
     refused: pairs that would have moved farther than the prior allows, with their motion in sigmas.
     overlaps: all overlaps.
+    poses: covariance of the aligned poses, given the prior (boards, and a sway of the size found)
+        and the overlaps; None if a pair was refused, or Open3D aligned.
     """
 
     rig_from_camera: dict[str, RigidTransform]
     motion_mm: dict[str, float]
     refused: dict[str, float]
     overlaps: tuple[Overlap, ...]
+    poses: PoseCovariance | None = None
 
     @property
     def rms_before_mm(self) -> float:
@@ -110,9 +113,9 @@ def align(
             from bodyscan.alignment.open3d_registration import register  # Open3D loads for a second
 
             inner = [seen.inner for seen in clouds]
-            motion = register(inner, start, names, prior, settings)
+            motion, left = register(inner, start, names, prior, settings), None
         else:
-            motion = _register(pool, (coarse, clouds), start, names, prior, settings)
+            motion, left = _register(pool, (coarse, clouds), start, names, prior, settings)
         widest = sway.covariance(names, prior, sway.most)
         motion, refused = bound_motions(names, motion, widest, settings.limit_sigmas)
         moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
@@ -131,6 +134,7 @@ def align(
             Overlap(names[i], names[j], COARSE.step * count, was.get((i, j), UNKNOWN)[1], *apart)
             for (i, j), (count, *apart) in now.items()
         ),
+        None if left is None or refused else PoseCovariance(tuple(names), left),
     )
 
 
@@ -141,8 +145,9 @@ def _register(
     names: Sequence[str],
     prior: PoseCovariance,
     settings: AlignmentSettings,
-) -> Array:
-    """Motions (P, 6), rig frame, by rounds of new matches and one joint step of all pairs.
+) -> tuple[Array, Array]:
+    """Motions (P, 6), rig frame, by rounds of new matches and one joint step of all pairs; and their
+    covariance (6P, 6P).
 
     clouds: coarse, and fine for the last rounds.
     """
@@ -154,9 +159,10 @@ def _register(
         moved = [t.moved(m) for t, m in zip(start, motion, strict=True)]
         taken = fine if left <= FINE_ROUNDS else coarse
         overlaps = _each_overlap(equations, pool, taken, moved, reach, settings)
-        motion = solve_motions(overlaps, motion, sway.covariance(names, prior, scale))
+        known = sway.covariance(names, prior, scale)
+        motion = solve_motions(overlaps, motion, known)
         reach, scale = max(reach / 2.0, settings.least_reach_mm), sway.scale(motion)
-    return motion
+    return motion, motion_covariance(overlaps, known)
 
 
 def _each_overlap(

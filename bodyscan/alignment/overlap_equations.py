@@ -11,7 +11,7 @@ from bodyscan.alignment.matching import Matches
 from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
 from bodyscan.geometry.robust import spread
-from bodyscan.geometry.scaled_systems import solve_scaled
+from bodyscan.geometry.scaled_systems import invert_scaled, solve_scaled
 
 LEAST_SPREAD_MM = 0.01
 
@@ -58,19 +58,32 @@ def solve_motions(
 
     One step is enough, since every round of the alignment matches anew.
     """
-    normal = np.asarray(np.linalg.inv(covariance), np.float64)
     right = np.zeros(motion.size)
     for (a, b), overlap in overlaps.items():
-        i, j = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
         # The distance left after the step: d + J (x_i - m_i) - J (x_j - m_j).
         wanted = overlap.information @ (motion[a] - motion[b]) - overlap.gradient
+        right[6 * a : 6 * a + 6] += wanted
+        right[6 * b : 6 * b + 6] -= wanted
+    return solve_scaled(_normal(overlaps, covariance), right).reshape(-1, 6)
+
+
+def motion_covariance(
+    overlaps: Mapping[tuple[int, int], OverlapEquations], covariance: Array
+) -> Array:
+    """Covariance (6P, 6P) of the motions that `solve_motions` finds, given that of the prior."""
+    return invert_scaled(_normal(overlaps, covariance))
+
+
+def _normal(overlaps: Mapping[tuple[int, int], OverlapEquations], covariance: Array) -> Array:
+    """Normal matrix (6P, 6P) of all motions: the prior's, and each overlap's by both of its ends."""
+    normal = np.asarray(np.linalg.inv(covariance), np.float64)
+    for (a, b), overlap in overlaps.items():
+        i, j = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
         normal[i, i] += overlap.information
         normal[j, j] += overlap.information
         normal[i, j] -= overlap.information
         normal[j, i] -= overlap.information
-        right[i] += wanted
-        right[j] -= wanted
-    return solve_scaled(normal, right).reshape(-1, 6)
+    return normal
 
 
 @compiled

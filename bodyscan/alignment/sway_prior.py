@@ -93,3 +93,10 @@ def bound_motions(
             refused[name] = sigmas
             kept[k] = 0.0
     return kept, refused
+
+
+def better_known(one: PoseCovariance, other: PoseCovariance) -> PoseCovariance:
+    """Of two covariances the one by which `other`'s pairs put the body's centre off by less."""
+    sizes = ([centre_sigmas(poses)[name] for name in other.names] for poses in (one, other))
+    ours, theirs = (rms(np.array(sigmas)) for sigmas in sizes)
+    return other if theirs < ours else one

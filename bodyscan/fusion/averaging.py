@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from bodyscan.fusion.evidence import Evidence
 from bodyscan.fusion.quadratics import NORMAL_MEDIAN
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.progress import THREADS
 
@@ -31,10 +33,14 @@ def average(
     surfaces: Sequence[SmoothSurface],
     evidence: Sequence[Evidence],
     grey: EvenGrey,
+    poses: PoseCovariance | None = None,
     workers: int = THREADS,
 ) -> BodyCloud:
-    """Average each sample with what agrees with it; outvoted samples are dropped."""
-    general = scatter(samples, surfaces, evidence) ** 2
+    """Average each sample with what agrees with it; outvoted samples are dropped.
+
+    poses: how well the pairs' poses are known, None for exactly.
+    """
+    general = scatter(samples, surfaces, evidence, poses) ** 2
 
     def part(start: int) -> tuple[NDArray[Any], ...]:
         some = slice(start, start + AT_A_TIME)
@@ -56,15 +62,43 @@ def average(
 
 
 def scatter(
-    samples: Samples, surfaces: Sequence[SmoothSurface], evidence: Sequence[Evidence]
+    samples: Samples,
+    surfaces: Sequence[SmoothSurface],
+    evidence: Sequence[Evidence],
+    poses: PoseCovariance | None = None,
 ) -> float:
-    """Typical distance between pairs in units of its predicted sigma; at least 1."""
+    """Typical distance between pairs in units of its predicted sigma; at least 1.
+
+    Errors of the pairs' poses set their surfaces apart too, but are no fault of the points: they
+    are part of the prediction here, and `pose_variance` adds them to the points' sigmas once.
+    """
     ratios = [np.empty(0)]
     for surface, one in zip(surfaces, evidence, strict=True):
-        ours, theirs = samples.sigma_mm[one.index[::EVERY]], surface.sigma_mm[one.at[::EVERY]]
-        ratios.append(np.abs(one.shift_mm[::EVERY]) / np.hypot(ours, theirs))
+        index, shift_mm = one.index[::EVERY], one.shift_mm[::EVERY]
+        variance = samples.sigma_mm[index] ** 2 + surface.sigma_mm[one.at[::EVERY]] ** 2
+        if poses is not None:
+            variance += _apart_by_poses(samples, index, surfaces, surface.pair, poses)
+        ratios.append(np.abs(shift_mm) / np.sqrt(variance))
     every = np.concatenate(ratios)
     return max(1.0, float(np.median(every)) / NORMAL_MEDIAN) if every.size else 1.0
+
+
+def _apart_by_poses(
+    samples: Samples,
+    index: NDArray[np.int32],
+    surfaces: Sequence[SmoothSurface],
+    other: str,
+    poses: PoseCovariance,
+) -> Floats:
+    """Variance (n,) mm^2, along the normals of samples `index`, of the pair `other` against the
+    samples' own pairs."""
+    variance = np.empty(len(index), np.float32)
+    ends = np.searchsorted(index, samples.starts)
+    for own, (first, last) in zip(surfaces, pairwise(ends), strict=True):
+        points, normals = samples.points[index[first:last]], samples.normals[index[first:last]]
+        lever = np.hstack([np.cross(points, normals), normals])
+        variance[first:last] = np.sum(lever @ poses.between(own.pair, other) * lever, axis=1)
+    return variance
 
 
 @compiled

@@ -16,6 +16,7 @@ from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.evidence import compare
 from bodyscan.fusion.smoothing import smooth
 from bodyscan.fusion.thinning import take_samples
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.progress import THREADS
@@ -36,9 +37,12 @@ def merge(
     rig_from_camera: dict[str, RigidTransform],
     settings: FusionSettings,
     *,
+    poses: PoseCovariance | None = None,
     workers: int = THREADS,
 ) -> MergedCloud:
     """Merge aligned, cleaned range images into one even cloud of about `settings.points` points.
+
+    poses: how well the pairs' poses are known; None for exactly. See `averaging.scatter`.
 
     Surfaces of two pairs within `settings.agreement_mm` along the normal are averaged by weight;
     between that and `settings.double_mm` they are a double surface, of which the heavier one stays.
@@ -64,6 +68,6 @@ def merge(
         )
         evidence = list(compared)
     grey = even_brightness(samples, surfaces, evidence)
-    cloud = average(samples, surfaces, evidence, grey, workers)
+    cloud = average(samples, surfaces, evidence, grey, poses, workers)
     found = Contradictions.of(list(shown), evidence, samples, surfaces, settings.agreement_mm)
     return MergedCloud(cloud, found)

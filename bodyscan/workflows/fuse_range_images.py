@@ -12,7 +12,7 @@ from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.following import Followed
 from bodyscan.alignment.icp import align
 from bodyscan.alignment.oblique_light import ObliqueLight, light_lines, take_out
-from bodyscan.alignment.sway_prior import SwayPrior
+from bodyscan.alignment.sway_prior import SwayPrior, better_known
 from bodyscan.alignment.together import Together, bring_together
 from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.contradictions import Contradictions
@@ -137,13 +137,18 @@ def _aligned(
     rig_from_camera = start | together.alignment.rig_from_camera
     images = at_once(images, rig_from_camera, together.followed)
     untied = {image.pair for image in images} - together.alignment.motion_mm.keys()
-    known = SwayPrior.of(settings).loosen(boards, untied)
+    known, aligned = SwayPrior.of(settings).loosen(boards, untied), together.alignment.poses
+    if aligned is not None:
+        # As the boards left them, if nobody moved; as the overlaps left them, whoever moved.
+        known = better_known(known, aligned)
     return _Placed(images, rig_from_camera, known, together, oblique)
 
 
 def _merged(placed: _Placed, settings: FusionSettings) -> MergedCloud:
     """Merge to one cloud; its sigmas include those of the pairs' poses and the person's motion."""
-    merged = merge(placed.images, placed.rig_from_camera, settings)
+    # Following a person fits the pairs to each other: what it leaves between them is not the poses'.
+    poses = None if placed.followed else placed.known
+    merged = merge(placed.images, placed.rig_from_camera, settings, poses=poses)
     cloud = add_pose_variance(merged.cloud, placed.there, placed.known)
     if placed.followed:
         cloud = add_motion_variance(merged.cloud, cloud, placed.followed)

@@ -261,7 +261,9 @@ def test_each_round_looks_half_as_far_and_believes_the_sway_that_the_last_one_fo
     nothing: Any = None
     clouds: Any = "coarse", "fine"
     start = [RigidTransform.identity()]
-    motion = icp._register(nothing, clouds, start, ["a"], nothing, settings)
+    monkeypatch.setattr(icp, "motion_covariance", lambda overlaps, known: (overlaps, known))
+    motion, left = icp._register(nothing, clouds, start, ["a"], nothing, settings)
+    assert left == ("overlaps", 40.0), "what the last round knew"
     assert rounds == [
         ("coarse", 20.0, 0.0), ("coarse", 10.0, 1.0), ("coarse", 5.0, 2.0), ("fine", 3.0, 3.0),
         ("fine", 3.0, 4.0),

@@ -7,7 +7,11 @@ import pytest
 from scipy import stats
 
 from bodyscan.alignment.matching import Matches
-from bodyscan.alignment.overlap_equations import OverlapEquations, solve_motions
+from bodyscan.alignment.overlap_equations import (
+    OverlapEquations,
+    motion_covariance,
+    solve_motions,
+)
 from bodyscan.alignment.pair_drift import PairDrift, mean_drift
 
 
@@ -125,3 +129,18 @@ def test_two_scans_do_not_tell_a_pair_that_moved_from_a_person() -> None:
     assert few.sigma_mm is None
     assert not few.moved
     assert mean_drift("p", np.tile([9.0, 0.0, 0.0], (3, 1))).moved
+
+
+def test_motions_are_known_by_the_prior_and_by_what_overlaps_say_of_their_difference() -> None:
+    """Two pairs, each known to a, tied along x to b: their mean keeps a / sqrt(2), their difference
+    has 1 / (1 / 2 a^2 + 1 / b^2); along y, of which the overlap says nothing, all stays."""
+    a, b = 0.3, 0.1
+    tie = OverlapEquations(np.diag([0.0, 0.0, 0.0, b**-2, 0.0, 0.0]), np.zeros(6))
+    found = motion_covariance({(0, 1): tie}, a**2 * np.eye(12))
+    mean, difference = np.zeros(12), np.zeros(12)
+    mean[[3, 9]], difference[[3, 9]] = 0.5, (1.0, -1.0)
+    assert mean @ found @ mean == pytest.approx(a**2 / 2.0)
+    expected = 1.0 / (1.0 / (2.0 * a**2) + 1.0 / b**2)
+    assert difference @ found @ difference == pytest.approx(expected)
+    assert found[4, 4] == pytest.approx(a**2)
+    assert found[4, 10] == pytest.approx(0.0, abs=1e-12)

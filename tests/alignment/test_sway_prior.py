@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.alignment.sway_prior import SwayPrior, bound_motions, centre_shifts
+from bodyscan.alignment.sway_prior import (
+    SwayPrior,
+    better_known,
+    bound_motions,
+    centre_shifts,
+)
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.settings import BODY_CENTRE_MM
@@ -68,3 +73,14 @@ def test_what_all_pairs_share_is_not_between_two() -> None:
     known.matrix[12:, 12:] += own
     assert np.allclose(known.between("p1", "p2"), 0.0)
     assert np.allclose(known.between("p2", "p3"), own)
+
+
+@pytest.mark.parametrize(("first_mm", "second_mm"), [(0.1, 0.2), (0.2, 0.1)])
+def test_of_two_covariances_the_one_that_puts_the_body_off_by_less_counts(
+    first_mm: float, second_mm: float
+) -> None:
+    """Pairs that only one of them knows have no say."""
+    every = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0] * 2 + [0.0, 0.0, 0.0, 1e6, 1e6, 1e6])
+    one = PoseCovariance(("a", "b", "c"), first_mm**2 * every)
+    other = PoseCovariance(("a", "b"), second_mm**2 * every[:12, :12])
+    assert better_known(one, other) is (one if first_mm < second_mm else other)

@@ -15,6 +15,7 @@ from bodyscan.fusion.brightness import EvenGrey
 from bodyscan.fusion.evidence import Evidence, compare
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples, take_samples
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 
@@ -42,7 +43,7 @@ def fused(
     samples = take_samples(surfaces, 10**6)
     evidence = [compare(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)]
     return (
-        average(samples, surfaces, evidence, as_seen(samples, surfaces), 1),
+        average(samples, surfaces, evidence, as_seen(samples, surfaces), workers=1),
         samples,
         surfaces,
         evidence,
@@ -71,7 +72,7 @@ def test_what_one_pair_alone_saw_is_as_certain_as_it_says() -> None:
     surface = known_to(wall(WALL_MM, 60, RigidTransform.identity()), 0.1)
     samples = take_samples([surface], 10**6)
     alone = [compare(samples, surface, 0, 1.5, 6.0)]
-    cloud = average(samples, [surface], alone, as_seen(samples, [surface]), 1)
+    cloud = average(samples, [surface], alone, as_seen(samples, [surface]), workers=1)
     assert cloud.sigma_mm == pytest.approx(0.1, rel=1e-5)
 
 
@@ -83,7 +84,7 @@ def test_where_a_surface_ends_there_is_no_step() -> None:
     ]
     samples = take_samples(surfaces, 10**6)
     evidence = [compare(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)]
-    cloud = average(samples, surfaces, evidence, as_seen(samples, surfaces), 1)
+    cloud = average(samples, surfaces, evidence, as_seen(samples, surfaces), workers=1)
     left, right = surfaces[1].points[:, 0].min(), surfaces[0].points[:, 0].max()
     middle = np.abs(cloud.points[:, 1]) < 20.0
     x, z = cloud.points[middle, 0], cloud.points[middle, 2]
@@ -108,6 +109,27 @@ def test_pairs_that_disagree_everywhere_are_all_less_certain() -> None:
     assert cloud.sigma_mm[both] == pytest.approx(times * 0.1 / np.sqrt(2.0), rel=0.01)
 
 
+def test_pairs_that_stand_apart_as_their_poses_are_known_are_no_less_certain() -> None:
+    """Of 0.5 mm along z, 0.48 are explained by how well the two poses are known; a turn about z, which
+    moves no point of the wall along its normal, explains nothing."""
+    _, samples, surfaces, evidence = fused(0.5, (0.1, 0.1))
+    first, second = (
+        replace(surface, pair=name) for surface, name in zip(surfaces, "ab", strict=True)
+    )
+    along_z = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 0.48**2])
+    about_z = np.diag([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    unknown = scatter(samples, [first, second], evidence)
+    for turned, expected in ((along_z, 0.5 / 0.5 / 0.6745), (about_z, unknown)):
+        both = np.zeros((12, 12))
+        both[6:, 6:] = turned
+        poses = PoseCovariance(("a", "b"), both)
+        found = scatter(samples, [first, second], evidence, poses)
+        assert found == pytest.approx(expected, rel=0.01)
+    # Errors that both share set nothing apart.
+    alike = PoseCovariance(("a", "b"), np.tile(along_z, (2, 2)))
+    assert scatter(samples, [first, second], evidence, alike) == pytest.approx(unknown, rel=1e-6)
+
+
 def test_a_place_where_pairs_disagree_by_more_than_elsewhere_is_less_certain() -> None:
     surfaces = [
         known_to(wall(WALL_MM, 100, RigidTransform.identity()), 0.1),
@@ -119,7 +141,7 @@ def test_a_place_where_pairs_disagree_by_more_than_elsewhere_is_less_certain() -
     samples = take_samples(surfaces, 10**6)
     evidence = [compare(samples, surface, k, 1.5, 6.0) for k, surface in enumerate(surfaces)]
     assert scatter(samples, surfaces, evidence) == 1.0
-    cloud = average(samples, surfaces, evidence, as_seen(samples, surfaces), 1)
+    cloud = average(samples, surfaces, evidence, as_seen(samples, surfaces), workers=1)
     both = cloud.pairs_seen == 2
     apart = np.isclose(np.abs(cloud.points[:, 2] - WALL_MM), 0.4, atol=0.01) & both
     assert apart.sum() > 50
