@@ -125,12 +125,16 @@ def _nothing_seen(
 def repaired(calibration: RigCalibration, moves: Sequence[Move]) -> RigCalibration:
     """The calibration with the moved pairs at their new poses, everything else unchanged.
 
-    The covariance of its move is added to that of its pairs, which share its error.
+    A pole takes along those of its pairs that saw no board. The covariance of a move is added to that
+    of its pairs, which share its error.
     """
     placing, covariance = dict(calibration.rig_from_camera), calibration.covariance
+    poles = calibration.rig.poles
     for move in moves:
-        placing |= {pair: move.motion @ placing[pair] for pair in move.pairs}
-        covariance = covariance.moved_together(move.pairs, move.covariance)
+        carried = {poles[pair] for pair in move.pairs if len(move.pairs) > 1}
+        pairs = [pair for pair in placing if pair in move.pairs or poles.get(pair) in carried]
+        placing |= {pair: move.motion @ placing[pair] for pair in pairs}
+        covariance = covariance.moved_together(pairs, move.covariance)
     said = tuple(f"repaired: {move_line(move)}" for move in moves)
     return replace(
         calibration,

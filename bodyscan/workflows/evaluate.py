@@ -140,12 +140,13 @@ def evaluate_workspace(workspace: Path, body_at: BodyAt | None = None) -> str:
     if body_at is not None and moment_ms is not None:
         truth = replace(truth, vertices=body_at(moment_ms))
     lines += _scan_lines(stored, folder, calibration, truth)
+    exported = [workspace / "export"] if (workspace / "export").is_dir() else []
     lines += [
         "results:",
         f"  calibration {workspace / 'calibration' / 'calibration.json'}",
         f"  cloud       {folder / 'cloud.ply'}",
         f"  mesh        {folder / 'mesh.ply'}",
-        f"  exports     {workspace / 'export'}",
+        *(f"  exports     {path}" for path in exported),
         f"  pictures    {', '.join(str(path) for path in sorted(folder.glob('*.png')))}",
     ]
     return "\n".join(lines)

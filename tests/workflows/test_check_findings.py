@@ -28,6 +28,7 @@ CALIBRATION: Any = SimpleNamespace(
 class Placed:
     """Of a calibration, what a repair changes."""
 
+    rig: Any
     rig_from_camera: dict[str, RigidTransform]
     covariance: PoseCovariance
     notes: tuple[str, ...]
@@ -127,18 +128,20 @@ def test_an_undecided_check_asks_for_more_scans(scans: int, asked: str) -> None:
 
 
 def test_pairs_of_a_repaired_pole_are_as_well_known_to_each_other_as_before() -> None:
-    """They were carried by one motion: its error is shared by all of them."""
-    names = ("p1-1", "p1-2", "p2-1")
-    mixing = 0.1 * np.random.default_rng(2).standard_normal((18, 18))
+    """They were carried by one motion: its error is shared by all of them, and by the third of them,
+    p1-3, which saw no board and went along."""
+    names = ("p1-1", "p1-2", "p2-1", "p1-3")
+    mixing = 0.1 * np.random.default_rng(2).standard_normal((24, 24))
     known = PoseCovariance(names, mixing @ mixing.T)
     placing = {name: RigidTransform.identity() for name in names}
-    calibration: Any = Placed(placing, known, ("as it was",))
+    rig = SimpleNamespace(poles={name: name[:2] for name in names})
+    calibration: Any = Placed(rig, placing, known, ("as it was",))
     motion = RigidTransform(np.eye(3), np.array([3.0, 0.0, 4.0]))
     move = Move("pole p1", names[:2], motion, np.diag([1e-6] * 3 + [0.25] * 3), 5.0, 0.9, 0.0)
     mended = repaired(calibration, [move])
     after = mended.covariance
     np.testing.assert_allclose(after.between("p1-1", "p1-2"), known.between("p1-1", "p1-2"))
-    for name in move.pairs:
+    for name in (*move.pairs, "p1-3"):
         np.testing.assert_allclose(after.of(name), known.of(name) + move.covariance)
         grown = after.between(name, "p2-1") - known.between(name, "p2-1")
         np.testing.assert_allclose(grown, move.covariance, atol=1e-12)
