@@ -2,7 +2,8 @@
 
 Near the cloud its points say. Elsewhere distances are filled in harmonically, which continues the
 surface from rim to rim. But what cameras saw through is outside: a first guess webs gaps over, free
-space opens them. And so is what lies below the floor.
+space opens them. And so is what lies below the floor, and above the tangent planes of a crown, over
+which a harmonic surface stands by some millimetres.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
+from bodyscan.fusion.crown import Crown
 from bodyscan.fusion.free_space import Guess, sees_through
 from bodyscan.fusion.harmonic_filling import fill_harmonically
 from bodyscan.fusion.signed_distances import REACH_CELLS, splat
@@ -81,8 +83,13 @@ def likely_distances(
     least = np.full(values.shape, -np.inf, np.float32)
     guess = np.maximum(fill_harmonically(values, fixed, least, SURE * reach), -height)
     free = _seen_through(guess, measured, bricks, range_images, rig_from_camera, workers)
-    if free.any():
-        least[free] = 0.5 * cell_mm
+    least[free] = 0.5 * cell_mm
+    bulges = (np.abs(guess) < cell_mm) & ~measured
+    over = Crown.of(cloud.points, cloud.normals).outside(
+        bricks.origin + cell_mm * np.argwhere(bulges)
+    )
+    least[bulges] = np.where(over > 0.0, np.maximum(over, least[bulges]), least[bulges])
+    if np.isfinite(least).any():
         _mirror(least, below, ~measured)
         guess = np.maximum(fill_harmonically(values, fixed, least, SURE * reach), -height)
     return Distances(guess, bricks.origin, cell_mm)
