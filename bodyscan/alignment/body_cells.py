@@ -47,7 +47,7 @@ class BodyCells:
         """The cells of points (N, 3) with normals (N, 3), and each one's cell (N,), -1 for none."""
         centres, turned, cell = _gather(points, normals, CELL_MM, FEWEST_POINTS)
         links = _link(centres, turned, points[::SOME])
-        landmarks = _one_each(centres, LANDMARK_MM)
+        landmarks = one_each(centres, LANDMARK_MM)
         away = _distances(links, landmarks)
         return BodyCells(centres, turned, links, landmarks, away), cell
 
@@ -161,7 +161,7 @@ def _gather(
     return centres / count[enough, None], turned / length, number[key]
 
 
-def _one_each(centres: Array, size_mm: float) -> Indices:
+def one_each(centres: Array, size_mm: float) -> Indices:
     """Of each cube of that size the cell nearest to its middle."""
     place = (centres - centres.min(axis=0)) / size_mm
     cube = np.floor(place).astype(np.int64)
