@@ -26,6 +26,7 @@ from benchmarks import (
     fusion,
     fuzz,
     lens,
+    motion_budget,
     mutants,
     one_solve,
     people,
@@ -46,6 +47,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "living": full_size.living,
     "skin": skin.report,
     "people": people.report,
+    "motion-budget": motion_budget.report,
     "sigmas": sigmas.report,
     "sigmas-rigs": sigmas.rigs,
     "one-solve": one_solve.report,
@@ -63,7 +65,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "lens": lens.report,
     "mutants": mutants.report,
 }
-SLOW = ("mutants", "day", "sigmas-rigs")
+SLOW = ("mutants", "day", "sigmas-rigs", "motion-budget")
 """Run only when named."""
 
 

@@ -50,7 +50,7 @@ class BodyCells:
         """Cells of points (N, 3) with normals (N, 3), and each point's cell (N,), -1 for none."""
         centres, turned, cell = _gather(points, normals, CELL_MM, FEWEST_POINTS)
         links = _link(centres, turned, points[::SOME])
-        landmarks = _one_each(centres, LANDMARK_MM)
+        landmarks = one_each(centres, LANDMARK_MM)
         away = _distances(links, landmarks)
         return BodyCells(centres, turned, links, landmarks, away), cell
 
@@ -167,7 +167,7 @@ def _gather(
     return centres / count[enough, None], turned / length, number[key]
 
 
-def _one_each(centres: Array, size_mm: float) -> Indices:
+def one_each(centres: Array, size_mm: float) -> Indices:
     """The cell nearest to the middle of each cube of that size."""
     place = (centres - centres.min(axis=0)) / size_mm
     cube = np.floor(place).astype(np.int64)

@@ -2,7 +2,8 @@
 
 Near the cloud its points determine them. Elsewhere distances are filled in harmonically, which
 continues the surface from rim to rim. But what cameras saw through is outside, and so is what lies
-below the floor: a first guess spans gaps, and free space opens them.
+below the floor, or above the tangent planes of a crown: a first guess spans gaps and bulges over
+crowns by millimetres, and these bounds correct it.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Floats, Mask
 from bodyscan.compiled import compiled
+from bodyscan.fusion.crown import NOISE_MM, Crown
 from bodyscan.fusion.free_space import Guess, sees_through
 from bodyscan.fusion.harmonic_filling import fill_harmonically
 from bodyscan.fusion.signed_distances import REACH_CELLS, splat
@@ -84,11 +86,28 @@ def likely_distances(
     least = np.full(values.shape, -np.inf, np.float32)
     guess = np.maximum(fill_harmonically(values, fixed, least, SURE * reach), -height)
     free = _seen_through(guess, measured, bricks, range_images, rig_from_camera, workers)
-    if free.any():
-        least[free] = 0.5 * cell_mm
+    least[free] = 0.5 * cell_mm
+    _hold_crown(least, guess, measured, bricks, Crown.of(cloud.points, cloud.normals))
+    if np.isfinite(least).any():
         _mirror(least, below, ~measured)
         guess = np.maximum(fill_harmonically(values, fixed, least, SURE * reach), -height)
     return Distances(guess, bricks.origin, cell_mm)
+
+
+def _hold_crown(least: Floats, guess: Floats, measured: Mask, bricks: Bricks, crown: Crown) -> None:
+    """Bound nodes around which a guessed surface stands above a crown's planes, as these say."""
+    inside, cell_mm = guess < 0.0, bricks.cell_mm
+    ends = inside[..., :-1] & ~inside[..., 1:] & ~(measured[..., :-1] & measured[..., 1:])
+    node = np.argwhere(ends)
+    below, above = guess[..., :-1][ends], guess[..., 1:][ends]
+    low = bricks.origin + cell_mm * node
+    up = np.array([0.0, 0.0, cell_mm])
+    crossing = low + up * (below / np.minimum(below - above, -1e-6))[:, None]
+    bulges = crown.outside(crossing) > NOISE_MM
+    for places, at in ((low, node), (low + up, node + [0, 0, 1])):
+        chosen = tuple(at[bulges].T)
+        over = crown.outside(places[bulges])
+        least[chosen] = np.where(over > 0.0, np.maximum(over, least[chosen]), least[chosen])
 
 
 def _mirror(values: Floats | Mask, below: int, where: Mask) -> None:

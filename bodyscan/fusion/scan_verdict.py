@@ -18,6 +18,7 @@ from bodyscan.alignment.sway_prior import centre_sigmas
 from bodyscan.alignment.together import Together
 from bodyscan.arrays import Array
 from bodyscan.fusion.contradictions import Contradictions
+from bodyscan.fusion.crown import Crown
 from bodyscan.fusion.proportions import odd_proportions
 from bodyscan.fusion.seams import SeamReport, find_misfits
 from bodyscan.fusion.surface_check import SurfaceCheck
@@ -52,7 +53,7 @@ CAMERA_MM, TURNED_DEG, STAYED = 1000.0, 5.0, 0.25
 """A bumped pole turns about its foot and takes its view of the body with it. If the body's middle
 stays within a quarter of that, and the turn is too large for a bump, the body turned. Few cameras
 stand nearer to it than this."""
-FLOOR_MM = 4.0
+FLOOR_MM = CROWN_MM = 4.0
 """What ISO 20685-1 allows for stature, for all errors; floors are flat to 2 mm over a metre."""
 CELL_MM = 50.0
 SIDE_BY_SIDE = 0.4  # of the taller one's height
@@ -81,8 +82,6 @@ SOLES_MM = 50.0
 ONE_SIDE = 0.7
 """Cosine to the cameras' mean direction: within 45 degrees of it, all of them see the same half."""
 UNKNOWN_BAND = 0.5
-CROWN_MM = 5.0
-"""A dome's top 5 mm are 40 mm across; if a head ends where its hair begins, they close it."""
 SOME_SATURATED = 0.05
 """of the skin: highlights on nose and forehead are less."""
 LEAST_YIELD = 0.6
@@ -623,10 +622,10 @@ def _gaps(cloud: BodyCloud, surface: SurfaceCheck | None) -> Iterator[Finding]:
             f"next to nothing was measured from {BAND_MM * low:.0f} to {BAND_MM * high:.0f} mm "
             "(hair, black cloth, or out of view)",
         )
-    crown = surface.heights_mm > surface.heights_mm.max() - CROWN_MM
-    if (area * surface.filled)[crown].sum() > UNKNOWN_BAND * area[crown].sum():
+    crown = Crown.of(cloud.points, cloud.normals)
+    if crown.unknown_mm > CROWN_MM:
         yield (
             "usable",
-            f"nothing was measured of the crown, and perhaps of all above "
-            f"{surface.heights_mm.max():.0f} mm (hair, a cap, or out of view): the stature is a guess",
+            f"nothing was measured of the crown, and perhaps of all above {crown.highest[2]:.0f} mm "
+            "(hair, a cap, or out of view): the stature is a guess",
         )

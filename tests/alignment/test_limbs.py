@@ -138,16 +138,17 @@ def test_breath_shows_on_the_trunk_in_front_more_than_behind() -> None:
         assert breathing(turned)[at(cells, 0.0, 1125.0)] == pytest.approx(front)
 
 
-def test_a_breath_lifts_the_front_of_the_trunk_alike_over_a_hand() -> None:
+def test_a_breath_lifts_the_front_of_the_trunk_alike_over_a_palm() -> None:
     """Products of the fields sum to how alike two cells rise, times how far each may: all as one, and
-    a third of it by 110 mm."""
+    a third of it by 80 mm, in few fields."""
     cells = person()
     lifts, apart = breathing(cells), cells.away
     fields = breath_fields(cells)
     assert np.abs(fields[:, 1:3]).max() == 0.0, "outwards, which is along x here"
-    likeness = np.outer(lifts, lifts) * (1.0 + 0.35**2 * np.exp(-0.5 * (apart / 110.0) ** 2))
-    # Functions of less than a 25th of the largest are left out, some of them beside each other.
+    likeness = np.outer(lifts, lifts) * (1.0 + 0.35**2 * np.exp(-0.5 * (apart / 80.0) ** 2))
+    # Functions of less than a fiftieth of the largest are left out.
     assert np.abs(fields[:, 0] @ fields[:, 0].T - likeness).max() < 0.03
+    assert fields.shape[2] <= 1 + np.ptp(cells.centres[lifts > 0.0, 2]) / 60.0
 
 
 def followed(cells: BodyCells, rise: Array, amounts: Array, sigma_mm: float = 0.5) -> Followed:
