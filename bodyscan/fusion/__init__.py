@@ -3,7 +3,7 @@
 Read in this order: scan (what it gives), cleaning (removes what is not the subject), merging
 (smoothing, with quadratics and robust_windows; thinning; evidence; brightness; averaging),
 pose_variance (what the rig adds to each point's sigma), regions and roughness (skin, hair, cloth),
-meshing (signed_distances, hole_filling with harmonic_filling and free_space, support with
+meshing (signed_distances, hole_filling with harmonic_filling, free_space and crown, support with
 point_columns; surface_check), scan_verdict (whether it is good: contradictions, seams, proportions,
-floor), storage, scan_facts. Their order of work is `workflows.fuse_range_images`.
+floor), storage, scan_facts. Workflows say in which order they work.
 """
