@@ -19,7 +19,6 @@ from bodyscan.alignment.pole_steps import PoleStep, StepSearch
 from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.scan_verdict import silent_poles
 from bodyscan.fusion.seams import Seam, SeamReport
-from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.registration.nominal_size import NominalSize
 from bodyscan.settings import UseLimits
 from bodyscan.verdict import Verdict
@@ -275,17 +274,6 @@ def test_pairs_that_failed_alike_share_a_line_and_its_remedy(scan: MadeScan) -> 
         "left out: p1-1, p1-2: s01/p1-1/lit.png: is missing\n  Copy it here.",
         "left out: p2-1: too dark",
     )
-
-
-@pytest.mark.parametrize("filled", [True, False])
-def test_a_head_that_ends_in_a_cut_has_no_stature(scan: MadeScan, filled: bool) -> None:
-    """Nothing of its hair was measured: the mesh is closed flat where the forehead ends."""
-    heights = np.append(np.linspace(0.0, 1500.0, 1000), np.full(20, 1503.0))
-    areas = np.full(len(heights), 1600.0)
-    check = SurfaceCheck(heights, areas, (heights > 1500.0) & filled, {}, {})
-    verdict = graded(scan, use=NO_LIMITS, surface=check)
-    assert verdict.grade == ("usable" if filled else "good")
-    assert ("above 1503 mm" in str(verdict)) == filled
 
 
 @pytest.mark.parametrize(
