@@ -44,10 +44,11 @@ def breath_fields(cells: BodyCells) -> Array:
 
 
 def _places(centres: Array, as_one: Array) -> Array:
-    """(C, M) functions of cells with centres (C, 3), whose products sum to how alike two rise by
-    themselves, times as_one (C, 1); those that are next to nothing are left out.
+    """Functions (C, M) of cells with centres (C, 3), whose products sum to the correlation of the
+    cells' own rises, times as_one (C, 1); negligible ones are left out.
 
-    Straight through the body a trunk's front is far from its back: no way along the skin is needed.
+    A trunk's front is far from its back in a straight line too: no distances along the skin are
+    needed.
     """
     trunk = np.flatnonzero(as_one)
     if not len(trunk):

@@ -1,8 +1,8 @@
-"""How high a head may end, where cameras see its crown too flat to measure it.
+"""How high a head may end where cameras see its crown at too flat an angle to measure it.
 
-A crown is convex: it lies below the tangent planes of all that was measured around it. Where what is
-missing is small, or its rim nearly level, they hold it to a millimetre; where a head ends at its
-hair they stand steep, and hold nothing.
+A crown is convex, so it lies below the tangent planes of everything measured around it. If the gap is
+small, or its rim nearly level, the planes bound it to a millimetre; where a head ends at its hairline
+they are steep and bound nothing.
 """
 
 from __future__ import annotations
@@ -10,27 +10,33 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linprog
 
 from bodyscan.arrays import Array, Floats
 
 CELL_MM = 8.0
-"""Over which points and normals are averaged: a crown bends by 0.1 mm over half of it, a fingertip's
-radius is as long."""
+"""Size of the cells over which points and normals are averaged: a crown bends by 0.1 mm over half of
+one; a fingertip has that radius."""
 AROUND_MM = 100.0
-"""Half the length of a head: what lies farther aside of its highest point is no part of it."""
+"""Half the length of a head: what lies farther from its highest point is not part of it."""
 DOME_MM = 60.0
-"""Below its highest point a head widens down to there; ears begin lower."""
+"""A head widens from its highest point down to here; ears begin lower."""
 UPWARD = 0.5
-"""Least cosine to the vertical of planes that say how high a head goes."""
+"""Least cosine to the vertical of the planes that bound a head's height."""
 NOISE_MM = 0.5
-"""A plane that something measured stands above by more is no bound: there the body is not convex."""
+"""A plane that measured points exceed by more is no bound: the body is not convex there."""
+REFINEMENTS, FINER = 10, 0.3
+"""Grids, each 0.3 times as wide as the last: from 10 mm between nodes to a thousandth of one."""
+GRID = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 21)] * 2), axis=-1).reshape(-1, 2)
+"""Nodes (441, 2) of a grid of half width 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class Crown:
-    """highest: (3,) mm, what was measured highest.  normals (P, 3), offsets (P,): of tangent planes
-    below which all that was measured around lies."""
+    """Tangent planes below which everything measured around the top of a head lies.
+
+    highest: the highest point measured, (3,) mm.
+    normals, offsets: of the planes, (P, 3) and (P,) mm.
+    """
 
     highest: Array
     normals: Array
@@ -38,7 +44,7 @@ class Crown:
 
     @staticmethod
     def of(points: Array, normals: Array | Floats) -> Crown:
-        """From points (N, 3), z up, and their normals (N, 3)."""
+        """The crown of a body's points (N, 3), z up, with normals (N, 3)."""
         highest = points[np.argmax(points[:, 2])]
         near = points[:, 2] > highest[2] - DOME_MM
         near &= np.hypot(*(points[:, :2] - highest[:2]).T) < AROUND_MM
@@ -59,15 +65,24 @@ class Crown:
 
     @property
     def unknown_mm(self) -> float:
-        """By how much the head may end higher than was measured; inf if nothing holds it."""
+        """By how much the head may end higher than was measured; inf if nothing holds it.
+
+        The planes' lower envelope is concave: ever finer grids around its best node find its top.
+        """
         if not len(self.offsets):
             return np.inf
-        off = self.offsets - self.normals @ self.highest
-        found = linprog([0.0, 0.0, -1.0], A_ub=self.normals, b_ub=off, bounds=(None, None))
-        return max(0.0, float(found.x[2])) if found.x is not None else np.inf
+        slopes = self.normals[:, :2] / self.normals[:, 2:]
+        above = (self.offsets - self.normals @ self.highest) / self.normals[:, 2]
+        centre, half, top = np.zeros(2), AROUND_MM, 0.0
+        for _ in range(REFINEMENTS):
+            aside = centre + half * GRID
+            heights = np.min(above - aside @ slopes.T, axis=1)
+            centre, top = aside[np.argmax(heights)], float(heights.max())
+            half *= FINER
+        return max(0.0, top)
 
     def outside(self, places: Array) -> Array:
-        """(N,) mm by which places (N, 3) at the top of the head stand above its planes, at least 0."""
+        """How far places (N, 3) at the top of the head lie above its planes, (N,) mm, at least 0."""
         near = places[:, 2] > self.highest[2] - DOME_MM / 3.0
         near &= np.hypot(*(places[:, :2] - self.highest[:2]).T) < AROUND_MM
         found = np.zeros(len(places))

@@ -95,7 +95,7 @@ def likely_distances(
 
 
 def _hold_crown(least: Floats, guess: Floats, measured: Mask, bricks: Bricks, crown: Crown) -> None:
-    """Bound nodes around which a guessed surface stands above a crown's planes, as these say."""
+    """Bound the nodes around which the guessed surface stands above a crown's planes."""
     inside, cell_mm = guess < 0.0, bricks.cell_mm
     ends = inside[..., :-1] & ~inside[..., 1:] & ~(measured[..., :-1] & measured[..., 1:])
     node = np.argwhere(ends)
