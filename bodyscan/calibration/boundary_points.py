@@ -17,6 +17,10 @@ BENDS = 2
 """Iterations that lift a ray's point to a bent board's surface; the first alone is off by how much
 the board rises over a few tenths of a millimetre."""
 
+FEWEST_BOUNDARIES = 10
+"""A projector with a lens has eleven unknowns, of which one boundary on tilted boards determines
+three. Large images have thousands of points a boundary: of whole ones two were left to start from."""
+
 Height = Callable[[Array], Array]
 """Maps places (..., 2) mm of a board to heights (...) mm above its plane."""
 
@@ -108,18 +112,22 @@ def concatenate(parts: Sequence[BoundaryPoints]) -> BoundaryPoints:
     )
 
 
-def select(data: BoundaryPoints, kept: Mask) -> BoundaryPoints:
-    """The points where `kept` (N,) is true."""
+def select(data: BoundaryPoints, kept: Mask | Indices) -> BoundaryPoints:
+    """The points where `kept` (N,) is true, or of these numbers."""
     return BoundaryPoints(*(getattr(data, field.name)[kept] for field in fields(data)))
 
 
 def subsample(data: BoundaryPoints, most: int) -> BoundaryPoints:
-    """Keep every n-th boundary only, so that no more than about `most` points are left."""
+    """Keep about `most` points: every n-th boundary, whole unless that would leave fewer than
+    FEWEST_BOUNDARIES."""
     every = -(-len(data.index) // most)
     if every <= 1:
         return data
     _, rank = np.unique(data.index, return_inverse=True)
-    return select(data, rank % every == min(every // 2, int(rank.max())))
+    boundaries = int(rank.max()) + 1
+    step = min(every, max(boundaries // FEWEST_BOUNDARIES, 1))
+    kept = np.flatnonzero(rank % step == min(step // 2, boundaries - 1))
+    return select(data, kept[:: -(-every // step)])
 
 
 @dataclass(frozen=True, eq=False)

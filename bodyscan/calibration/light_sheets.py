@@ -24,6 +24,9 @@ from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import Axis, LightPlanes, LightSheets
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 
+LEAST_MEASURED = 0.5
+"""Share of held-out boards' points that a model gives a depth: one that fits gives all but a few at
+the rim, and one that missed gives few or none."""
 CHOICE_BINS, FIT_BINS = 4000, 25000
 START_BINS, START_STEPS, FOLD_STEPS = 1000, 15, 8
 AXIS_STARTS = (-0.5, 0.0, 0.5, 1.0, 1.5)
@@ -94,7 +97,8 @@ def fit_light_sheets(bins: BoundaryPoints, stripes: int, direction: Axis) -> She
     if chosen < len(starts):
         fit = fit_sheets(starts[chosen][1], subsample(bins, FIT_BINS), board_error_mm=error)
         sheets = fit.sheets
-        if not np.isfinite(sheets.covariance).all():
+        missed = any(one.chosen and one.measured < LEAST_MEASURED for one in figures)
+        if missed or not np.isfinite(sheets.covariance).all():
             raise PairFailed(
                 f"the stripes on {boards} boards fit no sheets of light",
                 remedy="capture the stripe sequence on the board in more poses, nearer and farther",

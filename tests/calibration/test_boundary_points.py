@@ -97,10 +97,20 @@ def test_every_nth_boundary_is_kept_whole() -> None:
     third = subsample(data, 400)
     assert np.unique(third.index).tolist() == list(range(11, 40, 3))
     assert np.bincount(third.board)[[0, 3]].tolist() == [200, 200]
-    # By their rank, not their number; at least one is left.
+    # By their rank, not their number.
     gaps = replace(data, index=7 * data.index)
     assert np.unique(subsample(gaps, 400).index).tolist() == list(range(77, 280, 21))
-    assert np.unique(subsample(data, 3).index).tolist() == [39]
+
+
+@pytest.mark.parametrize(("most", "points"), [(200, 200), (60, 58)])
+def test_boundaries_of_many_points_are_thinned_before_they_get_too_few(
+    most: int, points: int
+) -> None:
+    """Ten of 30 tell one model of the light from another; one alone would tell nothing."""
+    few = subsample(many(), most)
+    assert np.unique(few.index).tolist() == list(range(11, 40, 3))
+    assert len(few.index) == points
+    assert np.unique(few.board).tolist() == [0, 3], "on all boards"
 
 
 def test_points_selected_and_joined_keep_all_that_is_known_of_them() -> None:

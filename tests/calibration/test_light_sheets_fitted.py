@@ -81,6 +81,17 @@ def test_a_mirror_is_known_to_microns_on_boards_that_are() -> None:
     assert flatness(scene, fit, 400.0) < 0.002
 
 
+def test_thousands_of_points_a_boundary_are_fitted_as_well_as_a_hundred() -> None:
+    """As images of five megapixels have them. Whole boundaries alone would be two to start from, which
+    any projector fits; the sheets were then anywhere, and the calibration could not be written."""
+    scene, usual = mirror()
+    data = boards(scene, CHAPTER_POSES)
+    dense = select(data, np.repeat(np.arange(len(data.index)), 12))
+    fit = fitted(scene, dense)
+    assert fit.model.startswith("bowed sheets")
+    assert flatness(scene, fit, 400.0) < 1.5 * flatness(scene, usual, 400.0) + 0.002
+
+
 def test_stripes_out_of_step_keep_their_own_planes() -> None:
     even = chapter_scene()
     scene = replace(even, projector=Uneven(even.projector, 0.4))
