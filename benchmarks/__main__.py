@@ -70,15 +70,15 @@ SLOW = ("mutants", "day", "sigmas-rigs", "motion-budget")
 
 
 def main() -> None:
-    """Run benchmarks; other sections keep the results of
-    their last run, and say how old they are."""
+    """Run benchmarks; other sections keep the results of their last run, and say how old they are."""
     named = sys.argv[1:] or [name for name in BENCHMARKS if name not in SLOW]
-    sections = _sections()
+    made: dict[str, str] = {}
     for name in named:
         found, load = BENCHMARKS[name]().strip(), os.getloadavg()[1]
         title, _, rest = found.partition("\n")
-        sections[name] = f"{title}\n\n{_origin(load)}\n{rest}"
-        print(sections[name], flush=True)
+        made[name] = f"{title}\n\n{_origin(load)}\n{rest}"
+        print(made[name], flush=True)
+    sections = _sections() | made  # read now: other runs may have written meanwhile
     head = (
         "# Results\n\nWritten by `make bench` (`python -m benchmarks`); each section says how, when, "
         "on what and of which\ncommit it was got, and whether the code has changed since.\n"
