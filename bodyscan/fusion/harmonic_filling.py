@@ -20,6 +20,7 @@ COARSEST_SWEEPS = 200
 COARSEST = 16  # nodes along the shortest side of the coarsest grid, at most
 OVERSHOOT = 1.6  # successive over-relaxation
 NEAR = 2  # nodes of a coarser grid, which is off by less than one where it puts the zero set
+PUSHED = SWEEPS // 2  # nodes of a coarser grid: as far as sweeps carry a bound that it lacks
 
 Values = TypeVar("Values", Floats, Mask)
 
@@ -29,15 +30,19 @@ def fill_harmonically(values: Floats, fixed: Mask, least: Floats, sure: float) -
 
     least: lower bounds (a, b, c) of nodes that are not fixed; -inf for none.
     sure: nodes that a coarser grid puts farther from 0 keep its value, and so do those far from any
-        change of sign, since only the zero set matters.
+        change of sign and from any bound that pushes, since only the zero set matters.
     """
     if min(values.shape) <= COARSEST or any(size % 2 for size in values.shape):
         found, sweeps = np.where(fixed, values, np.maximum(np.float32(0.0), least)), COARSEST_SWEEPS
         unsure = ~fixed
     else:
         coarse = fill_harmonically(*_halved(values, fixed, least), sure)
-        found, sweeps = np.where(fixed, values, np.maximum(_doubled(coarse), least)), SWEEPS
-        unsure = ~fixed & _doubled(_near_zero(coarse)) & (np.abs(found) < sure)
+        guess, near = _doubled(coarse), _near_zero(coarse)
+        found, sweeps = np.where(fixed, values, np.maximum(guess, least)), SWEEPS
+        pushed = ~fixed & (least > guess)
+        if pushed.any():  # a gap is narrow: of the eight nodes of a coarser one not all have bounds
+            near |= _widened(_any_of_eight(pushed), PUSHED)
+        unsure = ~fixed & _doubled(near) & (np.abs(found) < sure)
     found = np.ascontiguousarray(found, np.float32)
     nodes = np.flatnonzero(unsure).astype(np.int32)
     _relax(found.ravel(), nodes, found.shape[1:], least.ravel(), sweeps)
@@ -58,18 +63,24 @@ def _halved(values: Floats, fixed: Mask, least: Floats) -> tuple[Floats, Mask, F
     return np.asarray(known, np.float32), count > 0, total(0.125 * least)
 
 
+def _any_of_eight(where: Mask) -> Mask:
+    where = where[::2] | where[1::2]
+    where = where[:, ::2] | where[:, 1::2]
+    return where[:, :, ::2] | where[:, :, 1::2]
+
+
 def _near_zero(values: Floats) -> Mask:
     """Nodes (a, b, c) within NEAR nodes of both signs."""
     negative = values < 0.0
-    return _widened(negative) & _widened(~negative)
+    return _widened(negative, NEAR) & _widened(~negative, NEAR)
 
 
-def _widened(where: Mask) -> Mask:
-    """`where`, and the nodes at most NEAR away along each axis."""
+def _widened(where: Mask, nodes: int) -> Mask:
+    """`where`, and the nodes at most so many away along each axis."""
     wide = where.copy()
     for axis in range(3):
         along = np.moveaxis(wide, axis, 0)  # a view: the next axis starts from this one's outcome
-        for _ in range(NEAR):
+        for _ in range(nodes):
             was = along.copy()
             along[1:] |= was[:-1]
             along[:-1] |= was[1:]

@@ -55,6 +55,7 @@ stays within a quarter of that, and the turn is too large for a bump, the body t
 stand nearer to it than this."""
 FLOOR_MM = CROWN_MM = 4.0
 """What ISO 20685-1 allows for stature, for all errors; floors are flat to 2 mm over a metre."""
+TOP_MM = 20.0  # of a head: if it goes on higher, the mesh is filled there
 CELL_MM = 50.0
 SIDE_BY_SIDE = 0.4  # of the taller one's height
 SMALL_PIECE = 0.01
@@ -623,7 +624,9 @@ def _gaps(cloud: BodyCloud, surface: SurfaceCheck | None) -> Iterator[Finding]:
             "(hair, black cloth, or out of view)",
         )
     crown = Crown.of(cloud.points, cloud.normals)
-    if crown.unknown_mm > CROWN_MM:
+    # Curls that were measured are not convex: no plane holds them, and none has to.
+    top = surface.heights_mm > surface.heights_mm.max() - TOP_MM
+    if surface.filled[top].any() and crown.unknown_mm > CROWN_MM:
         yield (
             "usable",
             f"nothing was measured of the crown, and perhaps of all above {crown.highest[2]:.0f} mm "

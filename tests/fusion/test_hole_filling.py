@@ -63,6 +63,25 @@ def test_bounds_hold_and_reach_no_farther_than_they_must() -> None:
     assert found[2, 2, 2] < -0.9
 
 
+def test_a_bound_too_narrow_for_coarser_grids_pushes_the_surface_as_far_as_a_wide_one() -> None:
+    """Between plates at -1 values fall from a bound of one node, 16 nodes away from either: no coarser
+    grid knows of the bound."""
+    shape = (32, 64, 32)
+    fixed = np.zeros(shape, bool)
+    for axis in range(3):
+        np.moveaxis(fixed, axis, 0)[[0, -1]] = True
+    fixed[:, [16, 48]] = True
+    values = np.full(shape, -1.0, np.float32)
+    least = np.full(shape, -np.inf, np.float32)
+    least[1:-1, 32, 1:-1] = 1.0
+    found = fill_harmonically(values, fixed, least, sure=10.0)
+    # Halfway it would be 8 nodes away; the rims, 16 away too, and sixteen sweeps alone leave four.
+    # A surface that hugs the bound is less than one away.
+    inside = np.flatnonzero(found[16, :, 16] > 0.0)
+    assert 4 <= 32 - inside.min() <= 8
+    assert 4 <= inside.max() - 32 <= 8
+
+
 def test_splatted_distances_are_those_of_the_surface() -> None:
     bricks = Bricks.where(np.ones((4, 4, 4), bool), np.full(3, -48.0), 3.0)
     cloud = ball((0.0, 0.0, 0.0), 30.0, 20_000)

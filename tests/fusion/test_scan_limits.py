@@ -322,10 +322,19 @@ def test_soles_are_never_seen(scan: MadeScan) -> None:
     assert told(scan.cloud, surface=check) == ("good", "")
 
 
-@pytest.mark.parametrize(("unknown_mm", "said"), [(4.5, True), (3.5, False)])
-def test_a_stature_is_a_guess_where_the_head_may_go_on(
-    scan: MadeScan, monkeypatch: pytest.MonkeyPatch, unknown_mm: float, said: bool
+@pytest.mark.parametrize(
+    ("unknown_mm", "filled_mm", "said"),
+    [(4.5, 0.0, True), (3.5, 0.0, False), (4.5, 19.0, True), (4.5, 21.0, False)],
+)
+def test_a_stature_is_a_guess_where_the_head_may_go_on_and_was_not_measured(
+    scan: MadeScan,
+    monkeypatch: pytest.MonkeyPatch,
+    unknown_mm: float,
+    filled_mm: float,
+    said: bool,
 ) -> None:
+    """Curls seen from all sides are held by no plane, but nothing of them is a guess."""
+
     class Known:
         highest = np.array([0.0, 0.0, 1500.0])
 
@@ -333,5 +342,6 @@ def test_a_stature_is_a_guess_where_the_head_may_go_on(
             self.unknown_mm = unknown_mm
 
     monkeypatch.setattr(Crown, "of", lambda *_: Known())
-    check = SurfaceCheck(np.zeros(1), np.ones(1), np.zeros(1, bool), {}, {})
+    height, filled = np.array([1500.0, 1500.0 - filled_mm]), np.array([False, True])
+    check = SurfaceCheck(height, np.ones(2), filled, {}, {})
     assert ("nothing was measured of the crown" in told(scan.cloud, surface=check)[1]) == said

@@ -150,6 +150,12 @@ def fields() -> dict[str, Any]:
     return to_fields(Camera(600.0, 601.0, 0.0, 320.0, 240.0, LENSES["radial"](), 640, 480))
 
 
+@pytest.mark.parametrize("lens", [Brown(p1=0.01, p2=-0.02), Rational(p1=0.01, p2=-0.02)])
+def test_points_in_whole_numbers_are_distorted_as_others_are(lens: Lens) -> None:
+    whole = np.array([[0, 0], [1, 0], [0, -1]])
+    np.testing.assert_array_equal(lens.distort(whole), lens.distort(whole.astype(float)))
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

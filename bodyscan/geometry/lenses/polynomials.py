@@ -58,7 +58,7 @@ def decentred(ideal: Array, p1: float, p2: float) -> Array:
     """(..., 2): where p1 and p2 move the points (..., 2), `decentring(ideal) @ (p1, p2)`."""
     x, y = ideal[..., 0], ideal[..., 1]
     xx, xy, yy = x * x, 2.0 * x * y, y * y
-    moved = np.empty_like(ideal)
+    moved = np.empty_like(ideal, np.float64)
     moved[..., 0] = p1 * xy + p2 * (3.0 * xx + yy)
     moved[..., 1] = p1 * (xx + 3.0 * yy) + p2 * xy
     return moved
