@@ -95,8 +95,13 @@ def bound_motions(
     return kept, refused
 
 
-def better_known(one: PoseCovariance, other: PoseCovariance) -> PoseCovariance:
-    """Of two covariances the one by which `other`'s pairs put the body's centre off by less."""
-    sizes = ([centre_sigmas(poses)[name] for name in other.names] for poses in (one, other))
+def better_known(
+    one: PoseCovariance, other: PoseCovariance, names: Collection[str]
+) -> PoseCovariance:
+    """Of two covariances the one by which these pairs put the body's centre off by less; the first
+    where there are none."""
+    if not names:
+        return one
+    sizes = ([centre_sigmas(poses)[name] for name in names] for poses in (one, other))
     ours, theirs = (rms(np.array(sigmas)) for sigmas in sizes)
     return other if theirs < ours else one

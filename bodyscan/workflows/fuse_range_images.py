@@ -136,11 +136,12 @@ def _aligned(
     together = bring_together(images, start, found, boards, calibration.rig.poles, settings)
     rig_from_camera = start | together.alignment.rig_from_camera
     images = at_once(images, rig_from_camera, together.followed)
-    untied = {image.pair for image in images} - together.alignment.motion_mm.keys()
-    known, aligned = SwayPrior.of(settings).loosen(boards, untied), together.alignment.poses
+    tied, known, aligned = together.alignment.motion_mm, boards, together.alignment.poses
     if aligned is not None:
         # As the boards left them, if nobody moved; as the overlaps left them, whoever moved.
-        known = better_known(known, aligned)
+        known = better_known(boards, aligned, tied)
+    untied = {image.pair for image in images} - tied.keys()
+    known = SwayPrior.of(settings).loosen(known, untied)
     return _Placed(images, rig_from_camera, known, together, oblique)
 
 

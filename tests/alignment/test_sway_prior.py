@@ -79,8 +79,10 @@ def test_what_all_pairs_share_is_not_between_two() -> None:
 def test_of_two_covariances_the_one_that_puts_the_body_off_by_less_counts(
     first_mm: float, second_mm: float
 ) -> None:
-    """Pairs that only one of them knows have no say."""
-    every = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0] * 2 + [0.0, 0.0, 0.0, 1e6, 1e6, 1e6])
-    one = PoseCovariance(("a", "b", "c"), first_mm**2 * every)
-    other = PoseCovariance(("a", "b"), second_mm**2 * every[:12, :12])
-    assert better_known(one, other) is (one if first_mm < second_mm else other)
+    """Pairs that nothing ties have no say: their sway is the prior's, whichever is taken."""
+    known = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0] * 2 + [0.0] * 6)
+    loose = np.diag([0.0] * 15 + [1.0, 1.0, 1.0])
+    one = PoseCovariance(("a", "b", "c"), first_mm**2 * known + 4.0 * loose)
+    other = PoseCovariance(("a", "b", "c"), second_mm**2 * known + loose)
+    assert better_known(one, other, ["a", "b"]) is (one if first_mm < second_mm else other)
+    assert better_known(one, other, []) is one, "nothing ties any"
