@@ -32,6 +32,9 @@ def test_one_shot_that_fits_no_other_is_left_out_and_named() -> None:
     (note,) = kept.notes
     assert note.startswith("p1-1: the stripes of shot c do not fit the others'")
     assert "2.5 px" in note
+    two = ProjectorMotion(np.array([0, 1, 3]), np.array([2, 4]), 2.5, 0.1)
+    (note,) = drop_disagreeing("p1-1", SHOTS, two).notes
+    assert note.startswith("p1-1: the stripes of shots c, e do not fit the others'")
 
 
 def test_a_projector_that_moved_costs_the_pair_and_the_shots_are_named() -> None:

@@ -80,6 +80,18 @@ def rows(change: dict[str, str] | None = None) -> str:
     return "\n".join(["shot,pair,frame,ms", *(lines | (change or {})).values()]) + "\n"
 
 
+@pytest.mark.parametrize("more", [0, 1])
+def test_a_file_of_times_may_be_as_long_as_a_million_frames_need(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: int
+) -> None:
+    monkeypatch.setattr("bodyscan.captures.timing.MOST_BYTES", len(rows()) - more)
+    if not more:
+        assert taken(tmp_path, "  times: times.csv\n", times=rows()).frame_ms("b1", "p1")
+        return
+    with pytest.raises(CaptureError, match="is longer than"):
+        taken(tmp_path, "  times: times.csv\n", times=rows())
+
+
 def test_a_file_of_times(tmp_path: Path) -> None:
     captures = taken(tmp_path, "  times: times.csv\n", times=rows())
     assert captures.frame_ms("b1", "p1") == {name: 3.0 * k for k, name in enumerate(DEFAULT)}

@@ -48,6 +48,18 @@ def test_a_pair_that_is_shifted_along_x_errs_where_it_looks_along_x(cloud: BodyC
     assert found.points is cloud.points
 
 
+def test_a_pair_counts_wherever_it_stands_before_the_surface(cloud: BodyCloud) -> None:
+    """Along y too, where the point's normal has no other part."""
+    covariance = np.diag([0.0, 0.0, 0.0, 0.0, 0.04**2, 0.0])
+    for side in (1.0, -1.0):
+        found = add_pose_variance(
+            cloud, placed([0, 1300 * side, 900]), PoseCovariance(("p0",), covariance)
+        )
+        seen = side * cloud.normals[:, 1] > 0.999
+        assert found.sigma_mm[seen] == pytest.approx(0.05, rel=1e-3)
+        assert found.sigma_mm[side * cloud.normals[:, 1] < 0.0] == pytest.approx(0.03)
+
+
 def test_draws_of_the_placing_spread_by_the_error_bar(cloud: BodyCloud) -> None:
     rng = np.random.default_rng(4)
     root = rng.normal(size=(6, 6)) * np.array([1e-5] * 3 + [0.02] * 3)[:, None]
