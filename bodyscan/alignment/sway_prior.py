@@ -102,6 +102,6 @@ def better_known(
     where there are none."""
     if not names:
         return one
-    sizes = ([centre_sigmas(poses)[name] for name in names] for poses in (one, other))
-    ours, theirs = (rms(np.array(sigmas)) for sigmas in sizes)
+    sizes = (centre_sigmas(poses) for poses in (one, other))
+    ours, theirs = (rms(np.array([sigmas[name] for name in names])) for sigmas in sizes)
     return other if theirs < ours else one

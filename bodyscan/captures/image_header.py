@@ -24,7 +24,7 @@ _JPEG_END = b"\xff\xd9"
 _BMP = b"BM"
 _TIFF = (b"II*\0", b"MM\0*")
 _MOST_TAGS, _MOST_STRIPS = 1000, 1 << 20
-LOCKED, MANY = 5120, 16
+_LOCKED, _MANY = 5120, 16  # bytes summed without releasing the lock; pieces worth holding it
 _TAIL = 65536  # some writers add a few bytes after the end
 
 
@@ -88,13 +88,13 @@ def png_damage(data: bytes) -> str | None:
 def _checksum(content: memoryview, before: int) -> int:
     """CRC-32 of a chunk, continued from `before`.
 
-    Chunks are a few kilobytes, whose sum takes a microsecond. From LOCKED bytes on ISA-L releases
+    Chunks are a few kilobytes, whose sum takes a microsecond. From _LOCKED bytes on ISA-L releases
     the interpreter's lock for it, and getting it back from another thread takes many times as long.
     """
-    if len(content) > MANY * LOCKED:
+    if len(content) > _MANY * _LOCKED:
         return isal_zlib.crc32(content, before)
-    for first in range(0, len(content), LOCKED):
-        before = isal_zlib.crc32(content[first : first + LOCKED], before)
+    for first in range(0, len(content), _LOCKED):
+        before = isal_zlib.crc32(content[first : first + _LOCKED], before)
     return before
 
 

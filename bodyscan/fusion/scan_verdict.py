@@ -623,10 +623,12 @@ def _gaps(cloud: BodyCloud, surface: SurfaceCheck | None) -> Iterator[Finding]:
             f"next to nothing was measured from {BAND_MM * low:.0f} to {BAND_MM * high:.0f} mm "
             "(hair, black cloth, or out of view)",
         )
-    crown = Crown.of(cloud.points, cloud.normals)
     # Curls that were measured are not convex: no plane holds them, and none has to.
     top = surface.heights_mm > surface.heights_mm.max() - TOP_MM
-    if surface.filled[top].any() and crown.unknown_mm > CROWN_MM:
+    if not surface.filled[top].any():
+        return
+    crown = Crown.of(cloud.points, cloud.normals)
+    if crown.unknown_mm > CROWN_MM:
         yield (
             "usable",
             f"nothing was measured of the crown, and perhaps of all above {crown.highest[2]:.0f} mm "
