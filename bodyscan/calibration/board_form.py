@@ -1,8 +1,10 @@
 """The form of a board: a face as found, and the unknowns of bend and print.
 
 The sheet departs from its plane by a polynomial of second and third degree, and its corners are
-printed slightly off their places. Both have priors, so whatever boards in few poses cannot show
-stays as uncertain as it was, and enters every covariance.
+printed slightly off their places: each by itself, and all together where a printer's feed or
+carriage errs slowly over the sheet. All have priors, so whatever boards in few poses cannot show
+stays as uncertain as it was, and enters every covariance. Of a print that is its stretch and its
+skew: a camera of another aspect or skew sees the same corners.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag, solve_triangular
 
 from bodyscan.arrays import Array, Indices
 
@@ -18,8 +21,13 @@ from bodyscan.arrays import Array, Indices
 POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 THIRD_DEGREE = np.add.outer(np.arange(4), np.arange(4)) <= 3
 FALL = 0.3
-"""Expected size of a third-degree coefficient relative to one of second degree."""
+"""Expected size of each degree relative to the one below: what bends a sheet, and what errs slowly
+while it is printed, does so over lengths beyond the sheet's own."""
+SLOW = ((1, 0), (0, 1), *POWERS)
+"""Powers of x and y by which a print is distorted."""
 DIGITS = 6
+LEAST_MM = 1e-6
+"""Standard deviation of what is described as exact: a nanometre."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +64,22 @@ def rounded(points: Array) -> Array:
     return np.round(points, DIGITS) + 0.0
 
 
+@dataclass(frozen=True)
+class PrintSpread:
+    """Standard deviations of where corners are printed, along each axis, mm.
+
+    corner_mm: of each corner by itself.
+    stretch_mm: of what they share by one stretch or skew, RMS over the corners; that of higher
+        degrees follows from it (FALL).
+    """
+
+    corner_mm: float
+    stretch_mm: float = 0.0
+
+
+EXACT_PRINT = PrintSpread(0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class BoardForm:
     """The form of a board as unknowns.
@@ -64,21 +88,21 @@ class BoardForm:
     heights: coefficients of POWERS, each less its own best plane, (7,) mm; x and y are -1 and 1 at
         the outermost corners.
     printed: how far corners lie from `points` in the sheet, (N, 2) mm.
-    flatness_mm, print_mm: prior standard deviations of heights and printed.
+    flatness_mm, print_spread: prior standard deviations of heights and printed.
     """
 
     points: Array
     heights: Array
     printed: Array
     flatness_mm: float
-    print_mm: float
+    print_spread: PrintSpread
 
     @staticmethod
-    def flat(points: Array, flatness_mm: float, print_mm: float) -> BoardForm:
+    def flat(points: Array, flatness_mm: float, print_spread: PrintSpread) -> BoardForm:
         """A board as described; points (M, 3) are the corners of any views given."""
         known = np.unique(rounded(points), axis=0)
         return BoardForm(
-            known, np.zeros(len(POWERS)), np.zeros((len(known), 2)), flatness_mm, print_mm
+            known, np.zeros(len(POWERS)), np.zeros((len(known), 2)), flatness_mm, print_spread
         )
 
     @property
@@ -87,15 +111,35 @@ class BoardForm:
         return len(self.heights) + self.printed.size
 
     @property
-    def prior_sigmas(self) -> Array:
-        """Prior standard deviations, (count,) mm; at least 1 nm, for boards described as exact."""
+    def prior(self) -> tuple[Array, Array]:
+        """Residuals of the prior, (count,), and their derivatives by the unknowns, (count, count)."""
         bent = [self.flatness_mm * (1.0 if sum(power) == 2 else FALL) for power in POWERS]
-        return np.maximum([*bent, *[self.print_mm] * self.printed.size], 1e-6)
+        jacobian = block_diag(np.diag(1.0 / np.maximum(bent, LEAST_MM)), self.print_whitening)
+        return jacobian @ self.unknowns, jacobian
+
+    @property
+    def print_whitening(self) -> Array:
+        """(2N, 2N) by which `printed`, row by row, becomes unit normal."""
+        spread, slow = self.print_spread, self.slow
+        covariance = spread.stretch_mm**2 * slow @ slow.T
+        covariance += max(spread.corner_mm, LEAST_MM) ** 2 * np.eye(len(slow))
+        root = np.linalg.cholesky(covariance)
+        return np.kron(solve_triangular(root, np.eye(len(slow)), lower=True), np.eye(2))
+
+    @property
+    def slow(self) -> Array:
+        """(N, 9): orthogonal polynomials SLOW at the corners, 1 RMS for degree one and FALL of it
+        for each degree more."""
+        x, y = ((self.points[:, :2] - self._middle) / self._half).T
+        powers = [np.ones_like(x), *(x**i * y**j for i, j in SLOW)]
+        modes = np.linalg.qr(np.stack(powers, axis=1))[0][:, 1:]
+        fall = FALL ** (np.sum(SLOW, axis=1) - 1.0)
+        return np.asarray(modes * np.sqrt(len(x)) * fall[: modes.shape[1]])
 
     @property
     def exact(self) -> BoardForm:
         """The same form, taken to be exact."""
-        return replace(self, flatness_mm=0.0, print_mm=0.0)
+        return replace(self, flatness_mm=0.0, print_spread=EXACT_PRINT)
 
     @property
     def unknowns(self) -> Array:

@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.board_form import POWERS, BoardForm
+from bodyscan.calibration.board_form import EXACT_PRINT, POWERS, BoardForm, PrintSpread
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
@@ -214,8 +214,8 @@ def known_apart(
     return _fit(solution, boards, covariance)
 
 
-def print_errors(fit: JointFit[Sheets], boards: Sequence[StripedBoard]) -> dict[str, float]:
-    """Maximum-likelihood sigma of each board's print errors, mm, given what `fit` found.
+def print_errors(fit: JointFit[Sheets], boards: Sequence[StripedBoard]) -> dict[str, PrintSpread]:
+    """Maximum-likelihood spread of each board's print errors, given what `fit` found.
 
     In each direction in which corners and stripes determine the corners' places, the places found
     scatter by print errors and noise together.
@@ -227,23 +227,39 @@ def print_errors(fit: JointFit[Sheets], boards: Sequence[StripedBoard]) -> dict[
     for name, own in state.of_form.items():
         form, of_print = fit.forms[name], own[len(POWERS) :]
         rest = np.setdiff1d(np.arange(state.unknowns), of_print)
-        known = 1.0 / form.print_mm**2
+        known = form.print_whitening.T @ form.print_whitening
         cross = normal[np.ix_(of_print, rest)]
-        information = normal[np.ix_(of_print, of_print)] - known * np.eye(len(of_print))
-        information -= cross @ invert_scaled(normal[np.ix_(rest, rest)]) @ cross.T
-        values, vectors = np.linalg.eigh(information)
+        both = normal[np.ix_(of_print, of_print)]
+        both = both - cross @ invert_scaled(normal[np.ix_(rest, rest)]) @ cross.T
+        values, vectors = np.linalg.eigh(both - known)
         shown = values > LEAST_SHOWN * values[-1]
-        values = values[shown]
-        places = (vectors.T @ form.printed.ravel())[shown] * (values + known) / values
-        found[name] = _likeliest_spread(places, 1.0 / values)
+        values, vectors = values[shown], vectors[:, shown]
+        # Without their prior the places would be these.
+        places = vectors.T @ both @ form.printed.ravel() / values
+        slow = vectors.T @ np.kron(form.slow, np.eye(2))
+        found[name] = _likeliest_spread(places, 1.0 / values, slow)
     return found
 
 
-def _likeliest_spread(values: Array, variances: Array) -> float:
-    """Standard deviation of values (N,) seen with noise of `variances` (N,), noise taken off."""
-    total = SPREADS_MM[:, None] ** 2 + variances
-    misfit = np.sum(np.log(total) + values**2 / total, axis=1)
-    return float(SPREADS_MM[np.argmin(misfit)])
+def _likeliest_spread(values: Array, variances: Array, slow: Array) -> PrintSpread:
+    """Of values (N,) seen with noise of `variances` (N,): of each one's own part, and of unknowns
+    that `slow` (N, K) adds to them."""
+    stretch = SPREADS_MM[:, None] ** 2
+    best, found = np.inf, EXACT_PRINT
+    for corner in SPREADS_MM:
+        total = corner**2 + variances
+        white = values / np.sqrt(total)
+        gains, modes = np.linalg.eigh(slow.T @ (slow / total[:, None]))
+        along = modes.T @ (slow.T @ (white / np.sqrt(total)))
+        grown = 1.0 + stretch * gains
+        misfit = np.sum(np.log(grown) - stretch * along**2 / grown, axis=1)
+        misfit += np.sum(np.log(total)) + np.sum(white**2)
+        if misfit.min() < best:
+            best, found = (
+                misfit.min(),
+                PrintSpread(float(corner), float(SPREADS_MM[np.argmin(misfit)])),
+            )
+    return found
 
 
 def _solve(
@@ -294,12 +310,13 @@ def _blocks(state: _State[Sheets], boards: Sequence[StripedBoard]) -> Iterator[B
         yield known_beforehand(state.camera, camera)
     known, jacobian = state.sheets.prior()
     yield Block(known, lambda: jacobian, sheets, EXACT)
-    for name, own in state.forms.items():
-        yield Block(own.unknowns / own.prior_sigmas, partial(_of_prior, own), of_form[name], EXACT)
+    for name, form in state.forms.items():
+        yield _known_of_form(form, of_form[name])
 
 
-def _of_prior(form: BoardForm) -> Array:
-    return np.diag(1.0 / form.prior_sigmas)
+def _known_of_form(form: BoardForm, own: Indices) -> Block:
+    known, jacobian = form.prior
+    return Block(known, lambda: jacobian, own, EXACT)
 
 
 def _corners_of(state: _State[Sheets], k: int, board: StripedBoard) -> Array:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.board_form import BoardForm
+from bodyscan.calibration.board_form import BoardForm, PrintSpread
 from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate
 from bodyscan.calibration.camera import CameraCalibration, fit_camera, locate_board
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain, shared_weights
@@ -37,8 +37,8 @@ REFINED_BINS = 6000
 """Bins of boundaries that determine camera, boards and sheets to a tenth as well as all bins do."""
 FOLD_STEPS = 5
 """A fold's solution lies less than a standard deviation from the solution with all boards."""
-PRINT_MM = 0.05
-"""Prior sigma of a corner's printed place: what office printers and plotters do."""
+PRINT = PrintSpread(0.05)
+"""Of a corner's printed place, to begin with: what office printers and plotters do."""
 WAYS = APART, TOGETHER, BENT = (
     "corners, then stripes",
     "joint solve",
@@ -105,11 +105,11 @@ def refine_where_better(
     forms = {name: _flat(name, boards, mm) for name, mm in sorted(flatness_mm.items())}
     first = refine_jointly(camera, poses, sheets, boards, forms)
     printed = print_errors(first, boards)
-    forms = {name: replace(form, print_mm=printed[name]) for name, form in forms.items()}
+    forms = {name: replace(form, print_spread=printed[name]) for name, form in forms.items()}
     apart = known_apart(camera, poses, sheets, boards, forms)
     if len(boards) < FEWEST_BOARDS:
         return Refinement(apart, False, f"{len(boards)} boards with stripes are too few")
-    found = {name: replace(form, print_mm=printed[name]) for name, form in first.forms.items()}
+    found = {name: replace(form, print_spread=printed[name]) for name, form in first.forms.items()}
     fits = [
         apart,
         refine_jointly(camera, poses, sheets, boards, forms, bent=False),
@@ -144,7 +144,7 @@ def refine_where_better(
 
 def _flat(name: str, boards: Sequence[StripedBoard], flatness_mm: float) -> BoardForm:
     points = np.concatenate([board.view.points for board in boards if board.board == name])
-    return BoardForm.flat(points, flatness_mm, PRINT_MM)
+    return BoardForm.flat(points, flatness_mm, PRINT)
 
 
 def _said(trials: Sequence[RefinementTrial]) -> str:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bodyscan.arrays import Array
-from bodyscan.calibration.board_form import POWERS, BoardFace, BoardForm
+from bodyscan.calibration.board_form import POWERS, BoardFace, BoardForm, PrintSpread
 
 
 def corners() -> Array:
@@ -21,7 +23,7 @@ def scaled(places: Array) -> tuple[Array, Array]:
 
 
 def bent(*heights: float) -> BoardForm:
-    flat = BoardForm.flat(corners(), 0.2, 0.05)
+    flat = BoardForm.flat(corners(), 0.2, PrintSpread(0.05))
     return flat.moved(np.concatenate([heights, np.zeros(flat.count - 7)]))
 
 
@@ -62,17 +64,43 @@ def test_corners_are_where_the_form_says() -> None:
     assert form.count == 7 + 2 * 54
 
 
+def expected_covariance(form: BoardForm) -> Array:
+    """Of the unknowns, beforehand."""
+    _, jacobian = form.prior
+    return np.asarray(np.linalg.inv(jacobian.T @ jacobian))
+
+
 def test_what_is_expected_beforehand_is_the_flatness_and_the_print() -> None:
     form = bent(0, 0, 0, 0, 0, 0, 0)
-    sigmas = form.prior_sigmas
+    sigmas = np.sqrt(np.diag(expected_covariance(form)))
     np.testing.assert_allclose(sigmas[:3], 0.2)
     np.testing.assert_allclose(sigmas[3:7], 0.06)  # of third degree three tenths
     np.testing.assert_allclose(sigmas[7:], 0.05)
-    np.testing.assert_allclose(form.exact.prior_sigmas, 1e-6)  # a nanometre
+    exact = np.sqrt(np.diag(expected_covariance(form.exact)))
+    np.testing.assert_allclose(exact, 1e-6)  # a nanometre
+    known, jacobian = bent(0.4, 0, 0, 0, 0, 0, 0.03).prior
+    np.testing.assert_allclose(known[:7], [2.0, 0, 0, 0, 0, 0, 0.5])
+    np.testing.assert_allclose(jacobian @ bent(0.4, 0, 0, 0, 0, 0, 0.03).unknowns, known)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("power", "share"), [((1, 0), 1.0), ((0, 1), 1.0), ((1, 1), 0.3)])
+def test_corners_share_a_print_s_stretch_and_skew(
+    power: tuple[int, int], share: float, axis: int
+) -> None:
+    """Each pattern has the size asked for, RMS over the corners, and three tenths of it a degree higher."""
+    form = replace(bent(0, 0, 0, 0, 0, 0, 0), print_spread=PrintSpread(0.01, 0.08))
+    x, y = scaled(form.points)  # a regular grid, on which these are orthogonal
+    pattern = np.zeros((54, 2))
+    pattern[:, axis] = x ** power[0] * y ** power[1]
+    pattern /= np.linalg.norm(pattern)
+    there = pattern.ravel() @ expected_covariance(form)[7:, 7:] @ pattern.ravel()
+    # Of a unit vector over 54 corners: the pattern's mean square, 54 times, and one corner's own.
+    assert there == pytest.approx(54 * (share * 0.08) ** 2 + 0.01**2, rel=1e-6)
 
 
 def test_corners_given_by_several_views_count_once() -> None:
-    form = BoardForm.flat(np.concatenate([corners(), corners()[:5] + 1e-8]), 0.2, 0.05)
+    form = BoardForm.flat(np.concatenate([corners(), corners()[:5] + 1e-8]), 0.2, PrintSpread(0.05))
     assert len(form.points) == 54
 
 

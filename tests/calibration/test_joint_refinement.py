@@ -7,7 +7,7 @@ import pytest
 from lit_boards import Mirror, Scene, binned
 from table_one import CAMERA
 
-from bodyscan.calibration.board_form import BoardForm
+from bodyscan.calibration.board_form import EXACT_PRINT, BoardForm
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import boundary_points, concatenate
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
@@ -71,7 +71,7 @@ def calibrated(seed: int) -> tuple[CameraCalibration, SmoothSheets, list[Striped
 
 
 def forms(boards: list[StripedBoard], flatness_mm: float = 0.0) -> dict[str, BoardForm]:
-    return {"board": BoardForm.flat(boards[0].view.points, flatness_mm, 0.0)}
+    return {"board": BoardForm.flat(boards[0].view.points, flatness_mm, EXACT_PRINT)}
 
 
 def flatness_rms_mm(camera: Camera, sheets: LightSheets) -> float:

@@ -13,7 +13,7 @@ from sheet_models import PINHOLE
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.calibration import refinement_choice
-from bodyscan.calibration.board_form import BoardForm
+from bodyscan.calibration.board_form import EXACT_PRINT, BoardForm
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import boundary_points, concatenate, subsample
 from bodyscan.calibration.camera import CameraCalibration, calibrate_camera
@@ -76,7 +76,16 @@ class Solved:
     refinement: Refinement
 
 
-def solved(bow_mm: float, boards: int, seed: int = 0) -> Solved:
+def printer_errors(size_mm: float, seed: int) -> Array:
+    """How far off a printer sets 48 corners, (48, 3) mm: a stretch, a skew and a bend of each axis,
+    that is of `size_mm` times 1, 1 and 1/2 at the rims."""
+    x, y = (np.moveaxis(np.indices((6, 8)), 0, -1)[..., ::-1].reshape(-1, 2) / [3.5, 2.5] - 1.0).T
+    patterns = np.stack([x, y, x * y / 2.0, x**2 / 2.0, y**2 / 2.0], axis=1)
+    amounts = size_mm * np.random.default_rng([seed, 48]).standard_normal((5, 2))
+    return np.column_stack([patterns @ amounts, np.zeros(48)])
+
+
+def solved(bow_mm: float, boards: int, seed: int = 0, print_mm: float = 0.0) -> Solved:
     rng = np.random.default_rng(seed)
     poses = [
         SCENE.looking_at([5.0 * k - 10.0, 0.0, 390.0 + 8.0 * k], turn)
@@ -85,6 +94,7 @@ def solved(bow_mm: float, boards: int, seed: int = 0) -> Solved:
     column, row = np.meshgrid(np.arange(1, 9), np.arange(1, 7))
     corners = np.column_stack([20.0 * column.ravel(), 20.0 * row.ravel(), np.zeros(48)])
     true = corners + np.column_stack([np.zeros((48, 2)), bow(corners[:, :2], bow_mm)])
+    true += printer_errors(print_mm, seed)
     views = [
         PlanarView(f"s{k}", corners, pixels + rng.normal(0.0, CORNER_PX, pixels.shape))
         for k, pixels in enumerate(SCENE.camera.project(pose.apply(true)) for pose in poses)
@@ -179,11 +189,26 @@ def test_sigmas_are_those_of_the_errors_whether_boards_are_bent_or_not(
     assert max(rms) < 3.0
 
 
+def test_what_few_poses_cannot_see_of_a_print_is_in_the_camera_s_sigmas() -> None:
+    """A print that is skewed looks like a camera that is: its other faults tell how much of that
+    there may be."""
+    pulls = []
+    for seed in range(6):
+        found = solved(0.0, 3, seed, print_mm=0.02).refinement.fit
+        assert found is not None
+        off = found.camera.parameters - SCENE.camera.parameters
+        pulls.append((off / np.sqrt(np.diag(found.camera_covariance)))[2:5])
+    # Skew and principal point of six draws: 7.5 if corners err one by one alone. 18 draws of unit
+    # normals have an RMS of 1 +- 0.17; but how much stretch there may be is told by three patterns
+    # of each axis, which is known to a factor of 1.5 or so.
+    assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 2.0, np.round(pulls, 1)
+
+
 def test_what_few_poses_cannot_see_of_a_bow_is_in_the_sigmas(flat: Solved) -> None:
     points = flat.boards[0].view.points
     sigmas = []
     for flatness_mm in (0.0, 0.1, 1.0):
-        forms = {"b": BoardForm.flat(points, flatness_mm, 0.0)}
+        forms = {"b": BoardForm.flat(points, flatness_mm, EXACT_PRINT)}
         known = known_apart(
             flat.own.camera, flat.own.camera_from_board, flat.sheets, flat.boards, forms
         )
