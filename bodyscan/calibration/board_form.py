@@ -124,7 +124,8 @@ class BoardForm:
         covariance = spread.stretch_mm**2 * slow @ slow.T
         covariance += max(spread.corner_mm, LEAST_MM) ** 2 * np.eye(len(slow))
         root = np.linalg.cholesky(covariance)
-        return np.kron(solve_triangular(root, np.eye(len(slow)), lower=True), np.eye(2))
+        root = solve_triangular(root, np.eye(len(slow)), lower=True)
+        return np.asarray(np.kron(root, np.eye(2)), np.float64)
 
     @property
     def slow(self) -> Array:

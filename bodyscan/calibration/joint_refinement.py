@@ -310,8 +310,8 @@ def _blocks(state: _State[Sheets], boards: Sequence[StripedBoard]) -> Iterator[B
         yield known_beforehand(state.camera, camera)
     known, jacobian = state.sheets.prior()
     yield Block(known, lambda: jacobian, sheets, EXACT)
-    for name, form in state.forms.items():
-        yield _known_of_form(form, of_form[name])
+    for name, own in state.forms.items():
+        yield _known_of_form(own, of_form[name])
 
 
 def _known_of_form(form: BoardForm, own: Indices) -> Block:

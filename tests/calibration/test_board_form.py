@@ -88,7 +88,7 @@ def test_what_is_expected_beforehand_is_the_flatness_and_the_print() -> None:
 def test_corners_share_a_print_s_stretch_and_skew(
     power: tuple[int, int], share: float, axis: int
 ) -> None:
-    """Each pattern has the size asked for, RMS over the corners, and three tenths of it a degree higher."""
+    """Each has the size asked for, RMS over the corners, and three tenths of it a degree higher."""
     form = replace(bent(0, 0, 0, 0, 0, 0, 0), print_spread=PrintSpread(0.01, 0.08))
     x, y = scaled(form.points)  # a regular grid, on which these are orthogonal
     pattern = np.zeros((54, 2))
