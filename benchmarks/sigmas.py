@@ -102,11 +102,9 @@ def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
     true = apparatus.CAMERA
     parameters = [true.alpha, true.beta, true.gamma, true.u0, true.v0, true.k1, true.k2]
     found, sigmas = ours.camera.parameters[:7], np.sqrt(np.diag(covariance))[:7]
-    return UnitErrors(
-        point_sigma(ours, captures),
-        (found - parameters) / sigmas,
-        measure_artefacts(ours, captures),
-    )
+    print_ppm = centre_distances(setup.board.corners, corner_points(apparatus.BOARD)).scale_ppm
+    points, accuracy = point_sigma(ours, captures), measure_artefacts(ours, captures)
+    return UnitErrors(points, (found - parameters) / sigmas, accuracy, print_ppm)
 
 
 @dataclass(frozen=True, eq=False)
