@@ -15,6 +15,7 @@ from bodyscan.captures.exposures import merge_exposures
 from bodyscan.captures.folder import open_scan
 from bodyscan.captures.images import read_sequence
 from bodyscan.errors import ImageError, RigFileError
+from bodyscan.geometry.robust import spread
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.stripes.codes import stripe_code
 from bodyscan.stripes.decoding import decode_stripes
@@ -76,6 +77,17 @@ def test_hair_and_skin_come_in_one_scan(code: dict[str, Any]) -> None:
     # What the short one told is told as well by both.
     both = np.isfinite(alone[skin]) & np.isfinite(off[skin])
     assert np.std(off[skin][both]) < 1.1 * np.std(alone[skin][both]) + 0.001
+
+
+def test_sigmas_of_hair_and_of_skin_are_as_large_as_their_errors() -> None:
+    (short, s), (long, _) = exposed(GRAY, 1.0), exposed(GRAY, 16.0)
+    images = merge_exposures([short, long], ["short", "long"], "")
+    spec = stripe_code({**GRAY, "stripes": STRIPES, "direction": "vertical"})
+    seen = decode_stripes(spec, images[0], images[1], np.ascontiguousarray(images[2:]))
+    for rows in (slice(3, 56), slice(64, 117)):
+        normalised = ((seen.s - s) / seen.sigma)[rows, 5:-5]
+        # Some 2,500 boundaries; of an error's tenth that is due to rendering nothing is predicted.
+        assert spread(normalised[np.isfinite(normalised)]) == pytest.approx(1.0, abs=0.2)
 
 
 def test_the_merged_images_are_the_shorter_ones_with_less_noise() -> None:
