@@ -20,7 +20,6 @@ FEWEST, ENOUGH = 1000, 20_000
 CLEARLY = 1.2
 """Sigmas too small by this factor are corrected; less may be due to the surface."""
 
-
 WINDOW_PX, FAR, SURELY = 31, 3.0, 3.0
 """Window around a boundary, with some 400 others; sigmas beyond which one counts no more, since it
 strays alone; and sigmas by which a mean square must exceed that of CLEARLY."""
@@ -38,7 +37,8 @@ def scatter(boundaries: Boundaries) -> float:
 
 
 def local_scatter(boundaries: Boundaries) -> Array:
-    """The same ratio in the window around each boundary, (N,); 1 where it is not clearly more."""
+    """The same ratio, at most FAR, in the window around each boundary, (N,); 1 where it is not
+    clearly more."""
     middle, off = _strays(boundaries, 1)
     if not len(middle):
         return np.ones(len(boundaries.line))
