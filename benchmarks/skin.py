@@ -67,6 +67,7 @@ def report() -> str:
     both = _with_two_exposures()
     told = {"matt": matt, "skin, 1 mm": oblique, "the same, not taken out": untouched}
     told["skin, hair and shorts"] = dressed
+    told["the same, two exposures"] = both
     clothed = {"one": dressed, f"two, {LONGER} times apart": both}
     return f"""## Skin, hair and dark cloth (synthetic)
 
@@ -77,11 +78,11 @@ leave open; the woman stands still. Oblique light as found, and the cloud agains
 |---|---|---|---|---|
 {chr(10).join(_light_row(name, case) for name, case in told.items())}
 
-Regions of points against the nearest vertex of the truth (3 mm apart), and what of the surface that two
-pairs see has a point within {REACH_MM:g} mm:
+Regions of points against the nearest vertex of the truth (3 mm apart), what of the surface that two
+pairs see has a point within {REACH_MM:g} mm, and the errors of points that are truly of that region:
 
-| exposures | region | precision | recall | covered |
-|---|---|---|---|---|
+| exposures | region | precision | recall | covered | RMS mm | error over sigma |
+|---|---|---|---|---|---|---|
 {chr(10).join(row for name, case in clothed.items() for row in _region_rows(name, case))}
 
 Of the matt subject {_shares(matt)}.
@@ -127,8 +128,7 @@ def _scan(calibration: RigCalibration, person: Path, know_light: bool) -> Scan:
 
 
 def _light_row(name: str, case: Case) -> str:
-    scan, (vertices, faces) = case.scan, _surface(case.truth)
-    off = signed_distances(_laid(case), vertices, faces)
+    scan, off = case.scan, _errors(case)
     light, sigmas = scan.oblique_light, spread(off / scan.cloud.sigma_mm)
     length = "" if light is None else f"{light.aside_mm:.3f} ± {light.sigma_mm:.3f}"
     size = f"{off.mean():.3f}, {rms(off):.3f}, {np.percentile(np.abs(off), 95):.3f}"
@@ -136,7 +136,7 @@ def _light_row(name: str, case: Case) -> str:
 
 
 def _region_rows(name: str, case: Case) -> list[str]:
-    vertices, faces = _surface(case.truth)
+    (vertices, faces), off = _surface(case.truth), _errors(case)
     true = np.where(wears_shorts(vertices), DARK_CLOTH, SKIN)
     true[grows_hair(vertices)] = HAIR
     laid = _laid(case)
@@ -150,7 +150,10 @@ def _region_rows(name: str, case: Case) -> list[str]:
         precision = np.mean(of_points[regions == kind] == kind)
         recall = np.mean(regions[of_points == kind] == kind)
         covered = np.mean(near[seen & (true == kind)])
+        own = of_points == kind
+        sigmas = spread(off[own] / case.scan.cloud.sigma_mm[own])
         figures = f"{precision:.4f} | {recall:.4f} | {100.0 * covered:.1f} %"
+        figures += f" | {rms(off[own]):.3f} | {sigmas:.2f}"
         rows.append(f"| {name} | {NAMES[kind]} | {figures} |")
     return rows
 
@@ -165,6 +168,11 @@ def _surface(truth: Truth) -> tuple[Array, Indices]:
     assert truth.vertices is not None
     assert truth.faces is not None
     return truth.vertices, truth.faces
+
+
+def _errors(case: Case) -> Array:
+    """How far the cloud's points lie off the truth, (N,) mm."""
+    return signed_distances(_laid(case), *_surface(case.truth))
 
 
 def _laid(case: Case) -> Array:

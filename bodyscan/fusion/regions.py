@@ -40,7 +40,8 @@ SMALLEST = 3e-4
 MOST = 0.5
 """Share of a cell's points: dim points among dark ones are dark, and bright ones highlights."""
 ROUGH, ROUGH_MM = 3.0, 0.2
-"""ROUGH: times what sigmas predict, which were found wrong by a factor of two on dark surfaces.
+"""ROUGH: times what sigmas predict. Those of dark cloth are right to a third; where several exposures
+show relief they carry it, so that only what is coarser than the stripes counts.
 ROUGH_MM: half of what locks of hair stand apart, as far as a window of 7 mm preserves it."""
 FEWEST = 50  # pixels needed to tell how rough a cell is
 HEAD_WIDE = 0.12  # of the stature: around the axis, for heads that lean forward and long hair

@@ -13,7 +13,7 @@ from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.albedo_edges import Brightness, without_edges_across
 from bodyscan.stripes.bit_words import WordCode, bit_that_flips
 from bodyscan.stripes.boundaries import find_boundaries
-from bodyscan.stripes.boundary_scatter import scatter
+from bodyscan.stripes.boundary_scatter import local_scatter, scatter
 from bodyscan.stripes.code_lines import fill_from_codes
 from bodyscan.stripes.grey_noise import noise_variance
 from bodyscan.stripes.line_bands import LineBands
@@ -73,7 +73,12 @@ def decode_bits(
     boundaries = replace(boundaries, sigma_px=scatter(boundaries) * boundaries.sigma_px)
     if images.bands is not None:
         return boundary_map(images, lit, boundaries, stripes)
-    s, sigma = interpolate_stripes(boundaries, codes, usable, carried)
+    rough = None
+    if images.lit.dtype != np.uint8:  # noise in whole levels hides relief, and is known less well
+        ratio = local_scatter(boundaries)
+        boundaries = replace(boundaries, sigma_px=ratio * boundaries.sigma_px)
+        rough = ratio > 1.0
+    s, sigma = interpolate_stripes(boundaries, codes, usable, carried, rough)
     if code.single:  # in other codes words at boundaries may be wrong by any number
         fill_from_codes(s, sigma, codes, shown)
     s, sigma = without_edges_across(s, sigma, brightness, boundaries.blur2)

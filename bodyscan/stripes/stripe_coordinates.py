@@ -30,11 +30,16 @@ MAX_PULL = 0.05
 
 
 def interpolate_stripes(
-    boundaries: Boundaries, codes: NDArray[np.int32], usable: Mask, carried: float = 0.0
+    boundaries: Boundaries,
+    codes: NDArray[np.int32],
+    usable: Mask,
+    carried: float = 0.0,
+    rough: Mask | None = None,
 ) -> tuple[Floats, Floats]:
     """s and its standard deviation, (L, P) each, NaN where there is none.
 
     carried: how far boundaries may have been carried from where the codes change, stripes.
+    rough: (N,) boundaries on relief that a smooth run would flatten: they are left in place.
 
     Between two boundaries s is a cubic with slopes from the boundaries around them (Hermite). Past
     the last boundary of a run it continues a little with the slope there.
@@ -42,7 +47,7 @@ def interpolate_stripes(
     s = np.full(codes.shape, np.nan, np.float32)
     sigma = s.copy()
     if boundaries.joined.any():
-        found = _Segments.of(boundaries)
+        found = _Segments.of(boundaries, rough)
         segments = (found.start, found.width, found.index, found.rise, found.sigma)
         bends = (found.slope_in, found.slope_out, found.pull)
         slack, places = SLACK + carried, (boundaries.line, boundaries.before)
@@ -73,8 +78,11 @@ class _Segments:
     sigma: Array
 
     @staticmethod
-    def of(boundaries: Boundaries) -> _Segments:
-        position, sigma_px = smooth_runs(boundaries, boundaries.joined)
+    def of(boundaries: Boundaries, rough: Mask | None = None) -> _Segments:
+        smooth = boundaries.joined
+        if rough is not None:
+            smooth = smooth & ~(rough[1:] | rough[:-1])
+        position, sigma_px = smooth_runs(boundaries, smooth)
         width = np.where(boundaries.joined, np.diff(position), np.nan)
         width[width < MIN_STRIPE_PX] = np.nan
         rise = np.diff(boundaries.index).astype(float)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bodyscan.stripes.boundaries import Boundaries
-from bodyscan.stripes.boundary_scatter import scatter
+from bodyscan.stripes.boundary_scatter import local_scatter, scatter
 
 
 def boundaries(
@@ -48,3 +50,32 @@ def test_a_thousand_fives_tell_and_fewer_do_not() -> None:
 def test_five_boundaries_that_reach_over_twelve_pixels_are_no_neighbours() -> None:
     assert scatter(boundaries(2000, claimed=0.02, apart_px=2.9)) > 2.0
     assert scatter(boundaries(2000, claimed=0.02, apart_px=3.1)) == 1.0
+
+
+def patch(rough: float) -> Boundaries:
+    """A hundred lines of fifty boundaries; those of lines 50 and on lie farther off than claimed."""
+    even = boundaries(5000, claimed=0.05, line=50)
+    position = even.position.copy()
+    straight = 30.0 + 2.0 * (even.index - 1)
+    position[2500:] += (rough - 1.0) * (position - straight)[2500:]
+    return replace(even, position=position)
+
+
+def test_only_where_boundaries_scatter_are_their_sigmas_too_small() -> None:
+    found = local_scatter(patch(2.0)).reshape(100, 50)
+    # Windows of 31 lines: those of the first 35 and the last 35 lines see one kind alone.
+    assert np.all(found[:35] == 1.0)
+    # Squares of twice a normal deviate, no more than 9, have a mean of 3.114; a window's 230 to 450
+    # overlapping fives know its root to 6 %.
+    assert np.median(found[65:]) == pytest.approx(np.sqrt(3.114), rel=0.06)
+    assert np.all(np.abs(found[65:] / np.sqrt(3.114) - 1.0) < 0.2)
+    # One that lies far off alone is none of it.
+    stray = boundaries(5000, claimed=0.05, line=50)
+    stray.position[2525] += 5.0
+    assert np.all(local_scatter(stray) == 1.0)
+
+
+def test_a_little_scatter_or_hardly_any_boundaries_say_nothing_of_a_place() -> None:
+    assert np.all(local_scatter(patch(1.1)) == 1.0)
+    for count in (0, 4, 5):
+        assert np.all(local_scatter(boundaries(count, claimed=0.02)) == 1.0)

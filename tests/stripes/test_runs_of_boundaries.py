@@ -300,3 +300,21 @@ def test_a_boundary_lies_where_the_light_of_its_pixels_has_its_middle(
     )
     moved = found.position - (20.0 * found.index - 0.5)
     np.testing.assert_allclose(moved[inner], USUAL_BLUR2 * right, atol=1e-3)
+
+
+def test_on_relief_boundaries_are_left_in_place() -> None:
+    position = 2.0 * np.arange(1, 41) + 0.05 * np.random.default_rng(0).normal(size=40)
+    codes = np.tile(np.searchsorted(position, X).astype(np.int32), (2, 1))
+    rough = np.arange(40) >= 20
+    some = run(position, np.arange(1, 41), 0.05)
+    usable = np.ones(codes.shape, bool)
+    smooth, even = (
+        interpolate_stripes(some, codes, usable)[1],
+        interpolate_stripes(some, codes, usable, 0.0, rough)[1],
+    )
+    # Between two boundaries of 2 px: 0.05 / 2, and seven that are smoothed leave 0.577 of it.
+    np.testing.assert_allclose(
+        even[1, 50:76], 0.05 / np.diff(position)[23:-1][(X[50:76] - 48) // 2], rtol=0.2
+    )
+    np.testing.assert_allclose(even[1, 10:30], smooth[1, 10:30])
+    assert np.all(smooth[1, 50:70] < 0.8 * even[1, 50:70])
