@@ -46,11 +46,10 @@ RING_MM = 20.0  # band of heights in one girth: less than a cell's size
 STILL_MM = 0.1
 """RMS of motion beyond rigid ones; less does no harm, and calibrations bend by half of it."""
 
-UNSEEN = 0.7
+UNSEEN = 0.5
 """Share of a place's motion by breath since a pair saw it that is unknown long after. A pole's
-pairs show place, speed and its change, so soon after next to nothing is missing; a second later a
-quarter is (people simulated by ray casting: 0.1 to 0.45 of a belly that nobody saw at its
-fullest)."""
+pairs show place, speed and its change, so soon after next to nothing is missing; a second later
+a fifth is. (Of people simulated by ray casting, trunks err by 0.8 of their sigmas with it.)"""
 
 NEARER = 0.95
 """If bending does not bring overlaps closer than this share, they are apart because of the pairs'
