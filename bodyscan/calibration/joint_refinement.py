@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from bodyscan.arrays import Array, Indices
-from bodyscan.calibration.board_form import EXACT_PRINT, POWERS, BoardForm, PrintSpread
+from bodyscan.calibration.board_form import POWERS, BoardForm, PrintSpread
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.boundary_points import (
     BoundaryPoints,
@@ -24,6 +24,7 @@ from bodyscan.calibration.boundary_points import (
     rays_on_board,
 )
 from bodyscan.calibration.camera import known_beforehand
+from bodyscan.calibration.held_out import CLEARLY
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
 from bodyscan.geometry.light_planes import Axis
@@ -243,23 +244,22 @@ def print_errors(fit: JointFit[Sheets], boards: Sequence[StripedBoard]) -> dict[
 
 def _likeliest_spread(values: Array, variances: Array, slow: Array) -> PrintSpread:
     """Of values (N,) seen with noise of `variances` (N,): of each one's own part, and of unknowns
-    that `slow` (N, K) adds to them."""
+    that `slow` (N, K) adds to them, if they are clearly there."""
     stretch = SPREADS_MM[:, None] ** 2
-    best, found = np.inf, EXACT_PRINT
-    for corner in SPREADS_MM:
+    misfit = np.empty((len(SPREADS_MM), len(SPREADS_MM)))
+    for row, corner in zip(misfit, SPREADS_MM, strict=True):
         total = corner**2 + variances
         white = values / np.sqrt(total)
         gains, modes = np.linalg.eigh(slow.T @ (slow / total[:, None]))
         along = modes.T @ (slow.T @ (white / np.sqrt(total)))
         grown = 1.0 + stretch * gains
-        misfit = np.sum(np.log(grown) - stretch * along**2 / grown, axis=1)
-        misfit += np.sum(np.log(total)) + np.sum(white**2)
-        if misfit.min() < best:
-            best, found = (
-                misfit.min(),
-                PrintSpread(float(corner), float(SPREADS_MM[np.argmin(misfit)])),
-            )
-    return found
+        row[:] = np.sum(np.log(grown) - stretch * along**2 / grown, axis=1)
+        row += np.sum(np.log(total)) + np.sum(white**2)
+    # Twice a log likelihood is a squared number of standard errors.
+    if misfit[:, 0].min() - misfit.min() < CLEARLY**2:
+        return PrintSpread(float(SPREADS_MM[np.argmin(misfit[:, 0])]))
+    corner, shared = np.unravel_index(np.argmin(misfit), misfit.shape)
+    return PrintSpread(float(SPREADS_MM[corner]), float(SPREADS_MM[shared]))
 
 
 def _solve(
