@@ -15,13 +15,13 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_form import BoardFace, rounded
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain
-from bodyscan.geometry.robust import rms_length
+from bodyscan.geometry.robust import rms, rms_length
 from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import rigid_fit
 from bodyscan.registration.full_solve import solve_fully
 from bodyscan.registration.inconsistent_views import fit_board
 from bodyscan.registration.joint_solve import JointSolution
-from bodyscan.registration.normal_equations import CORNERS
+from bodyscan.registration.normal_equations import CORNERS, FreeShape, view_sigmas
 
 ROUNDS = 15
 HASTE = 1.6
@@ -70,6 +70,26 @@ class BoardShape:
         along = (np.polyfit(self.points[:, axis], self.offsets[:, axis], 1)[0] for axis in range(2))
         x, y = (float(value) for value in along)
         return x, y
+
+    @property
+    def free(self) -> FreeShape:
+        """What the covariance of a solve that found this shape needs of it."""
+        return FreeShape(self.points + self.offsets, PRIOR * self.diagonal, self.size_sigma)
+
+    @property
+    def size_sigma(self) -> float:
+        """Standard deviation of the size as a whole, relative, which images cannot tell.
+
+        What stretches a print one way only, or shears it, is seen. Errors that know no direction
+        change its size as much: each face shows two such strains, as large as the third is unseen.
+        """
+        strains = []
+        for z in np.unique(self.points[:, 2]):
+            face = self.points[:, 2] == z
+            arms = self.points[face, :2] - self.points[face, :2].mean(axis=0)
+            (xx, xy), (yx, yy) = np.linalg.lstsq(arms, self.offsets[face, :2], rcond=None)[0]
+            strains += [0.5 * (xx - yy), 0.5 * (xy + yx)]
+        return rms(np.array(strains))
 
     def face(self, points: Array) -> BoardFace:
         """The face on which a view saw corners (M, 3), through every corner of it in any view."""
@@ -246,7 +266,11 @@ def _corner_equations(
         corners += [first[shaped[k].board] + numbers[k] for k in own]
         parts.append(_by_corner([shaped[k] for k in own], solution))
     number = np.concatenate(corners)
-    jacobian, residuals = (np.concatenate(part) for part in zip(*parts, strict=True))
+    sigmas = view_sigmas([residuals.ravel() for _, own in parts for residuals in own])
+    counts = [len(residuals) for _, own in parts for residuals in own]
+    sigma = np.repeat(sigmas, counts)
+    jacobian = np.concatenate([by_place for by_place, _ in parts]) / sigma[:, None, None]
+    residuals = np.concatenate([one for _, own in parts for one in own]) / sigma[:, None]
     weights = CORNERS.weights(residuals.ravel() / CORNERS.spread_of(residuals.ravel()))
     variance = float(np.sum(weights * residuals.ravel() ** 2) / np.sum(weights))
     weighted = np.swapaxes(jacobian * weights.reshape(-1, 2, 1), 1, 2)
@@ -260,11 +284,11 @@ def _corner_equations(
     )
 
 
-def _by_corner(views: Sequence[LocatedView], solution: JointSolution) -> tuple[Array, Array]:
+def _by_corner(views: Sequence[LocatedView], solution: JointSolution) -> tuple[Array, list[Array]]:
     """Derivatives and residuals of the corners seen by one pair.
 
     (N, 2, 3) px/mm: of pixels by the corners' places on their boards.
-    (N, 2) px: residuals.
+    (M, 2) px of each view: residuals.
     """
     pair = views[0].pair
     camera, camera_from_root = solution.cameras[pair], solution.root_from_camera[pair].inverse()
@@ -272,7 +296,8 @@ def _by_corner(views: Sequence[LocatedView], solution: JointSolution) -> tuple[A
     points = np.concatenate([p.apply(view.points) for p, view in zip(placed, views, strict=True)])
     turns = np.repeat([p.rotation for p in placed], [len(view.points) for view in views], axis=0)
     pixels = np.concatenate([view.pixels for view in views])
-    return camera.jacobians(points)[1] @ turns, camera.project(points) - pixels
+    cuts = np.cumsum([len(view.points) for view in views])[:-1]
+    return camera.jacobians(points)[1] @ turns, np.split(camera.project(points) - pixels, cuts)
 
 
 def _hold_out(

@@ -19,7 +19,7 @@ from bodyscan.calibration.camera import known_beforehand
 from bodyscan.geometry.camera import MATRIX, Camera
 from bodyscan.geometry.least_squares import EXACT, Block, minimize
 from bodyscan.registration.joint_solve import JointSolution
-from bodyscan.registration.normal_equations import CORNERS, corners_seen
+from bodyscan.registration.normal_equations import CORNERS, corners_seen, view_sigmas
 
 MOST_STEPS = 12
 SETTLED = 1e-3
@@ -85,17 +85,25 @@ def _blocks(
 ) -> Iterator[Block]:
     """The corners of each pair's views, then the priors on the cameras."""
     placings = solution.cameras, solution.root_from_camera, solution.root_from_board
-    for views in of_pair:
+    seen = [
+        corners_seen(views, *placings, cameras_free=unknowns.refine_cameras) for views in of_pair
+    ]
+    runs = [np.array([2 * len(view.points) for view in views]) for views in of_pair]
+    apart = [
+        np.split(residuals, np.cumsum(own)[:-1])
+        for (residuals, _), own in zip(seen, runs, strict=True)
+    ]
+    sigmas = iter(view_sigmas([one for views in apart for one in views]))
+    for views, (residuals, linearize), own in zip(of_pair, seen, runs, strict=True):
         pair = views[0].pair
-        residuals, linearize = corners_seen(views, *placings, cameras_free=unknowns.refine_cameras)
         of_motion, of_camera = unknowns.of_pair[pair], unknowns.of_camera[pair]
         columns = [
             np.concatenate([of_motion, unknowns.of_board[view.target], of_camera]) for view in views
         ]
         if not len(of_motion):
             linearize = _without_motion(linearize)
-        runs = np.array([2 * len(view.points) for view in views])
-        yield Block(residuals, linearize, np.array(columns), CORNERS, runs=runs)
+        sigma = np.repeat([next(sigmas) for _ in views], own)
+        yield Block(residuals, linearize, np.array(columns), CORNERS, sigma, runs=own)
     if unknowns.refine_cameras:
         for name, own in unknowns.of_camera.items():
             yield from camera_priors(solution.cameras[name], own)

@@ -105,10 +105,14 @@ def _excess(information: Array, pulls: Array, inverse: Array, variance: float) -
     where S is the place's share of all information; it is less than S because the solve followed
     the place.
     """
-    shares = information @ inverse
-    kept = shares - shares @ shares
-    expected = np.einsum("kii->k", kept)
-    freedoms = expected**2 / np.maximum(np.einsum("kij,kji->k", kept, kept), 1e-300)
+    # Place by place: with the corners of boards as unknowns all at once would take gigabytes.
+    traces = []
+    for own in information:
+        share = own @ inverse
+        kept = share - share @ share
+        traces.append((np.trace(kept), np.sum(kept * kept.T)))
+    expected, squared = np.array(traces).T
+    freedoms = expected**2 / np.maximum(squared, 1e-300)
     found = np.einsum("ki,ij,kj->k", pulls, inverse, pulls) / variance
     if not expected.sum() > 1.0:  # a single place: its errors cannot be judged
         return _Excess(np.ones(len(pulls)), 1.0)

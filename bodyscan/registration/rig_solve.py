@@ -203,13 +203,14 @@ def _placed(rig: Rig, solved: _Solved, refine: bool) -> RigSolution:
     rig_from_camera = {name: to_rig @ t for name, t in solution.root_from_camera.items()}
     rig_from_board = {target: to_rig @ t for target, t in solution.root_from_board.items()}
     equations = normal_equations(
-        kept,
+        shaped.views,  # a turned board's motion is the same, but its shape would be turned
         solution.cameras,
         rig_from_camera,
-        rig_from_board,
+        {target: to_rig @ t for target, t in shaped.solution.root_from_board.items()},
         fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
         fixed_target=frame_target(rig),
         cameras_free=refine,
+        shapes={name: shape.free for name, shape in shaped.shapes.items()},
     )
     known = honest_covariance(equations, board_places(kept, rig_from_board))
     rms = {

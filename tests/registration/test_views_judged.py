@@ -211,13 +211,16 @@ def lens(kind: str, *trials: LensTrial) -> ChosenLens:
 @pytest.mark.parametrize(
     ("gains", "changed"),
     [
-        ((1.4, 1.4, 1.4, 1.4), ""),  # three standard errors of a sum of four are six
-        ((1.6, 1.6, 1.6, 1.6), "abcd"),
-        ((1.6, 1.6, 1.6, 1.6, None), "abcd"),  # whose lens the rig file names
-        ((2.0, 2.0, 2.9, -0.5), "abc"),  # its own boards speak against it
-        ((9.0, 2.0, 1.0, 0.5), "bcd"),  # one camera counts as its boards prove it, no more
-        ((9.0, 1.0, 1.0, 0.5), ""),
-        ((2.9,), ""),
+        # Three standard errors of a sum of four are six, of which four times a half is what a lens
+        # that is not needed costs.
+        ((0.9, 0.9, 0.9, 0.9), ""),
+        ((1.1, 1.1, 1.1, 1.1), "abcd"),
+        ((1.1, 1.1, 1.1, 1.1, None), "abcd"),  # whose lens the rig file names
+        ((2.0, 2.0, 2.9, -0.5), "abcd"),
+        ((2.9, 2.9, 2.9, -3.1), "abc"),  # its own boards clearly speak against it
+        ((9.0, 1.0, 0.5, 0.0), "bcd"),  # one camera counts as its boards prove it, no more
+        ((9.0, 0.5, 0.2, 0.2), ""),
+        ((2.4,), ""),
     ],
 )
 def test_cameras_of_one_make_get_the_lens_they_call_for_together(
