@@ -23,10 +23,10 @@ from bodyscan.registration.inconsistent_views import fit_board
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.normal_equations import CORNERS, FreeShape, view_sigmas
 
-ROUNDS = 15
+ROUNDS = 30
 HASTE = 1.6
 """Over-relaxation of the corner steps: cameras and poses follow the corners."""
-SETTLED = 4e-6
+SETTLED = 2e-6
 PRIOR = 4e-3
 """Prior sigma of a corner's place, as a share of the board's diagonal (a millimetre in 250),
 because boards may be given in any unit."""

@@ -23,11 +23,10 @@ from bodyscan.registration.view_graph import Target
 CORNERS = Noise("corners", group=2, cauchy=4.0)
 KNOWN_FROM = 10.0
 """Residuals at which a view's own noise counts for half, the rest being that of all views: ten know
-a variance to 45 %, and of 40 to 96, as views have, the six that its board's pose takes matter little."""
+a variance to 45 %; of 40 to 96, as views have, the six that its board's pose takes matter little."""
 MOST_NOISE = 4.0
 """Times the noise of all views: boards at 65 degrees err 3 times as much; a view that seems worse
 is wrong rather than noisy, which is judged elsewhere."""
-
 HELD = 1e-4
 """Of a shape's prior sigma: what its motion and size are held to, a thousandth of what views tell."""
 
@@ -233,9 +232,9 @@ def view_sigmas(residuals: Sequence[Array]) -> Array:
     0.065 px at 65 degrees. Were all thought alike, the solve would trust just those that it should
     not, and the board on the floor, which holds the frame, is seen so by every camera.
     """
-    own = np.array([_mean_square(one) for one in residuals])
+    own = np.maximum([_mean_square(one) for one in residuals], CORNERS.least**2)
     counts = np.array([len(one) for one in residuals], float)
-    every = max(float(own @ counts / counts.sum()), CORNERS.least**2)
+    every = float(own @ counts / counts.sum())
     shrunk = (KNOWN_FROM * every + counts * own) / (KNOWN_FROM + counts)
     return np.clip(np.sqrt(shrunk / every), 1.0 / MOST_NOISE, MOST_NOISE)
 
