@@ -169,10 +169,12 @@ def _estimate(
     root: str,
     refine_cameras: bool,
     start: Mapping[str, BoardShape] | None = None,
+    *,
+    alike: bool = False,
 ) -> ShapedSolution:
     """Alternate between shapes and everything else until both settle.
 
-    start: shapes that the solution has; None for boards as described.
+    start: shapes that the solution has; None for boards as described. alike: see `solve_fully`.
     """
     shapes = _flat(views)
     if start:
@@ -183,7 +185,7 @@ def _estimate(
     shaped = [in_shape(view, shapes) for view in views]
     numbers = [shapes[view.board].numbers(view.points) for view in views]
     for _ in range(ROUNDS):
-        steps = _corner_steps(shaped, numbers, shapes, solution)
+        steps = _corner_steps(shaped, numbers, shapes, solution, alike)
         shapes = {
             name: _without_motion(replace(shape, offsets=shape.offsets + HASTE * steps[name]))
             for name, shape in shapes.items()
@@ -192,7 +194,9 @@ def _estimate(
             replace(view, points=view.points + shapes[view.board].offsets[own])
             for view, own in zip(views, numbers, strict=True)
         ]
-        solution = solve_fully(shaped, solution, root=root, refine_cameras=refine_cameras)
+        solution = solve_fully(
+            shaped, solution, root=root, refine_cameras=refine_cameras, alike=alike
+        )
         moved = (np.sqrt(np.mean(steps[name] ** 2)) / s.diagonal for name, s in shapes.items())
         if max(moved) < SETTLED:
             break
@@ -222,9 +226,10 @@ def _corner_steps(
     numbers: Sequence[Indices],
     shapes: Mapping[str, BoardShape],
     solution: JointSolution,
+    alike: bool,
 ) -> dict[str, Array]:
     """Gauss-Newton steps (N, 3) mm of single corners, with a prior at the nominal board."""
-    information, pull, variance = _corner_equations(shaped, numbers, shapes, solution)
+    information, pull, variance = _corner_equations(shaped, numbers, shapes, solution, alike)
     steps = {}
     for name, shape in shapes.items():
         held = variance / (PRIOR * shape.diagonal) ** 2
@@ -238,7 +243,7 @@ def _gain_per_unknown(views: Sequence[LocatedView], solution: JointSolution) -> 
     """Mean reduction of the squared residuals per coordinate of freed corners, in variances."""
     shapes = _flat(views)
     numbers = [shapes[view.board].numbers(view.points) for view in views]
-    information, pull, variance = _corner_equations(views, numbers, shapes, solution)
+    information, pull, variance = _corner_equations(views, numbers, shapes, solution, True)
     gain, unknowns = 0.0, 0
     for name in shapes:
         inverse = np.linalg.pinv(information[name], rcond=1e-6, hermitian=True)
@@ -252,6 +257,7 @@ def _corner_equations(
     numbers: Sequence[Indices],
     shapes: Mapping[str, BoardShape],
     solution: JointSolution,
+    alike: bool,
 ) -> tuple[dict[str, Array], dict[str, Array], float]:
     """J^T W J (N, 3, 3) and J^T W r (N, 3) of each board's corners, and the variance in px2.
 
@@ -266,11 +272,12 @@ def _corner_equations(
         corners += [first[shaped[k].board] + numbers[k] for k in own]
         parts.append(_by_corner([shaped[k] for k in own], solution))
     number = np.concatenate(corners)
-    sigmas = view_sigmas([residuals.ravel() for _, own in parts for residuals in own])
-    counts = [len(residuals) for _, own in parts for residuals in own]
+    every = [residuals for _, own in parts for residuals in own]
+    sigmas = np.ones(len(every)) if alike else view_sigmas([one.ravel() for one in every])
+    counts = [len(residuals) for residuals in every]
     sigma = np.repeat(sigmas, counts)
     jacobian = np.concatenate([by_place for by_place, _ in parts]) / sigma[:, None, None]
-    residuals = np.concatenate([one for _, own in parts for one in own]) / sigma[:, None]
+    residuals = np.concatenate(every) / sigma[:, None]
     weights = CORNERS.weights(residuals.ravel() / CORNERS.spread_of(residuals.ravel()))
     variance = float(np.sum(weights * residuals.ravel() ** 2) / np.sum(weights))
     weighted = np.swapaxes(jacobian * weights.reshape(-1, 2, 1), 1, 2)
@@ -312,8 +319,9 @@ def _hold_out(
         others = [view for view in views if view.target not in held]
         kept = {t: p for t, p in solution.root_from_board.items() if t not in held}
         start = replace(solution, root_from_board=kept)
-        flat = solve_fully(others, start, root=root, refine_cameras=refine_cameras)
-        bent = _estimate(others, flat, root, refine_cameras)
+        # While it is open whether boards are as described, what they err by for that is no noise.
+        flat = solve_fully(others, start, root=root, refine_cameras=refine_cameras, alike=True)
+        bent = _estimate(others, flat, root, refine_cameras, alike=True)
         for target in sorted(held):
             own = [view for view in views if view.target == target]
             true = [in_shape(view, bent.shapes) for view in own]

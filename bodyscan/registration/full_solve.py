@@ -28,16 +28,24 @@ of the minimum; that step leaves a few thousandths."""
 
 
 def solve_fully(
-    views: Sequence[LocatedView], solution: JointSolution, *, root: str, refine_cameras: bool
+    views: Sequence[LocatedView],
+    solution: JointSolution,
+    *,
+    root: str,
+    refine_cameras: bool,
+    alike: bool = False,
 ) -> JointSolution:
-    """Least squares from a solution of `solve_jointly`, in the root camera's frame."""
+    """Least squares from a solution of `solve_jointly`, in the root camera's frame.
+
+    alike: whether all views are taken to be as noisy as each other.
+    """
     unknowns = _Unknowns(solution, root, refine_cameras)
     of_pair = [
         [view for view in views if view.pair == name] for name in sorted({v.pair for v in views})
     ]
     return minimize(
         solution,
-        lambda state: _blocks(of_pair, state, unknowns),
+        lambda state: _blocks(of_pair, state, unknowns, alike),
         unknowns.moved,
         unknowns=unknowns.count,
         steps=MOST_STEPS,
@@ -81,7 +89,10 @@ class _Unknowns:
 
 
 def _blocks(
-    of_pair: Sequence[Sequence[LocatedView]], solution: JointSolution, unknowns: _Unknowns
+    of_pair: Sequence[Sequence[LocatedView]],
+    solution: JointSolution,
+    unknowns: _Unknowns,
+    alike: bool,
 ) -> Iterator[Block]:
     """The corners of each pair's views, then the priors on the cameras."""
     placings = solution.cameras, solution.root_from_camera, solution.root_from_board
@@ -93,7 +104,8 @@ def _blocks(
         np.split(residuals, np.cumsum(own)[:-1])
         for (residuals, _), own in zip(seen, runs, strict=True)
     ]
-    sigmas = iter(view_sigmas([one for views in apart for one in views]))
+    every = [one for views in apart for one in views]
+    sigmas = iter(np.ones(len(every)) if alike else view_sigmas(every))
     for views, (residuals, linearize), own in zip(of_pair, seen, runs, strict=True):
         pair = views[0].pair
         of_motion, of_camera = unknowns.of_pair[pair], unknowns.of_camera[pair]

@@ -84,8 +84,9 @@ def test_two_cameras_before_a_board_that_looks_the_same_turned(
 # Left out together: those, and twice two of the others, one of them near the edges.
 PLACES = ([f"{shot:02}" for shot in range(9)], ["10", "14"], ["12", "16"])
 GOOD_LENSES = {"back": {"brown", "rational"}, "mid": {"brown", "rational"},
-               "side": {"brown", "rational"}, "top": {"radial"}}  # fmt: skip
-"""top's picture has no boards near its edges."""
+               "side": {"brown", "rational"}, "top": {"radial", "brown"}}  # fmt: skip
+"""top's picture has no boards near its edges: its own boards cannot tell, and boards left out do not
+care (0.0266 px with the one, 0.0270 with the other)."""
 
 
 @pytest.fixture(scope="module")
@@ -139,9 +140,9 @@ def test_four_real_cameras_agree_on_boards_left_out(
 ) -> None:
     rms_px, rms_mm, _ = pooled([one for place in PLACES for one in left_out[place[0]]])
     # Wanted: 0.09 px and 0.20 mm. Others, fitting all shots: 0.22 to 0.54 px and 0.23 to 0.49 mm.
-    # Ours are left out, all of a place at a time; reached are 0.051 px and 0.199 mm against a flat
+    # Ours are left out, all of a place at a time; reached are 0.027 px and 0.193 mm against a flat
     # board, of which nearly all is the board's own bend.
-    assert rms_px < 0.08
+    assert rms_px < 0.04
     assert rms_mm < 0.205
 
 
