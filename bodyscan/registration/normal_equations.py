@@ -27,6 +27,8 @@ a variance to 45 %; of 40 to 96, as views have, the six that its board's pose ta
 MOST_NOISE = 4.0
 """Times the noise of all views: boards at 65 degrees err 3 times as much; a view that seems worse
 is wrong rather than noisy, which is judged elsewhere."""
+FINEST_PX = 1e-4
+"""No corner is found as well as that; residuals below it are those of computed views."""
 HELD = 1e-4
 """Of a shape's prior sigma: what its motion and size are held to, a thousandth of what views tell."""
 
@@ -232,7 +234,7 @@ def view_sigmas(residuals: Sequence[Array]) -> Array:
     0.065 px at 65 degrees. Were all thought alike, the solve would trust just those that it should
     not, and the board on the floor, which holds the frame, is seen so by every camera.
     """
-    own = np.maximum([_mean_square(one) for one in residuals], CORNERS.least**2)
+    own = np.maximum([_mean_square(one) for one in residuals], FINEST_PX**2)
     counts = np.array([len(one) for one in residuals], float)
     every = float(own @ counts / counts.sum())
     shrunk = (KNOWN_FROM * every + counts * own) / (KNOWN_FROM + counts)
