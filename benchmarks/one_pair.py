@@ -29,20 +29,21 @@ from bodyscan.workflows.decode import decode_sequence
 from bodyscan.workflows.range_images import reconstruct_sequence
 
 FOLDER = PROJECT / "bench" / "one-pair"
-SWAYS, BREATHES = "sways, 7.5 mm/s at the head", "and breathes, moves arms and head"
-STILL = "sways by a hundredth of that"
-MOTIONS: dict[str, Sequence[object]] = {
-    STILL: ["--subject-preset", "mannequin", "--set", "person.sway_mm_s=0.075"],
-    SWAYS: ["--subject-preset", "mannequin", "--set", "person.sway_mm_s=7.5"],
-    BREATHES: ["--subject-preset", "standing", "--set", "person.sway_mm_s=7.5"],
+MOTIONS = {
+    "sways by a hundredth of that": ("mannequin", 0.075),
+    "sways, 7.5 mm/s at the head": ("mannequin", 7.5),
+    "and breathes, moves arms and head": ("standing", 7.5),
 }
+"""Subject's preset, and its sway, mm/s."""
 NEAR_MM = 5.0
 """A depth that is off by more is of another surface: the truth's ray passes a rim."""
 
 
 def report() -> str:
     """The section of docs/results.md."""
-    rows = [row for name, motion in MOTIONS.items() for row in _rows(name, _rendered(name, motion))]
+    rows = [
+        row for name, motion in MOTIONS.items() for row in _rows(name, _rendered(name, *motion))
+    ]
     return f"""## One pair and a person who moves (synthetic)
 
 The woman in the rig of `three-pole-12`, calibrated there, workshop devices; twelve pairs one after
@@ -57,20 +58,19 @@ over all pairs, median and worst pair. Plain: stripes decoded as if nothing move
 """
 
 
-def _rendered(name: str, motion: Sequence[object]) -> Path:
+def _rendered(name: str, preset: str, sway_mm_s: float) -> Path:
     folder = FOLDER / str(list(MOTIONS).index(name))
     made: list[object] = [PROJECT / "rigs" / "three-pole-12.yaml", "--out", folder]
     made += ["--subject", PROJECT / "data" / "subjects" / "woman_average.ply"]
-    run_commands({"simulate": [*made, "--board-shots", 0, *motion]}, folder)
+    made += ["--subject-preset", preset, "--set", f"person.sway_mm_s={sway_mm_s}"]
+    run_commands({"simulate": [*made, "--board-shots", 0]}, folder)
     return folder
 
 
 def _rows(name: str, folder: Path) -> list[str]:
     calibration = load_calibration(WORKSPACE / "calibration")
-    captures, body = (
-        open_scan(calibration.rig, folder / "captures" / "person"),
-        body_of(folder / "truth"),
-    )
+    captures = open_scan(calibration.rig, folder / "captures" / "person")
+    body = body_of(folder / "truth")
     assert body
     carried = [reconstruct_sequence(calibration, captures, one)[0] for one in captures.sequences]
     plain = [_plain(calibration, one) for one in captures.sequences]

@@ -17,6 +17,7 @@ from bodyscan.boards.board_layout import corner_points
 from bodyscan.evaluation.spheres import centre_distances
 from bodyscan.evaluation.surface import signed_distances
 from bodyscan.fusion.storage import load_scan
+from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.robust import rms
 from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.calibrating import calibrate_ours
@@ -26,6 +27,7 @@ from bodyscan.laboratory.chapter.point_sigma import PointSigma, point_sigma
 from bodyscan.laboratory.rivals.targets import by_reference_plane
 from bodyscan.progress import THREADS
 from bodyscan.registration.storage import load_calibration
+from bodyscan.simulation.truth import describe_camera
 from bodyscan.workflows.evaluate import compare_rig, load_truth
 
 PROJECT = Path(__file__).parents[1]
@@ -99,12 +101,11 @@ def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
     setup = apparatus.chapter_setup(settings, seed)
     captures = take_captures(setup, boards=boards, stage_stops=0)
     ours, covariance, *_ = calibrate_ours(captures, *by_reference_plane(TARGET, captures.boards))
-    true = apparatus.CAMERA
-    parameters = [true.alpha, true.beta, true.gamma, true.u0, true.v0, true.k1, true.k2]
-    found, sigmas = ours.camera.parameters[:7], np.sqrt(np.diag(covariance))[:7]
+    true = from_fields(describe_camera(apparatus.CAMERA)).parameters
+    off = (ours.camera.parameters - true) / np.sqrt(np.diag(covariance))
     print_ppm = centre_distances(setup.board.corners, corner_points(apparatus.BOARD)).scale_ppm
     points, accuracy = point_sigma(ours, captures), measure_artefacts(ours, captures)
-    return UnitErrors(points, (found - parameters) / sigmas, accuracy, print_ppm)
+    return UnitErrors(points, off, accuracy, print_ppm)
 
 
 @dataclass(frozen=True, eq=False)

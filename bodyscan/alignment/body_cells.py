@@ -124,12 +124,6 @@ def modulated(fields: Array, cells: BodyCells, functions: Array) -> Array:
     return out.reshape(len(fields), 12, -1)
 
 
-def normal_field(cells: BodyCells) -> Array:
-    """A field (C, 12, 1) of 1 mm outwards."""
-    slopes = cells.slopes(cells.normals).reshape(-1, 9)
-    return np.hstack([cells.normals, slopes])[:, :, None]
-
-
 def displaced(field: Array, off: Array) -> Array:
     """Displacements (N, 3) mm by fields (N, 12) of points `off` (N, 3) their cells' centres."""
     return field[:, :3] + np.einsum("nki,nk->ni", field[:, 3:].reshape(-1, 3, 3), off)

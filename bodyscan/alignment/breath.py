@@ -44,9 +44,10 @@ def breath_fields(cells: BodyCells) -> Array:
     far the trunk moves forward is smoother than how far it moves along its normals. The fields are
     zero elsewhere.
     """
-    level = rigid_fields(cells, np.zeros(3), 1.0)[..., 3:5] @ _level_axes(cells)
+    axes = _level_axes(cells)
+    level = rigid_fields(cells, np.zeros(3), 1.0)[..., 3:5] @ axes
     both = []
-    for k, share in enumerate(_swelling(cells).T[..., None]):
+    for k, share in enumerate(_swelling(cells, axes).T[..., None]):
         functions = np.hstack([share, PLACE * _places(cells.centres, share)])
         both.append(modulated(level[..., k : k + 1], cells, functions))
     as_one = sum(own[..., :1] for own in both)
@@ -106,12 +107,14 @@ def likely_breath(information: Array, pull: Array, breaths: Array, likely: Array
 
 def breathing(cells: BodyCells) -> Array:
     """How far a breath that carries the front of the trunk by 1 mm carries each cell outwards, (C,)."""
-    ways = _swelling(cells) @ _level_axes(cells).T
+    axes = _level_axes(cells)
+    ways = _swelling(cells, axes) @ axes.T
     return np.asarray(np.sum(ways * cells.normals[:, :2], axis=1))
 
 
-def _swelling(cells: BodyCells) -> Array:
-    """How far forward and leftward each cell goes, (C, 2), as the front of the trunk goes forward.
+def _swelling(cells: BodyCells, axes: Array) -> Array:
+    """How far along `axes` (forward, leftward) each cell goes, (C, 2), as the trunk's front goes
+    forward.
 
     Ribs turn about the spine and a belly swells before it: what lies farther from the back, or from
     the middle, goes farther.
@@ -122,7 +125,7 @@ def _swelling(cells: BodyCells) -> Array:
     breathes = share > 0.5
     if not breathes.any():
         return np.zeros((len(share), 2))
-    places = cells.centres[:, :2] @ _level_axes(cells)
+    places = cells.centres[:, :2] @ axes
     low, high = np.percentile(places[breathes], EXTENT, axis=0)
     deep, wide = np.maximum(high - low, np.multiply(LEAST_TRUNK, cells.centres[:, 2].max()))
     forward = np.clip((places[:, 0] - high[0]) / deep + 1.0, 0.0, 1.0)

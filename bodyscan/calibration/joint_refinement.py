@@ -228,11 +228,11 @@ def print_errors(fit: JointFit[Sheets], boards: Sequence[StripedBoard]) -> dict[
     for name, own in state.of_form.items():
         form, of_print = fit.forms[name], own[len(POWERS) :]
         rest = np.setdiff1d(np.arange(state.unknowns), of_print)
-        known = form.print_whitening.T @ form.print_whitening
+        whitening = form.print_whitening
         cross = normal[np.ix_(of_print, rest)]
         both = normal[np.ix_(of_print, of_print)]
         both = both - cross @ invert_scaled(normal[np.ix_(rest, rest)]) @ cross.T
-        values, vectors = np.linalg.eigh(both - known)
+        values, vectors = np.linalg.eigh(both - whitening.T @ whitening)
         shown = values > LEAST_SHOWN * values[-1]
         values, vectors = values[shown], vectors[:, shown]
         # Without their prior the places would be these.
@@ -287,7 +287,7 @@ def _fit(
         {b.view.shot: pose for b, pose in zip(boards, state.poses, strict=True)},
         state.sheets.with_covariance(_of_depths(state, boards, covariance)),
         covariance[:first, :first],
-        _weighted_rms(corners, CORNERS) * np.sqrt(2.0),
+        float(np.sqrt(CORNERS.mean_square(corners)) * np.sqrt(2.0)),
         state.forms,
     )
 
@@ -495,8 +495,3 @@ def _of_depths(state: _State[Sheets], boards: Sequence[StripedBoard], covariance
     columns = np.concatenate([np.arange(state.first_pose), own])
     total = carried @ covariance[np.ix_(columns, columns)] @ carried.T
     return np.asarray(0.5 * (total + total.T), np.float64)
-
-
-def _weighted_rms(residuals: Array, noise: Noise) -> float:
-    weights = noise.weights(residuals / noise.spread_of(residuals))
-    return float(np.sqrt(np.sum(weights * residuals**2) / np.sum(weights)))

@@ -72,6 +72,11 @@ class Noise:
             return np.ones(len(residuals))
         return cauchy_weights(residuals, self.group, self.cauchy)
 
+    def mean_square(self, residuals: Array) -> float:
+        """Of residuals (N,) weighted against outliers, in their own unit squared."""
+        weights = self.weights(residuals / self.spread_of(residuals))
+        return float(weights @ residuals**2 / np.sum(weights))
+
 
 EXACT = Noise("in standard deviations", known=1.0)
 """For priors, and for everything already expressed in its own standard deviations."""

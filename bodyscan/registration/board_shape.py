@@ -27,6 +27,7 @@ ROUNDS = 30
 HASTE = 1.6
 """Over-relaxation of the corner steps: cameras and poses follow the corners."""
 SETTLED = 2e-6
+"""RMS of a step, as a share of the board's diagonal: at twice that a stretch was found to 88 %."""
 PRIOR = 4e-3
 """Prior sigma of a corner's place, as a share of the board's diagonal (a millimetre in 250),
 because boards may be given in any unit."""

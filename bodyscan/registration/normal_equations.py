@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -60,7 +61,11 @@ class FreeShape:
 
     def numbers(self, points: Array) -> Indices:
         """Which corners (M,) the points (M, 3) mm of a view are."""
-        return np.asarray(KDTree(self.points).query(points)[1], np.int64)
+        return np.asarray(self._tree.query(points)[1], np.int64)
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(self.points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,16 +239,11 @@ def view_sigmas(residuals: Sequence[Array]) -> Array:
     0.065 px at 65 degrees. Were all thought alike, the solve would trust just those that it should
     not, and the board on the floor, which holds the frame, is seen so by every camera.
     """
-    own = np.maximum([_mean_square(one) for one in residuals], FINEST_PX**2)
+    own = np.maximum([CORNERS.mean_square(one) for one in residuals], FINEST_PX**2)
     counts = np.array([len(one) for one in residuals], float)
     every = float(own @ counts / counts.sum())
     shrunk = (KNOWN_FROM * every + counts * own) / (KNOWN_FROM + counts)
     return np.clip(np.sqrt(shrunk / every), 1.0 / MOST_NOISE, MOST_NOISE)
-
-
-def _mean_square(residuals: Array) -> float:
-    weights = CORNERS.weights(residuals / CORNERS.spread_of(residuals))
-    return float(weights @ residuals**2 / np.sum(weights))
 
 
 def _total(parts: Sequence[OfTarget], size: int) -> tuple[Array, Array]:

@@ -270,5 +270,4 @@ def _robust_rms(parts: Sequence[Array]) -> float:
     if not parts:
         return float("nan")
     residuals = np.concatenate(parts).ravel()
-    weights = CORNERS.weights(residuals / CORNERS.spread_of(residuals))
-    return float(np.sqrt(2.0 * np.sum(weights * residuals**2) / np.sum(weights)))
+    return float(np.sqrt(2.0 * CORNERS.mean_square(residuals)))

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ball import ball_points
+from normal_field import normal_field
 from ring import looking_at
 
 from bodyscan.alignment.bending import _bend, _one_in_each_block, bend
-from bodyscan.alignment.body_cells import BodyCells, modulated, normal_field, rigid_fields
+from bodyscan.alignment.body_cells import BodyCells, modulated, rigid_fields
 from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.matching import alignment_points, match_projected
 from bodyscan.fusion.smoothing import smooth

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from normal_field import normal_field
 
 from bodyscan.alignment.body_cells import (
     BodyCells,
     displaced,
     modulated,
-    normal_field,
     rigid_fields,
     seen_from,
 )
