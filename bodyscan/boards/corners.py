@@ -7,8 +7,12 @@ that may fall off to one side:
     E(d) = erf(d / (sqrt(2) sigma)),
 
 with c the corner, n1 and n2 the normals of the two edge lines. Light multiplies: a slope added to
-the squares instead shifts all corners of a tilted board alike, by 0.01 px at 70 degrees. All
-corners of a board are fitted at once.
+the squares instead shifts all corners of a tilted board alike, by 0.01 px at 70 degrees.
+
+A marker in a white square turns it dark from a gap g_i beyond both edges on: the product of the
+edges is reversed there, by the factor 1 - 2 F1 F2 with F_i = (1 + E(|n_i . (p - c)| - g_i)) / 2.
+Left out, its blurred rim pulls corners of small boards at 60 degrees away from the camera, by 0.02
+px all alike. All corners of a board are fitted at once.
 """
 
 from __future__ import annotations
@@ -44,6 +48,8 @@ TIMES_MEDIAN = 2.0
 all are worse, in noise or blur, a corner may be twice as bad as the median of its board."""
 LEAST_OF_SEEN = 0.02
 """Share of the seen variance of light between corners that is real, at least."""
+NO_RIM = 4.0
+"""Blurs before a marker's rim at which it takes less than 1e-4 of the contrast."""
 STEPS = 12
 UNSEEN = 1e-9  # share of a diagonal: what a window without pixels leaves open stays as it is
 SETTLED = 1e-2  # a tenth of a corner's own sigma; one more step then makes it far less
@@ -66,11 +72,17 @@ class SightedCorners:
 
 @dataclass(frozen=True, eq=False)
 class _Patches:
-    """P pixels around each of N corners: place (N, P, 2) px, grey (N, P), weight (N, P): 0 or 1."""
+    """P pixels around each of N corners.
+
+    place: (N, P, 2) px. grey: (N, P). weight: (N, P), 0 or 1.
+    rims: (N, 3): how far beyond either edge a marker begins, px, infinite without markers, and the
+        sign of the product of distances from both edges where squares are white.
+    """
 
     place: Array
     grey: Array
     weight: Array
+    rims: Array
 
 
 def refine_corners(
@@ -87,8 +99,7 @@ def refine_corners(
         neighbouring edges out of the windows.
     bright_diagonal: (N,) whether the white squares at a corner are the one before it in x and y and
         the one after it in both, or the other two.
-    marker_gap: on a ChArUco board the white rim around a marker, in squares; keeps markers out of
-        the windows.
+    marker_gap: on a ChArUco board the white rim around a marker, in squares.
     """
     if not len(start):
         return start, np.zeros(0, bool)
@@ -141,14 +152,18 @@ def _patches(
     squares = np.einsum("nij,npj->npi", np.linalg.pinv(along), from_corner)
     weight = inside & np.all(np.abs(squares) < WINDOW_SQUARES, axis=-1)
     weight &= np.sum(from_corner**2, axis=-1) <= radius_px**2
+    # Along the diagonal the product of distances from the edges' normals is negative.
+    rims = np.full((len(start), 3), np.inf)
+    rims[:, 2] = np.where(bright_diagonal, -1.0, 1.0)
     if marker_gap is not None:
-        # Distances in px from the two edges through the corner, and where markers begin.
+        # Distances in px from the edges along y and x through the corner, and where markers begin.
         lengths = np.abs(np.linalg.det(along))[:, None] / np.linalg.norm(along, axis=1)[:, ::-1]
+        rims[:, :2] = marker_gap * lengths[:, ::-1]
         from_edge = np.abs(squares) * lengths[:, None]
         clear = np.maximum(marker_gap * lengths - CLEAR_OF_MARKER_PX, MIN_ARM_PX)
         white = (squares.prod(axis=-1) > 0) == bright_diagonal[:, None]
         weight &= np.any(from_edge < clear[:, None], axis=-1) | ~white
-    return _Patches(place, image[row, column].astype(float), weight.astype(float))
+    return _Patches(place, image[row, column].astype(float), weight.astype(float), rims)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,14 +255,23 @@ def _linear(patches: _Patches, state: Array) -> Array:
 
 def _equations(patches: _Patches, state: Array) -> StackedEquations:
     """Normal equations of every corner's fit at a state (N, 9)."""
-    return StackedEquations(*sum_equations(patches.place, patches.grey, patches.weight, state))
+    return StackedEquations(
+        *sum_equations(patches.place, patches.grey, patches.weight, patches.rims, state)
+    )
+
+
+@compiled
+def edge_and_slope(distance: float, blur: float) -> tuple[float, float]:
+    """E(d) of a blurred edge, and its derivative."""
+    scaled = distance / (math.sqrt(2.0) * blur)
+    return math.erf(scaled), math.sqrt(2.0 / math.pi) / blur * math.exp(-scaled * scaled)
 
 
 @compiled
 def sum_equations(
-    place: Array, grey: Array, weight: Array, state: Array
+    place: Array, grey: Array, weight: Array, rims: Array, state: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """The fields of `StackedEquations` for pixels and weights as in `_Patches` at states (N, 9).
+    """The fields of `StackedEquations` for pixels, weights and rims of `_Patches` at states (N, 9).
 
     Compiled, because it takes most of the time of finding boards: pixels without weight cost
     nothing, and no derivative is stored.
@@ -258,7 +282,6 @@ def sum_equations(
     by = np.empty(9)
     for n in range(count):
         blur, b, a = state[n, 4], state[n, 5], max(state[n, 6], MIN_CONTRAST)
-        steep = math.sqrt(2.0 / math.pi) / blur
         cos1, sin1 = math.cos(state[n, 2]), math.sin(state[n, 2])
         cos2, sin2 = math.cos(state[n, 3]), math.sin(state[n, 3])
         for p in range(pixels):
@@ -266,19 +289,29 @@ def sum_equations(
                 continue
             x, y = place[n, p, 0] - state[n, 0], place[n, p, 1] - state[n, 1]
             across1, across2 = x * cos1 + y * sin1, x * cos2 + y * sin2
-            edge1 = math.erf(across1 / (math.sqrt(2.0) * blur))
-            edge2 = math.erf(across2 / (math.sqrt(2.0) * blur))
-            squares = a + b * edge1 * edge2
+            edge1, steep1 = edge_and_slope(across1, blur)
+            edge2, steep2 = edge_and_slope(across2, blur)
+            product, by1, by2 = edge1 * edge2, steep1 * edge2, edge1 * steep2
+            by_blur = by1 * across1 + by2 * across2
+            into1, into2 = abs(across1) - rims[n, 0], abs(across2) - rims[n, 1]
+            if across1 * across2 * rims[n, 2] > 0.0 and min(into1, into2) > -NO_RIM * blur:
+                rim1, steep1 = edge_and_slope(into1, blur)
+                rim2, steep2 = edge_and_slope(into2, blur)
+                kept = 1.0 - 0.5 * (1.0 + rim1) * (1.0 + rim2)
+                lost1, lost2 = (1.0 + rim2) * steep1, (1.0 + rim1) * steep2
+                by_blur = kept * by_blur - 0.5 * product * (lost1 * into1 + lost2 * into2)
+                by1 = kept * by1 - 0.5 * product * math.copysign(lost1, across1)
+                by2 = kept * by2 - 0.5 * product * math.copysign(lost2, across2)
+                product *= kept
+            squares = a + b * product
             light = 1.0 + (x * state[n, 7] + y * state[n, 8]) / a
             residual = squares * light - grey[n, p]
-            # The effect of a change of one edge's value: b times the other edge's value.
-            worth1 = b * light * edge2 * steep * math.exp(-0.5 * (across1 / blur) ** 2)
-            worth2 = b * light * edge1 * steep * math.exp(-0.5 * (across2 / blur) ** 2)
+            worth1, worth2 = b * light * by1, b * light * by2
             by[0] = -squares / a * state[n, 7] - worth1 * cos1 - worth2 * cos2
             by[1] = -squares / a * state[n, 8] - worth1 * sin1 - worth2 * sin2
             by[2], by[3] = worth1 * (y * cos1 - x * sin1), worth2 * (y * cos2 - x * sin2)
-            by[4] = -(worth1 * across1 + worth2 * across2) / blur
-            by[5], by[6] = edge1 * edge2 * light, light - squares * (light - 1.0) / a
+            by[4] = -b * light * by_blur / blur
+            by[5], by[6] = product * light, light - squares * (light - 1.0) / a
             by[7], by[8] = squares / a * x, squares / a * y
             for i in range(9):
                 weighted = weight[n, p] * by[i]

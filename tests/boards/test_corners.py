@@ -13,6 +13,7 @@ from scipy.special import erf
 from bodyscan.arrays import Array, Bytes
 from bodyscan.boards.board_map import fit_board_map
 from bodyscan.boards.corners import _patches, refine_corners, sum_equations
+from bodyscan.boards.detection import find_boards
 from bodyscan.geometry.least_squares import StackedEquations
 from bodyscan.rig.board import Board
 
@@ -95,30 +96,63 @@ def test_light_that_falls_off_over_a_tilted_board_moves_no_corner() -> None:
     assert np.all(np.abs(np.mean(shifts, axis=0)) < 0.004)
 
 
-def test_compiled_equations_are_those_of_the_corner_s_image() -> None:
+@pytest.mark.parametrize(("slant_deg", "fill"), [(30, 0.5), (45, 0.5), (60, 0.8)])
+def test_markers_beside_small_squares_move_no_corner(slant_deg: int, fill: float) -> None:
+    """Their rims lie 2 px from the edges, within the blur of the windows' pixels."""
+    board = Board(
+        name="marked",
+        kind="charuco",
+        columns=9,
+        rows=7,
+        square_mm=70,
+        marker_mm=52,
+        dictionary="DICT_4X4_1000",
+    )
+    shifts, errors = [], []
+    for seed in range(4):
+        view = view_of(board, slant_deg, 90, 4, width=400, height=320, fill=fill)
+        image = render([(board, view)], blur_px=0.9, noise=0.7, seed=seed)
+        (found,) = find_boards(image, [board], pair="a", shot="b")
+        error = found.pixels - true_corners(board, view)[found.corner_ids]
+        shifts.append(error.mean(axis=0))
+        errors.append(error)
+    # Measured 0.0016 px at most, and 0.006 to 0.011 RMS, which is noise; with the rims left out of
+    # the model 0.010 to 0.033, and 0.026 to 0.070.
+    assert np.all(np.abs(np.mean(shifts, axis=0)) < 0.004)
+    assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.015
+
+
+@pytest.mark.parametrize("rim_px", [np.inf, 2.0])
+def test_compiled_equations_are_those_of_the_corner_s_image(rim_px: float) -> None:
     rng = np.random.default_rng(4)
     place = rng.uniform(-6.0, 6.0, (5, 40, 2)) + 100.0
     grey, weight = rng.uniform(20.0, 220.0, (5, 40)), (rng.random((5, 40)) < 0.7).astype(float)
     state = np.tile([100.0, 100.0, 0.3, 1.7, 0.9, 60.0, 110.0, 0.5, -0.3], (5, 1))
     state += 0.1 * rng.standard_normal(state.shape)
+    rims = np.tile([rim_px, 1.5 * rim_px, -1.0], (5, 1))
+    rims[2:, 2] = 1.0
 
     def residuals(state: Array) -> Array:
         """The formula at the head of `corners`, less what is seen."""
         off = place - state[:, None, :2]
         one, two = (
-            erf((off @ np.stack([np.cos(angle), np.sin(angle)], -1)[..., None])[..., 0] / blur)
+            (off @ np.stack([np.cos(angle), np.sin(angle)], -1)[..., None])[..., 0]
             for angle in (state[:, 2], state[:, 3])
-            for blur in [np.sqrt(2.0) * state[:, 4:5]]
         )
+        blur = np.sqrt(2.0) * state[:, 4:5]
         a, b = state[:, 6:7], state[:, 5:6]
         light = 1.0 + np.einsum("npi,ni->np", off, state[:, 7:]) / a
-        return np.asarray((a + b * one * two) * light - grey)
+        marker = (1.0 + erf((np.abs(one) - rims[:, :1]) / blur)) / 2.0
+        marker *= (1.0 + erf((np.abs(two) - rims[:, 1:2]) / blur)) / 2.0
+        white = one * two * rims[:, 2:] > 0.0
+        edges = erf(one / blur) * erf(two / blur) * np.where(white, 1.0 - 2.0 * marker, 1.0)
+        return np.asarray((a + b * edges) * light - grey)
 
     step = 1e-5
     ways = step * np.eye(9)
     slopes = [(residuals(state + way) - residuals(state - way)) / (2 * step) for way in ways]
     plain = StackedEquations.of(residuals(state), np.stack(slopes, axis=-1), weight)
-    found = StackedEquations(*sum_equations(place, grey, weight, state))
+    found = StackedEquations(*sum_equations(place, grey, weight, rims, state))
     for name in ("normal", "gradient", "cost", "freedoms"):
         expected = getattr(plain, name)
         # central differences of 1e-5 px are good to 1e-9 of the greatest entry
