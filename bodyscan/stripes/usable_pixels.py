@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Floats, Mask
+from bodyscan.arrays import Floats, Greys, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.indirect_light import mostly_direct
 from bodyscan.stripes.scan_lines import ScanLines

@@ -63,9 +63,9 @@ def test_a_pixel_at_the_rim_that_is_much_darker_than_its_neighbour_is_half_cover
 def uncovered_of(level: float, lit: float = 100.0, of: type = np.uint8, noise: float = 0.0) -> bool:
     """Whether a pixel is taken to have lost the surface that the lit frame and one pair of a pattern
     and its inverse show at `lit` above a dark of 20, since another pair shows it at `level`."""
-    high = np.full((3, 2, 2), 20.0 + lit).astype(of)
+    high: Greys = np.full((3, 2, 2), 20.0 + lit).astype(of)
     high[1] = np.float32(20.0 + level).astype(of)
-    dark = np.full((3, 2, 2), 20.0).astype(of)
+    dark: Greys = np.full((3, 2, 2), 20.0).astype(of)
     images = ScanLines(high[0], dark[0], high, dark, False)
     found = uncovered_meanwhile(images, np.full(256, noise**2, np.float32))
     assert np.all(found == found[0, 0])
