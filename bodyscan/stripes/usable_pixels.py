@@ -52,8 +52,8 @@ def shown_pixels(
     """The usable pixels (L, P), and all that show a code, including those beside its jumps.
 
     Excluded are low contrast, saturation, codes that were not projected, pixels that the surface's
-    rim covers only in part or passed over, and pixels that get more light from other surfaces than
-    from the projector.
+    rim covers only in part, and pixels that get more light from other surfaces than from the
+    projector.
 
     variance: (256,) of each grey level.
     fine_bit: see `mostly_direct`.
@@ -65,7 +65,7 @@ def shown_pixels(
         bright = contrast >= cv2.LUT(cv2.max(images.lit, images.dark), least)
     else:
         bright = contrast >= least[np.maximum(images.lit, images.dark).astype(np.uint8)]
-    bright &= ~half_covered_pixels(contrast, bright) & ~uncovered_meanwhile(images, variance)
+    bright &= ~half_covered_pixels(contrast, bright)
     shown = bright & (images.lit < SATURATED) & (codes >= 0) & (codes < stripes)
     usable = shown & ~beside_jumps(codes, shown)
     direct = mostly_direct(images, usable, fine_bit, variance)
@@ -87,7 +87,9 @@ def uncovered_meanwhile(images: ScanLines, variance: Floats) -> Mask:
     passed over them, and their boundaries are partly those of another surface.
 
     A pattern and its inverse together are as bright as lit and dark, however blurred their stripes
-    are; no image is brighter than the lit one. Without inverses nothing is known.
+    are; no image is brighter than the lit one. Cameras that sharpen, or JPEG, break that rule at a
+    pixel in twenty, so that it is for bodies that are known to have moved. Without inverses nothing
+    is known.
     """
     uncovered = np.zeros(images.lit.shape, np.bool_)
     if images.inverses is not None:
