@@ -48,15 +48,17 @@ def calibration_from_facts(
     *,
     shift_mm: float = SHIFT_MM,
     turn_deg: float = TURN_DEG,
+    planes_mm: float = PLANES_MM,
 ) -> RigCalibration:
-    """A calibration from `pairs` of truth.json. shift_mm, turn_deg: pose errors, per axis."""
+    """A calibration from `pairs` of truth.json. shift_mm, turn_deg: pose errors, per axis; planes_mm:
+    of the planes of each pair in common."""
     rng = np.random.default_rng(seed)
     sigmas = np.repeat([np.radians(turn_deg), shift_mm], 3)
     pairs, placed, covariances = {}, {}, []
     to_rig = adjoint(MIDDLE)
     for pair in rig.pairs:
         true = truth[pair.name]
-        pairs[pair.name] = _pair(pair, true, rng)
+        pairs[pair.name] = _pair(pair, true, planes_mm, rng)
         turn, shift = np.split(sigmas * rng.standard_normal(6), 2)
         off = MIDDLE @ RigidTransform.from_rotation_vector(turn, shift) @ MIDDLE.inverse()
         placed[pair.name] = off @ RigidTransform.from_matrix(true["rig_from_camera"])
@@ -67,13 +69,15 @@ def calibration_from_facts(
     return RigCalibration(rig, pairs, placed, covariance, {}, {}, ())
 
 
-def _pair(pair: Pair, true: Mapping[str, Any], rng: np.random.Generator) -> PairCalibration:
+def _pair(
+    pair: Pair, true: Mapping[str, Any], planes_mm: float, rng: np.random.Generator
+) -> PairCalibration:
     camera = from_fields(true["camera"])
     planes = np.array(true["boundary_planes"])
     planes *= np.where(planes[:, 3:] < 0.0, -1.0, 1.0)
-    planes[:, 3] += PLANES_MM * rng.standard_normal()
+    planes[:, 3] += planes_mm * rng.standard_normal()
     spread = np.zeros((len(planes), 4, 4))
-    spread[:, 3, 3] = PLANES_MM**2
+    spread[:, 3, 3] = planes_mm**2
     assert pair.projector is not None
     sheets = LightPlanes(planes, spread, pair.projector.direction)
     size = len(camera.parameters)

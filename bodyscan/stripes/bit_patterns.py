@@ -12,7 +12,7 @@ from bodyscan.arrays import Floats, Greys
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.albedo_edges import Brightness, without_edges_across
 from bodyscan.stripes.bit_words import WordCode, bit_that_flips
-from bodyscan.stripes.boundaries import find_boundaries
+from bodyscan.stripes.boundaries import find_boundaries, kept_boundaries
 from bodyscan.stripes.boundary_scatter import local_scatter, scatter
 from bodyscan.stripes.code_lines import fill_from_codes
 from bodyscan.stripes.grey_noise import noise_variance
@@ -23,7 +23,7 @@ from bodyscan.stripes.sequence_checks import check_codes, check_exposure
 from bodyscan.stripes.stripe_coordinates import interpolate_stripes
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap, boundary_map, stripe_map
-from bodyscan.stripes.usable_pixels import MIN_CONTRAST, shown_pixels
+from bodyscan.stripes.usable_pixels import MIN_CONTRAST, shown_pixels, uncovered_meanwhile
 
 SAMPLES = 20_000
 COARSE_BITS = 3
@@ -67,9 +67,12 @@ def decode_bits(
     boundaries, motion, carried = replace(boundaries, sigma_px=sigma_px), None, 0.0
     if moments is not None:
         bit = bit_that_flips(boundaries.index + code.first, len(images.patterns))
-        boundaries, motion, carried = carry_to_moment(
-            boundaries, bit, moments, turned=images.turned
-        )
+        seen = boundaries
+        boundaries, motion, carried = carry_to_moment(seen, bit, moments, turned=images.turned)
+        if carried > 0.0:
+            covered = ~uncovered_meanwhile(images, variance)
+            usable, shown = usable & covered, shown & covered
+            boundaries = boundaries.where(*kept_boundaries(seen, usable))
     boundaries = replace(boundaries, sigma_px=scatter(boundaries) * boundaries.sigma_px)
     if images.bands is not None:
         return boundary_map(images, lit, boundaries, stripes)

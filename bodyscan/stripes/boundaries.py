@@ -53,6 +53,27 @@ class Boundaries:
     joined: Mask
     blur2: float
 
+    def where(self, kept: Mask, joined: Mask) -> Boundaries:
+        """Those that are kept, (N,); joined: of them, as above."""
+        return Boundaries(
+            self.line[kept],
+            self.before[kept],
+            self.position[kept],
+            self.line_position[kept],
+            self.sigma_px[kept],
+            self.index[kept],
+            joined,
+            self.blur2,
+        )
+
+
+def kept_boundaries(seen: Boundaries, usable: Mask) -> tuple[Mask, Mask]:
+    """Which boundaries lie between two usable pixels (L, P), (N,), and which of the M kept ones are
+    joined, (M - 1,)."""
+    kept = usable[seen.line, seen.before] & usable[seen.line, seen.before + 1]
+    places = seen.line[kept], seen.before[kept], seen.position[kept], seen.index[kept]
+    return kept, continues_to_next(*places, usable)
+
 
 def find_boundaries(
     images: ScanLines,

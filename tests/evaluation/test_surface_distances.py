@@ -14,7 +14,7 @@ from surface_coverage import coverage
 
 from bodyscan.errors import BadInput
 from bodyscan.evaluation import comparison
-from bodyscan.evaluation.comparison import _surface
+from bodyscan.evaluation.comparison import _surface, fit_to_surface
 from bodyscan.evaluation.surface import deviation, sample_surface, signed_distances
 from bodyscan.geometry.transforms import RigidTransform
 
@@ -63,6 +63,20 @@ def test_a_point_beyond_a_corner_is_outside_however_obtuse_the_faces(seed: int) 
     outside = np.einsum("pfk,fk->pf", points[:, None] - corners[faces[:, 0]], normals) > 0.0
     found = signed_distances(points, corners, faces)
     assert np.array_equal(found > 0.0, outside.any(axis=1))
+
+
+def test_points_on_one_side_of_a_round_surface_are_laid_onto_its_faces() -> None:
+    """Seen from one side, as by one pair: the nearest corner's tangent plane lies outside a round
+    surface, and would draw all of them that way."""
+    ball = o3d.geometry.TriangleMesh.create_sphere(60.0, 30)
+    vertices = np.asarray(ball.vertices) * [1.0, 1.3, 2.0] + [300.0, 100.0, 900.0]
+    faces = np.asarray(ball.triangles).astype(np.int64)
+    points, normals = sample_surface(vertices, faces, 60_000)
+    points = points[normals[:, 0] > 0.3]
+    off = RigidTransform.from_rotation_vector([0.0, 0.002, 0.001], [-2.0, 1.0, 0.5])
+    laid = fit_to_surface(off.apply(points), vertices, faces)
+    away = laid.apply(off.apply(points)) - points
+    assert np.abs(away.mean(axis=0)).max() < 0.005  # 0.135 by the corners
 
 
 def test_statistics() -> None:

@@ -80,6 +80,34 @@ def test_what_moved_meanwhile_is_taken_out_of_s(seen: tuple[bool, list[np.ndarra
     assert len(after) > 0.995 * len(before)
 
 
+def test_a_rim_that_moves_meanwhile_leaves_no_s_beyond_it() -> None:
+    """A surface before a dark room whose rim comes in by a tenth of a pixel an image."""
+
+    def rim(time: float, u: Array | Indices) -> Array:
+        return np.asarray(70.0 - 0.1 * time + 0.15 * u, np.float64)
+
+    def moving(time: float, u: Array | Indices, v: Array | Indices) -> Array:
+        return np.where(v < rim(time, u), s_at(time, u, v), np.nan)
+
+    bits, images = gray_bits(np.arange(STRIPES)), []
+    for time, light in enumerate(np.stack([bits, 1 - bits], axis=1).reshape(2 * BITS, STRIPES)):
+        s = partial(moving, float(time))
+        images.append(render(s, light[None], stripes=STRIPES, shape=SHAPE, seed=time))
+    patterns = [image[2] for image in images]
+    given = *images[0][:2], np.concatenate([*patterns[::2], *patterns[1::2]])
+    code = Gray(stripes=STRIPES, direction="horizontal")
+    firsts: Array = np.arange(0.0, 2.0 * BITS, 2.0, dtype=np.float64)
+    times: dict[str, Array] = {"pattern": firsts, "inverse": np.asarray(firsts + 1.0, np.float64)}
+    moments = Moments(times, code.moment(times), told)
+    v, u = np.indices(SHAPE)
+    beyond = v - np.floor(rim(moments.moment, u))
+    carried = np.isfinite(decode_stripes(code, *given, moments=(moments,)).s)
+    assert not carried[beyond >= 1].any()
+    assert carried[beyond < -2].mean() > 0.98
+    # Of what is not known to move, as of a still body, all pixels stay: 3 in 10 of the first beyond.
+    assert np.isfinite(decode_stripes(code, *given).s)[beyond == 1].mean() > 0.2
+
+
 def told_in_mm(comb: Comb) -> StripeMotion | None:
     if not len(comb.speed):
         return None
