@@ -38,9 +38,10 @@ FIRST_MM, WHOLE_MM = 1.0, 2.0
 SIZINGS = 3
 """Resizings in each round: what the evidence does not ask for shrinks step by step."""
 SMALLEST_MM = 1e-3
-PARTS_MM = 0.25
-"""mm by which parts above the legs may have moved unseen, a sixth of a breath: evidence sizes the
-parts of the whole body at once, and legs that stood still say nothing about a hip."""
+PARTS_SHARE = 1 / 15
+"""How far parts above the legs may have moved unseen, relative to the breath found: 0.1 mm in those who
+stand, 0.25 in the restless. Evidence sizes the parts of the whole body at once, and legs that stood
+still say nothing about a hip; but who breathes and stirs little moves a hip little."""
 APART_MM = 0.07
 """mm between the surfaces of two pairs in a cell that no motion of the body explains: calibrations
 are bent by 0.05 mm each, which no number of matches averages out."""
@@ -269,9 +270,12 @@ class BodyMotion:
         return motion
 
     def doubted(self) -> Array:
-        """Covariance (n, n) of the amplitudes if parts had moved as people's do."""
+        """Covariance (n, n) of the amplitudes if parts had moved as in people who breathe so."""
+        breath = self.kind("breath").alike
+        assert breath is not None
+        least = PARTS_SHARE * float(np.sqrt(np.linalg.eigvalsh(breath)[-1]))
         kinds = (
-            replace(kind, size=max(kind.size, PARTS_MM)) if kind.name == "parts" else kind
+            replace(kind, size=max(kind.size, least)) if kind.name == "parts" else kind
             for kind in self.kinds
         )
         return replace(self, kinds=tuple(kinds))._settled().covariance

@@ -32,11 +32,18 @@ class Fit:
     sigma: Floats
 
 
-def fit_quadratics(inverse: Floats, noise: Floats, reach: int, pixel_mm: float) -> tuple[Fit, Mask]:
+def fit_quadratics(
+    inverse: Floats,
+    noise: Floats,
+    reach: int,
+    pixel_mm: float,
+    alike_px: tuple[float, float] = (0.0, 0.0),
+) -> tuple[Fit, Mask]:
     """Fit an inverse depth, 0 where nothing was measured; return the fits and where they succeed.
 
     noise: its standard deviation; only the scale is corrected, if residuals are larger.
     reach: windows have 2 reach + 1 pixels a side, of `pixel_mm` on the surface.
+    alike_px: see `noise_left`.
     """
     valid = inverse > 0
     fit, fitted = fit_whole_windows(inverse, noise, reach)
@@ -57,7 +64,22 @@ def fit_quadratics(inverse: Floats, noise: Floats, reach: int, pixel_mm: float) 
     easy.ravel()[cut] = True  # already fitted robustly
     uneasy = np.flatnonzero(valid & ~easy)
     fit_windows(padded, noise, uneasy, reach, pixel_mm, fits, fitted)
+    np.multiply(fit.sigma, np.float32(noise_left(reach, alike_px)), out=fit.sigma)
     return fit, fitted
+
+
+def noise_left(reach: int, alike_px: tuple[float, float]) -> float:
+    """How much more noise a window's fit keeps than if every pixel's were its own.
+
+    alike_px: distance along rows and along columns over which the correlation of two pixels' noise
+        falls linearly from one to nothing; 0 if they share none.
+    """
+    basis = window_basis(reach)
+    weights = (np.linalg.inv(basis.T @ basis)[0] @ basis.T).reshape(2 * reach + 1, -1)
+    away = np.abs(np.subtract.outer(np.arange(2 * reach + 1), np.arange(2 * reach + 1)))
+    along_u, along_v = (np.maximum(0.0, 1.0 - away / max(px, 1.0)) for px in alike_px)
+    kept = np.sum((along_v @ weights @ along_u) * weights)
+    return float(np.sqrt(kept / np.sum(weights**2)))
 
 
 def _size_of_noise(inverse: Floats, noise: Floats, fit: Fit, full: Mask) -> np.float32:

@@ -75,7 +75,7 @@ def smooth(
     inverse, noise = inverse_depths(image.points, image.sigma_mm, common, ends_of(box))
     pixel_mm = pixel_size(inverse, image.camera)
     reach = window_reach(pixel_mm, window_mm)
-    fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm)
+    fit, fitted = fit_quadratics(inverse, noise, reach, pixel_mm, image.alike_px)
     return _surface(image, common, rig_from_camera, box, fit, fitted, reach)
 
 

@@ -34,6 +34,8 @@ class RangeImage:
     bent: whether points were carried to another moment, off the rays of their pixels.
     corner: row and column of the camera's image at which the kept part begins.
     whole_depth, whole_colours: `open_depth` and `lit` from before a cut.
+    alike_px: distance along rows and columns within which pixels share noise, because their depths
+        come from the same stripe boundaries; 0 if each has its own.
     """
 
     pair: str
@@ -51,6 +53,7 @@ class RangeImage:
     corner: tuple[int, int] = (0, 0)
     whole_depth: Floats | None = None
     whole_colours: Bytes | None = None
+    alike_px: tuple[float, float] = (0.0, 0.0)
 
     @property
     def valid(self) -> Mask:

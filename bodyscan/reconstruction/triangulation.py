@@ -45,7 +45,7 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
             remedy="scan with the camera settings of the calibration, or calibrate again",
         )
     points, sigma_mm, common_mm = _triangulated(pair, pair.sheets, stripes.s, stripes.sigma)
-    agreement = None
+    agreement, alike_px = None, stripes.alike_px
     if pair.crossing is not None and stripes.crossing is not None:
         across = stripes.crossing
         *others, common_too = _triangulated(pair, pair.crossing, across.s, across.sigma)
@@ -58,13 +58,18 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
         # larger one.
         common_mm = sigma_mm * np.fmax(*share)
         if agreement is not None:
+            # Of two directions' noise, each is alike along another way: their mean hardly is.
+            alike_px = (0.0, 0.0)
             agreement = replace(agreement, apart_stripes=apart, stripes=counted)
         _require_fit(pair, stripes, agreement)
     normals = grid_normals(points, np.isfinite(sigma_mm))
     # A copy: the lit image is part of a stack, which would be kept alive with it.
     images = (stripes.lit.copy(), stripes.beyond)
     return RangeImage(
-        pair.name, camera, points, normals, sigma_mm, *images, agreement, common_mm=common_mm
+        *(pair.name, camera, points, normals, sigma_mm),
+        *(*images, agreement),
+        common_mm=common_mm,
+        alike_px=alike_px,
     )
 
 

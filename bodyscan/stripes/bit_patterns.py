@@ -20,7 +20,7 @@ from bodyscan.stripes.line_bands import LineBands
 from bodyscan.stripes.one_moment import Moments, carry_to_moment
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.sequence_checks import check_codes, check_exposure
-from bodyscan.stripes.stripe_coordinates import interpolate_stripes
+from bodyscan.stripes.stripe_coordinates import alike_along_lines, interpolate_stripes
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap, boundary_map, stripe_map
 from bodyscan.stripes.usable_pixels import MIN_CONTRAST, shown_pixels, uncovered_meanwhile
@@ -86,7 +86,9 @@ def decode_bits(
         fill_from_codes(s, sigma, codes, shown)
     s, sigma = without_edges_across(s, sigma, brightness, boundaries.blur2)
     found = stripe_map(images, lit, s, sigma, boundaries, stripes, beyond)
-    return replace(found, motion=motion)
+    along = alike_along_lines(boundaries)
+    alike_px = (0.0, along) if images.turned else (along, 0.0)
+    return replace(found, motion=motion, alike_px=alike_px)
 
 
 def bit_lines(

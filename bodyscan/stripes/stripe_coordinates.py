@@ -28,6 +28,11 @@ BEYOND_DOUBT = 3.0
 MAX_PULL = 0.05
 """More than blur does to s on any smooth surface."""
 
+SHARED, SHARED_BY_RUNS = 1.4, 2.4
+"""Stripes over which the noise of s is alike. One stripe apart, two pixels between boundaries share a
+quarter of it, and 0.65 if the boundaries were smoothed; two apart nothing, and 0.14: a line that falls
+to nothing at these distances is nowhere off by more than a tenth."""
+
 
 def interpolate_stripes(
     boundaries: Boundaries,
@@ -53,6 +58,18 @@ def interpolate_stripes(
         slack, places = SLACK + carried, (boundaries.line, boundaries.before)
         _fill(s, sigma, codes, usable, *places, segments, bends, slack)
     return s, sigma
+
+
+def alike_along_lines(boundaries: Boundaries) -> float:
+    """Distance along a line, px, within which pixels share noise: all between two boundaries, and
+    more where those share it because a run was smoothed. 0 without stripes."""
+    width = np.diff(boundaries.position)[boundaries.joined]
+    width = width[width >= MIN_STRIPE_PX]
+    if not len(width):
+        return 0.0
+    usual = float(np.median(width))
+    smoothed = (len(SMOOTHERS[0]) - 1) * usual < 2 * REACH_PX
+    return (SHARED_BY_RUNS if smoothed else SHARED) * usual
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,6 +47,8 @@ class StripeMap:
     beyond: (height, width) bool, lit by a stripe that lies deeper than wanted, where s is NaN (see
         `StripeLimits`); None if all stripes were wanted.
     crossing: the map of the stripes that run the other way, if such were projected.
+    alike_px: distance along rows and along columns within which pixels share noise, as they lie between
+        the same boundaries; 0 if each has its own.
     crossing_fault: why there is none although they were, else "".
     response: what the projector's response did, for codes that measure it; None if noise explains
         it.
@@ -65,6 +67,7 @@ class StripeMap:
     response: ResponseShare | None = None
     motion: StripeMotion | None = None
     crossing_fault: str = ""
+    alike_px: tuple[float, float] = (0.0, 0.0)
 
 
 def stripe_map(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import sparse
+from scipy.linalg import block_diag
 
 from bodyscan.alignment import body_motion
 from bodyscan.alignment.body_cells import BodyCells
@@ -28,12 +29,13 @@ COUNT = 6 * PAIRS + 3 * 2
 
 def seen(kinds: tuple[Kind, ...] = (POSE, PARTS)) -> tuple[BodyMotion, Array]:
     """A motion with what was seen of it, solved, and that as a whole matrix."""
-    root = np.random.default_rng(6).normal(size=(COUNT, 30))
+    count = sum(kind.count for kind in kinds)
+    root = np.random.default_rng(6).normal(size=(count, 30))
     square, pull = root @ root.T, root @ np.random.default_rng(7).normal(size=30)
     fields = np.concatenate([kind.fields for kind in kinds], axis=2)
     nothing: Any = None
     lower = np.tril(square)
-    start = BodyMotion(kinds, fields, np.zeros(COUNT), lower, pull, nothing, nothing, nothing)
+    start = BodyMotion(kinds, fields, np.zeros(count), lower, pull, nothing, nothing, nothing)
     return start._settled(), square
 
 
@@ -156,17 +158,15 @@ def test_a_breath_is_asked_of_what_other_motions_leave() -> None:
     assert found._resized().kind("breath") is found.kind("breath")
 
 
-def test_parts_are_doubted_as_if_they_had_moved_as_peoples_do() -> None:
-    small = replace(PARTS, size=0.1)
-    motion, square = seen((POSE, small))
-    bold = np.diag([*np.diag(KNOWN), *[0.25**-2.0] * 6])
-    np.testing.assert_allclose(
-        motion.doubted(), np.linalg.inv(square + bold), rtol=1e-7, atol=1e-12
-    )
-    large, square = seen()
-    np.testing.assert_allclose(
-        large.doubted(), np.linalg.inv(square + prior()), rtol=1e-7, atol=1e-12
-    )
+def test_parts_are_doubted_as_if_they_had_moved_as_in_people_who_breathe_so() -> None:
+    """A fifteenth of the breath along its main course; a larger size stays."""
+    alike = np.array([[5.0, 4.0], [4.0, 5.0]])
+    breath = Kind("breath", PARTS.fields, COURSES, alike=alike)
+    for size, doubted in ((0.1, 3.0 / 15.0), (0.8, 0.8)):
+        motion, square = seen((POSE, replace(PARTS, size=size), breath))
+        known = np.diag([*np.diag(KNOWN), *[doubted**-2.0] * 6])
+        full = square + block_diag(known, np.kron(np.eye(3), np.linalg.inv(alike)))
+        np.testing.assert_allclose(motion.doubted(), np.linalg.inv(full), rtol=1e-6, atol=1e-10)
 
 
 def test_what_is_asked_of_poses_is_what_any_motion_leaves() -> None:

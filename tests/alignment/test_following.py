@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from bodyscan.alignment import body_motion
 from bodyscan.alignment.bending import at_once
-from bodyscan.alignment.body_motion import PARTS_MM, BodyMotion, Kind
+from bodyscan.alignment.body_motion import PARTS_SHARE, BodyMotion, Kind
 from bodyscan.alignment.body_parts import PartMotion, PersonMotion
 from bodyscan.alignment.breath import breathing
 from bodyscan.alignment.following import (
@@ -256,17 +256,23 @@ def shrunk(kind: Kind, size: float) -> Kind:
 def test_what_stood_still_does_not_vouch_for_a_hip(
     found: tuple[Alignment, Alignment, Followed | None],
 ) -> None:
-    """Parts of people move by half a millimetre: by less no evidence makes them certain."""
+    """Parts of people move by a share of their breath: by less no evidence makes them certain."""
     _, _, followed = found
     assert followed is not None
     seconds = [0.0, 1.0]
     boards, sway = 1e-8 * np.eye(12), np.full(6, 1e-3)
     motion = BodyMotion.start(followed.cells, seconds, boards, sway)
-    motion = replace(motion, kinds=tuple(shrunk(kind, 0.01) for kind in motion.kinds))
-    parts = motion.slices[[kind.name for kind in motion.kinds].index("parts")]
-    known = np.sqrt(np.diag(motion.doubted()))
-    np.testing.assert_allclose(known[parts], PARTS_MM)
-    np.testing.assert_allclose(np.delete(known[12:], np.arange(len(known))[parts] - 12), 0.01)
+    sizes = {kind.name: 0.01 for kind in motion.kinds} | {"breath": 3.0}
+    motion = replace(motion, kinds=tuple(shrunk(kind, sizes[kind.name]) for kind in motion.kinds))
+    names = [kind.name for kind in motion.kinds]
+    known = {
+        name: np.sqrt(np.diag(motion.doubted()))[motion.slices[names.index(name)]]
+        for name in names
+        if name != "pose"
+    }
+    np.testing.assert_allclose(known.pop("parts"), 3.0 * PARTS_SHARE)
+    for name, own in known.items():
+        np.testing.assert_allclose(own, sizes[name])
 
 
 def test_a_breath_that_nobody_saw_is_known_to_a_share(
@@ -284,7 +290,7 @@ def test_a_breath_that_nobody_saw_is_known_to_a_share(
     # Nothing else is unknown.
     sure = tuple(shrunk(kind, 1e-3) for kind in motion.kinds)
     motion = replace(motion, kinds=sure, amplitudes=amplitudes)
-    monkeypatch.setattr(body_motion, "PARTS_MM", 0.0)
+    monkeypatch.setattr(body_motion, "PARTS_SHARE", 0.0)
     moved = motion.displacements(("breath",), from_middle=True)[..., :3]
     way = np.abs(np.einsum("pci,ci->pc", moved, cells.normals))
     every = np.ones((3, len(cells.centres)), bool)

@@ -14,6 +14,7 @@ from bodyscan.fusion.quadratics import (
     close_holes,
     fit_full_windows,
     fit_quadratics,
+    noise_left,
 )
 from bodyscan.fusion.smoothing import (
     SmoothSurface,
@@ -123,6 +124,38 @@ def test_noise_goes_down_as_sigma_says() -> None:
     assert abs(np.mean(distance)) < 0.01
     # About 800 independent windows: their standard deviation is known to 3 %.
     assert 0.9 < np.std(distance / sigma) < 1.15
+
+
+@pytest.mark.parametrize("along", [0, 1])
+def test_noise_that_neighbours_share_along_a_line_goes_down_less_and_sigma_says_so(
+    along: int,
+) -> None:
+    """Means of five pixels: their correlation falls linearly to nothing over five."""
+    rng, noise = np.random.default_rng(8), 0.05
+    white = rng.normal(size=(244, 324))
+    mean = sum(np.roll(white, k, axis=along) for k in range(5)) / np.sqrt(5.0)
+    image = image_of(plane_depth(np.array([0.0, 0.0, -1.0])))
+    off = noise * mean[:240, :320] / np.linalg.norm(RAYS, axis=-1)
+    points = image.points + (RAYS * off[..., None]).astype(np.float32)
+    alike = (0.0, 5.0) if along == 0 else (5.0, 0.0)
+    shared = replace(image, points=points, alike_px=alike)
+    surface, own = (smooth(one, POSE, WINDOW_MM) for one in (shared, replace(image, points=points)))
+    assert surface is not None
+    assert own is not None
+    back = POSE.inverse().apply(surface.points.astype(float))[:, 2] - DISTANCE
+    whole = surface.rim == 1.0
+    ratios = [np.std((back / one.sigma_mm)[whole]) for one in (surface, own)]
+    assert ratios[0] == pytest.approx(1.0, abs=0.06)
+    assert ratios[1] > 1.5
+
+
+def test_noise_of_its_own_leaves_what_a_fit_leaves() -> None:
+    """Half a pixel is no distance, and of noise that all share everything is left."""
+    assert noise_left(4, (0.0, 0.5)) == pytest.approx(1.0)
+    everything = fit_full_windows(
+        np.zeros((9, 9), np.float32), np.ones((9, 9), np.float32), 4
+    ).sigma
+    assert noise_left(4, (1e6, 1e6)) == pytest.approx(1.0 / everything[4, 4], rel=1e-3)
 
 
 def test_sigmas_that_promise_too_much_are_corrected() -> None:

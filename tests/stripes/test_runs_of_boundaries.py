@@ -16,7 +16,12 @@ from bodyscan.stripes.albedo_edges import (
 )
 from bodyscan.stripes.boundaries import Boundaries, find_boundaries
 from bodyscan.stripes.scan_lines import ScanLines
-from bodyscan.stripes.stripe_coordinates import end_slopes, interpolate_stripes, smooth_runs
+from bodyscan.stripes.stripe_coordinates import (
+    alike_along_lines,
+    end_slopes,
+    interpolate_stripes,
+    smooth_runs,
+)
 
 WIDTH = 100
 
@@ -318,3 +323,20 @@ def test_on_relief_boundaries_are_left_in_place() -> None:
     )
     np.testing.assert_allclose(even[1, 10:30], smooth[1, 10:30])
     assert np.all(smooth[1, 50:70] < 0.8 * even[1, 50:70])
+
+
+@pytest.mark.parametrize("width", [2.2, 5.0])
+def test_pixels_share_the_noise_of_the_boundaries_around_them(width: float) -> None:
+    """As measured on many runs of noisy boundaries: narrow stripes are smoothed, wide ones are not."""
+    rng, index = np.random.default_rng(2), np.arange(int(WIDTH / width) - 1)
+    even, codes = (index + 1) * width, np.floor(X / width).astype(np.int32) - 1
+    off = []
+    for _ in range(400):
+        boundaries = run(even + 0.05 * rng.normal(size=len(index)), index, 0.05)
+        s, _ = interpolate_stripes(boundaries, np.tile(codes, (2, 1)), np.ones((2, WIDTH), bool))
+        off.append(s[1, 20:80] - (X[20:80] / width - 1))
+    alike = alike_along_lines(boundaries)
+    seen = np.array([np.mean([o[: 60 - k] * o[k:] for o in off]) for k in range(16)])
+    line = np.maximum(0.0, 1.0 - np.arange(16) / alike)
+    np.testing.assert_allclose(seen / seen[0], line, atol=0.16)
+    assert alike_along_lines(run(even[:1], index[:1])) == 0.0
