@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.slices import Loop, height_ranges, loops_at
+from bodyscan.mesh.slices import Loop, Run, height_ranges, joined, loops_at, runs_of
 from bodyscan.verdict import Grade
 
 STEP = 1.0 / 54.0
@@ -31,6 +31,9 @@ DEEP = 1.0
 """Depth over width of a chest between the arms: 0.65 to 0.75 on average, 0.9 for a barrel chest."""
 ALIKE = 0.5
 """Section of the smaller leg relative to the larger one."""
+SHORTEST_GAP_MM, NARROW = 15.0, 0.5
+"""Where filling joins the thighs: length of its outline in front and behind, as in measurements; and
+the chord of a leg that is cut there, over its arc. Half of a round trunk has 2 / pi, a thigh 0.2."""
 FLAT = 0.8
 """Height over the largest horizontal extent: 1 with arms held out."""
 LIMB_MM2 = 1500.0
@@ -177,7 +180,28 @@ def _without_hands(above: _Section, below: _Section) -> _Section:
 
 def _on_two_legs(section: _Section) -> bool:
     loops = section.loops
-    return len(loops) > 1 and loops[1].area_mm2 > ALIKE * loops[0].area_mm2
+    apart = len(loops) > 1 and loops[1].area_mm2 > ALIKE * loops[0].area_mm2
+    return apart or _joined_by_filling(loops[0])
+
+
+def _joined_by_filling(loop: Loop) -> bool:
+    """Whether an outline goes round two legs, between which filled surface lies in front and
+    behind."""
+    runs = runs_of(loop, SHORTEST_GAP_MM)
+    gaps = [k for k, run in enumerate(runs) if not run.measured]
+    for one, other in combinations(gaps, 2):
+        legs = runs[one + 1 : other], (*runs[other + 1 :], *runs[:one])
+        if all(leg and _is_cut_narrowly(loop, leg) for leg in legs):
+            small, large = sorted(joined(loop, leg).area_mm2 for leg in legs)
+            if small > ALIKE * large:
+                return True
+    return False
+
+
+def _is_cut_narrowly(loop: Loop, runs: Sequence[Run]) -> bool:
+    arc = sum(loop.lengths[run.segments].sum() for run in runs)
+    chord = loop.segments[runs[0].first, 0] - loop.segments[runs[-1].last, 1]
+    return bool(np.linalg.norm(chord) < NARROW * arc)
 
 
 def _chest(sections: Sequence[_Section]) -> Iterator[tuple[Grade, str]]:

@@ -66,6 +66,39 @@ def test_hands_that_begin_where_hips_widen_are_no_bag() -> None:
     assert "carried" in asked(*legs, hips, trunk, hands[0], bag)
 
 
+def prism(outline: list[tuple[float, float]], low: float, high: float) -> Truth:
+    """The sides of an upright prism; side k gives faces 2 k and 2 k + 1."""
+    below = np.array([(*corner, low) for corner in outline])
+    here = np.arange(len(outline))
+    beyond = np.roll(here, -1)
+    above, opposite = here + len(outline), beyond + len(outline)
+    faces = np.stack([here, beyond, opposite, here, opposite, above], axis=1).reshape(-1, 3)
+    return Truth(np.concatenate([below, below + [0.0, 0.0, high - low]]), faces)
+
+
+@pytest.mark.parametrize("filled", [True, False])
+def test_thighs_that_filling_joined_are_still_two_legs(filled: bool) -> None:
+    """As of a heavy man, above whose crotch hips and belly widen by 28 % in 30 mm; what was measured
+    to be one piece is asked about."""
+    legs = [box((150.0, 180.0, 700.0), (0.0, side, 350.0)) for side in (-100.0, 100.0)]
+    right = [
+        (20.0, 10.0),
+        (75.0, 10.0),
+        (75.0, 190.0),
+        (-75.0, 190.0),
+        (-75.0, 10.0),
+        (-20.0, 10.0),
+    ]
+    thighs = prism([*right, *((-x, -y) for x, y in right)], 700.0, 800.0)
+    trunk = box((235.0, 300.0, 960.0), (0.0, 0.0, 1280.0))
+    mesh = meshed(thighs, *legs, trunk)
+    webs = np.isin(np.arange(len(mesh.faces)), [10, 11, 22, 23])
+    mesh = replace(mesh, filled=webs & filled)
+    said = [question for _, question in odd_proportions(mesh)]
+    assert bool(said) is not filled
+    assert bool(find_loads(mesh)) is not filled
+
+
 @pytest.mark.parametrize(
     ("size", "middle"),
     [
