@@ -70,6 +70,10 @@ def bring_together(
         if off is None and places is not None and size is None:
             off = find_off(places, rig_from_camera, poles, _pairs(steps))
         if off is None:
+            if followed is not None:
+                # What pairs stand off by for a head or an arm that was followed is not their own.
+                again = _search(images, rig_from_camera, alignment, poles, steps)
+                search = replace(search, own_mm=again.own_mm)
             motions = _tied_motions(rig_from_camera, alignment)
             return Together(alignment, followed, _measured_again(steps, motions), size, search)
         if isinstance(off, SizeStep):

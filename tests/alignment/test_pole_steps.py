@@ -258,6 +258,24 @@ def test_poles_are_set_free_one_after_the_other(
     assert found.followed is followed
 
 
+@pytest.mark.parametrize(("followed", "own_mm"), [(object(), 0.05), (None, 0.5)])
+def test_what_a_followed_head_moved_by_is_no_place_of_a_pair_s_own(
+    monkeypatch: pytest.MonkeyPatch, followed: Any, own_mm: float
+) -> None:
+    """A child who moved her head by 11 mm was told that pairs stood 0.5 mm off."""
+    apart = {"first": 0.5, "followed": 0.05}
+    monkeypatch.setattr(
+        together, "_search", lambda _, __, at, *of: StepSearch(None, 0.5, 2.7, apart[at])
+    )
+    monkeypatch.setattr(together, "follow", lambda *of: ("followed", followed, None))
+    monkeypatch.setattr(together, "_tied_motions", lambda *of: {})
+    nothing: Any = None
+    first: Any = "first"
+    boards = PoseCovariance(("a",), np.eye(6))
+    found = together.bring_together(nothing, nothing, first, boards, {}, nothing)
+    assert found.search == StepSearch(None, 0.5, 2.7, own_mm)
+
+
 def test_what_may_have_moved_by_itself_are_pairs_and_whole_poles() -> None:
     found = moving_alone(["a1", "a2", "b1", "c"], {"a1": "a", "a2": "a", "b1": "b", "other": "d"})
     assert found == {
