@@ -167,10 +167,8 @@ def _errors(calibration: RigCalibration, image: RangeImage, body: LivingBody, ms
 
 def _speed(calibration: RigCalibration, image: RangeImage, body: LivingBody, ms: float) -> float:
     """RMS over the pixels, mm/s in depth."""
-    there, faces = (
-        calibration.rig_from_camera[image.pair],
-        np.asarray(body.rest.triangles, np.int64),
-    )
+    there = calibration.rig_from_camera[image.pair]
+    faces = np.asarray(body.rest.triangles, np.int64)
     points = there.apply(image.points[image.valid].astype(float))
     earlier, later = (
         _depth_errors(points, there.translation, body.vertices(ms + step), faces)

@@ -72,11 +72,11 @@ tells (0.02 mm RMS in real light).
 
 
 def rigs() -> str:
-    """The section of docs/results.md on whole rigs: four minutes per seed and preset."""
+    """The section of docs/results.md on whole rigs: two minutes per seed and preset."""
     found = [
-        (f"{preset}{', fresh' if seeds is FRESH_SEEDS else ''}", [_rig(preset, n) for n in seeds])
+        (f"{preset}{kind}", [_rig(preset, seed) for seed in seeds])
         for preset in PRESETS
-        for seeds in (RIG_SEEDS, FRESH_SEEDS)
+        for kind, seeds in (("", RIG_SEEDS), (", fresh", FRESH_SEEDS))
     ]
     return f"""## Errors over their sigmas, of whole rigs (synthetic)
 

@@ -15,7 +15,15 @@ import numpy as np
 
 from bodyscan.arrays import Array
 from bodyscan.mesh.body import BodyMesh
-from bodyscan.mesh.slices import Loop, Run, height_ranges, joined, loops_at, runs_of
+from bodyscan.mesh.slices import (
+    SHORTEST_GAP_MM,
+    Loop,
+    Run,
+    height_ranges,
+    joined,
+    loops_at,
+    runs_of,
+)
 from bodyscan.verdict import Grade
 
 STEP = 1.0 / 54.0
@@ -31,9 +39,9 @@ DEEP = 1.0
 """Depth over width of a chest between the arms: 0.65 to 0.75 on average, 0.9 for a barrel chest."""
 ALIKE = 0.5
 """Section of the smaller leg relative to the larger one."""
-SHORTEST_GAP_MM, NARROW = 15.0, 0.5
-"""Where filling joins the thighs: length of its outline in front and behind, as in measurements; and
-the chord of a leg that is cut there, over its arc. Half of a round trunk has 2 / pi, a thigh 0.2."""
+NARROW = 0.5
+"""Where filling joins the thighs: chord over arc of a leg that is cut there. Half of a round trunk has
+2 / pi, a thigh 0.2."""
 FLAT = 0.8
 """Height over the largest horizontal extent: 1 with arms held out."""
 LIMB_MM2 = 1500.0

@@ -14,10 +14,8 @@ from itertools import combinations
 import numpy as np
 
 from bodyscan.arrays import Array
-from bodyscan.mesh.slices import Loop, Run, joined, runs_of
+from bodyscan.mesh.slices import SHORTEST_GAP_MM, Loop, Run, joined, runs_of
 
-SHORTEST_GAP_MM = 15.0
-"""A straight line across a shorter gap on a limb is less than 0.5 mm shorter than the curve."""
 LIMB = 2.0 / np.pi
 """Chord over arc of half a circle: a limb goes round by more, the trunk's own side by less."""
 INSIDE = 0.15

@@ -14,6 +14,9 @@ from scipy.spatial import ConvexHull, QhullError
 from bodyscan.arrays import Array, Bytes, Indices, Mask
 from bodyscan.mesh.regions import regions_at, shares
 
+SHORTEST_GAP_MM = 15.0
+"""A straight line across a shorter gap on a limb is less than 0.5 mm shorter than the curve."""
+
 
 @dataclass(frozen=True, eq=False)
 class Loop:

@@ -66,8 +66,13 @@ def reconstruct_range_image(pair: PairCalibration, stripes: StripeMap) -> RangeI
     # A copy: the lit image is part of a stack, which would be kept alive with it.
     images = (stripes.lit.copy(), stripes.beyond)
     return RangeImage(
-        *(pair.name, camera, points, normals, sigma_mm),
-        *(*images, agreement),
+        pair.name,
+        camera,
+        points,
+        normals,
+        sigma_mm,
+        *images,
+        agreement,
         common_mm=common_mm,
         alike_px=alike_px,
     )
