@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from bodyscan.alignment.following import Followed
-from bodyscan.arrays import Array, Floats
+from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.compiled import compiled
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
@@ -27,15 +27,18 @@ def add_pose_variance(
 ) -> BodyCloud:
     """The cloud with the pairs' pose errors included in its sigmas along the normals.
 
-    A small motion (w, t) of a pair moves a point p along its normal n by (p x n).w + n.t. The
-    variance is the mean over the pairs that face the point: shared errors do not average out.
+    A small motion (w, t) of a pair moves a point p along its normal n by (p x n).w + n.t. A point
+    is the mean of as many pairs as saw it, of those that face it: what is each pair's own averages
+    out, what they share does not.
     """
     centres = np.array([placing.translation for placing in rig_from_camera.values()])
-    covariances = np.array([prior.of(name) for name in rig_from_camera])
+    size = len(centres)
+    joint = prior.among(tuple(rig_from_camera)).reshape(size, 6, size, 6).swapaxes(1, 2).copy()
     placing_mm = np.empty(len(cloud.points))
 
     def fill(part: slice) -> None:
-        _placing(cloud.points[part], cloud.normals[part], centres, covariances, placing_mm[part])
+        surface = cloud.points[part], cloud.normals[part], cloud.pairs_seen[part]
+        _placing(*surface, centres, joint, placing_mm[part])
 
     threaded(fill, parts(len(placing_mm)), stage="sigmas of places")
     return replace(cloud, sigma_mm=np.hypot(cloud.sigma_mm, placing_mm).astype(np.float32))
@@ -57,29 +60,47 @@ def add_motion_variance(cloud: BodyCloud, placed: BodyCloud, followed: Followed)
 def _placing(
     points: Array,
     normals: Floats,
+    pairs_seen: Bytes,
     centres: Array,
-    covariances: Array,
+    joint: Array,
     placing_mm: Array,
 ) -> None:
     """Write standard deviations (N,) mm along the normals due to pose errors.
 
-    Pairs stand at `centres` (P, 3) with `covariances` (P, 6, 6).
+    Pairs stand at `centres` (P, 3) with covariances `joint` (P, P, 6, 6).
     """
-    lever = np.empty(6)
+    lever, facing = np.empty(6), np.empty(len(centres), np.int64)
     for n in range(len(points)):
         (x, y, z), (a, b, c) = points[n], normals[n]
         lever[0], lever[1], lever[2] = y * c - z * b, z * a - x * c, x * b - y * a
         lever[3], lever[4], lever[5] = a, b, c
-        total, count = 0.0, 0
+        own, shared, count = 0.0, 0.0, 0
         for pair in range(len(centres)):
             dx, dy, dz = centres[pair, 0] - x, centres[pair, 1] - y, centres[pair, 2] - z
             towards = a * dx + b * dy + c * dz
             if towards <= FACING * math.sqrt(dx * dx + dy * dy + dz * dz):
                 continue
+            own += _along(lever, joint[pair, pair])
+            for k in range(count):
+                shared += _along(lever, joint[pair, facing[k]])
+            facing[count] = pair
             count += 1
-            for row in range(6):
-                part = 0.5 * covariances[pair, row, row] * lever[row]
-                for column in range(row + 1, 6):
-                    part += covariances[pair, row, column] * lever[column]
-                total += 2.0 * part * lever[row]
-        placing_mm[n] = math.sqrt(total / max(count, 1))
+        if count == 0:
+            placing_mm[n] = 0.0
+            continue
+        own /= count
+        shared = 2.0 * shared / (count * (count - 1)) if count > 1 else own
+        alone = 1.0 / max(min(pairs_seen[n], count), 1)
+        placing_mm[n] = math.sqrt(max(alone * own + (1.0 - alone) * shared, 0.0))
+
+
+@compiled
+def _along(lever: Array, covariance: Array) -> float:
+    """Covariance mm^2 along the normal whose `lever` (6,) it is."""
+    total = 0.0
+    for row in range(6):
+        part = 0.0
+        for column in range(6):
+            part += covariance[row, column] * lever[column]
+        total += part * lever[row]
+    return total
