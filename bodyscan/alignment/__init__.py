@@ -6,9 +6,10 @@ same spot), overlaps and overlap_equations (what overlaps ask for, and the joint
 (how far a subject is believed to move).
 
 A person who moves while pair after pair sees them: following (motion found and taken out),
-body_cells and cell_evidence, cell_speeds, moments (how motion at one moment correlates with the
-next), body_motion (everything in one solve), breath, limbs, part_names and body_parts (the same in
-an operator's words), bending (range images carried to one moment).
+motion_sigmas (what stays unknown), body_cells and cell_evidence, cell_speeds, moments (how motion
+at one moment correlates with the next), body_motion (everything in one solve), breath, limbs,
+part_names and body_parts (the same in an operator's words), bending (range images carried to one
+moment).
 
 What is not motion: pole_steps and place_evidence (poles that stand off), pair_drift (what every
 scan shows), oblique_light (skin), object_refinement (an object that stands still).

@@ -16,16 +16,16 @@ from typing import TypeVar
 import numpy as np
 
 from bodyscan.alignment.body_cells import BodyCells, displaced
-from bodyscan.alignment.body_motion import BodyMotion, observed, outward_errors
+from bodyscan.alignment.body_motion import BodyMotion, outward_errors
 from bodyscan.alignment.cell_evidence import CellEvidence
 from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.limbs import LIMBS, SHIFTS
 from bodyscan.alignment.matching import AlignmentPoints, Matches
+from bodyscan.alignment.motion_sigmas import cell_sigmas, sigmas_around
 from bodyscan.alignment.overlaps import COARSE, OverlapPoints, each_overlap, match_overlap
-from bodyscan.alignment.part_names import LEGS, PARTS, name_parts
 from bodyscan.alignment.place_evidence import PlaceEvidence
-from bodyscan.alignment.sway_prior import BODY_CENTRE, SwayPrior, centre_shifts
+from bodyscan.alignment.sway_prior import SwayPrior, centre_shifts
 from bodyscan.arrays import Array, Indices, Mask
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.robust import rms, rms_length
@@ -40,16 +40,9 @@ Result = TypeVar("Result")
 SWAYING = ("lean", "sway")
 BENDING = (*LIMBS, *SHIFTS, "parts", "breath")
 MOVING = (*SWAYING, *BENDING)
-BLEND_MM = 60.0
 ROUNDS = 3  # the last with all points
-RING_MM = 20.0  # band of heights in one girth: less than a cell's size
 STILL_MM = 0.1
 """RMS of motion beyond rigid ones; less does no harm, and calibrations bend by half of it."""
-
-UNSEEN = 0.5
-"""Share of a place's motion by breath since a pair saw it that is unknown long after. A pole's
-pairs show place, speed and its change, so soon after next to nothing is missing; a second later
-a fifth is. (Of people simulated by ray casting, trunks err by 0.8 of their sigmas with it.)"""
 
 NEARER = 0.95
 """If bending does not bring overlaps closer than this share, they are apart because of the pairs'
@@ -265,16 +258,6 @@ def _mean_breath(motion: BodyMotion, cells: BodyCells) -> MeanBreath:
     return MeanBreath(field, sigmas_around(errors, cells.centres[:, 2]))
 
 
-def sigmas_around(errors: Array, height: Array) -> Array:
-    """Standard deviations (C,) mm of errors (C, n), counting only what cells at one height share.
-
-    The rest does not change a girth. height: (C,) mm.
-    """
-    near = np.exp(-0.5 * ((height[:, None] - height) / RING_MM) ** 2)
-    own = np.linalg.norm(errors, axis=1)
-    return own * np.linalg.norm(near @ errors, axis=1) / np.maximum(near @ own, 1e-12)
-
-
 def _each_overlap(
     measure: Callable[[Matches, Indices], Result],
     pool: ThreadPoolExecutor,
@@ -352,48 +335,3 @@ def _placed(
             for o in aligned.overlaps
         ),
     )
-
-
-def cell_sigmas(motion: BodyMotion, cells: BodyCells, seen: Mask) -> Array:
-    """Sigma (C,) mm along the normals of the shape, not counting motions of the whole.
-
-    Computed at the landmarks, between which it changes slowly.
-    """
-    pair, mark = np.nonzero(seen[:, cells.landmarks])
-    there = cells.landmarks[mark]
-    rows = np.concatenate(
-        [
-            observed(motion, k, there[pair == k], cells.normals[there[pair == k]])
-            for k in np.unique(pair)
-        ]
-    )
-    off, normals = cells.centres[there] - BODY_CENTRE, cells.normals[there]
-    whole = np.linalg.qr(np.hstack([np.cross(off, normals), normals]))[0]
-    rows -= whole @ (whole.T @ rows)
-    # Legs stand on the floor: what overlaps do not ask of them, they did not do.
-    stands = np.isin(name_parts(cells)[there], [PARTS.index(leg) for leg in LEGS])
-    variance = np.sum((rows @ motion.covariance) * rows, axis=1)
-    others = rows[~stands]
-    variance[~stands] = np.sum((others @ motion.doubted()) * others, axis=1)
-    size = len(cells.landmarks)
-    mean = np.bincount(mark, variance, size) / np.maximum(np.bincount(mark, minlength=size), 1)
-    mean += (UNSEEN * _breath_unseen(motion, cells, seen)[cells.landmarks]) ** 2
-    near = (
-        np.exp(-0.5 * (cells.away / BLEND_MM) ** 2)
-        * (np.bincount(mark, minlength=size) > 0)[:, None]
-    )
-    return np.sqrt(mean @ near / np.maximum(near.sum(axis=0), 1e-12))
-
-
-def _breath_unseen(motion: BodyMotion, cells: BodyCells, seen: Mask) -> Array:
-    """How far breath carried each cell to the middle since it was seen, (C,) mm along normals.
-
-    Weighted by how little that moment tells about the middle; of several moments the most telling.
-    """
-    moments = motion.kind("sway").courses
-    ways = motion.displacements(("breath",), from_middle=True)[..., :3]
-    apart = 1.0 - moments.values @ moments.middle
-    far = np.abs(np.einsum("pci,ci->pc", ways, cells.normals)) * apart[:, None] ** 2
-    least = np.min(far, axis=0, where=seen, initial=np.inf)
-    told = np.isfinite(least) & moments.middle.any()
-    return np.where(told, least, 0.0)

@@ -13,22 +13,17 @@ from living_body import STANDING, STILL, LivingScan, Motion, cast_living, errors
 from ray_cast_scan import load_rig
 from scipy.spatial import cKDTree
 
-from bodyscan.alignment import body_motion
 from bodyscan.alignment.bending import at_once
-from bodyscan.alignment.body_motion import PARTS_SHARE, BodyMotion, Kind
 from bodyscan.alignment.body_parts import PartMotion, PersonMotion
 from bodyscan.alignment.breath import breathing
 from bodyscan.alignment.following import (
-    UNSEEN,
     Followed,
     _is_unbent,
     _is_unswayed,
-    cell_sigmas,
     follow,
-    sigmas_around,
 )
 from bodyscan.alignment.icp import Alignment, align
-from bodyscan.alignment.part_names import LEGS, PARTS, name_parts
+from bodyscan.alignment.part_names import PARTS, name_parts
 from bodyscan.arrays import Array
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.reconstruction.range_image import RangeImage
@@ -200,14 +195,6 @@ def test_the_way_to_mean_breath_is_told(
     assert sigma[front].mean() < 1.5
 
 
-def test_a_girth_is_uncertain_by_what_all_around_it_shares() -> None:
-    """Errors of many cells, each by itself, cancel around a girth; one of them all does not."""
-    height = np.repeat([1000.0, 1200.0], 50)
-    alone, together = np.eye(100), np.ones((100, 1))
-    np.testing.assert_allclose(sigmas_around(together, height), 1.0)
-    np.testing.assert_allclose(sigmas_around(alone, height), 50.0**-0.5)
-
-
 def middle(scan: LivingScan) -> LivingScan:
     """Of half of the pairs: each has its own unknowns, and the work grows with their cube."""
     return replace(
@@ -243,68 +230,6 @@ def test_who_only_sways_is_carried_along_time() -> None:
     truth = scan.body.at(scan.middle_s)
     rigid = errors_mm(truth, surface(scan, aligned, None))
     assert rms(errors_mm(truth, surface(scan, alignment, followed))) < 0.3 * rms(rigid)
-
-
-def shrunk(kind: Kind, size: float) -> Kind:
-    """Known to be so small, if it is the person's."""
-    if not kind.moves:
-        return kind
-    alike = None if kind.alike is None else size**2 * np.eye(kind.courses.count)
-    return replace(kind, size=size, alike=alike)
-
-
-def test_what_stood_still_does_not_vouch_for_a_hip(
-    found: tuple[Alignment, Alignment, Followed | None],
-) -> None:
-    """Parts of people move by a share of their breath: by less no evidence makes them certain."""
-    _, _, followed = found
-    assert followed is not None
-    seconds = [0.0, 1.0]
-    boards, sway = 1e-8 * np.eye(12), np.full(6, 1e-3)
-    motion = BodyMotion.start(followed.cells, seconds, boards, sway)
-    sizes = {kind.name: 0.01 for kind in motion.kinds} | {"breath": 3.0}
-    motion = replace(motion, kinds=tuple(shrunk(kind, sizes[kind.name]) for kind in motion.kinds))
-    names = [kind.name for kind in motion.kinds]
-    known = {
-        name: np.sqrt(np.diag(motion.doubted()))[motion.slices[names.index(name)]]
-        for name in names
-        if name != "pose"
-    }
-    np.testing.assert_allclose(known.pop("parts"), 3.0 * PARTS_SHARE)
-    for name, own in known.items():
-        np.testing.assert_allclose(own, sizes[name])
-
-
-def test_a_breath_that_nobody_saw_is_known_to_a_share(
-    found: tuple[Alignment, Alignment, Followed | None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of a belly that two pairs saw, both breathed out, smoothness does not tell how full it
-    was between them; of one that was seen there, and of legs, it has nothing to tell."""
-    _, _, followed = found
-    assert followed is not None
-    cells = followed.cells
-    motion = BodyMotion.start(cells, [0.0, 2.0, 4.0], 1e-8 * np.eye(18), np.full(6, 1e-3))
-    breath = motion.slices[[kind.name for kind in motion.kinds].index("breath")]
-    amplitudes = np.zeros(len(motion.amplitudes))
-    amplitudes[breath] = np.random.default_rng(5).standard_normal(breath.stop - breath.start)
-    # Nothing else is unknown.
-    sure = tuple(shrunk(kind, 1e-3) for kind in motion.kinds)
-    motion = replace(motion, kinds=sure, amplitudes=amplitudes)
-    monkeypatch.setattr(body_motion, "PARTS_SHARE", 0.0)
-    moved = motion.displacements(("breath",), from_middle=True)[..., :3]
-    way = np.abs(np.einsum("pci,ci->pc", moved, cells.normals))
-    every = np.ones((3, len(cells.centres)), bool)
-    by_two = every.copy()
-    by_two[1] = False
-    fully, partly = (cell_sigmas(motion, cells, seen) for seen in (every, by_two))
-    belly = breathing(cells) > 0.9
-    nearest = np.minimum(way[0], way[2])[belly]
-    assert rms(nearest) > 0.3
-    # Two seconds are long, and a stance of then tells a twentieth of now.
-    assert rms(partly[belly]) == pytest.approx(UNSEEN * rms(nearest), rel=0.25)
-    assert rms(fully[belly]) < 0.4 * rms(partly[belly])
-    legs = np.isin(name_parts(cells), [PARTS.index(leg) for leg in LEGS])
-    assert rms(partly[legs]) < 0.1 * rms(partly[belly])
 
 
 @pytest.mark.parametrize(
