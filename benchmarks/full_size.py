@@ -23,6 +23,11 @@ from bodyscan.simulation.living import body_of
 
 PROJECT = Path(__file__).parents[1]
 WORKSPACE = PROJECT / "bench" / "three-pole-12"
+STANDING = {
+    "three-pole-12": ("standing", "woman_average"),
+    "four-pole-16": ("standing-four", "man_average"),
+}
+"""By rig: the folder and the subject of a scan of a person who stands."""
 
 
 def three_pole() -> str:
@@ -36,21 +41,27 @@ def four_pole() -> str:
 
 
 def living() -> str:
-    """The section of docs/results.md on the woman standing as people do, calibrated by
-    `three_pole`."""
-    workspace = PROJECT / "bench" / "standing"
-    rig, subject = PROJECT / "rigs" / "three-pole-12.yaml", _subject("woman_average")
-    commands = _commands(rig, workspace, subject)
+    """The section of docs/results.md on people who stand as people do, in the rigs calibrated by
+    `three_pole` and `four_pole`."""
+    scenes = [_stood(rig, *scene) for rig, scene in STANDING.items()]
+    return f"""## People who sway, breathe and move their arms, full size (synthetic)
+
+The woman in the rig of `three-pole-12` and the man in that of `four-pole-16`, calibrated there, pairs
+one after the other (`bodyscan simulate --subject-preset standing`). Distances are to the body at the
+moment that the scan stands for.
+
+{chr(10).join(scenes)}"""
+
+
+def _stood(rig: str, folder: str, subject: str) -> str:
+    workspace = PROJECT / "bench" / folder
+    commands = _commands(PROJECT / "rigs" / f"{rig}.yaml", workspace, _subject(subject))
     commands["simulate"] += ["--subject-preset", "standing", "--board-shots", 0]
     del commands["calibrate-rig"], commands["export"]
     shutil.rmtree(workspace / "calibration", ignore_errors=True)
-    shutil.copytree(WORKSPACE / "calibration", workspace / "calibration")
+    shutil.copytree(PROJECT / "bench" / rig / "calibration", workspace / "calibration")
     outputs, _, _ = run_commands(commands, workspace)
-    return f"""## A person who sways, breathes and moves her arms, full size (synthetic)
-
-The woman in the rig of `three-pole-12`, calibrated there, twelve pairs one after the other
-(`bodyscan simulate --subject-preset standing`). Distances are to the body at the moment that the
-scan stands for.
+    return f"""`{rig}`, `{subject}`:
 
 ```
 {_against_truth(outputs)}
