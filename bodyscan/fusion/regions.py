@@ -48,6 +48,19 @@ HEAD_WIDE = 0.12  # of the stature: around the axis, for heads that lean forward
 
 
 @dataclass(frozen=True, eq=False)
+class Regions:
+    """Of N points.
+
+    numbers: (N,) uint8, each point's region in `mesh.regions.NAMES`.
+    relief_mm: (N,) float32, how far strands and locks of hair stand off a smooth surface, standard
+        deviation; 0 elsewhere. Smoothing flattens it.
+    """
+
+    numbers: Bytes
+    relief_mm: Floats
+
+
+@dataclass(frozen=True, eq=False)
 class _Cells:
     """A grid of cubes around the body: its lowest corner, mm, and its size along each axis."""
 
@@ -97,11 +110,13 @@ class _Texture:
     known: whether enough pixels were examined.
     rough: whether it is rough beyond noise.
     smooth: whether it is smooth, noise included.
+    relief_mm: standard deviation of what lies off the smooth surface beyond noise.
     """
 
     known: Mask
     rough: Mask
     smooth: Mask
+    relief_mm: Array
 
 
 def label_regions(
@@ -109,8 +124,8 @@ def label_regions(
     range_images: Sequence[RangeImage],
     rig_from_camera: Mapping[str, RigidTransform],
     window_mm: float,
-) -> Bytes:
-    """Number (N,) of each point's region in `mesh.regions.NAMES`.
+) -> Regions:
+    """Label each point of a cloud.
 
     range_images: those that the cloud was merged from.
     window_mm: window over which they were smoothed.
@@ -121,7 +136,8 @@ def label_regions(
     grey = cloud.colours[:, 0].astype(np.float32)
     usual = float(np.median(grey))
     if DARK * usual < DARKEST or np.mean(grey > usual / DARK) > SOME_BRIGHTER:
-        return np.full(len(grey), UNSURE, np.uint8)
+        unsure = np.full(len(grey), UNSURE, np.uint8)
+        return Regions(unsure, np.zeros(len(grey), np.float32))
     cells = _Cells.around(cloud.points)
     cell, dark = cells.find(cloud.points), grey < DARK * usual
     own, darks = (np.bincount(some, minlength=cells.count) for some in (cell, cell[dark]))
@@ -141,7 +157,8 @@ def label_regions(
     bright = np.where(covered | shaggy, UNSURE, SKIN)
     dim = np.where(covered, kind, UNSURE)
     found = np.where(dark, kind[cell], np.where(grey < DIM * usual, dim[cell], bright[cell]))
-    return found.astype(np.uint8)
+    relief_mm = np.where(found == HAIR, texture.relief_mm[cell], 0.0)
+    return Regions(found.astype(np.uint8), relief_mm.astype(np.float32))
 
 
 def _coverings(head: Mask, on_head: Mask, rough: Mask, smooth: Mask) -> Indices:
@@ -182,7 +199,7 @@ def _texture(
     found = [one for one in each if one is not None]
     if not found:
         nowhere = np.zeros(cells.count, bool)
-        return _Texture(nowhere, nowhere, nowhere)
+        return _Texture(nowhere, nowhere, nowhere, np.zeros(cells.count))
     return _told(cells, found)
 
 
@@ -219,12 +236,14 @@ def lies_in(
 def _told(cells: _Cells, found: Sequence[Misfits]) -> _Texture:
     cell = np.concatenate([cells.find(one.points) for one in found])
     off = np.concatenate([one.misfit_mm for one in found])
-    over = off / np.concatenate([one.expected_mm for one in found])
+    expected_mm = np.concatenate([one.expected_mm for one in found])
     known = np.bincount(cell, minlength=cells.count) >= FEWEST
     seen_mm = SIGMAS_PER_MEDIAN * _medians(off, cell, cells.count)
-    sigmas = SIGMAS_PER_MEDIAN * _medians(over, cell, cells.count)
+    sigmas = SIGMAS_PER_MEDIAN * _medians(off / expected_mm, cell, cells.count)
+    noise_mm = _medians(expected_mm, cell, cells.count)
+    relief_mm = np.sqrt(np.maximum(seen_mm**2 - noise_mm**2, 0.0))
     rough = known & (sigmas > ROUGH) & (seen_mm > ROUGH_MM)
-    return _Texture(known, rough, known & (seen_mm < ROUGH_MM))
+    return _Texture(known, rough, known & (seen_mm < ROUGH_MM), relief_mm)
 
 
 def _medians(values: Floats, group: Indices, count: int) -> Array:

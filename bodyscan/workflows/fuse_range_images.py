@@ -7,6 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
+import numpy as np
+
 from bodyscan.alignment.bending import at_once
 from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.following import Followed
@@ -188,7 +190,9 @@ def _meshed(
 
     def named() -> BodyCloud:
         regions = label_regions(cloud, placed.images, placed.there, settings.fusion.window_mm)
-        known = replace(cloud, regions=regions)
+        # A smooth surface leaves out how far strands of hair stand off it.
+        sigma_mm = np.hypot(cloud.sigma_mm, regions.relief_mm)
+        known = replace(cloud, sigma_mm=sigma_mm, regions=regions.numbers)
         made(known)
         return known
 

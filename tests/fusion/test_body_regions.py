@@ -10,7 +10,7 @@ import pytest
 from ray_cast_scan import Scan, cast_scan, load_body, load_rig
 
 from bodyscan.arrays import Bytes, Mask
-from bodyscan.fusion.regions import CELL_MM, label_regions, lies_in
+from bodyscan.fusion.regions import CELL_MM, Regions, label_regions, lies_in
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.regions import DARK_CLOTH, HAIR, SKIN, UNSURE, covered_shares
@@ -31,7 +31,12 @@ class Seen:
         return self.scan.rig_from_camera[image.pair].apply(image.points.astype(float))
 
     def labels(self, images: Sequence[RangeImage]) -> list[Bytes]:
-        """Of each image's pixels; the cloud is all of them."""
+        """Of each image's pixels."""
+        ends = np.cumsum([image.valid.sum() for image in images])[:-1]
+        return np.split(self.regions(images).numbers, ends)
+
+    def regions(self, images: Sequence[RangeImage]) -> Regions:
+        """The cloud is all pixels."""
         valid = [image.valid for image in images]
         points = np.concatenate(
             [self.in_rig(image)[v] for image, v in zip(images, valid, strict=True)]
@@ -45,8 +50,7 @@ class Seen:
             np.repeat(grey[:, None], 3, axis=1),
             np.ones(count, np.uint8),
         )
-        found = label_regions(cloud, images, self.scan.rig_from_camera, 7.0)
-        return np.split(found, np.cumsum([v.sum() for v in valid])[:-1])
+        return label_regions(cloud, images, self.scan.rig_from_camera, 7.0)
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +119,26 @@ def test_hair_and_shorts_are_told_apart(seen: Seen) -> None:
     bare = [~(h | s) for h, s in zip(hair, shorts, strict=True)]
     # Bright points of a cell that is mostly dark are highlights, or beside the rim.
     assert share(found, bare, images, SKIN) > 0.97
+
+
+@pytest.mark.parametrize("rough_mm", [0.5, 1.0, 2.0])
+def test_hair_stands_off_by_how_rough_it_is_beyond_its_noise(seen: Seen, rough_mm: float) -> None:
+    """In the median of its points to a tenth: a window of five pixels fits a twentieth of the
+    scatter away, and cells hold a hundred pixels. Skin does not stand off."""
+    noise_mm = np.float32(0.8)
+    hair = [scalp(seen, image) for image in seen.images]
+    images = [
+        replace(
+            covered(image, h, 6, rough_mm=float(np.hypot(rough_mm, noise_mm))),
+            sigma_mm=np.where(h, noise_mm, image.sigma_mm) + 0 * image.sigma_mm,
+        )
+        for image, h in zip(seen.images, hair, strict=True)
+    ]
+    found = seen.regions(images)
+    of_hair = np.concatenate([h[i.valid] for h, i in zip(hair, images, strict=True)])
+    own = of_hair & (found.numbers == HAIR)
+    assert np.median(found.relief_mm[own]) == pytest.approx(rough_mm, rel=0.2)
+    assert not found.relief_mm[found.numbers != HAIR].any()
 
 
 def test_hair_is_told_by_its_place_where_noise_hides_that_it_is_rough(seen: Seen) -> None:
