@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from bodyscan.alignment.following import Followed
-from bodyscan.arrays import Array, Bytes, Floats
+from bodyscan.arrays import Array, Bytes, Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
@@ -33,12 +33,14 @@ def add_pose_variance(
     """
     centres = np.array([placing.translation for placing in rig_from_camera.values()])
     size = len(centres)
-    joint = prior.among(tuple(rig_from_camera)).reshape(size, 6, size, 6).swapaxes(1, 2).copy()
+    joint = prior.among(tuple(rig_from_camera)).reshape(size, 6, size, 6).swapaxes(1, 2)
+    rows, columns = np.triu_indices(6)
+    packed = joint[..., rows, columns] + np.where(rows < columns, joint[..., columns, rows], 0.0)
     placing_mm = np.empty(len(cloud.points))
 
     def fill(part: slice) -> None:
         surface = cloud.points[part], cloud.normals[part], cloud.pairs_seen[part]
-        _placing(*surface, centres, joint, placing_mm[part])
+        _placing(*surface, centres, packed, placing_mm[part])
 
     threaded(fill, parts(len(placing_mm)), stage="sigmas of places")
     return replace(cloud, sigma_mm=np.hypot(cloud.sigma_mm, placing_mm).astype(np.float32))
@@ -67,40 +69,48 @@ def _placing(
 ) -> None:
     """Write standard deviations (N,) mm along the normals due to pose errors.
 
-    Pairs stand at `centres` (P, 3) with covariances `joint` (P, P, 6, 6).
+    Pairs stand at `centres` (P, 3). joint: their covariances (P, P, 21): of each two the upper
+    triangle, with what lies below it added.
     """
-    lever, facing = np.empty(6), np.empty(len(centres), np.int64)
+    lever, products, facing = np.empty(6), np.empty(21), np.zeros(len(centres), np.bool_)
+    own, between = np.zeros(21), np.zeros(21)
     for n in range(len(points)):
         (x, y, z), (a, b, c) = points[n], normals[n]
         lever[0], lever[1], lever[2] = y * c - z * b, z * a - x * c, x * b - y * a
         lever[3], lever[4], lever[5] = a, b, c
-        own, shared, count = 0.0, 0.0, 0
+        k = 0
+        for row in range(6):
+            for column in range(row, 6):
+                products[k] = lever[row] * lever[column]
+                k += 1
+        count, others = 0, False
         for pair in range(len(centres)):
             dx, dy, dz = centres[pair, 0] - x, centres[pair, 1] - y, centres[pair, 2] - z
             towards = a * dx + b * dy + c * dz
-            if towards <= FACING * math.sqrt(dx * dx + dy * dy + dz * dz):
-                continue
-            own += _along(lever, joint[pair, pair])
-            for k in range(count):
-                shared += _along(lever, joint[pair, facing[k]])
-            facing[count] = pair
-            count += 1
-        if count == 0:
-            placing_mm[n] = 0.0
-            continue
-        own /= count
-        shared = 2.0 * shared / (count * (count - 1)) if count > 1 else own
+            faces = towards > FACING * math.sqrt(dx * dx + dy * dy + dz * dz)
+            others |= faces != facing[pair]
+            facing[pair] = faces
+            count += faces
+        if others:  # most points face the same pairs as the one before
+            _sum_up(joint, facing, own, between)
+        mean, shared = 0.0, 0.0
+        for k in range(21):
+            mean += own[k] * products[k] / max(count, 1)
+            shared += between[k] * products[k] / max(count * (count - 1) / 2, 1.0)
         alone = 1.0 / max(min(pairs_seen[n], count), 1)
-        placing_mm[n] = math.sqrt(max(alone * own + (1.0 - alone) * shared, 0.0))
+        placing_mm[n] = math.sqrt(max(alone * mean + (1.0 - alone) * shared, 0.0))
 
 
 @compiled
-def _along(lever: Array, covariance: Array) -> float:
-    """Covariance mm^2 along the normal whose `lever` (6,) it is."""
-    total = 0.0
-    for row in range(6):
-        part = 0.0
-        for column in range(6):
-            part += covariance[row, column] * lever[column]
-        total += part * lever[row]
-    return total
+def _sum_up(joint: Array, facing: Mask, own: Array, between: Array) -> None:
+    """Write the sums of the facing pairs' own covariances, and of those of each two of them."""
+    own[:], between[:] = 0.0, 0.0
+    for i in range(len(facing)):
+        if not facing[i]:
+            continue
+        for k in range(21):
+            own[k] += joint[i, i, k]
+        for j in range(i):
+            if facing[j]:
+                for k in range(21):
+                    between[k] += joint[i, j, k]
