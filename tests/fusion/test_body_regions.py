@@ -123,7 +123,7 @@ def test_hair_and_shorts_are_told_apart(seen: Seen) -> None:
 
 @pytest.mark.parametrize("rough_mm", [0.5, 1.0, 2.0])
 def test_hair_stands_off_by_how_rough_it_is_beyond_its_noise(seen: Seen, rough_mm: float) -> None:
-    """In the median of its points to a tenth: a window of five pixels fits a twentieth of the
+    """In the median of its points to a fifth: a window of five pixels fits a twentieth of the
     scatter away, and cells hold a hundred pixels. Skin does not stand off."""
     noise_mm = np.float32(0.8)
     hair = [scalp(seen, image) for image in seen.images]
