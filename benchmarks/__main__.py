@@ -86,7 +86,9 @@ def main() -> None:
         "on what and of which\ncommit it was got, and whether the code has changed since.\n"
     )
     body = [
-        f"<!-- {name} -->\n{_aged(sections[name])}\n" for name in BENCHMARKS if name in sections
+        f"<!-- {name} -->\n{_aged(name, sections[name])}\n"
+        for name in BENCHMARKS
+        if name in sections
     ]
     write_text(RESULTS, "\n".join([head, *body]))
 
@@ -111,19 +113,30 @@ def _processor() -> str:
         return platform.machine()
 
 
-MEASURED = ("bodyscan", "benchmarks")
-"""The folders whose commits make a section outdated."""
-
+_IMPORTED = re.compile(r"^\s*from benchmarks(?:\.| import )(\w+)", re.MULTILINE)
 _ORIGIN = re.compile(r"^\*Commit ([0-9a-f]{7,})[^*]*\*", re.MULTILINE)
 _AGE = re.compile(r"\n\*\*Older than the code\*\*[^\n]*\n")
 
 
-def _aged(section: str) -> str:
-    """The section with a line on how many commits have changed the package since, if any."""
+def _measured(name: str) -> list[str]:
+    """The paths whose commits make a section outdated: the package, and what its benchmark imports
+    of the others."""
+    found, waiting = set[str](), {BENCHMARKS[name].__module__.removeprefix("benchmarks.")}
+    while waiting:
+        found |= waiting
+        texts = [(PROJECT / "benchmarks" / f"{one}.py").read_text("utf-8") for one in waiting]
+        waiting = {one for text in texts for one in _IMPORTED.findall(text)} - found
+    return ["bodyscan", *(f"benchmarks/{one}.py" for one in sorted(found))]
+
+
+def _aged(name: str, section: str) -> str:
+    """The section with a line on how many commits have changed what it measures, if any."""
     section = _AGE.sub("\n", section)
     title, _, rest = section.partition("\n")
     origin = _ORIGIN.search(section)
-    since = _git("rev-list", "--count", f"{origin[1]}..HEAD", "--", *MEASURED) if origin else ""
+    since = (
+        _git("rev-list", "--count", f"{origin[1]}..HEAD", "--", *_measured(name)) if origin else ""
+    )
     if origin is None:
         parts = [title, "**Older than the code**: made before sections said of which commit.", rest]
     elif since in ("", "0"):

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from benchmarks.full_size import run_commands
 from bodyscan.arrays import Array
@@ -22,7 +23,11 @@ from bodyscan.geometry.robust import rms
 from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.calibrating import calibrate_ours
 from bodyscan.laboratory.chapter.captures import TARGET, take_captures
-from bodyscan.laboratory.chapter.measuring import ApproachAccuracy, measure_artefacts
+from bodyscan.laboratory.chapter.measuring import (
+    ApproachAccuracy,
+    measure_artefacts,
+    true_approach,
+)
 from bodyscan.laboratory.chapter.point_sigma import PointSigma, point_sigma
 from bodyscan.laboratory.rivals.targets import by_reference_plane
 from bodyscan.progress import THREADS
@@ -62,12 +67,14 @@ parameters), {len(SEEDS)} seeds:
 {chr(10).join(_unit_row(*unit) for unit in units)}
 
 How far off they are: of the whole plate what no noise of stripes explains, RMS from flat, in the
-median of the seeds and the worst; the ten distances between the spheres' centres, RMS; what of
-it is scale, and what is left of that with the scale of the board as it was printed, which no image
-tells (0.02 mm RMS in real light).
+median of the seeds and the worst; the ten distances between the spheres' centres, RMS, in the
+same way; and what no calibration can better, "true": the same distances from the same images with
+the true camera and light, and "+ print": together with the size of the board as it was printed
+(0.02 mm RMS in real light), which no image tells. Then the scale of the distances, that of the
+print, and what is left with the print's known.
 
-| boards | light | plate, mm | sphere distances, mm | scale, ppm | less the board's |
-|---|---|---|---|---|---|
+| boards | light | plate, mm | distances, mm | true | + print | scale, ppm | print | less print |
+|---|---|---|---|---|---|---|---|---|
 {chr(10).join(_size_row(*unit) for unit in units)}
 """
 
@@ -96,13 +103,20 @@ the fault that one of them showed was mended:
 
 @dataclass(frozen=True, eq=False)
 class UnitErrors:
-    """camera: (7,) errors over sigmas of its parameters. print_ppm: how much larger the board is
-    than it is said to be."""
+    """camera: (7,) errors over sigmas of its parameters. best: with the true calibration, from the
+    same images. print_ppm: how much larger the board is than it is said to be."""
 
     points: PointSigma
     camera: Array
     accuracy: ApproachAccuracy
+    best: ApproachAccuracy
     print_ppm: float
+
+    @property
+    def with_print_mm(self) -> float:
+        """RMS error of the spheres' distances with the true calibration and a board of this size."""
+        of_print = 1e-6 * self.print_ppm * rms(pdist(apparatus.CENTRES))
+        return float(np.hypot(self.best.distances.rms_mm, of_print))
 
 
 def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
@@ -113,8 +127,8 @@ def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
     true = from_fields(describe_camera(apparatus.CAMERA)).parameters
     off = (ours.camera.parameters - true) / np.sqrt(np.diag(covariance))
     print_ppm = centre_distances(setup.board.corners, corner_points(apparatus.BOARD)).scale_ppm
-    points, accuracy = point_sigma(ours, captures), measure_artefacts(ours, captures)
-    return UnitErrors(points, off, accuracy, print_ppm)
+    accuracy, best = (measure_artefacts(one, captures) for one in (ours, true_approach(setup)))
+    return UnitErrors(point_sigma(ours, captures), off, accuracy, best, print_ppm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,16 +175,21 @@ def _unit_row(boards: int, light: str, seeds: Sequence[UnitErrors]) -> str:
 
 
 def _size_row(boards: int, light: str, seeds: Sequence[UnitErrors]) -> str:
-    plate = [s.accuracy.plate_systematic_mm for s in seeds]
-    distances = [s.accuracy.distances.rms_mm for s in seeds]
-    scale = [abs(s.accuracy.distances.scale_ppm) for s in seeds]
+    millimetres = [
+        [s.accuracy.plate_systematic_mm for s in seeds],
+        [s.accuracy.distances.rms_mm for s in seeds],
+        [s.best.distances.rms_mm for s in seeds],
+        [s.with_print_mm for s in seeds],
+    ]
     # What is measured by a board that is larger than it is said to be comes out smaller.
-    known = [abs(s.accuracy.distances.scale_ppm + s.print_ppm) for s in seeds]
-    return (
-        f"| {boards} | {light} | {np.median(plate):.4f}, {max(plate):.4f} | "
-        f"{np.median(distances):.4f}, {max(distances):.4f} | "
-        f"{np.median(scale):.0f}, {max(scale):.0f} | {np.median(known):.0f}, {max(known):.0f} |"
-    )
+    scales = [
+        [abs(s.accuracy.distances.scale_ppm) for s in seeds],
+        [abs(s.print_ppm) for s in seeds],
+        [abs(s.accuracy.distances.scale_ppm + s.print_ppm) for s in seeds],
+    ]
+    cells = [f"{np.median(of):.4f}, {max(of):.4f}" for of in millimetres]
+    cells += [f"{np.median(of):.0f}, {max(of):.0f}" for of in scales]
+    return f"| {boards} | {light} | {' | '.join(cells)} |"
 
 
 def _rig_row(preset: str, seeds: Sequence[RigErrors]) -> str:
