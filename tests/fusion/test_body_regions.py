@@ -121,6 +121,17 @@ def test_hair_and_shorts_are_told_apart(seen: Seen) -> None:
     assert share(found, bare, images, SKIN) > 0.97
 
 
+@pytest.mark.parametrize(("grey", "kind"), [(0.55, SKIN), (0.45, UNSURE)])
+def test_skin_in_shade_is_skin_down_to_half_the_usual_light(
+    seen: Seen, grey: float, kind: int
+) -> None:
+    shade = [between(seen, image, 0.41, 0.565) for image in seen.images]
+    images = [
+        covered(image, s, round(grey * BRIGHT)) for image, s in zip(seen.images, shade, strict=True)
+    ]
+    assert share(seen.labels(images), shade, images, kind) == 1.0
+
+
 @pytest.mark.parametrize("rough_mm", [0.5, 1.0, 2.0])
 def test_hair_stands_off_by_how_rough_it_is_beyond_its_noise(seen: Seen, rough_mm: float) -> None:
     """In the median of its points to a fifth: a window of five pixels fits a twentieth of the

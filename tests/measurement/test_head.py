@@ -132,6 +132,21 @@ def test_the_sigma_of_the_top_is_that_of_centre_and_height_together() -> None:
     assert found.sigma_mm == pytest.approx(spread, rel=1e-3)
 
 
+def test_where_a_head_leans_to_changes_nothing() -> None:
+    """Not even by what is expected of its place: 300 mm are whole cells, so nothing but rounding is
+    left."""
+    turn, down = np.meshgrid(np.linspace(-1.2, 1.2, 7), np.linspace(0.3, 0.75, 3))
+    ways = [np.cos(down) * np.cos(turn), np.cos(down) * np.sin(turn), np.sin(down)]
+    skin = np.stack(ways, axis=-1).reshape(-1, 3) * [99.0, 77.0, 95.0] + [0.0, 0.0, 1600.0]
+    upright = estimate_head_top(skin, 1705.0)
+    assert upright is not None
+    for aside in ([300.0, 0.0, 0.0], [0.0, 300.0, 0.0], [0.0, -300.0, 0.0]):
+        found = estimate_head_top(skin + aside, 1705.0)
+        assert found is not None
+        assert found.height_mm == pytest.approx(upright.height_mm, abs=1e-6)
+        assert found.sigma_mm == pytest.approx(upright.sigma_mm, abs=1e-6)
+
+
 def test_a_dozen_places_of_a_forehead_are_enough() -> None:
     """Fewer say no more than that the head ends between skin and hair."""
     across = 15.0 * np.arange(4) + 7.5

@@ -80,6 +80,20 @@ def test_a_sound_sequence_passes_and_so_does_one_blurred_away() -> None:
     check_pairs(pairs(*blurred))
 
 
+@pytest.mark.parametrize(("blurred", "named"), [("b3 b4 b5", None), ("b2 b3 b4 b5", "bit 2")])
+def test_the_three_finest_bits_may_be_blurred_away(blurred: str, named: str | None) -> None:
+    """An even grey, but for a noise that leaves no pattern equal to its inverse."""
+    patterns, inverses = frames(**dict.fromkeys(blurred.split(), 0.0))
+    grey = [int(name[1:]) for name in blurred.split()]
+    rng = np.random.default_rng(0)
+    patterns[grey] += rng.normal(0.0, 0.5, (len(grey), PIXELS)).astype(np.float32)
+    if named is None:
+        check_seen(pairs(patterns, inverses))
+    else:
+        with pytest.raises(DecodingFailed, match=f"{named} look alike"):
+            check_seen(pairs(patterns, inverses))
+
+
 def test_a_bit_that_shows_nowhere_is_named() -> None:
     with pytest.raises(DecodingFailed, match="bit 2 look alike: the bit shows in"):
         check_seen(pairs(*frames(b2=0.0)))
