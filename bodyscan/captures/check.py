@@ -304,8 +304,8 @@ def _bad_lines(bad: tuple[BadImage, ...]) -> list[str]:
     lines = []
     for (pair, where, what), group in groupby(sorted(bad, key=key), key=key):
         files = [image.path for image in group]
-        rest = f" and {len(files) - 1} more" if len(files) > 1 else ""
-        lines.append(f"error: pair {pair}, {where}: {files[0]}{rest}: {what}")
+        rest = f" (and {len(files) - 1} more)" if len(files) > 1 else ""
+        lines.append(f"error: pair {pair}, {where}: {files[0]}: {what}{rest}")
     return lines
 
 

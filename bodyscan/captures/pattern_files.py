@@ -55,7 +55,9 @@ def write_patterns(rig: Rig, out: Path, width: int, height: int) -> tuple[Path, 
         raise BadInput(
             "none of its projectors shows images",
             where=f"rig {rig.name}",
-            remedy="an instrument with code: stripe-index projects stripes of its own",
+            remedy="an instrument with code: stripe-index projects stripes of its own"
+            if any(pair.projector for pair in rig.pairs)
+            else "give its pairs a `projector`: docs/formats.md shows how",
         )
     names = _folder_names(tuple(kinds))
     # Make every kind before writing the first: if one does not fit, nothing is written.

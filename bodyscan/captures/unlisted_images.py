@@ -24,8 +24,11 @@ def describe_unlisted_images(captures: Captures) -> str | None:
 def find_unlisted_images(captures: Captures) -> list[Path]:
     """Images next to those of the captures' shots that belong to no pair and frame of the rig file.
 
-    Shots that are not wanted are ignored.
+    Shots that are not wanted are ignored, unless nothing is left of one that is: it may have been
+    renamed.
     """
+    seen = {s.shot for s in captures.sequences if len(s.missing) < len(s.paths)}
+    renamed = any(shot not in seen for shot in captures.shots)
     wanted = {path for sequence in captures.sequences for path in sequence.paths}
     beside = {path.parent.parent for path in wanted} | {path.parent for path in wanted}
     named = {(len(path.parts), path.stem) for path in wanted}
@@ -36,7 +39,8 @@ def find_unlisted_images(captures: Captures) -> list[Path]:
         for path in _images(folder)
         if path not in wanted
         and (
-            _belongs(path.relative_to(folder), captures, path.parent in beside)
+            renamed
+            or _belongs(path.relative_to(folder), captures, path.parent in beside)
             # of another shot whose name differs only in its suffix
             or (path.suffix not in suffixes and (len(path.parts), path.stem) in named)
         )

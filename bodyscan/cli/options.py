@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-RigFile = Annotated[Path, typer.Argument(metavar="RIG.YAML", help="The rig file.")]
+RigFile = Annotated[Path, typer.Argument(metavar="RIG.YAML", help="The rig file.", dir_okay=False)]
 ScanFolder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Captures of one scan.")]
 Result = Annotated[Path, typer.Argument(metavar="RESULT", help="Folder that `scan` wrote.")]
 CalibrationArgument = Annotated[

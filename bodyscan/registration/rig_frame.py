@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
 from bodyscan.calibration.board_views import board_symmetries
 from bodyscan.errors import BadInput
+from bodyscan.files.model import did_you_mean
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.view_graph import Target
 from bodyscan.rig.pair import NominalPose, Pair
@@ -29,6 +30,19 @@ def frame_target(rig: Rig) -> Target | None:
     """The (shot, board) that fixes the rig frame, or None if a pair does."""
     board, shot = rig.frame_board, rig.rig_frame.shot
     return (shot, board.name) if board and shot else None
+
+
+def refuse_without_frame_shot(rig: Rig, shots: Collection[str]) -> None:
+    """Raise BadInput if the shot that fixes the rig frame is none of `shots`."""
+    target = frame_target(rig)
+    if target is not None and target[0] not in shots:
+        raise BadInput(
+            f"rig_frame.shot: there is no shot '{target[0]}'{did_you_mean(target[0], shots)} in the "
+            "calibration captures",
+            where=f"rig {rig.name}",
+            remedy="capture the board where it fixes the rig frame, or fix the frame by a pair "
+            "(rig_frame: {pair: NAME})",
+        )
 
 
 def frame_board_turn(

@@ -21,11 +21,11 @@ def pattern_frames(code: StripeCode, width: int, height: int) -> Bytes:
 
 
 def _frames_one_way(code: StripeCode, width: int, height: int) -> Bytes:
-    across = height if code.direction == "horizontal" else width
+    side, across = ("height", height) if code.direction == "horizontal" else ("width", width)
     if code.stripes > across:
         raise BadInput(
             f"{code.stripes} stripes do not fit on {across} projector pixels",
-            remedy="project fewer stripes",
+            remedy=f"give the projector's own {side}, or project fewer stripes",
         )
     s = (np.arange(across) + 0.5) * code.stripes / across
     lines = np.concatenate([code.intensity(kind, s) for kind in code.image_counts])

@@ -30,7 +30,7 @@ from bodyscan.registration.board_checks import describe_findings
 from bodyscan.registration.nominal_size import check_nominal_size
 from bodyscan.registration.references import find_size, resized, solving_views
 from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.registration.rig_frame import frame_target
+from bodyscan.registration.rig_frame import frame_target, refuse_without_frame_shot
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.registration.seen_corners import seen_corners
 from bodyscan.registration.soundness import find_faults
@@ -64,6 +64,7 @@ def calibrate_rig(
     FailedWork if no pair is left, RigDisconnected if nothing ties the pairs together, BadInput if
     nothing fixes the rig frame.
     """
+    refuse_without_frame_shot(rig, captures.shots)
     boards = find_all_boards(rig, captures, progress)
     return remarked(join_rig(rig, captures, boards, progress, folder=folder), progress)
 
@@ -78,6 +79,7 @@ def calibrate_folder(
     """
     rig = load_rig(rig_file)
     captures = open_captures(rig, rig_file)
+    refuse_without_frame_shot(rig, captures.shots)
     boards = find_all_boards(rig, captures, progress)
     found = join_rig(rig, captures, boards, progress, folder=Path(rig_file).parent)
     keep_former(folder)

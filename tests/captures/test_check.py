@@ -54,7 +54,7 @@ def test_missing_images_are_grouped_by_pair_and_shot(rig_path: Path) -> None:
     assert len(report.bad_images) == 3
     (line,) = lines_with(rig_path, "is missing")
     first = image(rig_path, "b2", "p1", "dark")
-    assert line == f"error: pair p1, shot b2: {first} and 2 more: is missing"
+    assert line == f"error: pair p1, shot b2: {first}: is missing (and 2 more)"
     assert report.pairs[0].stripe_shots == 2  # that sequence cannot be used
     (few,) = lines_with(rig_path, "calibration needs 3")
     assert few.startswith("error: pair p1: has 2 whole stripe sequences")
@@ -196,6 +196,19 @@ def test_a_renamed_folder_is_not_passed_over_in_silence(rig_path: Path) -> None:
     (warning,) = lines_with(rig_path, "spelt differently")
     assert f"{len(FRAMES)} images belong to no pair" in warning
     assert str(folder.with_name("P1")) in warning
+
+
+def test_a_listed_shot_whose_folder_was_renamed_is_not_passed_over(rig_path: Path) -> None:
+    folder = rig_path.parent / "captures"
+    shots = [f"{{name: b{k}, stripes: [p1, p2], lit: [cam]}}" for k in (1, 2, 3)]
+    (folder / "captures.yaml").write_text(
+        f"version: 1\nkind: calibration\nshots: [{', '.join(shots)}]\n"
+    )
+    assert lines_with(rig_path, "spelt differently") == []
+    (folder / "b2").rename(folder / "pose-2")
+    (warning,) = lines_with(rig_path, "spelt differently")
+    assert f"{2 * len(FRAMES) + 1} images belong to no pair" in warning
+    assert str(folder / "pose-2") in warning
 
 
 def test_images_of_shots_that_are_not_wanted_are_left_alone(rig_path: Path) -> None:

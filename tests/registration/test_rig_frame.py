@@ -14,6 +14,7 @@ from bodyscan.registration.rig_frame import (
     frame_board_turn,
     frame_target,
     nominal_pose,
+    refuse_without_frame_shot,
     rig_from_root,
 )
 from bodyscan.registration.view_graph import RelativePose
@@ -32,6 +33,14 @@ def rig(frame: dict[str, Any], board: dict[str, Any] = PLAIN, **nominal: Any) ->
         for name in ("p", "q")
     ]
     return Rig.model_validate({"name": "r", "boards": (board,), "pairs": pairs, "rig_frame": frame})
+
+
+def test_a_rig_whose_frame_shot_was_not_captured_is_refused_before_any_work() -> None:
+    on_floor = rig({"shot": "floor", "board": "b"})
+    refuse_without_frame_shot(on_floor, ["b01", "floor"])
+    with pytest.raises(BadInput, match=r"there is no shot 'floor' \(did you mean 'flor'\?\)"):
+        refuse_without_frame_shot(on_floor, ["b01", "flor"])
+    refuse_without_frame_shot(rig({"pair": "p"}), [])
 
 
 @pytest.mark.parametrize(
