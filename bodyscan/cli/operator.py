@@ -412,7 +412,7 @@ def forget(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be removed, and remove nothing.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask first.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask first; needed without a terminal.")] = False,
 ) -> None:
     """Remove every file of a subject: images, jobs, results, exports, rows of summaries."""
     from bodyscan.jobs import forgetting
@@ -420,12 +420,22 @@ def forget(
 
     found = forgetting.find_subject(subject, workspace)
     if not dry_run:
-        if sys.stdin.isatty() and not yes and found.files:
-            question = f"remove {len(found.files)} files of {subject} for good?"
-            typer.confirm(question, abort=True, err=True)
+        if not yes and (found.files or found.rows):
+            _ask(f"{len(found.files)} files of {subject}", workspace)
         found = forgetting.forget_subject(subject, workspace)
     verb = "would remove" if dry_run else "removed"
     output.say(*(f"{verb} {printable(str(path))}" for path in found.files))
     output.notes((printable(str(path)) for path in found.unreadable), "cannot tell whose")
     output.figures(files=len(found.files), removed=not dry_run)
     output.say(f"{verb} {len(found.files)} files of {subject}")
+
+
+def _ask(what: str, workspace: Path) -> None:
+    """Go on only if a person says yes; a pipe's answer may be meant for something else."""
+    if sys.stdin is None or not sys.stdin.isatty():  # None: closed
+        raise BadInput(
+            f"nobody can be asked whether to remove {what} for good: there is no terminal",
+            where=str(workspace),
+            remedy="add --yes to remove them, or --dry-run to see which they are",
+        )
+    typer.confirm(f"remove {what} for good?", abort=True, err=True)
