@@ -396,6 +396,7 @@ def verify(
     verified = look(folder)
     output.figures(files=verified.files)
     output.say(*(printable(fault) for fault in verified.faults), wrong=True)
+    output.notes((printable(str(path)) for path in verified.added), "added since, not checked")
     if verified.faults:
         raise FailedWork(
             f"{len(verified.faults)} of {verified.files} files have changed",
@@ -412,7 +413,9 @@ def forget(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be removed, and remove nothing.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask first; needed without a terminal.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask first; needed without a terminal.")
+    ] = False,
 ) -> None:
     """Remove every file of a subject: images, jobs, results, exports, rows of summaries."""
     from bodyscan.jobs import forgetting

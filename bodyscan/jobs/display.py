@@ -63,6 +63,8 @@ def lines() -> Iterator[Listen]:
     def listen(event: dict[str, Any]) -> None:
         if event["event"] == "verdict":
             console.print(_verdict_text(event), soft_wrap=True)
+        elif "kept" in event:
+            console.print(_kept_text(event), soft_wrap=True)
         elif event["event"] == "job" and event["state"] in ("done", "set aside"):
             style = "dim" if event["state"] == "done" else "red"
             console.print(Text(ending(event), style=style), soft_wrap=True)
@@ -123,6 +125,9 @@ class _Screen:
             self._bars.console.print(_verdict_text(event), soft_wrap=True)
 
     def _stage(self, event: dict[str, Any]) -> None:
+        if "kept" in event:
+            self._bars.console.print(_kept_text(event), soft_wrap=True)
+            return
         if event["job"] in self._running:
             self._bars.update(
                 self._running[event["job"]],
@@ -137,6 +142,12 @@ def _verdict_text(event: dict[str, Any]) -> Text:
     grade = event["grade"] if event["final"] else f"{event['grade']} so far"
     said = ": ".join([event["job"], grade, *event["reasons"][:1]])
     return Text(said, style=_STYLES[MARKS.get(event["grade"], "bad")])
+
+
+def _kept_text(event: dict[str, Any]) -> Text:
+    return Text(
+        f"{event['job']}: files that were added to {event['stage']} are now in {event['kept']}"
+    )
 
 
 def ending(event: dict[str, Any]) -> str:

@@ -65,9 +65,7 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
             tables.append(folder)
     files.sort(key=lambda path: (_rank(path.name), path))
     rows = [out for out in tables if _without(subject, out / SUMMARY) is not None]
-    return SubjectFiles(
-        tuple(files), tuple(folders), tuple(tables), tuple(rows), tuple(unreadable)
-    )
+    return SubjectFiles(tuple(files), tuple(folders), tuple(tables), tuple(rows), tuple(unreadable))
 
 
 def forget_subject(subject: str, workspace: Path) -> SubjectFiles:

@@ -6,12 +6,11 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from bodyscan.errors import BodyscanError
-from bodyscan.files.hashing import file_hashes, files_below
-from bodyscan.jobs.job import STAGE, STATE, Job, read_record
+from bodyscan.files.hashing import file_hashes
+from bodyscan.jobs.job import STAGE, STATE, Job, read_record, results_in
 from bodyscan.jobs.stages import Stage
 
 SCHEMA, VERSION = "bodyscan-stage", 1
@@ -80,16 +79,9 @@ def reason_to_run(job: Job, now: Origin) -> str:
         return f"settings changed: {said}"
     if said := _difference(inputs, now.inputs):
         return f"inputs changed: {said}"
-    if said := _difference(outputs, result_hashes(folder)):
+    if said := _difference(outputs, file_hashes(results_in(folder))):
         return f"its result was changed: {said}"
     return ""
-
-
-def result_hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file in a stage's folder except stage.json, by relative path."""
-    paths = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
-    paths.pop(STAGE, None)
-    return file_hashes(paths)
 
 
 def _difference(was: Mapping[str, str], now: Mapping[str, str]) -> str:

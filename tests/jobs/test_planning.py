@@ -11,6 +11,7 @@ import cheap_job
 import pytest
 from cheap_batch import jobs_of, run_cheap
 
+from bodyscan.files.hashing import files_below
 from bodyscan.jobs.plan import Step, plan
 
 
@@ -75,6 +76,47 @@ def test_results_that_were_touched_are_made_again(day: Path) -> None:
     assert steps(day)[0] == "its result was changed: 1.bin has other content"
     assert run_cheap(day / "scans", day / "out").endings()["anna"]["stages"] == ["scan"]
     assert steps(day) == ["", ""]
+
+
+def add(day: Path) -> tuple[Path, Path]:
+    """Files of a person's own among Anna's results, one in a folder."""
+    added = (day / "out/anna/scan/measurements.json", day / "out/anna/scan/export/body.ply")
+    for path in added:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    return added
+
+
+def test_files_that_a_person_added_do_not_count(day: Path) -> None:
+    added = add(day)
+    assert steps(day) == ["", ""]
+    assert run_cheap(day / "scans", day / "out").endings()["anna"]["stages"] == []
+    assert all(path.read_text() == "mine" for path in added)
+
+
+def test_files_that_a_person_added_are_kept_when_a_stage_runs_again(day: Path) -> None:
+    added = add(day)
+    (day / "scans" / "anna" / "image.txt").write_text("other")
+    told = run_cheap(day / "scans", day / "out").events
+    (kept,) = (day / "out" / "anna").glob("kept-scan-*")
+    assert {path.relative_to(kept).as_posix() for path in files_below(kept)} == {
+        "measurements.json",
+        "export/body.ply",
+    }
+    assert [event["kept"] for event in told if "kept" in event] == [kept.name]
+    assert not any(path.exists() for path in added)  # they belong to the former result
+    assert steps(day) == ["", ""]
+
+
+def test_files_that_a_person_added_outlive_a_kill(day: Path) -> None:
+    """Between the steps that put a new result in place of the former."""
+    add(day)
+    job = day / "out" / "anna"
+    (job / "scan").rename(job / ".old-scan-0123")
+    assert run_cheap(day / "scans", day / "out").endings()["anna"]["stages"] == ["scan"]
+    assert (job / "kept-scan-0123" / "measurements.json").read_text() == "mine"
+    assert len(list(files_below(job / "kept-scan-0123"))) == 2
+    assert not list(job.glob(".old-*"))
 
 
 def test_a_failure_is_told_the_next_time(make_scans: Callable[..., Path], tmp_path: Path) -> None:
