@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.text import Text
 
 from bodyscan.jobs.supervision import Listen
-from bodyscan.verdict import MARKS
+from bodyscan.verdict import LEFT_OUT, MARKS
 
 _STYLES = {"good": "green", "usable": "yellow", "bad": "red"}
 
@@ -138,9 +138,12 @@ class _Screen:
 
 
 def _verdict_text(event: dict[str, Any]) -> Text:
-    """A scan's verdict with its worst reason."""
+    """A scan's verdict with its worst reason, and every other pair that was lost."""
     grade = event["grade"] if event["final"] else f"{event['grade']} so far"
     said = ": ".join([event["job"], grade, *event["reasons"][:1]])
+    others = [reason for reason in event["reasons"][1:] if reason.startswith(LEFT_OUT)]
+    lost = ", ".join(reason.removeprefix(LEFT_OUT).partition(": ")[0] for reason in others)
+    said += f"\n  also left out: {lost}" if lost else ""
     return Text(said, style=_STYLES[MARKS.get(event["grade"], "bad")])
 
 
