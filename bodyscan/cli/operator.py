@@ -277,7 +277,8 @@ def _explain(output: Output, jobs: Sequence[Job], stages: Sequence[Stage]) -> No
     with ThreadPoolExecutor() as pool:
         for job, steps in zip(jobs, pool.map(lambda job: plan(job, stages), jobs), strict=True):
             for step in steps:
-                said = f"will run: {step.why}" if step.why else "up to date"
+                run = "will run" if step.certain else "may run"
+                said = f"{run}: {step.why}" if step.why else "up to date"
                 output.say(printable(f"{job.name}: {step.stage}: {said}"))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from bodyscan.errors import BodyscanError
@@ -35,10 +35,15 @@ class Origin:
 
 @dataclass(frozen=True)
 class Step:
-    """A stage, and why it has to run; "" if its results are up to date."""
+    """What is to be expected of a stage.
+
+    why: it has to run; "" if its results are up to date.
+    certain: False if it depends on what a stage before it will give.
+    """
 
     stage: str
     why: str
+    certain: bool = True
 
 
 def origin_of(job: Job, stage: Stage) -> Origin:
@@ -51,15 +56,26 @@ def plan(job: Job, stages: Sequence[Stage]) -> list[Step]:
     """What a batch would do now, stage by stage."""
     steps: list[Step] = []
     for stage in stages:
-        if steps and steps[-1].why:
-            steps.append(Step(stage.name, f"{steps[-1].stage} runs before it"))
-            continue
         try:
-            why = reason_to_run(job, origin_of(job, stage))
+            again = [step.stage for step in steps if step.why]
+            steps.append(_step(job, origin_of(job, stage), again))
         except (BodyscanError, OSError) as error:
             why = f"its inputs cannot be used as they are: {error}"
-        steps.append(Step(stage.name, why))
+            steps.append(Step(stage.name, why))
     return steps
+
+
+def _step(job: Job, now: Origin, again: Sequence[str]) -> Step:
+    """again: stages that run before; made again, their results are often the same."""
+    read = read_record(job.folder / now.stage / STAGE).get("inputs")
+    was = read if isinstance(read, dict) else {}
+    before = {name.split("/")[0] for name in was}.intersection(again)
+    if not before:
+        return Step(now.stage, reason_to_run(job, now))
+    if why := reason_to_run(job, replace(now, inputs=was)):
+        return Step(now.stage, why)
+    why = f"{', '.join(sorted(before))} runs before it, and may give another result"
+    return Step(now.stage, why, certain=False)
 
 
 def reason_to_run(job: Job, now: Origin) -> str:

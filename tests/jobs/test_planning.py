@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cheap_job
@@ -13,6 +15,8 @@ from cheap_batch import jobs_of, run_cheap
 
 from bodyscan.files.hashing import files_below
 from bodyscan.jobs.plan import Step, plan
+
+PERHAPS = "scan runs before it, and may give another result"
 
 
 @pytest.fixture
@@ -45,7 +49,7 @@ def test_another_content_counts(day: Path) -> None:
     (day / "scans" / "anna" / "image.txt").write_text("other")
     scan, export = steps(day)
     assert scan == "inputs changed: image.txt has other content"
-    assert export == "scan runs before it"
+    assert export == PERHAPS
 
 
 def test_files_that_come_and_go_count(day: Path) -> None:
@@ -57,7 +61,7 @@ def test_files_that_come_and_go_count(day: Path) -> None:
 def test_settings_count_for_the_stages_that_obey_them(day: Path) -> None:
     assert steps(day, "fusion.points=2000") == [
         "settings changed: fusion.points 1000000 -> 2000",
-        "scan runs before it",
+        PERHAPS,
     ]
     assert steps(day, "export.formats=ply") == [
         "",
@@ -117,6 +121,32 @@ def test_files_that_a_person_added_outlive_a_kill(day: Path) -> None:
     assert (job / "kept-scan-0123" / "measurements.json").read_text() == "mine"
     assert len(list(files_below(job / "kept-scan-0123"))) == 2
     assert not list(job.glob(".old-*"))
+
+
+def test_a_forecast_is_certain_only_of_what_cannot_turn_out_otherwise(day: Path) -> None:
+    """Bert's scan is made again with the same result, of which his export then is still true."""
+    (day / "out" / "bert" / "scan" / "1.bin").write_bytes(b"x")
+    stages = cheap_job.kinds()["fuse"]
+
+    def forecast(*changes: str) -> list[bool]:
+        _, bert = jobs_of(day / "scans", day / "out", *changes)
+        return [step.certain for step in plan(bert, stages)]
+
+    assert forecast() == [True, False]
+    assert forecast("export.formats=ply") == [True, True]
+    assert run_cheap(day / "scans", day / "out").endings()["bert"]["stages"] == ["scan"]
+    shutil.rmtree(day / "out" / "bert")
+    assert forecast() == [True, True]
+
+
+def test_a_stage_waits_for_those_alone_whose_results_it_reads(day: Path) -> None:
+    scan, export = cheap_job.kinds()["fuse"]
+    beside = replace(export, name="beside", sections=())
+    shutil.copytree(day / "out/anna/export", day / "out/anna/beside")
+    record = day / "out/anna/beside/stage.json"
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"settings": {}}))
+    anna, _ = jobs_of(day / "scans", day / "out", "export.formats=ply")
+    assert [bool(step.why) for step in plan(anna, (scan, export, beside))] == [False, True, False]
 
 
 def test_a_failure_is_told_the_next_time(make_scans: Callable[..., Path], tmp_path: Path) -> None:
