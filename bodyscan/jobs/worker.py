@@ -152,7 +152,7 @@ def _remove_results(old: Path, tell: Tell) -> None:
     stage = token.rpartition("-")[0]
     if old.is_dir() and not old.is_symlink():
         # Without a record (an upload that was cut short) the new result tells what stages write.
-        ours = {*results_in(old), *results_in(old.with_name(stage))}
+        ours = results_in(old) or results_in(old.with_name(stage))
         for path in [*files_below(old)]:
             if path.relative_to(old).as_posix() in ours:
                 path.unlink()
