@@ -15,6 +15,9 @@ MARKS: dict[str, Mark] = {
 }
 """The mark that each grade stands for; any other grade is bad."""
 
+LEFT_OUT = "left out: "
+"""Begins a reason that names pairs that were lost, then a colon and why."""
+
 
 @dataclass(frozen=True)
 class Verdict:

@@ -191,3 +191,34 @@ def test_libraries_that_print_do_not_spoil_the_document(capfd: pytest.CaptureFix
     said = capfd.readouterr()
     assert json.loads(said.out)["command"] == "x"
     assert "a library's warning" in said.err
+
+
+@pytest.mark.parametrize("answer", ["n\n", "y\n", ""])
+def test_nobody_is_forgotten_unasked(answer: str, tmp_path: Path) -> None:
+    scan = tmp_path / "anna"
+    scan.mkdir()
+    (scan / "captures.yaml").write_text("kind: scan\nsubject: mallow\n")
+    line = [sys.executable, "-m", "bodyscan", "forget", "mallow", "--workspace", str(tmp_path)]
+
+    def forget(*more: str) -> Done:
+        return subprocess.run(
+            [*line, *more], input=answer, capture_output=True, text=True, check=False, timeout=120
+        )
+
+    refused = forget()
+    assert refused.returncode == 2
+    assert "1 files of mallow" in refused.stderr
+    assert "--yes" in refused.stderr
+    assert "--dry-run" in refused.stderr
+    assert forget("--dry-run").returncode == 0
+    assert scan.exists()
+    assert forget("--yes").returncode == 0
+    assert not scan.exists()
+
+
+def test_rows_of_a_summary_are_not_forgotten_unasked(tmp_path: Path, bodyscan: Command) -> None:
+    (tmp_path / "batch.lock").touch()
+    (tmp_path / "summary.csv").write_text("job,subject\na,mallow\n")
+    done = bodyscan("forget", "mallow", "--workspace", tmp_path)
+    assert (done.returncode, "--yes" in done.stderr) == (2, True)
+    assert "mallow" in (tmp_path / "summary.csv").read_text()

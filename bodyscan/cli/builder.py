@@ -178,7 +178,11 @@ def accept_changed(output: Output, calibration: CalibrationArgument) -> None:
     """Accept a calibration that was edited by hand, and add a note that says so."""
     from bodyscan.registration.storage import accept_calibration
 
-    output.made("calibration", accept_calibration(calibration))
+    accepted = accept_calibration(calibration)
+    if accepted is None:
+        output.say("nothing was changed since it was stored: there is nothing to accept")
+    else:
+        output.made("calibration", accepted)
 
 
 def refine_rig(

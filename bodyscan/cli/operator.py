@@ -277,7 +277,8 @@ def _explain(output: Output, jobs: Sequence[Job], stages: Sequence[Stage]) -> No
     with ThreadPoolExecutor() as pool:
         for job, steps in zip(jobs, pool.map(lambda job: plan(job, stages), jobs), strict=True):
             for step in steps:
-                said = f"will run: {step.why}" if step.why else "up to date"
+                run = "will run" if step.certain else "may run"
+                said = f"{run}: {step.why}" if step.why else "up to date"
                 output.say(printable(f"{job.name}: {step.stage}: {said}"))
 
 
@@ -396,6 +397,7 @@ def verify(
     verified = look(folder)
     output.figures(files=verified.files)
     output.say(*(printable(fault) for fault in verified.faults), wrong=True)
+    output.notes((printable(str(path)) for path in verified.added), "added since, not checked")
     if verified.faults:
         raise FailedWork(
             f"{len(verified.faults)} of {verified.files} files have changed",
@@ -412,7 +414,9 @@ def forget(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be removed, and remove nothing.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask first.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask first; needed without a terminal.")
+    ] = False,
 ) -> None:
     """Remove every file of a subject: images, jobs, results, exports, rows of summaries."""
     from bodyscan.jobs import forgetting
@@ -420,12 +424,22 @@ def forget(
 
     found = forgetting.find_subject(subject, workspace)
     if not dry_run:
-        if sys.stdin.isatty() and not yes and found.files:
-            question = f"remove {len(found.files)} files of {subject} for good?"
-            typer.confirm(question, abort=True, err=True)
+        if not yes and (found.files or found.rows):
+            _ask(f"{len(found.files)} files of {subject}", workspace)
         found = forgetting.forget_subject(subject, workspace)
     verb = "would remove" if dry_run else "removed"
     output.say(*(f"{verb} {printable(str(path))}" for path in found.files))
     output.notes((printable(str(path)) for path in found.unreadable), "cannot tell whose")
     output.figures(files=len(found.files), removed=not dry_run)
     output.say(f"{verb} {len(found.files)} files of {subject}")
+
+
+def _ask(what: str, workspace: Path) -> None:
+    """Go on only if a person says yes; a pipe's answer may be meant for something else."""
+    if sys.stdin is None or not sys.stdin.isatty():  # None: closed
+        raise BadInput(
+            f"nobody can be asked whether to remove {what} for good: there is no terminal",
+            where=str(workspace),
+            remedy="add --yes to remove them, or --dry-run to see which they are",
+        )
+    typer.confirm(f"remove {what} for good?", abort=True, err=True)

@@ -31,7 +31,7 @@ from bodyscan.registration.nominal_size import NominalSize, nominal_size
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Volume
 from bodyscan.settings import UseLimits
-from bodyscan.verdict import Grade, Verdict
+from bodyscan.verdict import LEFT_OUT, Grade, Verdict
 
 Finding = tuple[Grade, str]
 GRADES: tuple[Grade, ...] = ("good", "usable", "repeat")
@@ -226,7 +226,7 @@ def _pairs(failed: Mapping[str, str], alignment: Alignment | None) -> Iterator[F
     for name, reason in failed.items():
         alike.setdefault(reason.replace(name, "*"), []).append(name)
     for names in alike.values():
-        yield "usable", f"left out: {', '.join(names)}: {failed[names[0]]}"
+        yield "usable", f"{LEFT_OUT}{', '.join(names)}: {failed[names[0]]}"
     for name in alignment.refused if alignment else ():
         yield (
             "repeat",

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.text import Text
 
 from bodyscan.jobs.supervision import Listen
-from bodyscan.verdict import MARKS
+from bodyscan.verdict import LEFT_OUT, MARKS
 
 _STYLES = {"good": "green", "usable": "yellow", "bad": "red"}
 
@@ -63,6 +63,8 @@ def lines() -> Iterator[Listen]:
     def listen(event: dict[str, Any]) -> None:
         if event["event"] == "verdict":
             console.print(_verdict_text(event), soft_wrap=True)
+        elif "kept" in event:
+            console.print(_kept_text(event), soft_wrap=True)
         elif event["event"] == "job" and event["state"] in ("done", "set aside"):
             style = "dim" if event["state"] == "done" else "red"
             console.print(Text(ending(event), style=style), soft_wrap=True)
@@ -123,6 +125,9 @@ class _Screen:
             self._bars.console.print(_verdict_text(event), soft_wrap=True)
 
     def _stage(self, event: dict[str, Any]) -> None:
+        if "kept" in event:
+            self._bars.console.print(_kept_text(event), soft_wrap=True)
+            return
         if event["job"] in self._running:
             self._bars.update(
                 self._running[event["job"]],
@@ -133,10 +138,19 @@ class _Screen:
 
 
 def _verdict_text(event: dict[str, Any]) -> Text:
-    """A scan's verdict with its worst reason."""
+    """A scan's verdict with its worst reason, and every other pair that was lost."""
     grade = event["grade"] if event["final"] else f"{event['grade']} so far"
     said = ": ".join([event["job"], grade, *event["reasons"][:1]])
+    others = [reason for reason in event["reasons"][1:] if reason.startswith(LEFT_OUT)]
+    lost = ", ".join(reason.removeprefix(LEFT_OUT).partition(": ")[0] for reason in others)
+    said += f"\n  also left out: {lost}" if lost else ""
     return Text(said, style=_STYLES[MARKS.get(event["grade"], "bad")])
+
+
+def _kept_text(event: dict[str, Any]) -> Text:
+    return Text(
+        f"{event['job']}: files that were added to {event['stage']} are now in {event['kept']}"
+    )
 
 
 def ending(event: dict[str, Any]) -> str:

@@ -36,13 +36,15 @@ class SubjectFiles:
 
     files: of the subject.
     folders: of the subject alone.
-    tables: summaries and manifests of batches, which are rewritten.
+    tables: folders of batches, whose manifests are rewritten.
+    rows: those of them whose summary has rows of the subject.
     unreadable: files that should name a folder's owner, and do not.
     """
 
     files: tuple[Path, ...]
     folders: tuple[Path, ...]
     tables: tuple[Path, ...]
+    rows: tuple[Path, ...]
     unreadable: tuple[Path, ...]
 
 
@@ -62,7 +64,8 @@ def find_subject(subject: str, workspace: Path) -> SubjectFiles:
         if BATCH_LOCK in names and owner is None:
             tables.append(folder)
     files.sort(key=lambda path: (_rank(path.name), path))
-    return SubjectFiles(tuple(files), tuple(folders), tuple(tables), tuple(unreadable))
+    rows = [out for out in tables if _without(subject, out / SUMMARY) is not None]
+    return SubjectFiles(tuple(files), tuple(folders), tuple(tables), tuple(rows), tuple(unreadable))
 
 
 def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
@@ -75,14 +78,13 @@ def forget_subject(subject: str, workspace: Path) -> SubjectFiles:
         found = find_subject(subject, workspace)
         for out in found.tables:
             locks.enter_context(file_lock(out / BATCH_LOCK, wait=False))
-        rows = [out for out in found.tables if _without(subject, out / SUMMARY) is not None]
-        if not found.files and not rows:
+        if not found.files and not found.rows:
             raise BadInput(
                 f"holds nothing of subject {subject!r}",
                 where=str(workspace),
                 remedy="give the pseudonym as captures.yaml has it, and the --workspace",
             )
-        for out in rows:
+        for out in found.rows:
             write_text(out / SUMMARY, _without(subject, out / SUMMARY) or "")
         for path in found.files:
             path.unlink(missing_ok=True)

@@ -12,10 +12,12 @@ from typing import Any
 
 from bodyscan.errors import BadInput, ResultError
 from bodyscan.files.atomic import write_json
+from bodyscan.files.hashing import files_below
 from bodyscan.jobs.pipeline import Pipeline
 
 SCHEMA, VERSION = "bodyscan-job", 1
 JOB, STATE, LOG, LOCK, MANIFEST = "job.json", "state.json", "log.txt", "lock", "manifest.json"
+KEPT = "kept-"  # begins the name of a folder with what people added to a result that is gone
 STAGE = "stage.json"  # in every stage's folder: what it was made from, and its hashes
 SUMMARY, BATCH_LOCK = "summary.csv", "batch.lock"
 
@@ -110,6 +112,13 @@ def read_record(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
+
+
+def results_in(folder: Path) -> dict[str, Path]:
+    """What a stage wrote, as far as it is there, by relative path: people may have added files."""
+    named = read_record(folder / STAGE).get("outputs")
+    there = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
+    return {name: there[name] for name in there if isinstance(named, dict) and name in named}
 
 
 def _there(folder: Path, relative: str) -> Path:

@@ -18,7 +18,7 @@ from bodyscan.captures.captures_file import FILE_NAME as CAPTURES
 from bodyscan.errors import BadInput
 from bodyscan.files.hashing import files_below
 from bodyscan.jobs.discovery import find_jobs
-from bodyscan.jobs.job import LOCK, MANIFEST, STAGE, SUMMARY, Job, write_job
+from bodyscan.jobs.job import KEPT, LOCK, MANIFEST, STAGE, SUMMARY, Job, write_job
 from bodyscan.jobs.pipeline import Pipeline
 from bodyscan.jobs.supervision import JobProcess, JobResult, Listen, ignore_events, supervise_job
 
@@ -111,6 +111,8 @@ def _stages(folder: Path) -> dict[str, bytes]:
 
 def _put_back(folder: Path, there: _Files, was: dict[str, bytes], ran: tuple[str, ...]) -> None:
     """Put back results. was: the stages as fetched. ran: those made again, perhaps identical."""
+    for path in sorted(path for kept in folder.glob(f"{KEPT}*") for path in files_below(kept)):
+        there.put(path, path.relative_to(folder).as_posix())  # before what it is taken from goes
     now = _stages(folder)
     for stage in was.keys() - now.keys():
         there.remove(stage)

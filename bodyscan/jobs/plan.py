@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from bodyscan.errors import BodyscanError
-from bodyscan.files.hashing import file_hashes, files_below
-from bodyscan.jobs.job import STAGE, STATE, Job, read_record
+from bodyscan.files.hashing import file_hashes
+from bodyscan.jobs.job import STAGE, STATE, Job, read_record, results_in
 from bodyscan.jobs.stages import Stage
 
 SCHEMA, VERSION = "bodyscan-stage", 1
@@ -36,10 +35,15 @@ class Origin:
 
 @dataclass(frozen=True)
 class Step:
-    """A stage, and why it has to run; "" if its results are up to date."""
+    """What is to be expected of a stage.
+
+    why: it has to run; "" if its results are up to date.
+    certain: False if it depends on what a stage before it will give.
+    """
 
     stage: str
     why: str
+    certain: bool = True
 
 
 def origin_of(job: Job, stage: Stage) -> Origin:
@@ -52,15 +56,26 @@ def plan(job: Job, stages: Sequence[Stage]) -> list[Step]:
     """What a batch would do now, stage by stage."""
     steps: list[Step] = []
     for stage in stages:
-        if steps and steps[-1].why:
-            steps.append(Step(stage.name, f"{steps[-1].stage} runs before it"))
-            continue
         try:
-            why = reason_to_run(job, origin_of(job, stage))
+            again = [step.stage for step in steps if step.why]
+            steps.append(_step(job, origin_of(job, stage), again))
         except (BodyscanError, OSError) as error:
             why = f"its inputs cannot be used as they are: {error}"
-        steps.append(Step(stage.name, why))
+            steps.append(Step(stage.name, why))
     return steps
+
+
+def _step(job: Job, now: Origin, again: Sequence[str]) -> Step:
+    """again: stages that run before; made again, their results are often the same."""
+    read = read_record(job.folder / now.stage / STAGE).get("inputs")
+    was = read if isinstance(read, dict) else {}
+    before = {name.split("/")[0] for name in was}.intersection(again)
+    if not before:
+        return Step(now.stage, reason_to_run(job, now))
+    if why := reason_to_run(job, replace(now, inputs=was)):
+        return Step(now.stage, why)
+    why = f"{', '.join(sorted(before))} runs before it, and may give another result"
+    return Step(now.stage, why, certain=False)
 
 
 def reason_to_run(job: Job, now: Origin) -> str:
@@ -80,16 +95,9 @@ def reason_to_run(job: Job, now: Origin) -> str:
         return f"settings changed: {said}"
     if said := _difference(inputs, now.inputs):
         return f"inputs changed: {said}"
-    if said := _difference(outputs, result_hashes(folder)):
+    if said := _difference(outputs, file_hashes(results_in(folder))):
         return f"its result was changed: {said}"
     return ""
-
-
-def result_hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file in a stage's folder except stage.json, by relative path."""
-    paths = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
-    paths.pop(STAGE, None)
-    return file_hashes(paths)
 
 
 def _difference(was: Mapping[str, str], now: Mapping[str, str]) -> str:

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 from bodyscan.captures.folder import Captures, open_captures, open_scan
 from bodyscan.errors import BadInput, CalibrationFileError, CaptureError
-from bodyscan.files.hashing import files_below
 from bodyscan.jobs.discovery import CALIBRATION, RIG_FILE
-from bodyscan.jobs.job import STAGE, Job
+from bodyscan.jobs.job import Job, results_in
 from bodyscan.progress import Progress, step
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
@@ -145,9 +144,7 @@ def results_of(stage: str) -> Callable[[Job], dict[str, Path]]:
     """Inputs that are the results of an earlier stage."""
 
     def inputs(job: Job) -> dict[str, Path]:
-        folder = job.folder / stage
-        paths = [path for path in files_below(folder) if path.name != STAGE]
-        return {f"{stage}/{path.relative_to(folder).as_posix()}": path for path in paths}
+        return {f"{stage}/{name}": path for name, path in results_in(job.folder / stage).items()}
 
     return inputs
 

@@ -8,16 +8,18 @@ from pathlib import Path
 
 from bodyscan.errors import BadInput, BodyscanError
 from bodyscan.files.hashing import content_hash, file_hash, files_below
-from bodyscan.jobs.job import MANIFEST, read_job, read_record
+from bodyscan.jobs.job import MANIFEST, STAGE, read_job, read_record, results_in
 from bodyscan.jobs.stages import KINDS, Kinds
 
 
 @dataclass(frozen=True)
 class Verification:
-    """files: how many were checked. faults: what has changed, one line each."""
+    """files: how many were checked. faults: what has changed, one line each. added: files among
+    results that no stage wrote."""
 
     files: int
     faults: tuple[str, ...]
+    added: tuple[Path, ...] = ()
 
 
 def verify(folder: Path, kinds: Kinds = KINDS) -> Verification:
@@ -36,7 +38,7 @@ def verify(folder: Path, kinds: Kinds = KINDS) -> Verification:
         files += 1
         if fault:
             faults.append(f"{path}: {fault}")
-    return Verification(files, tuple(faults))
+    return Verification(files, tuple(faults), tuple(_added(folder)))
 
 
 def _all(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
@@ -65,11 +67,14 @@ def _job(folder: Path, kinds: Kinds) -> Iterator[tuple[Path, str]]:
     yield path, "" if content_hash(content) == own else "was changed"
     for name, digest in outputs.items():
         yield _held(folder / name, digest)
-    for stage in {name.split("/")[0] for name in outputs}:
-        for found in files_below(folder / stage):
-            if found.relative_to(folder).as_posix() not in outputs:
-                yield found, "is new: no stage wrote it"
     yield from _inputs(folder, inputs, kinds)
+
+
+def _added(folder: Path) -> Iterator[Path]:
+    """Files that people put among a batch's results, or a job's."""
+    for record in sorted((*folder.glob(f"*/{STAGE}"), *folder.glob(f"*/*/{STAGE}"))):
+        own = {record, *results_in(record.parent).values()}
+        yield from (path for path in files_below(record.parent) if path not in own)
 
 
 def _inputs(folder: Path, inputs: Mapping[str, str], kinds: Kinds) -> Iterator[tuple[Path, str]]:

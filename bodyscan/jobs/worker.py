@@ -26,8 +26,8 @@ from bodyscan.errors import BodyscanError, CaptureError
 from bodyscan.files.atomic import flush, json_text, write_json
 from bodyscan.files.hashing import content_hash, file_hash, file_hashes, files_below
 from bodyscan.files.locking import file_lock, for_owner_only
-from bodyscan.jobs.job import LOCK, MANIFEST, STAGE, Job, read_job
-from bodyscan.jobs.plan import Origin, origin_of, reason_to_run, result_hashes
+from bodyscan.jobs.job import KEPT, LOCK, MANIFEST, STAGE, Job, read_job, results_in
+from bodyscan.jobs.plan import Origin, origin_of, reason_to_run
 from bodyscan.jobs.stages import KINDS, Kinds, Stage, stages_until
 from bodyscan.memory import keep_freed_memory
 from bodyscan.verdict import Verdict
@@ -85,7 +85,7 @@ def become_worker() -> Tell:
 def work(folder: Path, kinds: Kinds, tell: Tell) -> None:
     """Bring a job's results up to date, waiting for anyone else at work on it."""
     with file_lock(folder / LOCK, wait=True):
-        _tidy(folder)
+        _tidy(folder, tell)
         job = read_job(folder)
         every = kinds[job.pipeline.kind]
         stages = stages_until(every, job.until)
@@ -95,7 +95,7 @@ def work(folder: Path, kinds: Kinds, tell: Tell) -> None:
                 tell(stage=stage.name, why=why)
                 _perform(job, stage, now, tell)
         for stage in every[len(stages) :]:
-            _drop_if_stale(job, stage)
+            _drop_if_stale(job, stage, tell)
         _write_manifest(job, every)
 
 
@@ -119,30 +119,59 @@ def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
                 where=str(job.source),
                 remedy="start the batch again when the folder is complete",
             )
-        write_json(made / STAGE, before.record(result_hashes(made)))
+        paths = {path.relative_to(made).as_posix(): path for path in files_below(made)}
+        write_json(made / STAGE, before.record(file_hashes(paths)))
         _flush_all(made)
     except BaseException:
         shutil.rmtree(made, ignore_errors=True)
         raise
-    _put_in_place(made, job.folder / stage.name)
+    _put_in_place(made, job.folder / stage.name, tell)
 
 
-def _put_in_place(made: Path, place: Path) -> None:
+def _put_in_place(made: Path, place: Path, tell: Tell) -> None:
     """Rename; a folder cannot replace another in one step, so the old one is moved aside first."""
+    old = _take_away(place)
+    made.rename(place)
+    flush(place.parent)
+    _remove_results(old, tell)
+
+
+def _take_away(place: Path) -> Path:
     old = place.with_name(f"{_TAKEN_AWAY}{place.name}-{secrets.token_hex(4)}")
     with suppress(FileNotFoundError):
         place.rename(old)
-    made.rename(place)
-    flush(place.parent)
-    _remove(old)
+    return old
 
 
-def _drop_if_stale(job: Job, stage: Stage) -> None:
+def _remove_results(old: Path, tell: Tell) -> None:
+    """Remove what a stage wrote, and its record last, so that this can be cut short at any moment.
+
+    Anything else is a person's, made from the former result: it stays in a folder of its own.
+    """
+    token = old.name.removeprefix(_TAKEN_AWAY)
+    stage = token.rpartition("-")[0]
+    if old.is_dir() and not old.is_symlink():
+        # Without a record (an upload that was cut short) the new result tells what stages write.
+        ours = results_in(old) or results_in(old.with_name(stage))
+        for path in [*files_below(old)]:
+            if path.relative_to(old).as_posix() in ours:
+                path.unlink()
+        (old / STAGE).unlink(missing_ok=True)
+        for folder, *_ in os.walk(old, topdown=False):
+            with suppress(OSError):  # something is left in it
+                os.rmdir(folder)
+    if os.path.lexists(old):
+        kept = old.rename(old.with_name(f"{KEPT}{token}"))
+        print(f"files that were added to {stage} are now in {kept.name}", flush=True)  # the log
+        tell(stage=stage, kept=kept.name)
+
+
+def _drop_if_stale(job: Job, stage: Stage, tell: Tell) -> None:
     """Remove results of a later stage that were made from other results than are there now."""
     folder = job.folder / stage.name
     with suppress(BodyscanError, OSError):
         if folder.exists() and reason_to_run(job, origin_of(job, stage)):
-            _remove(folder)
+            _remove_results(_take_away(folder), tell)
 
 
 def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
@@ -172,10 +201,12 @@ def _write_manifest(job: Job, stages: Sequence[Stage]) -> None:
         write_json(path, content)
 
 
-def _tidy(folder: Path) -> None:
-    """Remove what an earlier process was making when it was killed."""
-    for path in folder.iterdir():
-        if path.name.startswith((_BEING_MADE, _TAKEN_AWAY)) or path.name.endswith(".tmp.json"):
+def _tidy(folder: Path, tell: Tell) -> None:
+    """Remove what an earlier process was making, or taking away, when it was killed."""
+    for path in [*folder.iterdir()]:
+        if path.name.startswith(_TAKEN_AWAY):
+            _remove_results(path, tell)
+        elif path.name.startswith(_BEING_MADE) or path.name.endswith(".tmp.json"):
             _remove(path)
 
 

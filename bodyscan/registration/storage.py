@@ -168,13 +168,19 @@ def load_calibration(path: Path, *, accept_changed: bool = False) -> RigCalibrat
     return calibration
 
 
-def accept_calibration(path: Path) -> Path:
+def accept_calibration(path: Path) -> Path | None:
     """Store an edited calibration as valid, with a note that says so; return the path of its JSON.
 
-    Raises as `load_calibration`, except for the change.
+    None, with nothing written, if it is as it was stored. Raises as `load_calibration`, except for
+    the change.
     """
     folder = path if path.is_dir() else path.parent
     found = load_calibration(folder, accept_changed=True)
+    content = read_json_object(folder / FILE_NAME)
+    with suppress(CalibrationFileError):
+        _refuse_changed(content, folder / FILE_NAME, _arrays_of(folder / FILE_NAME, content))
+        if content["version"] != WITHOUT_HASH:  # which does not tell whether it was edited
+            return None
     return save_calibration(replace(found, notes=(*found.notes, EDITED)), folder)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from bodyscan.jobs.display import ending, json_lines, screen
+from bodyscan.jobs.display import ending, json_lines, lines, screen
 
 EVENTS: list[dict[str, Any]] = [
     {"event": "shares", "workers": 2, "threads": 1, "why": "2 cores"},
@@ -59,6 +59,31 @@ def test_a_reader_that_goes_away_stops_nothing(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(sys, "stdout", Gone())
     with json_lines() as listen:
         listen(EVENTS[0])
+
+
+@pytest.mark.parametrize("show", [lines, screen])
+@pytest.mark.parametrize(
+    ("reasons", "said"),
+    [
+        (
+            ["left out: p1-1, p1-2: lit.png: is no image", "left out: p2-3: dark.png: is missing"],
+            "anna: usable: left out: p1-1, p1-2: lit.png: is no image\n  also left out: p2-3\n",
+        ),
+        (
+            ["two bodies", "left out: p1-1: x: y", "cut off", "left out: p2-3: z"],
+            "anna: usable: two bodies\n  also left out: p1-1, p2-3\n",
+        ),
+        (["two bodies", "cut off"], "anna: usable: two bodies\n"),
+    ],
+)
+def test_a_verdict_names_every_pair_that_was_lost(
+    show: Any, reasons: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    event = {"event": "verdict", "job": "anna", "grade": "usable", "reasons": reasons}
+    with show() as listen:
+        listen(event | {"final": True})
+    told = capsys.readouterr()
+    assert said in told.out + told.err
 
 
 @pytest.mark.parametrize(

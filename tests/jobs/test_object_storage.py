@@ -79,10 +79,13 @@ def test_an_upload_that_was_cut_short_is_made_again(
     batch(tmp_path, "first")
     memory.rm("/day/out/anna/scan/stage.json")
     memory.pipe_file("/day/out/bert/export/body.bin", b"half")
+    memory.pipe_file("/day/out/anna/scan/measurements.json", b"mine")
     again = batch(tmp_path, "again")
     assert again["anna"].stages == ("scan",)
     assert again["bert"].stages == ("export",)
     assert len(memory.cat_file("/day/out/bert/export/body.bin")) > 4
+    (kept,) = memory.glob("/day/out/anna/kept-*/*")  # nothing of what was cut short
+    assert memory.cat_file(kept) == b"mine"
 
 
 def test_names_that_climb_out_are_refused(memory: MemoryFileSystem, tmp_path: Path) -> None:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cheap_job
 import pytest
 from cheap_batch import jobs_of, run_cheap
 
+from bodyscan.files.hashing import files_below
 from bodyscan.jobs.plan import Step, plan
+
+PERHAPS = "scan runs before it, and may give another result"
 
 
 @pytest.fixture
@@ -44,7 +49,7 @@ def test_another_content_counts(day: Path) -> None:
     (day / "scans" / "anna" / "image.txt").write_text("other")
     scan, export = steps(day)
     assert scan == "inputs changed: image.txt has other content"
-    assert export == "scan runs before it"
+    assert export == PERHAPS
 
 
 def test_files_that_come_and_go_count(day: Path) -> None:
@@ -56,7 +61,7 @@ def test_files_that_come_and_go_count(day: Path) -> None:
 def test_settings_count_for_the_stages_that_obey_them(day: Path) -> None:
     assert steps(day, "fusion.points=2000") == [
         "settings changed: fusion.points 1000000 -> 2000",
-        "scan runs before it",
+        PERHAPS,
     ]
     assert steps(day, "export.formats=ply") == [
         "",
@@ -75,6 +80,73 @@ def test_results_that_were_touched_are_made_again(day: Path) -> None:
     assert steps(day)[0] == "its result was changed: 1.bin has other content"
     assert run_cheap(day / "scans", day / "out").endings()["anna"]["stages"] == ["scan"]
     assert steps(day) == ["", ""]
+
+
+def add(day: Path) -> tuple[Path, Path]:
+    """Files of a person's own among Anna's results, one in a folder."""
+    added = (day / "out/anna/scan/measurements.json", day / "out/anna/scan/export/body.ply")
+    for path in added:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    return added
+
+
+def test_files_that_a_person_added_do_not_count(day: Path) -> None:
+    added = add(day)
+    assert steps(day) == ["", ""]
+    assert run_cheap(day / "scans", day / "out").endings()["anna"]["stages"] == []
+    assert all(path.read_text() == "mine" for path in added)
+
+
+def test_files_that_a_person_added_are_kept_when_a_stage_runs_again(day: Path) -> None:
+    added = add(day)
+    (day / "scans" / "anna" / "image.txt").write_text("other")
+    told = run_cheap(day / "scans", day / "out").events
+    (kept,) = (day / "out" / "anna").glob("kept-scan-*")
+    assert {path.relative_to(kept).as_posix() for path in files_below(kept)} == {
+        "measurements.json",
+        "export/body.ply",
+    }
+    assert [event["kept"] for event in told if "kept" in event] == [kept.name]
+    assert not any(path.exists() for path in added)  # they belong to the former result
+    assert steps(day) == ["", ""]
+
+
+def test_files_that_a_person_added_outlive_a_kill(day: Path) -> None:
+    """Between the steps that put a new result in place of the former."""
+    add(day)
+    job = day / "out" / "anna"
+    (job / "scan").rename(job / ".old-scan-0123")
+    assert run_cheap(day / "scans", day / "out").endings()["anna"]["stages"] == ["scan"]
+    assert (job / "kept-scan-0123" / "measurements.json").read_text() == "mine"
+    assert len(list(files_below(job / "kept-scan-0123"))) == 2
+    assert not list(job.glob(".old-*"))
+
+
+def test_a_forecast_is_certain_only_of_what_cannot_turn_out_otherwise(day: Path) -> None:
+    """Bert's scan is made again with the same result, of which his export then is still true."""
+    (day / "out" / "bert" / "scan" / "1.bin").write_bytes(b"x")
+    stages = cheap_job.kinds()["fuse"]
+
+    def forecast(*changes: str) -> list[bool]:
+        _, bert = jobs_of(day / "scans", day / "out", *changes)
+        return [step.certain for step in plan(bert, stages)]
+
+    assert forecast() == [True, False]
+    assert forecast("export.formats=ply") == [True, True]
+    assert run_cheap(day / "scans", day / "out").endings()["bert"]["stages"] == ["scan"]
+    shutil.rmtree(day / "out" / "bert")
+    assert forecast() == [True, True]
+
+
+def test_a_stage_waits_for_those_alone_whose_results_it_reads(day: Path) -> None:
+    scan, export = cheap_job.kinds()["fuse"]
+    beside = replace(export, name="beside", sections=())
+    shutil.copytree(day / "out/anna/export", day / "out/anna/beside")
+    record = day / "out/anna/beside/stage.json"
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"settings": {}}))
+    anna, _ = jobs_of(day / "scans", day / "out", "export.formats=ply")
+    assert [bool(step.why) for step in plan(anna, (scan, export, beside))] == [False, True, False]
 
 
 def test_a_failure_is_told_the_next_time(make_scans: Callable[..., Path], tmp_path: Path) -> None:

@@ -65,16 +65,22 @@ def test_any_byte_that_changed_is_found(day: Path) -> None:
 def test_what_came_and_went_is_found(day: Path) -> None:
     kinds = cheap_job.kinds()
     (day / "out" / "m1" / "scan" / "0.bin").unlink()
-    (day / "out" / "e1" / "export" / "more.bin").write_text("x")
     shutil.rmtree(day / "out" / "m2")
     (day / "scans" / "e1" / "image.txt").unlink()
     faults = "\n".join(verify(day / "out", kinds).faults)
     assert "0.bin: is gone" in faults
-    assert "more.bin: is new" in faults
     assert "m2/manifest.json: is gone" in faults
     assert "e1/image.txt: is gone" in faults
     with pytest.raises(BadInput, match="holds no manifest"):
         verify(day / "scans")
+
+
+def test_what_a_person_added_is_named_and_no_fault(day: Path) -> None:
+    clean = verify(day / "out", cheap_job.kinds())
+    added = day / "out" / "e1" / "export" / "more.bin"
+    added.write_text("x")
+    found = verify(day / "out", cheap_job.kinds())
+    assert (found.files, found.faults, found.added) == (clean.files, (), (added,))
 
 
 def test_forget_removes_a_subject_and_nothing_else(day: Path) -> None:

@@ -244,6 +244,15 @@ def test_an_edit_that_is_meant_is_stored_with_a_note(stored_now: Path, tmp_path:
     assert "edited by hand" in found.notes[-1]
 
 
+def test_a_calibration_that_nobody_edited_stays_as_it_is(stored_now: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(stored_now, tmp_path / "copy")
+    before = {path.name: path.read_bytes() for path in copy.iterdir()}
+    done = run("accept-changed", copy)
+    assert done.exit_code == 0
+    assert "nothing was changed" in done.output
+    assert {path.name: path.read_bytes() for path in copy.iterdir()} == before
+
+
 def test_an_edit_that_cannot_be_right_is_not_accepted(stored_now: Path, tmp_path: Path) -> None:
     content = read(stored_now)
     content["pairs"]["p1-2"]["camera"]["alpha"] *= -1.0

@@ -145,6 +145,7 @@ def test_what_is_done_stays_done_and_its_bytes_are_vouched_for(
     assert "anna: export: up to date" in said
     changed = batch(day, *SMALL, "--set", "fusion.points=30000", "--explain").output
     assert "anna: scan: will run: settings changed: fusion.points 20000 -> 30000" in changed
+    assert "anna: export: may run: scan runs before it, and may give another result" in changed
     assert run("verify", day / "out").exit_code == 0
     path = day / "out" / "anna" / "scan" / "mesh.ply"
     content = path.read_bytes()
