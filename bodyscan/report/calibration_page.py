@@ -103,6 +103,7 @@ def calibration_page(folder: Path) -> Page:
             ("calibration", calibration_id(folder)[:12]),
             ("made by", str(json.loads((folder / FILE_NAME).read_text("utf-8"))["software"])),
         ),
+        calibration.axes,
         sections_of(
             {
                 "The rig": lambda: _rig(calibration),

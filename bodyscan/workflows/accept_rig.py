@@ -84,7 +84,7 @@ def judge_readings(
     notes: list[str] = []
     page_path.unlink(missing_ok=True)  # left by an earlier test
     with optional("report", notes.append):
-        page = acceptance_page(found, readings, calibration.rig.name, origin, synthetic)
+        page = acceptance_page(found, readings, calibration, origin, synthetic)
         write_text(page_path, render(page))
     return Acceptance(
         tuple(found),
