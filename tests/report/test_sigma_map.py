@@ -108,7 +108,9 @@ def test_no_map_is_drawn_of_what_is_not_known() -> None:
     placings, cameras = ring_of_cameras(heights=(400,))
     unknown = PairQuality(None, 0, imported="foreign.yaml")
     calibration = calibrated(placings, cameras, shifts(placings, 0.3), unknown)
-    with pytest.raises(BadInput, match=r"nobody said how exact .* of p1-1, p2-1, p3-1 is") as caught:
+    with pytest.raises(
+        BadInput, match=r"nobody said how exact .* of p1-1, p2-1, p3-1 is"
+    ) as caught:
         draw_sigma_map(calibration)
     assert "--sigma-px" in caught.value.remedy
     one = {"p1-1": placings["p1-1"]}
