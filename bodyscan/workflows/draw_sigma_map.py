@@ -6,10 +6,8 @@ from pathlib import Path
 
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_bytes
-from bodyscan.registration.storage import load_calibration
+from bodyscan.registration.storage import MAP_NAME, load_calibration
 from bodyscan.report.sigma_map import draw_sigma_map as draw
-
-FILE_NAME = "sigma-map.png"
 
 
 def draw_sigma_map(calibration: Path, path: Path | None = None) -> Path:
@@ -18,7 +16,7 @@ def draw_sigma_map(calibration: Path, path: Path | None = None) -> Path:
     Raises BadInput for a path that does not end in .png and where no sigma is known,
     CalibrationFileError.
     """
-    path = path or (calibration if calibration.is_dir() else calibration.parent) / FILE_NAME
+    path = path or (calibration if calibration.is_dir() else calibration.parent) / MAP_NAME
     if path.suffix.lower() != ".png":
         raise BadInput("the map is drawn as PNG", where=str(path), remedy="name it .png")
     write_bytes(path, draw(load_calibration(calibration)))
