@@ -190,7 +190,7 @@ def _choice_lines(calibration: RigCalibration) -> Iterator[str]:
 
 
 def _better(gain: float) -> str:
-    return f"{gain:+.1f} standard errors"
+    return f"{gain:+z.1f} standard errors"
 
 
 def _advice(calibration: RigCalibration) -> Section:
