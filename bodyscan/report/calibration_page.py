@@ -128,13 +128,18 @@ def _rig(calibration: RigCalibration) -> Section:
     source = "the joint solve knows it"
     if calibration.is_import:
         source = "the import says (that of 1 px where it says nothing)"
+    ellipsoids = (
+        f"Ellipsoids: one sigma of each camera's place in the rig frame as {source}, drawn "
+        f"{times:,.0f} times too large. "
+        if len(calibration.pairs) > 1
+        else ""
+    )
     return Section(
         "The rig",
         [
             Viewer(
                 "Cameras in the rig frame",
-                "Pyramids: cameras and what they see. Ellipsoids: one sigma of each camera's place "
-                f"in the rig frame as {source}, drawn {times:,.0f} times too large. "
+                f"Pyramids: cameras and what they see. {ellipsoids}"
                 "Grey: boards as they were held, and the scan volume. Red, green and blue: the rig's "
                 "axes x, y and z.",
                 model,
