@@ -96,5 +96,5 @@ def _require_still(
     raise FailedWork(
         f"what was scanned moved{by} while the pairs saw it: poses fitted to it would be wrong",
         remedy="scan a mannequin or another rigid object that stands still; people are for `scan`, "
-        "which follows them",
+        "which follows them. If it did stand still, a pair has moved: `check-calibration` tells which",
     )
