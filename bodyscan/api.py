@@ -254,9 +254,11 @@ def save_scan(
     """
     from bodyscan.fusion.storage import Origin
     from bodyscan.fusion.storage import save_scan as save
-    from bodyscan.registration.storage import calibration_id
+    from bodyscan.registration.storage import calibration_id, load_calibration
 
-    save(scan, Path(folder), Origin(calibration_id(Path(calibration)), subject, when))
+    stored = Path(calibration)
+    axes = load_calibration(stored).axes
+    save(scan, Path(folder), Origin(calibration_id(stored), subject, when, axes=axes))
     return load_scan(folder)
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.icp import Alignment, align
+from bodyscan.alignment.together import bring_together
 from bodyscan.errors import FailedWork
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
@@ -13,6 +15,7 @@ from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
 
 STILL = AlignmentSettings(sway_mm=0.0, sway_deg=0.0)  # a rigid object
+SCANNED = AlignmentSettings()  # as a person, who may move
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +57,14 @@ def refine_on_object(
     images: Sequence[RangeImage],
     rig_from_camera: Mapping[str, RigidTransform],
     prior: PoseCovariance,
+    poles: Mapping[str, str],
 ) -> ObjectRefinement:
     """Refine the poses of the pairs on an object.
 
     images: of one object that stood still while all pairs scanned it, background removed.
+    poles: the pole of each pair that stands on one.
 
-    Raises FailedWork if no two pairs saw the same part of it.
+    Raises FailedWork if no two pairs saw the same part of it, or if it moved.
     """
     found = align(images, rig_from_camera, prior, STILL)
     if not found.overlaps:
@@ -67,4 +72,29 @@ def refine_on_object(
             "no two pairs see the same part of the object",
             remedy="take a larger object, or put it where the pairs look",
         )
+    _require_still(images, rig_from_camera, prior, poles)
     return ObjectRefinement(found, dict(rig_from_camera) | found.rig_from_camera)
+
+
+def _require_still(
+    images: Sequence[RangeImage],
+    rig_from_camera: Mapping[str, RigidTransform],
+    prior: PoseCovariance,
+    poles: Mapping[str, str],
+) -> None:
+    """Raise FailedWork if a scan of these images would follow a motion.
+
+    Overlaps of what moved come closer too, but by putting the pairs wrong.
+    """
+    aligned = align(images, rig_from_camera, prior, SCANNED)
+    together = bring_together(images, rig_from_camera, aligned, prior, poles, SCANNED)
+    if together.followed is None:
+        return
+    parts = PersonMotion.of(together.followed).parts
+    most = max(parts, key=lambda part: part.moved_mm, default=None)
+    by = f" by up to {most.moved_mm:.1f} mm ({most.name})" if most else ""
+    raise FailedWork(
+        f"what was scanned moved{by} while the pairs saw it: poses fitted to it would be wrong",
+        remedy="scan a mannequin or another rigid object that stands still; people are for `scan`, "
+        "which follows them. If it did stand still, a pair has moved: `check-calibration` tells which",
+    )

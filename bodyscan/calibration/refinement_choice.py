@@ -151,7 +151,7 @@ def _said(trials: Sequence[RefinementTrial]) -> str:
     """Which method was chosen, and by how much each was better than the one before."""
     chosen = next(trial.way for trial in trials if trial.chosen)
     others = "; ".join(
-        f"{trial.way}: {trial.gain:+.1f} standard errors on held-out boards"
+        f"{trial.way}: {trial.gain:+z.1f} standard errors on held-out boards"
         for trial in trials
         if trial.gain is not None
     )

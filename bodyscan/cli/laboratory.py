@@ -156,6 +156,7 @@ def accept(
     out: Annotated[
         Path | None, typer.Option(help="Default: `acceptance` beside the calibration.")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Measure spheres and a plate of known size at several places, and judge the figures."""
     from bodyscan.evaluation.acceptance_file import limit_from, load_acceptance
@@ -163,7 +164,7 @@ def accept(
     from bodyscan.registration.storage import load_calibration
     from bodyscan.report.acceptance_page import NO_STANDARD, screen_table
     from bodyscan.report.page import is_synthetic
-    from bodyscan.workflows.accept_rig import judge_readings, read_captures
+    from bodyscan.workflows.accept_rig import judge_readings, read_captures, refuse_former
 
     captured = [*(spheres or ()), *(plate or ())]
     if bool(captured) == (simulate is not None):
@@ -175,6 +176,8 @@ def accept(
         raise BadInput("no calibration", remedy="give --calibration, what calibrate-rig wrote")
     file = load_acceptance(artefact, dict(limit_from(text) for text in limit or ()))
     place = calibration or (simulate or Path()) / "calibration"
+    folder = out or (place if place.is_dir() else place.parent).parent / "acceptance"
+    refuse_former(folder, overwrite)
     rig = load_calibration(place)
     with output.stages() as progress:
         if simulate is not None:
@@ -182,7 +185,6 @@ def accept(
         else:
             readings = read_captures(rig, spheres or [], plate or [], file, progress)
     synthetic = simulate is not None or any(map(is_synthetic, captured))
-    folder = out or (place if place.is_dir() else place.parent).parent / "acceptance"
     found = judge_readings(readings, file, rig, place, folder, synthetic=synthetic)
     with output.optional("table"):
         output.show(screen_table(found.figures, synthetic))

@@ -6,6 +6,7 @@ stated here; it is not a test by these standards, which require more (artefacts,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import permutations
 
@@ -32,6 +33,12 @@ FACING = 0.8
 TRIES, TRY_POINTS = 600, 3000
 NEAR_PLATE_MM, RIM_MM, CELL_MM = 4.0, 12.0, 10.0
 FEWEST_ON_PLATE = 300
+ROUND, NOISE_SHELL_MM = 0.05, 2.0
+"""A sphere's shell may be so many radii wide, or so many mm, the noise of a poor pair. What is most
+like a sphere on a person has a tenth of a radius."""
+FLAT_MM = 1.2
+"""Points anywhere within NEAR_PLATE_MM of a plane have an RMS of 2.3 mm, and a person's back 2.2: what
+has more than half of that is no plate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +112,31 @@ def read_sphere(points: Array, normals: Array, near: Sphere, radius_mm: float) -
     )
 
 
-def spacing_errors(readings: list[SphereReading], centres_mm: Array) -> Array:
+def require_spheres(readings: Sequence[SphereReading], radius_mm: float, centres_mm: Array) -> None:
+    """Raise FailedWork if what was read in the spheres' place is something else.
+
+    A rig may be so wrong that its spheres are refused here; the error says by how much.
+    """
+    remedy = "does the folder show the artefact, and does ARTEFACT.yaml describe it?"
+    widest = max(ROUND * radius_mm, NOISE_SHELL_MM)
+    for k, one in enumerate(readings, start=1):
+        if one.shell_mm > widest:
+            raise FailedWork(
+                f"sphere {k} of radius {radius_mm:g} mm was not found: what is most like it lies in a "
+                f"shell of {one.shell_mm:.1f} mm, and a sphere within {widest:.1f}",
+                remedy=remedy,
+            )
+    errors = spacing_errors(readings, centres_mm)
+    worst = float(errors[np.argmax(np.abs(errors))]) if len(errors) else 0.0
+    if abs(worst) > radius_mm:
+        raise FailedWork(
+            f"the spheres were not found: two of what is most like them are {abs(worst):.0f} mm too "
+            f"{'far apart' if worst > 0.0 else 'close'}, more than a radius",
+            remedy=remedy,
+        )
+
+
+def spacing_errors(readings: Sequence[SphereReading], centres_mm: Array) -> Array:
     """(K,) mm: distances of the spheres' centres less the calibrated ones, for every two."""
     return pdist(np.stack([one.fitted.centre for one in readings])) - pdist(centres_mm)
 
@@ -133,6 +164,11 @@ def read_plate(points: Array, normals: Array) -> PlateReading:
         raise FailedWork("no plate is among the points")
     normal, offset = best_plane(kept)
     off = kept @ normal - offset
+    if rms(off) > FLAT_MM:
+        raise FailedWork(
+            f"no plate is among the points: what is most like one is {rms(off):.1f} mm RMS off a plane",
+            remedy="does the folder show the plate?",
+        )
     return PlateReading(len(kept), float(np.ptp(_drop_farthest(off))), rms(off), area)
 
 

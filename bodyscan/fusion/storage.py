@@ -27,6 +27,7 @@ from bodyscan.fusion.scan_facts import (
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
 from bodyscan.progress import threaded
+from bodyscan.registration.rig_calibration import FLOOR_AXES
 from bodyscan.verdict import Verdict
 from bodyscan.version import __version__
 
@@ -38,12 +39,16 @@ DERIVED = (
 
 @dataclass(frozen=True)
 class Origin:
-    """Whose scan it is (a pseudonym), when it was taken, and the calibration it was made with."""
+    """Whose scan it is (a pseudonym), when it was taken, and the calibration it was made with.
+
+    axes: where the rig frame lies, in words.
+    """
 
     calibration_id: str
     subject: str | None
     when: datetime | None
     simulated: bool = False
+    axes: str = FLOOR_AXES
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -53,7 +58,7 @@ class Origin:
             "version": VERSION,
             "software": f"bodyscan {__version__}",
             "units": "mm",
-            "axes": "origin on the floor at the rig's centre, x forward, y to the left, z up",
+            "axes": self.axes,
             "subject": self.subject,
             "when": self.when.isoformat() if self.when else None,
             "calibration_id": self.calibration_id,

@@ -160,7 +160,7 @@ def _said(name: str, shape: BoardShape) -> str:
     return (
         f"board {name} is not as described: corners {shape.rms_mm:.3f} mm RMS off, "
         f"{shape.out_of_plane_mm:.2f} mm out of plane, "
-        f"{1e3 * (across - down):+.2f} per mille wider than high (its size as a whole cannot be seen)"
+        f"{1e3 * (across - down):+z.2f} per mille wider than high (its size as a whole cannot be seen)"
     )
 
 

@@ -117,7 +117,7 @@ def _times(board: Board, factor: float) -> Board:
 
 
 def _words(size: Size) -> str:
-    return f"{100.0 * (size.factor - 1.0):+.3f} % (sigma {100.0 * size.sigma:.3f} %)"
+    return f"{100.0 * (size.factor - 1.0):+z.3f} % (sigma {100.0 * size.sigma:.3f} %)"
 
 
 def _refuse(rig: Rig, found: dict[str, Size], size: Size) -> None:

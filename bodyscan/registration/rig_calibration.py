@@ -13,6 +13,8 @@ from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.rig.rig import Rig
 
+FLOOR_AXES = "origin on the floor at the rig's centre, x forward, y to the left, z up"
+
 
 @dataclass(frozen=True, eq=False)
 class SeenCorners:
@@ -52,3 +54,22 @@ class RigCalibration:
     notes: tuple[str, ...]
     advice: tuple[str, ...] = ()
     seen: dict[str, SeenCorners] = field(default_factory=dict)
+
+    @property
+    def is_import(self) -> bool:
+        """Whether all of it was taken from other programs, and no image looked at."""
+        return all(pair.quality.imported for pair in self.pairs.values())
+
+    @property
+    def axes(self) -> str:
+        """Where the rig frame lies, in words."""
+        pair = self.rig.frame_pair
+        if pair is None or pair.nominal is not None:
+            return FLOOR_AXES
+        placed = self.rig_from_camera.get(pair.name, RigidTransform.identity())
+        named = not self.is_import or self.rig.rig_frame.pair is not None
+        if not named and not np.array_equal(placed.matrix, np.eye(4)):
+            return "that of the imported files, wherever it lies"
+        return (
+            f"that of camera {pair.name}: x to the right in its picture, y down, z the way it looks"
+        )

@@ -32,12 +32,16 @@ UNNEEDED = 0.5
 coefficients costs p variances, give or take 2 sqrt(p): 0.9 for three; 24 cameras showed 0.6."""
 
 
+OF_MAKE = "as cameras of its make, though its own boards do not prove it"
+
+
 def lens_notes(trials: Mapping[str, Sequence[LensTrial]]) -> list[str]:
     """One line for each camera that the chapter's lens does not describe."""
     return [
-        f"{name}: lens {chosen.kind}, by {chosen.gain:.0f} standard errors"
-        f"{'' if chosen.gain >= CLEARLY else ', as cameras of its make'}: boards held out fit to "
-        f"{chosen.rms_px:.3f} px with it, {tried[0].rms_px:.3f} with {tried[0].kind}"
+        f"{name}: lens {chosen.kind}, "
+        f"{f'by {chosen.gain:.0f} standard errors' if chosen.gain >= CLEARLY else OF_MAKE}: "
+        f"boards held out fit to {chosen.rms_px:.3f} px with it, {tried[0].rms_px:.3f} with "
+        f"{tried[0].kind}"
         for name, tried in trials.items()
         for chosen in tried
         if chosen.chosen and chosen.gain is not None

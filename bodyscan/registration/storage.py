@@ -45,6 +45,10 @@ MOST_FAULTS = 5  # how many an error lists
 FILE_NAME = "calibration.json"
 HISTORY = "history"
 ARRAYS_NAME = "calibration.npz"
+CORNERS_NAME = "corners.vnl"
+REPORT_NAME, MAP_NAME = "report.html", "sigma-map.png"
+DERIVED = (REPORT_NAME, MAP_NAME)
+"""What is made from a calibration and lies beside it; it goes when the calibration changes."""
 ACCEPT = "if the change is meant, say `bodyscan accept-changed` of its folder"
 CHANGED = f"restore the file from a copy, or calibrate again; {ACCEPT}"
 
@@ -61,7 +65,8 @@ def refuse_existing(folder: Path, overwrite: bool) -> None:
 
 
 def keep_former(folder: Path) -> Path | None:
-    """Copy the calibration in `folder` into its `history/HASH`, before it is replaced.
+    """Copy the calibration in `folder` into its `history/HASH`, before it is replaced; what was made
+    from it moves there.
 
     HASH is the one by which scans refer to it. Returns the copy's folder, None if there is none.
     """
@@ -71,11 +76,16 @@ def keep_former(folder: Path) -> Path | None:
     with suppress(FileNotFoundError):  # without its arrays it is as damaged there as here
         for name in (ARRAYS_NAME, FILE_NAME):  # the JSON, which vouches for both, comes last
             write_bytes(kept / name, read_regular(folder / name))
+    for name in (*DERIVED, CORNERS_NAME):
+        with suppress(FileNotFoundError):
+            (folder / name).replace(kept / name)
     return kept
 
 
 def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
     """Write `calibration.json` and `calibration.npz` into `folder`; return the JSON's path.
+
+    Reports and maps of what was there are removed: they would be taken for the new one's.
 
     Until the JSON is replaced, which is atomic, the calibration that `keep_former` kept is loaded.
     """
@@ -112,6 +122,8 @@ def save_calibration(calibration: RigCalibration, folder: Path) -> Path:
         "advice": calibration.advice,
     }
     plain = json.loads(json_text(content))
+    for name in DERIVED:
+        (folder / name).unlink(missing_ok=True)
     write_json(folder / FILE_NAME, plain | {HASH: content_hash(plain)})
     return folder / FILE_NAME
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from rich.table import Table as ScreenTable
 
 from bodyscan.evaluation.acceptance_readings import ALL, Figure, Readings, grade_acceptance
+from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.page import Column, Lines, Number, Numbers, Page, Section, Table, format_value
 
 NO_STANDARD = (
@@ -31,13 +32,18 @@ def screen_table(found: Sequence[Figure], synthetic: bool) -> ScreenTable:
 
 
 def acceptance_page(
-    found: Sequence[Figure], readings: Readings, rig: str, calibration_id: str, synthetic: bool
+    found: Sequence[Figure],
+    readings: Readings,
+    calibration: RigCalibration,
+    calibration_id: str,
+    synthetic: bool,
 ) -> Page:
     return Page(
-        f"Acceptance of rig {rig}",
+        f"Acceptance of rig {calibration.rig.name}",
         grade_acceptance(found, readings),
         synthetic,
         (("calibration", calibration_id[:12]),),
+        calibration.axes,
         [
             Section("Figures", [_numbers(found)], NO_STANDARD),
             Section("Spheres, all pairs merged", [_spheres(readings), _spacings(readings)]),

@@ -111,7 +111,7 @@ def held_out_chart(calibration: RigCalibration) -> bytes:
     """Mean error on held-out boards of every model tried, by pair; the model used is filled."""
     tried = {n: pair.quality.held_out for n, pair in calibration.pairs.items()}
     models = list(dict.fromkeys(one.model for every in tried.values() for one in every))
-    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, max(len(models), 1)))
+    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, len(models)))
     with style():
         figure, axis = plt.subplots(figsize=(9.6, 3.4), constrained_layout=True)
         for k, (model, colour) in enumerate(zip(models, colours, strict=True)):
@@ -131,8 +131,7 @@ def held_out_chart(calibration: RigCalibration) -> bytes:
             ticks("{x:g}")
         axis.set_ylabel("mean error, mm")
         axis.grid(axis="y", which="both", color=GREY, alpha=0.25, linewidth=0.6)
-        if models:
-            figure.legend(loc="outside right upper", frameon=False)
+        figure.legend(loc="outside right upper", frameon=False)
     return svg(figure)
 
 

@@ -31,11 +31,15 @@ from bodyscan.report.page import (
     sections_of,
 )
 from bodyscan.report.rig_model import rig_model
-from bodyscan.report.sigma_map import draw_sigma_map
+from bodyscan.report.sigma_map import draw_sigma_map, why_no_sigma
 
 NOT_STORED = (
     "This calibration was made before corners were kept with it: calibrate again to see where the "
     "boards lay in each picture and how far their corners are off."
+)
+NO_IMAGES = (
+    "This calibration was imported: no image of a board was looked at. `bodyscan check-calibration` "
+    "tells from a few whether it is right."
 )
 PAIR_COLUMNS = (
     Column("pair"),
@@ -103,6 +107,7 @@ def calibration_page(folder: Path) -> Page:
             ("calibration", calibration_id(folder)[:12]),
             ("made by", str(json.loads((folder / FILE_NAME).read_text("utf-8"))["software"])),
         ),
+        calibration.axes,
         sections_of(
             {
                 "The rig": lambda: _rig(calibration),
@@ -120,13 +125,21 @@ def calibration_page(folder: Path) -> Page:
 
 def _rig(calibration: RigCalibration) -> Section:
     model, times = rig_model(calibration)
+    source = "the joint solve knows it"
+    if calibration.is_import:
+        source = "the import says (that of 1 px where it says nothing)"
+    ellipsoids = (
+        f"Ellipsoids: one sigma of each camera's place in the rig frame as {source}, drawn "
+        f"{times:,.0f} times too large. "
+        if len(calibration.pairs) > 1
+        else ""
+    )
     return Section(
         "The rig",
         [
             Viewer(
                 "Cameras in the rig frame",
-                "Pyramids: cameras and what they see. Ellipsoids: one sigma of each camera's place "
-                f"in the rig frame as the joint solve knows it, drawn {times:,.0f} times too large. "
+                f"Pyramids: cameras and what they see. {ellipsoids}"
                 "Grey: boards as they were held, and the scan volume. Red, green and blue: the rig's "
                 "axes x, y and z.",
                 model,
@@ -182,17 +195,23 @@ def _choice_lines(calibration: RigCalibration) -> Iterator[str]:
 
 
 def _better(gain: float) -> str:
-    return f"{gain:+.1f} standard errors"
+    return f"{gain:+z.1f} standard errors"
 
 
 def _advice(calibration: RigCalibration) -> Section:
-    lines = calibration.advice or ("No advice: a single pair has nothing to be tied to.",)
+    why = (
+        "another program tied the pairs"
+        if calibration.is_import
+        else "a single pair has nothing to be tied to"
+    )
+    lines = calibration.advice or (f"No advice: {why}.",)
     return Section("How well the pairs are tied, and what would help", [Lines(lines)])
 
 
 def _boards(calibration: RigCalibration) -> Section:
     if not calibration.seen:
-        return Section("Boards in the pictures", [Lines((NOT_STORED,))])
+        why = NO_IMAGES if calibration.is_import else NOT_STORED
+        return Section("Boards in the pictures", [Lines((why,))])
     residuals, times = draw.residual_chart(calibration)
     return Section(
         "Boards in the pictures",
@@ -229,16 +248,25 @@ def _planes(calibration: RigCalibration) -> Section:
                 "them, a rotating mirror hardly does. Of bent sheets: their tangent planes.",
                 draw.planes_chart(calibration),
             ),
-            Picture(
-                "Models of the light on held-out boards",
-                "Each model was fitted without a board and tried on it; mean distance from that board "
-                "(mm, outliers capped). Filled: the model in use, the simplest that none after it "
-                "beats by three standard errors at the same points.",
-                draw.held_out_chart(calibration),
-            ),
-            Lines(tuple(_choice_lines(calibration))),
+            *_light_models(calibration),
         ],
     )
+
+
+def _light_models(calibration: RigCalibration) -> list[Block]:
+    """What was tried as a model of the light: nothing, if all of it was imported."""
+    if not any(pair.quality.held_out for pair in calibration.pairs.values()):
+        return [Lines(("No model of the light was tried on held-out boards: it was given.",))]
+    return [
+        Picture(
+            "Models of the light on held-out boards",
+            "Each model was fitted without a board and tried on it; mean distance from that board "
+            "(mm, outliers capped). Filled: the model in use, the simplest that none after it "
+            "beats by three standard errors at the same points.",
+            draw.held_out_chart(calibration),
+        ),
+        Lines(tuple(_choice_lines(calibration))),
+    ]
 
 
 def _view_graph(calibration: RigCalibration) -> Section:
@@ -269,21 +297,19 @@ def _view_graph(calibration: RigCalibration) -> Section:
 
 
 def _sigma(calibration: RigCalibration) -> Section:
-    cameras = {name: pair.camera for name, pair in calibration.pairs.items()}
+    title = "How well each place is known"
+    why = why_no_sigma(calibration)
+    if why is not None:
+        return Section(title, [Lines((f"There is no map: {why[0]}; {why[1]}.",))])
     picture = Picture(
         "Sigma over the scan volume",
         "How far the poses of the pairs alone may put a point wrong (one sigma, all axes together, "
         "mm), in two upright planes through the rig's axis. Stripe noise and the subject's sway are "
-        "not in it. Light grey: no camera sees anything.",
-        draw_sigma_map(
-            calibration.rig.volume,
-            calibration.rig_from_camera,
-            cameras,
-            calibration.covariance,
-            height_px=PICTURE_PX,
-        ),
+        "not in it. Light grey: nothing is measured there (no camera sees it, or a single one "
+        "without a projector).",
+        draw_sigma_map(calibration, height_px=PICTURE_PX),
     )
-    return Section("How well each place is known", [picture])
+    return Section(title, [picture])
 
 
 def _notes(calibration: RigCalibration) -> Section:

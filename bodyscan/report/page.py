@@ -161,6 +161,7 @@ class Page:
 
     synthetic: whether what is reported was simulated.
     facts: what it is, as (name, value).
+    axes: where the rig frame lies, in words.
     subject: pseudonym of the person shown.
     """
 
@@ -168,6 +169,7 @@ class Page:
     verdict: Verdict
     synthetic: bool
     facts: tuple[tuple[str, str], ...]
+    axes: str
     sections: Sequence[Section] = ()
     subject: str | None = None
 

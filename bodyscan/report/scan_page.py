@@ -18,6 +18,7 @@ from bodyscan.fusion.storage import StoredScan, load_scan
 from bodyscan.mesh.holes import holes
 from bodyscan.mesh.regions import covered_shares
 from bodyscan.mesh.topology import topology
+from bodyscan.registration.rig_calibration import FLOOR_AXES
 from bodyscan.report import charts
 from bodyscan.report.body_model import layers, light_mesh, shape_of
 from bodyscan.report.canvas import PICTURE_PX
@@ -68,6 +69,7 @@ def scan_page(folder: Path, other: Path | None = None) -> Page:
             ("made by", str(facts["software"])),
             ("folder", folder.resolve().name),
         ),
+        facts.get("axes", FLOOR_AXES),
         sections,
         subject,
     )

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import cv2
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Indices
+from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.geometry.visibility import in_image
+from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.canvas import (
     BACKGROUND,
     INK,
@@ -38,12 +40,15 @@ def sigma_at(
     rig_from_camera: Mapping[str, RigidTransform],
     cameras: Mapping[str, Camera],
     covariance: PoseCovariance,
+    alone: Collection[str],
 ) -> tuple[Array, Indices]:
     """Sigma (N,) mm at rig points (N, 3), all axes together, and how many pairs see each (N,).
 
+    alone: pairs that measure what no other sees, with their projectors.
+
     A point is the mean of what the pairs that see it measure, so only their common error, and a
     share of their independent errors, remains. Poses alone: no stripe noise, no swaying subject.
-    NaN where no pair sees anything.
+    NaN where nothing is measured: a camera without a projector tells depth only with another.
     """
     seen = np.stack(
         [
@@ -62,25 +67,44 @@ def sigma_at(
     motions = np.einsum("mp,piqj,mq->mij", shares, blocks, shares, optimize=True)
     jacobian = twist_jacobian(points)
     variance = np.einsum("nki,nij,nkj->n", jacobian, motions[which.reshape(-1)], jacobian)
-    return np.where(count > 0, np.sqrt(np.maximum(variance, 0.0)), np.nan), count
+    lit = seen[:, [name in alone for name in covariance.names]].any(axis=1)
+    measured = lit | (count > 1)
+    return np.where(measured, np.sqrt(np.maximum(variance, 0.0)), np.nan), count
 
 
-def draw_sigma_map(
-    volume: Volume,
-    rig_from_camera: Mapping[str, RigidTransform],
-    cameras: Mapping[str, Camera],
-    covariance: PoseCovariance,
-    *,
-    height_px: int = 900,
-) -> bytes:
+def why_no_sigma(calibration: RigCalibration) -> tuple[str, str] | None:
+    """Why a map of `sigma_at` would say nothing, and what to do; None if there is one to draw."""
+    unknown = [name for name, pair in calibration.pairs.items() if pair.quality.unjudged]
+    if unknown:
+        return (
+            f"nobody said how exact the imported calibration of {', '.join(unknown)} is",
+            "if you know it, say it when you import (`import --sigma-px`); to find out, show the rig "
+            "a board (`check-calibration`), or calibrate it with bodyscan (`calibrate-rig`)",
+        )
+    if len(calibration.pairs) == 1:
+        return (
+            "a single pair has no pose that could be wrong: the rig frame is fixed to it",
+            "how exact it measures is told by the report's table of pairs, and by the sigmas of a scan",
+        )
+    return None
+
+
+def draw_sigma_map(calibration: RigCalibration, *, height_px: int = 900) -> bytes:
     """Maps of `sigma_at` in the planes x = 0 (front) and y = 0 (side) on one colour scale, as PNG.
 
-    Light grey where no pair sees anything.
+    Light grey where nothing is measured. Raises BadInput if no sigma is known (`why_no_sigma`).
     """
+    why = why_no_sigma(calibration)
+    if why is not None:
+        raise BadInput(why[0], where=f"rig {calibration.rig.name}", remedy=why[1])
+    volume, placed = calibration.rig.volume, calibration.rig_from_camera
+    cameras = {name: pair.camera for name, pair in calibration.pairs.items()}
+    lit = {name for name, pair in calibration.pairs.items() if pair.sheets is not None}
     maps = {}
     for caption, right in PLANES.items():
         points = plane_points(volume, np.array(right), STEP_MM)
-        sigma, _ = sigma_at(points.reshape(-1, 3), rig_from_camera, cameras, covariance)
+        flat = points.reshape(-1, 3)
+        sigma, _ = sigma_at(flat, placed, cameras, calibration.covariance, lit)
         maps[caption] = sigma.reshape(points.shape[:2])
     known = np.concatenate([values[np.isfinite(values)] for values in maps.values()])
     top = float(np.percentile(known, 98)) if known.size else 1.0

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bodyscan.captures.folder import open_scan
+from bodyscan.errors import BadInput
 from bodyscan.evaluation.acceptance_file import AcceptanceFile
 from bodyscan.evaluation.acceptance_readings import (
     Figure,
@@ -16,6 +17,7 @@ from bodyscan.evaluation.acceptance_readings import (
     grade_acceptance,
 )
 from bodyscan.files.atomic import write_json, write_text
+from bodyscan.files.os_errors import require_writable
 from bodyscan.optional import optional
 from bodyscan.progress import Progress, silent
 from bodyscan.registration.rig_calibration import RigCalibration
@@ -24,6 +26,8 @@ from bodyscan.report.acceptance_page import acceptance_page
 from bodyscan.report.page import render
 from bodyscan.verdict import Verdict
 from bodyscan.workflows.read_artefacts import read_plates, read_spheres
+
+FILE_NAME = "acceptance.json"
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,17 @@ class Acceptance:
     file: Path
     page: Path | None
     notes: tuple[str, ...]
+
+
+def refuse_former(folder: Path, overwrite: bool) -> None:
+    """Raise BadInput if `folder` holds a test that may not be replaced, or cannot be written to."""
+    require_writable(folder)
+    if (folder / FILE_NAME).exists() and not overwrite:
+        raise BadInput(
+            "an acceptance test lies here already",
+            where=str(folder),
+            remedy="give another --out, or say --overwrite",
+        )
 
 
 def read_captures(
@@ -79,12 +94,12 @@ def judge_readings(
     found = figures(readings, file)
     origin = calibration_id(stored)
     content = acceptance_document(readings, found, file, synthetic=synthetic, calibration_id=origin)
-    file_path, page_path = out / "acceptance.json", out / "acceptance.html"
+    file_path, page_path = out / FILE_NAME, out / "acceptance.html"
     write_json(file_path, content)
     notes: list[str] = []
     page_path.unlink(missing_ok=True)  # left by an earlier test
     with optional("report", notes.append):
-        page = acceptance_page(found, readings, calibration.rig.name, origin, synthetic)
+        page = acceptance_page(found, readings, calibration, origin, synthetic)
         write_text(page_path, render(page))
     return Acceptance(
         tuple(found),

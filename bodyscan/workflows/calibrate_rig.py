@@ -34,7 +34,7 @@ from bodyscan.registration.rig_frame import frame_target, refuse_without_frame_s
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.registration.seen_corners import seen_corners
 from bodyscan.registration.soundness import find_faults
-from bodyscan.registration.storage import keep_former, save_calibration
+from bodyscan.registration.storage import CORNERS_NAME, keep_former, save_calibration
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.workflows.decode import Through, decode_on_boards
@@ -85,8 +85,8 @@ def calibrate_folder(
     keep_former(folder)
     save_calibration(found.calibration, folder)
     unsaid: list[str] = []
-    with optional("corners.vnl", unsaid.append):
-        write_found_corners(folder / "corners.vnl", rig, captures, boards.value)
+    with optional(CORNERS_NAME, unsaid.append):
+        write_found_corners(folder / CORNERS_NAME, rig, captures, boards.value)
     with optional("images that are not used", unsaid.append):
         unsaid += filter(None, [describe_unlisted_images(captures)])
     calibration = remarked(found, progress)

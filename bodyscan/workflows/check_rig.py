@@ -117,7 +117,7 @@ def _of_boards(calibration: RigCalibration, check: BoardCheck) -> Findings:
     said += [
         f"projector of {offset.pair} moved against its camera{_or_imported(calibration, offset.pair)}: "
         "the board's surface is measured "
-        f"{offset.offset_mm:+.2f} mm off, tilted by {offset.turned_mm:+.2f} mm at its ends"
+        f"{offset.offset_mm:+z.2f} mm off, tilted by {offset.turned_mm:+z.2f} mm at its ends"
         for offset in check.stripes
         if offset.moved
     ]

@@ -6,21 +6,18 @@ from pathlib import Path
 
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_bytes
-from bodyscan.registration.storage import load_calibration
+from bodyscan.registration.storage import MAP_NAME, load_calibration
 from bodyscan.report.sigma_map import draw_sigma_map as draw
-
-FILE_NAME = "sigma-map.png"
 
 
 def draw_sigma_map(calibration: Path, path: Path | None = None) -> Path:
     """Draw the map and return the picture's path, beside the calibration if no path is given.
 
-    Raises BadInput for a path that does not end in .png, CalibrationFileError.
+    Raises BadInput for a path that does not end in .png and where no sigma is known,
+    CalibrationFileError.
     """
-    path = path or (calibration if calibration.is_dir() else calibration.parent) / FILE_NAME
+    path = path or (calibration if calibration.is_dir() else calibration.parent) / MAP_NAME
     if path.suffix.lower() != ".png":
         raise BadInput("the map is drawn as PNG", where=str(path), remedy="name it .png")
-    rig = load_calibration(calibration)
-    cameras = {name: pair.camera for name, pair in rig.pairs.items()}
-    write_bytes(path, draw(rig.rig.volume, rig.rig_from_camera, cameras, rig.covariance))
+    write_bytes(path, draw(load_calibration(calibration)))
     return path

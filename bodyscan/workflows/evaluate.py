@@ -240,12 +240,12 @@ def _placings(stored: StoredScan, calibration: RigCalibration) -> dict[str, Rigi
 def _girth_figures(girths: GirthErrors) -> str:
     return (
         f"RMS {girths.rms_mm:.2f}, worst {girths.worst_mm:.2f} mm at {girths.worst_at_mm:.0f} mm, "
-        f"{girths.heights} heights; stature {girths.stature_mm:+.2f} mm"
+        f"{girths.heights} heights; stature {girths.stature_mm:+z.2f} mm"
     )
 
 
 def _figures(d: Deviation) -> str:
     return (
-        f"bias {d.bias_mm:+.3f}, median {d.median_mm:.3f}, RMS {d.rms_mm:.3f}, "
+        f"bias {d.bias_mm:+z.3f}, median {d.median_mm:.3f}, RMS {d.rms_mm:.3f}, "
         f"95 % {d.p95_mm:.3f}, worst {d.worst_mm:.2f} mm"
     )

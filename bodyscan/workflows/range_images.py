@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.errors import BodyscanError, ScanFailed, listed
+from bodyscan.errors import BadInput, BodyscanError, ScanFailed, listed
 from bodyscan.fusion.cleaning import cut_to_volume
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent
@@ -19,6 +19,7 @@ from bodyscan.reconstruction.scan_volume import stripes_in_volume
 from bodyscan.reconstruction.sequence_moments import FASTEST_MM_S, MS, sequence_moments
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
+from bodyscan.rig.rig import Rig
 from bodyscan.stripes.one_moment import Moments, StripeMotion
 from bodyscan.stripes.stripe_map import ResponseShare
 from bodyscan.workflows.decode import decode_sequence, one_way_notes, response_notes, responses_in
@@ -81,8 +82,9 @@ def reconstruct_range_images(
     made: range images made already, while other sequences were still arriving.
     volume_only: see `reconstruct_sequence`.
 
-    Raises ScanFailed if no pair gives one.
+    Raises ScanFailed if no pair gives one, BadInput if no pair has a projector.
     """
+    _require_projector(calibration.rig)
     failed = {
         pair.name: calibration.failed.get(pair.name, "is not calibrated")
         for pair in calibration.rig.pairs
@@ -119,6 +121,16 @@ def reconstruct_range_images(
     notes += map(captures.relative, one_way_notes({one: own[-1] for one, own in found.items()}))
     notes += motion_notes(motions, timed=bool(captures.times))
     return Outcome(images, (*notes, *response_notes(responses)), failed)
+
+
+def _require_projector(rig: Rig) -> None:
+    if not any(pair.projector for pair in rig.pairs):
+        raise BadInput(
+            "no pair has a projector, and cameras alone measure no surface here",
+            where=f"rig {rig.name}",
+            remedy="give a pair a `projector` in the rig file and calibrate it; a calibration of "
+            "cameras alone is for other programs (`bodyscan export-rig`)",
+        )
 
 
 def motion_notes(motions: Mapping[str, StripeMotion], *, timed: bool) -> Iterator[str]:

@@ -54,6 +54,7 @@ def read_spheres(
         merged, *single = clouds
         near = artefacts.locate_spheres(merged.points, merged.normals, radius, centres)
         read = [artefacts.read_sphere(merged.points, merged.normals, s, radius) for s in near]
+        artefacts.require_spheres(read, radius, centres)
         rows = [_row(place, shot, ALL, k, one) for k, one in enumerate(read, start=1)]
         for cloud in single:
             rows += _of_one(cloud, place, shot, read, radius)
@@ -107,7 +108,8 @@ def _each_shot(
         try:
             total += read(shot, _clouds(calibration, captures, shot, progress))
         except BodyscanError as error:
-            total += Readings(problems=(f"{place}, {shot}: {error.what}",))
+            said = "; ".join(filter(None, (error.what, error.remedy)))
+            total += Readings(problems=(f"{place}, {shot}: {said}",))
     return total
 
 

@@ -22,13 +22,16 @@ def refine_rig(
     captures: a scan of an object that stood still.
     name: what the calibration's notes call it.
 
-    Raises FailedWork if the overlaps do not come closer, ScanFailed if nothing was scanned.
+    Raises FailedWork if the overlaps do not come closer or the object moved, ScanFailed if nothing
+    was scanned.
     """
     measured = reconstruct_range_images(calibration, captures, progress)
     with step(progress, "aligning"):
         cleaned = clean(measured.value, calibration.rig_from_camera, calibration.rig.volume)
         seen = require_subject(cleaned)
-        found = refine_on_object(seen, calibration.rig_from_camera, calibration.covariance)
+        found = refine_on_object(
+            seen, calibration.rig_from_camera, calibration.covariance, calibration.rig.poles
+        )
     if not found.better:
         raise FailedWork(
             "\n".join(

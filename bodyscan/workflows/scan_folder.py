@@ -53,7 +53,7 @@ def scan_folder(
     nobody = open_scan(described, empty) if empty else None
     reconstructed = preparation.made_of(captures) if preparation else {}
     origin = Origin(
-        calibration_id(calibration), captures.subject, captures.when, captures.simulated
+        calibration_id(calibration), captures.subject, captures.when, captures.simulated, rig.axes
     )
     drawn: list[Future[Pictures]] = []
     with ThreadPoolExecutor(1) as beside:

@@ -6,11 +6,10 @@ from pathlib import Path
 
 from bodyscan.errors import BadInput
 from bodyscan.files.atomic import write_json, write_text
+from bodyscan.registration.storage import REPORT_NAME
 from bodyscan.report.page import render
 from bodyscan.report.result_page import build_page
 from bodyscan.verdict import Verdict
-
-FILE_NAME = "report.html"
 
 
 def write_report(
@@ -25,7 +24,7 @@ def write_report(
     Raises BadInput for anything that is not a result.
     """
     folder = result if result.is_dir() else result.parent
-    path = path or folder / FILE_NAME
+    path = path or folder / REPORT_NAME
     if path.is_dir():
         raise BadInput("is a folder", where=str(path), remedy="give --out the name of a file")
     page = build_page(result, other)

@@ -159,13 +159,13 @@ def test_a_rig_is_refined_on_a_still_object(
     images, truth = scanned
     start = pushed(truth, 0.8, seed=2) | {"unseen": truth["p0"]}
     prior = known_to(start, 0.8, 0.02)
-    refined = refine_on_object(images, start, prior)
+    refined = refine_on_object(images, start, prior, {})
     assert refined.better
     assert disagreement_mm({n: refined.rig_from_camera[n] for n in truth}, truth) < 0.3
     assert refined.rig_from_camera["unseen"] is start["unseen"]
     assert "mm RMS before" in refined.lines[0]
     with pytest.raises(FailedWork, match="no two pairs"):
-        refine_on_object([i for i in images if i.pair in ("p0", "p2")], start, prior)
+        refine_on_object([i for i in images if i.pair in ("p0", "p2")], start, prior, {})
 
 
 @pytest.mark.slow

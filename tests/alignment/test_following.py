@@ -9,7 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from living_body import STANDING, STILL, LivingScan, Motion, cast_living, errors_mm
+from living_body import (
+    STANDING,
+    STILL,
+    LivingScan,
+    Motion,
+    boards,
+    cast_living,
+    errors_mm,
+    images_of,
+)
 from ray_cast_scan import load_rig
 from scipy.spatial import cKDTree
 
@@ -25,27 +34,9 @@ from bodyscan.alignment.following import (
 from bodyscan.alignment.icp import Alignment, align
 from bodyscan.alignment.part_names import PARTS, name_parts
 from bodyscan.arrays import Array
-from bodyscan.geometry.pose_covariance import PoseCovariance
-from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import AlignmentSettings
 
 SCALE = 0.25  # pixels of 4 mm
-
-
-def boards(scan: LivingScan) -> PoseCovariance:
-    """Pairs known to 0.03 mm and 0.002 degrees about the body's middle, each by itself."""
-    carry = np.eye(6)
-    carry[3:, :3] = [[0.0, 900.0, 0.0], [-900.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
-    own = carry @ np.diag([np.radians(0.002) ** 2] * 3 + [0.03**2] * 3) @ carry.T
-    names = tuple(scan.rig_from_camera)
-    return PoseCovariance(names, np.kron(np.eye(len(names)), own).astype(float))
-
-
-def images_of(scan: LivingScan, *, timed: bool = True) -> list[RangeImage]:
-    return [
-        replace(image, time_ms=1e3 * scan.seconds[image.pair] if timed else None)
-        for image in scan.images
-    ]
 
 
 def together(

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from living_body import STANDING, STILL, boards, cast_living, images_of
+from ray_cast_scan import load_rig
 
 from bodyscan.alignment import object_refinement
 from bodyscan.alignment.object_refinement import ObjectRefinement, refine_on_object
@@ -32,14 +34,16 @@ def test_an_object_does_not_sway(monkeypatch: pytest.MonkeyPatch) -> None:
         return alignment(0.2, "overlap")
 
     monkeypatch.setattr(object_refinement, "align", align)
+    still = SimpleNamespace(followed=None)
+    monkeypatch.setattr(object_refinement, "bring_together", lambda *_: still)
     nothing: Any = None
-    found = refine_on_object([], {"a": HERE, "b": HERE}, nothing)
+    found = refine_on_object([], {"a": HERE, "b": HERE}, nothing, {})
     assert found.rig_from_camera == {"a": THERE, "b": HERE}
     # By a ten thousandth of a millimetre at the body's centre, so that matrices have an inverse.
     assert np.abs(SwayPrior.of(asked[0]).of_one()[3:, 3:]).max() < 1e-7
     monkeypatch.setattr(object_refinement, "align", lambda *_: alignment(0.2))
     with pytest.raises(FailedWork, match="no two pairs see the same part"):
-        refine_on_object([], {"a": HERE}, nothing)
+        refine_on_object([], {"a": HERE}, nothing, {})
 
 
 def test_it_is_better_where_overlaps_lie_closer_together() -> None:
@@ -55,3 +59,24 @@ def test_what_it_did_is_said_with_who_moved_farthest_and_who_would_have() -> Non
         "c would have moved by 7.3 sigmas, more than the boards allow: left as is",
     ]
     assert len(ObjectRefinement(alignment(0.2, "o"), {}).lines) == 1
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_who_moved_is_no_object(timed: bool) -> None:
+    """Overlaps of a person come closer too, by moving cameras that stood right."""
+    scan = cast_living(load_rig(), STANDING, seed=2, scale=0.25)
+    images = images_of(scan, timed=timed)
+    with pytest.raises(
+        FailedWork, match=r"moved by up to \d+\.\d mm \(.*\) while the pairs"
+    ) as caught:
+        refine_on_object(images, scan.rig_from_camera, boards(scan), {})
+    assert "stands still" in caught.value.remedy
+
+
+def test_a_mannequin_is_one() -> None:
+    scan = cast_living(load_rig(), STILL, seed=1, scale=0.125)
+    found = refine_on_object(images_of(scan), scan.rig_from_camera, boards(scan), {})
+    assert len(found.alignment.overlaps) > 10
+    for name, placed in found.rig_from_camera.items():
+        # A few of the sigmas, 0.03 mm, to which boards know it.
+        assert placed.translation == pytest.approx(scan.rig_from_camera[name].translation, abs=0.2)

@@ -12,6 +12,7 @@ from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import locate_board
 from bodyscan.outcome import Outcome
+from bodyscan.registration.board_shape import BoardShape, _said
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 
 PLACINGS, CAMERAS = ring_of_cameras(heights=(700, 1200))
@@ -88,3 +89,9 @@ def test_a_flat_board_is_left_alone(
     _, flat = placed
     assert not flat.value.board_shapes
     assert not flat.notes
+
+
+def test_nothing_is_not_said_with_a_minus() -> None:
+    points = np.array([[0.0, 0, 0], [100.0, 0, 0], [0.0, 80, 0], [100.0, 80, 0]])
+    shape = BoardShape(points, points * [-1e-7, 0.0, 0.0])
+    assert " +0.00 per mille wider than high" in _said("b", shape)

@@ -340,6 +340,26 @@ def test_one_that_is_replaced_stays_by_the_hash_that_scans_know(copy: Path) -> N
     assert load_calibration(kept).notes == former.notes
 
 
+@pytest.mark.parametrize("name", ["report.html", "sigma-map.png", "corners.vnl"])
+def test_what_was_made_from_it_goes_with_it(copy: Path, name: str) -> None:
+    (copy / name).write_text("of the former")
+    (copy / "mine.html").write_text("named by the user")
+    kept = keep_former(copy)
+    save_calibration(load_calibration(copy), copy)
+    assert kept is not None
+    assert (kept / name).read_text() == "of the former"
+    assert not (copy / name).exists()
+    assert (copy / "mine.html").exists()
+
+
+def test_a_report_does_not_outlive_an_edit(copy: Path) -> None:
+    for name in ("report.html", "corners.vnl"):
+        (copy / name).write_text("of the former")
+    accept_calibration(copy)
+    assert not (copy / "report.html").exists()
+    assert (copy / "corners.vnl").exists()  # of the images, which are the same
+
+
 def test_a_kill_while_it_is_replaced_leaves_one_of_the_two(
     copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -148,8 +148,8 @@ def test_lenses_other_than_the_chapters_are_told_with_what_speaks_for_them() -> 
     assert lens_notes(trials) == [
         "p: lens brown, by 8 standard errors: boards held out fit to 0.051 px with it, 0.082 with "
         "radial",
-        "r: lens brown, by 3 standard errors, as cameras of its make: boards held out fit to 0.060 "
-        "px with it, 0.061 with radial",
+        "r: lens brown, as cameras of its make, though its own boards do not prove it: boards held out "
+        "fit to 0.060 px with it, 0.061 with radial",
         "s: lens brown, by 3 standard errors: boards held out fit to 0.060 px with it, 0.061 with "
         "radial",
     ]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from ring import ring_of_cameras, ring_rig
 
+from bodyscan.calibration.camera import LensTrial
 from bodyscan.calibration.pair import PairCalibration, PairQuality
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.pose_covariance import PoseCovariance
@@ -18,7 +19,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.rig_calibration import RigCalibration, SeenCorners
 from bodyscan.registration.storage import load_calibration, save_calibration
 from bodyscan.report.calibration_charts import shared_boards
-from bodyscan.report.calibration_page import calibration_page
+from bodyscan.report.calibration_page import _lens_figure, calibration_page
 from bodyscan.report.calibration_verdict import grade_calibration
 from bodyscan.report.page import render
 from bodyscan.report.rig_model import RINGS, SECTORS, rig_model
@@ -144,3 +145,8 @@ def test_a_calibration_of_before_has_a_report_too(
     text = render(calibration_page(tmp_path))
     assert "calibrate again to see where the boards lay" in text
     assert "Sigma over the scan volume" in text
+
+
+def test_a_lens_that_is_no_better_is_not_better_by_minus_nothing() -> None:
+    said = _lens_figure(LensTrial("brown", 0.06, -0.04))
+    assert said == "brown 0.060 px (+0.0 standard errors better)"

@@ -21,6 +21,7 @@ from bodyscan.cli.main import app
 from bodyscan.errors import BadInput, ResultError
 from bodyscan.evaluation.comparison import compare_surfaces
 from bodyscan.files.atomic import write_json
+from bodyscan.fusion.storage import Origin
 from bodyscan.jobs.forgetting import find_subject
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.holes import holes
@@ -266,3 +267,12 @@ def coloured(picture: np.ndarray) -> int:
 def moved(first: np.ndarray, second: np.ndarray) -> int:
     """Pixels that differ visibly."""
     return int(np.count_nonzero(np.abs(first.astype(int) - second).max(axis=-1) > 25))
+
+
+def test_the_footer_says_where_the_rig_frame_lies(tmp_path: Path) -> None:
+    folder = make_scan(tmp_path).folder
+    facts = json.loads((folder / "scan.json").read_text("utf-8"))
+    del facts["sha256"]  # no model, and a quick report
+    for axes in ("origin on the floor", "that of camera L"):
+        write_json(folder / "scan.json", facts | Origin("01", None, None, axes=axes).facts)
+        assert f"Rig frame: {axes}. This" in render(build_page(folder))

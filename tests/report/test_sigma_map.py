@@ -1,16 +1,19 @@
 import cv2
 import numpy as np
 import pytest
-from ring import ring_of_cameras
+from ring import ring_of_cameras, ring_rig
 
+from bodyscan.calibration.pair import PairCalibration, PairQuality
+from bodyscan.errors import BadInput
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.geometry.visibility import in_image
+from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.report.sigma_map import draw_sigma_map, sigma_at
-from bodyscan.rig.rig import Volume
 
+GOOD = PairQuality(0.05, 9)
 MIDDLE = np.array([[0.0, 0.0, 1000.0]])
 
 
@@ -20,9 +23,22 @@ def shifts(names: dict[str, RigidTransform], mm: float) -> PoseCovariance:
     return PoseCovariance(tuple(names), np.kron(np.eye(len(names)), own).astype(float))
 
 
+def calibrated(
+    placings: dict[str, RigidTransform],
+    cameras: dict[str, Camera],
+    covariance: PoseCovariance,
+    quality: PairQuality = GOOD,
+) -> RigCalibration:
+    """Cameras without projectors."""
+    pairs = {
+        name: PairCalibration(name, cameras[name], np.eye(7), None, quality) for name in placings
+    }
+    return RigCalibration(ring_rig(placings), pairs, placings, covariance, {}, {}, ())
+
+
 def test_independent_shifts_average_out() -> None:
     placings, cameras = ring_of_cameras(heights=(1000,))
-    sigma, seen = sigma_at(MIDDLE, placings, cameras, shifts(placings, 0.3))
+    sigma, seen = sigma_at(MIDDLE, placings, cameras, shifts(placings, 0.3), ())
     assert seen[0] == 3
     assert sigma[0] == pytest.approx(0.3 * np.sqrt(3) / np.sqrt(3))  # three axes, three pairs
 
@@ -31,7 +47,7 @@ def test_shifts_in_common_do_not() -> None:
     placings, cameras = ring_of_cameras(heights=(1000,))
     own = np.diag([0.0, 0.0, 0.0, *[0.3**2] * 3])
     together = PoseCovariance(tuple(placings), np.kron(np.ones((3, 3)), own).astype(float))
-    sigma, _ = sigma_at(MIDDLE, placings, cameras, together)
+    sigma, _ = sigma_at(MIDDLE, placings, cameras, together, ())
     assert sigma[0] == pytest.approx(0.3 * np.sqrt(3))
 
 
@@ -43,7 +59,7 @@ def test_sigma_is_that_of_drawn_placings() -> None:
     mixing = rng.normal(size=(36, 36)) / 6.0 * np.tile([1e-4] * 3 + [0.1] * 3, 6)[:, None]
     points = rng.uniform([-300, -300, 700], [300, 300, 1500], (20, 3))
     covariance = PoseCovariance(names, mixing @ mixing.T)
-    sigma, seen = sigma_at(points, placings, cameras, covariance)
+    sigma, seen = sigma_at(points, placings, cameras, covariance, names)
     sights = np.array([in_image(cameras[n], placings[n].inverse().apply(points)) for n in names])
     assert np.array_equal(sights.sum(axis=0), seen)
     squared = np.zeros(len(points))
@@ -63,12 +79,11 @@ def test_sigma_is_that_of_drawn_placings() -> None:
 
 def test_what_no_pair_sees_has_no_sigma() -> None:
     placings, cameras = ring_of_cameras(heights=(400,))
-    sigma, seen = sigma_at(np.array([[0.0, 0.0, 2100.0]]), placings, cameras, shifts(placings, 0.3))
+    own, above = shifts(placings, 0.3), np.array([[0.0, 0.0, 2100.0]])
+    sigma, seen = sigma_at(above, placings, cameras, own, placings)
     assert seen[0] == 0
     assert np.isnan(sigma[0])
-    drawn, again = (
-        draw_sigma_map(Volume(), placings, cameras, shifts(placings, 0.3)) for _ in range(2)
-    )
+    drawn, again = (draw_sigma_map(calibrated(placings, cameras, own)) for _ in range(2))
     assert drawn == again
     picture = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)
     height, width = picture.shape[:2]
@@ -77,6 +92,30 @@ def test_what_no_pair_sees_has_no_sigma() -> None:
     for column in (width // 4 - 50, 3 * width // 4 - 100):
         assert np.ptp(picture[100, column].astype(int)) == 0
         assert np.ptp(picture[700, column].astype(int)) > 50
+
+
+def test_a_camera_measures_depth_only_with_another_or_with_its_projector() -> None:
+    placings, cameras = ring_of_cameras(poles=1, heights=(1000,))
+    own = shifts(placings, 0.3)
+    sigma, seen = sigma_at(MIDDLE, placings, cameras, own, ())
+    assert seen[0] == 1
+    assert np.isnan(sigma[0])
+    sigma, _ = sigma_at(MIDDLE, placings, cameras, own, placings)
+    assert sigma[0] == pytest.approx(0.3 * np.sqrt(3))
+
+
+def test_no_map_is_drawn_of_what_is_not_known() -> None:
+    placings, cameras = ring_of_cameras(heights=(400,))
+    unknown = PairQuality(None, 0, imported="foreign.yaml")
+    calibration = calibrated(placings, cameras, shifts(placings, 0.3), unknown)
+    with pytest.raises(
+        BadInput, match=r"nobody said how exact .* of p1-1, p2-1, p3-1 is"
+    ) as caught:
+        draw_sigma_map(calibration)
+    assert "--sigma-px" in caught.value.remedy
+    one = {"p1-1": placings["p1-1"]}
+    with pytest.raises(BadInput, match="a single pair has no pose that could be wrong"):
+        draw_sigma_map(calibrated(one, cameras, shifts(one, 0.0)))
 
 
 def test_points_that_the_lens_folds_back_are_not_seen() -> None:

@@ -29,6 +29,7 @@ from bodyscan.evaluation.artefacts import (
     locate_spheres,
     read_plate,
     read_sphere,
+    require_spheres,
     spacing_errors,
 )
 from bodyscan.evaluation.spheres import Sphere
@@ -114,6 +115,33 @@ def test_a_missing_sphere_is_said() -> None:
         locate_spheres(points, normals, RADIUS, CENTRES)
 
 
+@pytest.mark.parametrize(
+    ("squeeze", "apart", "said"),
+    [
+        (0.8, 1.0, "sphere 1 of radius 60 mm was not found: .* lies in a shell of"),
+        (1.0, 0.7, "two of what is most like them are 150 mm too close"),
+    ],
+)
+def test_what_is_no_sphere_or_stands_elsewhere_is_not_read(
+    squeeze: float, apart: float, said: str
+) -> None:
+    """A head is an egg. A rig of a wrong size, some hundredths, has its spheres read."""
+    centres = np.array([[0.0, 0.0, 0.0], [500.0, 0.0, 0.0]])
+    read = []
+    for k, centre in enumerate(apart * centres):
+        points, normals = ball(centre, RADIUS, seed=k)
+        points = centre + (points - centre) * [squeeze, 1.0, 1.0]
+        read.append(read_sphere(points, normals, Sphere(centre, RADIUS), RADIUS))
+    with pytest.raises(FailedWork, match=said):
+        require_spheres(read, RADIUS, centres)
+    scaled = [
+        replace(one, fitted=Sphere(1.05 * at, RADIUS))
+        for one, at in zip(read, centres, strict=True)
+    ]
+    require_spheres([replace(one, shell_mm=2.9) for one in scaled], RADIUS, centres)
+    require_spheres([replace(read[0], shell_mm=2.9)], RADIUS, centres[:1])
+
+
 def plate(wave_mm: float = 0.0) -> tuple[Array, Array]:
     """400 x 300 mm, tilted, with a rim that curls up by 3 mm, and clutter beside it."""
     rng = np.random.default_rng(3)
@@ -142,6 +170,8 @@ def test_no_plate_is_said() -> None:
         read_plate(*(part[:100] for part in plate()))
     with pytest.raises(FailedWork, match="no plate"):
         read_plate(*ball(AT, 30.0, 200_000))
+    with pytest.raises(FailedWork, match=r"what is most like one is [12].* mm RMS off a plane"):
+        read_plate(*plate(wave_mm=3.0))
 
 
 def test_artefacts_stand_inside_the_volume_as_they_are_described() -> None:
@@ -225,7 +255,7 @@ def test_a_test_is_written_down_and_the_page_of_an_earlier_one_does_not_stay(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(accept_rig, "calibration_id", lambda stored: "0123")
-    calibration: Any = SimpleNamespace(rig=SimpleNamespace(name="r"))
+    calibration: Any = SimpleNamespace(rig=SimpleNamespace(name="r"), axes="wherever")
     readings = Readings((sphere_row(),), (), ())
     file = load_acceptance(None, {"probing_size_mm": 0.4})
 

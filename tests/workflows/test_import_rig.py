@@ -195,10 +195,14 @@ def test_the_rig_frame_is_as_the_rig_file_says(folder: Path) -> None:
     np.testing.assert_allclose(found["b"].matrix, np.eye(4), atol=1e-12)
     relative = WORLD_FROM["b"].inverse() @ WORLD_FROM["a"]
     np.testing.assert_allclose(found["a"].matrix, relative.matrix, atol=1e-9)
+    assert import_rig(load_rig(folder / "rig.yaml"), folder).axes.startswith(
+        "that of camera b: x to"
+    )
     content = described("a", "b")
     content["pairs"][0]["nominal"] = {"position_mm": [0, 0, 500], "look_at_mm": [100, 0, 500]}
     found = import_rig(load_rig(write_rig_file(folder, content)), folder).rig_from_camera
     np.testing.assert_allclose(found["a"].translation, [0, 0, 500])
+    assert import_rig(load_rig(folder / "rig.yaml"), folder).axes.startswith("origin on the floor")
     board = {"name": "b", "columns": 9, "rows": 6, "square_mm": 10}
     content = described("a", rig_frame={"shot": "floor"}, boards=[board])
     with pytest.raises(BadInput, match="a board is to fix the rig frame"):
@@ -368,6 +372,14 @@ def test_the_command_makes_a_calibration_folder(folder: Path) -> None:
     report = CliRunner().invoke(app, ["report", str(folder / "out")])
     assert report.exit_code == 0, report.output
     assert "not judged" in report.output
+    text = (folder / "out" / "report.html").read_text("utf-8")
+    assert "left out" not in text
+    assert "This calibration was imported: no image of a board was looked at" in text
+    assert "calibrate again" not in text
+    assert "There is no map: nobody said how exact the imported calibration of a is" in text
+    assert "Rig frame: that of the imported files, wherever it lies." in text
+    drawn = CliRunner().invoke(app, ["sigma-map", str(folder / "out")])
+    assert "nobody said how exact" in str(drawn.exception)
     export = ["export-rig", str(folder / "out"), "--out", str(folder / "rig"), "--format", "kalibr"]
     assert "Kalibr has no lens like 'brown'" in str(CliRunner().invoke(app, export).exception)
     export[-1] = "mrcal,aniposelib"

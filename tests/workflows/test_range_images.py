@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 
+from bodyscan.errors import BadInput
 from bodyscan.reconstruction.two_ways import Agreement
 from bodyscan.stripes.one_moment import Moments
 from bodyscan.workflows import range_images
-from bodyscan.workflows.range_images import reconstruct_sequence
+from bodyscan.workflows.range_images import reconstruct_range_images, reconstruct_sequence
 
 
 @dataclass
@@ -58,3 +59,12 @@ def test_motion_that_makes_both_directions_disagree_is_none(
     assert (told is motion) == believed
     assert image.agreement is not None
     assert image.agreement.apart_mm == (moved_mm if believed else 0.9)
+
+
+def test_cameras_alone_are_told_what_they_lack() -> None:
+    rig = SimpleNamespace(name="stereo", pairs=[SimpleNamespace(name="a", projector=None)])
+    calibration: Any = SimpleNamespace(rig=rig, pairs={"a": None}, failed={})
+    captures: Any = SimpleNamespace(sequences=[])
+    with pytest.raises(BadInput, match="rig stereo: no pair has a projector") as caught:
+        reconstruct_range_images(calibration, captures)
+    assert "export-rig" in caught.value.remedy

@@ -98,6 +98,24 @@ def test_spheres_are_accepted_from_captures(
     assert "is no test by these standards" in text
 
 
+def test_a_person_is_taken_for_no_artefact_and_no_test_is_replaced_unasked(
+    workspace: Workspace, tmp_path: Path
+) -> None:
+    person, calibration = workspace.folder / "captures" / "person", workspace.folder / "calibration"
+    result, found = accept(person, calibration, tmp_path, "--plate", person)
+    assert result.exit_code == 1
+    assert not found["spheres"]
+    assert not found["plates"]
+    assert "was not found" in found["problems"][0]
+    assert "does the folder show the plate?" in found["problems"][1]
+    (tmp_path / "acceptance.json").write_text("{}", "utf-8")
+    again, kept = accept(person, calibration, tmp_path)
+    assert getattr(again.exception, "exit_code", None) == 2
+    assert kept == {}
+    assert "--overwrite" in str(again.exception)
+    assert accept(person, calibration, tmp_path, "--overwrite")[1]["problems"]
+
+
 def test_a_calibration_of_the_wrong_size_is_not_accepted(
     workspace: Workspace, spheres: Path, tmp_path: Path
 ) -> None:
