@@ -1,16 +1,13 @@
 """The lens of each camera in a rig of several, chosen after all were solved with the richest one.
 
 So no view is thought wrong because a lens was too simple, and boards found to be bent test the
-lenses in their true shape. Cameras of a rig are usually of one make: what none can prove alone, all
-may prove together.
+lenses in their true shape.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from bodyscan.calibration.board_views import LocatedView, PlanarView
 from bodyscan.calibration.camera import LensTrial
@@ -18,7 +15,6 @@ from bodyscan.calibration.held_out import CLEARLY
 from bodyscan.calibration.lens_choice import ChosenLens, choose_lens
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import family_up_to
-from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform
@@ -27,24 +23,15 @@ from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.rig.pair import AUTO
 from bodyscan.rig.rig import Rig
 
-UNNEEDED = 0.5
-"""Standard errors by which held-out boards fit worse with a decentring that is not there. Noise in p
-coefficients costs p variances, give or take 2 sqrt(p): 0.9 for three; 24 cameras showed 0.6."""
-
-
-OF_MAKE = "as cameras of its make, though its own boards do not prove it"
-
 
 def lens_notes(trials: Mapping[str, Sequence[LensTrial]]) -> list[str]:
-    """One line for each camera that the chapter's lens does not describe."""
+    """One line for each camera that the chapter's lens clearly does not describe."""
     return [
-        f"{name}: lens {chosen.kind}, "
-        f"{f'by {chosen.gain:.0f} standard errors' if chosen.gain >= CLEARLY else OF_MAKE}: "
-        f"boards held out fit to {chosen.rms_px:.3f} px with it, {tried[0].rms_px:.3f} with "
-        f"{tried[0].kind}"
+        f"{name}: lens {chosen.kind}, by {chosen.gain:.0f} standard errors: boards held out fit to "
+        f"{chosen.rms_px:.3f} px with it, {tried[0].rms_px:.3f} with {tried[0].kind}"
         for name, tried in trials.items()
         for chosen in tried
-        if chosen.chosen and chosen.gain is not None
+        if chosen.chosen and chosen.gain is not None and chosen.gain >= CLEARLY
     ]
 
 
@@ -62,7 +49,7 @@ class ChosenLenses:
 
 
 def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolution) -> ChosenLenses:
-    """Choose each camera's lens by held-out boards, its own or those of all cameras of its make.
+    """Choose each camera's lens by its own held-out boards.
 
     A lens that the rig file names stays.
 
@@ -82,8 +69,6 @@ def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolutio
     names = list(looked)
     own = threaded(lambda name: looked[name].choose(kinds[name]), names, stage="choosing lenses")
     chosen = dict(zip(names, own, strict=True))
-    for alike in _of_one_make(looked):
-        chosen |= _choose_together({name: chosen[name] for name in alike}, looked, kinds)
     cameras = {
         name: lens.fit.camera
         for name, lens in chosen.items()
@@ -120,47 +105,3 @@ class _Looked:
 
     def choose(self, kinds: Sequence[type[Lens]]) -> ChosenLens:
         return choose_lens(kinds, self.camera, self.poses, self.views)
-
-
-def _of_one_make(looked: Mapping[str, _Looked]) -> Iterator[list[str]]:
-    """Groups of cameras with images of one size, as far as images show which are of one make."""
-    size = {name: (own.camera.width, own.camera.height) for name, own in looked.items()}
-    for one in sorted(set(size.values())):
-        yield [name for name in looked if size[name] == one]
-
-
-def _choose_together(
-    chosen: Mapping[str, ChosenLens],
-    looked: Mapping[str, _Looked],
-    kinds: Mapping[str, Sequence[type[Lens]]],
-) -> dict[str, ChosenLens]:
-    """The lenses, with Brown's in place of the chapter's where the cameras together call for it.
-
-    A camera's own boards must not clearly speak against it. A decentring too small for one camera to
-    prove is not zero: left out, it hides in the principal point, whose sigma does not account for
-    it. The other terms of a rational lens hide nowhere.
-    """
-    found = dict(chosen)
-    said = {name: _gain(lens, Brown) for name, lens in found.items()}
-    known = [min(gain, CLEARLY) + UNNEEDED for gain in said.values() if gain is not None]
-    if sum(known) < CLEARLY * np.sqrt(max(len(known), 1)):
-        return found
-    for name, gain in said.items():
-        if gain is not None and -CLEARLY < gain < CLEARLY:
-            own = kinds[name]
-            again = looked[name].choose(own[own.index(Brown) :])
-            trials = _with_what_followed(found[name].trials, again)
-            found[name] = replace(again, trials=trials)
-    return found
-
-
-def _gain(lens: ChosenLens, kind: type[Lens]) -> float | None:
-    """Standard errors by which this camera's own boards call for such a lens; None if not tried."""
-    return next((trial.gain for trial in lens.trials if trial.kind == kind.kind), None)
-
-
-def _with_what_followed(trials: Sequence[LensTrial], again: ChosenLens) -> tuple[LensTrial, ...]:
-    """The trials, when a lens first refused was taken after all and richer ones were tried."""
-    *before, refused = trials
-    taken = replace(refused, chosen=again.fit.camera.lens.kind == refused.kind)
-    return (*(replace(trial, chosen=False) for trial in before), taken, *again.trials[1:])

@@ -41,9 +41,7 @@ def views() -> list[BoardView]:
 
 def test_each_camera_gets_its_own_lens_and_no_view_is_lost(views: list[BoardView]) -> None:
     placed, notes, located = solved(ring_rig(PLACINGS), views)
-    assert {n: c.lens.kind for n, c in placed.cameras.items()} == {
-        name: "brown" if name == BENT else "radial" for name in CAMERAS
-    }
+    assert {camera.lens.kind for camera in placed.cameras.values()} == {"brown"}
     assert len(placed.views) == located
     assert next(note for note in notes if "lens" in note).startswith(f"{BENT}: lens brown, by ")
     assert len(notes) == 1
@@ -54,8 +52,8 @@ def test_each_camera_gets_its_own_lens_and_no_view_is_lost(views: list[BoardView
         assert placed.camera_covariances[name].shape == (len(placed.cameras[name].parameters),) * 2
 
 
-def test_what_no_camera_proves_by_itself_all_may_together() -> None:
-    """Decentred by 2e-4 each, 0.06 px at the rim: left out it hides in the principal points."""
+def test_a_decentring_that_no_camera_proves_is_in_the_sigmas() -> None:
+    """Of 2e-4 each, 0.06 px at the rim: left out it hides in the principal points."""
     lens = {name: Brown(-0.1, 0.05, 2e-4 * (-1) ** k, 2e-4, 0.0) for k, name in enumerate(CAMERAS)}
     cameras = {name: replace(camera, lens=lens[name]) for name, camera in CAMERAS.items()}
     placed, notes, _ = solved(
@@ -64,7 +62,7 @@ def test_what_no_camera_proves_by_itself_all_may_together() -> None:
     assert {camera.lens.kind for camera in placed.cameras.values()} == {"brown"}
     gains = {n: next(t.gain for t in tried if t.chosen) for n, tried in placed.lenses.items()}
     assert max(gain for gain in gains.values() if gain is not None) < 3.0
-    assert sum("as cameras of its make" in note for note in notes) == len(CAMERAS)
+    assert not any("lens" in note for note in notes)
     for name, camera in placed.cameras.items():
         off = camera.parameters - cameras[name].parameters
         sigma = np.sqrt(np.diag(placed.camera_covariances[name]))

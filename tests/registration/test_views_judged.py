@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence, Set
-from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,17 +12,12 @@ import pytest
 from bodyscan.boards.view import ViewKey
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.camera import LensTrial
-from bodyscan.calibration.lens_choice import ChosenLens
-from bodyscan.geometry.lenses import family_up_to
-from bodyscan.geometry.lenses.rational import Rational
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration import consistent_solve
 from bodyscan.registration.consistent_solve import ConsistentSolve, solve_consistently
 from bodyscan.registration.inconsistent_views import _wrong_squares, error_limit
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.registration.rig_lenses import (
-    _choose_together,
-    _with_what_followed,
     lens_notes,
 )
 from bodyscan.registration.seen_corners import seen_corners
@@ -137,7 +131,7 @@ def test_a_board_of_the_same_other_size_in_three_shots_has_other_squares() -> No
     assert "1.021 times" in said
 
 
-def test_lenses_other_than_the_chapters_are_told_with_what_speaks_for_them() -> None:
+def test_lenses_that_boards_call_for_are_told_with_what_speaks_for_them() -> None:
     brown = LensTrial("brown", 0.051, 8.4, True)
     trials = {
         "p": (LensTrial("radial", 0.082), brown, LensTrial("rational", 0.051, 0.3)),
@@ -148,28 +142,9 @@ def test_lenses_other_than_the_chapters_are_told_with_what_speaks_for_them() -> 
     assert lens_notes(trials) == [
         "p: lens brown, by 8 standard errors: boards held out fit to 0.051 px with it, 0.082 with "
         "radial",
-        "r: lens brown, as cameras of its make, though its own boards do not prove it: boards held out "
-        "fit to 0.060 px with it, 0.061 with radial",
         "s: lens brown, by 3 standard errors: boards held out fit to 0.060 px with it, 0.061 with "
         "radial",
     ]
-
-
-def test_a_lens_taken_after_all_is_told_with_what_was_tried_after_it() -> None:
-    trials = (LensTrial("radial", 0.061, None, True), LensTrial("brown", 0.060, 2.9))
-    after = (
-        LensTrial("brown", 0.060, None), LensTrial("rational", 0.05, 7.0, True),
-        LensTrial("spline", 0.05, 1.0),
-    )  # fmt: skip
-
-    def told(kind: str, *tried: LensTrial) -> tuple[LensTrial, ...]:
-        fit = SimpleNamespace(camera=SimpleNamespace(lens=SimpleNamespace(kind=kind)))
-        again: Any = SimpleNamespace(fit=fit, trials=tried)
-        return _with_what_followed(trials, again)
-
-    first, second = LensTrial("radial", 0.061), LensTrial("brown", 0.060, 2.9)
-    assert told("rational", *after) == (first, second, after[1], after[2])
-    assert told("brown") == (first, LensTrial("brown", 0.060, 2.9, True))
 
 
 class PinholeOfOne:
@@ -200,46 +175,3 @@ def test_what_a_camera_saw_is_told_corner_by_corner_with_its_targets_number() ->
     np.testing.assert_allclose(found["p"].residuals_px, [[-0.25, 0.5]] * 2, atol=1e-6)
     np.testing.assert_allclose(found["q"].pixels[:3], there + 0.5, rtol=1e-6)
     np.testing.assert_allclose(found["q"].residuals_px[3], 0.0, atol=1e-6)
-
-
-def lens(kind: str, *trials: LensTrial) -> ChosenLens:
-    fit: Any = SimpleNamespace(camera=SimpleNamespace(lens=SimpleNamespace(kind=kind)))
-    rays: Any = None
-    return ChosenLens(fit, trials, rays)
-
-
-@pytest.mark.parametrize(
-    ("gains", "changed"),
-    [
-        # Three standard errors of a sum of four are six, of which four times a half is what a lens
-        # that is not needed costs.
-        ((0.9, 0.9, 0.9, 0.9), ""),
-        ((1.1, 1.1, 1.1, 1.1), "abcd"),
-        ((1.1, 1.1, 1.1, 1.1, None), "abcd"),  # whose lens the rig file names
-        ((2.0, 2.0, 2.9, -0.5), "abcd"),
-        ((2.9, 2.9, 2.9, -3.1), "abc"),  # its own boards clearly speak against it
-        ((9.0, 1.0, 0.5, 0.0), "bcd"),  # one camera counts as its boards prove it, no more
-        ((9.0, 0.5, 0.2, 0.2), ""),
-        ((2.4,), ""),
-    ],
-)
-def test_cameras_of_one_make_get_the_lens_they_call_for_together(
-    gains: tuple[float | None, ...], changed: str
-) -> None:
-    first = LensTrial("radial", 0.06)
-    chosen, looked = {}, {}
-    for name, gain in zip("abcde", gains, strict=False):
-        tried = () if gain is None else (LensTrial("brown", 0.05, gain),)
-        chosen[name] = lens("radial", first, *tried)
-
-        def again(kinds: Sequence[Any]) -> ChosenLens:
-            assert [kind.kind for kind in kinds] == ["brown", "rational"]
-            return lens("brown", LensTrial("brown", 0.05, None, True))
-
-        looked[name] = SimpleNamespace(choose=again)
-    kinds: Any = {name: family_up_to(Rational) for name in chosen}
-    found = _choose_together(chosen, cast(Any, looked), kinds)
-    brown = "".join(name for name, own in found.items() if own.fit.camera.lens.kind == "brown")
-    assert brown == changed
-    for name in changed:
-        assert found[name].trials[1:] == (replace(chosen[name].trials[1], chosen=True),)
