@@ -36,7 +36,7 @@ def refine_rig(
         raise FailedWork(
             "\n".join(
                 [
-                    "the overlaps do not come closer: the calibration is better as it is",
+                    "the overlaps come no closer, or hardly: the calibration is better as it is",
                     *(f"  {line}" for line in found.lines),
                 ]
             )
