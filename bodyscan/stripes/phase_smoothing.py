@@ -17,6 +17,9 @@ WEIGHTS = np.array([[-1, 2, -1], [2, 5, 2], [-1, 2, -1]], np.float32) / np.float
 """Weights of the pixels for the fitted quadratic's value in the middle."""
 
 LEFT = np.float32(np.sqrt(np.sum(np.square(WEIGHTS))))
+ALIKE_PX = 1.2
+"""Within which neighbours share noise afterwards, as `StripeMap.alike_px`: the fit keeps all that
+varies slowly, so a mean of many pixels is as noisy as before, not `LEFT` times that."""
 MAX_STRAY = 4.0
 """Sigmas; where the fit would change s by more there is an edge, not noise: s is kept."""
 

@@ -17,7 +17,7 @@ from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.bit_patterns import read_words
 from bodyscan.stripes.bit_words import GRAY
 from bodyscan.stripes.grey_noise import noise_variance
-from bodyscan.stripes.phase_smoothing import smooth_phase
+from bodyscan.stripes.phase_smoothing import ALIKE_PX, smooth_phase
 from bodyscan.stripes.pixel_stripes import pixel_stripe_map
 from bodyscan.stripes.projector_response import error_of_repeated, share_of_error, without_error
 from bodyscan.stripes.scan_lines import ScanLines, transpose
@@ -67,7 +67,8 @@ def decode_phase(
     s[~usable] = np.nan
     s, sigma = smooth_phase(s, np.where(usable, sigma * period, np.float32(np.nan)))
     found = pixel_stripe_map(images, lit, s, sigma, variance, stripes)
-    return replace(found, response=share_of_error(error, seen, found.sigma))
+    response = share_of_error(error, seen, found.sigma)
+    return replace(found, response=response, alike_px=(ALIKE_PX, ALIKE_PX))
 
 
 def _check_waves(images: ScanLines, waves: Greys, usable: Mask) -> None:

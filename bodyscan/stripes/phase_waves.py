@@ -13,7 +13,7 @@ import numpy as np
 from bodyscan.arrays import Floats, Greys, Mask
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.phase_order import PhaseOrder, phase_order
-from bodyscan.stripes.phase_smoothing import smooth_phase
+from bodyscan.stripes.phase_smoothing import ALIKE_PX, smooth_phase
 from bodyscan.stripes.pixel_stripes import pixel_stripe_map
 from bodyscan.stripes.projector_response import (
     FEWEST_PERIODS,
@@ -83,7 +83,8 @@ def decode_waves(
     s, sigma = smooth_phase(s, sigma)
     light = ScanLines(read.white, read.black, lines[:0], None, turned)
     found = pixel_stripe_map(light, lit, s, sigma, read.variance, stripes)
-    return replace(found, response=share_of_error(read.errors[0], read.finest, found.sigma))
+    response = share_of_error(read.errors[0], read.finest, found.sigma)
+    return replace(found, response=response, alike_px=(ALIKE_PX, ALIKE_PX))
 
 
 @dataclass(frozen=True, eq=False)

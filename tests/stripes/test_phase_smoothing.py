@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
+import pytest
 
-from bodyscan.stripes.phase_smoothing import LEFT, smooth_phase
+from bodyscan.fusion.quadratics import noise_left, window_basis
+from bodyscan.stripes.phase_smoothing import ALIKE_PX, LEFT, smooth_phase
 
 V, U = np.mgrid[:80, :100].astype(np.float32)
 SIGMA = np.full(U.shape, 0.1, np.float32)
@@ -24,6 +27,20 @@ def test_noise_shrinks_as_the_sigma_says() -> None:
     np.testing.assert_allclose(sigma[inner], 0.1 * LEFT, rtol=1e-5)
     assert np.std((s - U)[inner]) < 1.03 * 0.1 * LEFT
     assert 0.7 < LEFT < 0.75
+
+
+@pytest.mark.parametrize("reach", [2, 3, 5])
+def test_a_fit_over_many_pixels_is_nearly_as_noisy_as_before_and_its_sigma_says_so(
+    reach: int,
+) -> None:
+    """Found by the spread of fits to smoothed noise; a triangle of correlation is right to 6 %."""
+    basis = window_basis(reach)
+    weights = np.linalg.solve(basis.T @ basis, basis.T)[0].reshape(2 * reach + 1, -1)
+    noise = np.random.default_rng(5).normal(0.0, 0.1, (600, 600)).astype(np.float32)
+    smooth, sigma = smooth_phase(noise, np.full_like(noise, 0.1))
+    fits = cv2.filter2D(smooth, -1, weights)[9:-9, 9:-9]
+    claimed = sigma[300, 300] * noise_left(reach, (ALIKE_PX, ALIKE_PX)) * np.linalg.norm(weights)
+    assert claimed == pytest.approx(np.std(fits), rel=0.06)
 
 
 def test_what_is_beside_a_gap_or_no_noise_stays_as_it_is() -> None:
