@@ -14,6 +14,7 @@ from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.held_out import CLEARLY, Compared
 from bodyscan.calibration.lens_choice import (
     _HeldOut,
+    _tells_decentring,
     calibrate_with_lenses,
     choose_lens,
     places,
@@ -84,16 +85,21 @@ def test_two_poses_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("gains", "kind", "richest"),
+    ("told", "gains", "kind", "richest"),
     [
-        ([-CLEARLY - 0.1], Radial, Brown),
-        ([-CLEARLY, CLEARLY - 0.1], Brown, Rational),
-        ([CLEARLY, CLEARLY - 0.1], Brown, Rational),
-        ([CLEARLY, CLEARLY], Rational, Rational),
+        (True, [-CLEARLY - 0.1], Radial, Brown),
+        (True, [-CLEARLY, CLEARLY - 0.1], Brown, Rational),
+        (False, [CLEARLY - 0.1], Radial, Brown),
+        (False, [CLEARLY, CLEARLY - 0.1], Brown, Rational),
+        (True, [CLEARLY, CLEARLY], Rational, Rational),
     ],
 )
 def test_lenses_are_tried_until_a_usual_one_is_worse_or_a_richer_one_not_clearly_better(
-    gains: list[float], kind: type[Lens], richest: type[Lens], monkeypatch: pytest.MonkeyPatch
+    told: bool,
+    gains: list[float],
+    kind: type[Lens],
+    richest: type[Lens],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """What the last one tried leaves open says how well pixels are known."""
     fits = {each: SimpleNamespace(camera=SimpleNamespace(lens=each())) for each in FAMILY}
@@ -112,6 +118,7 @@ def test_lenses_are_tried_until_a_usual_one_is_worse_or_a_richer_one_not_clearly
         "places": lambda views: np.arange(4),
         "gain": better,
         "ray_uncertainty": lambda camera, rich, _: (type(camera.lens), type(rich.camera.lens)),
+        "_tells_decentring": lambda fit: told,
     }
     for name, value in instead.items():
         monkeypatch.setattr(lens_choice, name, value)
@@ -164,3 +171,15 @@ def test_a_board_that_moved_by_a_twentieth_of_its_picture_is_elsewhere(
     assert places([views[0], PlanarView("a", points, later + 200.0)]).tolist() == [0, 0], "one shot"
     none_alike = PlanarView("c", points + [0.0, 0.0, 7.0], pixels)
     assert places([views[0], none_alike]).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(("sigma", "told"), [(2.4e-4, True), (2.6e-4, False)])
+@pytest.mark.parametrize("which", [7, 8])
+def test_boards_tell_a_decentring_if_they_know_both_parts_twice_as_well_as_anyone(
+    which: int, sigma: float, told: bool
+) -> None:
+    """Before any image p1 and p2 are known to 5e-4."""
+    sigmas = np.full(10, 1e-4)
+    sigmas[which] = sigma
+    fit: Any = SimpleNamespace(camera=SimpleNamespace(lens=Brown()), covariance=np.diag(sigmas**2))
+    assert _tells_decentring(fit) is told
