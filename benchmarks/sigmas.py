@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import multiprocessing
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.distance import pdist
@@ -20,6 +21,7 @@ from bodyscan.evaluation.surface import signed_distances
 from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.robust import rms
+from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.calibrating import calibrate_ours
 from bodyscan.laboratory.chapter.captures import TARGET, take_captures
@@ -31,6 +33,7 @@ from bodyscan.laboratory.chapter.measuring import (
 from bodyscan.laboratory.chapter.point_sigma import PointSigma, point_sigma
 from bodyscan.laboratory.rivals.targets import by_reference_plane
 from bodyscan.progress import THREADS
+from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.registration.storage import load_calibration
 from bodyscan.simulation.truth import describe_camera
 from bodyscan.workflows.evaluate import compare_rig, load_truth
@@ -98,6 +101,12 @@ the fault that one of them showed was mended:
 | preset | camera centres | beyond three | cloud | beyond three | cloud RMS mm |
 |---|---|---|---|---|---|
 {chr(10).join(_rig_row(*one) for one in found)}
+
+The cameras' rotations, and alpha, beta, gamma, u0, v0, k1, k2:
+
+| preset | rotations | beyond three | parameters | beyond three |
+|---|---|---|---|---|
+{chr(10).join(_camera_row(*one) for one in found)}
 """
 
 
@@ -133,9 +142,12 @@ def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
 
 @dataclass(frozen=True, eq=False)
 class RigErrors:
-    """centres: (P, 3) errors over sigmas. cloud: (N,) likewise. cloud_mm: (N,) errors."""
+    """Errors over sigmas: of camera centres (P, 3), of the cameras' turns about the rig's axes (P, 3),
+    of alpha, beta, gamma, u0, v0, k1, k2 (P, 7), and of the cloud (N,). cloud_mm: (N,) errors."""
 
     centres: Array
+    turns: Array
+    cameras: Array
     cloud: Array
     cloud_mm: Array
 
@@ -154,13 +166,39 @@ def _rig(preset: str, seed: int) -> RigErrors:
     }
     run_commands(commands, workspace)
     truth = load_truth(workspace / "truth")
-    placed = compare_rig(load_calibration(calibration), truth)
+    found = load_calibration(calibration)
+    placed = compare_rig(found, truth)
     assert truth.vertices is not None
     assert truth.faces is not None
     cloud = load_scan(workspace / "scan").cloud
     distances = signed_distances(cloud.points, truth.vertices, truth.faces)
     shutil.rmtree(workspace / "scan")
-    return RigErrors(placed.centres_mm / placed.sigmas_mm, distances / cloud.sigma_mm, distances)
+    names = sorted(found.pairs)
+    return RigErrors(
+        placed.centres_mm / placed.sigmas_mm,
+        np.array([_turned(found, truth.facts["pairs"][name], name) for name in names]),
+        np.array([_camera_off(found, truth.facts["pairs"][name], name) for name in names]),
+        distances / cloud.sigma_mm,
+        distances,
+    )
+
+
+def _turned(found: RigCalibration, true: Mapping[str, Any], name: str) -> Array:
+    """Errors (3,) of a camera's rotation over their sigmas, about the rig's axes."""
+    off = (
+        found.rig_from_camera[name] @ RigidTransform.from_matrix(true["rig_from_camera"]).inverse()
+    )
+    sigmas = np.sqrt(np.diag(found.covariance.of(name))[:3])
+    if not sigmas.any():  # the camera that holds the frame
+        return np.zeros(3)
+    return np.asarray(off.twist[:3] / sigmas)
+
+
+def _camera_off(found: RigCalibration, true: Mapping[str, Any], name: str) -> Array:
+    """Errors (7,) of the parameters that all lenses have, over their sigmas."""
+    pair = found.pairs[name]
+    off = pair.camera.parameters[:7] - from_fields(true["camera"]).parameters[:7]
+    return np.asarray(off / np.sqrt(np.diag(pair.camera_covariance))[:7])
 
 
 def _unit_row(boards: int, light: str, seeds: Sequence[UnitErrors]) -> str:
@@ -201,6 +239,14 @@ def _rig_row(preset: str, seeds: Sequence[RigErrors]) -> str:
         f"| {preset} | {_each(centres)} | {100 * apart:.1f} % | {_each(cloud)} | "
         f"{100 * beyond:.2f} % | {size:.3f} |"
     )
+
+
+def _camera_row(preset: str, seeds: Sequence[RigErrors]) -> str:
+    cells = []
+    for each in ([s.turns for s in seeds], [s.cameras for s in seeds]):
+        apart = 100.0 * np.mean(np.abs(np.concatenate(each)) > 3.0)
+        cells += [_each([rms(one) for one in each]), f"{apart:.1f} %"]
+    return f"| {preset} | {' | '.join(cells)} |"
 
 
 def _each(spreads: Sequence[float]) -> str:
