@@ -188,7 +188,7 @@ def told(**values: list[float]) -> Support:
     count = len(next(iter(values.values())))
     given = {"sigma_mm": 0.0, "weight": 1.0, "shift_mm": 0.0, "spread_mm": 0.0}
     all_ = {name: np.broadcast_to(values.get(name, usual), count) for name, usual in given.items()}
-    return Support(np.zeros(count, np.int64), reach_mm=REACH_MM, **all_)  # type: ignore[arg-type]
+    return Support(np.zeros(count, np.int64), reach_mm=REACH_MM, **all_)
 
 
 def test_noise_allows_for_four_sigmas_off_the_points_and_two_between_their_planes() -> None:

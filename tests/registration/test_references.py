@@ -230,7 +230,7 @@ def test_shots_that_scatter_by_more_than_their_sigmas_make_a_mean_as_uncertain_a
         assert own == pytest.approx(expected / np.sqrt(5.0))
     # The better one counts more, by the square of their sigmas; one alone is as good as it says.
     assert _mean([_Reading(400.0, 0.1), _Reading(400.01, 0.2)])[0] == pytest.approx(400.002)
-    assert _mean([_Reading(400.0, 0.1)]) == (400.0, pytest.approx(0.1))
+    assert _mean([_Reading(400.0, 0.1)]) == pytest.approx((400.0, 0.1))
 
 
 @pytest.mark.parametrize(("sigmas", "refused"), [(3.9, False), (4.1, True)])
@@ -280,7 +280,7 @@ def test_two_cameras_have_to_see_six_corners_of_each_board(
         seen = [view for view in views if view.board == "left"]
     found = find_size(small_rig(bar()), placed(SMALLER), seen)
     assert ("measured in no shot" in found.notes[0]) != measured
-    # From half of its corners, 30 mm off, a middle is reached by the size that the print is said to have.
+    # From half of its corners, 30 mm off, a middle is reached by the size that is told of the print.
     assert found.value.factor == pytest.approx(1.0 / SMALLER if measured else 1.0, abs=3e-4)
 
 

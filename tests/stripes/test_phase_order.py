@@ -136,7 +136,7 @@ def test_one_wave_alone_tells_s_within_its_period() -> None:
 
 @pytest.mark.parametrize("known", [(18.0, 20.0, 23.0), (20.0, 400.0)])
 def test_orders_are_ranked_by_chi_squared_of_the_other_waves(known: tuple[float, ...]) -> None:
-    """All that begin before the last stripe; and how much worse than the true one others are at least."""
+    """All that begin before the last stripe; and by how much others are worse than the true one."""
     rng, periods = np.random.default_rng(4), np.array(known)
     order = np.arange(np.ceil(STRIPES / periods[0]))[:, None]
     turns = rng.random((len(known), 200)).astype(np.float32)

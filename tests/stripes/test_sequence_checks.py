@@ -243,8 +243,8 @@ def test_three_causes_are_named_at_most_the_simplest_first() -> None:
     with pytest.raises(DecodingFailed) as refused_:
         check(words, GRAY, stripes=32)
     assert str(refused_.value).endswith(
-        "it would fit if pattern and inverse of bit 0 were exchanged, or if bits 0 and 1 were exchanged, "
-        "or if bits 0 and 2 were exchanged"
+        "it would fit if pattern and inverse of bit 0 were exchanged, or if bits 0 and 1 were "
+        "exchanged, or if bits 0 and 2 were exchanged"
     )
 
 
