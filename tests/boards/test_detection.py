@@ -150,6 +150,15 @@ def test_a_square_plain_board_is_refused() -> None:
         found(np.zeros((60, 80), np.uint8), PLAIN.model_copy(update={"rows": 10}))
 
 
+@pytest.mark.parametrize(("columns", "rows"), [(9, 3), (3, 9)])
+def test_a_plain_board_with_two_rows_of_corners_is_refused(columns: int, rows: int) -> None:
+    board = PLAIN.model_copy(update={"columns": columns, "rows": rows})
+    with pytest.raises(BadInput, match=f"{columns} columns and {rows} rows cannot be found"):
+        found(np.zeros((60, 80), np.uint8), board)
+    larger = PLAIN.model_copy(update={"columns": max(columns, 4), "rows": max(rows, 4)})
+    assert found(np.zeros((60, 80), np.uint8), larger) == []
+
+
 @pytest.mark.parametrize("back", [False, True])
 @pytest.mark.parametrize("slant_deg", [0, 45, 60])
 def test_a_marked_board_is_found_from_either_face(slant_deg: int, back: bool) -> None:

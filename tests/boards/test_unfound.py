@@ -158,3 +158,14 @@ def test_of_a_checkerboard_that_is_quite_another_its_size_is_told(
 ) -> None:
     board = Board(name="b", kind="checkerboard", columns=9, rows=7, square_mm=30)
     assert describe_unfound(picture, board) == f"no grid of 8 x 6 inner corners{words}"
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(9, 4), (4, 9)])
+def test_of_the_narrowest_checkerboard_that_was_not_found_it_is_said_what_shows(
+    columns: int, rows: int
+) -> None:
+    board = Board(name="b", kind="checkerboard", columns=columns, rows=rows, square_mm=30)
+    words = describe_unfound(checkered(columns + 1, rows), board)
+    assert f"but one of {columns} x {rows - 1}: {columns + 1} columns x {rows} rows" in words
+    nothing = describe_unfound(np.full((240, 320), 90, np.uint8), board)
+    assert nothing.endswith(", nor of one more or fewer either way")
