@@ -24,6 +24,8 @@ SAME_CORNER_SQUARES = 0.15
 leave a few hundredths of a square, mixed-up corners a whole one."""
 MIN_SHARE_OF_CORNERS = 0.8
 MIN_SHARE_TO_GO_ON = 0.4
+FEWEST_SQUARES = 4
+"""either way: OpenCV's quick detectors refuse to look for fewer than three corners."""
 LEAST_BEYOND = 0.5
 """Share of the corners, and of the contrast, that a larger board shows beyond the last ones."""
 ROUNDS = 3
@@ -32,6 +34,7 @@ ROUNDS = 3
 def find_checkerboard(image: Bytes, board: Board) -> SightedCorners | None:
     """All inner corners of a checkerboard seen whole, numbered by the convention above."""
     _refuse_square(board)
+    _refuse_narrow(board)
     for candidate in _candidates(image, board):
         found = _refined(image, board, candidate)
         if found is not None:
@@ -58,6 +61,16 @@ def _refuse_square(board: Board) -> None:
             "by a quarter",
             where=f"board {board.name}",
             remedy="use a board whose columns and rows differ, or a charuco board",
+        )
+
+
+def _refuse_narrow(board: Board) -> None:
+    if min(board.columns, board.rows) < FEWEST_SQUARES:
+        raise BadInput(
+            f"a plain checkerboard of {board.columns} columns and {board.rows} rows cannot be found: "
+            f"it takes {FEWEST_SQUARES} squares either way",
+            where=f"board {board.name}",
+            remedy="use a board with more squares, or a charuco board",
         )
 
 

@@ -17,7 +17,7 @@ from bodyscan.boards.appearance import AS_PRINTED, OTHERWISE, Appearance
 from bodyscan.boards.aprilgrid import BORDER_BITS, place_tags
 from bodyscan.boards.board_layout import marker_corners
 from bodyscan.boards.charuco import Markers, detect_markers, place_markers
-from bodyscan.boards.checkerboard import find_quickly
+from bodyscan.boards.checkerboard import FEWEST_SQUARES, find_quickly
 from bodyscan.rig.board import LARGEST_DICTIONARIES, MARKERS_IN, Board
 
 FEW_MARKERS = 4
@@ -150,7 +150,7 @@ def _describe_grids(image: Bytes, board: Board) -> str:
         if more or taller
     ]
     for columns, rows in dict.fromkeys(sizes):
-        if min(columns, rows) < 3 or (columns, rows) == (board.columns, board.rows):
+        if min(columns, rows) < FEWEST_SQUARES or (columns, rows) == (board.columns, board.rows):
             continue
         other = board.model_copy(update={"columns": columns, "rows": rows})
         if find_quickly(image, other) is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -297,3 +297,35 @@ def test_a_pole_is_set_free_by_centimetres_and_degrees_about_the_body_all_its_pa
     np.testing.assert_allclose(np.diag(own)[:3], np.radians(5.0) ** 2)
     centre = twist_jacobian(BODY_CENTRE[None])[0]
     np.testing.assert_allclose(centre @ own @ centre.T, 30.0**2 * np.eye(3), atol=1e-6)
+
+
+def test_a_step_is_the_shift_of_the_body_s_centre_and_the_turn_against_the_mean_of_the_others() -> (
+    None
+):
+    turn, shift = np.radians([1.0, 2.0, -2.0]), np.array([3.0, 0.0, 4.0])
+    moved = np.r_[turn, shift - np.cross(turn, BODY_CENTRE)]
+    motions = {"p1-1": 0.0 * moved, "p1-2": 0.2 * moved, "p2-1": 1.2 * moved, "p2-2": 1.0 * moved}
+    found = PoleStep.of("pole p2", frozenset(["p2-1", "p2-2"]), motions)
+    assert (found.shift_mm, found.turn_deg) == pytest.approx((5.0, 3.0))
+
+
+def still(names: Sequence[str], every_ms: dict[str, float]) -> StepSearch:
+    """Of a mannequin."""
+    rng = np.random.default_rng(0)
+    twists = {name: 0.1 * rng.standard_normal(6) * [0, 0, 0, 1, 1, 1] for name in names}
+    return find_steps([(twists, {name: every_ms[name] for name in names})], POLES)
+
+
+def test_of_fewer_than_four_pairs_any_may_be_the_one_that_moved() -> None:
+    at = {name: SEQUENCE_MS * k for k, name in enumerate(NAMES)}
+    assert still(["p1-1", "p1-2", "p2-1"], at).least_mm == np.inf
+    assert still(["p1-1", "p1-2", "p2-1", "p2-2"], at).least_mm < 5.0
+
+
+def test_poles_that_fire_two_seconds_apart_tell_nothing_of_each_other_even_of_what_holds_still() -> (
+    None
+):
+    at = {name: 2000.0 * int(POLES[name][1]) for name in NAMES}
+    assert still(NAMES, at).least_mm == np.inf
+    together_ = dict.fromkeys(NAMES, 0.0)
+    assert still(NAMES, together_).least_mm < 5.0

@@ -15,7 +15,8 @@ from bodyscan.arrays import Array, Bytes
 from bodyscan.boards import checkerboard
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.board_map import fit_board_map
-from bodyscan.boards.detection import find_boards
+from bodyscan.boards.corners import SightedCorners
+from bodyscan.boards.detection import _determines_plane, find_boards
 from bodyscan.boards.view import BoardView
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
@@ -149,6 +150,15 @@ def test_a_square_plain_board_is_refused() -> None:
         found(np.zeros((60, 80), np.uint8), PLAIN.model_copy(update={"rows": 10}))
 
 
+@pytest.mark.parametrize(("columns", "rows"), [(9, 3), (3, 9)])
+def test_a_plain_board_with_two_rows_of_corners_is_refused(columns: int, rows: int) -> None:
+    board = PLAIN.model_copy(update={"columns": columns, "rows": rows})
+    with pytest.raises(BadInput, match=f"{columns} columns and {rows} rows cannot be found"):
+        found(np.zeros((60, 80), np.uint8), board)
+    larger = PLAIN.model_copy(update={"columns": max(columns, 4), "rows": max(rows, 4)})
+    assert found(np.zeros((60, 80), np.uint8), larger) == []
+
+
 @pytest.mark.parametrize("back", [False, True])
 @pytest.mark.parametrize("slant_deg", [0, 45, 60])
 def test_a_marked_board_is_found_from_either_face(slant_deg: int, back: bool) -> None:
@@ -187,6 +197,25 @@ def test_a_covered_part_costs_only_the_corners_there() -> None:
 def test_too_little_of_a_board_is_no_view() -> None:
     place = view_of(MARKED, 0, 0, 0, fill=3.0, shift=(700, 400))
     assert found(render([(MARKED, place)]), MARKED) == []
+
+
+@pytest.mark.parametrize(
+    ("corners", "printed", "enough"), [(5, 48, False), (6, 48, True), (3, 4, False), (4, 4, True)]
+)
+def test_six_corners_make_a_view_or_all_of_a_board_that_has_fewer(
+    corners: int, printed: int, enough: bool
+) -> None:
+    ids = np.arange(corners)
+    pixels = 40.0 * np.stack(np.divmod(ids, 2), axis=1)
+    assert _determines_plane(SightedCorners(ids, pixels, printed)) == enough
+
+
+@pytest.mark.parametrize(("aside_px", "enough"), [(0.0, False), (1.5, False), (3.0, True)])
+def test_corners_on_one_line_make_no_view_however_many(aside_px: float, enough: bool) -> None:
+    """All but one on a line askew: that one alone may be off by a pixel or two."""
+    pixels = np.arange(20.0)[:, None] * [30.0, 20.0]
+    pixels[10] += aside_px * np.array([-20.0, 30.0]) / np.hypot(30.0, 20.0)
+    assert _determines_plane(SightedCorners(np.arange(20), pixels, 48)) == enough
 
 
 def test_two_boards_in_one_picture() -> None:

@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from bodyscan.boards.checkerboard import find_checkerboard
-from bodyscan.boards.regions import _strongest_saddles, board_regions, shows_lattice
+from bodyscan.boards.regions import (
+    _like_a_lattice,
+    _strongest_saddles,
+    board_regions,
+    shows_lattice,
+)
 from bodyscan.rig.board import Board
 
 BOARD = Board(name="b", kind="checkerboard", columns=10, rows=7, square_mm=30.0)
@@ -82,6 +87,54 @@ def test_no_more_saddles_are_given_than_asked_for_and_the_clearest_first() -> No
     np.testing.assert_array_equal(few, many[:10])
 
 
+def test_neighbours_are_looked_for_among_more_than_eight_saddles() -> None:
+    rng = np.random.default_rng(0)
+    for count in (0, 1, 8, 9):
+        assert _like_a_lattice(rng.integers(0, 99, (count, 2)), rng.uniform(0.0, 3.0, count)) == 0
+
+
+@pytest.mark.parametrize(("squares", "shown"), [(3, False), (4, True)])
+def test_three_in_ten_of_a_board_s_inner_corners_have_to_look_like_a_lattice(
+    squares: int, shown: bool
+) -> None:
+    """Of 28, the four corners of 3 x 3 squares do, and the nine of 4 x 4."""
+    even = np.add.outer(np.arange(squares), np.arange(squares)) % 2
+    image = np.full((300, 300), 150, np.uint8)
+    image[flat_board(30, 30, squares, squares, 30)] = np.kron(even, np.ones((30, 30))) * 150 + 40
+    assert shows_lattice(image, SIZE) == shown
+
+
+def test_of_four_corners_within_a_board_one_has_to_be_seen() -> None:
+    assert not shows_lattice(np.zeros((48, 64), np.uint8), (4, 4))
+
+
+def test_a_large_board_out_of_focus_shows_its_lattice() -> None:
+    even = np.add.outer(np.arange(7), np.arange(10)) % 2
+    flat = np.pad(np.kron(even, np.ones((100, 100))) * 150.0 + 40.0, 50, constant_values=150.0)
+    assert shows_lattice(grey(flat, blur_px=30.0, noise=1.0), SIZE)
+
+
+def checkers(image: np.ndarray, left: int, top: int, columns: int, rows: int, square: int) -> None:
+    even = np.add.outer(np.arange(rows), np.arange(columns)) % 2
+    part = np.kron(even, np.ones((square, square))) * 150 + 40
+    image[flat_board(left, top, columns, rows, square)] = part
+
+
+def test_corners_far_apart_are_one_board_and_near_ones_beside_others_are_too() -> None:
+    """Squares of 60 px; and of 10 px with something like them 45 px away, at first by itself."""
+    image = np.full((480, 640), 150, np.uint8)
+    checkers(image, 60, 60, 8, 6, 60)
+    (one,) = board_regions(image, 7 * 5)
+    assert one.left < 60 < 540 < one.right
+    assert one.top < 60 < 420 < one.bottom
+    image[:] = 150
+    checkers(image, 100, 100, 12, 9, 10)
+    checkers(image, 265, 100, 5, 9, 10)
+    first, *others = board_regions(image, 11 * 8)
+    assert first.right < 265
+    assert [other.right > 315 for other in others] == [True]
+
+
 def flat_board(left: int, top: int, columns: int, rows: int, square: int) -> tuple[slice, slice]:
     return slice(top, top + rows * square), slice(left, left + columns * square)
 
@@ -105,4 +158,6 @@ def test_regions_hold_boards_with_a_margin_the_larger_first() -> None:
     both = board_regions(image, 45)
     assert len(both) == 2
     assert both[0] == one
-    assert abs(both[1].left - (500 - 12 - 20)) <= 3
+    expected = (500 - 12 - 20, 350 - 9 - 20, 580 + 12 + 20, 410 + 9 + 20)
+    found_ = np.array([both[1].left, both[1].top, both[1].right, both[1].bottom])
+    assert np.abs(found_ - expected).max() <= 3

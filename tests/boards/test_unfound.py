@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bodyscan.arrays import Array
+from bodyscan.arrays import Array, Bytes
 from bodyscan.boards import unfound
 from bodyscan.boards.appearance import AS_PRINTED, Appearance
 from bodyscan.boards.board_layout import marker_corners
@@ -18,6 +18,13 @@ from bodyscan.rig.board import Board
 
 BOARD = Board(name="b", kind="charuco", columns=9, rows=8, square_mm=50, marker_mm=40)
 NOTHING = np.zeros((4, 4), np.uint8)
+
+
+def checkered(columns: int, rows: int) -> Bytes:
+    """Squares of 24 px, straight on."""
+    row, column = np.indices((rows, columns))
+    squares = np.kron(((row + column) % 2).astype(np.uint8), np.full((24, 24), 200, np.uint8))
+    return np.asarray(cv2.GaussianBlur(np.pad(squares, 40, constant_values=200), (0, 0), 0.9))
 
 
 def image_of(points: Array) -> Array:
@@ -38,14 +45,19 @@ def changed(**keys: Any) -> Board:
     return BOARD.model_copy(update=keys)
 
 
-def said(markers: Markers, monkeypatch: pytest.MonkeyPatch, seen: Appearance = AS_PRINTED) -> str:
+def said(
+    markers: Markers,
+    monkeypatch: pytest.MonkeyPatch,
+    seen: Appearance = AS_PRINTED,
+    board: Board = BOARD,
+) -> str:
     """Of markers that show in one appearance alone."""
     none = Markers(np.zeros(0, np.int64), np.zeros((0, 4, 2)))
     monkeypatch.setattr(
         unfound, "_markers", lambda image, board, how: markers if how == seen else none
     )
     monkeypatch.setattr(unfound, "_other_dictionaries", lambda image, board: ", but others")
-    return describe_unfound(NOTHING, BOARD)
+    return describe_unfound(NOTHING, board)
 
 
 def test_how_large_markers_are_is_told_by_their_middles() -> None:
@@ -109,10 +121,51 @@ def test_a_checkerboard_of_one_line_more_or_fewer_either_way_is_named(
     columns: int, rows: int
 ) -> None:
     board = Board(name="b", kind="checkerboard", columns=9, rows=7, square_mm=30)
-    row, column = np.indices((rows, columns))
-    squares = np.kron(((row + column) % 2).astype(np.uint8), np.full((24, 24), 200, np.uint8))
-    picture = cv2.GaussianBlur(np.pad(squares, 40, constant_values=200), (0, 0), 0.9)
-    assert describe_unfound(picture, board) == (
+    assert describe_unfound(checkered(columns, rows), board) == (
         f"no grid of 8 x 6 inner corners, but one of {columns - 1} x {rows - 1}: {columns} columns x "
         f"{rows} rows of squares"
     )
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(9, 3), (3, 9)])
+def test_a_board_of_three_rows_or_columns_is_named_as_it_is(
+    columns: int, rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A rig file may describe such boards: the smallest on which markers lie as they were seen."""
+    monkeypatch.setattr(unfound, "OTHER_SIZES", (-1, 1))
+    seen, described = changed(columns=columns, rows=rows), changed(columns=columns + 1, rows=rows)
+    words = said(shown(seen), monkeypatch, board=described)
+    assert f"as on a board of {columns} columns x {rows} rows, not {columns + 1} x {rows}" in words
+
+
+def test_a_board_may_have_the_last_marker_of_its_dictionary(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    board = changed(dictionary="DICT_4X4_50", first_marker=50 - 36)
+    assert board.marker_count == 36
+    assert "with too few corners" in said(shown(board), monkeypatch, board=board)
+
+
+@pytest.mark.parametrize(
+    ("picture", "words"),
+    [
+        (checkered(11, 9), "; the largest found has 10 x 8"),
+        (np.full((240, 320), 90, np.uint8), ", nor of one more or fewer either way"),
+    ],
+)
+def test_of_a_checkerboard_that_is_quite_another_its_size_is_told(
+    picture: np.ndarray, words: str
+) -> None:
+    board = Board(name="b", kind="checkerboard", columns=9, rows=7, square_mm=30)
+    assert describe_unfound(picture, board) == f"no grid of 8 x 6 inner corners{words}"
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(9, 4), (4, 9)])
+def test_of_the_narrowest_checkerboard_that_was_not_found_it_is_said_what_shows(
+    columns: int, rows: int
+) -> None:
+    board = Board(name="b", kind="checkerboard", columns=columns, rows=rows, square_mm=30)
+    words = describe_unfound(checkered(columns + 1, rows), board)
+    assert f"but one of {columns} x {rows - 1}: {columns + 1} columns x {rows} rows" in words
+    nothing = describe_unfound(np.full((240, 320), 90, np.uint8), board)
+    assert nothing.endswith(", nor of one more or fewer either way")

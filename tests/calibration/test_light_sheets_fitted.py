@@ -16,11 +16,12 @@ from lit_boards import (
     body_scene,
     chapter_scene,
 )
-from sheet_models import PINHOLE
+from sheet_models import MATRIX, MIDDLE, PINHOLE
 
 from bodyscan.arrays import Array
 from bodyscan.calibration.boundary_points import BoundaryPoints, concatenate, select
-from bodyscan.calibration.light_sheets import SheetsFit, fit_light_sheets
+from bodyscan.calibration.light_sheets import SheetsFit, count_boards, fit_light_sheets
+from bodyscan.calibration.sheet_fit import _blocks, fit_sheets
 from bodyscan.errors import PairFailed
 from bodyscan.geometry.lens_sheets import LensSheets
 from bodyscan.geometry.light_planes import LightPlanes
@@ -250,3 +251,76 @@ def test_boundaries_between_two_stripes_count_and_not_those_at_the_pictures_ends
 
     assert count(LightPlanes(planes, np.zeros((11, 4, 4)), "vertical")) == 3
     assert count(PINHOLE) == 4
+
+
+def test_a_boundary_is_counted_once_on_each_board_that_shows_it() -> None:
+    index, board = np.array([0, 0, 1, 3, 3, 3, 3]), np.array([0, 1, 1, 0, 2, 2, 0])
+    nowhere = np.zeros((7, 3))
+    data = BoundaryPoints(index, board, nowhere, nowhere, np.ones(7))
+    assert count_boards(data, 4).tolist() == [2, 1, 0, 2, 0]
+    assert count_boards(select(data, index > 5), 4).tolist() == [0] * 5
+
+
+def beside_sheets(aside_mm: Array, sigma_px: float) -> BoundaryPoints:
+    """Points so far beside the planes that a pinhole's 2 x 4 matrix makes of stripes; a pixel is half
+    a millimetre, at right angles to them."""
+    points = MIDDLE + np.random.default_rng(0).uniform(-250.0, 250.0, (len(aside_mm), 3))
+    above, below = MATRIX @ np.column_stack([points, np.ones(len(points))]).T
+    index = np.rint(above / below).astype(np.int64)
+    planes = MATRIX[0] - index[:, None] * MATRIX[1]
+    planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+    normals = planes[:, :3]
+    off = np.sum(points * normals, axis=1) + planes[:, 3]
+    points = points + (aside_mm - off)[:, None] * normals
+    board, sigma = np.zeros(len(points), np.int64), np.full(len(points), sigma_px)
+    return BoundaryPoints(index, board, points, 0.5 * normals, sigma)
+
+
+def test_how_far_points_lie_from_fitted_sheets_is_told_in_millimetres() -> None:
+    aside = 0.1 * np.random.default_rng(1).choice([-1.0, 1.0], 2000)
+    fit = fit_sheets(PINHOLE, beside_sheets(aside, 0.2))
+    # Eight unknowns take a fifteenth of what 2000 points err by.
+    np.testing.assert_allclose(np.abs(fit.distances_mm), 0.1, atol=0.02)
+    assert fit.rms_mm == pytest.approx(0.1, rel=0.02)
+
+
+def test_fitted_sheets_are_as_uncertain_as_the_points_make_them() -> None:
+    """In 40 draws, five of their unknowns and more are told by the points alone."""
+    rng, exact = np.random.default_rng(2), beside_sheets(np.zeros(300), 0.2)
+    some, pulls = exact.points[::10], []
+    rays, s = some / some[:, 2:], exact.index[::10].astype(float)
+    for _ in range(40):
+        fit = fit_sheets(PINHOLE, beside_sheets(rng.normal(0.0, 0.1, 300), 0.2))
+        off = fit.sheets.depth(rays, s) - some[:, 2]
+        pulls.append(np.mean(off**2 / fit.sheets.variance_mm2(rays, s)))
+    # 40 draws of some five numbers: 1 +- 0.05.
+    assert np.sqrt(np.mean(pulls)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_sheets_that_leave_points_behind_the_projector_fit_none() -> None:
+    """The planes go on there, the light does not."""
+    data = beside_sheets(np.zeros(20), 0.2)
+    centre = PINHOLE.projector_from_camera.inverse().translation
+    np.testing.assert_allclose(MATRIX @ [*centre, 1.0], 0.0, atol=1e-6)
+    points = data.points.copy()
+    points[::4] = 2.0 * centre - points[::4]
+    found = _blocks(PINHOLE, replace(data, points=points))[0].residuals
+    behind = np.arange(20) % 4 == 0
+    assert np.isnan(found[behind]).all()
+    np.testing.assert_allclose(found[~behind], 0.0, atol=1e-6)
+
+
+def test_no_point_counts_for_more_than_a_fiftieth_of_a_pixel() -> None:
+    """However many pixels were averaged, cameras and boards are not known better."""
+    exact, coarse = (_blocks(PINHOLE, beside_sheets(np.zeros(20), px))[0] for px in (0.0, 0.15))
+    ratio = np.asarray(exact.sigma) / np.asarray(coarse.sigma)
+    np.testing.assert_allclose(ratio, 0.02 / np.hypot(0.02, 0.15))
+
+
+def test_fifty_points_on_two_boards_are_enough() -> None:
+    scene = body_scene(-0.035)
+    data = boards(scene, BODY_POSES[1:3])
+    some = np.linspace(0, len(data.index) - 1, 50).astype(int)
+    fitted(scene, select(data, some))
+    with pytest.raises(PairFailed, match="49 points of stripe boundaries on 2 boards are too few"):
+        fitted(scene, select(data, some[1:]))

@@ -105,7 +105,7 @@ K1 = CHOSEN.parameter_names.index("k1")
 OFF = 1e-3
 
 
-def told_by(richest: Camera, sigma_k1: float = 0.0) -> RayUncertainty:
+def told_by(richest: Camera, sigma_k1: float = 0.0, chosen: Camera = CHOSEN) -> RayUncertainty:
     """Of boards in two places, from a camera with such a lens of which k1 alone is open."""
     turns = ([0.3, 0.2, 0.0], [-0.2, 0.4, 0.1])
     poses = tuple(
@@ -116,7 +116,7 @@ def told_by(richest: Camera, sigma_k1: float = 0.0) -> RayUncertainty:
     covariance[K1, K1] = sigma_k1**2
     fit: Any = SimpleNamespace(camera=richest, poses=poses, covariance=covariance)
     views = [PlanarView(f"s{k}", POINTS, POINTS[:, :2]) for k in range(2)]
-    return ray_uncertainty(CHOSEN, fit, views)
+    return ray_uncertainty(chosen, fit, views)
 
 
 def test_how_far_another_lens_shows_rays_elsewhere_is_told_but_for_a_motion_of_the_camera() -> None:
@@ -157,3 +157,19 @@ def test_a_sigma_of_a_coefficient_is_as_large_as_a_lens_that_differs_by_it() -> 
     )
     assert not by_lens.noise_px.any()
     assert not by_noise.lens_px.any()
+
+
+def test_where_a_lens_folds_rays_are_as_uncertain_as_the_worst_that_it_has() -> None:
+    """r (1 - r^2 / 2) is 0.54 at most, less than the picture's corners are from its middle."""
+    folding = Camera(FOCAL, FOCAL, 0.0, 645.0, 508.0, Radial(-0.5, 0.0), WIDTH, HEIGHT)
+    found = told_by(folding.moved(1e-5 * np.eye(7)[K1]), 1e-5, folding)
+    pixels = nodes(WIDTH, HEIGHT)
+    away = np.linalg.norm((pixels - [645.0, 508.0]) / FOCAL, axis=-1)
+    folds = away > np.sqrt(2.0 / 3.0) * 2.0 / 3.0
+    assert folds[0, 0]
+    assert folds.mean() < 0.2
+    for told in (found.noise_px, found.lens_px):
+        worst = told[~folds].max()
+        assert 0.0 < worst < 0.1
+        np.testing.assert_array_equal(told[folds], worst)
+        assert np.median(told[~folds]) < 0.5 * worst

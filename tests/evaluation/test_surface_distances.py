@@ -79,6 +79,61 @@ def test_points_on_one_side_of_a_round_surface_are_laid_onto_its_faces() -> None
     assert np.abs(away.mean(axis=0)).max() < 0.005  # 0.135 by the corners
 
 
+def uneven_body() -> tuple[np.ndarray, np.ndarray]:
+    """No motion brings it onto itself, and its box's middle is not that of its vertices."""
+    ball = o3d.geometry.TriangleMesh.create_sphere(1.0, 40)
+    vertices = np.asarray(ball.vertices) * [60.0, 80.0, 130.0]
+    vertices[:, 0] *= np.where(vertices[:, 0] > 0.0, 1.8, 1.0)
+    vertices[:, 2] *= np.where(vertices[:, 2] > 0.0, 1.5, 1.0)
+    return vertices + [300.0, 100.0, 900.0], np.asarray(ball.triangles).astype(np.int64)
+
+
+def test_a_scan_that_stands_centimetres_off_is_laid_onto_the_surface() -> None:
+    """By 25 mm and five degrees: two scans of somebody who stepped off and on again."""
+    vertices, faces = uneven_body()
+    points, _ = sample_surface(vertices, faces, 20_000)
+    middle = RigidTransform.shift(np.array([300.0, 100.0, 900.0]))
+    turned = RigidTransform.from_rotation_vector([0.05, -0.04, 0.06], [15.0, -18.0, 10.0])
+    off = middle @ turned @ middle.inverse()
+    laid = fit_to_surface(off.apply(points), vertices, faces)
+    assert np.abs(laid.apply(off.apply(points)) - points).max() < 0.01
+
+
+def test_a_front_that_nowhere_touches_the_surface_is_laid_onto_it() -> None:
+    """Seen from one side and 20 mm off, so that no point lies within 5 mm of the surface."""
+    vertices, faces = uneven_body()
+    points, normals = sample_surface(vertices, faces, 40_000)
+    points = points[normals[:, 0] > 0.3]
+    laid = fit_to_surface(points + [20.0, 0.0, 0.0], vertices, faces)
+    assert np.abs(laid.apply(points + [20.0, 0.0, 0.0]) - points).mean() < 0.05
+
+
+def test_what_has_changed_by_millimetres_does_not_move_the_rest() -> None:
+    """A tenth of the surface stands out by 3 mm: an arm held otherwise, a fold of cloth."""
+    vertices, faces = uneven_body()
+    points, normals = sample_surface(vertices, faces, 20_000)
+    changed = points[:, 0] > np.quantile(points[:, 0], 0.9)
+    laid = fit_to_surface(points + 3.0 * changed[:, None] * normals, vertices, faces)
+    # 0.1 of 3 mm if all counted alike.
+    assert np.abs(laid.apply(points) - points)[~changed].max() < 0.02
+
+
+def test_only_what_was_measured_is_compared(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The upper half of a body is filled, and lies a centimetre off."""
+    vertices, faces = cylinder(50.0, 0.0, 400.0)
+    filled = vertices[faces, 2].max(axis=1) > 200.0
+    moved = vertices + np.where(vertices[:, 2:] > 200.0, [10.0, 0.0, 0.0], 0.0)
+    monkeypatch.setattr(comparison, "_surface", lambda other: (vertices, faces))
+    standing, laid = comparison.compare_surfaces(
+        mesh_of(moved, faces, filled), tmp_path / "other.ply"
+    )
+    for one in (standing, laid):
+        np.testing.assert_array_equal(one.vertices, np.unique(faces[~filled]))
+        assert np.abs(one.signed_mm).max() < 0.01
+
+
 def test_statistics() -> None:
     found = deviation(np.array([0.0, 1.0, -1.0, 2.0]))
     assert found.count == 4

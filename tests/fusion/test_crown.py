@@ -80,3 +80,65 @@ def test_a_mesh_does_not_bulge_over_a_hole_in_the_crown() -> None:
     found = mesh(head(beside_a_hole), MeshSettings())
     assert found.filled.any()
     assert abs(found.vertices[:, 2].max() - TOP) < 1.0
+
+
+def roof(top: Array, slopes: tuple[float, float]) -> tuple[Array, Array]:
+    """Normals and offsets of four planes that meet in `top` and fall from it by so much to a side."""
+    ways = np.array([(x, y, 1.0) for x in (-slopes[0], slopes[0]) for y in (-slopes[1], slopes[1])])
+    normals = ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    return normals, normals @ top
+
+
+@pytest.mark.parametrize("aside", [(37.0, -21.0), (-80.0, 5.0), (0.0, 0.0)])
+def test_a_head_may_reach_where_its_planes_meet(aside: tuple[float, float]) -> None:
+    highest = np.array([100.0, 50.0, TOP])
+    normals, offsets = roof(highest + [*aside, 12.345], (0.2, 0.5))
+    # The finest grid is 100 mm * 0.3^9 / 10 wide: a few ten-thousandths.
+    assert Crown(highest, normals, offsets).unknown_mm == pytest.approx(12.345, abs=1e-3)
+    lower = offsets - 20.0
+    assert Crown(highest, normals, lower).unknown_mm == 0.0
+    assert Crown(highest, normals[:0], offsets[:0]).unknown_mm == np.inf
+
+
+def test_what_lies_above_the_planes_of_a_crown_is_outside() -> None:
+    highest = np.array([100.0, 50.0, TOP])
+    normals, offsets = roof(highest, (0.0, 0.75))  # a ridge along x
+    crown = Crown(highest, normals, offsets)
+    off = np.array(
+        [[30, 0, 0], [30, 0, 3], [0, 20, -15], [0, 20, -10], [0, -20, -10], [0, 0, -5], [0, 60, -19],
+         [0, 60, -21], [98, 0, 5], [102, 0, 5]], float,
+    )  # fmt: skip
+    # Of planes (0, 0.6, 0.8); 20 mm below the top and 100 mm aside the head ends.
+    wanted = [0.0, 2.4, 0.0, 4.0, 4.0, 0.0, 20.8, 0.0, 4.0, 0.0]
+    np.testing.assert_allclose(crown.outside(highest + off), wanted, atol=1e-9)
+    np.testing.assert_array_equal(
+        Crown(highest, normals[:0], offsets[:0]).outside(highest + off), 0.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("radius", "depth", "least"), [(90.0, 65.0, 0.5), (90.0, 50.0, 0.75), (120.0, 30.0, 0.5)]
+)
+def test_planes_hold_that_are_no_steeper_than_sixty_degrees_and_that_no_part_of_the_head_exceeds(
+    radius: float, depth: float, least: float
+) -> None:
+    """A ball with a rim around it. What lies 60 mm lower, or 100 mm aside, is no part of the head;
+    else planes whose normals have z hold if radius sqrt(1 - z^2) + (80 - depth) z < 80."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 200)
+    rim = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.full(200, TOP - depth)])
+    whole = head(lambda points: np.ones(len(points), bool), noise_mm=0.0, tilt=0.0)
+    found = Crown.of(
+        np.concatenate([whole.points, rim]),
+        np.concatenate([whole.normals, np.tile([1.0, 0.0, 0.0], (200, 1))]),
+    )
+    # Of cells 8 mm wide, a twentieth of the ball's radius to either side.
+    assert found.normals[:, 2].min() == pytest.approx(least, abs=0.06)
+    assert found.normals[:, 2].min() > 0.5
+
+
+@pytest.mark.parametrize(("higher_mm", "planes"), [(0.4, 2), (0.6, 1)])
+def test_a_plane_that_points_exceed_by_half_a_millimetre_holds_nothing(
+    higher_mm: float, planes: int
+) -> None:
+    points = np.array([[0.0, 0.0, TOP], [30.0, 0.0, TOP + higher_mm]])
+    assert len(Crown.of(points, np.tile([0.0, 0.0, 1.0], (2, 1))).offsets) == planes

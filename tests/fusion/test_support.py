@@ -45,7 +45,7 @@ def test_a_vertex_over_a_plane_knows_how_far() -> None:
     assert found.measured.all()
 
 
-@pytest.mark.parametrize(("height", "measured"), [(0.9, True), (1.1, False), (-1.1, False)])
+@pytest.mark.parametrize(("height", "measured"), [(0.98, True), (1.02, False), (-1.02, False)])
 def test_what_is_lifted_off_the_points_is_not_measured(height: float, measured: bool) -> None:
     # A quarter of the reach is the limit.
     assert asked(cloud_of(sheet(), UP), [[-10.0, 0.0, height]]).measured == [measured]
@@ -181,3 +181,52 @@ def test_a_vertex_takes_after_the_point_nearest_to_it() -> None:
     found = asked(cloud, [*(points + [0.1, 0.1, 0.2]).tolist(), [500.0, 0.0, 0.0]])
     np.testing.assert_array_equal(found.nearest[:-1], np.arange(len(points)))
     assert 0 <= found.nearest[-1] < len(points)
+
+
+def told(**values: list[float]) -> Support:
+    """Vertices whose weight is 1, and that lie on points of no noise, but for `values`."""
+    count = len(next(iter(values.values())))
+    given = {"sigma_mm": 0.0, "weight": 1.0, "shift_mm": 0.0, "spread_mm": 0.0}
+    all_ = {name: np.broadcast_to(values.get(name, usual), count) for name, usual in given.items()}
+    return Support(np.zeros(count, np.int64), reach_mm=REACH_MM, **all_)
+
+
+def test_noise_allows_for_four_sigmas_off_the_points_and_two_between_their_planes() -> None:
+    """Beyond a quarter and an eighth of the reach."""
+    found = told(sigma_mm=[0.5] * 3, shift_mm=[1.95, -2.05, 2.05])
+    assert found.measured.tolist() == [True, False, False]
+    found = told(sigma_mm=[0.0, 0.0, 0.5, 0.5], spread_mm=[0.49, 0.51, 0.98, 1.02])
+    assert found.measured.tolist() == [True, False, True, False]
+
+
+def test_one_point_3_mm_away_is_enough_where_points_are_few_and_not_where_they_are_many() -> None:
+    """There a sixth of what is usual is."""
+    for away, enough in ((3.0, True), (3.2, False)):
+        alone = cloud_of(np.array([[away, 0.0, 0.0]]), UP)
+        assert asked(alone, [[0.0, 0.0, 0.0]]).measured == [enough]
+    assert told(weight=[6.0] * 5 + [1.05, 0.95]).measured.tolist() == [True] * 6 + [False]
+
+
+@pytest.mark.parametrize(
+    ("shift", "weight", "moved_mm"),
+    [(0.8, 3.0, 0.8), (3.0, 3.0, 1.0), (-3.0, 3.0, -1.0), (0.8, 0.5, 0.4), (-3.0, 0.5, -0.5)],
+)
+def test_a_vertex_moves_by_a_quarter_of_the_reach_at_most_and_less_where_points_end(
+    shift: float, weight: float, moved_mm: float
+) -> None:
+    vertices, faces = ball(50.0)
+    count = len(vertices)
+    around = told(shift_mm=[shift] * count, weight=[weight] * count)
+    normals = (vertices / 50.0).astype(np.float32)
+    moved = fit_to_points(vertices, faces, normals, around)
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 50.0 + moved_mm, atol=1e-4)
+
+
+def test_where_a_face_would_fold_its_corners_move_by_half_a_quarter_or_not_at_all() -> None:
+    """On a ball whose faces are smaller than the moves."""
+    vertices, faces = ball(5.0)
+    normals = (vertices / 5.0).astype(np.float32)
+    shifts = np.random.default_rng(0).uniform(-1.0, 1.0, len(vertices))
+    moved = fit_to_points(vertices, faces, normals, told(shift_mm=shifts.tolist()))
+    shares = np.sum((moved - vertices) * normals, axis=1) / shifts
+    np.testing.assert_array_equal(np.unique(shares.round(4)), [0.0, 0.25, 0.5, 1.0])

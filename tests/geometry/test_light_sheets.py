@@ -192,6 +192,29 @@ def test_planes_have_slope_and_variance_between_two_and_at_the_last() -> None:
     assert np.isnan(chapter.variance_mm2(ray, np.array([149.5]))).all()
 
 
+def test_planes_of_any_length_and_sign_measure_and_do_not_say_how_well() -> None:
+    planes = models(4)[4].tangent_planes(np.arange(STRIPES + 1.0))
+    factor = np.random.default_rng(3).uniform(0.5, 3.0, (STRIPES + 1, 1))
+    factor[::2] *= -1.0
+    exact = LightPlanes.exact(factor * planes, "horizontal")
+    np.testing.assert_allclose(exact.coefficients, planes, rtol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(exact.coefficients[:, :3], axis=1), 1.0)
+    assert (exact.coefficients[:, 3] > 0.0).all()
+    assert exact.stripes == STRIPES
+    ray, s = np.array([[0.02, 0.01, 1.0]]), np.array([100.5])
+    assert np.isfinite(exact.depth(ray, s)).all()
+    assert np.isnan(exact.variance_mm2(ray, s)).all()
+    again = from_arrays("planes", to_arrays(exact), "horizontal")
+    assert np.isnan(again.variance_mm2(ray, s)).all()
+
+
+def test_a_plane_behind_the_camera_measures_nothing() -> None:
+    ahead, behind = [0.0, 0.0, -1.0, 500.0], [0.0, 0.0, 1.0, 500.0]
+    planes = LightPlanes.exact(np.array([ahead, ahead, behind, behind]), "vertical")
+    depth = planes.depth(np.tile([0.1, 0.0, 1.0], (2, 1)), np.array([0.5, 2.5]))
+    np.testing.assert_allclose(depth, [500.0, np.nan])
+
+
 def test_what_is_too_uncertain_is_not_measured() -> None:
     """More uncertain than a thousandth of the distance, and than thrice what is amid the boards."""
     model = models(2)[0]

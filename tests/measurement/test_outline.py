@@ -12,9 +12,11 @@ from bodyscan.mesh.slices import Loop, loops_at
 TRUNK_MM, ARM_MM, ARM_AT_MM = 150.0, 45.0, 230.0
 
 
-def arc(radius: float, centre: float, start_deg: float, end_deg: float) -> Array:
+def arc(
+    radius: float, centre: float, start_deg: float, end_deg: float, every_deg: float = 1.0
+) -> Array:
     """Points (N, 2) about (0, centre), anticlockwise from x to y."""
-    angle = np.radians(np.arange(start_deg, end_deg + 0.1, 1.0))
+    angle = np.radians(np.arange(start_deg, end_deg + 0.1, every_deg))
     return np.stack([radius * np.cos(angle), centre + radius * np.sin(angle)], axis=-1)
 
 
@@ -112,11 +114,17 @@ def test_a_strip_that_is_itself_seen_in_two_parts_is_no_limb_either() -> None:
     assert found.loop.girth_mm == pytest.approx(2.0 * np.pi * TRUNK_MM, rel=1e-3)
 
 
+@pytest.mark.parametrize("segments", [None, 3])
 @pytest.mark.parametrize(("half_deg", "limb"), [(85.0, False), (95.0, True)])
-def test_a_limb_goes_round_by_more_than_half(half_deg: float, limb: bool) -> None:
-    """A round piece beside the trunk, of which so much on either side of its outermost was seen."""
+def test_a_limb_goes_round_by_more_than_half(
+    half_deg: float, limb: bool, segments: int | None
+) -> None:
+    """A round piece beside the trunk, of which so much on either side of its outermost was seen;
+    however coarse the mesh, from where its first segment begins to where its last one ends."""
     turned = np.radians(half_deg)
-    arm = arc(ARM_MM, ARM_AT_MM, 90.0 - half_deg, 90.0 + half_deg)
+    every = 1.0 if segments is None else 2.0 * half_deg / segments
+    half_deg += 0.0 if segments is None else 5.0 if limb else 0.0
+    arm = arc(ARM_MM, ARM_AT_MM, 90.0 - half_deg, 90.0 + half_deg, every)
     points = np.concatenate(
         [arc(TRUNK_MM, 0.0, -70.0, 70.0), arm, arc(TRUNK_MM, 0.0, 110.0, 290.0)]
     )
@@ -133,3 +141,20 @@ def test_a_trunk_holds_the_middle_by_a_seventh_of_its_width(across: float, both:
     y = np.array([-300.0 * across, 300.0 * (1.0 - across)])
     assert holds_middle(y) == both
     assert holds_middle(-y) == both
+
+
+def test_a_strip_across_the_front_is_no_trunk_with_the_rest_for_a_limb() -> None:
+    """Both hold the middle, and the rest goes round by far more than half."""
+    points = arc(TRUNK_MM, 0.0, -180.0, 179.0)
+    degrees = np.arange(len(points)) - 180
+    found = outline(wall(points, (abs(degrees) > 30) & (abs(degrees) < 50)))
+    assert found.loop.girth_mm == pytest.approx(2.0 * np.pi * TRUNK_MM, rel=1e-3)
+
+
+def test_of_two_legs_that_filled_surface_joins_neither_is_the_trunk() -> None:
+    """Each lies on its side of the middle and goes round by more than half."""
+    legs = [arc(70.0, 100.0, -60.0, 240.0), arc(70.0, -100.0, 120.0, 420.0)]
+    points = np.concatenate(legs)
+    filled = np.isin(np.arange(len(points)), [len(legs[0]) - 1, len(points) - 1])
+    whole = wall(points, filled)
+    assert outline(whole).loop.girth_mm == pytest.approx(whole.girth_mm)

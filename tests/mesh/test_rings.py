@@ -49,7 +49,31 @@ def test_rings_less_than_eight_centimetres_high_are_folds() -> None:
     small = upright_ring(40.0, (0.0, 0.0, 500.0))
     assert not rings(*small)
     assert len(rings(*small, smallest_mm=50.0)) == 1
+    assert len(rings(*upright_ring(60.0, (0.0, 0.0, 500.0)))) == 1  # its hole is 90 mm high
+
+
+def test_rings_come_from_the_lowest_up_and_beside_each_other_from_the_right() -> None:
+    places = ((0.0, 200.0, 1000.0), (0.0, 0.0, 1400.0), (0.0, -200.0, 1000.0), (0.0, 0.0, 500.0))
+    parts = [upright_ring(80.0, at) for at in places]
+    vertices = np.concatenate([own for own, _ in parts])
+    faces = np.concatenate([own + k * len(parts[0][0]) for k, (_, own) in enumerate(parts)])
+    found = rings(vertices, faces)
+    assert [round(ring.y_mm, -2) for ring in found] == [0.0, -200.0, 200.0, 0.0]
+    assert np.diff([ring.low_mm for ring in found]).tolist() == [500.0, 0.0, 400.0]
+
+
+def test_an_edge_longer_than_a_layer_makes_no_ring() -> None:
+    """A tetrahedron 200 mm high, one of whose edges has a vertex half way up."""
+    vertices = np.array([[0, 0, 0], [90, 0, 0], [0, 90, 0], [0, 0, 200], [0, 0, 100]], float)
+    faces = [[0, 2, 1], [1, 2, 3], [0, 1, 4], [4, 1, 3], [2, 0, 4], [2, 4, 3]]
+    assert not rings(vertices, np.array(faces))
 
 
 def _edges(joined: Indices) -> set[frozenset[int]]:
     return {frozenset(edge) for edge in joined.tolist()}
+
+
+def test_a_mesh_within_one_layer_has_no_ring() -> None:
+    ball = o3d.geometry.TriangleMesh.create_sphere(5.0, 10)
+    vertices = np.asarray(ball.vertices) + [0.0, 0.0, 1010.0]
+    assert not rings(vertices, np.asarray(ball.triangles, np.int64), smallest_mm=0.0)

@@ -53,7 +53,17 @@ def test_a_size_that_no_tape_measure_errs_by_is_refused(factor: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("factor", "mark"), [(0.89, "bad"), (0.91, "usable"), (0.98, "good"), (1.09, "usable")]
+    ("factor", "mark"),
+    [
+        (0.899, "bad"),
+        (0.901, "usable"),
+        (0.969, "usable"),
+        (0.971, "good"),
+        (1.029, "good"),
+        (1.031, "usable"),
+        (1.099, "usable"),
+        (1.101, "bad"),
+    ],
 )
 def test_a_calibration_in_use_is_marked(factor: float, mark: str) -> None:
     size = nominal_size(RIG, placed(factor))
@@ -66,3 +76,36 @@ def test_a_rig_without_boards_is_told_as_well() -> None:
     (note,) = check_nominal_size(RIG.model_copy(update={"boards": ()}), placed(1.05))
     assert "1.050 times" in note
     assert "correct `nominal`" in note
+
+
+def rig_of(places: dict[str, tuple[float, float, float]]) -> Rig:
+    pairs = [
+        {
+            "name": name,
+            "camera": {"width": 640, "height": 480},
+            "nominal": {"position_mm": place, "look_at_mm": (0, 0, 500)},
+        }
+        for name, place in places.items()
+    ]
+    return Rig.model_validate({"name": "some", "boards": RIG.boards, "pairs": tuple(pairs)})
+
+
+def test_one_camera_whose_nominal_place_is_wrong_hides_no_size() -> None:
+    """Of five: six of ten distances are right."""
+    places = {**PLACES, "d": (0.0, -1000.0, 500.0), "e": (700.0, 700.0, 1500.0)}
+    stand = {n: RigidTransform(np.eye(3), 1.04 * np.array(p)) for n, p in places.items()}
+    size = nominal_size(rig_of({**places, "e": (700.0, 3700.0, 1500.0)}), stand)
+    assert size is not None
+    assert size.ratio == pytest.approx(1.04, abs=0.01)
+
+
+@pytest.mark.parametrize(("apart_mm", "told"), [(90.0, False), (110.0, True)])
+def test_two_cameras_tell_the_size_unless_they_are_to_stand_side_by_side(
+    apart_mm: float, told: bool
+) -> None:
+    """A tape's 5 mm are a twentieth of 100."""
+    places = {"a": (1000.0, 0.0, 500.0), "b": (1000.0, 0.0, 500.0 + apart_mm)}
+    stand = {n: RigidTransform(np.eye(3), 1.05 * np.array(p)) for n, p in places.items()}
+    size = nominal_size(rig_of(places), stand)
+    assert (size is not None and size.ratio == pytest.approx(1.05)) == told
+    assert nominal_size(rig_of(places), {"a": stand["a"]}) is None

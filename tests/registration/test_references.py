@@ -15,6 +15,11 @@ from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.references import (
     Size,
+    _along,
+    _between,
+    _mean,
+    _Middle,
+    _Reading,
     _words,
     board_length,
     find_size,
@@ -164,3 +169,138 @@ def test_boards_of_references_do_not_place_the_rig() -> None:
 def test_a_size_is_told_in_per_cent_with_its_sigma() -> None:
     assert _words(Size(1.00123, 0.00045)) == "+0.123 % (sigma 0.045 %)"
     assert _words(Size(0.998, 0.0002)) == "-0.200 % (sigma 0.020 %)"
+
+
+PLAIN = Board(name="plain", columns=12, rows=11, square_mm=30)
+ROW, COLUMN = np.divmod(np.arange(110), 11)
+FEW = np.flatnonzero((ROW < 3) & (abs(COLUMN - 5) < 3))
+"""Corners of the middle of the first three rows: 15, 120 by 60 mm."""
+
+
+def test_a_board_s_middle_is_where_it_is_whatever_corners_were_seen() -> None:
+    at = RigidTransform.from_rotation_vector([0.3, -0.2, 0.9], [100.0, 200.0, 1300.0])
+    seen = _Middle.of(PLAIN, FEW, at.apply(corner_points(PLAIN)[FEW]))
+    np.testing.assert_allclose(seen.place, at.apply(np.array([180.0, 165.0, 0.0])), atol=1e-9)
+    # 105 mm from the corners' own middle; these lie 30 sqrt(2 + 2 / 3) mm from it, RMS.
+    assert seen.lever == pytest.approx(105.0 / (30.0 * np.sqrt(8.0 / 3.0)))
+
+
+def test_the_less_of_a_board_was_seen_the_farther_off_its_middle_may_be() -> None:
+    """Corners that err turn a board about themselves. Two middles, as they err in 600 draws."""
+    layout, rng = corner_points(PLAIN)[FEW], np.random.default_rng(0)
+    lengths, sigmas, worse = [], [], []
+    for _ in range(600):
+        noise = rng.normal(0.0, 0.05, (2, *layout.shape))
+        both = [
+            _Middle.of(PLAIN, FEW, layout + [x, 0, 0] + own)
+            for x, own in zip((0, 500), noise, strict=True)
+        ]
+        lengths.append(_between(both, 1.0).length_mm)
+        sigmas.append(_between(both, 1.0).sigma_mm)
+        worse.append(_between(both, 4.0).sigma_mm)
+    assert np.mean(lengths) == pytest.approx(500.0, abs=0.02)
+    # A fit takes 1 / 15 of the residuals' variance by its shift, and a quarter of that by its turn; the
+    # spread of 600 draws is known to 3 %.
+    left = np.sqrt(1.0 - 1.25 / 15.0)
+    assert np.sqrt(np.mean(np.square(sigmas))) == pytest.approx(left * np.std(lengths), rel=0.09)
+    np.testing.assert_allclose(worse, 2.0 * np.array(sigmas))
+
+
+def test_the_length_of_one_board_is_as_uncertain_as_its_corners_make_it() -> None:
+    layout, rng, every = corner_points(PLAIN), np.random.default_rng(0), np.arange(110)
+    read = [
+        [_along(PLAIN, every, layout + noise, excess) for excess in (1.0, 4.0)]
+        for noise in rng.normal(0.0, 0.05, (300, 110, 3))
+    ]
+    lengths = [one.length_mm for one, _ in read]
+    assert np.mean(lengths) == pytest.approx(300.0, abs=0.002)
+    sigmas = np.array([[one.sigma_mm, other.sigma_mm] for one, other in read])
+    # The spread of 300 draws is known to 4 %.
+    assert np.sqrt(np.mean(sigmas[:, 0] ** 2)) == pytest.approx(np.std(lengths), rel=0.12)
+    np.testing.assert_allclose(sigmas[:, 1], 2.0 * sigmas[:, 0])
+
+
+def test_shots_that_scatter_by_more_than_their_sigmas_make_a_mean_as_uncertain_as_they_say() -> (
+    None
+):
+    lengths = 400.0 + np.array([0.3, -0.2, 0.1, -0.4, 0.2])
+    for sigma, expected in ((0.01, np.std(lengths, ddof=1)), (0.9, 0.9)):
+        mean, own = _mean([_Reading(length, sigma) for length in lengths])
+        assert mean == pytest.approx(np.mean(lengths))
+        assert own == pytest.approx(expected / np.sqrt(5.0))
+    # The better one counts more, by the square of their sigmas; one alone is as good as it says.
+    assert _mean([_Reading(400.0, 0.1), _Reading(400.01, 0.2)])[0] == pytest.approx(400.002)
+    assert _mean([_Reading(400.0, 0.1)]) == pytest.approx((400.0, 0.1))
+
+
+@pytest.mark.parametrize(("sigmas", "refused"), [(3.9, False), (4.1, True)])
+def test_references_count_by_their_sigmas_and_may_differ_by_four(
+    sigmas: float, refused: bool
+) -> None:
+    """A board of 90 mm and a bar of 400 mm, each certified to 0.01 mm, and corners without noise."""
+    one, other = 0.01 / 90.0, 0.01 / 400.0
+    share = one**-2 / (one**-2 + other**-2)
+    longer = sigmas * one / (1.0 - share)
+    steel = Reference(
+        name="steel", boards=("left",), length_mm=90.0 * (1.0 + longer), sigma_mm=0.01
+    )
+    views = bar_views(np.random.default_rng(0), noise_px=1e-6)
+    if refused:
+        with pytest.raises(FailedWork, match="contradict each other"):
+            find_size(small_rig(bar(), steel), placed(1.0), views)
+        return
+    size = find_size(small_rig(bar(), steel), placed(1.0), views).value
+    assert size.factor == pytest.approx(1.0 + share * longer, abs=1e-6)
+    assert size.sigma == pytest.approx((one**-2 + other**-2) ** -0.5, rel=1e-3)
+
+
+def cut(views: list[BoardView], board: str, corners: dict[str, int]) -> list[BoardView]:
+    """Of that board, cameras saw so many corners."""
+    return [
+        replace(
+            view,
+            corner_ids=view.corner_ids[: corners[view.pair]],
+            pixels=view.pixels[: corners[view.pair]],
+        )
+        if view.board == board
+        else view
+        for view in views
+    ]
+
+
+@pytest.mark.parametrize(
+    ("corners", "measured"), [((6, 12), True), ((5, 12), False), ((12, 5), False), ((0, 0), False)]
+)
+def test_two_cameras_have_to_see_six_corners_of_each_board(
+    corners: tuple[int, int], measured: bool
+) -> None:
+    views = bar_views(np.random.default_rng(0), noise_px=1e-6)
+    seen = cut(views, "right", dict(zip(("p1-1", "p1-2"), corners, strict=True)))
+    if not any(corners):
+        seen = [view for view in views if view.board == "left"]
+    found = find_size(small_rig(bar()), placed(SMALLER), seen)
+    assert ("measured in no shot" in found.notes[0]) != measured
+    # From half of its corners, 30 mm off, a middle is reached by the size that is told of the print.
+    assert found.value.factor == pytest.approx(1.0 / SMALLER if measured else 1.0, abs=3e-4)
+
+
+@pytest.mark.parametrize(
+    ("scale", "refused"), [(0.92, False), (0.9, True), (1.1, False), (1.12, True)]
+)
+def test_a_size_a_tenth_off_is_refused_and_less_is_not(scale: float, refused: bool) -> None:
+    """1 / 1.1 is 9 % off, 1 / 0.9 is 11 %."""
+    views = bar_views(np.random.default_rng(0))
+    if refused:
+        with pytest.raises(FailedWork, match="times as large as square_mm says"):
+            find_size(small_rig(bar()), placed(scale), views)
+    else:
+        size = find_size(small_rig(bar()), placed(scale), views).value
+        assert size.factor == pytest.approx(1.0 / scale, abs=1e-3)
+
+
+def test_a_board_is_resized_with_its_markers_and_a_certified_one_alone_as_well() -> None:
+    rig = resized(small_rig(bar()), 1.25)
+    assert [board.square_mm for board in rig.boards] == [87.5, 30.0, 30.0]
+    assert [board.marker_mm for board in rig.boards] == [65.0, 22.0, 22.0]
+    alone = resized(small_rig(bar()).model_copy(update={"boards": (LEFT, RIGHT)}), 1.25)
+    assert [(board.square_mm, board.marker_mm) for board in alone.boards] == [(37.5, 27.5)] * 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyscan.stripes.phase_order import PhaseOrder, phase_order
+from bodyscan.stripes.phase_order import PhaseOrder, _best_orders, _least_gap, phase_order
 from bodyscan.stripes.wave import Wave
 from bodyscan.stripes.waves import WaveSeen
 
@@ -132,3 +132,67 @@ def test_one_wave_alone_tells_s_within_its_period() -> None:
     assert found.apart == ()
     assert found.misfit == 1.0
     assert order_of((240.0,), usable=np.zeros(SHAPE, bool)).agreed == 0.0
+
+
+@pytest.mark.parametrize("known", [(18.0, 20.0, 23.0), (20.0, 400.0)])
+def test_orders_are_ranked_by_chi_squared_of_the_other_waves(known: tuple[float, ...]) -> None:
+    """All that begin before the last stripe; and by how much others are worse than the true one."""
+    rng, periods = np.random.default_rng(4), np.array(known)
+    order = np.arange(np.ceil(STRIPES / periods[0]))[:, None]
+    turns = rng.random((len(known), 200)).astype(np.float32)
+    sigmas = rng.uniform(0.01, 0.05, turns.shape).astype(np.float32)
+    whole = (turns[0].astype(float) + order) * periods[0]
+    doubt = np.hypot(sigmas[1:], sigmas[0] * periods[0] / periods[1:, None])
+
+    def chi_squared(off: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sum(((off - np.rint(off)) / doubt[:, None]) ** 2, axis=0))
+
+    costs = chi_squared(turns[1:, None] - whole / periods[1:, None, None])
+    costs[whole >= STRIPES] = np.inf
+    found, best, second = _best_orders(turns, sigmas, periods, float(STRIPES))
+    np.testing.assert_array_equal(found, np.argmin(costs, axis=0))
+    ranked = np.sort(costs, axis=0)
+    np.testing.assert_allclose(best, ranked[0], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(second, ranked[1], rtol=1e-4, atol=1e-4)
+    exact = order[1:] * periods[0] / periods[1:, None, None]
+    gaps = chi_squared(np.repeat(exact, 200, axis=2))
+    least = _least_gap(sigmas, periods, float(STRIPES))
+    np.testing.assert_allclose(least, gaps.min(axis=0), rtol=1e-5)
+
+
+LONG = 240.0
+
+
+def sigma_for(gap: float) -> float:
+    """Sigma of the turns of waves of 20 and 240 stripes by which the next order's chi squared is
+    larger by so much: the longer one is a twelfth of a turn off, and the finest's own error counts."""
+    return float(20.0 / LONG / np.sqrt(gap * (1.0 + (20.0 / LONG) ** 2)))
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.96, False), (1.04, True)])
+def test_an_order_is_believed_if_the_next_is_ten_thousand_times_less_likely(
+    share: float, told: bool
+) -> None:
+    gap = share * 2.0 * np.log(1e4)
+    found = order_of((20.0, LONG), sigma=1e-5, claimed=sigma_for(gap))
+    assert (found.certain.mean() > 0.97) == told
+    assert (found.agreed > 0.97) == told
+    assert found.certain.any() == told
+
+
+@pytest.mark.parametrize(("share", "agreed"), [(2.9, 1.0), (3.1, 0.7)])
+def test_waves_are_held_to_agree_where_noise_lets_the_order_be_told_with_ease(
+    share: float, agreed: float
+) -> None:
+    """On three tenths of a picture the longer wave shows anything, its noise allowing for thrice
+    what tells an order or not."""
+    sigma = np.full(SHAPE, sigma_for(80.0), np.float32)
+    sigma[:, ::10] = sigma[:, 1::10] = sigma[:, 2::10] = sigma_for(share * 2.0 * np.log(1e4))
+    anything = sigma != sigma[0, 5]
+    grey, waves = np.full(SHAPE, 50.0, np.float32), []
+    for period in (20.0, LONG):
+        turn = (S / period) % 1.0
+        turn[anything] += 0.5 * (period == LONG) * 20.0 / LONG
+        waves.append(WaveSeen(Wave(period, 4), (turn % 1.0).astype(np.float32), grey, grey))
+    found = phase_order(waves, [sigma, sigma], np.ones(SHAPE, bool), STRIPES)
+    assert found.agreed == pytest.approx(agreed, abs=0.02)

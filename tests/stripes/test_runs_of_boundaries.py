@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
@@ -17,6 +19,8 @@ from bodyscan.stripes.albedo_edges import (
 from bodyscan.stripes.boundaries import Boundaries, find_boundaries
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.stripe_coordinates import (
+    _fill,
+    _Segments,
     alike_along_lines,
     end_slopes,
     interpolate_stripes,
@@ -84,6 +88,50 @@ def test_beside_the_last_boundary_s_goes_on_for_four_tenths_of_a_stripe() -> Non
     assert np.isnan(sigma[np.isnan(s)]).all()
 
 
+def test_a_boundary_by_itself_at_the_very_end_tells_nothing_of_pixels_beside_it() -> None:
+    """Nor does what lies in memory behind the last segment: here the one that goes on from it."""
+    on = np.arange(6)
+    line = np.array([0, 0, 0, 0, 1, 1])
+    whole = replace(run(10.0 + 5.0 * on, on + 3), line=line, joined=line[1:] == line[:-1])
+    of = _Segments.of(whole)
+    codes = np.tile(np.floor(1.0 + 0.2 * X).astype(np.int32), (2, 1))
+    for count, told in ((6, True), (5, False)):
+        s, sigma = np.full((2, *codes.shape), np.nan, np.float32)
+        known = of.start, of.width, of.index, of.rise, of.sigma
+        bends = of.slope_in, of.slope_out, of.pull
+        segments, bent_ = (tuple(each[: count - 1] for each in own) for own in (known, bends))
+        usable = np.ones(codes.shape, bool)
+        _fill(
+            s, sigma, codes, usable, whole.line[:count], whole.before[:count], segments, bent_, 0.15
+        )
+        assert np.isfinite(s[0]).sum() > 10
+        assert np.isfinite(s[1]).any() == told
+
+
+def test_beside_a_run_s_is_three_times_as_uncertain_and_by_all_of_its_bend() -> None:
+    s, sigma = interpolated(run(POSITION, INDEX, sigma=0.002))
+    for end, side, segment in ((0, -1.0, 0), (-1, 1.0, -1)):
+        away = side * (X - POSITION[end])
+        beside = np.isfinite(s) & (away > 0.0)
+        assert beside.any()
+        alone = 3.0 * 0.002 / np.diff(POSITION)[segment]
+        expected = np.hypot(alone, 0.001 * away[beside] ** 2)
+        # The last segment's slopes are those of its neighbours: its bend is known to some per cent.
+        np.testing.assert_allclose(sigma[beside], expected, rtol=0.02)
+        assert expected.max() > (1.2 if end == 0 else 1.0) * alone
+
+
+def test_a_boundary_by_itself_at_the_beginning_tells_nothing_either() -> None:
+    """Though on the next line a run ends beside its place."""
+    line = np.array([0, 1, 1, 1, 1])
+    place, index = np.array([30.0, 15.0, 20.0, 25.0, 30.0]), np.array([7, 4, 5, 6, 7])
+    some = replace(run(place, index), line=line, joined=line[1:] == line[:-1])
+    codes = np.tile(np.floor(1.0 + 0.2 * X).astype(np.int32), (2, 1))
+    s, _ = interpolate_stripes(some, codes, np.ones(codes.shape, bool))
+    assert np.isnan(s[0]).all()
+    assert np.isfinite(s[1, 31])
+
+
 def test_s_that_contradicts_the_pixels_code_is_none() -> None:
     s, _ = interpolated(run(POSITION, INDEX), off=1)
     # A code is a sixth of a stripe off at most: what is left lies so near to the next stripe.
@@ -91,6 +139,7 @@ def test_s_that_contradicts_the_pixels_code_is_none() -> None:
     near = bent(X) % 1.0
     assert known.sum() < 0.3 * WIDTH
     assert np.all(near[known] > 0.85 - 1e-3)
+    assert known[(near > 0.85 + 1e-3) & (bent(X) > 3.0) & (bent(X) < 25.0)].all()
     carried, _ = interpolated(run(POSITION, INDEX), carried=0.3, off=1)
     assert np.isfinite(carried).sum() > known.sum() + 10
 
@@ -101,6 +150,9 @@ def test_blur_lifts_s_where_it_bends() -> None:
     within = (POSITION[1] < X) & (POSITION[-2] > X)
     # blur^2 / 2 times the second derivative, 0.002.
     np.testing.assert_allclose((s - blurred)[within], 0.002, rtol=0.02)
+    beside = np.isfinite(s) & ((POSITION[0] > X) | (POSITION[-1] < X))
+    assert beside.sum() > 2
+    np.testing.assert_allclose((s - blurred)[beside], 0.002, rtol=0.02)
     most, _ = interpolated(run(POSITION, INDEX, blur2=1000.0))
     np.testing.assert_allclose((s - most)[within & np.isfinite(most)], 0.05, atol=1e-5)
 
@@ -148,6 +200,10 @@ def test_smoothing_stops_at_the_ends_of_a_run_and_at_what_noise_does_not_explain
     position, sigma = smooth_runs(run(stray, np.arange(40), 0.02), np.ones(39, bool))
     assert position[10] == stray[10]
     assert sigma[10] == 0.02
+    # The fit to five moves one that strays alone by 18 / 35 of that: here by 3.9 sigmas, and 4.2.
+    for sigmas, fits in ((7.6, True), (8.2, False)):
+        stray[10] = place[10] + sigmas * 0.02
+        assert (smooth_runs(run(stray, np.arange(40)), np.ones(39, bool))[1][10] < 0.02) == fits
     # Five boundaries over 12 px and more are not smoothed at all.
     wide = 3.0 * np.arange(40)
     assert np.all(smooth_runs(run(wide, np.arange(40)), np.ones(39, bool))[1] == 0.02)
@@ -323,6 +379,8 @@ def test_on_relief_boundaries_are_left_in_place() -> None:
     )
     np.testing.assert_allclose(even[1, 10:30], smooth[1, 10:30])
     assert np.all(smooth[1, 50:70] < 0.8 * even[1, 50:70])
+    # A run ends where relief begins: its last two boundaries, 18 and 19, are left in place too.
+    assert even[1, 39] == pytest.approx(0.05 / np.diff(position)[18], rel=0.01)
 
 
 @pytest.mark.parametrize("width", [2.2, 5.0])

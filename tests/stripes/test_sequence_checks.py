@@ -234,3 +234,50 @@ def test_fifty_places_at_which_stripes_count_down_are_too_few_to_tell(
             asked()
     else:
         asked()
+
+
+def test_three_causes_are_named_at_most_the_simplest_first() -> None:
+    """Words of the last four stripes of 64 where there are 32. More would undo it: any exchange of the
+    coarsest bit, alone lit, for one of the next three."""
+    words = counted(np.tile(np.arange(60, 64).repeat(5), (120, 1)))
+    with pytest.raises(DecodingFailed) as refused_:
+        check(words, GRAY, stripes=32)
+    assert str(refused_.value).endswith(
+        "it would fit if pattern and inverse of bit 0 were exchanged, or if bits 0 and 1 were "
+        "exchanged, or if bits 0 and 2 were exchanged"
+    )
+
+
+def exchanged(words: Indices, one: int, other: int) -> Indices:
+    """Of two bits, 0 the coarsest."""
+    first, second = (1 << (BITS - 1 - bit) for bit in (one, other))
+    rest = words & ~(first | second)
+    return np.asarray(rest | (words & first > 0) * second | (words & second > 0) * first)
+
+
+PICTURE = counted(np.tile(np.arange(60).repeat(5), (120, 1)))
+REVERSED = exchanged(exchanged(exchanged(PICTURE, 0, 5), 1, 4), 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("words", "cause"),
+    [
+        (PICTURE ^ 0b010000, "pattern and inverse of bit 1 were exchanged"),
+        (PICTURE ^ 0b000001, "pattern and inverse of bit 5 were exchanged"),
+        (PICTURE ^ 0b111111, "all patterns and inverses were exchanged"),
+        (REVERSED, "the bits came in reverse order"),
+        (exchanged(PICTURE, 1, 3), "bits 1 and 3 were exchanged"),
+        (exchanged(PICTURE, 0, 5), "bits 0 and 5 were exchanged"),
+    ],
+)
+def test_a_mistake_with_the_frames_is_named(words: Indices, cause: str) -> None:
+    refused(words, GRAY, f"it would fit if (.*, or if )?{cause}", stripes=60)
+
+
+@pytest.mark.parametrize(("right", "named"), [(79, False), (82, True)])
+def test_a_cause_is_named_if_four_of_five_changes_of_each_bit_fit(right: int, named: bool) -> None:
+    """The coarsest bit was exchanged, so that all words lie beyond; undone, bit 2 fits in so many."""
+    words = changing(RIGHT[GRAY], WRONG[GRAY], right, 100 - right) ^ 0b100000
+    with pytest.raises(DecodingFailed) as found:
+        check(words, GRAY, stripes=32)
+    assert ("if pattern and inverse of bit 0 were exchanged" in str(found.value)) == named
