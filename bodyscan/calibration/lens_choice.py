@@ -117,8 +117,9 @@ def choose_lens(
         out = _hold_out(tried, views, place)
         better_by = gain(Compared(held.stacked, out.stacked, of_corner))
         trials.append((tried, out, better_by))
-        usual = kind is USUAL and _tells_decentring(tried)
-        if better_by < (-CLEARLY if usual else CLEARLY):
+        if better_by < CLEARLY:
+            if kind is USUAL and better_by > -CLEARLY and _tells_decentring(tried):
+                chosen = tried
             break  # the next has all coefficients of this one, and more
         chosen, held = tried, out
     weights = [shared_weights([out.stacked for _, out, _ in trials])]

@@ -88,7 +88,8 @@ def test_two_poses_are_refused() -> None:
     ("told", "gains", "kind", "richest"),
     [
         (True, [-CLEARLY - 0.1], Radial, Brown),
-        (True, [-CLEARLY, CLEARLY - 0.1], Brown, Rational),
+        (True, [-CLEARLY + 0.1], Brown, Brown),
+        (True, [CLEARLY - 0.1], Brown, Brown),
         (False, [CLEARLY - 0.1], Radial, Brown),
         (False, [CLEARLY, CLEARLY - 0.1], Brown, Rational),
         (True, [CLEARLY, CLEARLY], Rational, Rational),
