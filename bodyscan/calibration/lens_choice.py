@@ -26,19 +26,10 @@ from bodyscan.calibration.camera import (
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain, shared_weights
 from bodyscan.calibration.ray_uncertainty import ray_uncertainty
 from bodyscan.geometry.camera import Camera
-from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform
 
-USUAL = Brown
-"""Every lens is a little off its axis: taken unless boards speak against it. A decentring that boards
-cannot prove is not zero. Left out, it hides in the principal point, whose sigma does not account for
-it; other terms hide nowhere."""
-TOLD = 0.5
-"""Sigma of a usual lens's decentring, relative to what is known of it before any image. Boards that
-tell less add noise: the four of procam-board (0.7) measured a held-out one 8 % worse. In rigs of 12
-to 16 shots it is 0.15 to 0.3."""
 FEWEST_PLACES = 4
 """With one place held out, a camera still has the three that it needs."""
 MOST_FOLDS = 6
@@ -98,7 +89,7 @@ def choose_lens(
     poses: Sequence[RigidTransform],
     views: Sequence[PlanarView],
 ) -> ChosenLens:
-    """The simplest lens that no richer one clearly beats, though with the usual decentring.
+    """The simplest lens that no richer one clearly beats.
 
     kinds: simplest first, each with all coefficients of the one before and more.
     camera: a start, with the last kind of lens.
@@ -118,8 +109,6 @@ def choose_lens(
         better_by = gain(Compared(held.stacked, out.stacked, of_corner))
         trials.append((tried, out, better_by))
         if better_by < CLEARLY:
-            if kind is USUAL and better_by > -CLEARLY and _tells_decentring(tried):
-                chosen = tried
             break  # the next has all coefficients of this one, and more
         chosen, held = tried, out
     weights = [shared_weights([out.stacked for _, out, _ in trials])]
@@ -130,13 +119,6 @@ def choose_lens(
         for fit, out, better_by in trials
     )
     return ChosenLens(chosen, told, ray_uncertainty(chosen.camera, trials[-1][0], views))
-
-
-def _tells_decentring(fit: CameraFit) -> bool:
-    lens = fit.camera.lens
-    own = np.isin(lens.names, ["p1", "p2"])
-    sigmas = np.sqrt(np.diag(fit.covariance))[-len(own) :]
-    return bool(np.all(sigmas[own] < TOLD * lens.prior_sigmas[own]))
 
 
 def _fit(

@@ -1,20 +1,25 @@
 """The lens of each camera in a rig of several, chosen after all were solved with the richest one.
 
 So no view is thought wrong because a lens was too simple, and boards found to be bent test the
-lenses in their true shape.
+lenses in their true shape. Cameras of a rig are usually of one make: what none can prove alone, all
+may prove together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from bodyscan.arrays import Array
 from bodyscan.calibration.board_views import LocatedView, PlanarView
-from bodyscan.calibration.camera import LensTrial
+from bodyscan.calibration.camera import CameraFit, LensTrial
 from bodyscan.calibration.held_out import CLEARLY
 from bodyscan.calibration.lens_choice import ChosenLens, choose_lens
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses import family_up_to
+from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform
@@ -49,7 +54,7 @@ class ChosenLenses:
 
 
 def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolution) -> ChosenLenses:
-    """Choose each camera's lens by its own held-out boards.
+    """Choose each camera's lens by its own held-out boards, or as all cameras of its make show.
 
     A lens that the rig file names stays.
 
@@ -69,6 +74,8 @@ def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolutio
     names = list(looked)
     own = threaded(lambda name: looked[name].choose(kinds[name]), names, stage="choosing lenses")
     chosen = dict(zip(names, own, strict=True))
+    for alike in _of_one_make(looked):
+        chosen |= _decentred_together({name: chosen[name] for name in alike}, looked, kinds)
     cameras = {
         name: lens.fit.camera
         for name, lens in chosen.items()
@@ -105,3 +112,59 @@ class _Looked:
 
     def choose(self, kinds: Sequence[type[Lens]]) -> ChosenLens:
         return choose_lens(kinds, self.camera, self.poses, self.views)
+
+
+def _of_one_make(looked: Mapping[str, _Looked]) -> Iterator[list[str]]:
+    """Groups of cameras with images of one size, as far as images show which are of one make."""
+    size = {name: (own.camera.width, own.camera.height) for name, own in looked.items()}
+    for one in sorted(set(size.values())):
+        yield [name for name in looked if size[name] == one]
+
+
+def _decentred_together(
+    chosen: Mapping[str, ChosenLens],
+    looked: Mapping[str, _Looked],
+    kinds: Mapping[str, Sequence[type[Lens]]],
+) -> dict[str, ChosenLens]:
+    """Brown's lens in place of the chapter's, if the cameras together are decentred beyond chance.
+
+    A camera's own boards must not clearly speak against it. A decentring too small for one camera to
+    prove is not zero: left out, it hides in the principal point, whose sigma does not account for
+    it. Held-out boards hardly see what hides so well; how many of its sigmas it is off zero does. The
+    other terms of a rational lens hide nowhere.
+    """
+    open_ = [
+        name
+        for name, lens in chosen.items()
+        if (gain := _gain(lens, Brown)) is not None and -CLEARLY < gain < CLEARLY
+    ]
+    if not open_:
+        return {}
+    fits = threaded(lambda name: looked[name].choose((Brown,)).fit, open_, stage="choosing lenses")
+    off = np.concatenate([_decentring(fit) for fit in fits])
+    if np.mean(off**2) < 1.0 + CLEARLY * np.sqrt(2.0 / len(off)):
+        return {}
+    found = {}
+    for name in open_:
+        again = looked[name].choose(kinds[name][kinds[name].index(Brown) :])
+        found[name] = replace(again, trials=_with_what_followed(chosen[name].trials, again))
+    return found
+
+
+def _decentring(fit: CameraFit) -> Array:
+    """p1 and p2 in their sigmas, (2,)."""
+    names = fit.camera.parameter_names
+    own = [names.index("p1"), names.index("p2")]
+    return np.asarray(fit.camera.parameters[own] / np.sqrt(np.diag(fit.covariance)[own]))
+
+
+def _gain(lens: ChosenLens, kind: type[Lens]) -> float | None:
+    """Standard errors by which this camera's own boards call for such a lens; None if not tried."""
+    return next((trial.gain for trial in lens.trials if trial.kind == kind.kind), None)
+
+
+def _with_what_followed(trials: Sequence[LensTrial], again: ChosenLens) -> tuple[LensTrial, ...]:
+    """The trials, when a lens first refused was taken after all and richer ones were tried."""
+    *before, refused = trials
+    taken = replace(refused, chosen=again.fit.camera.lens.kind == refused.kind)
+    return (*(replace(trial, chosen=False) for trial in before), taken, *again.trials[1:])

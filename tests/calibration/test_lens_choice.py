@@ -1,4 +1,4 @@
-"""Held-out boards choose the lens: a decentred one, unless they speak against it or for more."""
+"""Held-out boards choose the lens: the simplest that shows them as well as any."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.held_out import CLEARLY, Compared
 from bodyscan.calibration.lens_choice import (
     _HeldOut,
-    _tells_decentring,
     calibrate_with_lenses,
     choose_lens,
     places,
@@ -27,8 +26,7 @@ from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.lenses.rational import Rational
 
 CASES = [
-    (Radial(-0.3, 0.1), "brown"),
-    (Brown(-0.3, 0.1, 2e-4, -1e-4, 0.0), "brown"),
+    (Radial(-0.3, 0.1), "radial"),
     (Brown(-0.3, 0.1, 1.5e-3, -1e-3, 0.0), "brown"),
     # Its radial factor levels out towards the corners, where no polynomial of three terms does.
     (Rational(0.2, 0.05, 0.0, 0.0, 0.0, 1.1, 0.3, 0.0), "rational"),
@@ -37,32 +35,22 @@ CASES = [
 
 @pytest.mark.parametrize(("lens", "kind"), CASES)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_lens_that_there_is_is_chosen_or_a_decentred_one(
-    lens: Lens, kind: str, seed: int
-) -> None:
+def test_the_lens_that_there_is_is_chosen(lens: Lens, kind: str, seed: int) -> None:
     found = calibrate_with_lenses(FAMILY, seen(lens, shots=16, seed=seed), WIDTH, HEIGHT)
     assert found.camera.lens.kind == kind
     (chosen,) = (tried for tried in found.lenses if tried.chosen)
     assert chosen.kind == kind
     # Corners err by NOISE_PX in u and v, boards held out hardly more: their poses are fitted to them.
     assert chosen.rms_px == pytest.approx(np.sqrt(2.0) * NOISE_PX, rel=0.15)
-    needed = [one for one in found.lenses if one.gain is not None and one.gain >= CLEARLY]
-    for one in needed:
-        before = found.lenses[found.lenses.index(one) - 1]
-        assert before.rms_px > one.rms_px
-    # What was taken without need errs within its own sigmas.
-    names = list(vars(lens))
-    off = found.camera.lens.coefficients[: len(names)] - lens.coefficients
-    sigma = np.sqrt(np.diag(found.covariance))[-len(found.camera.lens.coefficients) :][: len(names)]
-    if kind == "brown":
-        assert np.all(np.abs(off) < 4.0 * sigma)
+    simpler = found.lenses[: found.lenses.index(chosen)]
+    assert all(one.rms_px > chosen.rms_px for one in simpler)
 
 
 def test_a_board_whose_corners_are_mixed_up_does_not_choose() -> None:
     views = seen(Radial(-0.3, 0.1), shots=14)
     mixed = views[3].pixels[np.random.default_rng(0).permutation(len(views[3].pixels))]
     views[3] = PlanarView(views[3].shot, views[3].points, mixed)
-    assert calibrate_with_lenses(FAMILY, views, WIDTH, HEIGHT).camera.lens.kind == "brown"
+    assert calibrate_with_lenses(FAMILY, views, WIDTH, HEIGHT).camera.lens.kind == "radial"
 
 
 def test_boards_that_stood_still_are_one_place() -> None:
@@ -85,22 +73,15 @@ def test_two_poses_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "gains", "kind", "richest"),
+    ("gains", "kind", "richest"),
     [
-        (True, [-CLEARLY - 0.1], Radial, Brown),
-        (True, [-CLEARLY + 0.1], Brown, Brown),
-        (True, [CLEARLY - 0.1], Brown, Brown),
-        (False, [CLEARLY - 0.1], Radial, Brown),
-        (False, [CLEARLY, CLEARLY - 0.1], Brown, Rational),
-        (True, [CLEARLY, CLEARLY], Rational, Rational),
+        ([CLEARLY - 0.1], Radial, Brown),
+        ([CLEARLY, CLEARLY - 0.1], Brown, Rational),
+        ([CLEARLY, CLEARLY], Rational, Rational),
     ],
 )
-def test_lenses_are_tried_until_a_usual_one_is_worse_or_a_richer_one_not_clearly_better(
-    told: bool,
-    gains: list[float],
-    kind: type[Lens],
-    richest: type[Lens],
-    monkeypatch: pytest.MonkeyPatch,
+def test_lenses_are_tried_until_one_is_not_clearly_better(
+    gains: list[float], kind: type[Lens], richest: type[Lens], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What the last one tried leaves open says how well pixels are known."""
     fits = {each: SimpleNamespace(camera=SimpleNamespace(lens=each())) for each in FAMILY}
@@ -119,7 +100,6 @@ def test_lenses_are_tried_until_a_usual_one_is_worse_or_a_richer_one_not_clearly
         "places": lambda views: np.arange(4),
         "gain": better,
         "ray_uncertainty": lambda camera, rich, _: (type(camera.lens), type(rich.camera.lens)),
-        "_tells_decentring": lambda fit: told,
     }
     for name, value in instead.items():
         monkeypatch.setattr(lens_choice, name, value)
@@ -172,15 +152,3 @@ def test_a_board_that_moved_by_a_twentieth_of_its_picture_is_elsewhere(
     assert places([views[0], PlanarView("a", points, later + 200.0)]).tolist() == [0, 0], "one shot"
     none_alike = PlanarView("c", points + [0.0, 0.0, 7.0], pixels)
     assert places([views[0], none_alike]).tolist() == [0, 1]
-
-
-@pytest.mark.parametrize(("sigma", "told"), [(2.4e-4, True), (2.6e-4, False)])
-@pytest.mark.parametrize("which", [7, 8])
-def test_boards_tell_a_decentring_if_they_know_both_parts_twice_as_well_as_anyone(
-    which: int, sigma: float, told: bool
-) -> None:
-    """Before any image p1 and p2 are known to 5e-4."""
-    sigmas = np.full(10, 1e-4)
-    sigmas[which] = sigma
-    fit: Any = SimpleNamespace(camera=SimpleNamespace(lens=Brown()), covariance=np.diag(sigmas**2))
-    assert _tells_decentring(fit) is told
