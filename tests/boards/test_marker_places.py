@@ -189,3 +189,19 @@ def test_corners_not_found_are_looked_for_once_more_where_a_dozen_others_say(
         # A dozen corners of two rows tell a homography: it is exact.
         assert np.abs(asked[1] - true).max() < 0.01
         np.testing.assert_allclose(pixels[max(found, 40) :], true[max(found, 40) :] + 0.1)
+
+
+@pytest.mark.parametrize(("first_px", "whole"), [(0.3, True), (-0.3, False)])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_marker_at_the_pictures_first_pixels_lies_wholly_within_it(
+    first_px: float, whole: bool, axis: int
+) -> None:
+    """One that begins at pixel 0.3 could have been seen; the map is good to 0.01."""
+    ids, points = marker_corners(BOARD)
+    pixels = 20.0 + points[..., :2]
+    pixels[..., axis] += first_px - pixels[..., axis].min()
+    beside = pixels[..., axis].min(axis=1) > 1.0  # all but the first column, or row
+    placed = place_markers(BOARD, Markers(np.asarray(ids)[beside], pixels[beside]))
+    assert placed is not None
+    assert 0 < placed.agreeing == beside.sum() < len(pixels)
+    assert placed.all_seen((500, 500)) != whole

@@ -1,4 +1,5 @@
-from dataclasses import replace
+import itertools
+from dataclasses import asdict, replace
 from typing import Any
 
 import cv2
@@ -175,3 +176,13 @@ def test_a_coefficient_left_out_is_named() -> None:
     del damaged["k2"]
     with pytest.raises(ValueError, match="lacks or does not have k2"):
         from_fields(damaged)
+
+
+def test_a_coefficient_that_lenses_share_is_as_likely_large_in_each() -> None:
+    """A lens may be called by a longer formula: k1 and k2 say the same there."""
+    named = [
+        dict(zip(asdict(lens), lens.prior_sigmas.tolist(), strict=True))
+        for lens in (Radial(), Brown(), Rational())
+    ]
+    for shorter, longer in itertools.pairwise(named):
+        assert shorter == {name: longer[name] for name in shorter}

@@ -20,6 +20,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.scan_volume import (
     LAYER_MM,
     MARGIN_MM,
+    _bulges,
     _corner_rays,
     stripes_in_volume,
     volume_interval,
@@ -212,3 +213,18 @@ def test_blocks_begin_at_the_first_pixels_outer_edge_and_cover_the_picture() -> 
     assert rays.shape == (3, 4, 3)
     np.testing.assert_allclose(100.0 * rays[0, :, 0], [-0.5, 9.5, 19.5, 29.5])
     np.testing.assert_allclose(100.0 * rays[:, 0, 1], [-0.5, 9.5, 19.5])
+
+
+def test_limits_are_widened_as_much_on_the_left_as_on_the_right() -> None:
+    """What a camera sees that looks down on a round volume is its own mirror image, stripes too."""
+    at = looking_at_the_middle(600.0, 0.0, 0.5)
+    plain = Camera(200.0, 200.0, 0.0, 79.5, 59.5, Radial(), 160, 120)
+    rays = _corner_rays(plain, 8)
+    near, far = volume_interval(rays, at, VOLUME, raised_mm=0.0)
+    np.testing.assert_allclose(near, near[:, ::-1], rtol=1e-9)
+    finer = 1.0 + rays[..., 0] ** 2 + rays[..., 1]
+    limits = 1e5 * finer * np.stack([1.0 / far, 1.0 / near, 1.0 / near])
+    for by in _bulges(rays, at, VOLUME, (near, far), limits):
+        assert np.count_nonzero(by) > 10
+        # The two halves are rounded differently, and nothing else.
+        np.testing.assert_allclose(by, by[:, ::-1], rtol=1e-6)

@@ -126,3 +126,12 @@ def test_what_leaves_a_tie_open_is_told() -> None:
     assert "(shots s0, s1, s2, s3; at best s0, s1 agree)" in words
     assert "at best" not in said_of(2, 2)
     assert "(shots s0, s1, s2, s3, s4, s5; at best s0, s1 agree)" in said_of(9, 2)
+
+
+def test_one_board_with_one_numbering_ties_two_pairs() -> None:
+    """Nothing contradicts it, so its one vote is most."""
+    found, left_out = initial_poses([view("a", 1), view("b", 1)], "ab")
+    assert not left_out
+    between = (found["a"].inverse() @ found["b"]).matrix
+    # Both views are exact: rounding of 1 m is left.
+    np.testing.assert_allclose(between, PLACED["b"].matrix, atol=1e-6)

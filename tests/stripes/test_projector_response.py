@@ -125,3 +125,23 @@ def test_what_the_error_did_to_s_is_told_beside_noise() -> None:
     np.testing.assert_allclose(found, [20.0 * true, noise], rtol=1e-4)
     assert share_of_error(None, wave, sigma) is None
     assert share_of_error(ERROR, wave, np.full(S.shape, np.nan, np.float32)) is None
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_surface_that_shows_one_side_of_the_error_hides_no_whole_turn_of_the_finer_wave(
+    sign: float,
+) -> None:
+    """Seen where the error is mostly below zero, or above, its mean is more than half a period of
+    the finer wave: 0.41 * 0.045 * 30."""
+    error = PhaseError(3, np.zeros(4), np.array([sign * 0.045, 0.0, 0.0, 0.0]))
+    turn = np.tile(np.linspace(0.005, 0.995, 400, dtype=np.float32), (100, 1))
+    grey = np.full(turn.shape, 50.0, np.float32)
+    s = STRIPES * (turn - error.at(turn)).astype(float)
+    noisy = s / 4.0 + 0.002 * np.random.default_rng(0).normal(size=s.shape)
+    fine = WaveSeen(Wave(4.0, 8), (noisy % 1.0).astype(np.float32), grey, grey)
+    seen_there = np.sin(2.0 * np.pi * 3 * turn) < 0.5
+    found = error_against(WaveSeen(Wave(120.0, 3), turn, grey, grey), fine, seen_there, STRIPES)
+    assert found is not None
+    # Noise leaves 0.002 / 30 of a turn even of one pixel; a whole turn amiss is 1 / 30.
+    np.testing.assert_allclose(found.sines, error.sines, atol=5e-4)
+    np.testing.assert_allclose(found.cosines, error.cosines, atol=5e-4)

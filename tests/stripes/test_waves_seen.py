@@ -113,3 +113,9 @@ def test_how_nearly_alike_is_for_the_caller_to_say() -> None:
     # After three periods of 10 a wave of 28 is 30 / 28 = 1.0714 turns on.
     assert alike_again((10.0, 28.0), 35, 0.08) == 30.0
     assert alike_again((10.0, 28.0), 35, 0.07) is None
+
+
+def test_a_wave_finer_than_a_stripe_is_followed_over_all_stripes() -> None:
+    # Alike again after eight periods of half a stripe: more of them than stripes.
+    assert alike_again((0.5, 4.0), 5, 0.05) == 4.0
+    assert alike_again((0.5, 4.0), 4, 0.05) is None
