@@ -25,7 +25,7 @@ leave a few hundredths of a square, mixed-up corners a whole one."""
 MIN_SHARE_OF_CORNERS = 0.8
 MIN_SHARE_TO_GO_ON = 0.4
 FEWEST_SQUARES = 4
-"""either way: OpenCV's quick detectors refuse to look for fewer than three corners."""
+"""Either way: OpenCV's quick detectors refuse to look for fewer than three corners."""
 LEAST_BEYOND = 0.5
 """Share of the corners, and of the contrast, that a larger board shows beyond the last ones."""
 ROUNDS = 3

@@ -50,11 +50,13 @@ class ChosenLens:
     fit: the camera fitted with it.
     trials: how each lens did; () if there were too few places, or one lens only.
     rays: how well the boards determine each pixel's ray.
+    refused: the fit with the lens tried last, if it was not taken.
     """
 
     fit: CameraFit
     trials: tuple[LensTrial, ...]
     rays: RayUncertainty
+    refused: CameraFit | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +120,9 @@ def choose_lens(
         )
         for fit, out, better_by in trials
     )
-    return ChosenLens(chosen, told, ray_uncertainty(chosen.camera, trials[-1][0], views))
+    last = trials[-1][0]
+    rays = ray_uncertainty(chosen.camera, last, views)
+    return ChosenLens(chosen, told, rays, None if last is chosen else last)
 
 
 def _fit(

@@ -13,7 +13,6 @@ from bodyscan.captures.image_faults import NO_INVERSES, absence, header_fault
 from bodyscan.captures.image_header import NoImage, read_header
 from bodyscan.captures.unlisted_images import describe_unlisted_images
 from bodyscan.errors import BadInput, CaptureError
-from bodyscan.files.model import did_you_mean
 from bodyscan.rig.board import Board
 from bodyscan.rig.pair import Pair
 from bodyscan.rig.rig import Rig
@@ -278,15 +277,12 @@ def _untied(rig: Rig, good: list[ImageSequence]) -> list[str]:
 
 
 def _frame_errors(calibration: Captures, good: list[ImageSequence]) -> list[str]:
-    shot = calibration.rig.rig_frame.shot
-    if shot is None:
+    frame = calibration.rig.rig_frame
+    if missing := frame.missing_shot(calibration.shots):
+        return [missing]
+    if frame.shot is None or any(sequence.shot == frame.shot for sequence in good):
         return []
-    if shot in calibration.shots:
-        if any(sequence.shot == shot for sequence in good):
-            return []
-        return [f"rig_frame.shot: no pair has its images of '{shot}', which fixes the rig frame"]
-    hint = did_you_mean(shot, calibration.shots)
-    return [f"rig_frame.shot: there is no shot '{shot}'{hint} in the calibration captures"]
+    return [f"rig_frame.shot: no pair has its images of '{frame.shot}', which fixes the rig frame"]
 
 
 def _bad_lines(bad: tuple[BadImage, ...]) -> list[str]:

@@ -44,6 +44,11 @@ def files_below(folder: Path) -> Iterator[Path]:
         yield from (Path(root, name) for name in sorted([*files, *links]))
 
 
+def named_below(folder: Path) -> dict[str, Path]:
+    """`files_below` by their paths relative to `folder`."""
+    return {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
+
+
 def content_hash(content: Any) -> str:
     """SHA-256 of plain data, by its JSON with sorted keys."""
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)

@@ -12,7 +12,7 @@ from typing import Any
 
 from bodyscan.errors import BadInput, ResultError
 from bodyscan.files.atomic import write_json
-from bodyscan.files.hashing import files_below
+from bodyscan.files.hashing import named_below
 from bodyscan.jobs.pipeline import Pipeline
 
 SCHEMA, VERSION = "bodyscan-job", 1
@@ -117,8 +117,9 @@ def read_record(path: Path) -> dict[str, Any]:
 def results_in(folder: Path) -> dict[str, Path]:
     """What a stage wrote, as far as it is there, by relative path: people may have added files."""
     named = read_record(folder / STAGE).get("outputs")
-    there = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
-    return {name: there[name] for name in there if isinstance(named, dict) and name in named}
+    if not isinstance(named, dict):
+        return {}
+    return {name: path for name, path in named_below(folder).items() if name in named}
 
 
 def _there(folder: Path, relative: str) -> Path:

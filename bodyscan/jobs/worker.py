@@ -24,7 +24,7 @@ from typing import Any
 
 from bodyscan.errors import BodyscanError, CaptureError
 from bodyscan.files.atomic import flush, json_text, write_json
-from bodyscan.files.hashing import content_hash, file_hash, file_hashes, files_below
+from bodyscan.files.hashing import content_hash, file_hash, file_hashes, files_below, named_below
 from bodyscan.files.locking import file_lock, for_owner_only
 from bodyscan.jobs.job import KEPT, LOCK, MANIFEST, STAGE, Job, read_job, results_in
 from bodyscan.jobs.plan import Origin, origin_of, reason_to_run
@@ -119,8 +119,7 @@ def _perform(job: Job, stage: Stage, before: Origin, tell: Tell) -> None:
                 where=str(job.source),
                 remedy="start the batch again when the folder is complete",
             )
-        paths = {path.relative_to(made).as_posix(): path for path in files_below(made)}
-        write_json(made / STAGE, before.record(file_hashes(paths)))
+        write_json(made / STAGE, before.record(file_hashes(named_below(made))))
         _flush_all(made)
     except BaseException:
         shutil.rmtree(made, ignore_errors=True)
@@ -153,8 +152,8 @@ def _remove_results(old: Path, tell: Tell) -> None:
     if old.is_dir() and not old.is_symlink():
         # Without a record (an upload that was cut short) the new result tells what stages write.
         ours = results_in(old) or results_in(old.with_name(stage))
-        for path in [*files_below(old)]:
-            if path.relative_to(old).as_posix() in ours:
+        for name, path in named_below(old).items():
+            if name in ours:
                 path.unlink()
         (old / STAGE).unlink(missing_ok=True)
         for folder, *_ in os.walk(old, topdown=False):

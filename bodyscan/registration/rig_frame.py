@@ -8,7 +8,6 @@ import numpy as np
 
 from bodyscan.calibration.board_views import board_symmetries
 from bodyscan.errors import BadInput
-from bodyscan.files.model import did_you_mean
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.view_graph import Target
 from bodyscan.rig.pair import NominalPose, Pair
@@ -34,11 +33,9 @@ def frame_target(rig: Rig) -> Target | None:
 
 def refuse_without_frame_shot(rig: Rig, shots: Collection[str]) -> None:
     """Raise BadInput if the shot that fixes the rig frame is none of `shots`."""
-    target = frame_target(rig)
-    if target is not None and target[0] not in shots:
+    if missing := rig.rig_frame.missing_shot(shots):
         raise BadInput(
-            f"rig_frame.shot: there is no shot '{target[0]}'{did_you_mean(target[0], shots)} in the "
-            "calibration captures",
+            missing,
             where=f"rig {rig.name}",
             remedy="capture the board where it fixes the rig frame, or fix the frame by a pair "
             "(rig_frame: {pair: NAME})",

@@ -138,11 +138,8 @@ def _decentred_together(
         for name, lens in chosen.items()
         if (gain := _gain(lens, Brown)) is not None and -CLEARLY < gain < CLEARLY
     ]
-    if not open_:
-        return {}
-    fits = threaded(lambda name: looked[name].choose((Brown,)).fit, open_, stage="choosing lenses")
-    off = np.concatenate([_decentring(fit) for fit in fits])
-    if np.mean(off**2) < 1.0 + CLEARLY * np.sqrt(2.0 / len(off)):
+    off = np.array([_decentring(chosen[name].refused) for name in open_]).ravel()
+    if not open_ or np.mean(off**2) < 1.0 + CLEARLY * np.sqrt(2.0 / len(off)):
         return {}
     found = {}
     for name in open_:
@@ -151,8 +148,9 @@ def _decentred_together(
     return found
 
 
-def _decentring(fit: CameraFit) -> Array:
-    """p1 and p2 in their sigmas, (2,)."""
+def _decentring(fit: CameraFit | None) -> Array:
+    """p1 and p2 in their sigmas, (2,), of a fit with a lens that has them."""
+    assert fit is not None
     names = fit.camera.parameter_names
     own = [names.index("p1"), names.index("p2")]
     return np.asarray(fit.camera.parameters[own] / np.sqrt(np.diag(fit.covariance)[own]))

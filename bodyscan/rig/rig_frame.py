@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
-from bodyscan.files.model import Model, Name, Problem, ShotName
+from bodyscan.files.model import Model, Name, Problem, ShotName, did_you_mean
 
 Vector = tuple[float, float, float]
 
@@ -31,6 +31,13 @@ class RigFrame(Model):
 
     def problems(self) -> Iterator[Problem]:
         return _problems(self)
+
+    def missing_shot(self, shots: Collection[str]) -> str | None:
+        """What is wrong if the shot that fixes the frame is none of `shots`, in words."""
+        if self.shot is None or self.shot in shots:
+            return None
+        hint = did_you_mean(self.shot, shots)
+        return f"rig_frame.shot: there is no shot '{self.shot}'{hint} in the calibration captures"
 
 
 def _problems(frame: RigFrame) -> Iterator[Problem]:
