@@ -34,6 +34,7 @@ from benchmarks import (
     png,
     procam,
     rig,
+    rig_sigmas,
     seconds,
     sigmas,
     skin,
@@ -51,7 +52,8 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "people": people.report,
     "motion-budget": motion_budget.report,
     "sigmas": sigmas.report,
-    "sigmas-rigs": sigmas.rigs,
+    "sigmas-rigs": rig_sigmas.known,
+    "sigmas-fresh": rig_sigmas.fresh,
     "one-solve": one_solve.report,
     "fusion": fusion.report,
     "faults": faults.report,
@@ -67,7 +69,7 @@ BENCHMARKS: dict[str, Callable[[], str]] = {
     "lens": lens.report,
     "mutants": mutants.report,
 }
-SLOW = ("mutants", "day", "sigmas-rigs", "motion-budget")
+SLOW = ("mutants", "day", "sigmas-rigs", "sigmas-fresh", "motion-budget")
 """Run only when named."""
 
 

@@ -1,27 +1,20 @@
-"""Errors over their sigmas, over seeds: for the chapter's unit, and for a rig with a body."""
+"""Errors over their sigmas, over seeds: for the chapter's unit."""
 
 from __future__ import annotations
 
 import multiprocessing
-import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.distance import pdist
 
-from benchmarks.full_size import run_commands
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.evaluation.spheres import centre_distances
-from bodyscan.evaluation.surface import signed_distances
-from bodyscan.fusion.storage import load_scan
 from bodyscan.geometry.camera_fields import from_fields
 from bodyscan.geometry.robust import rms
-from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.laboratory.chapter import apparatus
 from bodyscan.laboratory.chapter.calibrating import calibrate_ours
 from bodyscan.laboratory.chapter.captures import TARGET, take_captures
@@ -33,23 +26,11 @@ from bodyscan.laboratory.chapter.measuring import (
 from bodyscan.laboratory.chapter.point_sigma import PointSigma, point_sigma
 from bodyscan.laboratory.rivals.targets import by_reference_plane
 from bodyscan.progress import THREADS
-from bodyscan.registration.rig_calibration import RigCalibration
-from bodyscan.registration.storage import load_calibration
 from bodyscan.simulation.truth import describe_camera
-from bodyscan.workflows.evaluate import compare_rig, load_truth
 
-PROJECT = Path(__file__).parents[1]
-SEEDS, RIG_SEEDS = range(10), range(5)
-"""Ten units: what is unknown of a unit is common to all its
-points, so that five gave 0.6 for 0.9."""
-ONCE_FRESH_SEEDS, LATER_SEEDS = range(10, 14), range(20, 24)
-"""Of rigs that no choice was made by until one of the first four led to a fault of corners, and one of
-the others to decentred lenses."""
-KINDS = (("", RIG_SEEDS), (", once fresh", ONCE_FRESH_SEEDS), (", fresh later", LATER_SEEDS))
-PRESETS = ("ideal", "workshop")
+SEEDS = range(10)
+"""Of units: what is unknown of one is common to all its points, so that five gave 0.6 for 0.9."""
 BOARDS = (3, 10)
-SCALE, SHOTS = 0.4, 24
-"""Of the rig: at full size a calibration and a scan take minutes each to render."""
 
 
 def report() -> str:
@@ -83,34 +64,6 @@ print, and what is left with the print's known.
 """
 
 
-def rigs() -> str:
-    """The section of docs/results.md on whole rigs: two minutes per seed and preset."""
-    found = [
-        (f"{preset}{kind}", [_rig(preset, seed) for seed in seeds])
-        for preset in PRESETS
-        for kind, seeds in KINDS
-    ]
-    return f"""## Errors over their sigmas, of whole rigs (synthetic)
-
-Root mean square over all seeds, in brackets that of each seed.
-
-`rigs/three-pole-12.yaml` with the woman as a mannequin, `--scale {SCALE:g}`, {SHOTS} shots of the
-board, {len(RIG_SEEDS)} seeds with devices and a board of their own, by the commands; and twice
-{len(LATER_SEEDS)} more, by which no choice in the code was made until one of each showed a fault
-that was mended then (of corners; of decentred lenses):
-
-| preset | camera centres | beyond three | cloud | beyond three | cloud RMS mm |
-|---|---|---|---|---|---|
-{chr(10).join(_rig_row(*one) for one in found)}
-
-The cameras' rotations, and alpha, beta, gamma, u0, v0, k1, k2:
-
-| preset | rotations | beyond three | parameters | beyond three |
-|---|---|---|---|---|
-{chr(10).join(_camera_row(*one) for one in found)}
-"""
-
-
 @dataclass(frozen=True, eq=False)
 class UnitErrors:
     """camera: (7,) errors over sigmas of its parameters. best: with the true calibration, from the
@@ -141,75 +94,14 @@ def _unit(boards: int, real_light: bool, seed: int) -> UnitErrors:
     return UnitErrors(point_sigma(ours, captures), off, accuracy, best, print_ppm)
 
 
-@dataclass(frozen=True, eq=False)
-class RigErrors:
-    """Errors over sigmas: of camera centres (P, 3), of the cameras' turns about the rig's axes (P, 3),
-    of alpha, beta, gamma, u0, v0, k1, k2 (P, 7), and of the cloud (N,). cloud_mm: (N,) errors."""
-
-    centres: Array
-    turns: Array
-    cameras: Array
-    cloud: Array
-    cloud_mm: Array
-
-
-def _rig(preset: str, seed: int) -> RigErrors:
-    workspace = PROJECT / "bench" / "sigmas" / f"{preset}-{seed}"
-    rig, subject = PROJECT / "rigs" / "three-pole-12.yaml", "data/subjects/woman_average.ply"
-    calibration = workspace / "calibration"
-    commands: dict[str, list[object]] = {
-        "simulate": [rig, "--out", workspace, "--subject", PROJECT / subject, "--scale", SCALE]
-        + ["--board-shots", SHOTS, "--preset", preset, "--subject-preset", "mannequin"]
-        + ["--seed", seed],
-        "calibrate-rig": [workspace / "rig.yaml", "--overwrite"],
-        "scan": [workspace / "captures" / "person", "--calibration", calibration]
-        + ["--out", workspace / "scan", "--overwrite"],
-    }
-    run_commands(commands, workspace)
-    truth = load_truth(workspace / "truth")
-    found = load_calibration(calibration)
-    placed = compare_rig(found, truth)
-    assert truth.vertices is not None
-    assert truth.faces is not None
-    cloud = load_scan(workspace / "scan").cloud
-    distances = signed_distances(cloud.points, truth.vertices, truth.faces)
-    shutil.rmtree(workspace / "scan")
-    names = sorted(found.pairs)
-    return RigErrors(
-        placed.centres_mm / placed.sigmas_mm,
-        np.array([_turned(found, truth.facts["pairs"][name], name) for name in names]),
-        np.array([_camera_off(found, truth.facts["pairs"][name], name) for name in names]),
-        distances / cloud.sigma_mm,
-        distances,
-    )
-
-
-def _turned(found: RigCalibration, true: Mapping[str, Any], name: str) -> Array:
-    """Errors (3,) of a camera's rotation over their sigmas, about the rig's axes."""
-    off = (
-        found.rig_from_camera[name] @ RigidTransform.from_matrix(true["rig_from_camera"]).inverse()
-    )
-    sigmas = np.sqrt(np.diag(found.covariance.of(name))[:3])
-    if not sigmas.any():  # the camera that holds the frame
-        return np.zeros(3)
-    return np.asarray(off.twist[:3] / sigmas)
-
-
-def _camera_off(found: RigCalibration, true: Mapping[str, Any], name: str) -> Array:
-    """Errors (7,) of the parameters that all lenses have, over their sigmas."""
-    pair = found.pairs[name]
-    off = pair.camera.parameters[:7] - from_fields(true["camera"]).parameters[:7]
-    return np.asarray(off / np.sqrt(np.diag(pair.camera_covariance))[:7])
-
-
 def _unit_row(boards: int, light: str, seeds: Sequence[UnitErrors]) -> str:
     beyond = 100.0 * np.mean([one.points.beyond_three for one in seeds])
     spheres, plate = [s.points.spheres for s in seeds], [s.points.plate for s in seeds]
     camera = [rms(s.camera) for s in seeds]
     apart = 100.0 * np.mean(np.abs([s.camera for s in seeds]) > 3.0)
     return (
-        f"| {boards} | {light} | {_each(spheres)} | {_each(plate)} | {beyond:.2f} % | "
-        f"{_each(camera)} | {apart:.1f} % |"
+        f"| {boards} | {light} | {each_seed(spheres)} | {each_seed(plate)} | {beyond:.2f} % | "
+        f"{each_seed(camera)} | {apart:.1f} % |"
     )
 
 
@@ -231,24 +123,6 @@ def _size_row(boards: int, light: str, seeds: Sequence[UnitErrors]) -> str:
     return f"| {boards} | {light} | {' | '.join(cells)} |"
 
 
-def _rig_row(preset: str, seeds: Sequence[RigErrors]) -> str:
-    centres, cloud = [rms(s.centres) for s in seeds], [rms(s.cloud) for s in seeds]
-    apart = np.mean(np.abs(np.concatenate([s.centres for s in seeds])) > 3.0)
-    beyond = np.mean(np.abs(np.concatenate([s.cloud for s in seeds])) > 3.0)
-    size = rms(np.concatenate([s.cloud_mm for s in seeds]))
-    return (
-        f"| {preset} | {_each(centres)} | {100 * apart:.1f} % | {_each(cloud)} | "
-        f"{100 * beyond:.2f} % | {size:.3f} |"
-    )
-
-
-def _camera_row(preset: str, seeds: Sequence[RigErrors]) -> str:
-    cells = []
-    for each in ([s.turns for s in seeds], [s.cameras for s in seeds]):
-        apart = 100.0 * np.mean(np.abs(np.concatenate(each)) > 3.0)
-        cells += [_each([rms(one) for one in each]), f"{apart:.1f} %"]
-    return f"| {preset} | {' | '.join(cells)} |"
-
-
-def _each(spreads: Sequence[float]) -> str:
+def each_seed(spreads: Sequence[float]) -> str:
+    """The root mean square over all seeds, and in brackets each of them."""
     return f"{rms(np.array(spreads)):.2f} ({', '.join(f'{one:.2f}' for one in spreads)})"
