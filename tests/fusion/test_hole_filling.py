@@ -6,13 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ray_cast_scan import looking, nominal_camera
 
 from bodyscan.fusion.harmonic_filling import fill_harmonically
+from bodyscan.fusion.hole_filling import CELL_MM, likely_distances
 from bodyscan.fusion.meshing import mesh
 from bodyscan.fusion.signed_distances import splat
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.bricks import SIDE, Bricks, dense_of
 from bodyscan.mesh.topology import topology
+from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.rig.pair import NominalPose
 from bodyscan.settings import MeshSettings
 
 
@@ -124,6 +128,30 @@ def test_two_limbs_close_to_each_other_stay_two() -> None:
     shape = topology(found.vertices, found.faces)
     assert (shape.components, shape.euler) == (1, 2)
     assert np.ptp(found.vertices[:, 1]) == pytest.approx(160.0, abs=1.0)
+
+
+def test_what_was_seen_through_is_half_a_cell_outside() -> None:
+    """The outer sides of two upright rods, which filling makes one; a wall shows between them."""
+    rng = np.random.default_rng(1)
+    angle, z = rng.uniform(-0.5 * np.pi, 0.5 * np.pi, 40_000), rng.uniform(800.0, 1000.0, 40_000)
+    side = np.where(np.arange(40_000) % 2 == 0, 1.0, -1.0)
+    normals = np.stack([np.sin(angle), side * np.cos(angle), np.zeros_like(angle)], axis=1)
+    rods = cloud_of(40.0 * normals + np.stack([0.0 * z, 50.0 * side, z], axis=1), normals)
+    camera = nominal_camera(320, 256)
+    pose = looking(NominalPose(position_mm=(1500.0, 0.0, 900.0), look_at_mm=(0.0, 0.0, 900.0)))
+    rays = camera.pixel_rays()
+    between = np.abs(1500.0 * rays[..., 0]) < 25.0
+    points = np.where(between[..., None], 3000.0 * rays, np.nan).astype(np.float32)
+    sigma = np.where(between, np.float32(0.1), np.float32(np.nan))
+    wall = RangeImage("p", camera, points, points, sigma, np.zeros(between.shape, np.uint8))
+    guessed, seen = (
+        likely_distances(rods, 1.0, images, {"p": pose}, workers=1) for images in ([], [wall])
+    )
+    _, y, height = guessed.origin[:, None, None, None] + CELL_MM * np.indices(guessed.values.shape)
+    gap = (np.abs(y) < 20.0) & (np.abs(height - 900.0) < 60.0) & (guessed.values < 0.0)
+    assert gap.sum() > 500
+    # So the surface lies between such nodes and the rods.
+    assert 0.5 * CELL_MM <= seen.values[gap].min() < CELL_MM
 
 
 def test_a_grid_of_which_no_half_can_be_halved_is_filled_as_well() -> None:

@@ -66,6 +66,17 @@ def test_hands_that_begin_where_hips_widen_are_no_bag() -> None:
     assert "carried" in asked(*legs, hips, trunk, hands[0], bag)
 
 
+def test_a_load_begins_above_the_crotch_whose_own_section_is_half_of_the_thighs() -> None:
+    """Where thighs meet, one section goes round both before the hips begin, 27 % larger."""
+    step = 1755.0 / 54.0
+    legs = [box((150.0, 180.0, 720.0), (0.0, side, 360.0)) for side in (-100.0, 100.0)]
+    for high, loads in ((step, 0), (3.0 * step, 1)):
+        meet = box((185.0, 300.0, high), (0.0, 0.0, 720.0 + 0.5 * high))
+        rest = 1755.0 - 720.0 - high
+        trunk = box((235.0, 300.0, rest), (0.0, 0.0, 1755.0 - 0.5 * rest))
+        assert len(find_loads(meshed(*legs, meet, trunk))) == loads
+
+
 def prism(outline: list[tuple[float, float]], low: float, high: float) -> Truth:
     """The sides of an upright prism; side k gives faces 2 k and 2 k + 1."""
     below = np.array([(*corner, low) for corner in outline])

@@ -9,8 +9,9 @@ from bodyscan.geometry.pose_covariance import position_sigma
 from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.advice import advise, crucial_shots
-from bodyscan.registration.more_shots import BoardPlace
+from bodyscan.registration.more_shots import BoardPlace, RigInformation
 from bodyscan.registration.normal_equations import normal_equations
+from bodyscan.registration.rig_frame import frame_target
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
 
@@ -70,6 +71,26 @@ def test_shots_as_advised_do_halve_the_sigma(ring: Ring) -> None:
     sigma = np.linalg.norm(position_sigma(again.covariance, more.pair, centre))
     # The noise is estimated anew and robust weights shift a little: 10 %.
     assert sigma == pytest.approx(more.after_mm, rel=0.1)
+
+
+def test_what_is_told_to_be_gained_is_gained_by_as_many_shots_as_are_told(ring: Ring) -> None:
+    rig, _, _, _, _, placed = ring
+    more = advise(rig, placed).more
+    assert more is not None
+    equations = normal_equations(
+        placed.views,
+        placed.cameras,
+        placed.rig_from_camera,
+        placed.rig_from_board,
+        fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
+        fixed_target=frame_target(rig),
+        cameras_free=True,
+    )
+    knowledge = RigInformation(equations, placed.cameras, placed.rig_from_camera)
+    told = knowledge.after(knowledge.information(more.place), more.pair, more.shots)
+    assert told.shots_to_halve == more.shots
+    gained = np.sqrt(told.after_mm2[-1] / told.before_mm2)
+    assert more.after_mm == pytest.approx(gained * more.before_mm)
 
 
 def test_the_worst_pair_is_that_of_the_covariance(ring: Ring) -> None:

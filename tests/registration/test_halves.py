@@ -206,6 +206,15 @@ def test_differences_are_counted_in_sigmas_with_their_correlation() -> None:
     assert _over_expected(np.array([3.0, 1.0]), np.ones((2, 2))) == pytest.approx(2.0)
 
 
+def test_the_frame_taken_out_of_many_pairs_leaves_the_rounding_of_their_largest_variance() -> None:
+    """Forty that go together have 40 times their own variance in common, which is known to 40 times
+    its rounding: 1e-8 of their own is nothing, and a difference there says nothing."""
+    together = (1.0 - 1e-8) * np.ones((40, 40)) + 1e-8 * np.eye(40)
+    alike, apart = np.ones(40), np.zeros(40)
+    apart[:2] = 1e-3, -1e-3
+    assert _over_expected(alike + apart, together) == pytest.approx(1.0, rel=1e-6)
+
+
 def test_a_centres_sigma_is_that_of_its_shift_and_of_the_turn_about_the_origin() -> None:
     covariance = np.zeros((12, 12))
     covariance[range(6), range(6)] = [1e-6, 4e-6, 9e-6, 0.25, 0.25, 0.25]

@@ -16,6 +16,7 @@ from bodyscan.registration.rig_frame import (
     nominal_pose,
     refuse_without_frame_shot,
     rig_from_root,
+    rig_from_world,
 )
 from bodyscan.registration.view_graph import RelativePose
 from bodyscan.rig.board import Board
@@ -41,6 +42,21 @@ def test_a_rig_whose_frame_shot_was_not_captured_is_refused_before_any_work() ->
     with pytest.raises(BadInput, match=r"there is no shot 'floor' \(did you mean 'flor'\?\)"):
         refuse_without_frame_shot(on_floor, ["b01", "flor"])
     refuse_without_frame_shot(rig({"pair": "p"}), [])
+
+
+def test_placed_cameras_stay_where_they_are_unless_the_rig_file_places_one_that_holds_the_frame() -> (
+    None
+):
+    stands = {"position_mm": (1500.0, 0.0, 900.0), "look_at_mm": (0.0, 0.0, 900.0)}
+    world = {"p": SOMEWHERE, "q": SOMEWHERE.inverse()}
+    assert rig_from_world(rig({"shot": "floor", "board": "b"}, p=stands), world) is None
+    assert rig_from_world(rig({}), world) is None
+    moved = rig_from_world(rig({}, p=stands), world)
+    assert moved is not None
+    np.testing.assert_allclose((moved @ SOMEWHERE).translation, stands["position_mm"])
+    named = rig_from_world(rig({"pair": "q"}), world)  # which has no pose of its own: the origin
+    assert named is not None
+    np.testing.assert_allclose(named.matrix, SOMEWHERE.matrix, atol=1e-9)
 
 
 @pytest.mark.parametrize(
