@@ -10,7 +10,7 @@ from flat_walls import ASIDE, WALL_MM, wall
 
 from bodyscan.fusion.averaging import average
 from bodyscan.fusion.brightness import EvenGrey
-from bodyscan.fusion.evidence import Evidence, compare
+from bodyscan.fusion.evidence import EDGE_ON, Evidence, _faces, compare
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples, take_samples
 from bodyscan.geometry.transforms import RigidTransform
@@ -88,3 +88,13 @@ def test_a_surface_that_was_bent_is_asked_where_its_points_went() -> None:
     asked = compare(samples, replace(moved, bent=False), 1, 1.5, 6.0)
     off = moved.points[asked.at] - samples.points[asked.index]
     assert np.median(off[:, 0]) > 2.0, "looked up where they were"
+
+
+@pytest.mark.parametrize("distance_mm", [1.0, 1500.0])
+def test_a_camera_is_asked_where_it_sees_a_surface_less_than_edge_on(distance_mm: float) -> None:
+    normal = np.array([0.0, 0.6, 0.8], np.float32)
+    along = np.array([1.0, 0.0, 0.0])
+    point = np.array([30.0, -20.0, 900.0], np.float32)
+    for cosine, asked in ((1.02 * EDGE_ON, True), (0.98 * EDGE_ON, False), (-1.0, False)):
+        way = cosine * normal + np.sqrt(1.0 - cosine**2) * along
+        assert _faces(point, normal, point + distance_mm * way) == asked
