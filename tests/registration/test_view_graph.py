@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -103,6 +105,20 @@ def test_a_board_stands_where_most_corners_say_and_a_view_far_off_is_doubtful() 
     more = [view("a", 1, 100.0, corners=8), view("b", 1), view("c", 1, 130.0, corners=6)]
     _, boards, _ = place_boards(more, PLACED)
     assert np.linalg.norm(boards["s1", "board"].translation - board(1).translation) > 90.0
+
+
+def test_a_board_numbered_from_its_other_end_is_numbered_as_the_other_pairs_see_it() -> None:
+    from_there = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.array([120.0, 80.0, 0.0]))
+    either = RigidTransform.identity(), from_there
+    views = [replace(view(pair, 1), alternatives=either) for pair in "abc"]
+    views[2] = replace(views[2].resolved(from_there), alternatives=either)
+    kept, boards, doubtful = place_boards(views, PLACED)
+    assert not doubtful
+    for one in kept:
+        assert not one.ambiguous
+        seen = PLACED[one.pair] @ one.camera_from_board
+        np.testing.assert_allclose(seen.matrix, boards["s1", "board"].matrix, atol=1e-6)
+        np.testing.assert_allclose(one.points, kept[0].points, atol=1e-9)
 
 
 def said_of(shots: int, agreeing: int) -> str:
