@@ -28,6 +28,8 @@ def shifted(*mm: float) -> np.ndarray:
 def test_what_is_found_is_believed_within_bounds() -> None:
     assert PRIOR.scale(shifted(0.0, 0.0)) == 0.3
     assert PRIOR.scale(shifted(2.0, -2.0)) == pytest.approx(1.5 * 2.0 / np.sqrt(3.0))
+    usual = SwayPrior(shift_mm=2.0, rotation_deg=0.5, least=0.3, most=4.0)
+    assert usual.scale(shifted(2.0, -2.0)) == pytest.approx(0.5 * PRIOR.scale(shifted(2.0, -2.0)))
     assert PRIOR.scale(shifted(90.0, -90.0)) == 4.0
     assert SwayPrior(0.0, 0.0, 0.3, 4.0).scale(shifted(5.0, -5.0)) == 1.0
 

@@ -5,6 +5,7 @@ import pytest
 from table_one import CAMERA, POINTS, TURNS
 
 from bodyscan.arrays import Array
+from bodyscan.calibration import camera
 from bodyscan.calibration.board_views import PlanarView
 from bodyscan.calibration.camera import (
     calibrate_camera,
@@ -13,8 +14,10 @@ from bodyscan.calibration.camera import (
 from bodyscan.calibration.zhang import homography, matrix_from_homographies
 from bodyscan.errors import DegeneratePoses
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.least_squares import Noise
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration import normal_equations
 
 
 def views(
@@ -54,6 +57,14 @@ def test_an_outlier_corner_does_no_harm() -> None:
     clean = calibrate_camera(views(TURNS, 0.03), 640, 480).camera
     # The clean solution's own sigma of alpha is about 0.5 px.
     assert abs(found.alpha - clean.alpha) < 0.5
+
+
+@pytest.mark.parametrize("noise", [camera.CORNERS, normal_equations.CORNERS])
+def test_a_corner_that_is_off_along_one_axis_is_believed_less_along_both(noise: Noise) -> None:
+    off, beside = noise.weights(np.array([12.0, 0.0, 0.0, 0.0])).reshape(2, 2)
+    assert off[0] == off[1]
+    assert off[1] < 0.2  # three Cauchy spreads: a tenth
+    assert beside.tolist() == [1.0, 1.0]
 
 
 def test_two_poses_are_refused() -> None:
