@@ -1,5 +1,7 @@
 """Spots that two cameras see of one wavy surface, whose shape and place are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ball import ball_points
@@ -93,6 +95,33 @@ def test_projected_points_are_those_that_the_camera_saw(
     expected = np.zeros(len(rig), bool)
     expected[inside] = b.inner[rows[inside], columns[inside]] & (facing[inside] > 0.3)
     np.testing.assert_allclose(found.points, rig[expected], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "part", [np.s_[130:256, 0:320], np.s_[0:140, 0:320], np.s_[0:256, 130:185]]
+)
+def test_what_lies_outside_of_the_part_that_was_kept_has_no_match(
+    two: list[tuple[AlignmentPoints, RigidTransform]], part: tuple[slice, slice]
+) -> None:
+    (a, rig_from_a), (b, rig_from_b) = two
+    image, (rows, columns) = b.image, part
+    kept = replace(
+        image,
+        points=image.points[part],
+        normals=image.normals[part],
+        sigma_mm=image.sigma_mm[part],
+        colours=image.colours[part],
+        corner=(rows.start, columns.start),
+    )
+    whole, cut = (
+        match_projected(a, one, rig_from_a, rig_from_b, 6.0)
+        for one in (b, replace(b, image=kept, inner=b.inner[part]))
+    )
+    column, row = np.rint(CAMERA.project(rig_from_b.inverse().apply(whole.points))).astype(int).T
+    inside = (rows.start <= row) & (row < rows.stop) & (columns.start <= column)
+    inside &= column < columns.stop
+    assert 0.1 < inside.mean() < 0.9
+    np.testing.assert_array_equal(cut.source, whole.source[inside])
 
 
 def test_a_shift_is_measured_along_the_normals(

@@ -12,8 +12,9 @@ from stripe_rendering import gray_bits, render
 from bodyscan.arrays import Array, Indices
 from bodyscan.errors import DecodingFailed
 from bodyscan.geometry.velocity import SurfaceSpeeds, Velocity
+from bodyscan.stripes.boundaries import Boundaries
 from bodyscan.stripes.codes.gray import Gray
-from bodyscan.stripes.comb import Comb
+from bodyscan.stripes.comb import Comb, _window_starts
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.one_moment import Moments, StripeMotion
 from bodyscan.stripes.stripe_map import StripeMap
@@ -53,6 +54,12 @@ def seen(request: pytest.FixtureRequest) -> tuple[bool, list[np.ndarray]]:
         images.append(render(moving, light[None], stripes=STRIPES, shape=SHAPE, seed=time))
     lit, dark = images[0][:2]
     return request.param, [lit, dark, np.concatenate([image[2] for image in images])]
+
+
+def test_where_no_boundaries_are_no_window_begins() -> None:
+    number, place = np.empty(0, np.int64), np.empty(0)
+    none = Boundaries(number, number, place, place, place, number, number > 0, 1.0)
+    assert not len(_window_starts(none))
 
 
 def errors(found: StripeMap, time: float) -> Array:
