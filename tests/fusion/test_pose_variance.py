@@ -62,16 +62,20 @@ def test_a_pair_counts_wherever_it_stands_before_the_surface(cloud: BodyCloud) -
 
 def test_draws_of_the_placing_spread_by_the_error_bar(cloud: BodyCloud) -> None:
     rng = np.random.default_rng(4)
-    root = rng.normal(size=(6, 6)) * np.array([1e-5] * 3 + [0.02] * 3)[:, None]
+    # A turn of 4e-5 moves what is 900 mm away by more than the shift does.
+    root = rng.normal(size=(6, 6)) * np.array([4e-5] * 3 + [0.02] * 3)[:, None]
     prior = PoseCovariance(("p0",), root @ root.T)
     place = placed([1300, 0, 900])
-    alone = BodyCloud(
-        cloud.points, cloud.normals, 0 * cloud.sigma_mm, cloud.colours, cloud.pairs_seen
+    points = rng.uniform([-300.0, -300.0, 0.0], [300.0, 300.0, 1800.0], (73, 3))
+    normals = rng.normal(size=points.shape)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    alone = replace(
+        cloud, points=points, normals=normals.astype(np.float32), sigma_mm=0 * cloud.sigma_mm
     )
     sigma = add_pose_variance(alone, place, prior).sigma_mm
     twists = rng.normal(size=(4000, 6)) @ root.T
-    moved = np.array([RigidTransform.identity().moved(t).apply(cloud.points) for t in twists])
-    along = np.einsum("knc,nc->kn", moved - cloud.points, cloud.normals.astype(float))
+    moved = np.array([RigidTransform.identity().moved(t).apply(points) for t in twists])
+    along = np.einsum("knc,nc->kn", moved - points, normals)
     seen = sigma > 0
     assert seen.sum() > 20
     assert sigma[seen] == pytest.approx(along.std(axis=0)[seen], rel=0.06)
