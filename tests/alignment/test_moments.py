@@ -4,8 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import gamma, kv
 
-from bodyscan.alignment.moments import BEGUN, BREATHS_S, LAG, Courses, breaths, of_breath, of_stance
+from bodyscan.alignment.moments import (
+    BEGUN,
+    BREATHS_S,
+    LAG,
+    STANCE_S,
+    Courses,
+    breaths,
+    of_breath,
+    of_stance,
+)
 
 
 @pytest.mark.parametrize("correlation", [of_stance, of_breath])
@@ -31,6 +41,14 @@ def test_a_breath_comes_back_and_a_stance_does_not() -> None:
     assert of_breath(np.array([1.9]))[0] < -0.5
     assert of_stance(np.array([1.9]))[0] > 0.0
     assert of_stance(np.array([0.01]))[0] > 0.999
+
+
+def test_a_stance_is_materns_of_order_five_halves() -> None:
+    """By the Bessel function of the second kind (Rasmussen and Williams 2006, 4.14)."""
+    seconds = np.geomspace(0.01, 30.0, 40)
+    scaled = np.sqrt(5.0) * seconds / STANCE_S
+    bessel = 2.0**-1.5 / gamma(2.5) * scaled**2.5 * kv(2.5, scaled)
+    np.testing.assert_allclose(of_stance(-seconds), bessel, rtol=1e-9)
 
 
 def test_a_moment_that_is_not_known_is_like_no_other() -> None:

@@ -187,6 +187,17 @@ def test_narrow_stripes_are_smoothed_along_their_run() -> None:
     np.testing.assert_array_equal(position[[0, 1, -2, -1]], seen[[0, 1, -2, -1]])
 
 
+def test_a_run_is_not_smoothed_with_the_end_of_another() -> None:
+    """Even though the last run ends where the first would have gone on."""
+    last = 2.0 * np.arange(10)
+    both = np.concatenate([last + 20.0, last])
+    joined = np.arange(19) != 9
+    _, sigma = smooth_runs(run(both, np.arange(20)), joined)
+    smoothed = np.arange(10) % 9 > 1
+    smoothed[8] = False  # two of either end
+    np.testing.assert_array_equal(sigma < 0.02, np.tile(smoothed, 2))
+
+
 def test_smoothing_stops_at_the_ends_of_a_run_and_at_what_noise_does_not_explain() -> None:
     place = 1.5 * np.arange(40)
     joined = np.ones(39, bool)
