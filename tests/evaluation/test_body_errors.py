@@ -103,3 +103,29 @@ def test_only_what_camera_and_projector_see_counts() -> None:
     assert coverage_of_seen(dense, vertices, faces, true)[1] > 0.98
     off = dense + [1.5, 0.0, 0.0]
     assert coverage_of_seen(off, vertices, faces, true)[1] < 0.6
+
+
+def test_no_camera_sees_beyond_the_middles_of_its_last_pixels() -> None:
+    """200 mm a pixel: 4 x 3 of them of a wall of 2 x 2 m, 1 m away."""
+    side = np.linspace(-1000.0, 1000.0, 41)
+    z, x = (one.ravel() for one in np.meshgrid(side, side, indexing="ij"))
+    wall = np.stack([x, z, np.full_like(x, 1000.0)], axis=-1)
+    row, column = (one.ravel() for one in np.indices((40, 40)))
+    first = 41 * row + column
+    faces = np.concatenate(
+        [
+            np.stack([first, first + 41, first + 1], axis=-1),
+            np.stack([first + 1, first + 41, first + 42], axis=-1),
+        ]
+    )
+    coarse = Camera(5.0, 5.0, 0.0, 2.0, 1.5, Radial(), 5, 4)
+    still = RigidTransform.identity().matrix
+    facts = {
+        "rig_from_camera": still,
+        "swayed_from_still": still,
+        "camera": to_fields(coarse),
+        "projector": {"centre": [0.0, 0.0, 0.0]},
+    }
+    seen, _ = coverage_of_seen(wall, wall, faces, {"p": facts})
+    # Spots are drawn at random: a standard deviation of 0.3 % of some 20,000.
+    assert seen == pytest.approx(800.0 * 600.0 / 2000.0**2, rel=0.05)

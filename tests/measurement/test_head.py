@@ -9,7 +9,7 @@ import pytest
 from made_bodies import cylinder, mesh_of
 from ray_cast_scan import ROOT, load_body
 
-from bodyscan.measurement.head import BRAINCASE_MM, _Ellipsoid, _fit, estimate_head_top
+from bodyscan.measurement.head import BRAINCASE_MM, _between, _Ellipsoid, _fit, estimate_head_top
 from bodyscan.measurement.measurements import measure
 from bodyscan.mesh.body import BodyMesh
 from bodyscan.mesh.regions import DARK_CLOTH, HAIR, SKIN, UNSURE
@@ -68,6 +68,19 @@ def test_where_no_forehead_shows_the_head_is_somewhere_between(bald: BodyMesh) -
     low = body.vertices[body.regions == SKIN, 2].max()
     assert found.head.height_mm == pytest.approx(0.5 * (low + found.stature_mm), abs=1.0)
     assert found.head.sigma_mm == pytest.approx((found.stature_mm - low) / np.sqrt(12.0), abs=1.0)
+
+
+@pytest.mark.parametrize(("low", "high"), [(1692.0, 1720.0), (1650.0, 1703.0), (1704.0, 1709.0)])
+def test_of_an_estimate_only_what_lies_between_skin_and_hair_counts(
+    low: float, high: float
+) -> None:
+    heights = np.linspace(low, high, 20001)
+    weight = np.exp(-0.5 * ((heights - 1700.0) / 5.0) ** 2)
+    mean = np.average(heights, weights=weight)
+    found = _between(1700.0, 5.0, low, high)
+    assert found.height_mm == pytest.approx(mean, abs=0.01)
+    spread = np.sqrt(np.average((heights - mean) ** 2, weights=weight))
+    assert found.sigma_mm == pytest.approx(spread, abs=0.01)
 
 
 def test_a_head_that_nothing_shows_of_is_not_estimated() -> None:
