@@ -9,7 +9,9 @@ import pytest
 
 from bodyscan.calibration.board_views import board_symmetries
 from bodyscan.errors import BadInput
+from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
+from bodyscan.registration.rig_calibration import FLOOR_AXES, RigCalibration
 from bodyscan.registration.rig_frame import (
     frame_board_turn,
     frame_target,
@@ -57,6 +59,20 @@ def test_placed_cameras_stay_where_they_are_unless_the_rig_file_places_one_that_
     named = rig_from_world(rig({"pair": "q"}), world)  # which has no pose of its own: the origin
     assert named is not None
     np.testing.assert_allclose(named.matrix, SOMEWHERE.matrix, atol=1e-9)
+
+
+def test_the_axes_are_told_to_be_the_floors_where_board_or_pair_says_where_it_is() -> None:
+    stands = {"position_mm": (1500.0, 0.0, 900.0), "look_at_mm": (0.0, 0.0, 900.0)}
+
+    def told(given: Rig, placed: RigidTransform) -> str:
+        nothing = PoseCovariance((), np.zeros((0, 0)))
+        return RigCalibration(given, {}, {"p": placed}, nothing, {}, {}, ()).axes
+
+    assert told(rig({"shot": "floor", "board": "b"}), SOMEWHERE) == FLOOR_AXES
+    assert told(rig({"pair": "p"}, p=stands), SOMEWHERE) == FLOOR_AXES
+    assert told(rig({"pair": "p"}), SOMEWHERE).startswith("that of camera p")
+    assert told(rig({}), SOMEWHERE).startswith("that of the imported files")
+    assert told(rig({}), RigidTransform.identity()).startswith("that of camera p")
 
 
 @pytest.mark.parametrize(
