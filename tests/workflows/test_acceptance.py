@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from bodyscan.arrays import Array
 from bodyscan.cli.main import app
-from bodyscan.errors import FailedWork
+from bodyscan.errors import BadInput, FailedWork
 from bodyscan.evaluation.acceptance_file import AcceptanceError, load_acceptance
 from bodyscan.evaluation.acceptance_readings import (
     ALL,
@@ -54,6 +54,14 @@ def ball(
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     wave = wave_mm * np.sin(12.0 * np.arctan2(normals[:, 1], normals[:, 0]))
     return np.asarray(centre) + (radius + wave)[:, None] * normals, normals
+
+
+def test_a_former_test_is_replaced_only_where_that_is_asked(tmp_path: Path) -> None:
+    accept_rig.refuse_former(tmp_path, overwrite=False)
+    (tmp_path / accept_rig.FILE_NAME).write_text("{}")
+    accept_rig.refuse_former(tmp_path, overwrite=True)
+    with pytest.raises(BadInput, match="an acceptance test lies here already"):
+        accept_rig.refuse_former(tmp_path, overwrite=False)
 
 
 def test_form_and_size_are_what_was_put_in() -> None:
