@@ -41,6 +41,9 @@ def facing(azimuth_deg: float, board: Board = BOARD, centre: Any = FACE) -> list
 def test_boards_face_halfway_between_any_two_cameras_in_steps_of_15_degrees() -> None:
     found = np.degrees(facings([stood(0.0), stood(60.0), stood(130.0)], two_faced=False))
     np.testing.assert_allclose(found, [30.0, 60.0, 90.0])  # 65 and 95 lie nearer to these
+    # However far away either stands.
+    apart = [stood(0.0), stood(60.0, away_mm=500.0)]
+    np.testing.assert_allclose(np.degrees(facings(apart, two_faced=False)), [30.0])
     # Opposite each other they have no way between; of two faces either will do.
     np.testing.assert_allclose(facings([stood(0.0), stood(180.0)], two_faced=False), [])
     behind = [stood(200.0), stood(260.0)]

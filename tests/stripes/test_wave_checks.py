@@ -126,6 +126,10 @@ def test_periods_near_one_twice_and_half_of_it_are_tried() -> None:
     # A tenth of a hundred; a period that is no whole number, of which there are, is not counted.
     many = dict(_other_periods(2.4, 240))
     assert set(many.values()) == {240.0 / k for k in (*range(90, 111), 50) if k != 100}
+    # Two are the fewest.
+    assert {f"`periods` had {k} in place of 2" for k in (3, 4, 5, 6)} < set(
+        dict(_other_periods(120.0, 240))
+    )
     # One over everything is no period to mistake, and none is longer than half of all.
     assert all(value <= 120.0 for _, value in _other_periods(60.0, 240))
     assert dict(_other_periods(240.0, 240)) == {
