@@ -77,6 +77,21 @@ def test_a_load_begins_above_the_crotch_whose_own_section_is_half_of_the_thighs(
         assert len(find_loads(meshed(*legs, meet, trunk))) == loads
 
 
+def test_a_trunk_between_two_arms_is_not_on_two_legs() -> None:
+    """Beside which arms hang from the crotch to above the load."""
+    legs = [box((150.0, 180.0, 720.0), (0.0, side, 360.0)) for side in (-100.0, 100.0)]
+    trunk = box((235.0, 300.0, 1035.0), (0.0, 0.0, 1237.5))
+    arms = [box((90.0, 90.0, 900.0), (0.0, side, 1150.0)) for side in (-260.0, 260.0)]
+    assert find_loads(meshed(*legs, trunk, *arms)) == ()
+    lower, upper = (
+        box((235.0, 300.0, high), (0.0, 0.0, middle))
+        for high, middle in ((300.0, 870.0), (535.0, 1487.5))
+    )
+    pack = box((420.0, 300.0, 200.0), (0.0, 0.0, 1120.0))
+    loads = find_loads(meshed(*legs, lower, pack, upper, *arms))
+    assert [round(load.low_mm, -2) for load in loads] == [1000.0]
+
+
 def prism(outline: list[tuple[float, float]], low: float, high: float) -> Truth:
     """The sides of an upright prism; side k gives faces 2 k and 2 k + 1."""
     below = np.array([(*corner, low) for corner in outline])
