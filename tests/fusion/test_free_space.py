@@ -162,3 +162,13 @@ def test_what_is_beside_or_behind_the_camera_was_not_seen_through() -> None:
     with np.errstate(all="raise"):  # nothing is divided by a depth of 0
         through = sees_through(points, guess, shown(measured), HERE, 10.0)
     assert through.tolist() == [True, True, False, False, False, False, False]
+
+
+def test_the_pictures_outermost_pixels_see_as_well_as_others() -> None:
+    guess = plates((0.5, 59.5, 500.0, True))
+    pixels = np.array([[0, 0], [59, 0], [0, 19], [59, 19], [-1, 5], [60, 5], [5, -1], [5, 20]])
+    points = 500.0 * np.column_stack([(pixels - [30, 10]) / 100.0, np.ones(len(pixels))])
+    through = sees_through(
+        points.astype(np.float32), guess, shown(np.ones(60, bool)), HERE, margin_mm=10.0
+    )
+    assert through.tolist() == [True] * 4 + [False] * 4
