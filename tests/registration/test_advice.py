@@ -10,8 +10,7 @@ from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.advice import advise, crucial_shots
 from bodyscan.registration.more_shots import BoardPlace, RigInformation
-from bodyscan.registration.normal_equations import normal_equations
-from bodyscan.registration.rig_frame import frame_target
+from bodyscan.registration.normal_equations import NormalEquations, normal_equations
 from bodyscan.registration.rig_solve import RigSolution, solve_rig
 from bodyscan.rig.rig import Rig
 
@@ -34,6 +33,19 @@ def ring() -> Ring:
     views, truth = ring_views(placings, cameras, noise_px=NOISE_PX)
     rig = ring_rig(placings)
     return rig, placings, cameras, views, truth, solve_rig(rig, views, cameras).value
+
+
+def equations_of(placed: RigSolution, *, by_board: bool = False) -> NormalEquations:
+    """In the frame of the ring's first pair, or of a board."""
+    return normal_equations(
+        placed.views,
+        placed.cameras,
+        placed.rig_from_camera,
+        placed.rig_from_board,
+        fixed_pair=None if by_board else "p1-1",
+        fixed_target=min(placed.rig_from_board) if by_board else None,
+        cameras_free=True,
+    )
 
 
 def captured(
@@ -77,16 +89,7 @@ def test_what_is_told_to_be_gained_is_gained_by_as_many_shots_as_are_told(ring: 
     rig, _, _, _, _, placed = ring
     more = advise(rig, placed).more
     assert more is not None
-    equations = normal_equations(
-        placed.views,
-        placed.cameras,
-        placed.rig_from_camera,
-        placed.rig_from_board,
-        fixed_pair=rig.frame_pair.name if rig.frame_pair else None,
-        fixed_target=frame_target(rig),
-        cameras_free=True,
-    )
-    knowledge = RigInformation(equations, placed.cameras, placed.rig_from_camera)
+    knowledge = RigInformation(equations_of(placed), placed.cameras, placed.rig_from_camera)
     told = knowledge.after(knowledge.information(more.place), more.pair, more.shots)
     assert told.shots_to_halve == more.shots
     gained = np.sqrt(told.after_mm2[-1] / told.before_mm2)
@@ -146,15 +149,7 @@ def test_links_that_nothing_doubles_are_named() -> None:
 @pytest.mark.parametrize("by_board", [False, True])
 def test_eliminating_boards_keeps_the_covariance(ring: Ring, by_board: bool) -> None:
     placed = ring[-1]
-    equations = normal_equations(
-        placed.views,
-        placed.cameras,
-        placed.rig_from_camera,
-        placed.rig_from_board,
-        fixed_pair=None if by_board else "p1-1",
-        fixed_target=min(placed.rig_from_board) if by_board else None,
-        cameras_free=True,
-    )
+    equations = equations_of(placed, by_board=by_board)
     held = equations.held[equations.held < equations.first_board]
     information = equations.without_boards()
     free = np.setdiff1d(np.arange(len(information)), held)
