@@ -154,25 +154,20 @@ def _camera_off(found: RigCalibration, true: Mapping[str, Any], name: str) -> Ar
 
 def _rig_row(preset: str, seeds: Sequence[RigErrors]) -> str:
     cells = [
-        cell
-        for each in ([s.centres for s in seeds], [s.by_print for s in seeds])
-        for cell in (each_seed([rms(one) for one in each]), f"{_beyond(each):.1f} %")
-    ]
-    cells += [
-        each_seed([rms(s.cloud) for s in seeds]),
-        f"{_beyond([s.cloud for s in seeds]):.2f} %",
+        *_over_sigmas([s.centres for s in seeds]),
+        *_over_sigmas([s.by_print for s in seeds]),
+        *_over_sigmas([s.cloud for s in seeds], digits=2),
     ]
     size = rms(np.concatenate([s.cloud_mm for s in seeds]))
     return f"| {preset} | {' | '.join(cells)} | {size:.3f} |"
 
 
 def _camera_row(preset: str, seeds: Sequence[RigErrors]) -> str:
-    cells = []
-    for each in ([s.turns for s in seeds], [s.cameras for s in seeds]):
-        cells += [each_seed([rms(one) for one in each]), f"{_beyond(each):.1f} %"]
+    cells = _over_sigmas([s.turns for s in seeds]) + _over_sigmas([s.cameras for s in seeds])
     return f"| {preset} | {' | '.join(cells)} |"
 
 
-def _beyond(each: Sequence[Array]) -> float:
-    """Per cent of all errors that are beyond three sigmas."""
-    return 100.0 * float(np.mean(np.abs(np.concatenate(each)) > 3.0))
+def _over_sigmas(each: Sequence[Array], digits: int = 1) -> list[str]:
+    """Two cells on each seed's errors over sigmas: their size, and how many are beyond three."""
+    beyond = 100.0 * np.mean(np.abs(np.concatenate(each)) > 3.0)
+    return [each_seed([rms(one) for one in each]), f"{beyond:.{digits}f} %"]
