@@ -236,6 +236,20 @@ def test_fifty_places_at_which_stripes_count_down_are_too_few_to_tell(
         asked()
 
 
+@pytest.mark.parametrize(("leap", "wrong"), [(1, True), (2, False)])
+def test_what_falls_from_stripe_to_stripe_counts_down_and_what_leaps_is_an_edge(
+    leap: int, wrong: bool
+) -> None:
+    """Down by three or more stripes within 16 pixels, in half of the lines."""
+    rises = np.tile(np.arange(40).repeat(4), (120, 1))
+    rises[:60] = np.maximum(63 - leap * np.arange(160) // 4, 0)
+    words = counted(rises // leap * leap)
+    if wrong:
+        refused(words, GRAY, "count up and down in turn", inverses=False)
+    else:
+        check(words, GRAY, inverses=False)
+
+
 def test_three_causes_are_named_at_most_the_simplest_first() -> None:
     """Words of the last four stripes of 64 where there are 32. More would undo it: any exchange of the
     coarsest bit, alone lit, for one of the next three."""
