@@ -173,6 +173,14 @@ def test_a_trunk_holds_a_backpack_from_where_it_begins_to_where_it_ends(body: Tr
     assert max(load.high_mm for load in loads) == pytest.approx(0.86 * top)
 
 
+def test_what_hangs_below_the_crotch_is_a_load_from_there_on(body: Truth) -> None:
+    top = float(body.vertices[:, 2].max())
+    (load,) = find_loads(meshed(with_backpack(body, 0.4, 0.62)))
+    # Crotches of adults lie at 0.44 to 0.49, and sections are 0.02 apart.
+    assert 0.44 < load.low_mm / top < 0.51
+    assert load.high_mm == pytest.approx(0.62 * top, abs=0.03 * top)
+
+
 def test_a_bag_in_a_hand_is_no_load_of_the_trunk(body: Truth) -> None:
     height = 0.5 * float(body.vertices[:, 2].max())
     assert find_loads(meshed(body, box((300.0, 100.0, 300.0), (0.0, 450.0, height)))) == ()
