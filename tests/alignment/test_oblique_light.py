@@ -14,12 +14,15 @@ from bodyscan.alignment.oblique_light import (
     LightLine,
     ObliqueLight,
     _shared,
+    _steady,
     find_oblique_light,
     take_out,
     to_unit_length,
     undo,
 )
 from bodyscan.arrays import Array
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
@@ -206,3 +209,18 @@ def test_a_match_twice_its_spread_away_says_half_as_much() -> None:
     assert found.information[5, 6] == pytest.approx(39 * weight + far, rel=1e-3)
     even = weight * (-0.3 * 21 + 0.3 * 18) + far * distances[7]
     assert found.gradient[6] == pytest.approx(even, rel=1e-3)
+
+
+@pytest.mark.parametrize(("pixel_mm", "reach"), [(0.5, 7), (1.0, 4), (20.0, 1)])
+def test_normals_are_averaged_over_seven_millimetres_or_three_pixels(
+    pixel_mm: float, reach: int
+) -> None:
+    """Half of 7 mm to either side of an edge, which lies between two columns; pixels are whole."""
+    plain = Camera(1000.0, 1000.0, 0.0, 19.5, 9.5, Radial(), 40, 20)
+    points = (1000.0 * pixel_mm * plain.pixel_rays()).astype(np.float32)
+    normals = np.empty_like(points)
+    normals[:, :20], normals[:, 20:] = [0.6, 0.0, -0.8], [-0.6, 0.0, -0.8]
+    none = np.zeros(points.shape[:2])
+    image = RangeImage("p", plain, points, normals, none.astype(np.float32), none.astype(np.uint8))
+    mixed = np.abs(_steady(image)[10, :, 0]) < 0.599
+    assert np.flatnonzero(mixed).tolist() == list(range(20 - reach, 20 + reach))
