@@ -20,6 +20,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.reconstruction.scan_volume import (
     LAYER_MM,
     MARGIN_MM,
+    MARGIN_STRIPES,
     _bulges,
     _corner_rays,
     stripes_in_volume,
@@ -228,3 +229,35 @@ def test_limits_are_widened_as_much_on_the_left_as_on_the_right() -> None:
         assert np.count_nonzero(by) > 10
         # The two halves are rounded differently, and nothing else.
         np.testing.assert_allclose(by, by[:, ::-1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("distance_mm", "tilt"),
+    [(450.0, -0.2), (600.0, -0.15), (600.0, 0.0), (900.0, -0.1), (900.0, 0.2), (900.0, 0.5)],
+)
+def test_no_pixel_inside_a_block_loses_more_than_the_margin(
+    distance_mm: float, tilt: float
+) -> None:
+    """Where the wall meets the bottom, a limit bends by up to 80 stripes inside of a block: widened by
+    half as much it would cut 2 to 80 of them off. Along each ray s falls as 1e5 mm over depth."""
+    at = looking_at_the_middle(distance_mm, 0.0, tilt)
+    block_px, per_inverse = 8, 1e5
+    plain = Camera(200.0, 200.0, 0.0, 79.5, 59.5, Radial(), 160, 120)
+    rays = _corner_rays(plain, block_px)
+    near, far = volume_interval(rays, at, VOLUME, raised_mm=0.0)
+    limits = -per_inverse / np.stack([near, far, far])
+    near_by, far_by = _bulges(rays, at, VOLUME, (near, far), limits)
+    enter, leave = volume_interval(plain.pixel_rays(), at, VOLUME, raised_mm=0.0)
+    inside = enter < leave
+
+    def linear(corners: np.ndarray) -> np.ndarray:
+        """(120, 160): between the corners of blocks, at the pixels."""
+        down, across = (
+            np.maximum(1.0 - np.abs((np.arange(n)[:, None] + 0.5) / block_px - np.arange(k)), 0.0)
+            for n, k in zip((120, 160), corners.shape, strict=True)
+        )
+        return down @ corners @ across.T
+
+    too_near = linear(limits[0] - near_by) + per_inverse / enter
+    too_far = -per_inverse / leave - linear(limits[1] + far_by)
+    assert max(too_near[inside].max(), too_far[inside].max()) < MARGIN_STRIPES
