@@ -261,3 +261,11 @@ def test_wanted_stripes_are_decoded_as_if_all_were(code: Code, rising: bool) -> 
     assert part.beyond[deep].mean() > 0.99
     assert not part.beyond[whole.s < 34.0 if rising else whole.s > 21.0].any()
     assert whole.beyond is None
+
+
+@pytest.mark.parametrize(
+    ("code", "edges"), [(c, c not in (INDEX, PHASE, THREE_PHASES)) for c in ALL]
+)
+def test_edges_of_stripes_lie_on_whole_pixels_and_waves_have_none(code: Code, edges: bool) -> None:
+    """An instrument that numbers its stripes says nothing of pixels either."""
+    assert spec_of(code, 64).has_edges is edges
