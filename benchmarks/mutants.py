@@ -121,7 +121,7 @@ def main() -> None:
 
 
 COUNT = 80
-SEED = 73
+SEED = 79
 """Of the published sample: survivors of other seeds were examined and fixed before it was drawn."""
 
 
