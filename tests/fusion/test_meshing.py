@@ -15,7 +15,9 @@ from benchmarks.self_intersections import self_intersections
 from bodyscan.errors import ScanFailed
 from bodyscan.evaluation.surface import deviation, signed_distances
 from bodyscan.fusion.meshing import mesh
+from bodyscan.fusion.signed_distances import REACH_CELLS, touched
 from bodyscan.mesh.body import BodyCloud, BodyMesh
+from bodyscan.mesh.bricks import SIDE
 from bodyscan.mesh.regions import HAIR, SKIN, UNSURE
 from bodyscan.mesh.topology import signed_volume, topology
 from bodyscan.settings import MeshSettings
@@ -36,6 +38,20 @@ def between_the_thighs() -> tuple[np.ndarray, np.ndarray]:
     """Rays from front to back in the gap below the crotch (at 743 mm): open in the truth."""
     z = np.linspace(640.0, 700.0, 13)
     return np.stack([np.full_like(z, 500.0), np.zeros_like(z), z], axis=1), np.array([-1.0, 0, 0])
+
+
+def test_bricks_are_wanted_that_hold_a_node_within_reach_or_next_to_one() -> None:
+    rng = np.random.default_rng(0)
+    origin, cell_mm, shape = np.array([-40.0, 10.0, 5.0]), 2.5, (5, 4, 6)
+    places = rng.uniform(REACH_CELLS + 2.0, SIDE * np.array(shape) - REACH_CELLS - 2.0, (12, 3))
+    # A brick is as far from a point as its nearest node is, along each axis by itself.
+    first = SIDE * np.stack(np.indices(shape), axis=-1)[..., None, :]
+    inside = np.clip(places, first, first + SIDE - 1)
+    far = np.abs(inside - places).max(axis=-1)
+    found = touched(origin + cell_mm * places, origin, cell_mm, shape)
+    assert found[(far < REACH_CELLS + 2.0).any(axis=-1)].all()
+    assert not found[(far > REACH_CELLS + 3.0).all(axis=-1)].any()
+    assert 0.1 < found.mean() < 0.9
 
 
 def test_closed_manifold_one_piece_outward(scan: Scan, body: BodyMesh) -> None:
