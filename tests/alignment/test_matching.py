@@ -1,8 +1,11 @@
 """Spots that two cameras see of one wavy surface, whose shape and place are known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import open3d as o3d
 import pytest
 from ball import ball_points
 from ring import looking_at
@@ -12,6 +15,7 @@ from bodyscan.alignment.matching import (
     alignment_points,
     match_projected,
 )
+from bodyscan.alignment.open3d_registration import _matches, _Placed
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
@@ -153,3 +157,33 @@ def test_cameras_on_opposite_sides_share_nothing(
     opposite = looking_at(2.0 * CENTRE - rig_from_a.translation, CENTRE)
     other = alignment_points(seen("p2", opposite), 5.0)
     assert len(match_projected(a, other, rig_from_a, opposite, 6.0).distances) == 0
+
+
+def test_of_open3ds_matches_those_stay_whose_spots_face_alike() -> None:
+    """Normals 40 and 50 degrees apart about any axis: their cosines are 0.77 and 0.64."""
+    rng = np.random.default_rng(2)
+    angle = np.radians(np.tile([40.0, 50.0], 20))
+    normals, axes = rng.normal(size=(2, 40, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    axes = np.cross(normals, axes)
+    axes *= (angle / np.linalg.norm(axes, axis=1))[:, None]
+    motion = RigidTransform.from_rotation_vector([0.3, -0.2, 0.5], [10.0, -20.0, 30.0])
+    points = rng.uniform(-100.0, 100.0, (40, 3))
+    turned = [
+        RigidTransform.from_rotation_vector(a, np.zeros(3)).rotate(n)
+        for a, n in zip(axes, normals, strict=True)
+    ]
+
+    def placed(at: np.ndarray, facing: np.ndarray, sigma_mm: float) -> _Placed:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(at))
+        cloud.normals = o3d.utility.Vector3dVector(facing)
+        return _Placed(cloud, np.full(len(at), sigma_mm))
+
+    source = placed(motion.inverse().apply(points), motion.inverse().rotate(np.array(turned)), 0.3)
+    target = placed(points + 2.0 * normals, normals, 0.4)
+    pairs = rng.permutation(np.column_stack([np.arange(40), np.arange(40)]))
+    result: Any = SimpleNamespace(correspondence_set=pairs, transformation=motion.matrix)
+    found = _matches(source, target, result)
+    np.testing.assert_allclose(found.points, points[::2], atol=1e-9)
+    np.testing.assert_allclose(found.distances, -2.0, atol=1e-9)
+    np.testing.assert_allclose(found.sigma_mm, 0.5, rtol=1e-9)
