@@ -3,9 +3,10 @@
 `make mutants`, or `python -m benchmarks.mutants [--count N] [--seed S] [MODULE ...]`. cosmic-ray makes
 the mutants; a seeded sample of them, the same number of each module, is tried in copies of the
 project: against the test files that are nearest to the module by what imports what, quick tests
-first, up to the first that fails. That one has to pass without the mutant. What survives is listed, to
-be read: a mutant that changes nothing anyone could notice (an equivalent one) is put down in
-`equivalent_mutants.txt`, with the reason; what else survives, in `first_survivors.txt`.
+first, then against all others of its room, up to the first test that fails. That one has to pass
+without the mutant. What survives is listed, to be read: a mutant that changes nothing anyone could
+notice (an equivalent one) is put down in `equivalent_mutants.txt`, with the reason; what else
+survives, in `first_survivors.txt`.
 """
 
 from __future__ import annotations
@@ -81,9 +82,8 @@ DECLARATION = re.compile(r"-\s*@", re.MULTILINE)
 GUARD = re.compile(r"strict=\s*(True|False)|[*/],")
 """What zip refuses, which callers cannot pass; and the star before keyword-only arguments."""
 NEAREST, FIRST = 9, 2
-"""Test files tried, and how many of them alone at first, which is cheap and usually enough; files
-farther away use little of the module that nearer ones do not. With six, tests of neighbouring parts
-kept out those of whole sequences, which find most."""
+"""Test files tried before those of the room, and how many of them alone at first, which is cheap and
+usually enough. Tests of whole sequences find much, and lie behind those of neighbouring parts."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def _section(
     return f"""## Deliberate faults
 
 `make mutants`: {len(sample)} one-line faults that cosmic-ray made, drawn with seed {seed}, in {places}
-of mathematics and verdicts, each against the {NEAREST} test files nearest to it.
+of mathematics and verdicts, each against the {NEAREST} test files nearest to it and all of its room.
 {same} change nothing that anyone could notice, `benchmarks/equivalent_mutants.txt` says why. Of the
 {len(tried)} others **{len(survived)} survived when they were drawn, {share:.0%}.** Tests written since
 find {since} of these; what still survives:
@@ -293,12 +293,14 @@ def _found_by(mutant: Mutant, copy: Copy, hint: str) -> str:
     tests = _tests_of(mutant.path)
     if not tests:
         return ""
+    others = _others_of_room(mutant.path, tests)
     with _in_place(mutant, copy) as cache:
         failed = (
             (hint and _first_failure([hint], True, cache, copy))
             or _first_failure(tests[:FIRST], False, cache, copy)
             or (tests[FIRST:] and _first_failure(tests[FIRST:], False, cache, copy))
             or _first_failure(tests, True, cache, copy)
+            or (_first_failure(others, True, cache, copy) if others else "")
         )
     if failed and failed not in copy.sound:
         copy.sound[failed] = not _first_failure([failed], True, copy.cache, copy)
@@ -392,6 +394,12 @@ def _tests_of(path: str) -> tuple[str, ...]:
         return steps, name not in test.stem, len(imports[own]), own
 
     return tuple(one.as_posix() for one in sorted(tests, key=place)[:NEAREST])
+
+
+def _others_of_room(path: str, tests: Sequence[str]) -> list[str]:
+    """The test files of a module's room that are not among `tests`."""
+    room = (PROJECT / "tests" / Path(path).parts[1]).glob("test_*.py")
+    return sorted({one.relative_to(PROJECT).as_posix() for one in room} - set(tests))
 
 
 @lru_cache
