@@ -128,3 +128,10 @@ def test_places_are_those_that_two_pairs_would_see_within_the_volume() -> None:
     np.testing.assert_allclose(along, [-0.35 * radius, 0.0, 0.35 * radius])
     alone = {"a": placed["a"], "c": placed["c"]}
     assert not board_places(BOARD, Volume(), dict.fromkeys(alone, CAMERA), alone)
+
+
+@pytest.mark.parametrize(("columns", "rows", "whole"), [(5, 4, True), (12, 3, True), (3, 6, False)])
+def test_twelve_corners_are_enough(columns: int, rows: int, whole: bool) -> None:
+    """Whole boards of 12, 22 and 10."""
+    small = Board(name="b", kind="checkerboard", columns=columns, rows=rows, square_mm=20)
+    assert bool(seen(facing(0.0, small)[0], small, a=stood(0.0))) is whole
