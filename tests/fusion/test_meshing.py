@@ -45,7 +45,7 @@ def test_bricks_are_wanted_that_hold_a_node_within_reach_or_next_to_one() -> Non
     origin, cell_mm, shape = np.array([-40.0, 10.0, 5.0]), 2.5, (5, 4, 6)
     places = rng.uniform(REACH_CELLS + 2.0, SIDE * np.array(shape) - REACH_CELLS - 2.0, (12, 3))
     # A brick is as far from a point as its nearest node is, along each axis by itself.
-    first = SIDE * np.stack(np.indices(shape), axis=-1)[..., None, :]
+    first = SIDE * np.moveaxis(np.indices(shape), 0, -1)[..., None, :]
     inside = np.clip(places, first, first + SIDE - 1)
     far = np.abs(inside - places).max(axis=-1)
     found = touched(origin + cell_mm * places, origin, cell_mm, shape)
