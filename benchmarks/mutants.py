@@ -298,9 +298,9 @@ def _found_by(mutant: Mutant, copy: Copy, hint: str) -> str:
         failed = (
             (hint and _first_failure([hint], True, cache, copy))
             or _first_failure(tests[:FIRST], False, cache, copy)
-            or (tests[FIRST:] and _first_failure(tests[FIRST:], False, cache, copy))
+            or _first_failure(tests[FIRST:], False, cache, copy)
             or _first_failure(tests, True, cache, copy)
-            or (_first_failure(others, True, cache, copy) if others else "")
+            or _first_failure(others, True, cache, copy)
         )
     if failed and failed not in copy.sound:
         copy.sound[failed] = not _first_failure([failed], True, copy.cache, copy)
@@ -339,6 +339,8 @@ def _in_place(mutant: Mutant, copy: Copy) -> Iterator[Path]:
 
 
 def _first_failure(tests: Sequence[str], slow: bool, cache: Path, copy: Copy) -> str:
+    if not tests:  # pytest would try all that there are
+        return ""
     assert copy.runner.stdin
     assert copy.runner.stdout
     print(

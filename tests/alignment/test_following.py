@@ -120,8 +120,8 @@ def test_a_pair_has_seen_what_faces_it_and_not_what_faces_away(
 ) -> None:
     _, _, followed = found
     assert followed is not None
+    cells = followed.cells
     for pair, seen in zip(followed.bends, followed.seen, strict=True):
-        cells = followed.cells
         away = cells.centres - standing.rig_from_camera[pair].translation
         facing = -np.sum(away * cells.normals, axis=1) / np.linalg.norm(away, axis=1)
         # A cell's points face as it does, but a cell of a hand may have points of its other side.

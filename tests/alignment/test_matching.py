@@ -163,23 +163,20 @@ def test_of_open3ds_matches_those_stay_whose_spots_face_alike() -> None:
     """Normals 40 and 50 degrees apart about any axis: their cosines are 0.77 and 0.64."""
     rng = np.random.default_rng(2)
     angle = np.radians(np.tile([40.0, 50.0], 20))
-    normals, axes = rng.normal(size=(2, 40, 3))
+    normals, aside = rng.normal(size=(2, 40, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    axes = np.cross(normals, axes)
-    axes *= (angle / np.linalg.norm(axes, axis=1))[:, None]
+    aside = np.cross(normals, aside)
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    turned = np.cos(angle)[:, None] * normals + np.sin(angle)[:, None] * aside
     motion = RigidTransform.from_rotation_vector([0.3, -0.2, 0.5], [10.0, -20.0, 30.0])
     points = rng.uniform(-100.0, 100.0, (40, 3))
-    turned = [
-        RigidTransform.from_rotation_vector(a, np.zeros(3)).rotate(n)
-        for a, n in zip(axes, normals, strict=True)
-    ]
 
     def placed(at: np.ndarray, facing: np.ndarray, sigma_mm: float) -> _Placed:
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(at))
         cloud.normals = o3d.utility.Vector3dVector(facing)
         return _Placed(cloud, np.full(len(at), sigma_mm))
 
-    source = placed(motion.inverse().apply(points), motion.inverse().rotate(np.array(turned)), 0.3)
+    source = placed(motion.inverse().apply(points), motion.inverse().rotate(turned), 0.3)
     target = placed(points + 2.0 * normals, normals, 0.4)
     pairs = rng.permutation(np.column_stack([np.arange(40), np.arange(40)]))
     result: Any = SimpleNamespace(correspondence_set=pairs, transformation=motion.matrix)

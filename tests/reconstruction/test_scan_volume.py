@@ -30,6 +30,7 @@ from bodyscan.rig.rig import Volume
 from bodyscan.stripes.stripe_limits import StripeLimits
 
 VOLUME = Volume(radius_mm=120.0, bottom_mm=-100.0, top_mm=150.0)
+PLAIN = Camera(200.0, 200.0, 0.0, 79.5, 59.5, Radial(), 160, 120)
 
 
 def looking_at_the_middle(distance_mm: float, turn: float, tilt: float) -> RigidTransform:
@@ -219,8 +220,7 @@ def test_blocks_begin_at_the_first_pixels_outer_edge_and_cover_the_picture() -> 
 def test_limits_are_widened_as_much_on_the_left_as_on_the_right() -> None:
     """What a camera sees that looks down on a round volume is its own mirror image, stripes too."""
     at = looking_at_the_middle(600.0, 0.0, 0.5)
-    plain = Camera(200.0, 200.0, 0.0, 79.5, 59.5, Radial(), 160, 120)
-    rays = _corner_rays(plain, 8)
+    rays = _corner_rays(PLAIN, 8)
     near, far = volume_interval(rays, at, VOLUME, raised_mm=0.0)
     np.testing.assert_allclose(near, near[:, ::-1], rtol=1e-9)
     finer = 1.0 + rays[..., 0] ** 2 + rays[..., 1]
@@ -242,12 +242,11 @@ def test_no_pixel_inside_a_block_loses_more_than_the_margin(
     half as much it would cut 2 to 80 of them off. Along each ray s falls as 1e5 mm over depth."""
     at = looking_at_the_middle(distance_mm, 0.0, tilt)
     block_px, per_inverse = 8, 1e5
-    plain = Camera(200.0, 200.0, 0.0, 79.5, 59.5, Radial(), 160, 120)
-    rays = _corner_rays(plain, block_px)
+    rays = _corner_rays(PLAIN, block_px)
     near, far = volume_interval(rays, at, VOLUME, raised_mm=0.0)
     limits = -per_inverse / np.stack([near, far, far])
     near_by, far_by = _bulges(rays, at, VOLUME, (near, far), limits)
-    enter, leave = volume_interval(plain.pixel_rays(), at, VOLUME, raised_mm=0.0)
+    enter, leave = volume_interval(PLAIN.pixel_rays(), at, VOLUME, raised_mm=0.0)
     inside = enter < leave
 
     def linear(corners: np.ndarray) -> np.ndarray:

@@ -80,6 +80,8 @@ def test_a_pixel_that_the_rim_passed_over_while_the_patterns_were_taken_is_uncov
     assert uncovered_of(0.69, 1.0, np.float32)
     assert not uncovered_of(0.71, 1.0, np.float32)
     # Noise of 2: twice 2 sqrt(1 + 1 + 4 + 0.49), 10.19, below 70.
+    assert uncovered_of(59.0, noise=2.0)
+    assert not uncovered_of(61.0, noise=2.0)
     assert uncovered_of(59.7, of=np.float32, noise=2.0)
     assert not uncovered_of(59.9, of=np.float32, noise=2.0)
 
