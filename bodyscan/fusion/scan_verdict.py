@@ -19,7 +19,6 @@ from bodyscan.alignment.together import Together
 from bodyscan.arrays import Array
 from bodyscan.fusion.contradictions import Contradictions
 from bodyscan.fusion.crown import Crown
-from bodyscan.fusion.proportions import odd_proportions
 from bodyscan.fusion.seams import SeamReport, find_misfits
 from bodyscan.fusion.surface_check import SurfaceCheck
 from bodyscan.mesh.body import BodyCloud, BodyMesh
@@ -195,7 +194,7 @@ def grade_scan(
         ),
         "pieces": lambda: _company(cloud),
         "limbs": lambda: _limbs(shape) if shape else (),
-        "proportions": lambda: odd_proportions(shape) if shape else (),
+        "posture": lambda: _posture(shape) if shape else (),
         "cuts": lambda: _cuts(cloud, rig.volume),
         "omissions": lambda: _omissions(cloud, mesh) if mesh else (),
         "contacts": lambda: _contacts(shape) if shape else (),
@@ -512,6 +511,18 @@ def _limbs(mesh: BodyMesh) -> Iterator[Finding]:
             "usable",
             f"more than two legs at heights from {min(beside):.0f} to {max(beside):.0f} mm: is a "
             "stick, a rail, a chair or an animal in the volume? What touches the body is taken for it",
+        )
+
+
+def _posture(mesh: BodyMesh) -> Iterator[Finding]:
+    """A body less than 0.8 times as tall as wide does not stand; held out arms make it square."""
+    across = float(np.ptp(mesh.vertices[:, :2], axis=0).max())
+    top = float(mesh.vertices[:, 2].max())
+    if top < 0.8 * across:
+        yield (
+            "usable",
+            f"the body is {across:.0f} mm wide and {top:.0f} mm tall. Possible causes: the person lies "
+            "or bends. Girths are of level sections",
         )
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Mask
 from bodyscan.errors import BadInput
-from bodyscan.fusion.proportions import Load, find_loads
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.measurement.body_frame import rig_from_body
 from bodyscan.measurement.head import HeadTop, estimate_head_top
@@ -35,8 +34,7 @@ class Girth:
     """One part of the body in a horizontal slice.
 
     part: trunk (neck and head too), left leg, right leg, left arm, right arm; "trunk and left arm"
-        where a hand touches the trunk and the outline goes round both; "trunk and load" where it
-        goes round something that no body is shaped like.
+        where a hand touches the trunk and the outline goes round both.
     girth_mm: along the surface. A trunk joined to arms by filled surface is cut there, and closed
         straight.
     tape_mm: as a tape runs (convex hull).
@@ -122,14 +120,14 @@ def measure(
     stature = float(mesh.vertices[:, 2].max())
     frame = rig_from_body(mesh.vertices)
     vertices = frame.inverse().apply(mesh.vertices)
-    contacts, loads = _contacts(vertices, mesh), find_loads(mesh)
+    contacts = _contacts(vertices, mesh)
     if heights_mm is None:
         # If only part of a body was seen, whatever there is of it.
         every = np.arange(STEP_MM, stature, STEP_MM).tolist()
-        slices = [_slice(vertices, mesh, height, contacts, loads) for height in every]
+        slices = [_slice(vertices, mesh, height, contacts) for height in every]
     else:
         every = [float(height) for height in heights_mm]
-        slices = [_slice(vertices, mesh, height, contacts, loads) for height in every]
+        slices = [_slice(vertices, mesh, height, contacts) for height in every]
         for height, found in zip(heights_mm, slices, strict=True):
             if found is None:
                 low, high = vertices[:, 2].min(), vertices[:, 2].max()
@@ -140,7 +138,7 @@ def measure(
     if fuller is not None:
         more = frame.inverse().apply(fuller.vertices)
         slices = [
-            found and _doubted(found, _slice(more, mesh, height, contacts, loads))
+            found and _doubted(found, _slice(more, mesh, height, contacts))
             for found, height in zip(slices, every, strict=True)
         ]
     areas = face_areas(mesh.vertices, mesh.faces)
@@ -253,18 +251,15 @@ def _slice(
     mesh: BodyMesh,
     height_mm: float,
     contacts: Sequence[_Contact],
-    loads: Sequence[Load],
 ) -> Slice | None:
     """The slice at one height, None if there is no body."""
     loops = _loops(vertices, mesh, height_mm)
     if not loops:
         return None
     girths = []
-    loaded = any(load.low_mm < height_mm < load.high_mm for load in loads)
     for part, loop in zip(name_parts(loops), loops, strict=True):
         arms = [one.side for one in contacts if part == "trunk" and one.joins(loop, height_mm)]
         joined = "".join(f" and {side} arm" for side in dict.fromkeys(arms))
-        joined += " and load" if part == "trunk" and loaded and not arms else ""
         girths.append(_girth(part + joined, loop))
     return Slice(height_mm, tuple(sorted(girths, key=lambda girth: (girth.part, -girth.area_mm2))))
 
