@@ -12,5 +12,5 @@ part_names and body_parts (the same in an operator's words), bending (range imag
 moment).
 
 What is not motion: pole_steps and place_evidence (poles that stand off), pair_drift (what every
-scan shows), oblique_light (skin), object_refinement (an object that stands still).
+scan shows), object_refinement (an object that stands still).
 """

@@ -105,10 +105,6 @@ def scan_table(scan: Scan) -> Table:
             table.add_row("farthest moved", f"{name}, {motion:.2f} mm")
         for name, sigmas in scan.alignment.refused.items():
             table.add_row("left where it was", f"{name} (would have moved by {sigmas:.1f} sigmas)")
-    light = scan.oblique_light
-    if light is not None and light.told:
-        told = f"{light.aside_mm:.2f} ± {light.sigma_mm:.2f} mm, taken out"
-        table.add_row("light comes out of the skin aside", told)
     if scan.person is not None:
         for line in filter(None, (scan.person.summary, *scan.person.lines)):
             table.add_row("the person", line)

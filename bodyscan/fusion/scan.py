@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.icp import Alignment
-from bodyscan.alignment.oblique_light import ObliqueLight
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.reconstruction.range_image import RangeImage
@@ -32,7 +31,6 @@ class Scan:
     rig_from_camera: each pair's pose relative to the subject, after alignment.
     person: how a moving body moved, part by part.
     notes: on the range images, such as stripes that were not used.
-    oblique_light: how far aside light comes out of the skin, as far as overlaps show it.
     """
 
     cloud: BodyCloud
@@ -45,4 +43,3 @@ class Scan:
     rig_from_camera: dict[str, RigidTransform]
     person: PersonMotion | None = None
     notes: tuple[str, ...] = ()
-    oblique_light: ObliqueLight | None = None

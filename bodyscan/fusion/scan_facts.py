@@ -62,12 +62,6 @@ class _Person(_Part):
     moment_ms: float | None
 
 
-class _ObliqueLight(_Part):
-    aside_mm: float
-    sigma_mm: float
-    taken_out: bool
-
-
 class _Hashes(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
     cloud: str = Field(alias="cloud.ply")
@@ -89,7 +83,6 @@ class _Facts(_Part):
     measured: dict[str, int] = {}
     failed: dict[str, str] = {}
     alignment: _Alignment | None = None
-    oblique_light: _ObliqueLight | None = None
     person: _Person | None = None
 
 

@@ -128,7 +128,6 @@ def save_scan(scan: Scan, folder: Path, origin: Origin) -> Path:
             "measured": scan.measured,
             "failed": scan.failed,
             "alignment": _alignment(scan),
-            "oblique_light": _oblique_light(scan),
             "person": asdict(scan.person) if scan.person else None,
         },
     )
@@ -198,11 +197,6 @@ def _alignment(scan: Scan) -> dict[str, Any] | None:
             for overlap in alignment.overlaps
         ],
     }
-
-
-def _oblique_light(scan: Scan) -> dict[str, Any] | None:
-    found = scan.oblique_light
-    return None if found is None else asdict(found) | {"taken_out": found.told}
 
 
 def _number(value: Any) -> Any:

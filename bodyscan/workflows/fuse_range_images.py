@@ -13,7 +13,6 @@ from bodyscan.alignment.bending import at_once
 from bodyscan.alignment.body_parts import PersonMotion
 from bodyscan.alignment.following import Followed
 from bodyscan.alignment.icp import align
-from bodyscan.alignment.oblique_light import ObliqueLight, light_lines, take_out
 from bodyscan.alignment.sway_prior import SwayPrior, better_known
 from bodyscan.alignment.together import Together, bring_together
 from bodyscan.fusion.cleaning import clean, require_subject
@@ -44,14 +43,13 @@ class _Placed:
 
     rig_from_camera: the pairs' poses after alignment; as calibrated for those that saw nothing.
     known: covariance of these poses.
-    together, oblique_light: what alignment found; None if it took no part.
+    together: what alignment found; None if it took no part.
     """
 
     images: Sequence[RangeImage]
     rig_from_camera: dict[str, RigidTransform]
     known: PoseCovariance
     together: Together | None = None
-    oblique_light: ObliqueLight | None = None
 
     @property
     def there(self) -> dict[str, RigidTransform]:
@@ -120,21 +118,15 @@ def fuse(
         placed.rig_from_camera,
         placed.person,
         measured.notes,
-        placed.oblique_light,
     )
 
 
 def _aligned(
     calibrated: _Placed, calibration: RigCalibration, settings: AlignmentSettings
 ) -> _Placed:
-    """Bring the images together and to one moment; take out what oblique light does to skin."""
+    """Align the images and carry them to one moment."""
     images, start, boards = calibrated.images, calibrated.rig_from_camera, calibrated.known
-    found, oblique = align(images, start, boards, settings), None
-    pairs = calibration.pairs.items()
-    sheets = {name: pair.sheets for name, pair in pairs if pair.sheets is not None}
-    lines = light_lines(images, sheets)
-    if lines:
-        images, found, oblique = take_out(images, start, found, lines, boards, settings)
+    found = align(images, start, boards, settings)
     together = bring_together(images, start, found, boards, calibration.rig.poles, settings)
     rig_from_camera = start | together.alignment.rig_from_camera
     images = at_once(images, rig_from_camera, together.followed)
@@ -144,7 +136,7 @@ def _aligned(
         known = better_known(boards, aligned, tied)
     untied = {image.pair for image in images} - tied.keys()
     known = SwayPrior.of(settings).loosen(known, untied)
-    return _Placed(images, rig_from_camera, known, together, oblique)
+    return _Placed(images, rig_from_camera, known, together)
 
 
 def _merged(placed: _Placed, settings: FusionSettings) -> MergedCloud:

@@ -100,6 +100,8 @@ def test_the_first_fault_is_named_and_a_calibration_has_a_name(tmp_path: Path) -
         read_facts(tmp_path)
     with pytest.raises(ResultError, match="there is no such file"):
         read_facts(tmp_path / "elsewhere")
-    facts |= {"calibration_id": "7", "failed": {}}
+    # Earlier releases also wrote what they estimated of subsurface scattering.
+    light = {"aside_mm": 0.1, "sigma_mm": 0.02, "taken_out": True}
+    facts |= {"calibration_id": "7", "failed": {}, "oblique_light": light}
     (tmp_path / "scan.json").write_text(json.dumps(facts), "utf-8")
     assert read_facts(tmp_path) == facts

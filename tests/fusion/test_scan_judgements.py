@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from made_scan import MadeScan, make_scan
-from sheet_models import PINHOLE
 from verdict_given import verdict_given
 
 from bodyscan.alignment.icp import Alignment, Overlap
-from bodyscan.alignment.oblique_light import light_lines
 from bodyscan.alignment.place_evidence import SizeStep
 from bodyscan.alignment.pole_steps import PoleStep, StepSearch
 from bodyscan.fusion.contradictions import Contradictions
@@ -342,21 +340,6 @@ def test_what_pairs_say_of_each_other_is_counted_by_whose_point_it_is() -> None:
     assert found.beyond_noise == pytest.approx(4.0 / 9.0 - 0.0027, abs=1e-4)
     nothing = Contradictions.of(["a", "b"], [said([], [])] * 2, samples, [surface, surface], 1.5)
     assert (nothing.share, nothing.by_noise) == (0.0, 0.0)
-
-
-def test_where_light_comes_from_is_known_of_all_pairs_or_of_none() -> None:
-    def lines(light: dict[str, Any], agreement: Any = None) -> Any:
-        seen: Any = [SimpleNamespace(pair=name, agreement=agreement) for name in ("a", "b")]
-        return light_lines(seen, light)
-
-    found = lines({"a": PINHOLE, "b": PINHOLE.turned(140.0)})
-    assert sorted(found) == ["a", "b"]
-    # The projector stands where its frame begins.
-    there = PINHOLE.projector_from_camera.inverse().translation
-    apart = there - found["a"].origin
-    np.testing.assert_allclose(np.cross(apart, found["a"].along), 0.0, atol=1e-6)
-    assert lines({"a": PINHOLE}) is None, "a pair without light sheets"
-    assert lines({"a": PINHOLE, "b": PINHOLE}, agreement="of two directions") is None
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,6 @@ SLOW = (
     "registration/test_known_cameras.py",
     "calibration/test_joint_refinement.py",
     "jobs/test_full_disk.py",
-    "alignment/test_oblique_light.py",
     "fusion/test_cleaning.py",
     "report/test_report.py",
     "workflows/test_nothing_is_lost.py",
