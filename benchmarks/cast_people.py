@@ -1,6 +1,6 @@
 """Range images of a simulated person by ray casting, without rendering images.
 
-A scan at full size takes a quarter of an hour to render; this takes seconds. Depths, speeds and
+A scan at full size takes a quarter of an hour to render; this takes seconds. Depths and
 calibration have the errors of rendered scans (`bench/standing`, full size, workshop).
 """
 
@@ -16,7 +16,6 @@ import numpy as np
 from benchmarks.true_calibration import calibration_from_facts
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.velocity import SurfaceSpeeds, Velocity
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Rig
@@ -43,14 +42,6 @@ COMMON_MM = 0.04
 SHIFT_MM, TURN_DEG = 0.045, 0.0023
 """Pose error of each pair, at the person."""
 LEAST_COSINE = 0.2
-SPEED_MM_S, SHARED_MM_S, SHARED_PART = 5.0, 0.3, 0.028
-"""Error of one place's speed, of all places of a pair
-together, and of that as a share of the speed."""
-PLACE_MM = 17.0
-"""From one such place to the next."""
-STEP_MS = 20.0
-LEAP_MM = 0.3
-"""If a pixel's depth changes unevenly by this much over two steps, another surface came into it."""
 STANCE_DEG, STANCE_MM = 5.0, 15.0
 """Variation when people are asked to stand on the same marks again."""
 
@@ -142,17 +133,6 @@ def _cast(
     sigma = np.where(np.isfinite(depth), NOISE_MM / np.maximum(cosine, LEAST_COSINE), np.nan)
     off = sigma * rng.standard_normal(len(depth)) + COMMON_MM * rng.standard_normal()
     shape = pair.camera.height, pair.camera.width
-    step = max(1, round(PLACE_MM / (np.nanmedian(depth) / pair.camera.alpha)))
-    few = np.zeros(shape, bool)
-    few[step // 2 :: step, step // 2 :: step] = True
-    places = np.flatnonzero(few.ravel() & np.isfinite(depth))
-    earlier, later = (
-        _seen(pair, rays[places], scan, scan.moment_ms + step)[0] for step in (-STEP_MS, STEP_MS)
-    )
-    steady = np.abs(later + earlier - 2.0 * depth[places]) < LEAP_MM
-    rate, places = ((later - earlier) / (2e-3 * STEP_MS))[steady], places[steady]
-    facing = normals[places] / towards[places, None]
-    seen = _speeds(rays[places] * depth[places, None], facing, rate, rng)
     return RangeImage(
         pair.name,
         calibration.pairs[pair.name].camera,
@@ -161,7 +141,6 @@ def _cast(
         np.hypot(sigma, COMMON_MM).reshape(shape).astype(np.float32),
         np.where(np.isfinite(depth), 40.0 + 200.0 * cosine, 0.0).reshape(shape).astype(np.uint8),
         time_ms=scan.moment_ms,
-        velocity=Velocity(np.zeros(6), np.eye(6), seen),
         common_mm=np.full(shape, COMMON_MM, np.float32),
     )
 
@@ -176,11 +155,3 @@ def _seen(pair: TruePair, rays: Array, scan: CastScan, ms: float) -> tuple[Array
     normals = hits.normals.astype(np.float64)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return np.where(lit, hits.depth, np.nan).astype(np.float64), normals
-
-
-def _speeds(points: Array, facing: Array, rate: Array, rng: np.random.Generator) -> SurfaceSpeeds:
-    """Speeds with the errors of those measured from stripes."""
-    sigma = np.full(len(rate), SPEED_MM_S)
-    shared = np.stack([np.full(len(rate), SHARED_MM_S), SHARED_PART * rate], axis=1)
-    off = sigma * rng.standard_normal(len(rate)) + shared @ rng.standard_normal(2)
-    return SurfaceSpeeds(points, facing, rate + off, sigma, shared)

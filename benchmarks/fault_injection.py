@@ -366,7 +366,6 @@ def _seen(
         sigma_mm=np.where(whole, np.float32(CAST_NOISE_MM), np.float32(np.nan)),
         colours=np.where(seen, 40 + 200 * np.clip(facing, 0, 1), 0).astype(np.uint8),
         beyond=None,
-        velocity=None,
         common_mm=None,
     )
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,14 +21,12 @@ import open3d as o3d
 from benchmarks.fault_injection import Case, Fault, Sound, faults, faults_of_the_living
 from benchmarks.full_size import PROJECT, run_commands
 from benchmarks.true_calibration import calibration_from_truth
-from bodyscan.arrays import Array
 from bodyscan.captures.folder import open_scan
 from bodyscan.errors import BodyscanError
 from bodyscan.evaluation.body import compare_girths, true_girths
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
 from bodyscan.progress import THREADS
-from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.settings import FusionSettings, MeshSettings, ScanSettings
 from bodyscan.workflows.fuse_range_images import fuse
 from bodyscan.workflows.range_images import reconstruct_range_images
@@ -205,47 +203,22 @@ def _swaying(seed: int) -> Callable[[Sound], Case]:
         rng = np.random.default_rng(seed)
         placed = sound.calibration.rig_from_camera
         moment = np.linspace(0.0, 1.0, len(placed))[:, None]
-        path, rate = np.zeros((2, len(placed), 2))
+        path = np.zeros((len(placed), 2))
         for waves in (0.5, 1.0, 1.5):
             phase = 2.0 * np.pi * waves * moment + rng.uniform(0.0, 2.0 * np.pi, 2)
             size = rng.standard_normal(2) / waves
             path += size * np.sin(phase)
-            rate += size * np.cos(phase) * 2.0 * np.pi * waves
         path -= path[0]
         to_lean = SWAY_MM / np.linalg.norm(path, axis=1).max() / float(sound.vertices[:, 2].max())
         leans = to_lean * np.stack([-path[:, 1], path[:, 0], np.zeros(len(path))], axis=1)
-        turns = to_lean * np.stack([-rate[:, 1], rate[:, 0], np.zeros(len(path))], axis=1)
         moved = {
             name: RigidTransform.from_rotation_vector(lean, np.zeros(3)) @ at
             for (name, at), lean in zip(placed.items(), leans, strict=True)
         }
-        rates = dict(zip(placed, turns, strict=True))
         calibration = replace(sound.calibration, rig_from_camera=moved)
-        return calibration, Outcome(_at_speed(sound.images, moved, rates))
+        return calibration, Outcome(sound.images)
 
     return inject
-
-
-def _at_speed(
-    images: Sequence[RangeImage],
-    rig_from_camera: Mapping[str, RigidTransform],
-    turns: Mapping[str, Array],
-) -> list[RangeImage]:
-    """Add the effect of a body's turns (3,) about the rig's origin, in radians per scan, to the
-    speeds measured from stripes: a sway that these contradict would look like moved poles."""
-    times = [image.time_ms for image in images if image.time_ms is not None]
-    found = []
-    for image in images:
-        if image.velocity is not None:
-            at, seen = rig_from_camera[image.pair], image.velocity.seen
-            turn = turns[image.pair] / (1e-3 * (max(times) - min(times)))
-            moving = np.cross(turn, at.apply(seen.points)) @ at.rotation
-            speed = seen.speed + np.sum(seen.facing * moving, axis=1)
-            image = replace(
-                image, velocity=replace(image.velocity, seen=replace(seen, speed=speed))
-            )
-        found.append(image)
-    return found
 
 
 def _judge(rig: str, subject: str, fault: Fault, sound: Sound) -> Found:

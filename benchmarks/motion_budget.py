@@ -21,7 +21,6 @@ from bodyscan.fusion.cleaning import clean, require_subject
 from bodyscan.fusion.merging import merge
 from bodyscan.geometry.robust import rms
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.velocity import Velocity
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.settings import ScanSettings
@@ -31,7 +30,6 @@ from bodyscan.simulation.simulate import CALIBRATION, true_pairs
 
 SEEDS = range(101, 111)
 """Others than those of `people`."""
-STEP_MS = 10.0
 CELL_MM = 25.0
 Images = Sequence[RangeImage]
 Places = dict[str, RigidTransform]
@@ -96,8 +94,7 @@ def _followed(cast: CastScan, images: Images, settings: ScanSettings) -> tuple[I
 
 
 def _carried(cast: CastScan, images: Images, true: Places, *, breath: bool) -> list[RangeImage]:
-    """By the truth to the middle of the scan: by all that moved, or by breath alone, which their
-    speeds are then without, too."""
+    """By the truth to the middle of the scan: by all that moved, or by breath alone."""
 
     def at(ms: float | None = None) -> Array:
         whole = cast.vertices(ms)
@@ -107,8 +104,7 @@ def _carried(cast: CastScan, images: Images, true: Places, *, breath: bool) -> l
     for image in images:
         ms, there, valid = image.time_ms, true[image.pair], image.valid
         assert ms is not None
-        assert image.velocity is not None
-        tree, told = cKDTree(cast.vertices(ms)), image.velocity.seen
+        tree = cKDTree(cast.vertices(ms))
         places = there.apply(image.points[valid].astype(float))
         far, near = tree.query(places, k=3)
         weight = 1.0 / (np.asarray(far) + 1e-3)
@@ -116,11 +112,7 @@ def _carried(cast: CastScan, images: Images, true: Places, *, breath: bool) -> l
         places = places + np.einsum("nk,nkc->nc", weight, (at() - at(ms))[near])
         points = image.points.copy()
         points[valid] = there.inverse().apply(places)
-        rate = (at(ms + STEP_MS) - at(ms - STEP_MS)) / (2e-3 * STEP_MS)
-        own = there.inverse().rotate(rate[tree.query(there.apply(told.points))[1]])
-        told = replace(told, speed=told.speed - np.sum(told.facing * own, axis=1))
-        velocity = Velocity(image.velocity.twist, image.velocity.covariance, told)
-        carried.append(replace(image, points=points, velocity=velocity, bent=not breath))
+        carried.append(replace(image, points=points, bent=not breath))
     return carried
 
 

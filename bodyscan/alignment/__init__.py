@@ -6,7 +6,7 @@ same spot), overlaps and overlap_equations (what overlaps ask for, and the joint
 (how far a subject is believed to move).
 
 A person who moves while pair after pair sees them: following (motion found and taken out),
-motion_sigmas (what stays unknown), body_cells and cell_evidence, cell_speeds, moments (how motion
+motion_sigmas (what stays unknown), body_cells and cell_evidence, moments (how motion
 at one moment correlates with the next), body_motion (everything in one solve), breath, limbs,
 part_names and body_parts (the same in an operator's words), bending (range images carried to one
 moment).

@@ -20,7 +20,6 @@ from scipy.linalg.lapack import dpotrf, dpotri, dtrtri, dtrtrs
 from bodyscan.alignment.body_cells import BodyCells, modulated, rigid_fields
 from bodyscan.alignment.breath import breath_fields, likely_breath
 from bodyscan.alignment.cell_evidence import CellEvidence
-from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.limbs import limb_fields
 from bodyscan.alignment.moments import Courses, breaths, of_breath, of_stance
 from bodyscan.alignment.part_names import above_feet, ankles
@@ -222,38 +221,25 @@ class BodyMotion:
             total += field.reshape(len(total), -1) @ self.of(name, course.T)
         return total.T.reshape(total.shape[1], -1, 12)
 
-    def solved(
-        self,
-        evidence: Mapping[tuple[int, int], CellEvidence],
-        speeds: Mapping[int, CellSpeeds] | None = None,
-    ) -> BodyMotion:
+    def solved(self, evidence: Mapping[tuple[int, int], CellEvidence]) -> BodyMotion:
         """One step of all amplitudes, with each kind as large as the evidence says.
 
         Every round searches matches again.
 
         evidence: by pairs (a, b).
-        speeds: by pair, from its own stripes.
         """
-        names, speeds = [kind.name for kind in self.kinds], speeds or {}
-        now = self.displacements(names)
+        now = self.displacements([kind.name for kind in self.kinds])
 
         def asked_of(overlap: tuple[tuple[int, int], CellEvidence]) -> tuple[Array, Array]:
             (a, b), seen = overlap
             return self._asked(seen.doubted(APART_MM), now[a] - now[b])
 
         asked = threaded(asked_of, evidence.items(), stage="aligning")
-        asked += threaded(lambda told: told.asked(self.fields), speeds.values(), stage="aligning")
         squares, pulls = zip(*asked, strict=True)
         square, pull = np.array(squares), np.array(pulls)
         first, second = np.array(list(evidence)).T
-        alone = np.array(list(speeds), np.int64)
         ends = np.cumsum([0, *(kind.fields.shape[2] for kind in self.kinds)])
-        apart = [
-            np.concatenate(
-                [k.courses.values[first] - k.courses.values[second], k.courses.speeds[alone]]
-            )
-            for k in self.kinds
-        ]
+        apart = [k.courses.values[first] - k.courses.values[second] for k in self.kinds]
         count = len(self.amplitudes)
         normal, total = np.zeros((count, count), order="F"), np.zeros(count)
         for g, kind in enumerate(self.kinds):

@@ -18,7 +18,6 @@ import numpy as np
 from bodyscan.alignment.body_cells import BodyCells, displaced
 from bodyscan.alignment.body_motion import BodyMotion, outward_errors
 from bodyscan.alignment.cell_evidence import CellEvidence
-from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.icp import Alignment
 from bodyscan.alignment.limbs import LIMBS, SHIFTS
 from bodyscan.alignment.matching import AlignmentPoints, Matches
@@ -162,12 +161,7 @@ def follow(
         usual = np.repeat([np.radians(settings.sway_deg), settings.sway_mm], 3)
         boards = SwayPrior(0.0, 0.0, 0.0, 0.0).covariance(names, prior)
         start = BodyMotion.start(cells, seconds, boards, usual)
-        speeds = {
-            k: CellSpeeds.of(image.velocity.seen, place, cells)
-            for k, (image, place) in enumerate(zip(images, there, strict=True))
-            if image.velocity is not None and image.time_ms is not None
-        }
-        solved = _solve(pool, views, (start, cells), seen, speeds, settings)
+        solved = _solve(pool, views, (start, cells), seen, settings)
         if solved is None:
             return aligned, None, None
         motion = solved.motion
@@ -218,7 +212,6 @@ def _solve(
     views: Sequence[_View],
     person: tuple[BodyMotion, BodyCells],
     seen: Mask,
-    speeds: Mapping[int, CellSpeeds],
     settings: AlignmentSettings,
 ) -> _Solved | None:
     """In each round matches anew, and the motion that explains them; None where nothing overlaps.
@@ -231,7 +224,7 @@ def _solve(
         said = _each_overlap(asks, pool, taken, (motion, cells), reach, settings)
         if not said:
             return None
-        motion = motion.solved(_both_ways(said), speeds)
+        motion = motion.solved(_both_ways(said))
         reach = max(reach / 2.0, settings.least_reach_mm)
         if left == ROUNDS - 1 and _is_unbent(motion, seen) and _is_unswayed(motion, seen, settings):
             return _Solved(motion, reach, still=True)

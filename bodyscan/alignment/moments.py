@@ -28,13 +28,12 @@ LAG = 0.35
 IRREGULAR = 0.05
 """Share of a breath that is not a sine. What nobody saw is predicted by the sine alone, since
 nothing in a scan shows how large this share is."""
-STEP_S = 1e-3
 
 
 def of_stance(seconds: Array) -> Array:
     """Correlation of a stance with itself after so many seconds.
 
-    Matern's of order 5/2, whose speed is smooth too.
+    Matern's of order 5/2.
     """
     far = np.sqrt(5.0) * np.abs(seconds) / STANCE_S
     return np.asarray((1.0 + far + far**2 / 3.0) * np.exp(-far))
@@ -52,12 +51,10 @@ class Courses:
 
     values: at the pairs' moments, (P, J).
     middle: at the moment to which everything is carried, (J,).
-    speeds: per second, (P, J), 0 for pairs whose moment is not known.
     """
 
     values: Array
     middle: Array
-    speeds: Array
 
     @property
     def count(self) -> int:
@@ -75,29 +72,22 @@ class Courses:
         at = np.array([second for second in seconds if second is not None])
         values = np.zeros((len(seconds), len(alone)))
         values[alone, np.arange(len(alone))] = 1.0
-        middle, speeds = np.zeros(len(alone)), np.zeros_like(values)
+        middle = np.zeros(len(alone))
         if not timed:
-            return Courses(values, middle, speeds)
+            return Courses(values, middle)
         knots = np.append(at, 0.5 * (at.min() + at.max()))
         sizes, vectors = np.linalg.eigh(correlation(knots[:, None] - knots))
         kept = sizes > LEAST * sizes[-1]
         ways = vectors[:, kept] / np.sqrt(sizes[kept])
         found = correlation(knots[:, None] - knots) @ ways
-        ahead, behind = (
-            correlation(at[:, None] + step - knots) @ ways for step in (STEP_S, -STEP_S)
-        )
-        rows, rates = np.zeros((2, len(seconds), int(kept.sum())))
-        rows[timed], rates[timed] = found[:-1], (ahead - behind) / (2.0 * STEP_S)
-        return Courses(
-            np.hstack([rows, values]),
-            np.concatenate([found[-1], middle]),
-            np.hstack([rates, speeds]),
-        )
+        rows = np.zeros((len(seconds), int(kept.sum())))
+        rows[timed] = found[:-1]
+        return Courses(np.hstack([rows, values]), np.concatenate([found[-1], middle]))
 
     @staticmethod
     def steady(count: int) -> Courses:
         """Courses of something that differs from pair to pair and does not move."""
-        return Courses(np.eye(count), np.zeros(count), np.zeros((count, count)))
+        return Courses(np.eye(count), np.zeros(count))
 
 
 def breaths(courses: Courses, seconds: Sequence[float | None]) -> tuple[Array, Array]:

@@ -1,6 +1,6 @@
 """Mathematics without files or images: poses, cameras, light sheets, fitting.
 
-Poses: transforms, velocity, pose_covariance. Cameras: camera, lenses (one file each), camera_tables
+Poses: transforms, pose_covariance. Cameras: camera, lenses (one file each), camera_tables
 (for compiled loops), camera_fields (for files), pixel_rays, quadratic_table, ray_uncertainty,
 visibility, crop. Light sheets: light_planes (one plane per stripe, Eq. 6), smooth_sheets with
 bowed_sheets, lens_sheets with lens_points, projector_sheets; sheet_table and sheet_arrays (for

@@ -9,7 +9,6 @@ import numpy as np
 from bodyscan.arrays import Bytes, Floats, Mask
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.crop import Crop
-from bodyscan.geometry.velocity import Velocity
 from bodyscan.reconstruction.two_ways import Agreement
 
 
@@ -28,7 +27,6 @@ class RangeImage:
         seen has a point.
     agreement: of stripes of two directions, if such were projected.
     time_ms: the moment for which the depths hold, ms since the scan began; None if not known.
-    velocity: of the body at that moment; None where stripes or times do not determine it.
     common_mm: (h, w) float32, the part of sigma_mm that neighbours share because it comes from the
         calibration: it does not shrink when they are averaged. None if there is none.
     bent: whether points were carried to another moment, off the rays of their pixels.
@@ -47,7 +45,6 @@ class RangeImage:
     beyond: Mask | None = None
     agreement: Agreement | None = None
     time_ms: float | None = None
-    velocity: Velocity | None = None
     common_mm: Floats | None = None
     bent: bool = False
     corner: tuple[int, int] = (0, 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import islice
 from typing import Any, Self
 
@@ -131,6 +131,21 @@ class FrameNames(ImageNames):
         """Names as `of_code`, in the best order to show them (`StripeCode.show_order`)."""
         ways = zip((self, self.crossing), code.directions, strict=False)
         return tuple(own.of_one_way(way)[k] for own, way in ways for k in way.show_order)
+
+    def moment_ms(self, code: StripeCode, frame_ms: Mapping[str, float]) -> float:
+        """Compute the time at which a code's stripe map holds (`StripeCode.moment`), ms.
+
+        frame_ms: the time of each image by its name.
+        """
+        import numpy as np
+
+        counts = code.image_counts.items()
+        return code.moment(
+            {
+                kind.name: np.array([frame_ms[name] for name in self.of_kind(kind, count)])
+                for kind, count in counts
+            }
+        )
 
     def of_sequence(self, code: StripeCode | None) -> tuple[str, ...]:
         """Names of all images of a sequence in the default order in which they are taken; for a

@@ -12,5 +12,4 @@ where stripes end, albedo_edges corrects that at edges of the surface's brightne
 stripe_coordinates interpolates between boundaries, code_lines fills in where there are none;
 pixel_stripes does all that for codes that give s at each pixel. line_bands: boundaries of some
 lines only. bit_clarity, clear_changes and boundary_scatter compare what was decoded with its noise.
-comb and one_moment: motion while the images were taken.
 """

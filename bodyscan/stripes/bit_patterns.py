@@ -11,19 +11,18 @@ from numpy.typing import NDArray
 from bodyscan.arrays import Floats, Greys
 from bodyscan.errors import DecodingFailed
 from bodyscan.stripes.albedo_edges import Brightness, without_edges_across
-from bodyscan.stripes.bit_words import WordCode, bit_that_flips
-from bodyscan.stripes.boundaries import find_boundaries, kept_boundaries
+from bodyscan.stripes.bit_words import WordCode
+from bodyscan.stripes.boundaries import find_boundaries
 from bodyscan.stripes.boundary_scatter import local_scatter, scatter
 from bodyscan.stripes.code_lines import fill_from_codes
 from bodyscan.stripes.grey_noise import noise_variance
 from bodyscan.stripes.line_bands import LineBands
-from bodyscan.stripes.one_moment import Moments, carry_to_moment
 from bodyscan.stripes.scan_lines import ScanLines
 from bodyscan.stripes.sequence_checks import check_codes, check_exposure
 from bodyscan.stripes.stripe_coordinates import alike_along_lines, interpolate_stripes
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap, boundary_map, stripe_map
-from bodyscan.stripes.usable_pixels import MIN_CONTRAST, shown_pixels, uncovered_meanwhile
+from bodyscan.stripes.usable_pixels import MIN_CONTRAST, shown_pixels
 
 SAMPLES = 20_000
 COARSE_BITS = 3
@@ -40,12 +39,10 @@ def decode_bits(
     lit: Greys,
     stripes: int,
     limits: StripeLimits | None,
-    moments: Moments | None = None,
 ) -> StripeMap:
     """The stripe map from `bit_lines`.
 
     lit: (H, W) in the camera's layout.
-    moments: when its images were taken, if boundaries are to be carried to one moment.
 
     Raises DecodingFailed if the images are inconsistent.
     """
@@ -64,15 +61,7 @@ def decode_bits(
         images, brightness, codes, usable, variance, code.finest_run, code.first
     )
     sigma_px = np.hypot(boundaries.sigma_px, code.doubt_px)
-    boundaries, motion, carried = replace(boundaries, sigma_px=sigma_px), None, 0.0
-    if moments is not None:
-        bit = bit_that_flips(boundaries.index + code.first, len(images.patterns))
-        seen = boundaries
-        boundaries, motion, carried = carry_to_moment(seen, bit, moments, turned=images.turned)
-        if carried > 0.0:
-            covered = ~uncovered_meanwhile(images, variance)
-            usable, shown = usable & covered, shown & covered
-            boundaries = boundaries.where(*kept_boundaries(seen, usable))
+    boundaries = replace(boundaries, sigma_px=sigma_px)
     boundaries = replace(boundaries, sigma_px=scatter(boundaries) * boundaries.sigma_px)
     if images.bands is not None:
         return boundary_map(images, lit, boundaries, stripes)
@@ -81,14 +70,14 @@ def decode_bits(
         ratio = local_scatter(boundaries)
         boundaries = replace(boundaries, sigma_px=ratio * boundaries.sigma_px)
         rough = ratio > 1.0
-    s, sigma = interpolate_stripes(boundaries, codes, usable, carried, rough)
+    s, sigma = interpolate_stripes(boundaries, codes, usable, rough)
     if code.single:  # in other codes words at boundaries may be wrong by any number
         fill_from_codes(s, sigma, codes, shown)
     s, sigma = without_edges_across(s, sigma, brightness, boundaries.blur2)
     found = stripe_map(images, lit, s, sigma, boundaries, stripes, beyond)
     along = alike_along_lines(boundaries)
     alike_px = (0.0, along) if images.turned else (along, 0.0)
-    return replace(found, motion=motion, alike_px=alike_px)
+    return replace(found, alike_px=alike_px)
 
 
 def bit_lines(

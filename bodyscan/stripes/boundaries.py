@@ -67,14 +67,6 @@ class Boundaries:
         )
 
 
-def kept_boundaries(seen: Boundaries, usable: Mask) -> tuple[Mask, Mask]:
-    """Which boundaries lie between two usable pixels (L, P), (N,), and which of the M kept ones are
-    joined, (M - 1,)."""
-    kept = usable[seen.line, seen.before] & usable[seen.line, seen.before + 1]
-    places = seen.line[kept], seen.before[kept], seen.position[kept], seen.index[kept]
-    return kept, continues_to_next(*places, usable)
-
-
 def find_boundaries(
     images: ScanLines,
     brightness: Brightness,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from bodyscan.arrays import Greys
 from bodyscan.errors import DecodingFailed, WrongDirection
 from bodyscan.stripes.line_bands import LineBands
-from bodyscan.stripes.one_moment import Moments
 from bodyscan.stripes.stripe_code import ImageKind, SequenceImages, StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import StripeMap
@@ -23,7 +22,6 @@ def decode_stripes(
     coded: Greys,
     *,
     limits: StripeLimits | None = None,
-    moments: Sequence[Moments] = (),
     bands: LineBands | None = None,
     where: str = "",
 ) -> StripeMap:
@@ -33,8 +31,6 @@ def decode_stripes(
     coded: (F, H, W), the images of the code in the order of its `image_counts`, then those of the
         crossing stripes, which give the map's `crossing`.
     limits: the stripes that matter; others get no s.
-    moments: of the code's images, then of those of the crossing stripes, if motion is to be
-        measured and removed.
     bands: where boundaries are wanted, and no s.
 
     Raises DecodingFailed, naming the image if it can be identified, for inconsistent images. If
@@ -42,14 +38,13 @@ def decode_stripes(
     """
     try:
         own, *others = images_by_kind(code, coded)
-        seen, across = (*moments, None, None)[:2]
-        found = _decode(code, lit, dark, own, limits, seen, bands)
+        found = _decode(code, lit, dark, own, limits, bands)
         if code.crossing is None:
             return found
     except DecodingFailed as error:
         raise DecodingFailed(error.what, where=where, remedy=error.remedy) from error
     try:
-        crossing = _decode(code.crossing, lit, dark, others[0], None, across, bands)
+        crossing = _decode(code.crossing, lit, dark, others[0], None, bands)
         return replace(found, crossing=crossing)
     except DecodingFailed as error:
         remedy = error.remedy
@@ -64,7 +59,6 @@ def _decode(
     dark: Greys | None,
     coded: Mapping[ImageKind, Greys],
     limits: StripeLimits | None,
-    moments: Moments | None,
     bands: LineBands | None,
 ) -> StripeMap:
     """The map of stripes that run one way."""
@@ -75,7 +69,7 @@ def _decode(
         raise DecodingFailed(f"images of {shape} px, lit frame of {lit.shape} px")
     if dark is not None and dark.shape != shape:
         raise DecodingFailed(f"dark frame of {dark.shape} px, lit frame of {lit.shape} px")
-    found = way.decode(SequenceImages(lit, dark, coded, moments, bands), limits)
+    found = way.decode(SequenceImages(lit, dark, coded, bands), limits)
     if limits is None or found.beyond is not None:
         return found
     return restrict(found, limits)

@@ -24,7 +24,6 @@ from bodyscan.files.model import Model, Problem
 if TYPE_CHECKING:
     from bodyscan.arrays import Array, Greys
     from bodyscan.stripes.line_bands import LineBands
-    from bodyscan.stripes.one_moment import Moments
     from bodyscan.stripes.stripe_limits import StripeLimits
     from bodyscan.stripes.stripe_map import StripeMap
 
@@ -53,7 +52,6 @@ class SequenceImages:
 
     lit, dark: (H, W); dark is None if not taken.
     coded: (n, H, W) of each kind.
-    moments: when they were taken, if codes that can are to measure and remove motion.
     bands: where only boundaries are wanted; codes that can look there alone, and give no s.
 
     All images are of one type: uint8, or float32 if they hold fractions of grey levels.
@@ -62,7 +60,6 @@ class SequenceImages:
     lit: Greys
     dark: Greys | None
     coded: Mapping[ImageKind, Greys]
-    moments: Moments | None = None
     bands: LineBands | None = None
 
 

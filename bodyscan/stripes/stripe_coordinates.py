@@ -38,12 +38,10 @@ def interpolate_stripes(
     boundaries: Boundaries,
     codes: NDArray[np.int32],
     usable: Mask,
-    carried: float = 0.0,
     rough: Mask | None = None,
 ) -> tuple[Floats, Floats]:
     """s and its standard deviation, (L, P) each, NaN where there is none.
 
-    carried: how far boundaries may have been carried from where the codes change, stripes.
     rough: (N,) boundaries on relief that a smooth run would flatten: they are left in place.
 
     Between two boundaries s is a cubic with slopes from the boundaries around them (Hermite). Past
@@ -55,8 +53,8 @@ def interpolate_stripes(
         found = _Segments.of(boundaries, rough)
         segments = (found.start, found.width, found.index, found.rise, found.sigma)
         bends = (found.slope_in, found.slope_out, found.pull)
-        slack, places = SLACK + carried, (boundaries.line, boundaries.before)
-        _fill(s, sigma, codes, usable, *places, segments, bends, slack)
+        places = (boundaries.line, boundaries.before)
+        _fill(s, sigma, codes, usable, *places, segments, bends, SLACK)
     return s, sigma
 
 
@@ -143,11 +141,11 @@ def _fill(
             code, passed = codes[row, place], last >= 0 and line[last] == row
             value, doubt = np.nan, np.nan
             if passed and last + 1 < count:
-                value, doubt = _within(place, code, last, segments, bends, slack)
+                value, doubt = _within(place, code, last, segments, bends, SLACK)
             if passed and last >= 1 and math.isnan(value):
-                value, doubt = _beside(place, code, last - 1, segments, bends, slack)
+                value, doubt = _beside(place, code, last - 1, segments, bends, SLACK)
             if last + 2 < count and line[last + 1] == row and math.isnan(value):
-                value, doubt = _beside(place, code, last + 1, segments, bends, slack)
+                value, doubt = _beside(place, code, last + 1, segments, bends, SLACK)
             s[row, place], sigma[row, place] = value, doubt
 
 

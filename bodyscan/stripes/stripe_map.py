@@ -9,7 +9,6 @@ import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Floats, Greys, Indices, Mask, whole_grey
 from bodyscan.stripes.boundaries import Boundaries
-from bodyscan.stripes.one_moment import StripeMotion
 from bodyscan.stripes.scan_lines import ScanLines
 
 
@@ -52,7 +51,6 @@ class StripeMap:
     crossing_fault: why there is none although they were, else "".
     response: what the projector's response did, for codes that measure it; None if noise explains
         it.
-    motion: what moved while the images were taken, for codes that measure it, if moments are given.
     """
 
     s: Floats
@@ -65,7 +63,6 @@ class StripeMap:
     beyond: Mask | None = None
     crossing: StripeMap | None = None
     response: ResponseShare | None = None
-    motion: StripeMotion | None = None
     crossing_fault: str = ""
     alike_px: tuple[float, float] = (0.0, 0.0)
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyscan.arrays import Floats, Greys, Mask
+from bodyscan.arrays import Floats, Mask
 from bodyscan.compiled import compiled
 from bodyscan.stripes.indirect_light import mostly_direct
 from bodyscan.stripes.scan_lines import ScanLines
@@ -18,10 +17,6 @@ SATURATED = 254
 MIN_CONTRAST = 4.0
 MIN_CONTRAST_TO_NOISE = 5.0
 WHOLLY_COVERED = 0.7
-SURELY = 2.0
-"""Sigmas of the difference between the most and the least light in ten pairs of images. These are
-extremes, already some three sigmas apart by noise, of which WHOLLY_COVERED allows for as much where a
-surface is bright; where it is dark the sigmas do."""
 
 
 def least_contrast(of: np.dtype[Any]) -> float:
@@ -80,43 +75,6 @@ def half_covered_pixels(contrast: NDArray[Any], lit: Mask) -> Mask:
     around = np.ones((3, 3), np.uint8)
     at_rim = cv2.erode(lit.view(np.uint8), around, borderValue=1) == 0
     return at_rim & (contrast < np.float32(WHOLLY_COVERED) * cv2.dilate(contrast, around))
-
-
-def uncovered_meanwhile(images: ScanLines, variance: Floats) -> Mask:
-    """Pixels (L, P) that did not show the same surface in all images: the rim of a body that moved
-    passed over them, and their boundaries are partly those of another surface.
-
-    A pattern and its inverse together are as bright as lit and dark, however blurred their stripes
-    are; no image is brighter than the lit one. Cameras that sharpen, or JPEG, break that rule at a
-    pixel in twenty, so that it is for bodies that are known to have moved. Without inverses nothing
-    is known.
-    """
-    uncovered = np.zeros(images.lit.shape, np.bool_)
-    if images.inverses is not None:
-        _uncovered(images.lit, images.dark, images.patterns, images.inverses, variance, uncovered)
-    return uncovered
-
-
-@compiled
-def _uncovered(
-    lit: Greys, dark: Greys, patterns: Greys, inverses: Greys, variance: Floats, uncovered: Mask
-) -> None:
-    lines, places = lit.shape
-    for line in range(lines):
-        for place in range(places):
-            black = np.float32(dark[line, place])
-            most, least = np.float32(lit[line, place]), np.float32(np.inf)
-            doubt = np.float32(0.0)
-            for bit in range(patterns.shape[0]):
-                seen, other = patterns[bit, line, place], inverses[bit, line, place]
-                both = np.float32(seen) + np.float32(other)
-                most = max(most, np.float32(max(seen, other)))
-                if both < least:
-                    least = both
-                    doubt = variance[np.int64(seen)] + variance[np.int64(other)]
-            doubt += 4 * variance[np.int64(black)] + WHOLLY_COVERED**2 * variance[np.int64(most)]
-            missing = WHOLLY_COVERED * (most - black) - (least - black - black)
-            uncovered[line, place] = missing > SURELY * math.sqrt(doubt)
 
 
 def beside_jumps(codes: NDArray[np.int32], usable: Mask) -> Mask:

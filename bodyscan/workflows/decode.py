@@ -31,7 +31,6 @@ from bodyscan.rig.rig import Rig
 from bodyscan.rig.templates import fill
 from bodyscan.stripes.decoding import decode_stripes
 from bodyscan.stripes.line_bands import LineBands
-from bodyscan.stripes.one_moment import Moments
 from bodyscan.stripes.stripe_code import StripeCode
 from bodyscan.stripes.stripe_limits import StripeLimits
 from bodyscan.stripes.stripe_map import ResponseShare, StripeMap
@@ -52,14 +51,13 @@ def decode_sequence(
     pair: Pair,
     *,
     limits: StripeLimits | None = None,
-    moments: Sequence[Moments] = (),
     crop: Crop = WHOLE,
     bands: LineBands | None = None,
     workers: int = 1,
 ) -> StripeMap:
     """Read and decode what `pair` took in one shot.
 
-    limits, moments, bands: see `decode_stripes`.
+    limits, bands: see `decode_stripes`.
     crop: rows and columns of the images to decode; the map covers these alone.
 
     Raises ImageError for bad files; DecodingFailed (naming pair and shot) for frames that do not
@@ -78,7 +76,6 @@ def decode_sequence(
             images.dark,
             images.coded,
             limits=limits,
-            moments=moments,
             bands=bands,
             where=where,
         )

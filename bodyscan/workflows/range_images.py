@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
-
-import numpy as np
 
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.errors import BadInput, BodyscanError, ScanFailed, listed
@@ -16,17 +14,14 @@ from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent
 from bodyscan.reconstruction.range_image import RangeImage
 from bodyscan.reconstruction.scan_volume import stripes_in_volume
-from bodyscan.reconstruction.sequence_moments import FASTEST_MM_S, MS, sequence_moments
 from bodyscan.reconstruction.triangulation import reconstruct_range_image
 from bodyscan.registration.rig_calibration import RigCalibration
 from bodyscan.rig.rig import Rig
-from bodyscan.stripes.one_moment import Moments, StripeMotion
 from bodyscan.stripes.stripe_map import ResponseShare
 from bodyscan.workflows.decode import decode_sequence, one_way_notes, response_notes, responses_in
 
-Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...], StripeMotion | None, str]
-"""A range image with the projector's response, the motion, and why the crossing stripes were not
-used."""
+Reconstructed = tuple[RangeImage, tuple[ResponseShare, ...], str]
+"""A range image with the projector's response and why the crossing stripes were not used."""
 
 
 def reconstruct_sequence(
@@ -45,26 +40,14 @@ def reconstruct_sequence(
     pair, at = calibration.pairs[sequence.pair], calibration.rig_from_camera[sequence.pair]
     limits = stripes_in_volume(pair, at, calibration.rig.volume)
     spec = calibration.rig.pair(sequence.pair)
-    moments: tuple[Moments, ...] = ()
+    stripes = decode_sequence(sequence, spec, limits=limits)
+    image = reconstruct_range_image(pair, stripes)
     frame_ms = captures.frame_ms(sequence.shot, sequence.pair)
-    if spec.projector is not None:
-        frames, pairs = calibration.rig.frames, len(calibration.pairs)
-        moments = sequence_moments(pair, spec.projector, frames, frame_ms, pairs)
-    stripes = decode_sequence(sequence, spec, limits=limits, moments=moments)
-    image, motion = reconstruct_range_image(pair, stripes), stripes.motion
-    if motion is not None and motion.is_significant and image.agreement is not None:
-        # A still subject seen with faults that look like motion agrees better without the
-        # correction.
-        still = decode_sequence(sequence, spec, limits=limits)
-        standing = reconstruct_range_image(pair, still)
-        if standing.agreement and standing.agreement.apart_mm < image.agreement.apart_mm:
-            stripes, image, motion = still, standing, None
-    if frame_ms is not None and moments:
-        velocity = None if motion is None else motion.velocity
-        image = replace(image, time_ms=MS * moments[0].moment, velocity=velocity)
+    if frame_ms is not None and spec.projector is not None:
+        image = replace(image, time_ms=calibration.rig.frames.moment_ms(spec.projector, frame_ms))
     if volume_only:
         image = cut_to_volume(image, at, calibration.rig.volume)
-    return image, tuple(responses_in(stripes)), motion, stripes.crossing_fault
+    return image, tuple(responses_in(stripes)), stripes.crossing_fault
 
 
 def reconstruct_range_images(
@@ -112,14 +95,10 @@ def reconstruct_range_images(
         raise ScanFailed(f"no pair gave a range image:{listed(failed)}")
     images = [image for image, *_ in found.values()]
     responses: dict[str, list[ResponseShare]] = defaultdict(list)
-    motions: dict[str, StripeMotion] = {}
-    for image, shares, motion, _ in found.values():
+    for image, shares, _ in found.values():
         responses[image.pair] += shares
-        if motion is not None:
-            motions[image.pair] = motion
     notes = [f"{image.pair}: {image.agreement}" for image in images if image.agreement is not None]
     notes += map(captures.relative, one_way_notes({one: own[-1] for one, own in found.items()}))
-    notes += motion_notes(motions, timed=bool(captures.times))
     return Outcome(images, (*notes, *response_notes(responses)), failed)
 
 
@@ -130,33 +109,4 @@ def _require_projector(rig: Rig) -> None:
             where=f"rig {rig.name}",
             remedy="give a pair a `projector` in the rig file and calibrate it; a calibration of "
             "cameras alone is for other programs (`bodyscan export-rig`)",
-        )
-
-
-def motion_notes(motions: Mapping[str, StripeMotion], *, timed: bool) -> Iterator[str]:
-    """Notes on how the subject moved while each pair saw it.
-
-    timed: whether speeds are per second rather than from one image to the next.
-    """
-    moved = {pair: motion for pair, motion in motions.items() if motion.is_significant}
-    if not moved:
-        return
-    unit = "mm/s" if timed else "mm from image to image"
-    most = max(moved, key=lambda pair: moved[pair].speed_mm)
-    yield (
-        f"moved by up to {moved[most].speed_mm:.2g} {unit} in depth while a pair saw it ({most});"
-        f" what {len(moved)} of {len(motions)} pairs saw was carried to one moment each"
-    )
-    usual = float(np.median([motion.speed_mm for motion in moved.values()]))
-    if timed and usual > FASTEST_MM_S:
-        yield (
-            f"nobody who stands moves at {usual:.0f} mm/s, as these {len(moved)} pairs have it:"
-            " see whether `timing` of captures.yaml has the frames' true times; if it has,"
-            " repeat the scan"
-        )
-    unclear = max(moved, key=lambda pair: moved[pair].doubt_mm)
-    if moved[unclear].doubt_mm > 0.0:
-        yield (
-            f"up to {moved[unclear].doubt_mm:.2g} {unit} of it are no smooth motion ({unclear}): these"
-            " went into the sigmas"
         )

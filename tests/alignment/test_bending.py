@@ -12,14 +12,12 @@ from ring import looking_at
 
 from bodyscan.alignment.bending import _bend, _one_in_each_block, bend
 from bodyscan.alignment.body_cells import BodyCells, modulated, rigid_fields
-from bodyscan.alignment.cell_speeds import CellSpeeds
 from bodyscan.alignment.matching import alignment_points, match_projected
 from bodyscan.fusion.smoothing import smooth
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.crop import WHOLE, crop_of, widened
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.velocity import SurfaceSpeeds
 from bodyscan.reconstruction.range_image import RangeImage
 
 CAMERA = Camera(400.0, 404.0, -1.0, 158.0, 130.0, Radial(), 320, 256)
@@ -45,33 +43,6 @@ def ball() -> tuple[RangeImage, BodyCells]:
     there = image.valid
     cells, _ = BodyCells.of(PLACE.apply(points[there]), PLACE.rotate(normals[there]))
     return image, cells
-
-
-def test_the_speeds_that_a_pair_tells_are_asked_of_the_cells(
-    ball: tuple[RangeImage, BodyCells],
-) -> None:
-    image, cells = ball
-    shift = np.array([3.0, -4.0, 6.0])  # mm/s, rig frame
-    some = np.zeros(image.valid.shape, bool)
-    some[::12, ::12] = True
-    points = image.points[image.valid & some].astype(float)
-    normals = image.normals[image.valid & some].astype(float)
-    facing = normals * (points[:, 2] / np.sum(normals * points, axis=1))[:, None]
-    speed = facing @ PLACE.inverse().rotate(shift)
-    fields = rigid_fields(cells, CENTRE, 1.0)[:, :, 3:]
-    alone, both = (
-        CellSpeeds.of(
-            SurfaceSpeeds(points, facing, speed, np.full(len(points), 0.5), shared), PLACE, cells
-        ).asked(fields)
-        for shared in (np.zeros((len(points), 1)), 2.0 * facing[:, 2:])
-    )
-    # What moved towards the camera is carried back, from it.
-    np.testing.assert_allclose(np.linalg.solve(*alone), -shift, atol=1e-3)
-    np.testing.assert_allclose(np.linalg.solve(*both), -shift, atol=1e-3)
-    # An error of all of them together, 2 mm/s along the line of sight, is one of the shift.
-    sight = PLACE.rotate(np.array([[0.0, 0.0, 1.0]]))[0]
-    assert sight @ np.linalg.inv(alone[0]) @ sight < 0.1**2
-    assert 1.5**2 < sight @ np.linalg.inv(both[0]) @ sight < 2.5**2
 
 
 def test_a_rigid_motion_is_one(ball: tuple[RangeImage, BodyCells]) -> None:

@@ -20,7 +20,7 @@ from bodyscan.arrays import Array
 PAIRS, CELLS = 2, 3
 RNG = np.random.default_rng(5)
 NORMALS = np.array([[1.0, 0, 0], [0, 0.6, 0.8], [0, 0, 1.0]])
-COURSES = Courses(RNG.normal(size=(PAIRS, 2)), RNG.normal(size=2), RNG.normal(size=(PAIRS, 2)))
+COURSES = Courses(RNG.normal(size=(PAIRS, 2)), RNG.normal(size=2))
 KNOWN = np.diag(RNG.uniform(1.0, 3.0, 6 * PAIRS))
 POSE = Kind("pose", RNG.normal(size=(CELLS, 12, 6)), Courses.steady(PAIRS), 1.0, KNOWN)
 PARTS = Kind("parts", RNG.normal(size=(CELLS, 12, 3)), COURSES, 0.8)

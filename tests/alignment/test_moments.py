@@ -29,14 +29,6 @@ def test_courses_sum_to_what_is_alike(correlation: object) -> None:
     np.testing.assert_allclose(every @ every.T, alike(at[:, None] - at), atol=0.01)
 
 
-def test_speeds_are_those_of_the_courses() -> None:
-    seconds = [0.2, 0.5, 0.50001, 1.4]
-    courses = Courses.of(of_stance, seconds)
-    np.testing.assert_allclose(
-        (courses.values[2] - courses.values[1]) / 1e-5, courses.speeds[1], rtol=2e-3, atol=2e-3
-    )
-
-
 def test_a_breath_comes_back_and_a_stance_does_not() -> None:
     assert of_breath(np.array([1.9]))[0] < -0.5
     assert of_stance(np.array([1.9]))[0] > 0.0

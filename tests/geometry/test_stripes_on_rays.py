@@ -1,4 +1,4 @@
-"""How stripes lie over a picture's rays: per pixel, beside their sheets, and along a scan line."""
+"""How stripes lie over a picture's rays: per pixel, and beside their sheets."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.light_planes import LightPlanes
 from bodyscan.geometry.ray_depths import intersect_rays, stripes_apart, stripes_per_pixel
 from bodyscan.reconstruction.range_image import RangeImage
-from bodyscan.stripes.one_moment import _stripe_widths
 
 CAMERA = Camera(400.0, 400.0, 0.0, 79.5, 59.5, Radial(), 160, 120)
 APART, BASELINE = 0.01, 200.0
@@ -62,17 +61,6 @@ def test_rays_meet_their_sheets_and_depth_changes_with_s() -> None:
         found.per_stripe, APART * 800.0**2 / BASELINE * np.sign(found.per_stripe), rtol=5e-3
     )
     assert len(set(np.sign(found.per_stripe).tolist())) == 1
-
-
-def test_a_stripe_is_as_wide_as_its_neighbours_lie_apart() -> None:
-    position = np.array([1.0, 3.0, 6.0, 10.0, 40.0, 37.0, 50.0])
-    index = np.array([4, 5, 6, 7, 3, 2, 9])
-    joined = np.array([True, True, True, False, True, False])
-    np.testing.assert_allclose(
-        _stripe_widths(position, index, joined), [2.0, 2.5, 3.5, 4.0, 3.0, 3.0, 0.0]
-    )
-    falling = _stripe_widths(position[:3], index[:3][::-1].copy(), joined[:2])
-    np.testing.assert_allclose(falling, [-2.0, -2.5, -3.0])
 
 
 def test_a_part_of_a_range_image_knows_where_in_the_picture_it_is() -> None:

@@ -1,4 +1,4 @@
-"""Parts of a picture, what lies in it, how well its rays are known, and how what it shows moves."""
+"""Parts of a picture, what lies in it and how well its rays are known."""
 
 from __future__ import annotations
 
@@ -10,23 +10,10 @@ from bodyscan.geometry.crop import crop_of, ends_of, widened
 from bodyscan.geometry.lenses.radial import Radial
 from bodyscan.geometry.pose_covariance import PoseCovariance, point_covariance, position_sigma
 from bodyscan.geometry.ray_uncertainty import COLUMNS, ROWS, RayUncertainty, nodes
-from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.geometry.velocity import SurfaceSpeeds, Velocity
 from bodyscan.geometry.visibility import in_image
 
 PLAIN = Camera(500.0, 510.0, 0.0, 159.5, 119.5, Radial(0.0, 0.0), 320, 240)
 BARREL = Camera(300.0, 300.0, 0.0, 159.5, 119.5, Radial(-0.3, 0.0), 320, 240)
-
-
-def test_a_point_moves_as_the_rigid_motion_it_is_part_of() -> None:
-    twist = np.array([0.02, -0.05, 0.03, 4.0, -2.0, 7.0])
-    none = np.empty((0, 3))
-    unseen = SurfaceSpeeds(none, none, none[:, 0], none[:, 0], none[:, :1])
-    points = np.array([[100.0, -50.0, 900.0], [-30.0, 80.0, 1100.0]])
-    for_a_while = 1e-4
-    moved = RigidTransform.identity().moved(for_a_while * twist).apply(points) - points
-    velocity = Velocity(twist, np.eye(6), unseen).at(points)
-    np.testing.assert_allclose(velocity, moved / for_a_while, atol=1e-3)  # turns of 5e-6: 0.3 %
 
 
 def test_a_crop_is_the_smallest_box_and_grows_no_farther_than_the_first_row() -> None:

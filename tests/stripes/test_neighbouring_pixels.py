@@ -15,7 +15,6 @@ from bodyscan.stripes.usable_pixels import (
     half_covered_pixels,
     least_contrast,
     shown_pixels,
-    uncovered_meanwhile,
     usable_pixels,
 )
 
@@ -58,49 +57,6 @@ def test_a_pixel_at_the_rim_that_is_much_darker_than_its_neighbour_is_half_cover
     assert not half_covered_pixels(contrast, lit)[2, 2]
     contrast[0, 0] = 30  # beyond the picture nothing is known to be dark
     assert not half_covered_pixels(contrast, lit)[0, 0]
-
-
-def uncovered_of(level: float, lit: float = 100.0, of: type = np.uint8, noise: float = 0.0) -> bool:
-    """Whether a pixel is taken to have lost the surface that the lit frame and one pair of a pattern
-    and its inverse show at `lit` above a dark of 20, since another pair shows it at `level`."""
-    high: Greys = np.full((3, 2, 2), 20.0 + lit).astype(of)
-    high[1] = np.float32(20.0 + level).astype(of)
-    dark: Greys = np.full((3, 2, 2), 20.0).astype(of)
-    images = ScanLines(high[0], dark[0], high, dark, False)
-    found = uncovered_meanwhile(images, np.full(256, noise**2, np.float32))
-    assert np.all(found == found[0, 0])
-    return bool(found[0, 0])
-
-
-def test_a_pixel_that_the_rim_passed_over_while_the_patterns_were_taken_is_uncovered() -> None:
-    assert uncovered_of(69.0)
-    assert not uncovered_of(71.0)  # 70 % of the most light it ever got
-    assert uncovered_of(145.0)  # it was half covered in the lit frame and in all others
-    assert not uncovered_of(140.0)
-    assert uncovered_of(0.69, 1.0, np.float32)
-    assert not uncovered_of(0.71, 1.0, np.float32)
-    # Noise of 2: twice 2 sqrt(1 + 1 + 4 + 0.49), 10.19, below 70.
-    assert uncovered_of(59.0, noise=2.0)
-    assert not uncovered_of(61.0, noise=2.0)
-    assert uncovered_of(59.7, of=np.float32, noise=2.0)
-    assert not uncovered_of(59.9, of=np.float32, noise=2.0)
-
-
-def test_blur_and_non_linear_grey_levels_uncover_nothing() -> None:
-    """Where stripes are blurred, pattern and inverse show half of the light each, or more than half of
-    the grey levels."""
-    lit, dark = np.full((1, 1, 1), 120, np.uint8), np.full((1, 1, 1), 20, np.uint8)
-    for half in (70, 93):
-        both = np.concatenate([lit, np.full((1, 1, 1), half, np.uint8)])
-        other = np.concatenate([dark, both[1:]])
-        images = ScanLines(lit[0], dark[0], both, other, False)
-        assert not uncovered_meanwhile(images, np.zeros(256, np.float32)).any()
-
-
-def test_without_inverses_nothing_tells_what_was_uncovered() -> None:
-    lit, dark = np.full((2, 2), 120, np.uint8), np.full((2, 2), 20, np.uint8)
-    images = ScanLines(lit, dark, np.stack([lit, dark]), None, False)
-    assert not uncovered_meanwhile(images, np.zeros(256, np.float32)).any()
 
 
 def seen(lit: float, dark: float, of: type, *, code: int = 3, variance: float = 1.0) -> bool:

@@ -57,12 +57,10 @@ INDEX = np.arange(3, 26)
 POSITION = -100.0 + np.sqrt(100.0**2 + INDEX / 0.001)
 
 
-def interpolated(
-    boundaries: Boundaries, carried: float = 0.0, off: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
+def interpolated(boundaries: Boundaries, off: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """s and sigma of line 1; off: what codes are wrong by."""
     codes = np.tile(np.floor(bent(X)).astype(np.int32) + off, (2, 1))
-    s, sigma = interpolate_stripes(boundaries, codes, np.ones(codes.shape, bool), carried)
+    s, sigma = interpolate_stripes(boundaries, codes, np.ones(codes.shape, bool))
     assert np.isnan(s[0]).all(), "there is no boundary on line 0"
     return s[1], sigma[1]
 
@@ -140,8 +138,6 @@ def test_s_that_contradicts_the_pixels_code_is_none() -> None:
     assert known.sum() < 0.3 * WIDTH
     assert np.all(near[known] > 0.85 - 1e-3)
     assert known[(near > 0.85 + 1e-3) & (bent(X) > 3.0) & (bent(X) < 25.0)].all()
-    carried, _ = interpolated(run(POSITION, INDEX), carried=0.3, off=1)
-    assert np.isfinite(carried).sum() > known.sum() + 10
 
 
 def test_blur_lifts_s_where_it_bends() -> None:
@@ -382,7 +378,7 @@ def test_on_relief_boundaries_are_left_in_place() -> None:
     usable = np.ones(codes.shape, bool)
     smooth, even = (
         interpolate_stripes(some, codes, usable)[1],
-        interpolate_stripes(some, codes, usable, 0.0, rough)[1],
+        interpolate_stripes(some, codes, usable, rough)[1],
     )
     # Between two boundaries of 2 px: 0.05 / 2, and seven that are smoothed leave 0.577 of it.
     np.testing.assert_allclose(

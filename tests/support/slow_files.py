@@ -42,7 +42,6 @@ SLOW = (
     "jobs/test_object_storage.py",
     "registration/test_advice.py",
     "laboratory/test_rival_projectors.py",
-    "reconstruction/test_told_motion.py",
     "fusion/test_meshing.py",
     "workflows/test_check_calibration.py",
     "workflows/test_light_chosen.py",

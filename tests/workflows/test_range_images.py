@@ -1,64 +1,51 @@
-"""Which stripe map of a sequence is believed: with what seems to move taken out, or as it is."""
+"""The time of a range image, and rigs that give none."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from bodyscan.errors import BadInput
-from bodyscan.reconstruction.two_ways import Agreement
-from bodyscan.stripes.one_moment import Moments
+from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.lenses.radial import Radial
+from bodyscan.reconstruction.range_image import RangeImage
+from bodyscan.rig.frame_names import FrameNames
+from bodyscan.stripes.codes.gray import Gray
 from bodyscan.workflows import range_images
 from bodyscan.workflows.range_images import reconstruct_range_images, reconstruct_sequence
 
-
-@dataclass
-class Seen:
-    """Of a stripe map and of a range image: what the choice looks at."""
-
-    motion: Any = None
-    agreement: Agreement | None = None
-    crossing: None = None
-    response: None = None
-    crossing_fault: str = ""
+STRIPES = SimpleNamespace(crossing=None, response=None, crossing_fault="")
 
 
-def agreement(apart_mm: float) -> Agreement:
-    return Agreement(1000, apart_mm, 3.0, 0)
+def range_image() -> RangeImage:
+    points, grey = np.ones((4, 5, 3), np.float32), np.zeros((4, 5), np.uint8)
+    camera = Camera(400.0, 400.0, 0.0, 2.0, 1.5, Radial(), 5, 4)
+    return RangeImage("p", camera, points, points, points[..., 0], grey)
 
 
-@pytest.mark.parametrize(("moved_mm", "believed"), [(0.4, True), (1.6, False)])
-def test_motion_that_makes_both_directions_disagree_is_none(
-    monkeypatch: pytest.MonkeyPatch, moved_mm: float, believed: bool
+def test_a_range_image_holds_at_the_time_of_the_finest_pattern(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """0.9 mm as it is. In `gray-jpeg` a statue stands; faults of its patterns look like motion."""
-    motion: Any = SimpleNamespace(is_significant=True, velocity=None)
-
-    def decode(*_: Any, moments: tuple[Moments, ...] = (), **__: Any) -> Seen:
-        return Seen(motion) if moments else Seen()
-
-    def reconstruct(pair: Any, stripes: Seen) -> Seen:
-        return Seen(agreement=agreement(moved_mm if stripes.motion else 0.9))
-
-    monkeypatch.setattr(range_images, "decode_sequence", decode)
-    monkeypatch.setattr(range_images, "reconstruct_range_image", reconstruct)
+    code = Gray(stripes=4, direction="vertical")
+    frames = FrameNames()
+    # Two bits: pattern and inverse of the finer one are taken at 20 and 50 ms.
+    frame_ms = dict(zip(frames.of_code(code), (10.0, 20.0, 30.0, 50.0), strict=True))
+    found = range_image()
+    monkeypatch.setattr(range_images, "decode_sequence", lambda *_, **__: STRIPES)
+    monkeypatch.setattr(range_images, "reconstruct_range_image", lambda *_: found)
     monkeypatch.setattr(range_images, "stripes_in_volume", lambda *_: None)
-    monkeypatch.setattr(range_images, "sequence_moments", lambda *_: ("moments",))
-    spec = SimpleNamespace(projector=SimpleNamespace())
-    rig = SimpleNamespace(volume=None, pair=lambda _: spec, frames=None)
-    calibration: Any = SimpleNamespace(pairs={"p": None}, rig_from_camera={"p": None}, rig=rig)
-    captures: Any = SimpleNamespace(frame_ms=lambda *_: None)
-    image, _, told, _ = reconstruct_sequence(
-        calibration,
-        captures,
-        SimpleNamespace(pair="p", shot="s"),  # type: ignore[arg-type]
+    rig = SimpleNamespace(
+        volume=None, pair=lambda _: SimpleNamespace(projector=code), frames=frames
     )
-    assert (told is motion) == believed
-    assert image.agreement is not None
-    assert image.agreement.apart_mm == (moved_mm if believed else 0.9)
+    calibration: Any = SimpleNamespace(pairs={"p": None}, rig_from_camera={"p": None}, rig=rig)
+    for times, expected in ((frame_ms, 35.0), (None, None)):
+        captures: Any = SimpleNamespace(frame_ms=lambda *_, times=times: times)
+        sequence: Any = SimpleNamespace(pair="p", shot="s")
+        image, *_ = reconstruct_sequence(calibration, captures, sequence)
+        assert image.time_ms == expected
 
 
 def test_cameras_alone_are_told_what_they_lack() -> None:

@@ -106,7 +106,7 @@ class _NumberedStripes(StripeCode):
         frames = images.lit, images.dark, patterns, inverses
         lines = bit_lines(*frames, self.direction, images.bands)
         code, lit = self.word_code, images.lit
-        return decode_bits(code, lines, lit, self.stripes, limits, images.moments)
+        return decode_bits(code, lines, lit, self.stripes, limits)
 
 
 class Gray(_NumberedStripes):
