@@ -14,7 +14,7 @@ from bodyscan.arrays import Array, Bytes, Floats
 from bodyscan.compiled import compiled
 from bodyscan.fusion.brightness import EvenGrey
 from bodyscan.fusion.evidence import Evidence
-from bodyscan.fusion.quadratics import NORMAL_MEDIAN
+from bodyscan.fusion.quadratic_fit import NORMAL_MEDIAN
 from bodyscan.fusion.smoothing import SmoothSurface
 from bodyscan.fusion.thinning import Samples
 from bodyscan.geometry.pose_covariance import PoseCovariance

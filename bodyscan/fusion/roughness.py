@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array, Floats
-from bodyscan.fusion.quadratics import fit_whole_windows, window_basis
+from bodyscan.fusion.quadratic_fit import fit_full_windows, window_basis
 from bodyscan.fusion.smoothing import inverse_depths, pixel_size, window_reach
 from bodyscan.geometry.crop import Crop, ends_of
 from bodyscan.geometry.transforms import RigidTransform
@@ -37,7 +37,7 @@ def misfits(
     whole = (slice(0, sigma_mm.shape[0]), slice(0, sigma_mm.shape[1]))
     inverse, noise = inverse_depths(points, sigma_mm, common, ends_of(whole))
     reach = window_reach(pixel_size(inverse, image.camera), window_mm)
-    fit, full = fit_whole_windows(inverse, noise, reach)
+    fit, full = fit_full_windows(inverse, noise, reach)
     off = (inverse - fit.value)[full]
     seen = points[full]
     # Along the ray a point moves by its length over z times dz, and dz is z squared times d(1/z).

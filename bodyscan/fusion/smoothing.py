@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bodyscan.arrays import Array, Bytes, Floats, Mask
 from bodyscan.compiled import compiled
-from bodyscan.fusion.quadratics import Fit, fit_quadratics
+from bodyscan.fusion.quadratic_fit import QuadraticFit, fit_quadratics
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.camera_tables import projection_table
 from bodyscan.geometry.crop import crop_of, ends_of
@@ -95,7 +95,7 @@ def _surface(
     common: Floats,
     rig_from_camera: RigidTransform,
     box: tuple[slice, slice],
-    fit: Fit,
+    fit: QuadraticFit,
     fitted: Mask,
     reach: int,
 ) -> SmoothSurface:

@@ -9,13 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bodyscan.fusion.quadratics import (
-    _square_misfits,
-    close_holes,
-    fit_full_windows,
-    fit_quadratics,
-    noise_left,
-)
 from bodyscan.fusion.smoothing import (
     SmoothSurface,
     _distance_to_rim,
@@ -149,15 +142,6 @@ def test_noise_that_neighbours_share_along_a_line_goes_down_less_and_sigma_says_
     assert ratios[1] > 1.5
 
 
-def test_noise_of_its_own_leaves_what_a_fit_leaves() -> None:
-    """Half a pixel is no distance, and of noise that all share everything is left."""
-    assert noise_left(4, (0.0, 0.5)) == pytest.approx(1.0)
-    everything = fit_full_windows(
-        np.zeros((9, 9), np.float32), np.ones((9, 9), np.float32), 4
-    ).sigma
-    assert noise_left(4, (1e6, 1e6)) == pytest.approx(1.0 / everything[4, 4], rel=1e-3)
-
-
 def test_sigmas_that_promise_too_much_are_corrected() -> None:
     depth = plane_depth(np.array([0.0, 0.0, 1.0]))
     honest, boastful = image_of(depth, 0.3), image_of(depth, 0.3)
@@ -217,26 +201,6 @@ def test_points_are_numbered_row_by_row() -> None:
     np.testing.assert_allclose(seen, np.stack([columns, rows], axis=-1), atol=1e-3)
 
 
-def test_a_window_cut_by_a_rim_is_fitted_exactly() -> None:
-    """A quadratic in the pixels fits a quadratic exactly, however much of the window is missing."""
-    v, u = np.mgrid[:60, :60].astype(np.float32)
-    truth = 3e-3 + 2e-6 * u - 3e-6 * v + 1e-8 * u * u - 2e-8 * u * v + 1.5e-8 * v * v
-    inverse = np.where(u + 0.5 * v < 50, truth, 0.0).astype(np.float32)
-    noise = np.where(inverse > 0, 1e-6, 0.0).astype(np.float32)
-    fit, fitted = fit_quadratics(inverse, noise, 4, 0.75)
-    assert fitted[inverse > 0].mean() > 0.99
-    # float32 resolves 2e-10 of these values; at sharp corners the prior takes a hundredth of sigma.
-    error = np.abs(fit.value - truth)[fitted]
-    assert np.mean(error > 3e-9) < 0.01
-    assert (error < 0.02 * fit.sigma[fitted]).all()
-    slope = 2e-6 + 2e-8 * u - 2e-8 * v
-    np.testing.assert_allclose(fit.slope_u[fitted], slope[fitted], atol=1e-8)
-    # What a window lacks shows in its sigma: 1/4 of the noise in a full one.
-    inside, rim = fit.sigma[5:20, 5:20], fit.sigma[:, 0]
-    assert 0.2e-6 < inside.max() < 0.3e-6
-    assert np.median(rim) > 1.5 * inside.max()
-
-
 def test_an_image_of_nothing_gives_nothing() -> None:
     assert smooth(image_of(np.full((240, 320), np.nan)), POSE, WINDOW_MM) is None
 
@@ -284,60 +248,6 @@ def test_rims_are_where_nothing_lies_beside_or_something_behind(turns: int) -> N
     depth[12:] = 1000.0 * (1.0 + np.float32(0.009))
     flat = np.rot90(_distance_to_rim(np.ascontiguousarray(np.rot90(depth, turns)), 0.01), -turns)
     assert flat[11, 9] > 5.0
-
-
-def test_holes_of_a_few_pixels_are_closed_as_a_plane_goes_on() -> None:
-    """By opposite neighbours, of which four pairs have to be there."""
-    v, u = np.mgrid[:20, :24].astype(np.float32)
-    plane = (1.0 + 0.01 * u - 0.02 * v).astype(np.float32)
-    valid = np.ones(plane.shape, bool)
-    valid[8, 9] = valid[12, 5] = valid[12, 6] = valid[0, 3] = False
-    closed, whole = close_holes(plane * valid, valid)
-    assert whole[valid].all()
-    assert whole[8, 9]
-    assert whole[12, 5:7].all()
-    assert not whole[0, 3]  # at the picture's rim two pairs, in its own row
-    np.testing.assert_allclose(closed[whole], plane[whole], rtol=1e-6)
-    # A column of two pixels to one side and none to the other has no opposite pairs at all.
-    half = np.zeros(plane.shape, bool)
-    half[:, :10] = True
-    assert not close_holes(plane * half, half)[1][:, 10:].any()
-    for pairs, told in ((3, False), (4, True)):
-        few = np.zeros(plane.shape, bool)
-        for step in ((0, 1), (1, 0), (1, 1), (2, 2))[:pairs]:
-            few[8 + step[0], 9 + step[1]] = few[8 - step[0], 9 - step[1]] = True
-        few[6, 9] = few[6, 10] = True  # without their opposites
-        closed, whole = close_holes(plane * few, few)
-        assert whole[8, 9] == told
-    assert closed[8, 9] == pytest.approx(plane[8, 9], rel=1e-6)
-
-
-def test_full_windows_are_fitted_as_least_squares_would() -> None:
-    rng = np.random.default_rng(5)
-    image = (1.0 + 0.1 * rng.standard_normal((15, 17))).astype(np.float32)
-    noise = np.full(image.shape, 0.1, np.float32)
-    fit = fit_full_windows(image, noise, 3)
-    dv, du = np.mgrid[-3:4, -3:4].astype(float)
-    terms = np.stack([np.ones(49), *(t.ravel() for t in (du, dv, du**2, du * dv, dv**2))], axis=1)
-    inverse = np.linalg.inv(terms.T @ terms)
-    truth = inverse @ terms.T @ image[4:11, 5:12].ravel().astype(float)
-    assert fit.value[7, 8] == pytest.approx(truth[0], abs=1e-5)
-    assert fit.slope_u[7, 8] == pytest.approx(truth[1], abs=1e-5)
-    assert fit.slope_v[7, 8] == pytest.approx(truth[2], abs=1e-5)
-    assert fit.sigma[7, 8] == pytest.approx(0.1 * np.sqrt(inverse[0, 0]), rel=1e-5)
-
-
-def test_misfits_count_where_something_was_measured_and_outliers_are_not_calm() -> None:
-    inverse = np.array([[1.0, 1.02, 1.5, 0.0]], np.float32)
-    noise = np.full((1, 4), 0.01, np.float32)
-    squares, calm = np.full((1, 4), 9.0, np.float32), np.full((1, 4), 9, np.uint8)
-    fitted = np.array([[True, True, True, False]])
-    _square_misfits(inverse, noise, np.ones((1, 4), np.float32), fitted, squares, calm)
-    np.testing.assert_allclose(squares, [[0.0, 4.0, 2500.0, 0.0]], rtol=1e-4)
-    assert calm.tolist() == [[1, 1, 0, 1]]
-    fitted[0, 0] = False
-    _square_misfits(inverse, noise, np.ones((1, 4), np.float32), fitted, squares, calm)
-    assert calm.tolist() == [[0, 1, 0, 1]]
 
 
 def test_windows_are_as_wide_as_asked_within_two_to_six_pixels() -> None:

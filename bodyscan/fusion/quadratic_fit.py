@@ -1,0 +1,302 @@
+"""Local quadratic fits to an image of inverse depths.
+
+A full window takes a few fixed convolutions (Savitzky and Golay 1964, in two dimensions). At rims,
+holes and jumps in depth each window is fitted by trimmed least squares to the pixels that belong to
+the centre's surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyscan.arrays import Array, Bytes, Floats, Mask
+from bodyscan.compiled import compiled
+
+NORMAL_MEDIAN = 0.6745
+"""Median of the absolute value of a standard normal variable."""
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticFit:
+    """Per pixel (h, w): fitted inverse depth, its slope per column and row, its sigma."""
+
+    value: Floats
+    slope_u: Floats
+    slope_v: Floats
+    sigma: Floats
+
+
+def fit_quadratics(
+    inverse: Floats,
+    noise: Floats,
+    reach: int,
+    pixel_mm: float,
+    correlation_px: tuple[float, float] = (0.0, 0.0),
+) -> tuple[QuadraticFit, Mask]:
+    """Fit a quadratic around every measured pixel; return the fits and where they succeed, (h, w).
+
+    inverse: inverse depths (h, w), 0 where nothing was measured.
+    noise: their standard deviation; scaled up if the residuals are larger than it predicts.
+    reach: windows have 2 reach + 1 pixels a side, of `pixel_mm` on the surface.
+    correlation_px: see `noise_gain`.
+    """
+    valid = inverse > 0
+    fit, fitted = fit_full_windows(inverse, noise, reach)
+    scale = _noise_scale(inverse, noise, fit, fitted)
+    noise = noise * scale
+    np.multiply(fit.sigma, scale, out=fit.sigma)
+
+    cut = np.flatnonzero(valid & ~fitted)
+    fit_trimmed_windows(inverse, noise, cut, reach, pixel_mm, fit, fitted)
+    squares, inlier = np.empty_like(inverse), np.empty(inverse.shape, np.uint8)
+    _square_residuals(inverse, noise, fit.value, fitted, squares, inlier)
+    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    mean_square = cv2.boxFilter(squares, -1, (5, 5), borderType=cv2.BORDER_CONSTANT)
+    # A mean square of 4 variances over 5 x 5 pixels is a jump in depth, not noise.
+    smooth = (mean_square < 4.0) & (cv2.erode(inlier, window, borderValue=1) > 0)
+    smooth.ravel()[cut] = True  # already fitted by trimmed least squares
+    jumps = np.flatnonzero(valid & ~smooth)
+    fit_trimmed_windows(inverse, noise, jumps, reach, pixel_mm, fit, fitted)
+    np.multiply(fit.sigma, np.float32(noise_gain(reach, correlation_px)), out=fit.sigma)
+    return fit, fitted
+
+
+def noise_gain(reach: int, correlation_px: tuple[float, float]) -> float:
+    """Sigma of a full window's fit to correlated noise, over that to white noise.
+
+    correlation_px: distance along rows and along columns over which the correlation of two pixels'
+        noise falls linearly from 1 to 0; 0 for white noise.
+    """
+    basis = window_basis(reach)
+    weights = (np.linalg.inv(basis.T @ basis)[0] @ basis.T).reshape(2 * reach + 1, -1)
+    distance = np.abs(np.subtract.outer(np.arange(2 * reach + 1), np.arange(2 * reach + 1)))
+    along_u, along_v = (np.maximum(0.0, 1.0 - distance / max(px, 1.0)) for px in correlation_px)
+    variance = np.sum((along_v @ weights @ along_u) * weights)
+    return float(np.sqrt(variance / np.sum(weights**2)))
+
+
+def fit_full_windows(inverse: Floats, noise: Floats, reach: int) -> tuple[QuadraticFit, Mask]:
+    """Fit all windows by convolution, and find the measured pixels (h, w) whose window is full.
+
+    Holes of a few pixels are closed first. The fits of other windows are worthless.
+    """
+    valid = inverse > 0
+    closed, known = close_holes(inverse, valid)
+    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    full = cv2.erode(known.astype(np.uint8), window, borderValue=0) > 0
+    return convolve_quadratics(closed, noise, reach), valid & full
+
+
+def convolve_quadratics(inverse: Floats, noise: Floats, reach: int) -> QuadraticFit:
+    """Least-squares quadratics of full windows, as separable convolutions."""
+    offsets = np.arange(-reach, reach + 1, dtype=float)
+    basis = window_basis(reach)
+    normal = np.linalg.inv(basis.T @ basis)
+    one, slope, square = np.ones_like(offsets), offsets, offsets**2
+
+    def convolve(rows: Array, columns: Array) -> Floats:
+        return cv2.sepFilter2D(inverse, cv2.CV_32F, columns, rows, borderType=cv2.BORDER_CONSTANT)
+
+    constant, along_u2, along_v2 = normal[0, 0], normal[0, 3], normal[0, 5]
+    value = convolve(one, constant * one + along_u2 * square) + convolve(along_v2 * square, one)
+    slope_u = convolve(one, normal[1, 1] * slope)
+    slope_v = convolve(normal[2, 2] * slope, one)
+    return QuadraticFit(value, slope_u, slope_v, noise * np.float32(np.sqrt(constant)))
+
+
+def close_holes(inverse: Floats, valid: Mask) -> tuple[Floats, Mask]:
+    """Fill holes of a few pixels, so that they do not spoil the windows around them.
+
+    Each takes the mean of opposite neighbours up to two pixels away, exact on a plane; at least
+    four of the twelve opposite pairs must be there. Returns the image and where it has values.
+    """
+    known = valid.astype(np.uint8)
+    around = cv2.boxFilter(known, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    holes = np.flatnonzero(~valid & (around >= 8))
+    width = inverse.shape[1] + 4
+    padded = np.pad(np.where(valid, inverse, 0.0), 2).ravel()
+    centres = holes + 4 * (holes // inverse.shape[1]) + 2 * width + 2
+    steps = np.array([r * width + c for r in range(3) for c in range(-2, 3) if r > 0 or c > 0])
+    one, other = padded[centres[:, None] + steps], padded[centres[:, None] - steps]
+    both = (one > 0) & (other > 0)
+    count = both.sum(axis=1)
+    total = np.sum(np.where(both, one + other, 0.0), axis=1)
+    found = count >= 4
+    closed, whole = inverse.copy(), valid.copy()
+    closed.ravel()[holes[found]] = total[found] / (2.0 * count[found])
+    whole.ravel()[holes[found]] = True
+    return closed, whole
+
+
+def window_basis(reach: int) -> Array:
+    """(samples, 6): 1, du, dv, du^2, du dv, dv^2 over a square window, row by row."""
+    dv, du = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).astype(float)
+    return np.stack([np.ones_like(du), du, dv, du * du, du * dv, dv * dv], axis=-1)
+
+
+def fit_trimmed_windows(
+    inverse: Floats,
+    noise: Floats,
+    pixels: NDArray[np.intp],
+    reach: int,
+    pixel_mm: float,
+    fit: QuadraticFit,
+    fitted: Mask,
+) -> None:
+    """Fit the windows around some measured pixels to the samples on the centre's surface.
+
+    pixels: flat indices. Writes `fit` there, and `fitted`: whether the pixel lies on its own fit
+        and enough samples do.
+
+    Trimmed least squares, from the closest neighbours outwards. A prior on the second derivatives,
+    that surfaces rarely curve more tightly than a radius of 6 mm, keeps one-sided windows stable.
+    """
+    border = (reach, reach, reach, reach)
+    padded = cv2.copyMakeBorder(inverse, *border, cv2.BORDER_CONSTANT, value=0.0)
+    fits = (fit.value, fit.slope_u, fit.slope_v, fit.sigma)
+    _fit_trimmed(padded, noise, pixels, reach, pixel_mm, fits, fitted)
+
+
+@compiled
+def _fit_trimmed(
+    padded: Floats,
+    noise: Floats,
+    pixels: NDArray[np.intp],
+    reach: int,
+    pixel_mm: float,
+    fits: tuple[Floats, Floats, Floats, Floats],
+    fitted: Mask,
+) -> None:
+    """`fit_trimmed_windows` for inverse depths with a border of `reach` zeros."""
+    side, width = 2 * reach + 1, noise.shape[1]
+    residual, inlier = np.empty(side * side), np.empty(side * side, np.bool_)
+    normal, solution = np.empty((6, 6)), np.empty(6)
+    for pixel in pixels:
+        row, column = pixel // width, pixel % width
+        centre, unit = float(padded[row + reach, column + reach]), float(noise[row, column])
+        # Change of 1/z, in sigmas, per pixel on a surface at 45 degrees.
+        step = pixel_mm * centre * centre / unit
+        n = 0
+        for dv in range(-reach, reach + 1):
+            for du in range(-reach, reach + 1):
+                sample = padded[row + reach + dv, column + reach + du]
+                distance = np.sqrt(du * du + dv * dv)
+                residual[n] = (float(sample) - centre) / unit
+                # Four sigmas, plus as much as the steepest useful surface rises.
+                near = sample > 0.0 and abs(residual[n]) < 4.0 + 4.0 * step * distance
+                if not near:
+                    residual[n] = np.inf
+                inlier[n] = near and distance < 2.5
+                n += 1
+        ridge = (step * pixel_mm / (2.0 * 6.0)) ** -2.0
+        for limit in (8.0, 3.0):
+            _solve_window(residual, inlier, reach, ridge, normal, solution)
+            _find_inliers(residual, solution, reach, limit, inlier)
+        count = _solve_window(residual, inlier, reach, ridge, normal, solution)
+        variance = 1.0 / normal[0, 0]
+        fits[0][row, column] = centre + solution[0] * unit
+        fits[1][row, column] = solution[1] * unit
+        fits[2][row, column] = solution[2] * unit
+        fits[3][row, column] = np.sqrt(variance) * unit
+        fitted[row, column] = abs(solution[0]) < 4.0 and variance < 1.0 and count >= 15
+
+
+@compiled
+def _find_inliers(residual: Array, solution: Array, reach: int, limit: float, inlier: Mask) -> None:
+    """Mark the samples within `limit` of a quadratic."""
+    a, b, c, d, e, f = solution
+    n = 0
+    for v in range(-reach, reach + 1):
+        for u in range(-reach, reach + 1):
+            model = a + v * (c + v * f) + u * (b + v * e + u * d)
+            inlier[n] = abs(residual[n] - model) < limit
+            n += 1
+
+
+@compiled
+def _solve_window(
+    residual: Array, inlier: Mask, reach: int, ridge: float, normal: Array, solution: Array
+) -> int:
+    """Solve for a window's six coefficients; return the number of inliers.
+
+    ridge: information of the prior on each of the last three coefficients.
+    normal: overwritten; its first element becomes the first coefficient's inverse variance.
+    """
+    s00 = s10 = s01 = s20 = s11 = s02 = s30 = s21 = s12 = s03 = 0.0
+    s40 = s31 = s22 = s13 = s04 = r00 = r10 = r01 = r20 = r11 = r02 = 0.0
+    n = 0
+    for dv in range(-reach, reach + 1):
+        for du in range(-reach, reach + 1):
+            if inlier[n]:
+                u, v, r = float(du), float(dv), residual[n]
+                uu, uv, vv = u * u, u * v, v * v
+                s00, s10, s01 = s00 + 1.0, s10 + u, s01 + v
+                s20, s11, s02 = s20 + uu, s11 + uv, s02 + vv
+                s30, s21, s12, s03 = s30 + uu * u, s21 + uu * v, s12 + u * vv, s03 + vv * v
+                s40, s31, s22 = s40 + uu * uu, s31 + uu * uv, s22 + uu * vv
+                s13, s04 = s13 + uv * vv, s04 + vv * vv
+                r00, r10, r01 = r00 + r, r10 + r * u, r01 + r * v
+                r20, r11, r02 = r20 + r * uu, r11 + r * uv, r02 + r * vv
+            n += 1
+    tiny = 1e-6
+    upper = (
+        (s00 + tiny, s10, s01, s20, s11, s02),
+        (s10, s20 + tiny, s11, s30, s21, s12),
+        (s01, s11, s02 + tiny, s21, s12, s03),
+        (s20, s30, s21, s40 + ridge, s31, s22),
+        (s11, s21, s12, s31, s22 + ridge, s13),
+        (s02, s12, s03, s22, s13, s04 + ridge),
+    )
+    for i in range(6):
+        solution[i] = (r00, r10, r01, r20, r11, r02)[i]
+        for j in range(i, 6):
+            normal[i, j] = upper[i][j]
+    # Gaussian elimination from the last unknown to the second: the first one's pivot is then its
+    # inverse variance. The matrix is positive definite, so no pivoting is needed.
+    for k in range(5, 0, -1):
+        for i in range(k):
+            factor = normal[i, k] / normal[k, k]
+            solution[i] -= factor * solution[k]
+            for j in range(i, k):
+                normal[i, j] -= factor * normal[j, k]
+    for i in range(6):
+        for k in range(i):
+            solution[i] -= normal[k, i] * solution[k]
+        solution[i] /= normal[i, i]
+    return int(s00)
+
+
+def _noise_scale(
+    inverse: Floats, noise: Floats, fit: QuadraticFit, full: Mask, every: int = 8
+) -> np.float32:
+    """Factor for `noise`, at least 1, from the residuals of full windows in every 8th row."""
+    there = full[::every]
+    if not there.any():
+        return np.float32(1.0)
+    residual = (inverse - fit.value)[::every][there] / noise[::every][there]
+    # A residual lacks the part of the pixel's noise that the fit absorbed.
+    absorbed = np.square(fit.sigma[::every][there][0] / noise[::every][there][0])
+    typical = np.median(np.abs(residual)) / np.sqrt(1.0 - absorbed)
+    return np.float32(max(1.0, typical / NORMAL_MEDIAN))
+
+
+@compiled
+def _square_residuals(
+    inverse: Floats, noise: Floats, value: Floats, fitted: Mask, squares: Floats, inlier: Bytes
+) -> None:
+    """Write squared residuals over variances (h, w), 0 where nothing was measured, and `inlier`.
+
+    inlier: 0 for residuals beyond 5 sigmas and pixels without a fit, else 1.
+    """
+    for row in range(inverse.shape[0]):
+        for column in range(inverse.shape[1]):
+            squares[row, column] = 0.0
+            inlier[row, column] = 1
+            if inverse[row, column] > 0:
+                residual = (inverse[row, column] - value[row, column]) / noise[row, column]
+                squares[row, column] = residual * residual
+                inlier[row, column] = abs(residual) < 5.0 and fitted[row, column]
