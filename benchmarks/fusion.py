@@ -165,7 +165,7 @@ Step = tuple[Callable[[], Any], Callable[[Any], Figures]]
 
 def _read(workspace: Path, folder: Path) -> Step:
     from bodyscan.captures.images import read_sequence
-    from bodyscan.progress import threaded
+    from bodyscan.progress import map_threads
 
     calibration, captures = _scan_of(workspace)
     cameras = {pair.name: pair.camera for pair in calibration.rig.pairs}
@@ -173,7 +173,7 @@ def _read(workspace: Path, folder: Path) -> Step:
     def read(sequence: Any) -> None:
         read_sequence(sequence, cameras[sequence.pair], workers=1)
 
-    return lambda: threaded(read, captures.sequences, stage="reading"), lambda _: {}
+    return lambda: map_threads(read, captures.sequences, stage="reading"), lambda _: {}
 
 
 def _images_of(workspace: Path) -> list[list[str]]:
@@ -185,12 +185,12 @@ def _images_of(workspace: Path) -> list[list[str]]:
 def _read_with_opencv(paths: list[list[str]]) -> None:
     import cv2
 
-    from bodyscan.progress import threaded
+    from bodyscan.progress import map_threads
 
     def read(pair: list[str]) -> list[Any]:
         return [cv2.imread(path, cv2.IMREAD_GRAYSCALE) for path in pair]
 
-    threaded(read, paths, stage="reading")
+    map_threads(read, paths, stage="reading")
 
 
 def _ours(workspace: Path, folder: Path) -> Step:

@@ -113,7 +113,7 @@ def _work(workspace: Path, what: str) -> Callable[[], Any]:
     import bodyscan
     from bodyscan.captures.folder import open_scan
     from bodyscan.captures.images import read_sequence
-    from bodyscan.progress import threaded
+    from bodyscan.progress import map_threads
 
     calibration = bodyscan.load_calibration(workspace / "calibration")
     person = workspace / "captures" / "person"
@@ -122,7 +122,7 @@ def _work(workspace: Path, what: str) -> Callable[[], Any]:
     captures = open_scan(calibration.rig, person)
     if what == "read":
         cameras = {pair.name: pair.camera for pair in calibration.rig.pairs}
-        return lambda: threaded(
+        return lambda: map_threads(
             lambda own: read_sequence(own, cameras[own.pair], workers=1) and None,
             captures.sequences,
             stage="reading",
@@ -130,7 +130,7 @@ def _work(workspace: Path, what: str) -> Callable[[], Any]:
     import cv2
 
     paths = [[str(path) for path in sequence.paths] for sequence in captures.sequences]
-    return lambda: threaded(
+    return lambda: map_threads(
         lambda own: [cv2.imread(path, cv2.IMREAD_GRAYSCALE) for path in own] and None,
         paths,
         stage="reading",

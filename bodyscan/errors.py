@@ -23,13 +23,13 @@ class BodyscanError(Exception):
         return f"{text}\n  {self.remedy}" if self.remedy else text
 
 
-def plainly(error: BodyscanError) -> str:
-    """What went wrong and what to do, for messages that already say where."""
+def format_error(error: BodyscanError) -> str:
+    """Return `what` and the remedy as text, for messages that already say where."""
     return f"{error.what}\n  {error.remedy}" if error.remedy else error.what
 
 
-def listed(reasons: Mapping[str, str]) -> str:
-    """The reasons of several failures, one a line, then each distinct remedy once."""
+def format_list(reasons: Mapping[str, str]) -> str:
+    """Format several failures: name and reason, one a line, then each distinct remedy once."""
     parts = {name: reason.partition("\n") for name, reason in reasons.items()}
     first = [f"\n  {name}: {what}" for name, (what, _, _) in parts.items()]
     rest = dict.fromkeys(remedy for _, _, remedy in parts.values())

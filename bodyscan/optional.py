@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from bodyscan.errors import BodyscanError, plainly
+from bodyscan.errors import BodyscanError, format_error
 
 LOG = logging.getLogger("bodyscan")
 
@@ -20,7 +20,7 @@ def optional(what: str, say: Callable[[str], object]) -> Iterator[None]:
     try:
         yield
     except BodyscanError as error:
-        say(f"{what}: left out: {plainly(error)}")
+        say(f"{what}: left out: {format_error(error)}")
         LOG.debug("%s", what, exc_info=True)
     except Exception as error:
         say(

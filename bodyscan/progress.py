@@ -29,7 +29,7 @@ def step(progress: Progress, stage: str) -> Iterator[None]:
     progress(stage, 1, 1)
 
 
-def threaded(
+def map_threads(
     work: Callable[[Item], Result],
     items: Iterable[Item],
     *,
@@ -48,8 +48,8 @@ def threaded(
     return results
 
 
-def parts(count: int) -> list[slice]:
-    """So many things shared out, one part a thread."""
+def split_range(count: int) -> list[slice]:
+    """Split range(count) into THREADS slices of nearly equal length."""
     return [slice(k * count // THREADS, (k + 1) * count // THREADS) for k in range(THREADS)]
 
 
@@ -72,6 +72,6 @@ def attempt_each(
         except error as found:
             bad[item] = found
 
-    threaded(attempt, todo, stage=stage, progress=progress)
+    map_threads(attempt, todo, stage=stage, progress=progress)
     # In the order of the items, whichever finished first.
     return {i: good[i] for i in todo if i in good}, {i: bad[i] for i in todo if i in bad}

@@ -27,7 +27,7 @@ from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array, Indices
 from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, adjoint
-from bodyscan.progress import threaded
+from bodyscan.progress import map_threads
 
 LEAN_MM = 1000.0  # the middle of a body above the ankles: a unit of lean moves it by 1 mm
 PART_MM = 250.0  # extent of what moves as one: a forearm, half a thigh, a shoulder
@@ -234,7 +234,7 @@ class BodyMotion:
             (a, b), seen = overlap
             return self._asked(seen.doubted(APART_MM), now[a] - now[b])
 
-        asked = threaded(asked_of, evidence.items(), stage="aligning")
+        asked = map_threads(asked_of, evidence.items(), stage="aligning")
         squares, pulls = zip(*asked, strict=True)
         square, pull = np.array(squares), np.array(pulls)
         first, second = np.array(list(evidence)).T

@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 from bodyscan.alignment.body_cells import BodyCells, modulated, one_each, rigid_fields
 from bodyscan.alignment.part_names import PARTS, leftward, name_parts
 from bodyscan.arrays import Array
-from bodyscan.progress import threaded
+from bodyscan.progress import map_threads
 
 LENGTH_MM = 80.0
 """Length over which a trunk rises alike: a breast, the side of a chest beside an arm. With 110 mm, up
@@ -100,7 +100,7 @@ def likely_breath(information: Array, pull: Array, breaths: Array, likely: Array
         volume = np.log(more * SIZES_MM[:, None] ** 2).sum(axis=1)
         return np.asarray(0.5 * (along**2 / more).sum(axis=1) - 0.5 * volume)
 
-    gains = np.array(threaded(gain, roots, stage="aligning"))
+    gains = np.array(map_threads(gain, roots, stage="aligning"))
     weights = likely[:, None] * np.exp((gains - gains.max()) * EVIDENCE)
     return np.asarray(np.einsum("kij,ks,s->ij", breaths, weights / weights.sum(), SIZES_MM**2))
 

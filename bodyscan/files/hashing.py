@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bodyscan.files.regular import open_regular
-from bodyscan.progress import threaded
+from bodyscan.progress import map_threads
 
 _BLOCK = 1 << 20
 
@@ -32,7 +32,7 @@ def file_hash(path: Path) -> str:
 def file_hashes(files: Mapping[str, Path]) -> dict[str, str]:
     """SHA-256 of each file by name, sorted by name."""
     names = sorted(files)
-    hashes = threaded(lambda name: file_hash(files[name]), names, stage="hashing")
+    hashes = map_threads(lambda name: file_hash(files[name]), names, stage="hashing")
     return dict(zip(names, hashes, strict=True))
 
 

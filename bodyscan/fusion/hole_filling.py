@@ -24,7 +24,7 @@ from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.bricks import SIDE, Bricks, bricks_of, dense_of
 from bodyscan.mesh.surface_nets import surface_nets
-from bodyscan.progress import threaded
+from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 
 CELL_MM = 7.0  # of the coarse grid: half a finger, so that the filled surface follows the rims
@@ -149,7 +149,7 @@ def _seen_through(
     surface = Guess.of(vertices, faces, made_up[faces].any(axis=1))
     index = np.argwhere((guess < 0.0) & ~fixed)
     places = (bricks.origin + bricks.cell_mm * index).astype(np.float32)
-    votes = threaded(
+    votes = map_threads(
         lambda image: sees_through(places, surface, image, rig_from_camera[image.pair], MARGIN_MM),
         range_images,
         stage="free space",

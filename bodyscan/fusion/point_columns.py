@@ -13,7 +13,7 @@ import numpy as np
 
 from bodyscan.arrays import Array, Indices
 from bodyscan.compiled import compiled
-from bodyscan.progress import parts, threaded
+from bodyscan.progress import map_threads, split_range
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class PointColumns:
                 near[part],
             )
 
-        threaded(find, parts(len(places)), stage="nearest points")
+        map_threads(find, split_range(len(places)), stage="nearest points")
         return distance, np.append(self.order, len(self.points))[near]
 
 

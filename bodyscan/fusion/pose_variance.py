@@ -14,7 +14,7 @@ from bodyscan.compiled import compiled
 from bodyscan.geometry.pose_covariance import PoseCovariance
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
-from bodyscan.progress import parts, threaded
+from bodyscan.progress import map_threads, split_range
 
 FACING = 0.2
 """Cosine below which a pair sees a surface too flat to have measured it."""
@@ -42,7 +42,7 @@ def add_pose_variance(
         surface = cloud.points[part], cloud.normals[part], cloud.pairs_seen[part]
         _placing(*surface, centres, packed, placing_mm[part])
 
-    threaded(fill, parts(len(placing_mm)), stage="sigmas of places")
+    map_threads(fill, split_range(len(placing_mm)), stage="sigmas of places")
     return replace(cloud, sigma_mm=np.hypot(cloud.sigma_mm, placing_mm).astype(np.float32))
 
 

@@ -24,7 +24,7 @@ from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.mesh.body import BodyCloud
 from bodyscan.mesh.regions import DARK_CLOTH, HAIR, SKIN, UNSURE
-from bodyscan.progress import threaded
+from bodyscan.progress import map_threads
 from bodyscan.reconstruction.range_image import RangeImage
 
 DARK, DIM = 1 / 3, 1 / 2
@@ -195,7 +195,7 @@ def _texture(
         box = crop_of(wanted)
         return None if box is None else misfits(image, at, box, window_mm)
 
-    each = threaded(looked_at, range_images, stage="naming regions")
+    each = map_threads(looked_at, range_images, stage="naming regions")
     found = [one for one in each if one is not None]
     if not found:
         nowhere = np.zeros(cells.count, bool)

@@ -26,7 +26,7 @@ from bodyscan.fusion.scan_facts import (
 )
 from bodyscan.mesh.body import BodyCloud, BodyMesh
 from bodyscan.mesh.ply import read_ply_cloud, read_ply_mesh, write_ply
-from bodyscan.progress import threaded
+from bodyscan.progress import map_threads
 from bodyscan.registration.rig_calibration import FLOOR_AXES
 from bodyscan.verdict import Verdict
 from bodyscan.version import __version__
@@ -108,7 +108,7 @@ def save_scan(scan: Scan, folder: Path, origin: Origin) -> Path:
         return file_hash(folder / name)
 
     names = (CLOUD_NAME, MESH_NAME)
-    digests = threaded(write, names, stage="writing")
+    digests = map_threads(write, names, stage="writing")
     write_json(
         folder / FILE_NAME,
         origin.facts

@@ -23,7 +23,7 @@ from bodyscan.geometry.lenses.brown import Brown
 from bodyscan.geometry.lenses.lens import Lens
 from bodyscan.geometry.ray_uncertainty import RayUncertainty
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.progress import threaded
+from bodyscan.progress import map_threads
 from bodyscan.registration.joint_solve import JointSolution
 from bodyscan.rig.pair import AUTO
 from bodyscan.rig.rig import Rig
@@ -72,7 +72,7 @@ def choose_lenses(rig: Rig, views: Sequence[LocatedView], solution: JointSolutio
         for name, own in looked.items()
     }
     names = list(looked)
-    own = threaded(lambda name: looked[name].choose(kinds[name]), names, stage="choosing lenses")
+    own = map_threads(lambda name: looked[name].choose(kinds[name]), names, stage="choosing lenses")
     chosen = dict(zip(names, own, strict=True))
     for alike in _of_one_make(looked):
         chosen |= _decentred_together({name: chosen[name] for name in alike}, looked, kinds)

@@ -13,7 +13,7 @@ import open3d as o3d
 from bodyscan.arrays import Array
 from bodyscan.errors import BadInput
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.progress import Progress, silent, threaded
+from bodyscan.progress import Progress, map_threads, silent
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig
 from bodyscan.simulation import files
@@ -118,7 +118,7 @@ def capture_artefact(
             noise = np.random.default_rng(seed)
             render_task(rig, pair, view, room, task, settings, out.parent, noise, fixed)
 
-    threaded(work, taking, stage=f"simulating {out.name}", progress=progress)
+    map_threads(work, taking, stage=f"simulating {out.name}", progress=progress)
     striped = [pair.name for pair in taking]
     files.write_captures(out, "scan", [(name, striped, []) for name in names], "sim-artefact")
     return out

@@ -11,7 +11,7 @@ import numpy as np
 
 from bodyscan.files.atomic import write_json
 from bodyscan.geometry.transforms import RigidTransform
-from bodyscan.progress import THREADS, Progress, silent, threaded
+from bodyscan.progress import THREADS, Progress, map_threads, silent
 from bodyscan.rig.rig import Rig
 from bodyscan.rig.rig_file import load_rig, write_rig
 from bodyscan.rig.templates import fill
@@ -209,7 +209,7 @@ def _render_all(rig: Rig, truth: Truth, out: Path, workers: int, progress: Progr
             render_task(rig, pair, view, room, task, truth.settings, out, noise, fixed, empty)
             tell()
 
-    threaded(work, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
+    map_threads(work, enumerate(truth.pairs.values()), stage="simulate", workers=workers)
 
 
 def sensor_of(

@@ -22,7 +22,7 @@ from bodyscan.calibration.striped_view import (
 )
 from bodyscan.captures.folder import Captures, open_captures
 from bodyscan.captures.unlisted_images import describe_unlisted_images
-from bodyscan.errors import BadInput, BodyscanError, FailedWork, listed, plainly
+from bodyscan.errors import BadInput, BodyscanError, FailedWork, format_error, format_list
 from bodyscan.optional import optional
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent, step
@@ -209,7 +209,7 @@ def _seen_instead(rig: Rig, boards: FoundBoards, searched: int) -> str:
 
 def _nothing_calibrated(rig: Rig, failed: Mapping[str, str], remedy: str = "") -> FailedWork:
     return FailedWork(
-        f"no pair could be calibrated:{listed(failed)}", where=f"rig {rig.name}", remedy=remedy
+        f"no pair could be calibrated:{format_list(failed)}", where=f"rig {rig.name}", remedy=remedy
     )
 
 
@@ -325,7 +325,7 @@ def _fitted(
     return Outcome(
         {name: found.value for name, found in fitted.items()},
         tuple(note for found in fitted.values() for note in found.notes),
-        {name: plainly(error) for name, error in errors.items()},
+        {name: format_error(error) for name, error in errors.items()},
     )
 
 

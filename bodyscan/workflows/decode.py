@@ -22,7 +22,7 @@ from bodyscan.calibration.striped_view import (
 )
 from bodyscan.captures.folder import Captures, ImageSequence
 from bodyscan.captures.images import read_sequence
-from bodyscan.errors import BodyscanError, DecodingFailed, ImageError, plainly
+from bodyscan.errors import BodyscanError, DecodingFailed, ImageError, format_error
 from bodyscan.geometry.crop import WHOLE, Crop
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent
@@ -249,7 +249,7 @@ def failed_pairs(failures: Sequence[Failure], good: set[str]) -> dict[str, str]:
     """Pairs that failed in every shot, with the reason, or the first few of several reasons."""
     reasons: dict[str, dict[str, str]] = defaultdict(dict)
     for sequence, error in failures:
-        said = plainly(error)
+        said = format_error(error)
         # One fault gives a different share of pixels in each shot.
         reasons[sequence.pair].setdefault(NUMBER.sub("", said), said)
     return {
@@ -266,7 +266,7 @@ def failure_notes(failures: Sequence[Failure]) -> Iterator[str]:
     """One line a shot, or one for all shots of a pair that failed alike."""
     same: dict[tuple[str, str], list[Failure]] = defaultdict(list)
     for failure in failures:
-        same[failure[0].pair, plainly(failure[1])].append(failure)
+        same[failure[0].pair, format_error(failure[1])].append(failure)
     for (pair, said), group in same.items():
         if len(group) <= FEW:
             yield from (str(error) for _, error in group)

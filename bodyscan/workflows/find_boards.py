@@ -39,7 +39,7 @@ from bodyscan.geometry.lenses import FAMILY, LENSES
 from bodyscan.geometry.robust import rms_length
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.outcome import Outcome
-from bodyscan.progress import Progress, attempt_each, silent, threaded
+from bodyscan.progress import Progress, attempt_each, map_threads, silent
 from bodyscan.registration.board_appearance import appearance_notes, without_odd_mirrored
 from bodyscan.registration.soundness import camera_faults
 from bodyscan.rig.known import Known
@@ -95,7 +95,7 @@ def find_all_boards(rig: Rig, captures: Captures, progress: Progress = silent) -
             return [], error
         return found, None
 
-    results = threaded(find, captures.sequences, stage="finding boards", progress=progress)
+    results = map_threads(find, captures.sequences, stage="finding boards", progress=progress)
     views, odd = without_odd_mirrored([view for found, _ in results for view in found])
     without = [
         sequence
@@ -184,7 +184,7 @@ def _look_closer(
         said = [f"{board.name}: {describe_unfound(image, board)}" for board in rig.boards]
         return "; ".join(said)
 
-    return dict(zip(chosen, threaded(look, chosen, stage="looking closer"), strict=True))
+    return dict(zip(chosen, map_threads(look, chosen, stage="looking closer"), strict=True))
 
 
 def calibrate_cameras(

@@ -8,7 +8,7 @@ from dataclasses import replace
 from types import MappingProxyType
 
 from bodyscan.captures.folder import Captures, ImageSequence
-from bodyscan.errors import BadInput, BodyscanError, ScanFailed, listed
+from bodyscan.errors import BadInput, BodyscanError, ScanFailed, format_list
 from bodyscan.fusion.cleaning import cut_to_volume
 from bodyscan.outcome import Outcome
 from bodyscan.progress import Progress, attempt_each, silent
@@ -92,7 +92,7 @@ def reconstruct_range_images(
     )
     failed |= {s.pair: captures.relative(str(error)) for s, error in errors.items()}
     if not found:
-        raise ScanFailed(f"no pair gave a range image:{listed(failed)}")
+        raise ScanFailed(f"no pair gave a range image:{format_list(failed)}")
     images = [image for image, *_ in found.values()]
     responses: dict[str, list[ResponseShare]] = defaultdict(list)
     for image, shares, _ in found.values():
