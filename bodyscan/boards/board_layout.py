@@ -19,8 +19,7 @@ from bodyscan.rig.board import Board
 
 
 def corner_grid(board: Board) -> tuple[int, int]:
-    """Columns and rows of corners on one face: those between
-    squares, or those of an aprilgrid's tags."""
+    """Columns and rows of corners on one face: between squares, or of an aprilgrid's tags."""
     if board.kind == "aprilgrid":
         return 2 * board.columns, 2 * board.rows
     return board.columns - 1, board.rows - 1
@@ -33,7 +32,7 @@ def corners_per_face(board: Board) -> int:
 
 
 def corner_points(board: Board) -> Array:
-    """Corners in the board frame, (N, 3) mm, or (2N, 3) for a board with two faces.
+    """Compute the corners in the board frame, (N, 3) mm, or (2N, 3) for a board with two faces.
 
     Corner id r * (columns - 1) + c is the crossing of column line c + 1 and row line r + 1; the
     back's corners, numbered likewise on its own print, follow the front's. An aprilgrid has the
@@ -45,7 +44,7 @@ def corner_points(board: Board) -> Array:
 
 
 def printed_corners(board: Board) -> Array:
-    """(N, 2) mm on the print of one face, x along the columns."""
+    """Corners (N, 2) mm on the print of one face, x along the columns."""
     return corner_points(board.model_copy(update={"faces": 1}))[:, :2]
 
 
@@ -59,8 +58,7 @@ def _lines(board: Board, count: int) -> Array:
 
 
 def points_from_print(board: Board, printed: Array, face: int) -> Array:
-    """Map points (..., 2) mm of a face's print (0 front, 1
-    back) to the board frame, (..., 3) mm."""
+    """Map points (..., 2) mm of a face's print (0 front, 1 back) to the board frame, (..., 3)."""
     x, y = printed[..., 0], printed[..., 1]
     if face == 0:
         return np.stack([x, y, np.zeros_like(x)], axis=-1)
@@ -68,7 +66,7 @@ def points_from_print(board: Board, printed: Array, face: int) -> Array:
 
 
 def marker_dictionary(board: Board) -> cv2.aruco.Dictionary:
-    """The marker dictionary of a board. Raises BadInput for an unknown name."""
+    """Look up the marker dictionary of a board. Raises BadInput for an unknown name."""
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or not isinstance(number, int):
         raise BadInput(
@@ -80,7 +78,7 @@ def marker_dictionary(board: Board) -> cv2.aruco.Dictionary:
 
 
 def charuco_face(board: Board, face: int = 0) -> cv2.aruco.CharucoBoard:
-    """OpenCV's description of one face. The back's marker ids follow the front's.
+    """Describe one face as OpenCV's CharucoBoard. The back's marker ids follow the front's.
 
     Raises BadInput if marker_mm is missing or too large, or the dictionary has too few markers.
     """

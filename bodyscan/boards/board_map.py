@@ -1,4 +1,4 @@
-"""Where a flat print appears in an image: a homography with a mild lens distortion on top."""
+"""Map a flat print into an image: a homography plus a polynomial for the lens."""
 
 from __future__ import annotations
 
@@ -34,8 +34,7 @@ class BoardMap:
         )
 
     def jacobian(self, printed: Array) -> Array:
-        """d(pixel)/d(printed) at points (..., 2): (..., 2, 2)
-        px/mm, columns along x and along y."""
+        """d(pixel)/d(printed) at points (..., 2): (..., 2, 2) px/mm, columns along x and y."""
         step = 1e-3 * self.size
         columns = [
             (self.apply(printed + offset) - self.apply(printed - offset)) / (2 * step)
@@ -45,7 +44,7 @@ class BoardMap:
 
 
 def fit_board_map(printed: Array, pixels: Array) -> BoardMap:
-    """Least-squares fit to printed points (N, 2) mm and their image points (N, 2) px, N >= 4.
+    """Fit a map by least squares to printed points (N, 2) mm and their image points (N, 2) px, N >= 4.
 
     The polynomial is cubic, quadratic or absent, as the number of points allows; a slight ridge
     keeps it from running away where points are few.

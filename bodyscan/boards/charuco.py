@@ -1,4 +1,4 @@
-"""ChArUco boards: markers give rough corner positions, the corners' saddles exact ones."""
+"""Find ChArUco boards: markers predict where corners are, their saddles are measured."""
 
 from __future__ import annotations
 
@@ -9,20 +9,11 @@ import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Indices, Mask
 from bodyscan.boards import board_layout
-from bodyscan.boards.appearance import Appearance
 from bodyscan.boards.board_map import BoardMap, fit_board_map
-from bodyscan.boards.corners import SightedCorners, refine_corners
+from bodyscan.boards.corners import DetectedCorners, refine_corners
+from bodyscan.boards.view import Appearance
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
-
-MIN_CORNERS = 4
-LEAST_AGREEING = 0.6
-MIN_CORNERS_FOR_LENS = 12
-RANSAC_SHARE_OF_SQUARE = 0.15
-ROUNDS = 4
-QUICK_WINDOW_PX = 13
-"""Window of the threshold for markers: the middle one of OpenCV's three. Alone it finds all markers
-of nine images in ten in less than half the time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,19 +35,20 @@ def detect_markers(
     """Detect markers of the board's dictionary in the image (H, W).
 
     border_bits: width of their black rim in bits.
-    first: look only for so many, from the dictionary's first. Telling which of a thousand markers a
-        square shows takes most of the time.
-    quick: use one threshold (`QUICK_WINDOW_PX`), which may miss some.
+    first: look only for so many, from the dictionary's first. Identifying one of a thousand markers
+        takes most of the time.
+    quick: use the middle one of OpenCV's three thresholds only. It finds all markers of nine images
+        in ten in less than half the time.
     """
-    parameters = _parameters()
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerPerimeterRate = 0.01
     if quick:
-        parameters.adaptiveThreshWinSizeMin = QUICK_WINDOW_PX
-        parameters.adaptiveThreshWinSizeMax = QUICK_WINDOW_PX
+        parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = 13
     parameters.markerBorderBits = border_bits
     dictionary = board_layout.marker_dictionary(board)
-    some = np.ascontiguousarray(dictionary.bytesList[:first])
-    few = cv2.aruco.Dictionary(some, dictionary.markerSize, dictionary.maxCorrectionBits)
-    detector = cv2.aruco.ArucoDetector(few, parameters)
+    codes = np.ascontiguousarray(dictionary.bytesList[:first])
+    dictionary = cv2.aruco.Dictionary(codes, dictionary.markerSize, dictionary.maxCorrectionBits)
+    detector = cv2.aruco.ArucoDetector(dictionary, parameters)
     corners, ids, _ = detector.detectMarkers(image)
     if ids is None or len(ids) == 0:
         return Markers(np.empty(0, np.int64), np.empty((0, 4, 2)))
@@ -64,47 +56,44 @@ def detect_markers(
     return Markers(np.asarray(ids, np.int64).ravel(), corners)
 
 
-def markers_concerned(board: Board) -> int:
-    """How many of its dictionary's first markers to look for: a board's own and those with which it
-    would go on; of a board with two faces, whose back has the next ones, only its own."""
+def count_dictionary_markers(board: Board) -> int:
+    """Count the markers to look for, from the dictionary's first on: the board's, and those of two
+    more rows, which show that the print is larger than described.
+
+    The back of a board with two faces has the next markers, so nothing more is looked for.
+    """
     if board.faces == 2:
         return board.first_marker + board.marker_count
     longer = board.model_copy(update={"rows": board.rows + 2})
     return board.first_marker + longer.marker_count + board.columns
 
 
-def _parameters() -> cv2.aruco.DetectorParameters:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.minMarkerPerimeterRate = 0.01
-    return parameters
-
-
 @dataclass(frozen=True, eq=False)
-class PlacedMarkers:
-    """Markers that agree on where one face of a board, as described here, appears.
+class FacePosition:
+    """Where one face of a board appears in an image, by the markers that agree on it.
 
-    printed: (K, 4, 2) mm, of those that agree.
-    seen: how many of the face's markers were seen.
+    board: the board, in the layout that fits.
+    printed: (K, 4, 2) mm, corners of the markers that agree.
+    detected: how many of the face's markers were detected.
     """
 
     board: Board
     face: int
     board_map: BoardMap
     printed: Array
-    seen: int
+    detected: int
 
     @property
     def agreeing(self) -> int:
         return len(self.printed)
 
     @property
-    def believed(self) -> bool:
-        """Whether most markers agree: on a board with other
-        columns or rows only some rows seem to."""
-        return self.agreeing > LEAST_AGREEING * self.seen
+    def valid(self) -> bool:
+        """Whether most markers agree; with other columns or rows only those of some rows do."""
+        return self.agreeing > 0.6 * self.detected
 
-    def all_seen(self, shape: tuple[int, ...]) -> bool:
-        """Whether all markers that lie wholly within an image (H, W) were seen."""
+    def complete(self, shape: tuple[int, ...]) -> bool:
+        """Whether all markers that lie wholly within an image (H, W) were detected."""
         _, printed = board_layout.marker_corners(self.board, self.face)
         pixels, last = self.board_map.apply(printed), np.array(shape[::-1]) - 1
         inside = np.all((pixels >= 0.0) & (pixels <= last), axis=(1, 2))
@@ -112,68 +101,64 @@ class PlacedMarkers:
 
 
 def locate_charuco(
-    image: Bytes, board: Board, markers: Markers, placed: PlacedMarkers | None
-) -> SightedCorners | None:
-    """The board's corners beside the markers seen, for the face and layout on which most markers
-    agree (`place_markers`); `other_layout` says which layout that is."""
-    if placed is None or not placed.believed:
+    image: Bytes, board: Board, markers: Markers, position: FacePosition | None
+) -> DetectedCorners | None:
+    """Find the board's corners next to the detected markers.
+
+    position: from `place_markers`; None if it is None, or most markers disagree with it.
+    """
+    if position is None or not position.valid:
         return None
-    nearby = _corners_beside(board, placed.printed.mean(axis=1))
-    if len(nearby) < MIN_CORNERS:
+    nearby = _corners_next_to(board, position.printed.mean(axis=1))
+    if len(nearby) < 4:
         return None
-    pixels, good = _refine(image, board, placed.board_map, nearby, placed.printed)
+    pixels, good = _refine(image, board, position.board_map, nearby, position.printed)
     count = board_layout.corners_per_face(board)
-    ids = nearby[good] + placed.face * count
+    ids = nearby[good] + position.face * count
     appearance = Appearance(
-        other_layout=placed.board.legacy_layout != board.legacy_layout,
-        goes_on=_goes_on(placed, markers),
+        other_layout=position.board.legacy_layout != board.legacy_layout,
+        more_rows=_has_more_rows(position, markers),
     )
-    return SightedCorners(ids, pixels[good], count, appearance)
+    return DetectedCorners(ids, pixels[good], count, appearance)
 
 
-def _goes_on(placed: PlacedMarkers, markers: Markers) -> bool:
+def _has_more_rows(position: FacePosition, markers: Markers) -> bool:
     """Whether markers lie where a board of more rows would have its next ones."""
-    if placed.board.faces == 2:
+    board = position.board
+    if board.faces == 2:
         return False  # the back's markers have the next numbers
-    longer = placed.board.model_copy(update={"rows": placed.board.rows + 2})
-    ends = placed.board.first_marker + board_layout.markers_per_face(placed.board)
-    if not np.any((markers.ids >= ends) & (markers.ids < ends + placed.board.columns)):
+    longer = board.model_copy(update={"rows": board.rows + 2})
+    end = board.first_marker + board_layout.markers_per_face(board)
+    if not np.any((markers.ids >= end) & (markers.ids < end + board.columns)):
         return False
     try:
         more = place_markers(longer, markers)
     except BadInput:  # the dictionary has no more
         return False
-    return more is not None and more.agreeing > placed.agreeing
+    return more is not None and more.agreeing > position.agreeing
 
 
-def place_markers(board: Board, markers: Markers) -> PlacedMarkers | None:
-    """Place the board by its markers: the face and the layout on which most agree."""
+def place_markers(board: Board, markers: Markers) -> FacePosition | None:
+    """Locate the face of the board, and the layout, on which most markers agree; None if none."""
+    layouts = [board]
+    if board.rows % 2 == 0:  # OpenCV before 4.6 printed these differently
+        layouts.append(board.model_copy(update={"legacy_layout": not board.legacy_layout}))
     found = [
-        _place_face(described, face, markers)
-        for described in _layouts(board)
-        for face in range(board.faces)
+        _place_face(layout, face, markers) for layout in layouts for face in range(board.faces)
     ]
-    return max((one for one in found if one), key=lambda one: one.agreeing, default=None)
+    return max((face for face in found if face), key=lambda face: face.agreeing, default=None)
 
 
-def _layouts(board: Board) -> list[Board]:
-    """The board as described and, where OpenCV before 4.6
-    printed it differently, in that layout."""
-    if board.rows % 2:
-        return [board]
-    return [board, board.model_copy(update={"legacy_layout": not board.legacy_layout})]
-
-
-def _place_face(board: Board, face: int, markers: Markers) -> PlacedMarkers | None:
+def _place_face(board: Board, face: int, markers: Markers) -> FacePosition | None:
     face_ids, printed = board_layout.marker_corners(board, face)
-    _, seen, of_face = np.intersect1d(markers.ids, face_ids, return_indices=True)
-    if len(seen) < 2:
+    _, detected, of_face = np.intersect1d(markers.ids, face_ids, return_indices=True)
+    if len(detected) < 2:
         return None
-    fit = fit_markers(printed[of_face], markers.corners[seen], board)
+    fit = fit_markers(printed[of_face], markers.corners[detected], board)
     if fit is None:
         return None
     board_map, inliers = fit
-    return PlacedMarkers(board, face, board_map, printed[of_face[inliers]], len(seen))
+    return FacePosition(board, face, board_map, printed[of_face[inliers]], len(detected))
 
 
 def _refine(
@@ -183,8 +168,11 @@ def _refine(
     corner_ids: Indices,
     markers: Array,
 ) -> tuple[Array, Mask]:
-    """Refine corners where the markers predict them; then those not found where the corners found,
-    which are more accurate than markers, predict them."""
+    """Refine corners (N,) where the markers predict them; return pixels (N, 2) and which are good.
+
+    Those not found are tried once more where the other corners, which are more accurate than
+    markers, predict them.
+    """
     points = board_layout.printed_corners(board)[corner_ids]
     gap = (1.0 - (board.marker_mm or 0.0) / board.square_mm) / 2.0
     marked = np.floor(markers[0].mean(axis=0) / board.square_mm).astype(int).sum()
@@ -196,7 +184,7 @@ def _refine(
         return refine_corners(image, at.apply(points), along, bright_diagonal, marker_gap=gap)
 
     pixels, good = refine(board_map)
-    if MIN_CORNERS_FOR_LENS <= good.sum() < len(good):
+    if 12 <= good.sum() < len(good):
         again, good_again = refine(fit_board_map(points[good], pixels[good]))
         pixels = np.where(good[:, None], pixels, again)
         good = good | good_again
@@ -204,19 +192,19 @@ def _refine(
 
 
 def fit_markers(printed: Array, corners: Array, board: Board) -> tuple[BoardMap, Mask] | None:
-    """Where the print appears, and which markers (M,) agree on it; None if no two do.
+    """Fit where the print appears to markers (M, 4, 2) mm and px; also return the inliers (M,).
 
-    A homography selects those that agree; a few rounds follow a lens that bends the board's far
-    parts away from it.
+    A homography by RANSAC selects the first inliers; a few rounds follow the lens's distortion
+    beyond them. None if no two markers agree.
     """
     size = np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
-    tolerance = max(2.0, RANSAC_SHARE_OF_SQUARE * size * board.square_mm / (board.marker_mm or 1))
+    tolerance = max(2.0, 0.15 * size * board.square_mm / (board.marker_mm or 1))
     points, pixels = printed.reshape(-1, 2), corners.reshape(-1, 2)
     _, mask = cv2.findHomography(points, pixels, cv2.RANSAC, tolerance)
     if mask is None:
         return None
     agree = mask.reshape(-1, 4).all(axis=1)
-    for _ in range(ROUNDS):
+    for _ in range(4):
         if agree.sum() < 2:
             return None
         board_map = fit_board_map(printed[agree].reshape(-1, 2), corners[agree].reshape(-1, 2))
@@ -225,8 +213,8 @@ def fit_markers(printed: Array, corners: Array, board: Board) -> tuple[BoardMap,
     return (board_map, agree) if agree.sum() >= 2 else None
 
 
-def _corners_beside(board: Board, centres: Array) -> Indices:
-    """Ids, on one face, of the inner corners that touch squares with these centres (M, 2) mm."""
+def _corners_next_to(board: Board, centres: Array) -> Indices:
+    """Find the inner corners, ids on one face, of the squares with these centres (M, 2) mm."""
     square = np.floor(centres / board.square_mm).astype(int)
     column = (square[:, 0, None] + np.array([-1, 0, -1, 0])).ravel()
     row = (square[:, 1, None] + np.array([-1, -1, 0, 0])).ravel()

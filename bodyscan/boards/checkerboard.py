@@ -1,4 +1,4 @@
-"""Plain checkerboards: several detectors in turn, each judged by whether its corners form a board.
+"""Find plain checkerboards: try several detectors until the corners of one form the board.
 
 Convention: if the numbers of columns and rows differ in parity the print looks different from its
 two ends, and its first square (0, 0) is BLACK, as OpenCV prints it; that fixes the numbering.
@@ -14,47 +14,32 @@ import numpy as np
 from bodyscan.arrays import Array, Bytes, Floats, Indices
 from bodyscan.boards import board_layout
 from bodyscan.boards.board_map import BoardMap, fit_board_map
-from bodyscan.boards.corners import SightedCorners, refine_corners
+from bodyscan.boards.corners import DetectedCorners, refine_corners
 from bodyscan.boards.regions import Region, board_regions, shows_lattice
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 
-SAME_CORNER_SQUARES = 0.15
-"""A corner this far from where the others predict it is a different one: a bent board and a lens
-leave a few hundredths of a square, mixed-up corners a whole one."""
-MIN_SHARE_OF_CORNERS = 0.8
-MIN_SHARE_TO_GO_ON = 0.4
-FEWEST_SQUARES = 4
-"""Either way: OpenCV's quick detectors refuse to look for fewer than three corners."""
-LEAST_BEYOND = 0.5
-"""Share of the corners, and of the contrast, that a larger board shows beyond the last ones."""
-ROUNDS = 3
+MIN_SQUARES = 4
+"""In either direction: OpenCV's quick detectors refuse to look for fewer than three corners."""
 
 
-def find_checkerboard(image: Bytes, board: Board) -> SightedCorners | None:
-    """All inner corners of a checkerboard seen whole, numbered by the convention above."""
-    _refuse_square(board)
-    _refuse_narrow(board)
-    for candidate in _candidates(image, board):
-        found = _refined(image, board, candidate)
+def find_checkerboard(image: Bytes, board: Board, *, quick: bool = False) -> DetectedCorners | None:
+    """Find the inner corners of a checkerboard in view as a whole, numbered as stated above.
+
+    quick: use the two quickest detectors only, on any board.
+
+    Raises BadInput for a board that no detector finds, or whose numbering would be ambiguous.
+    """
+    if not quick:
+        _refuse_unsuitable(board)
+    for candidate in _candidates(image, board, quick):
+        found = _refine(image, board, candidate)
         if found is not None:
             return found
     return None
 
 
-def find_quickly(image: Bytes, board: Board) -> SightedCorners | None:
-    """As `find_checkerboard`, but with the two quickest detectors only."""
-    size = (board.columns - 1, board.rows - 1)
-    whole = Region(0, 0, image.shape[1], image.shape[0])
-    for detect in (_classic, _adaptive):
-        for candidate in _found(detect, image, size, whole, 1.0):
-            found = _refined(image, board, candidate)
-            if found is not None:
-                return found
-    return None
-
-
-def _refuse_square(board: Board) -> None:
+def _refuse_unsuitable(board: Board) -> None:
     if board.columns == board.rows:
         raise BadInput(
             "a plain checkerboard with as many columns as rows cannot be told from itself turned "
@@ -62,69 +47,68 @@ def _refuse_square(board: Board) -> None:
             where=f"board {board.name}",
             remedy="use a board whose columns and rows differ, or a charuco board",
         )
-
-
-def _refuse_narrow(board: Board) -> None:
-    if min(board.columns, board.rows) < FEWEST_SQUARES:
+    if min(board.columns, board.rows) < MIN_SQUARES:
         raise BadInput(
             f"a plain checkerboard of {board.columns} columns and {board.rows} rows cannot be found: "
-            f"it takes {FEWEST_SQUARES} squares either way",
+            f"it takes {MIN_SQUARES} squares in either direction",
             where=f"board {board.name}",
             remedy="use a board with more squares, or a charuco board",
         )
 
 
-def _refined(image: Bytes, board: Board, candidate: Array) -> SightedCorners | None:
-    """Refine a detector's corners (N, 2) px first, and only then judge them.
+def _refine(image: Bytes, board: Board, candidate: Array) -> DetectedCorners | None:
+    """Refine a detector's corners (N, 2) px; None unless most are found and form this board.
 
-    Detectors are sometimes off by a pixel or two; corners not found where they say are looked for
-    where the corners found predict them. None unless most are found and form this board.
+    Detectors err by a pixel or two at times: corners not found there are looked for where the
+    others predict them.
     """
     printed = board_layout.printed_corners(board)
     row, column = np.divmod(np.arange(len(printed)), board.columns - 1)
-    pixels, first_is_black = _numbered_as_printed(image, board, candidate, printed)
+    pixels, first_is_black = _number_as_printed(image, board, candidate, printed)
     bright_diagonal = ((row + column) % 2 == 0) != first_is_black
     board_map, start = fit_board_map(printed, pixels), pixels
     good = np.zeros(len(printed), bool)
-    for _ in range(ROUNDS):
+    for _ in range(3):
         along = board.square_mm * board_map.jacobian(printed)
         refined, found = refine_corners(image, start, along, bright_diagonal)
         pixels, good = np.where(found[:, None] & ~good[:, None], refined, pixels), good | found
-        if good.mean() < MIN_SHARE_TO_GO_ON:
+        if good.mean() < 0.4:
             return None
         board_map = fit_board_map(printed[good], pixels[good])
-        astray = np.linalg.norm(board_map.apply(printed) - pixels, axis=-1)
+        error = np.linalg.norm(board_map.apply(printed) - pixels, axis=-1)
         size = np.sqrt(np.abs(np.linalg.det(along)))
-        good &= astray < SAME_CORNER_SQUARES * size
+        # A bowed board and a lens leave hundredths of a square, mixed-up corners a whole one.
+        good &= error < 0.15 * size
         if good.all():
             break
         start = board_map.apply(printed)
-    if good.mean() < MIN_SHARE_OF_CORNERS or _goes_on(image, board, board_map, first_is_black):
+    if good.mean() < 0.8 or _is_part_of_larger(image, board, board_map, first_is_black):
         return None
-    return SightedCorners(np.flatnonzero(good).astype(np.int64), pixels[good], len(printed))
+    return DetectedCorners(np.flatnonzero(good).astype(np.int64), pixels[good], len(printed))
 
 
-def _goes_on(image: Bytes, board: Board, board_map: BoardMap, first_is_black: bool) -> bool:
-    """Whether corners and squares continue beyond a side:
-    the image shows part of a larger board."""
+def _is_part_of_larger(
+    image: Bytes, board: Board, board_map: BoardMap, first_is_black: bool
+) -> bool:
+    """Whether squares and corners continue beyond a side, at half the contrast or more."""
     inside = _greys(image, board, board_map, _inner_squares(board))
     contrast = abs(inside[0].mean() - inside[1].mean())
     for lines, squares in _beyond(board):
         even, odd = _greys(image, board, board_map, squares)
         dark, light = (even, odd) if first_is_black else (odd, even)
-        if light.min() - dark.max() < LEAST_BEYOND * contrast:
+        if light.min() - dark.max() < 0.5 * contrast:
             continue
         printed = board.square_mm * lines.astype(float)
         along = board.square_mm * board_map.jacobian(printed)
         bright_diagonal = (lines.sum(axis=1) % 2 == 0) != first_is_black
         _, found = refine_corners(image, board_map.apply(printed), along, bright_diagonal)
-        if found.mean() > LEAST_BEYOND:
+        if found.mean() > 0.5:
             return True
     return False
 
 
 def _beyond(board: Board) -> Iterator[tuple[Indices, Indices]]:
-    """For each side, the corners (N, 2) and squares (M, 2) that a larger board would have there."""
+    """Yield for each side the corners (N, 2) and squares (M, 2) of a larger board beyond it."""
     size = np.array([board.columns, board.rows])
     for along, across in ((0, 1), (1, 0)):
         for line, square in ((0, -1), (size[across], size[across])):
@@ -135,8 +119,8 @@ def _beyond(board: Board) -> Iterator[tuple[Indices, Indices]]:
             yield corners, squares
 
 
-def _candidates(image: Bytes, board: Board) -> Iterator[Array]:
-    """Corner sets (N, 2) px from the detectors, in order of speed and success.
+def _candidates(image: Bytes, board: Board, quick: bool) -> Iterator[Array]:
+    """Yield corner sets (N, 2) px from the detectors, in order of speed and success.
 
     The plain threshold of the whole image finds most boards in hundredths of a second. If it finds
     none and there is no lattice of saddles either, there is no board. Then: adaptive thresholds for
@@ -146,33 +130,35 @@ def _candidates(image: Bytes, board: Board) -> Iterator[Array]:
     """
     size = (board.columns - 1, board.rows - 1)
     whole = Region(0, 0, image.shape[1], image.shape[0])
-    yield from _found(_classic, image, size, whole, 1.0)
-    if not shows_lattice(image, size):
+    yield from _detect(_classic, image, size, whole, 1.0)
+    if not quick and not shows_lattice(image, size):
         return
-    yield from _found(_adaptive, image, size, whole, 1.0)
+    yield from _detect(_adaptive, image, size, whole, 1.0)
+    if quick:
+        return
     regions = board_regions(image, size[0] * size[1])
     small = [region for region in regions if 2 * region.area < image.size]
-    for region, scale in [(region, 2.0) for region in small] + [
-        (region, 1.0) for region in regions
-    ]:
-        yield from _found(_classic, image, size, region, scale)
+    for region in small:
+        yield from _detect(_classic, image, size, region, 2.0)
+    for region in regions:
+        yield from _detect(_classic, image, size, region, 1.0)
     for region in (*regions, whole):
-        yield from _found(_sector_based, image, size, region, 1.0)
+        yield from _detect(_sector_based, image, size, region, 1.0)
     for region in regions[:1]:
-        yield from _found(_sector_based_enlarged, image, size, region, 1.0)
+        yield from _detect(_sector_based_enlarged, image, size, region, 1.0)
 
 
 Detector = Callable[[Bytes, tuple[int, int]], tuple[bool, Floats | None]]
 
 
-def _found(
-    detect: Detector, image: Bytes, size: tuple[int, int], region: Region, scale: float
+def _detect(
+    detector: Detector, image: Bytes, size: tuple[int, int], region: Region, scale: float
 ) -> Iterator[Array]:
-    """Corners that a detector finds in a part of the image, enlarged."""
+    """Yield the corners that a detector finds in a region of the image, enlarged by `scale`."""
     part = region.cut(image)
     if scale != 1.0:
         part = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    found, corners = detect(part, size)
+    found, corners = detector(part, size)
     if found and corners is not None:
         pixels = np.asarray(corners, float).reshape(-1, 2)
         yield (pixels + 0.5) / scale - 0.5 + [region.left, region.top]
@@ -195,10 +181,10 @@ def _sector_based_enlarged(image: Bytes, size: tuple[int, int]) -> tuple[bool, F
     return cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
 
 
-def _numbered_as_printed(
+def _number_as_printed(
     image: Bytes, board: Board, corners: Array, printed: Array
 ) -> tuple[Array, bool]:
-    """Corners (N, 2) in the print's order, and whether its first square is black.
+    """Put corners (N, 2) in the print's order; also return whether its first square is black.
 
     Never mirrored; starts at the end where the first square is black if at the other end it is
     white.
@@ -233,8 +219,8 @@ def _inner_squares(board: Board) -> Indices:
 def _greys(
     image: Bytes, board: Board, board_map: BoardMap, squares: Indices
 ) -> tuple[Array, Array]:
-    """Grey levels in the middles of squares (N, 2), given by column and row: of those with an even
-    sum, and of the others."""
+    """Sample grey levels in the middles of squares (N, 2), given by column and row: of those with
+    an even sum, and of the others."""
     where = board_map.apply(board.square_mm * (squares.astype(float) + 0.5)).astype(np.float32)
     grey = cv2.remap(image, where[:, None], None, cv2.INTER_LINEAR).ravel().astype(float)
     even = squares.sum(axis=1) % 2 == 0

@@ -1,4 +1,4 @@
-"""Board corners to a small fraction of a pixel: a model of the image is fitted around each.
+"""Refine board corners by fitting a model of the image around each.
 
 Four squares meet in a corner; blurred, that is an offset plus the product of two edges, under light
 that may fall off to one side:
@@ -7,12 +7,12 @@ that may fall off to one side:
     E(d) = erf(d / (sqrt(2) sigma)),
 
 with c the corner, n1 and n2 the normals of the two edge lines. Light multiplies: a slope added to
-the squares instead shifts all corners of a tilted board alike, by 0.01 px at 70 degrees.
+the squares instead shifts all corners of a tilted board together, by 0.01 px at 70 degrees.
 
 A marker in a white square turns it dark from a gap g_i beyond both edges on: the product of the
 edges is reversed there, by the factor 1 - 2 F1 F2 with F_i = (1 + E(|n_i . (p - c)| - g_i)) / 2.
 Left out, its blurred rim pulls corners of small boards at 60 degrees away from the camera, by 0.02
-px all alike. All corners of a board are fitted at once.
+px, all of them. All corners of a board are fitted at once.
 """
 
 from __future__ import annotations
@@ -23,41 +23,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array, Bytes, Indices, Mask
-from bodyscan.boards.appearance import AS_PRINTED, Appearance
+from bodyscan.boards.view import AS_PRINTED, Appearance
 from bodyscan.compiled import compiled
 from bodyscan.geometry.least_squares import StackedEquations, minimize_each
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
 from bodyscan.geometry.scaled_systems import solve_scaled
 
-MAX_MOVE_PX = 1.5
-RADIUS_PX = 9.0
-NOISY_PX, NOISY_RADIUS_PX = 0.04, 16.0
-"""If corners of an image are less accurate than this, wider windows are worth their time."""
 WINDOW_SQUARES = 0.42
-BLUR_PX = 0.9
-CLEAR_OF_MARKER_PX = 1.4
-MIN_BORDER_PX = 5.0
-MIN_ARM_PX = 1.5
-BLUR_RANGE_PX = (0.3, 3.0)
-MIN_PIXELS = 16
+"""Half the width of the window around a corner, in squares: it stays clear of neighbouring edges."""
 MIN_CONTRAST = 4.0
-USUAL_RESIDUAL, MAX_RESIDUAL = 0.25, 0.7
-USUAL_SIGMA_PX, MAX_SIGMA_PX = 0.06, 0.35
-TIMES_MEDIAN = 2.0
-"""Residuals (shares of the contrast) and sigmas of good corners in a clear image, and in any. If
-all are worse, in noise or blur, a corner may be twice as bad as the median of its board."""
-LEAST_OF_SEEN = 0.02
-"""Share of the seen variance of light between corners that is real, at least."""
-NO_RIM = 4.0
-"""Blurs before a marker's rim at which it takes less than 1e-4 of the contrast."""
-STEPS = 12
-UNSEEN = 1e-9  # share of a diagonal: what a window without pixels leaves open stays as it is
-SETTLED = 1e-2  # a tenth of a corner's own sigma; one more step then makes it far less
+"""Least difference of grey levels between black and white, as a share of which noise is judged."""
 
 
 @dataclass(frozen=True, eq=False)
-class SightedCorners:
-    """Corners of one board face found in an image.
+class DetectedCorners:
+    """Corners of one board face as found in an image.
 
     ids: (N,) int64.
     pixels: (N, 2) px.
@@ -74,12 +54,12 @@ class SightedCorners:
 class _Patches:
     """P pixels around each of N corners.
 
-    place: (N, P, 2) px. grey: (N, P). weight: (N, P), 0 or 1.
+    pixels: (N, P, 2) px. grey: (N, P). weight: (N, P), 0 or 1.
     rims: (N, 3): how far beyond either edge a marker begins, px, infinite without markers, and the
         sign of the product of distances from both edges where squares are white.
     """
 
-    place: Array
+    pixels: Array
     grey: Array
     weight: Array
     rims: Array
@@ -93,10 +73,9 @@ def refine_corners(
     *,
     marker_gap: float | None = None,
 ) -> tuple[Array, Mask]:
-    """Refine corners (N, 2) px from starts about a pixel off; returns them and which to trust (N,).
+    """Refine corners (N, 2) px from starts about a pixel away; also return which are good (N,).
 
-    along: (N, 2, 2) px, columns: one square along the print's x, one along its y; keeps
-        neighbouring edges out of the windows.
+    along: (N, 2, 2) px, columns: one square along the print's x, one along its y.
     bright_diagonal: (N,) whether the white squares at a corner are the one before it in x and y and
         the one after it in both, or the other two.
     marker_gap: on a ChArUco board the white rim around a marker, in squares.
@@ -107,29 +86,30 @@ def refine_corners(
     def patches(radius_px: float) -> _Patches:
         return _patches(image, start, along, bright_diagonal, marker_gap, radius_px)
 
-    usual = patches(RADIUS_PX)
-    fit = _fit(usual, start, along)
-    if np.median(fit.sigma) > NOISY_PX:
-        fit = _fit(patches(NOISY_RADIUS_PX), start, along, _common_light(fit))
-    fitted, sigma = fit.state, fit.sigma
+    narrow = patches(9.0)
+    fit = _fit(narrow, start, along)
+    if np.median(fit.sigma) > 0.04:  # in such noise a wider window is worth its time
+        fit = _fit(patches(16.0), start, along, _common_light(fit))
     # b is the brightness of squares where one edge distance is negative: not those on the diagonal.
-    pixels, contrast = fitted[:, :2], np.where(bright_diagonal, -fitted[:, 5], fitted[:, 5])
-    good = usual.weight.sum(axis=1) >= MIN_PIXELS
-    good &= np.linalg.norm(pixels - start, axis=1) < MAX_MOVE_PX
+    pixels = fit.state[:, :2]
+    contrast = np.where(bright_diagonal, -fit.state[:, 5], fit.state[:, 5])
+    good = narrow.weight.sum(axis=1) >= 16
+    good &= np.linalg.norm(pixels - start, axis=1) < 1.5
     good &= contrast > MIN_CONTRAST
     share = fit.residual / np.maximum(contrast, MIN_CONTRAST)
-    good &= share < _limit(share[good], USUAL_RESIDUAL, MAX_RESIDUAL)
-    good &= sigma < _limit(sigma[good], USUAL_SIGMA_PX, MAX_SIGMA_PX)
-    # At the image's rim a corner seen on one side only is fitted well, but in the wrong place.
+    good &= share < _upper_limit(share[good], 0.25, 0.7)
+    good &= fit.sigma < _upper_limit(fit.sigma[good], 0.06, 0.35)
+    # At the image's rim a corner visible on one side only is fitted well, but at the wrong position.
     size = np.array(image.shape[::-1])
-    good &= np.all((pixels >= MIN_BORDER_PX) & (pixels <= size - 1 - MIN_BORDER_PX), axis=1)
+    good &= np.all((pixels >= 5.0) & (pixels <= size - 6.0), axis=1)
     return pixels, good
 
 
-def _limit(values: Array, usual: float, most: float) -> float:
-    """Upper limit for a corner, given the values (N,) of those that are good otherwise."""
+def _upper_limit(values: Array, clear: float, noisy: float) -> float:
+    """Largest value of a good corner: twice the median (N,), within the limits of a clear image and
+    of any image."""
     median = float(np.median(values)) if len(values) else 0.0
-    return float(np.clip(TIMES_MEDIAN * median, usual, most))
+    return float(np.clip(2.0 * median, clear, noisy))
 
 
 def _patches(
@@ -140,15 +120,15 @@ def _patches(
     marker_gap: float | None,
     radius_px: float,
 ) -> _Patches:
-    """The pixels of a square window that belong to the four squares around each corner."""
+    """Collect the pixels of a square window that belong to the four squares around each corner."""
     radius = int(np.ceil(radius_px))
     across = np.arange(-radius, radius + 1)
     offset = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
-    place = np.rint(start)[:, None] + offset.astype(np.float64)
+    pixels = np.rint(start)[:, None] + offset.astype(np.float64)
     height, width = image.shape
-    inside = np.all((place >= 0) & (place <= [width - 1, height - 1]), axis=-1)
-    column, row = np.clip(place, 0, [width - 1, height - 1]).astype(np.intp).transpose(2, 0, 1)
-    from_corner = place - start[:, None]
+    inside = np.all((pixels >= 0) & (pixels <= [width - 1, height - 1]), axis=-1)
+    column, row = np.clip(pixels, 0, [width - 1, height - 1]).astype(np.intp).transpose(2, 0, 1)
+    from_corner = pixels - start[:, None]
     squares = np.einsum("nij,npj->npi", np.linalg.pinv(along), from_corner)
     weight = inside & np.all(np.abs(squares) < WINDOW_SQUARES, axis=-1)
     weight &= np.sum(from_corner**2, axis=-1) <= radius_px**2
@@ -160,10 +140,11 @@ def _patches(
         lengths = np.abs(np.linalg.det(along))[:, None] / np.linalg.norm(along, axis=1)[:, ::-1]
         rims[:, :2] = marker_gap * lengths[:, ::-1]
         from_edge = np.abs(squares) * lengths[:, None]
-        clear = np.maximum(marker_gap * lengths - CLEAR_OF_MARKER_PX, MIN_ARM_PX)
+        # Clear of a marker's blurred rim, but never narrower than a pixel and a half.
+        clear = np.maximum(marker_gap * lengths - 1.4, 1.5)
         white = (squares.prod(axis=-1) > 0) == bright_diagonal[:, None]
         weight &= np.any(from_edge < clear[:, None], axis=-1) | ~white
-    return _Patches(place, image[row, column].astype(float), weight.astype(float), rims)
+    return _Patches(pixels, image[row, column].astype(float), weight.astype(float), rims)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,52 +170,52 @@ class _Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class _Light:
-    """Prior knowledge of g: mean (2,), and information (N, 2) in squared grey levels."""
+class _LightPrior:
+    """Gaussian prior of g: mean (2,), and information (N, 2) in squared grey levels."""
 
     mean: Array
     information: Array
 
-    def added(self, equations: StackedEquations, state: Array) -> StackedEquations:
-        off = state[:, 7:] - self.mean
+    def add_to(self, equations: StackedEquations, state: Array) -> StackedEquations:
+        """Add the prior's residuals at a state (N, 9) to the equations of the patches."""
+        residual = state[:, 7:] - self.mean
         normal, gradient = equations.normal.copy(), equations.gradient.copy()
         normal[:, [7, 8], [7, 8]] += self.information
-        gradient[:, 7:] += self.information * off
-        cost = equations.cost + np.sum(self.information * off**2, axis=1)
+        gradient[:, 7:] += self.information * residual
+        cost = equations.cost + np.sum(self.information * residual**2, axis=1)
         return StackedEquations(normal, gradient, cost, equations.freedoms)
 
 
-def _common_light(fit: _Fit) -> _Light:
-    """A prior for g from all corners: light varies over a board much alike at all of them, while in
-    noise each alone says little of it, and a wrong g moves the corner. Its variation between
-    corners sets the prior's width."""
+def _common_light(fit: _Fit) -> _LightPrior:
+    """Estimate a prior of g from all corners of a board.
+
+    Light falls off similarly at all of them, while in noise one corner hardly determines it, and a
+    wrong g displaces the corner. The prior's variance is the scatter of g less its noise.
+    """
     slope = fit.state[:, 7:]
     mean = np.median(slope, axis=0)
-    told = np.median(np.einsum("nii->ni", fit.covariance)[:, 7:], axis=0)
-    seen = (SIGMAS_PER_MEDIAN * np.median(np.abs(slope - mean), axis=0)) ** 2
-    differs = np.maximum(seen - told, LEAST_OF_SEEN * seen + 1e-12)
-    return _Light(mean, fit.variance[:, None] / differs)
+    noise = np.median(np.einsum("nii->ni", fit.covariance)[:, 7:], axis=0)
+    scatter = (SIGMAS_PER_MEDIAN * np.median(np.abs(slope - mean), axis=0)) ** 2
+    variance = np.maximum(scatter - noise, 0.02 * scatter + 1e-12)
+    return _LightPrior(mean, fit.variance[:, None] / variance)
 
 
-def _fit(patches: _Patches, start: Array, along: Array, light: _Light | None = None) -> _Fit:
+def _fit(patches: _Patches, start: Array, along: Array, light: _LightPrior | None = None) -> _Fit:
     """Fit the image model to every corner's patch."""
     angles = np.arctan2(along[:, 1], along[:, 0]) + np.pi / 2.0
-    state = np.column_stack(
-        [start, angles, np.full(len(start), BLUR_PX), np.zeros((len(start), 4))]
-    )
+    state = np.column_stack([start, angles, np.full(len(start), 0.9), np.zeros((len(start), 4))])
     state[:, 5:] = _linear(patches, state)
 
     def equations(state: Array) -> StackedEquations:
-        own = _equations(patches, state)
-        return light.added(own, state) if light else own
+        corners = _equations(patches, state)
+        return light.add_to(corners, state) if light else corners
 
     def within(state: Array) -> Array:
-        state[:, 4] = np.clip(state[:, 4], *BLUR_RANGE_PX)
+        state[:, 4] = np.clip(state[:, 4], 0.3, 3.0)  # blur, px
         return state
 
-    solution = minimize_each(
-        state, equations, within=within, steps=STEPS, settled=SETTLED, damping=1e-3
-    )
+    # Settled within a tenth of a corner's sigma; one more step then makes it far less.
+    solution = minimize_each(state, equations, within=within, steps=12, settled=1e-2, damping=1e-3)
     total = np.maximum(patches.weight.sum(axis=1), 1.0)
     return _Fit(
         solution.state,
@@ -245,38 +226,41 @@ def _fit(patches: _Patches, start: Array, along: Array, light: _Light | None = N
 
 
 def _linear(patches: _Patches, state: Array) -> Array:
-    """b, a and g (N, 4) by least squares for given edges: in a state without contrast and without
-    falling light, the image is linear in them."""
+    """Solve for b, a and g (N, 4) with the edges fixed.
+
+    Around a state without contrast and with even light the image is linear in them.
+    """
     even = np.column_stack([state[:, :5], np.tile([0.0, MIN_CONTRAST, 0.0, 0.0], (len(state), 1))])
     at = _equations(patches, even)
-    step = solve_scaled(at.normal[:, 5:, 5:], at.gradient[:, 5:], np.full(len(state), UNSEEN))
+    # A slight damping leaves unchanged what a window without pixels does not determine.
+    step = solve_scaled(at.normal[:, 5:, 5:], at.gradient[:, 5:], np.full(len(state), 1e-9))
     return even[:, 5:] - step
 
 
 def _equations(patches: _Patches, state: Array) -> StackedEquations:
     """Normal equations of every corner's fit at a state (N, 9)."""
     return StackedEquations(
-        *sum_equations(patches.place, patches.grey, patches.weight, patches.rims, state)
+        *sum_equations(patches.pixels, patches.grey, patches.weight, patches.rims, state)
     )
 
 
 @compiled
 def edge_and_slope(distance: float, blur: float) -> tuple[float, float]:
-    """E(d) of a blurred edge, and its derivative."""
+    """Evaluate E(d) of a blurred edge, and its derivative."""
     scaled = distance / (math.sqrt(2.0) * blur)
     return math.erf(scaled), math.sqrt(2.0 / math.pi) / blur * math.exp(-scaled * scaled)
 
 
 @compiled
 def sum_equations(
-    place: Array, grey: Array, weight: Array, rims: Array, state: Array
+    pixels: Array, grey: Array, weight: Array, rims: Array, state: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """The fields of `StackedEquations` for pixels, weights and rims of `_Patches` at states (N, 9).
+    """Sum the fields of `StackedEquations` for pixels, weights and rims of `_Patches` at states (N, 9).
 
     Compiled, because it takes most of the time of finding boards: pixels without weight cost
     nothing, and no derivative is stored.
     """
-    count, pixels = grey.shape
+    count, size = grey.shape
     normal, gradient = np.zeros((count, 9, 9)), np.zeros((count, 9))
     cost, freedoms = np.zeros(count), np.zeros(count)
     by = np.empty(9)
@@ -284,17 +268,18 @@ def sum_equations(
         blur, b, a = state[n, 4], state[n, 5], max(state[n, 6], MIN_CONTRAST)
         cos1, sin1 = math.cos(state[n, 2]), math.sin(state[n, 2])
         cos2, sin2 = math.cos(state[n, 3]), math.sin(state[n, 3])
-        for p in range(pixels):
+        for p in range(size):
             if weight[n, p] == 0.0:
                 continue
-            x, y = place[n, p, 0] - state[n, 0], place[n, p, 1] - state[n, 1]
+            x, y = pixels[n, p, 0] - state[n, 0], pixels[n, p, 1] - state[n, 1]
             across1, across2 = x * cos1 + y * sin1, x * cos2 + y * sin2
             edge1, steep1 = edge_and_slope(across1, blur)
             edge2, steep2 = edge_and_slope(across2, blur)
             product, by1, by2 = edge1 * edge2, steep1 * edge2, edge1 * steep2
             by_blur = by1 * across1 + by2 * across2
             into1, into2 = abs(across1) - rims[n, 0], abs(across2) - rims[n, 1]
-            if across1 * across2 * rims[n, 2] > 0.0 and min(into1, into2) > -NO_RIM * blur:
+            # Four blurs before a marker's rim it takes less than 1e-4 of the contrast.
+            if across1 * across2 * rims[n, 2] > 0.0 and min(into1, into2) > -4.0 * blur:
                 rim1, steep1 = edge_and_slope(into1, blur)
                 rim2, steep2 = edge_and_slope(into2, blur)
                 kept = 1.0 - 0.5 * (1.0 + rim1) * (1.0 + rim2)

@@ -1,4 +1,4 @@
-"""Calibration boards found in an image."""
+"""Find calibration boards in an image."""
 
 from __future__ import annotations
 
@@ -8,27 +8,30 @@ from dataclasses import replace
 import numpy as np
 
 from bodyscan.arrays import Bytes
-from bodyscan.boards.appearance import AS_PRINTED, OTHERWISE, Appearance
 from bodyscan.boards.aprilgrid import find_aprilgrid
 from bodyscan.boards.charuco import (
     Markers,
+    count_dictionary_markers,
     detect_markers,
     locate_charuco,
-    markers_concerned,
     place_markers,
 )
 from bodyscan.boards.checkerboard import find_checkerboard
-from bodyscan.boards.corners import SightedCorners
-from bodyscan.boards.view import BoardView
+from bodyscan.boards.corners import DetectedCorners
+from bodyscan.boards.view import AS_PRINTED, Appearance, BoardView
 from bodyscan.rig.board import Board
 
-MIN_CORNERS = 6
-Seen = dict[tuple[str, Appearance, bool], Markers]
-"""Markers found, once per dictionary, appearance, and quick or thorough search."""
+OTHER_APPEARANCES = (
+    Appearance(inverted=True),
+    Appearance(mirrored=True),
+    Appearance(inverted=True, mirrored=True),
+)
+MarkerCache = dict[tuple[str, Appearance, bool], Markers]
+"""Markers by dictionary, appearance, and quick or thorough search."""
 
 
 def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) -> list[BoardView]:
-    """Every board of `boards` that the image (H, W) shows, in their order; none: an empty list.
+    """Find the boards of `boards` that the image (H, W) shows, in their order.
 
     ChArUco boards and grids of AprilTags may be seen in part (at least 6 corners, not on one line),
     from either face, and be printed white on black, mirrored, or in OpenCV's other layout: the
@@ -40,13 +43,15 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
     Raises BadInput for a board that cannot be found.
     """
     views = []
-    seen: Seen = {}
+    cache: MarkerCache = {}
     first: dict[str, int] = {}
     for board in boards:
-        first[board.dictionary] = max(markers_concerned(board), first.get(board.dictionary, 0))
+        first[board.dictionary] = max(
+            count_dictionary_markers(board), first.get(board.dictionary, 0)
+        )
     for board in boards:
         if board.kind != "checkerboard":
-            found = _find_marked(image, board, seen, first)
+            found = _find_marked(image, board, cache, first)
         else:
             found = find_checkerboard(image, board)
         if found is not None and _determines_plane(found):
@@ -62,51 +67,51 @@ def find_boards(image: Bytes, boards: Sequence[Board], *, pair: str, shot: str) 
 def _find_marked(
     image: Bytes,
     board: Board,
-    seen: Seen,
+    cache: MarkerCache,
     first: dict[str, int],
-) -> SightedCorners | None:
+) -> DetectedCorners | None:
     """Find a board as printed, or else white on black, or mirrored.
 
     first: number of the markers, by dictionary, that are printed at all.
     """
-    for appearance in (AS_PRINTED, *OTHERWISE):
-        picture = appearance.as_printed(image)
+    for appearance in (AS_PRINTED, *OTHER_APPEARANCES):
+        picture = appearance.undo(image)
         if board.kind == "aprilgrid":
             found = find_aprilgrid(picture, board, thorough=appearance == AS_PRINTED)
         else:
-            found = _find_charuco(picture, board, appearance, seen, first[board.dictionary])
+            found = _find_charuco(picture, board, appearance, cache, first[board.dictionary])
         if found is not None and _determines_plane(found):
-            pixels = appearance.in_image(found.pixels, image.shape[1])
-            shown = replace(
+            pixels = appearance.original_pixels(found.pixels, image.shape[1])
+            combined = replace(
                 found.appearance, inverted=appearance.inverted, mirrored=appearance.mirrored
             )
-            return replace(found, pixels=pixels, appearance=shown)
+            return replace(found, pixels=pixels, appearance=combined)
     return None
 
 
 def _find_charuco(
-    picture: Bytes, board: Board, appearance: Appearance, seen: Seen, first: int
-) -> SightedCorners | None:
+    picture: Bytes, board: Board, appearance: Appearance, cache: MarkerCache, first: int
+) -> DetectedCorners | None:
     """Find a board by a quick search, followed by a thorough one if markers are missing."""
 
-    def look(quick: bool) -> Markers:
+    def detect(quick: bool) -> Markers:
         key = board.dictionary, appearance, quick
-        if key not in seen:
-            seen[key] = detect_markers(picture, board, first=first, quick=quick)
-        return seen[key]
+        if key not in cache:
+            cache[key] = detect_markers(picture, board, first=first, quick=quick)
+        return cache[key]
 
     if appearance == AS_PRINTED:  # true of nearly all
-        markers = look(quick=True)
-        placed = place_markers(board, markers)
-        if placed is not None and placed.believed and placed.all_seen(picture.shape):
-            return locate_charuco(picture, board, markers, placed)
-    markers = look(quick=False)
+        markers = detect(quick=True)
+        position = place_markers(board, markers)
+        if position is not None and position.valid and position.complete(picture.shape):
+            return locate_charuco(picture, board, markers, position)
+    markers = detect(quick=False)
     return locate_charuco(picture, board, markers, place_markers(board, markers))
 
 
-def _determines_plane(found: SightedCorners) -> bool:
+def _determines_plane(found: DetectedCorners) -> bool:
     """Whether there are six corners (four on a board that has no more), not all on one line."""
-    if len(found.ids) < min(MIN_CORNERS, found.printed_count):
+    if len(found.ids) < min(6, found.printed_count):
         return False
-    spread = np.linalg.svd(found.pixels - found.pixels.mean(axis=0), compute_uv=False)
-    return bool(spread[1] > 2.0)
+    extents = np.linalg.svd(found.pixels - found.pixels.mean(axis=0), compute_uv=False)
+    return bool(extents[1] > 2.0)

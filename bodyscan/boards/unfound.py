@@ -1,7 +1,6 @@
-"""What an image shows if a board was not found: markers, grids, and how close they are to the
-board.
+"""Describe what an image shows in which a board was not found: markers, or grids of other sizes.
 
-Slow, a second or more per image: meant for images that ought to show a board.
+It takes a second or more per image, and is meant for images that ought to show a board.
 """
 
 from __future__ import annotations
@@ -13,97 +12,95 @@ import cv2
 import numpy as np
 
 from bodyscan.arrays import Bytes
-from bodyscan.boards.appearance import AS_PRINTED, OTHERWISE, Appearance
 from bodyscan.boards.aprilgrid import BORDER_BITS, place_tags
 from bodyscan.boards.board_layout import marker_corners
 from bodyscan.boards.charuco import Markers, detect_markers, place_markers
-from bodyscan.boards.checkerboard import FEWEST_SQUARES, find_quickly
+from bodyscan.boards.checkerboard import MIN_SQUARES, find_checkerboard
+from bodyscan.boards.detection import OTHER_APPEARANCES
+from bodyscan.boards.view import AS_PRINTED, Appearance
 from bodyscan.rig.board import LARGEST_DICTIONARIES, MARKERS_IN, Board
 
-FEW_MARKERS = 4
+MIN_MARKERS = 4
 """Fewer may be chance: quadrilaterals that happen to read as a marker."""
-ENOUGH_MARKERS, ENOUGH_SHARE = 8, 0.8
-OTHER_SIDE = 0.2
-"""Share of a marker's side; unrefined outlines are too small by up to a tenth."""
-OTHER_SIZES = (-2, -1, 1, 2)
 
 
 def describe_unfound(image: Bytes, board: Board) -> str:
-    """What the image (H, W) shows instead of the board, in words that follow the board's name."""
+    """Describe what the image (H, W) shows instead of the board, to follow the board's name."""
     if board.kind == "checkerboard":
         return _describe_grids(image, board)
     return _describe_markers(image, board)
 
 
 def _describe_markers(image: Bytes, board: Board) -> str:
-    most, appearance = max(
-        ((_markers(image, board, seen), seen) for seen in (AS_PRINTED, *OTHERWISE)),
+    markers, appearance = max(
+        ((_detect(image, board, look), look) for look in (AS_PRINTED, *OTHER_APPEARANCES)),
         key=lambda found: len(found[0].ids),
     )
-    if len(most.ids) < FEW_MARKERS:
-        return f"{len(most.ids)} markers of {board.dictionary}{_other_dictionaries(image, board)}"
-    said = f"{len(most.ids)} markers of {board.dictionary}"
+    count = f"{len(markers.ids)} markers of {board.dictionary}"
+    if len(markers.ids) < MIN_MARKERS:
+        return count + _describe_other_dictionary(image, board)
     if appearance.inverted:
-        said += ", white on black"
+        count += ", white on black"
     if appearance.mirrored:
-        said += ", mirrored"
-    side = _marker_side(board, most)
-    if side is not None and abs(side / (board.marker_mm or 1.0) - 1.0) > OTHER_SIDE:
+        count += ", mirrored"
+    side = _estimate_marker_side(board, markers)
+    # Unrefined outlines are too small by up to a tenth.
+    if side is not None and abs(side / (board.marker_mm or 1.0) - 1.0) > 0.2:
         return (
-            f"{said}, whose sides are about {side / board.square_mm:.2f} of a square's: `marker_mm` is "
-            f"about {side:.2g} if `square_mm` is {board.square_mm:g}, not {board.marker_mm:g}"
+            f"{count}, whose sides are about {side / board.square_mm:.2f} of a square's: `marker_mm` "
+            f"is about {side:.2g} if `square_mm` is {board.square_mm:g}, not {board.marker_mm:g}"
         )
-    if _agreeing(board, most):
-        return f"{said}, with too few corners beside them that can be seen sharply"
-    better = max(_resized(board, most), default=None)
+    if _count_agreeing(board, markers):
+        return f"{count}, with too few sharp corners next to them"
+    better = max(_fit_other_sizes(board, markers), default=None)
     if better is None:
-        return f"{said}, which do not lie as on {board.columns} columns x {board.rows} rows"
-    agreeing, fewest_rows, columns = better
-    rows = -fewest_rows
+        return f"{count}, which do not lie as on {board.columns} columns x {board.rows} rows"
+    agreeing, negative_rows, columns = better
+    rows = -negative_rows
     exchanged = board.model_copy(update={"columns": board.rows, "rows": board.columns})
-    if _agreeing(exchanged, most) >= agreeing:
+    if _count_agreeing(exchanged, markers) >= agreeing:
         return (
-            f"{said}; {agreeing} of them fit with columns and rows exchanged: {board.rows} columns x "
+            f"{count}; {agreeing} of them fit with columns and rows exchanged: {board.rows} columns x "
             f"{board.columns} rows"
         )
     return (
-        f"{said}; {agreeing} of them lie as on a board of {columns} columns x {rows} rows, not "
+        f"{count}; {agreeing} of them lie as on a board of {columns} columns x {rows} rows, not "
         f"{board.columns} x {board.rows}"
     )
 
 
-def _markers(image: Bytes, board: Board, appearance: Appearance) -> Markers:
-    picture = appearance.as_printed(image)
+def _detect(image: Bytes, board: Board, appearance: Appearance) -> Markers:
+    """Detect the board's markers, with the rim on which most are found."""
+    picture = appearance.undo(image)
     rims = BORDER_BITS if board.kind == "aprilgrid" else (1,)
     found = [detect_markers(picture, board, border_bits=bits) for bits in rims]
     return max(found, key=lambda markers: len(markers.ids))
 
 
-def _agreeing(board: Board, markers: Markers) -> int:
-    """How many markers lie as on this board; 0 if too few to be this board."""
+def _count_agreeing(board: Board, markers: Markers) -> int:
+    """Count the markers that lie as on this board; 0 if too few to be this board."""
     if board.kind == "aprilgrid":
         tags = place_tags(board, markers)
         return tags.agreeing if tags else 0
     if board.first_marker + board.marker_count > MARKERS_IN.get(board.dictionary, 0):
         return 0
-    placed = place_markers(board, markers)
-    return placed.agreeing if placed and placed.believed else 0
+    position = place_markers(board, markers)
+    return position.agreeing if position and position.valid else 0
 
 
-def _marker_side(board: Board, markers: Markers) -> float | None:
-    """Side of a marker, mm, from the markers' spacing whatever `marker_mm` says; None if
-    unclear."""
+def _estimate_marker_side(board: Board, markers: Markers) -> float | None:
+    """Estimate a marker's side, mm, from the markers' spacing; None if unclear."""
     layouts = (board, board.model_copy(update={"legacy_layout": not board.legacy_layout}))
     for described in layouts if board.kind == "charuco" else (board,):
         ids, printed = marker_corners(described)
-        _, seen, of_board = np.intersect1d(markers.ids, ids, return_indices=True)
-        if len(seen) < ENOUGH_MARKERS:
+        _, detected, of_board = np.intersect1d(markers.ids, ids, return_indices=True)
+        if len(detected) < 8:
             continue
-        corners = markers.corners[seen]
+        corners = markers.corners[detected]
         middles = printed[of_board].mean(axis=1)[:, :2]
         near = 0.2 * board.square_mm
         homography, inliers = cv2.findHomography(corners.mean(axis=1), middles, cv2.RANSAC, near)
-        if homography is None or inliers.mean() < ENOUGH_SHARE:
+        if homography is None or inliers.mean() < 0.8:
             continue
         flat = cv2.perspectiveTransform(corners.reshape(-1, 1, 2), homography).reshape(-1, 4, 2)
         sides = np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=-1)
@@ -111,29 +108,28 @@ def _marker_side(board: Board, markers: Markers) -> float | None:
     return None
 
 
-def _other_dictionaries(image: Bytes, board: Board) -> str:
-    """Words on another dictionary with more markers in the image, if there is one."""
+def _describe_other_dictionary(image: Bytes, board: Board) -> str:
+    """Name another dictionary with more markers in the image, if there is one."""
     found = {
         name: len(detect_markers(image, board.model_copy(update={"dictionary": name})).ids)
         for name in LARGEST_DICTIONARIES
         if name != board.dictionary
     }
     name = max(found, key=found.__getitem__)
-    return f", but {found[name]} of {name}" if found[name] >= FEW_MARKERS else ""
+    return f", but {found[name]} of {name}" if found[name] >= MIN_MARKERS else ""
 
 
-def _resized(board: Board, markers: Markers) -> Iterator[tuple[int, int, int]]:
-    """Other numbers of columns and rows that most markers fit: how many, minus the rows,
-    columns."""
+def _fit_other_sizes(board: Board, markers: Markers) -> Iterator[tuple[int, int, int]]:
+    """Yield other board sizes on which markers agree: their number, minus the rows, the columns."""
     sizes = [
         (board.columns + more, board.rows + taller)
-        for more, taller in product((0, *OTHER_SIZES), repeat=2)
+        for more, taller in product((0, -2, -1, 1, 2), repeat=2)
     ]
     for columns, rows in [*sizes, (board.rows, board.columns)]:
         if min(columns, rows) < 3:
             continue
         other = board.model_copy(update={"columns": columns, "rows": rows})
-        agreeing = _agreeing(other, markers)
+        agreeing = _count_agreeing(other, markers)
         if agreeing:
             # The fewest rows that hold them all: rows below the last marker make no difference.
             yield agreeing, -rows, columns
@@ -141,7 +137,7 @@ def _resized(board: Board, markers: Markers) -> Iterator[tuple[int, int, int]]:
 
 def _describe_grids(image: Bytes, board: Board) -> str:
     wanted = f"{board.columns - 1} x {board.rows - 1} inner corners"
-    if find_quickly(255 - image, board) is not None:
+    if _find_grid(255 - image, board):
         return f"a grid of {wanted}, but white on black"
     sizes = [(board.columns, board.rows), (board.columns + 1, board.rows + 1)]
     sizes += [
@@ -150,10 +146,10 @@ def _describe_grids(image: Bytes, board: Board) -> str:
         if more or taller
     ]
     for columns, rows in dict.fromkeys(sizes):
-        if min(columns, rows) < FEWEST_SQUARES or (columns, rows) == (board.columns, board.rows):
+        if min(columns, rows) < MIN_SQUARES or (columns, rows) == (board.columns, board.rows):
             continue
         other = board.model_copy(update={"columns": columns, "rows": rows})
-        if find_quickly(image, other) is not None:
+        if _find_grid(image, other):
             return (
                 f"no grid of {wanted}, but one of {columns - 1} x {rows - 1}: {columns} columns x "
                 f"{rows} rows of squares"
@@ -162,4 +158,8 @@ def _describe_grids(image: Bytes, board: Board) -> str:
     if found and meta is not None and np.size(meta) > 9:
         rows, columns = np.asarray(meta).shape[:2]
         return f"no grid of {wanted}; the largest found has {columns} x {rows}"
-    return f"no grid of {wanted}, nor of one more or fewer either way"
+    return f"no grid of {wanted}, nor of one more or fewer in either direction"
+
+
+def _find_grid(image: Bytes, board: Board) -> bool:
+    return find_checkerboard(image, board, quick=True) is not None

@@ -57,7 +57,7 @@ def _notes_of_board(board: Board, views: Sequence[BoardView]) -> Iterator[str]:
     inverted = [view for view in views if view.appearance.inverted]
     mirrored = [view for view in views if view.appearance.mirrored]
     other = [view for view in views if view.appearance.other_layout]
-    beyond = [view for view in views if view.appearance.goes_on]
+    beyond = [view for view in views if view.appearance.more_rows]
     if inverted:
         yield f"board {board.name} is white on black in {where(inverted)}; used so"
     if mirrored:

@@ -12,9 +12,8 @@ import numpy as np
 from bodyscan.arrays import Array
 from bodyscan.boards.board_layout import corner_points
 from bodyscan.boards.detection import find_boards
-from bodyscan.boards.numbered_corners import number_corners
 from bodyscan.boards.unfound import describe_unfound
-from bodyscan.boards.view import BoardView, ViewKey
+from bodyscan.boards.view import BoardView, ViewKey, number_corners
 from bodyscan.calibration.board_views import (
     LocatedView,
     board_symmetries,

@@ -12,7 +12,7 @@ from scipy.special import erf
 
 from bodyscan.arrays import Array, Bytes
 from bodyscan.boards.board_map import fit_board_map
-from bodyscan.boards.corners import _patches, refine_corners, sum_equations
+from bodyscan.boards.corners import refine_corners, sum_equations
 from bodyscan.boards.detection import find_boards
 from bodyscan.geometry.least_squares import StackedEquations
 from bodyscan.rig.board import Board
@@ -37,7 +37,7 @@ def picture(
 
 @pytest.mark.parametrize("blur_px", [0.6, 0.8])
 @pytest.mark.parametrize("slant_deg", [0, 45, 60])
-def test_both_ways_find_corners_to_a_hundredth_of_a_pixel(slant_deg: int, blur_px: float) -> None:
+def test_corners_are_refined_to_a_hundredth_of_a_pixel(slant_deg: int, blur_px: float) -> None:
     image, true, start, along = picture(slant_deg, blur_px=blur_px)
     fitted, good = refine_corners(image, start, along, BRIGHT_DIAGONAL)
     assert good.all()
@@ -64,7 +64,7 @@ def test_uneven_light_does_not_move_corners() -> None:
     assert np.sqrt(np.mean((fitted - true) ** 2)) < 0.01
 
 
-def test_what_is_not_the_corner_asked_for_is_refused() -> None:
+def test_other_corners_edges_and_flat_areas_are_refused() -> None:
     image, true, start, along = picture(20)
     _, good = refine_corners(image, start, along, ~BRIGHT_DIAGONAL)
     assert not good.any(), "black and white exchanged"
@@ -97,7 +97,7 @@ def test_light_that_falls_off_over_a_tilted_board_moves_no_corner() -> None:
 
 
 @pytest.mark.parametrize(("slant_deg", "fill"), [(30, 0.5), (45, 0.5), (60, 0.8)])
-def test_markers_beside_small_squares_move_no_corner(slant_deg: int, fill: float) -> None:
+def test_markers_in_small_squares_do_not_displace_corners(slant_deg: int, fill: float) -> None:
     """Their rims lie 2 px from the edges, within the blur of the windows' pixels."""
     board = Board(
         name="marked",
@@ -125,7 +125,7 @@ def test_markers_beside_small_squares_move_no_corner(slant_deg: int, fill: float
 @pytest.mark.parametrize("rim_px", [np.inf, 2.0])
 def test_compiled_equations_are_those_of_the_corner_s_image(rim_px: float) -> None:
     rng = np.random.default_rng(4)
-    place = rng.uniform(-6.0, 6.0, (5, 40, 2)) + 100.0
+    pixels = rng.uniform(-6.0, 6.0, (5, 40, 2)) + 100.0
     grey, weight = rng.uniform(20.0, 220.0, (5, 40)), (rng.random((5, 40)) < 0.7).astype(float)
     state = np.tile([100.0, 100.0, 0.3, 1.7, 0.9, 60.0, 110.0, 0.5, -0.3], (5, 1))
     state += 0.1 * rng.standard_normal(state.shape)
@@ -133,8 +133,8 @@ def test_compiled_equations_are_those_of_the_corner_s_image(rim_px: float) -> No
     rims[2:, 2] = 1.0
 
     def residuals(state: Array) -> Array:
-        """The formula at the head of `corners`, less what is seen."""
-        off = place - state[:, None, :2]
+        """The formula at the head of `corners`, less the grey levels."""
+        off = pixels - state[:, None, :2]
         one, two = (
             (off @ np.stack([np.cos(angle), np.sin(angle)], -1)[..., None])[..., 0]
             for angle in (state[:, 2], state[:, 3])
@@ -149,53 +149,14 @@ def test_compiled_equations_are_those_of_the_corner_s_image(rim_px: float) -> No
         return np.asarray((a + b * edges) * light - grey)
 
     step = 1e-5
-    ways = step * np.eye(9)
-    slopes = [(residuals(state + way) - residuals(state - way)) / (2 * step) for way in ways]
+    slopes = [
+        (residuals(state + change) - residuals(state - change)) / (2 * step)
+        for change in step * np.eye(9)
+    ]
     plain = StackedEquations.of(residuals(state), np.stack(slopes, axis=-1), weight)
-    found = StackedEquations(*sum_equations(place, grey, weight, rims, state))
+    found = StackedEquations(*sum_equations(pixels, grey, weight, rims, state))
     for name in ("normal", "gradient", "cost", "freedoms"):
         expected = getattr(plain, name)
         # central differences of 1e-5 px are good to 1e-9 of the greatest entry
         scale = np.abs(expected).max()
         assert getattr(found, name) == pytest.approx(expected, abs=1e-7 * scale), name
-
-
-def window(marker_gap: float | None, radius_px: float = 9.0) -> Array:
-    """Weights of the pixels around the corner at (40, 30) of squares of 20 x 30 px."""
-    image = np.zeros((61, 81), np.uint8)
-    along = np.array([[[20.0, 0.0], [0.0, 30.0]]])
-    start, bright = np.array([[40.0, 30.0]]), np.array([True])
-    found = _patches(image, start, along, bright, marker_gap, radius_px)
-    side = 2 * int(radius_px) + 1
-    return np.asarray(found.weight.reshape(side, side))
-
-
-def test_a_window_holds_what_is_sure_to_be_of_the_four_squares() -> None:
-    """Within its radius, and within 0.42 of a square: 8.4 and 12.6 px."""
-    v, u = np.mgrid[-9:10, -9:10]
-    np.testing.assert_array_equal(window(None), (np.abs(u) <= 8) & (u**2 + v**2 <= 81))
-    v, u = np.mgrid[-14:15, -14:15]
-    inside = (np.abs(u) <= 8) & (np.abs(v) <= 12) & (u**2 + v**2 <= 196)
-    np.testing.assert_array_equal(window(None, 14.0), inside)
-
-
-def test_of_white_squares_a_window_holds_what_lies_before_their_markers() -> None:
-    """A gap of 0.2 is 4 px across and 6 down; 1.4 px less for blur. The white ones lie where u and v
-    have one sign. Of a narrow gap 1.5 px are left."""
-    v, u = np.mgrid[-9:10, -9:10]
-    inside = (np.abs(u) <= 8) & (u**2 + v**2 <= 81)
-    white = u * v > 0
-    before = (np.abs(u) < 2.6) | (np.abs(v) < 4.6)
-    np.testing.assert_array_equal(window(0.2), inside & (before | ~white))
-    narrow = (np.abs(u) < 1.5) | (np.abs(v) < 1.5)
-    np.testing.assert_array_equal(window(0.05), inside & (narrow | ~white))
-
-
-def test_what_lies_beside_the_picture_has_no_weight() -> None:
-    along, bright = np.array([[[20.0, 0.0], [0.0, 20.0]]]), np.array([True])
-    picture = np.zeros((61, 81), np.uint8)
-    found = _patches(picture, np.array([[3.0, 58.0]]), along, bright, None, 6.0)
-    weight = found.weight.reshape(13, 13)
-    assert not weight[:, :3].any()
-    assert not weight[9:].any()
-    assert weight[6, 3] == weight[8, 6] == 1.0

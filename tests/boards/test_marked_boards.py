@@ -74,34 +74,34 @@ def test_looking_for_few_markers_finds_those_as_well(dictionary: str) -> None:
 
 
 @pytest.mark.parametrize("missed", [0, 1])
-def test_a_quick_look_is_enough_where_it_misses_no_marker(
+def test_a_quick_search_suffices_where_it_misses_no_marker(
     picture: Bytes, missed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One threshold in place of three; markers that it misses cost a corner each at a board's rim."""
-    looks: list[bool] = []
+    quick_searches: list[bool] = []
 
-    def look(image: Bytes, board: Board, *, quick: bool = False, **how: int) -> Markers:
-        looks.append(quick)
+    def detect(image: Bytes, board: Board, *, quick: bool = False, **how: int) -> Markers:
+        quick_searches.append(quick)
         markers = detect_markers(image, board, quick=quick, **how)
         kept = slice(missed if quick else 0, None)
         return Markers(markers.ids[kept], markers.corners[kept])
 
-    monkeypatch.setattr(detection, "detect_markers", look)
+    monkeypatch.setattr(detection, "detect_markers", detect)
     (view,) = found(picture, MARKED)
-    assert looks == ([True] if not missed else [True, False])
+    assert quick_searches == ([True] if not missed else [True, False])
     assert len(view.corner_ids) == len(true_corners(MARKED, PLACE))
     assert rms(view, true_corners(MARKED, PLACE)) < 0.012
 
 
 def test_markers_that_a_picture_cuts_off_are_not_missing(picture: Bytes) -> None:
-    """Half of a board seen whole asks for no second look."""
+    """Half of a board seen whole needs no second search."""
     half = np.ascontiguousarray(picture[:, : int(true_corners(MARKED, PLACE)[:, 0].mean())])
     markers = detect_markers(half, MARKED, quick=True)
-    placed = place_markers(MARKED, markers)
-    assert placed is not None
+    position = place_markers(MARKED, markers)
+    assert position is not None
     assert 5 < len(markers.ids) < 25
-    assert placed.all_seen(half.shape)
-    assert not placed.all_seen(picture.shape)
+    assert position.complete(half.shape)
+    assert not position.complete(picture.shape)
 
 
 @pytest.mark.slow
@@ -135,26 +135,26 @@ def test_a_column_too_many_is_refused_and_the_right_number_named(picture: Bytes)
 def test_columns_and_rows_that_are_exchanged_are_named(picture: Bytes) -> None:
     described = MARKED.model_copy(update={"columns": 8, "rows": 9})
     assert found(picture, described) == []
-    said = describe_unfound(picture, described)
-    assert "columns and rows exchanged: 9 columns x 8 rows" in said
+    text = describe_unfound(picture, described)
+    assert "columns and rows exchanged: 9 columns x 8 rows" in text
 
 
 def test_rows_that_are_not_there_or_not_described_are_named(picture: Bytes) -> None:
-    for rows, said in ((10, "fewer than 10 rows"), (6, "more than 6 rows")):
+    for rows, text in ((10, "fewer than 10 rows"), (6, "more than 6 rows")):
         described = MARKED.model_copy(update={"rows": rows})
         views = found(picture, described) * 3
         rig = Rig(name="r", boards=(described,), pairs=(CAMERA,))
-        assert any(said in note for note in appearance_notes(rig, views)), said
+        assert any(text in note for note in appearance_notes(rig, views)), text
 
 
 def test_markers_of_another_size_are_named(picture: Bytes) -> None:
     assert MARKED.marker_mm is not None
     described = MARKED.model_copy(update={"marker_mm": 0.6 * MARKED.marker_mm})
-    said = describe_unfound(picture, described)
+    text = describe_unfound(picture, described)
     share = MARKED.marker_mm / MARKED.square_mm
-    told = re.search(r"sides are about (0\.\d+) of a square's", said)
-    assert told, said
-    assert float(told[1]) == pytest.approx(share, rel=0.1)
+    match = re.search(r"sides are about (0\.\d+) of a square's", text)
+    assert match, text
+    assert float(match[1]) == pytest.approx(share, rel=0.1)
 
 
 @pytest.mark.slow

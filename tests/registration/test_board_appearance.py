@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodyscan.boards.appearance import Appearance
 from bodyscan.boards.board_layout import corner_grid
-from bodyscan.boards.view import BoardView
+from bodyscan.boards.view import Appearance, BoardView
 from bodyscan.registration.board_appearance import appearance_notes, without_odd_mirrored
 from bodyscan.rig.board import Board
 from bodyscan.rig.rig import Rig
@@ -61,7 +60,7 @@ def test_every_other_look_is_told_with_how_many_views_had_it() -> None:
         "white on black in 2 views (p)": Appearance(inverted=True),
         "mirrored in 2 views (p)": Appearance(mirrored=True),
         "legacy_layout: true) in 2 views (p)": Appearance(other_layout=True),
-        "markers below its last row in 2 views (p)": Appearance(goes_on=True),
+        "markers below its last row in 2 views (p)": Appearance(more_rows=True),
     }
     for words, look in looks.items():
         plain, other = view(COLUMNS, ROWS), view(COLUMNS, ROWS, look)

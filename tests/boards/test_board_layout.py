@@ -1,4 +1,4 @@
-"""Where a board's corners and markers lie."""
+"""Where a board's corners and markers lie, and where a print appears in an image."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyscan.boards.board_layout import corner_points, corners_per_face, marker_corners
+from bodyscan.boards.board_map import fit_board_map
 from bodyscan.errors import BadInput
 from bodyscan.rig.board import Board
 
@@ -54,16 +55,64 @@ def test_markers_stand_in_the_white_squares(size: tuple[int, int], legacy: bool)
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"dictionary": "DICT_9X9"}, "unknown marker dictionary"),
         ({"dictionary": "DICT_4X4_50", "faces": 2}, "too few"),
         ({"marker_mm": None}, "marker_mm"),
     ],
 )
-def test_boards_that_cannot_be_printed_are_refused(changes: dict[str, Any], said: str) -> None:
+def test_boards_that_cannot_be_printed_are_refused(changes: dict[str, Any], message: str) -> None:
     board = Board(name="b", kind="charuco", columns=9, rows=7, square_mm=10, marker_mm=8)
-    with pytest.raises(BadInput, match=said):
+    with pytest.raises(BadInput, match=message):
         marker_corners(
             board.model_copy(update=changes), face=board.model_copy(update=changes).faces - 1
         )
+
+
+TRUE = np.array([[2.2, -0.3, 140.0], [0.25, 2.1, 130.0], [4e-4, -3e-4, 1.0]])
+
+
+def printed(columns: int, rows: int) -> np.ndarray:
+    x, y = np.meshgrid(30.0 * np.arange(1, columns + 1), 30.0 * np.arange(1, rows + 1))
+    return np.stack([x.ravel(), y.ravel()], axis=-1)
+
+
+def project(points: np.ndarray, distortion: float = 0.0) -> np.ndarray:
+    there = np.column_stack([points, np.ones(len(points))]) @ TRUE.T
+    pixels = there[:, :2] / there[:, 2:]
+    error = (pixels - [400.0, 300.0]) / 300.0
+    return np.asarray(pixels + distortion * error * np.sum(error**2, axis=1)[:, None])
+
+
+@pytest.mark.parametrize(
+    ("size", "degree", "terms"),
+    [((8, 5), 3, 10), ((13, 3), 2, 6), ((5, 4), 2, 6), ((19, 1), 0, 1)],
+)
+def test_terms_follow_the_number_of_points(size: tuple[int, int], degree: int, terms: int) -> None:
+    found = fit_board_map(printed(*size), project(printed(*size)))
+    assert found.degree == degree
+    assert found.coefficients.shape == (terms, 2), "those of x and y together up to the degree"
+
+
+def test_without_a_lens_it_is_the_homography_and_its_slopes() -> None:
+    points = printed(9, 6)
+    found = fit_board_map(points, project(points))
+    points_ = np.array([[33.0, 71.0], [200.0, 155.0]])
+    np.testing.assert_allclose(found.apply(points_), project(points_), atol=1e-6)
+    for k, step in enumerate(np.eye(2)):
+        slope = (project(points_ + 1e-3 * step) - project(points_ - 1e-3 * step)) / 2e-3
+        np.testing.assert_allclose(found.jacobian(points_)[..., k], slope, rtol=1e-5)
+    np.testing.assert_allclose(found.middle, [150.0, 105.0])
+    assert found.size == 120.0
+
+
+def test_a_gentle_lens_is_followed_where_points_are_many() -> None:
+    points = printed(9, 6)
+    found = fit_board_map(points, project(points, 3.0))
+    error = found.apply(points) - project(points, 3.0)
+    # Three pixels at 300 from the middle: a homography alone is error by half of one.
+    assert np.sqrt(np.mean(error**2)) < 0.05
+    few = printed(3, 3)
+    error = fit_board_map(few, project(few, 30.0)).apply(few) - project(few, 30.0)
+    assert np.sqrt(np.mean(error**2)) > 0.05, "nine points leave a lens open"
