@@ -9,7 +9,7 @@ import numpy as np
 from bodyscan.arrays import Array, Mask
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import StackedEquations, minimize_each
-from bodyscan.geometry.scaled_systems import solve_scaled
+from bodyscan.geometry.linear_gaussian import solve_scaled
 from bodyscan.geometry.transforms import RigidTransform
 
 STEPS = 5

@@ -25,7 +25,7 @@ from bodyscan.alignment.moments import Courses, breaths, of_breath, of_stance
 from bodyscan.alignment.part_names import above_feet, ankles
 from bodyscan.alignment.sway_prior import BODY_CENTRE
 from bodyscan.arrays import Array, Indices
-from bodyscan.geometry.scaled_systems import invert_scaled
+from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.progress import map_threads
 

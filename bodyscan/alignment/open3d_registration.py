@@ -21,8 +21,8 @@ from bodyscan.alignment.overlap_equations import OverlapEquations
 from bodyscan.alignment.overlaps import COARSE
 from bodyscan.alignment.sway_prior import SwayPrior
 from bodyscan.arrays import Array
+from bodyscan.geometry.linear_gaussian import solve_scaled
 from bodyscan.geometry.pose_covariance import PoseCovariance
-from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.settings import AlignmentSettings
 

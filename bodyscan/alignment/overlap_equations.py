@@ -10,8 +10,8 @@ import numpy as np
 from bodyscan.alignment.matching import Matches
 from bodyscan.arrays import Array
 from bodyscan.compiled import compiled
+from bodyscan.geometry.linear_gaussian import invert_scaled, solve_scaled
 from bodyscan.geometry.robust import spread
-from bodyscan.geometry.scaled_systems import invert_scaled, solve_scaled
 
 LEAST_SPREAD_MM = 0.01
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyscan.arrays import Array
+from bodyscan.geometry.linear_gaussian import solve_scaled
 from bodyscan.geometry.pose_covariance import PoseCovariance, position_sigma
 from bodyscan.geometry.robust import rms
-from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import RigidTransform, adjoint
 from bodyscan.settings import BODY_CENTRE_MM, AlignmentSettings
 

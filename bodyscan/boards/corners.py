@@ -26,8 +26,8 @@ from bodyscan.arrays import Array, Bytes, Indices, Mask
 from bodyscan.boards.view import AS_PRINTED, Appearance
 from bodyscan.compiled import compiled
 from bodyscan.geometry.least_squares import StackedEquations, minimize_each
+from bodyscan.geometry.linear_gaussian import solve_scaled
 from bodyscan.geometry.robust import SIGMAS_PER_MEDIAN
-from bodyscan.geometry.scaled_systems import solve_scaled
 
 WINDOW_SQUARES = 0.42
 """Half the width of the window around a corner, in squares: it stays clear of neighbouring edges."""

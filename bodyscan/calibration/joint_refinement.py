@@ -28,7 +28,7 @@ from bodyscan.calibration.held_out import CLEARLY
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import EXACT, Block, Noise, Solution, minimize
 from bodyscan.geometry.light_planes import Axis
-from bodyscan.geometry.scaled_systems import invert_scaled
+from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.smooth_sheets import SmoothSheets
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 

@@ -14,8 +14,8 @@ from bodyscan.calibration.boundary_points import (
     points_on_board,
 )
 from bodyscan.geometry.light_planes import Axis, LightPlanes
+from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.robust import cauchy_weights, spread
-from bodyscan.geometry.scaled_systems import invert_scaled
 
 __all__ = [
     "BoundaryPoints",

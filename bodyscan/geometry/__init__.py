@@ -5,5 +5,5 @@ Poses: transforms, pose_covariance. Cameras: camera, lenses (one file each), cam
 visibility, crop. Light sheets: light_planes (one plane per stripe, Eq. 6), smooth_sheets with
 bowed_sheets, lens_sheets with lens_points, projector_sheets; sheet_table and sheet_arrays (for
 compiled loops and for files), ray_depths (where a ray meets a sheet). Fitting: least_squares,
-robust, scaled_systems.
+robust, linear_gaussian.
 """

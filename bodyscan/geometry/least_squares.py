@@ -23,8 +23,8 @@ from typing import Generic, Literal, TypeVar
 import numpy as np
 
 from bodyscan.arrays import Array, Indices, Mask
+from bodyscan.geometry.linear_gaussian import invert_scaled, multiply_transposed, solve_scaled
 from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, spread
-from bodyscan.geometry.scaled_systems import gram, invert_scaled, solve_scaled
 
 Columns = Indices | slice
 State = TypeVar("State")
@@ -365,7 +365,7 @@ def _equations(
             _add_runs(block, weighted, normal, gradient)
             continue
         square = _square(block.columns)
-        normal[square] += gram(weighted, block.jacobian)
+        normal[square] += multiply_transposed(weighted, block.jacobian)
         gradient[block.columns] += weighted.T @ block.residuals
     return normal, gradient
 

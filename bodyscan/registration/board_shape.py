@@ -15,8 +15,8 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_form import BoardFace, rounded
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.calibration.held_out import CLEARLY, Compared, gain
+from bodyscan.geometry.linear_gaussian import solve_scaled
 from bodyscan.geometry.robust import rms, rms_length
-from bodyscan.geometry.scaled_systems import solve_scaled
 from bodyscan.geometry.transforms import rigid_fit
 from bodyscan.registration.full_solve import solve_fully
 from bodyscan.registration.inconsistent_views import fit_board

@@ -17,7 +17,7 @@ from bodyscan.arrays import Array, Indices
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
 from bodyscan.geometry.least_squares import Noise
-from bodyscan.geometry.scaled_systems import invert_scaled
+from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform, twist_jacobian
 from bodyscan.registration.view_graph import Target
 

@@ -20,8 +20,8 @@ from bodyscan.geometry.least_squares import (
     minimize,
     minimize_each,
 )
+from bodyscan.geometry.linear_gaussian import invert_scaled, solve_scaled
 from bodyscan.geometry.robust import cauchy_cost, cauchy_weights, rms, rms_length, spread
-from bodyscan.geometry.scaled_systems import gram, invert_scaled, solve_scaled
 
 TIME = np.linspace(0.0, 3.0, 60)
 TRUE = np.array([2.0, 0.7, -0.5])
@@ -304,11 +304,6 @@ def test_what_nothing_ties_gets_the_shortest_solution_and_no_infinite_covariance
     matrix = np.array([[4.0, 4.0], [4.0, 4.0]])
     assert np.allclose(solve_scaled(matrix, np.array([8.0, 8.0])), [1.0, 1.0])
     assert np.allclose(invert_scaled(matrix), np.full((2, 2), 1.0 / 16.0))
-
-
-def test_a_tall_product_in_small_blocks_is_the_product() -> None:
-    left, right = np.random.default_rng(8).normal(size=(2, 1000, 5))
-    assert np.allclose(gram(left, right), left.T @ right)
 
 
 def test_the_spread_is_a_standard_deviation_that_outliers_do_not_sway() -> None:

@@ -5,8 +5,8 @@ from ring import CHARUCO, ring_of_cameras, ring_rig, ring_views
 from bodyscan.boards.board_layout import corner_points, corners_per_face
 from bodyscan.calibration.board_views import LocatedView
 from bodyscan.geometry.camera import Camera
+from bodyscan.geometry.linear_gaussian import invert_scaled
 from bodyscan.geometry.pose_covariance import position_sigma
-from bodyscan.geometry.scaled_systems import invert_scaled
 from bodyscan.geometry.transforms import RigidTransform
 from bodyscan.registration.advice import advise, crucial_shots
 from bodyscan.registration.more_shots import BoardPlace, RigInformation
